@@ -1,0 +1,1 @@
+"""Presets of the methods, installed as `sadgs_ns.configs`."""

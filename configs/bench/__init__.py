@@ -1,0 +1,1 @@
+"""Benchmark protocols, installed as `sadgs_ns.configs.bench`."""

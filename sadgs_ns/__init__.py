@@ -1,0 +1,1 @@
+"""Structure-aware densification for Gaussian splatting, as a nerfstudio method."""

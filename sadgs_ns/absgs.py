@@ -1,0 +1,80 @@
+"""AbsGS densification: clone on the mean gradient, split on the absolute one (paper, section 3.6; AbsGS)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, MutableMapping
+from typing import Any
+
+import torch
+from gsplat.strategy.ops import duplicate, split
+from torch import Tensor
+
+from sadgs_ns.rasterization import visible
+from sadgs_ns.split import Params, limit_growth
+
+
+def empty_gradients(num_gaussians: int, device: torch.device) -> dict[str, Tensor]:
+    """Sums `grad2d`, `absgrad2d` and the number of views `grad_count` that they run over, each float32 [N]."""
+    zeros = torch.zeros(num_gaussians, device=device)
+    return {"grad2d": zeros, "absgrad2d": zeros.clone(), "grad_count": zeros.clone()}
+
+
+@torch.no_grad()
+def accumulate_gradients(gradients: MutableMapping[str, Tensor], info: Mapping[str, Any], num_views: int) -> None:
+    """Add the screen-space gradients of one backward pass, in place.
+
+    Gradients are normalised as in 3DGS: by half the image size, so that 1 is the gradient per half image, and by the
+    number of views, since the loss is a mean over views.
+
+    Args:
+        gradients: As made by `empty_gradients`.
+        info: gsplat's meta, unpacked, whose `means2d` [C, N, 2] kept its `.grad` and `.absgrad`.
+        num_views: Views that the loss is a mean of.
+    """
+    means2d = info["means2d"]
+    seen = visible(info)  # [C, N]
+    half_size = means2d.new_tensor([info["width"] / 2.0, info["height"] / 2.0]) * num_views
+    for key, gradient in (("grad2d", means2d.grad), ("absgrad2d", means2d.absgrad)):
+        gradients[key] += torch.where(seen, (gradient * half_size).norm(dim=-1), 0.0).sum(0)
+    gradients["grad_count"] += seen.sum(0)
+
+
+@torch.no_grad()
+def grow(
+    params: Params,
+    optimizers: MutableMapping[str, torch.optim.Optimizer],
+    state: MutableMapping[str, Any],
+    *,
+    clone_threshold: float,
+    split_threshold: float,
+    size_threshold: float,
+    budget: int,
+) -> tuple[int, int]:
+    """Clone small Gaussians by their mean gradient, split large ones in two by their absolute gradient.
+
+    Args:
+        params: gsplat's parameters.
+        optimizers: One per parameter.
+        state: The strategy's state with the sums of `empty_gradients`.
+        clone_threshold: Normalised mean gradient at which a small Gaussian is cloned; AbsGS uses 2e-4.
+        split_threshold: Normalised mean absolute gradient at which a large one is split; AbsGS uses 4e-4.
+        size_threshold: Largest scale in world units at which a Gaussian counts as small.
+        budget: Gaussians that may be added in all, the steepest gradients first.
+
+    Returns:
+        Numbers of clones and of splits.
+    """
+    count = state["grad_count"].clamp_min(1)
+    is_small = params["scales"].exp().amax(dim=-1) <= size_threshold
+    clone_ratio = state["grad2d"] / count / clone_threshold
+    split_ratio = state["absgrad2d"] / count / split_threshold
+    steepness = torch.where(is_small, clone_ratio, split_ratio)  # ≥ 1 grows
+    chosen = limit_growth((steepness >= 1).long(), steepness, budget)
+    is_clone, is_split = chosen & is_small, chosen & ~is_small
+    n_clone, n_split = int(is_clone.sum()), int(is_split.sum())
+    if n_clone > 0:
+        duplicate(params, optimizers, state, is_clone)  # type: ignore[arg-type]
+    if n_split > 0:
+        is_split = torch.cat([is_split, is_split.new_zeros(n_clone)])  # clones are not split
+        split(params, optimizers, state, is_split)  # type: ignore[arg-type]
+    return n_clone, n_split

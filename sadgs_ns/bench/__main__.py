@@ -1,0 +1,216 @@
+"""`sadgs-bench PROTOCOL.yaml --scenes ROOT --output results.jsonl`: run a benchmark, or what is left of it.
+
+Every run is a process of its own, so that none inherits another's memory, caches or random state.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from sadgs_ns.bench import protocol, results
+from sadgs_ns.bench.protocol import Job
+from sadgs_ns.bench.results import Result
+from sadgs_ns.bench.table import markdown
+
+POLL_SECONDS = 0.2
+KILL_SECONDS = 10.0
+"""How long a run may take to end when it is asked to, before it is killed."""
+
+Launch = Callable[[Job, "str | None", Path], "subprocess.Popen[bytes]"]
+"""Starts a job on a GPU (None: whatever is visible) in a folder: `result.json` and `log` appear there."""
+
+
+@dataclasses.dataclass
+class _Run:
+    job: Job
+    gpu: str | None
+    process: subprocess.Popen[bytes]
+    folder: tempfile.TemporaryDirectory[str]
+
+    def result(self, log: Path) -> Result:
+        """What the process, which has ended, measured; the output of one that failed goes to the log."""
+        written = Path(self.folder.name, "result.json")
+        code = self.process.returncode
+        if written.exists():
+            measured = json.loads(written.read_text())
+        else:
+            measured = {"status": "failed", "error": f"the run ended with code {code} and no result; see {log}."}
+        output = Path(self.folder.name, "log")
+        if measured["status"] == "failed" and output.exists():
+            with log.open("a") as file:
+                file.write(f"=== {self.job.key}\n{output.read_text(errors='replace')}\n")
+        row = self.job.row
+        identity = {"scene": self.job.scene.name, "label": row.label, "method": row.method, "seed": self.job.seed}
+        return {"key": self.job.key, **identity, "overrides": row.overrides, **measured}
+
+    def stop(self) -> None:
+        """End the process and what it started."""
+        try:
+            os.killpg(self.process.pid, signal.SIGTERM)
+            self.process.wait(KILL_SECONDS)
+        except ProcessLookupError:
+            pass
+        except subprocess.TimeoutExpired:
+            os.killpg(self.process.pid, signal.SIGKILL)
+            self.process.wait()
+
+
+def launcher(root: Path) -> Launch:
+    """Starts jobs with `sadgs_ns.bench.run`, on scenes in a folder."""
+
+    def launch(job: Job, gpu: str | None, folder: Path) -> subprocess.Popen[bytes]:
+        spec = json.dumps({**dataclasses.asdict(job), "root": str(root)}, default=str)
+        command = [sys.executable, "-m", "sadgs_ns.bench.run", "--spec", spec, "--out", str(folder / "result.json")]
+        environment = dict(os.environ) if gpu is None else {**os.environ, "CUDA_VISIBLE_DEVICES": gpu}
+        with (folder / "log").open("wb") as log:
+            # A session of its own, so that a compiler the run started can be ended with it.
+            return subprocess.Popen(
+                command, stdout=log, stderr=subprocess.STDOUT, env=environment, start_new_session=True
+            )
+
+    return launch
+
+
+def run_all(
+    jobs: Sequence[Job],
+    launch: Launch,
+    finished: Callable[[Result], None],
+    log: Path,
+    gpus: Sequence[str | None] = (None,),
+    jobs_per_gpu: int = 1,
+    time_limit: float = float("inf"),
+) -> int:
+    """Run jobs in their order, some at a time on each GPU; whatever ends this early also ends the runs.
+
+    Args:
+        finished: Called with each result as its run ends.
+        log: Takes the output of runs that fail.
+        time_limit: Seconds after which no run starts.
+
+    Returns:
+        How many jobs were not started because of the time limit.
+    """
+    deadline = time.monotonic() + time_limit
+    pending, running = deque(jobs), list[_Run]()
+    free = deque(gpu for _ in range(jobs_per_gpu) for gpu in gpus)
+    try:
+        while running or (pending and time.monotonic() < deadline):
+            while pending and free and time.monotonic() < deadline:
+                folder = tempfile.TemporaryDirectory(prefix="sadgs-bench-", ignore_cleanup_errors=True)
+                job, gpu = pending.popleft(), free.popleft()
+                running.append(_Run(job, gpu, launch(job, gpu, Path(folder.name)), folder))
+            for run in [run for run in running if run.process.poll() is not None]:
+                finished({**run.result(log), "jobs_per_gpu": jobs_per_gpu})
+                running.remove(run)
+                free.append(run.gpu)
+                run.folder.cleanup()
+            time.sleep(POLL_SECONDS if running else 0)
+    finally:
+        for run in running:
+            run.stop()
+            run.folder.cleanup()
+    return len(pending)
+
+
+def unfinished(jobs: Sequence[Job], done: Sequence[Result]) -> list[Job]:
+    """Jobs with no result that is ok."""
+    keys = {result["key"] for result in done if result["status"] == "ok"}
+    return [job for job in jobs if job.key not in keys]
+
+
+def line(result: Result) -> str:
+    """A finished run in one line."""
+    name = f"{result['scene']} {result['label']} seed {result['seed']}"
+    if result["status"] != "ok":
+        return f"{name}: failed: {result['error']}"
+    lpips = "" if result["lpips"] is None else f", LPIPS {result['lpips']:.4f}"
+    peak = "" if result["peak_gb"] is None else f", {result['peak_gb']:.2f} GB"
+    return (
+        f"{name}: loop {result['loop_seconds']:.1f} s, PSNR {result['psnr']:.2f}, SSIM {result['ssim']:.4f}{lpips}, "
+        f"{result['gaussians']:,} Gaussians{peak}"
+    )
+
+
+def _selected(arguments: argparse.Namespace) -> list[Job]:
+    """The protocol's jobs that are asked for, all checked before the first one runs."""
+    from sadgs_ns.bench.run import build_config
+
+    jobs = protocol.load(arguments.protocol).jobs()
+    try:
+        jobs = [job for job in jobs if re.search(arguments.only, f"{job.scene.name}/{job.row.label}/{job.seed}")]
+    except re.error as error:
+        raise ValueError(f"--only {arguments.only!r} is not a regular expression ({error}).") from error
+    if not jobs:
+        raise ValueError(f"--only {arguments.only!r} leaves no run; it is searched for in scene/label/seed.")
+    if arguments.jobs_per_gpu < 1:
+        raise ValueError(f"--jobs-per-gpu must be 1 or more, not {arguments.jobs_per_gpu}.")
+    for job in {(job.scene.name, job.row.label): job for job in jobs}.values():
+        build_config(job.scene, job.row, job.seed, arguments.scenes, Path("unused"))
+    return jobs
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a benchmark.
+
+    Returns:
+        Exit code: 0, 1 if a run failed, 2 if the input is wrong, 130 after an interrupt.
+    """
+    parser = argparse.ArgumentParser(prog="sadgs-bench", description="Run a benchmark, or what is left of it.")
+    parser.add_argument("protocol", type=Path, help="YAML file of scenes, rows and seeds")
+    parser.add_argument("--scenes", type=Path, required=True, metavar="ROOT", help="folder that holds the scenes")
+    parser.add_argument("--output", type=Path, required=True, help="JSON-lines file; runs already in it are skipped")
+    parser.add_argument("--gpus", metavar="0,1", help="GPUs to use (default: the first visible one)")
+    parser.add_argument("--jobs-per-gpu", type=int, default=1, help="times are only comparable with 1, the default")
+    parser.add_argument("--only", default="", metavar="REGEX", help="only runs whose scene/label/seed match")
+    parser.add_argument("--time-limit", type=float, default=float("inf"), metavar="SECONDS", help="then start no run")
+    parser.add_argument("--reference", metavar="LABEL", help="row whose loop seconds are 1 in the column Ratio")
+    arguments = parser.parse_args(argv)
+    try:
+        jobs = _selected(arguments)
+    except ValueError as error:
+        print(f"sadgs-bench: {error}", file=sys.stderr)
+        return 2
+
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    todo = unfinished(jobs, results.read(arguments.output))
+    log = arguments.output.with_suffix(".log")
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, disable=not sys.stdout.isatty()) as progress:
+        task = progress.add_task("Runs", total=len(jobs), completed=len(jobs) - len(todo))
+
+        def finished(result: Result) -> None:
+            results.append(arguments.output, result)
+            print(line(result), flush=True)
+            progress.advance(task)
+
+        arguments.output.parent.mkdir(parents=True, exist_ok=True)
+        gpus = arguments.gpus.split(",") if arguments.gpus else (None,)
+        launch = launcher(arguments.scenes.resolve())
+        try:
+            left = run_all(todo, launch, finished, log, gpus, arguments.jobs_per_gpu, arguments.time_limit)
+        except KeyboardInterrupt:
+            return 130
+    if left:
+        print(f"{left} runs were not started within the time limit; the same command continues.")
+    latest = {result["key"]: result for result in results.read(arguments.output)}
+    rows = [latest[job.key] for job in jobs if job.key in latest]
+    print(markdown(rows, arguments.reference))
+    return int(any(row["status"] != "ok" for row in rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,249 @@
+"""What a benchmark measures: scenes, rows and seeds, read from a YAML file.
+
+    scenes:
+      bonsai: {data: bonsai, dataparser: colmap, options: {colmap_path: sparse/0}}
+    seeds: [0, 1]
+    rows:
+      - {label: ours, method: sadgs, overrides: {max_num_iterations: 3000}}
+
+A row may name its own `scenes` and `seeds`, and `sweep: {dotted.path: [a, b]}` makes one row of each combination.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import hashlib
+import itertools
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A scene and how nerfstudio reads it."""
+
+    name: str
+    data: str
+    """Folder, relative to the root that holds all scenes."""
+    dataparser: str
+    """A registered nerfstudio dataparser; `blender` stands for `blender-data`."""
+    options: dict[str, Any] = field(default_factory=dict)
+    """Dotted paths into the dataparser's config."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A method with its settings; one line of the table per scene."""
+
+    label: str
+    method: str
+    """A registered nerfstudio method."""
+    overrides: dict[str, Any] = field(default_factory=dict)
+    """Dotted paths into the method's TrainerConfig."""
+    scenes: tuple[str, ...] | None = None
+    """Which scenes; None means all."""
+    seeds: tuple[int, ...] | None = None
+    """Which seeds; None means the protocol's."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training run."""
+
+    scene: Scene
+    row: Row
+    seed: int
+
+    @property
+    def key(self) -> str:
+        """Identifies the run in a results file: scene, label, seed and a hash of everything that sets it up."""
+        settings = [self.row.method, self.row.overrides, dataclasses.asdict(self.scene)]
+        digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()[:12]
+        return f"{self.scene.name}/{self.row.label}/{self.seed}/{digest}"
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """A benchmark."""
+
+    scenes: dict[str, Scene]
+    rows: tuple[Row, ...]
+    seeds: tuple[int, ...] = (0, 1)
+
+    def jobs(self) -> list[Job]:
+        """All runs: rows in their order, then scenes, then seeds."""
+        return [
+            Job(self.scenes[name], row, seed)
+            for row in self.rows
+            for name in (self.scenes if row.scenes is None else row.scenes)
+            for seed in (self.seeds if row.seeds is None else row.seeds)
+        ]
+
+
+def load(path: Path) -> Protocol:
+    """Read a protocol.
+
+    Raises:
+        ValueError: The file is not a protocol; one sentence that names the place and the remedy.
+    """
+    try:
+        return parse(yaml.safe_load(path.read_text()))
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read ({error.strerror}); give the path of a protocol file.") from error
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path} is not YAML: {' '.join(str(error).split())}.") from error
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def parse(content: object) -> Protocol:
+    """Turn the content of a protocol file into a Protocol.
+
+    Raises:
+        ValueError: As `load`, without the file's name.
+    """
+    top = _mapping(content, "the protocol", required={"scenes", "rows"}, optional={"seeds"})
+    scenes = {str(name): _scene(str(name), value) for name, value in _mapping(top["scenes"], "scenes").items()}
+    if not scenes:
+        raise ValueError("scenes is empty; name at least one scene.")
+    rows = tuple(
+        row for i, value in enumerate(_list(top["rows"], "rows")) for row in _rows(value, f"rows[{i}]", scenes)
+    )
+    labels = [row.label for row in rows]
+    for label in labels:
+        if labels.count(label) > 1:
+            raise ValueError(f"two rows have the label {label!r}; give each its own.")
+    return Protocol(scenes, rows, _seeds(top.get("seeds", [0, 1]), "seeds"))
+
+
+def set_dotted(config: Any, path: str, value: Any) -> None:
+    """Set one setting in a tree of dataclasses and dicts, in place.
+
+    Args:
+        config: Root of the tree.
+        path: Dataclass fields and dict keys, joined by dots.
+        value: What YAML holds; it becomes a Path, tuple or float where the present value is one.
+
+    Raises:
+        ValueError: The path leads nowhere, or the value has another type than the present one.
+    """
+    *parents, last = path.split(".")
+    node = config
+    for i, name in enumerate(parents):
+        node = _child(node, name, path, ".".join(parents[:i]))
+    value = _as_type_of(_child(node, last, path, ".".join(parents)), value, path)
+    if isinstance(node, dict):
+        node[last] = value
+    else:
+        setattr(node, last, value)
+
+
+def _child(node: Any, name: str, path: str, parent: str) -> Any:
+    where = parent or "the config"
+    if isinstance(node, dict):
+        names = [str(key) for key in node]
+    elif dataclasses.is_dataclass(node):
+        names = [f.name for f in dataclasses.fields(node)]
+    else:
+        raise ValueError(f"override {path!r}: {where} is {node!r}, which has no settings; shorten the path.")
+    if name not in names:
+        similar = difflib.get_close_matches(name, names, n=1)
+        remedy = f"did you mean {similar[0]!r}?" if similar else f"it has {', '.join(sorted(names))}."
+        raise ValueError(f"override {path!r}: {where} has no {name!r}; {remedy}")
+    return node[name] if isinstance(node, dict) else getattr(node, name)
+
+
+def _as_type_of(old: Any, value: Any, path: str) -> Any:
+    if old is None or value is None:
+        return value
+    if isinstance(old, bool) or isinstance(value, bool):
+        if isinstance(old, bool) and isinstance(value, bool):
+            return value
+    elif isinstance(old, (int, float)):
+        if isinstance(value, (int, float)):
+            return value
+        # YAML 1.1 reads 1e-4 as text: a float needs a dot there.
+        if isinstance(old, float) and isinstance(value, str):
+            try:
+                return float(value)
+            except ValueError:
+                pass
+    elif isinstance(old, Path) and isinstance(value, str):
+        return Path(value)
+    elif isinstance(old, (tuple, list)) and isinstance(value, list):
+        return type(old)(value)
+    elif isinstance(old, str) and isinstance(value, str):
+        return value
+    kind = "a group of settings" if isinstance(old, dict) or dataclasses.is_dataclass(old) else type(old).__name__
+    raise ValueError(f"override {path!r}: {value!r} is {type(value).__name__}, but the setting is {kind}.")
+
+
+def _rows(value: object, where: str, scenes: Mapping[str, Scene]) -> list[Row]:
+    row = _mapping(value, where, required={"label", "method"}, optional={"scenes", "seeds", "overrides", "sweep"})
+    label, method = _text(row["label"], f"{where}.label"), _text(row["method"], f"{where}.method")
+    names = None
+    if row.get("scenes") is not None:
+        names = tuple(str(name) for name in _list(row["scenes"], f"{where}.scenes"))
+        for name in names:
+            if name not in scenes:
+                raise ValueError(f"{where}.scenes names {name!r}, which is not under scenes; add it there.")
+    seeds = None if row.get("seeds") is None else _seeds(row["seeds"], f"{where}.seeds")
+    overrides = _mapping(row.get("overrides") or {}, f"{where}.overrides")
+    sweep = _mapping(row.get("sweep") or {}, f"{where}.sweep")
+    choices = [[(path, v) for v in _list(values, f"{where}.sweep.{path}")] for path, values in sweep.items()]
+    rows = []
+    for combination in itertools.product(*choices):
+        suffix = ",".join(f"{path.rsplit('.', 1)[-1]}={v}" for path, v in combination)
+        rows.append(
+            Row(f"{label}[{suffix}]" if suffix else label, method, {**overrides, **dict(combination)}, names, seeds)
+        )
+    return rows
+
+
+def _scene(name: str, value: object) -> Scene:
+    where = f"scenes.{name}"
+    scene = _mapping(value, where, required={"data", "dataparser"}, optional={"options"})
+    options = _mapping(scene.get("options") or {}, f"{where}.options")
+    return Scene(
+        name, _text(scene["data"], f"{where}.data"), _text(scene["dataparser"], f"{where}.dataparser"), options
+    )
+
+
+def _mapping(
+    value: object, where: str, required: set[str] | None = None, optional: set[str] | None = None
+) -> dict[str, Any]:
+    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
+        raise ValueError(f"{where} must be a mapping with names as keys, not {value!r}.")
+    if required is not None:
+        allowed = required | (optional or set())
+        for key in value:
+            if key not in allowed:
+                raise ValueError(f"{where} has an unknown key {key!r}; it takes {', '.join(sorted(allowed))}.")
+        for key in sorted(required - value.keys()):
+            raise ValueError(f"{where} lacks {key!r}; add it.")
+    return value
+
+
+def _list(value: object, where: str) -> list[Any]:
+    if not isinstance(value, list) or not value:
+        raise ValueError(f"{where} must be a list of at least one entry, not {value!r}.")
+    return value
+
+
+def _text(value: object, where: str) -> str:
+    if not isinstance(value, str) or not value:
+        raise ValueError(f"{where} must be text, not {value!r}; put it in quotes.")
+    return value
+
+
+def _seeds(value: object, where: str) -> tuple[int, ...]:
+    seeds = _list(value, where)
+    if not all(isinstance(seed, int) and not isinstance(seed, bool) and seed >= 0 for seed in seeds):
+        raise ValueError(f"{where} must be a list of whole numbers from 0, not {value!r}.")
+    return tuple(seeds)

@@ -1,0 +1,111 @@
+"""How far the torch splatter is from gsplat: `python -m sadgs_ns.bench.rasterizers` on a CUDA machine.
+
+Renders one random scene with gsplat on CUDA in float32 and with the splatter on the CPU in float32 and float64, and
+prints the largest deviations of the images, projections and gradients from gsplat's as a markdown table.
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+import gsplat
+import torch
+from torch import Tensor
+
+from sadgs_ns.rasterization import rasterize, visible
+
+_PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
+
+
+def random_scene(gaussians: int, size: int, seed: int) -> dict[str, Tensor]:
+    """A cube of Gaussians with SH of degree 3 in front of one camera, with random weights for a loss.
+
+    Args:
+        gaussians: Number N of Gaussians.
+        size: Width and height S of the image in pixels.
+        seed: Of the random numbers.
+
+    Returns:
+        float64 CPU tensors: the arguments of `rasterize` by name, and `weights` [1, S, S, 3].
+    """
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(low: float, high: float, *shape: int) -> Tensor:
+        return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    scene = {
+        "means": uniform(-1.0, 1.0, gaussians, 3),
+        "quats": torch.randn(gaussians, 4, generator=generator, dtype=torch.float64),
+        "scales": uniform(0.01, 0.08, gaussians, 3),
+        "opacities": uniform(0.05, 0.95, gaussians),
+        "colors": 0.3 * torch.randn(gaussians, 16, 3, generator=generator, dtype=torch.float64),
+        "viewmats": torch.eye(4, dtype=torch.float64)[None],
+        "Ks": torch.tensor([[[1.2 * size, 0.0, 0.5 * size], [0.0, 1.2 * size, 0.5 * size], [0.0, 0.0, 1.0]]]).double(),
+        "weights": uniform(0.5, 1.5, 1, size, size, 3),
+    }
+    scene["viewmats"][0, 2, 3] = 3.0
+    # Rounded once, so that every dtype renders the same numbers.
+    return {name: tensor.float().double() for name, tensor in scene.items()}
+
+
+def render_with_gradients(scene: dict[str, Tensor], device: str, dtype: torch.dtype) -> dict[str, Tensor]:
+    """Images, projections and gradients of mean(weights * colour^2), as float64 CPU tensors.
+
+    Args:
+        scene: From `random_scene`.
+        device: "cuda" renders with gsplat, "cpu" with the splatter.
+        dtype: Floating-point type to render in; gsplat needs float32.
+
+    Returns:
+        `visible` bool [1, N]; `colour`, `alpha`, `means2d`, `conics`, `absgrad`, and `gradient of ...` per parameter.
+    """
+    arguments: dict[str, Any] = {name: tensor.to(device, dtype) for name, tensor in scene.items()}
+    weights = arguments.pop("weights")  # [1, S, S, 3]
+    for name in _PARAMETERS:
+        arguments[name].requires_grad_()
+    height, width = weights.shape[1:3]
+    colors, alphas, info = rasterize(**arguments, width=width, height=height, sh_degree=3, absgrad=True)
+    (weights * colors.square()).mean().backward()
+    results = {"colour": colors, "alpha": alphas, "means2d": info["means2d"], "conics": info["conics"]}
+    results |= {f"gradient of {name}": arguments[name].grad for name in _PARAMETERS}
+    results["absgrad"] = info["means2d"].absgrad
+    return {"visible": visible(info).cpu()} | {name: value.detach().cpu().double() for name, value in results.items()}
+
+
+def main() -> None:
+    """Print the table; exit with status 1 where there is no CUDA device."""
+    parser = argparse.ArgumentParser(description="Compare the torch splatter with gsplat on CUDA.")
+    parser.add_argument("--gaussians", type=int, default=3000)
+    parser.add_argument("--size", type=int, default=128, help="width and height of the image in pixels")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    if not torch.cuda.is_available():
+        print("This comparison needs a CUDA device for gsplat, and torch finds none.")
+        raise SystemExit(1)
+
+    scene = random_scene(options.gaussians, options.size, options.seed)
+    reference = render_with_gradients(scene, "cuda", torch.float32)
+    splatted = {dtype: render_with_gradients(scene, "cpu", dtype) for dtype in (torch.float32, torch.float64)}
+    print(f"gsplat {gsplat.__version__}, torch {torch.__version__}, {torch.cuda.get_device_name()}; ", end="")
+    print(f"{options.gaussians} Gaussians, {options.size} x {options.size} px, seed {options.seed}. ", end="")
+    changed = {dtype: int((one["visible"] != reference["visible"]).sum()) for dtype, one in splatted.items()}
+    print(f"Gaussians visible in one only: {changed[torch.float32]} (float32), {changed[torch.float64]} (float64).\n")
+    print("Largest deviation from gsplat; the relative one is divided by gsplat's largest absolute value.\n")
+    print("| quantity | float32, absolute | float32, relative | float64, absolute | float64, relative |")
+    print("| --- | --- | --- | --- | --- |")
+    for name in [key for key in reference if key != "visible"]:
+        cells = []
+        for one in splatted.values():
+            expected, actual = reference[name], one[name]
+            if name in ("means2d", "conics"):
+                # gsplat leaves these uninitialised for culled Gaussians.
+                drawn = reference["visible"] & one["visible"]
+                expected, actual = expected[drawn], actual[drawn]
+            deviation = (actual - expected).abs().max().item()
+            cells += [f"{deviation:.1e}", f"{deviation / expected.abs().max().item():.1e}"]
+        print(f"| {name} | {' | '.join(cells)} |")
+
+
+if __name__ == "__main__":
+    main()

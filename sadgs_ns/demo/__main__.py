@@ -1,0 +1,300 @@
+"""Draw the demo scene, train on it with and without densification, and show what changed.
+
+Leaves in the output folder: `scene/` (a COLMAP dataset), `side_by_side.png`, `wavelength_and_eta.png`, `splat.ply`, and
+nerfstudio's own run folders under `runs/`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import sys
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.utils.rich_utils import CONSOLE
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+from pytorch_msssim import ssim
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from torch import Tensor
+
+from sadgs_ns.demo.scene import EVAL_INTERVAL, SPARSE_FOLDER, SceneDescription, expected_wavelength_map, write_scene
+from sadgs_ns.eta import wavelength
+from sadgs_ns.export import atomic_path, write_ply
+from sadgs_ns.model import SadgsModel
+from sadgs_ns.pipeline import SadgsPipeline
+from sadgs_ns.presets import load_preset
+from sadgs_ns.rasterization import rasterize
+from sadgs_ns.strategy import StructureAwareStrategy
+from sadgs_ns.trainer import SadgsTrainer, SadgsTrainerConfig
+
+PRESET = "sadgs"
+
+
+@dataclass
+class Snapshot:
+    """The Gaussians and their η just before the first structure step, if the run came that far."""
+
+    params: dict[str, Tensor] = field(default_factory=dict)
+    """Raw parameters by name, leading dimension N."""
+    eta_max: Tensor = field(default_factory=lambda: torch.empty(0, 3))
+    """Largest η seen per axis. [N, 3]"""
+
+
+@dataclass
+class Run:
+    """A trained model and what it took."""
+
+    label: str
+    pipeline: SadgsPipeline
+    seconds: float
+    """Of the training loop."""
+    renders: list[Tensor]
+    """Held-out views in [0, 1]. [H, W, 3] each"""
+    targets: list[Tensor]
+    """The same views as they are. [H, W, 3] each"""
+    before_split: Snapshot
+
+    @property
+    def model(self) -> SadgsModel:
+        """The trained Gaussians."""
+        return self.pipeline.model
+
+    def psnr(self) -> float:
+        """Mean over the held-out views, dB."""
+        errors = [(a - b).square().mean() for a, b in zip(self.renders, self.targets, strict=True)]
+        return float(torch.stack([-10 * error.log10() for error in errors]).mean())
+
+    def ssim(self) -> float:
+        """Mean over the held-out views, 11×11 window."""
+        first, second = (torch.stack(images).permute(0, 3, 1, 2) for images in (self.renders, self.targets))
+        return float(ssim(first, second, data_range=1.0))
+
+
+def fit_schedule(strategy: StructureAwareStrategy, iterations: int, max_gaussians: int) -> None:
+    """Shrink the preset's schedule, made for 3,000 iterations, to the demo's few.
+
+    Args:
+        strategy: Changed in place.
+        iterations: Length of the run.
+        max_gaussians: The demo's cap, which bounds the time of a step on a CPU.
+    """
+    factor = iterations / 3000
+    for name in ("structure_every", "absgs_every", "refine_start_iter", "refine_stop_iter", "reset_every"):
+        setattr(strategy, name, max(round(getattr(strategy, name) * factor), 1))
+    strategy.max_gaussians = max_gaussians
+
+
+def run_config(
+    scene: Path, output: Path, label: str, iterations: int, max_gaussians: int, densify: bool
+) -> SadgsTrainerConfig:
+    """The preset, set up for the demo: its own data, few iterations, no viewer, no evaluation on the way."""
+    config: SadgsTrainerConfig = copy.deepcopy(load_preset(PRESET).config)  # type: ignore[assignment]
+    config.output_dir, config.experiment_name, config.timestamp = output / "runs", label, "latest"
+    config.vis = "tensorboard"
+    config.max_num_iterations = iterations
+    config.steps_per_save = config.steps_per_eval_image = 0
+    config.logging.local_writer.enable = False
+    config.pipeline.datamanager.cache_images = "gpu"  # the training device; "cpu" pins memory, which needs CUDA
+    config.pipeline.datamanager.dataparser = ColmapDataParserConfig(
+        data=scene, colmap_path=SPARSE_FOLDER, downscale_factor=1, eval_mode="interval", eval_interval=EVAL_INTERVAL
+    )
+    config.pipeline.model.densify = densify
+    fit_schedule(config.pipeline.model.strategy, iterations, max_gaussians)
+    return config
+
+
+def train(config: SadgsTrainerConfig, label: str, on_step: Callable[[int, int], None]) -> Run:
+    """Train through nerfstudio's trainer and render the held-out views.
+
+    Args:
+        config: What to train.
+        label: How the run is called in tables and pictures.
+        on_step: Called after each iteration with its number, from 1, and the number of Gaussians.
+    """
+    torch.manual_seed(config.machine.seed)
+    np.random.seed(config.machine.seed)
+    trainer: SadgsTrainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    pipeline, snapshot = trainer.pipeline, Snapshot()
+
+    def before_densification(step: int) -> None:
+        strategy = pipeline.model.strategy
+        if step + 1 == strategy.structure_every and "eta_max" in pipeline.model.strategy_state:
+            snapshot.params = {name: value.detach().clone() for name, value in pipeline.model.gauss_params.items()}
+            snapshot.eta_max = pipeline.model.strategy_state["eta_max"].clone()
+
+    def after_step(step: int) -> None:
+        on_step(step + 1, pipeline.model.num_points)
+
+    after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+    trainer.callbacks = [TrainingCallback(after, before_densification), *trainer.callbacks]
+    trainer.callbacks.append(TrainingCallback(after, after_step))
+    start = time.perf_counter()
+    trainer.train()
+    seconds = time.perf_counter() - start
+
+    pipeline.eval()
+    dataset, renders, targets = pipeline.datamanager.eval_dataset, [], []
+    for index in range(len(dataset)):
+        outputs = pipeline.model.get_outputs_for_camera(dataset.cameras[index : index + 1])
+        renders.append(outputs["rgb"].cpu())
+        targets.append(dataset.get_image_float32(index).cpu())
+    return Run(label, pipeline, seconds, renders, targets, snapshot)
+
+
+@torch.no_grad()
+def eta_map(pipeline: SadgsPipeline, snapshot: Snapshot, index: int) -> NDArray[np.float32]:
+    """Largest η of the Gaussians that make up each pixel of a training view, blended like their colours.
+
+    Returns:
+        NaN where nothing is drawn. [H, W]
+    """
+    viewmats, Ks = pipeline.train_cameras
+    camera = pipeline.datamanager.train_dataset.cameras[index]
+    params = snapshot.params
+    values, alphas, _ = rasterize(
+        params["means"],
+        params["quats"],
+        params["scales"].exp(),
+        torch.sigmoid(params["opacities"]).squeeze(-1),
+        snapshot.eta_max.amax(1, keepdim=True),
+        viewmats[index : index + 1],
+        Ks[index : index + 1],
+        int(camera.width),
+        int(camera.height),
+    )
+    return torch.where(alphas > 0.05, values / alphas, torch.nan)[0, ..., 0].cpu().numpy()
+
+
+def draw_side_by_side(path: Path, runs: Sequence[Run]) -> None:
+    """One row a held-out view: ground truth, then each run."""
+    labels = ["ground truth", *(run.label for run in runs)]
+    rows = [
+        torch.cat([target, *(run.renders[index] for run in runs)], dim=1)  # [H, columns · W, 3]
+        for index, target in enumerate(runs[0].targets)
+    ]
+    pixels = (255 * torch.cat(rows).clamp(0, 1)).round().byte().numpy()
+    width, enlarge, margin = runs[0].targets[0].shape[1], 2, 18
+    pixels = pixels.repeat(enlarge, axis=0).repeat(enlarge, axis=1)
+    picture = Image.new("RGB", (pixels.shape[1], pixels.shape[0] + margin), "white")
+    picture.paste(Image.fromarray(pixels), (0, margin))
+    for column, label in enumerate(labels):
+        ImageDraw.Draw(picture).text((column * width * enlarge + 4, 3), label, fill="black")
+    with atomic_path(path) as partial:
+        picture.save(partial)
+
+
+def draw_wavelength_and_eta(path: Path, scene: SceneDescription, run: Run, index: int = 0) -> None:
+    """Four panels of a training view: image, estimated and true wavelength, and η before the first split.
+
+    The structure tensor measures ω = c / σ; a sine of period P has 1 / Λ_min = 2π c / P, so the panel shows the period
+    2π c Λ_min that belongs to the estimate.
+    """
+    pipeline = run.pipeline
+    dataset = pipeline.datamanager.train_dataset
+    name = dataset.image_filenames[index].name
+    truth = expected_wavelength_map(scene.surfaces, next(view for view in scene.views if view.name == name))
+    constant = pipeline.config.frequency_constant
+    estimate = 2 * torch.pi * constant * wavelength(pipeline.structure_tensors[index].float()).cpu().numpy()
+    figure = Figure(figsize=(14, 3.2), layout="constrained")
+    image_axes, estimate_axes, truth_axes, eta_axes = figure.subplots(1, 4)
+    image_axes.imshow(dataset.get_image_float32(index).cpu().numpy())
+    image_axes.set_title(f"training view {name}")
+    for axes, values, title in (
+        (estimate_axes, estimate, "wavelength, estimated (px)"),
+        (truth_axes, truth, "wavelength, true (px)"),
+    ):
+        shown = axes.imshow(values, norm="log", vmin=3, vmax=60, cmap="viridis")
+        axes.set_title(title)
+    figure.colorbar(shown, ax=[estimate_axes, truth_axes], ticks=[3, 5, 10, 20, 40], format="%d")
+    eta_axes.set_title("largest η before the first split")
+    if run.before_split.params:
+        shown = eta_axes.imshow(eta_map(pipeline, run.before_split, index), norm="log", vmin=0.1, vmax=10, cmap="coolwarm")
+        figure.colorbar(shown, ax=eta_axes, ticks=[0.1, 1, 10], format="%g")
+    for axes in (image_axes, estimate_axes, truth_axes, eta_axes):
+        axes.set_axis_off()
+    with atomic_path(path) as partial:
+        figure.savefig(partial, dpi=110)
+
+
+def demonstrate(output: Path, iterations: int, max_gaussians: int, width: int, height: int, views: int) -> list[Run]:
+    """Run the whole demo and return its runs: without densification, then with it.
+
+    Args:
+        output: Folder for everything that is left.
+        iterations: Of each run, at least 30.
+        max_gaussians: Cap on the number of Gaussians.
+        width, height, views: As for `write_scene`.
+
+    Raises:
+        ValueError: If a number is too small.
+        FileExistsError: If `output`/scene holds something else.
+    """
+    if iterations < 30:
+        raise ValueError(f"--max-num-iterations is {iterations}; give at least 30, or nothing is split")
+    console = Console()
+    scene = write_scene(output / "scene", width, height, views)
+    console.print(f"Scene: {len(scene.views)} views of {width}×{height} px, {len(scene.points)} points, in {output}/scene")
+    runs: list[Run] = []
+    columns = (TextColumn("{task.description:24s}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    CONSOLE.quiet, was_quiet = True, CONSOLE.quiet  # nerfstudio's console: the demo prints its own few lines
+    try:
+        with Progress(*columns, TextColumn("{task.fields[count]} Gaussians"), console=console) as progress:
+            for label, densify in (("without densification", False), (PRESET, True)):
+                task = progress.add_task(label, total=iterations, count=len(scene.points))
+
+                def on_step(iteration: int, count: int, task=task) -> None:
+                    progress.update(task, completed=iteration, count=count)
+
+                config = run_config(output / "scene", output, label.replace(" ", "-"), iterations, max_gaussians, densify)
+                runs.append(train(config, label, on_step))
+    finally:
+        CONSOLE.quiet = was_quiet
+    draw_side_by_side(output / "side_by_side.png", runs)
+    draw_wavelength_and_eta(output / "wavelength_and_eta.png", scene, runs[-1])
+    write_ply(output / "splat.ply", **runs[-1].model.gauss_params)
+    table = Table("held-out views", "PSNR (dB)", "SSIM", "Gaussians", "seconds")
+    for run in runs:
+        table.add_row(run.label, f"{run.psnr():.2f}", f"{run.ssim():.4f}", f"{run.model.num_points}", f"{run.seconds:.0f}")
+    console.print(table)
+    for name in ("side_by_side.png", "wavelength_and_eta.png", "splat.ply"):
+        console.print(f"{output / name}")
+    return runs
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m sadgs_ns.demo", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--output", type=Path, default=Path("demo-output"), help="folder to write (default %(default)s)")
+    parser.add_argument("--max-num-iterations", type=int, default=300, help="of each run (default %(default)s)")
+    parser.add_argument("--max-gaussians", type=int, default=6000, help="cap on their number (default %(default)s)")
+    parser.add_argument("--width", type=int, default=160, help="image width in px (default %(default)s)")
+    parser.add_argument("--height", type=int, default=120, help="image height in px (default %(default)s)")
+    parser.add_argument("--views", type=int, default=40, help="training and held-out views (default %(default)s)")
+    given = parser.parse_args(arguments)
+    # nerfstudio and torch warn about their own internals, which is not what the demo is about.
+    warnings.filterwarnings("ignore", module=r"(torch|nerfstudio|torchmetrics)\b")
+    try:
+        demonstrate(
+            given.output, given.max_num_iterations, given.max_gaussians, given.width, given.height, given.views
+        )
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

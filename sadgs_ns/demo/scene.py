@@ -1,0 +1,516 @@
+"""A drawn room corner with gratings and checkers of known wavelength, written as a COLMAP dataset.
+
+Every surface carries one texture whose wavelength is known in world units, so the wavelength that a view should show at
+each pixel follows from geometry alone (`expected_wavelength_map`). The world is z-up, cameras follow OpenCV (x right,
+y down, z forward), pixel centres lie at half-integers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+Array = NDArray[np.float64]
+
+EVAL_INTERVAL = 8
+"""Every 8th view is held out, as nerfstudio's colmap parser does with `--eval-mode interval --eval-interval 8`."""
+SPARSE_FOLDER = Path("sparse/0")
+"""Where the COLMAP model lies inside the scene's folder."""
+
+_DESCRIPTION_NAME = "scene.json"
+_FORMAT = "sadgs_ns demo scene"
+_BLACK = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """A textured rectangle, two-sided."""
+
+    name: str
+    """Unique in the scene."""
+    corner: Array
+    """World position of one corner. [3]"""
+    edge_u: Array
+    """From the corner along one side. [3]"""
+    edge_v: Array
+    """From the corner along the other side, orthogonal to `edge_u`. [3]"""
+    dark: tuple[float, float, float]
+    """Colour of the texture's troughs, in [0, 1]."""
+    bright: tuple[float, float, float]
+    """Colour of the texture's crests, in [0, 1]."""
+    texture: Literal["grating", "checker", "plain"] = "plain"
+    """A sine along one direction, hard-edged squares, or the mean colour."""
+    wavelength: float = float("nan")
+    """Period of the sine, or of the checker's fundamental (√2 times a square's side), in world units."""
+    angle: float = 0.0
+    """Of the grating's direction, or a row of squares, from `edge_u` towards `edge_v`, in rad."""
+
+    @property
+    def normal(self) -> Array:
+        """Unit normal. [3]"""
+        normal = np.cross(self.edge_u, self.edge_v)
+        return normal / np.linalg.norm(normal)
+
+    @property
+    def area(self) -> float:
+        """World units²."""
+        return float(np.linalg.norm(self.edge_u) * np.linalg.norm(self.edge_v))
+
+    @property
+    def _directions(self) -> tuple[Array, Array]:
+        """The texture's own orthonormal axes in the plane. [3] each"""
+        u, v = self.edge_u / np.linalg.norm(self.edge_u), self.edge_v / np.linalg.norm(self.edge_v)
+        return np.cos(self.angle) * u + np.sin(self.angle) * v, np.cos(self.angle) * v - np.sin(self.angle) * u
+
+    @property
+    def frequencies(self) -> Array:
+        """The texture's fundamental waves as vectors in the plane, cycles per world unit. [F, 3], F = 0 if plain."""
+        a, b = self._directions
+        if self.texture == "grating":
+            return a[None] / self.wavelength
+        if self.texture == "checker":
+            return np.stack([a + b, a - b]) / (np.sqrt(2.0) * self.wavelength)
+        return np.zeros((0, 3))
+
+    def depth(self, origin: Array, directions: Array) -> Array:
+        """Ray parameter of the hit, inf where there is none. [R]
+
+        Args:
+            origin: [3]
+            directions: [R, 3]
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = self.normal @ (self.corner - origin) / (directions @ self.normal)  # [R]
+            local = origin + t[:, None] * directions - self.corner  # [R, 3]
+            u, v = local @ self.edge_u / (self.edge_u @ self.edge_u), local @ self.edge_v / (self.edge_v @ self.edge_v)
+            hit = (t > 0) & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
+        return np.where(hit, t, np.inf)
+
+    def colour(self, points: Array) -> Array:
+        """Colour in [0, 1] at points on the surface. [P, 3] → [P, 3]"""
+        a, b = ((points - self.corner) @ direction for direction in self._directions)  # [P] each
+        wave = np.zeros(len(points))
+        if self.texture == "grating":
+            wave = np.sin(2 * np.pi * a / self.wavelength)
+        elif self.texture == "checker":
+            side = self.wavelength / np.sqrt(2.0)
+            wave = np.where((np.floor(a / side) + np.floor(b / side)) % 2 == 0, 1.0, -1.0)
+        dark, bright = np.array(self.dark), np.array(self.bright)
+        return dark + (bright - dark) * (0.5 + 0.5 * wave[:, None])
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Uniform points on the surface. [count, 3]"""
+        u, v = rng.random((2, count, 1))
+        return self.corner + u * self.edge_u + v * self.edge_v
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """An untextured sphere with fixed, view-independent shading from above."""
+
+    name: str
+    """Unique in the scene."""
+    centre: Array
+    """[3]"""
+    radius: float
+    """World units."""
+    albedo: tuple[float, float, float]
+    """In [0, 1]."""
+    wavelength: float = float("nan")
+    """There is none."""
+
+    @property
+    def area(self) -> float:
+        """World units²."""
+        return 4 * np.pi * self.radius**2
+
+    @property
+    def frequencies(self) -> Array:
+        """None. [0, 3]"""
+        return np.zeros((0, 3))
+
+    def depth(self, origin: Array, directions: Array) -> Array:
+        """Ray parameter of the nearest hit, inf where there is none. origin [3], directions [R, 3] → [R]"""
+        offset = origin - self.centre
+        a, b = (directions**2).sum(1), directions @ offset  # [R] each
+        discriminant = b**2 - a * (offset @ offset - self.radius**2)
+        t = (-b - np.sqrt(np.maximum(discriminant, 0))) / a
+        return np.where((discriminant > 0) & (t > 0), t, np.inf)
+
+    def colour(self, points: Array) -> Array:
+        """Colour in [0, 1] at points on the surface. [P, 3] → [P, 3]"""
+        upward = (points - self.centre)[:, 2:] / self.radius  # [P, 1]
+        return np.array(self.albedo) * (0.7 + 0.3 * upward)
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Uniform points on the surface. [count, 3]"""
+        directions = rng.normal(size=(count, 3))
+        return self.centre + self.radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+Surface = Rectangle | Sphere
+
+
+@dataclass(frozen=True)
+class View:
+    """One posed pinhole image."""
+
+    name: str
+    """File name in the folder `images`."""
+    rotation: Array
+    """World to camera. [3, 3]"""
+    translation: Array
+    """World to camera. [3]"""
+    focal: float
+    """px, the same for x and y."""
+    width: int
+    """px"""
+    height: int
+    """px"""
+
+    @property
+    def position(self) -> Array:
+        """Camera centre in the world. [3]"""
+        return -self.rotation.T @ self.translation
+
+    def rays(self, supersampling: int = 1) -> Array:
+        """Ray directions in the world, scaled so that the ray parameter is the depth.
+
+        Args:
+            supersampling: Samples per pixel and axis.
+
+        Returns:
+            Row by row over the image enlarged `supersampling` times. [H·s·W·s, 3]
+        """
+        x = (np.arange(self.width * supersampling) + 0.5) / supersampling - 0.5 * self.width
+        y = (np.arange(self.height * supersampling) + 0.5) / supersampling - 0.5 * self.height
+        x, y = np.meshgrid(x / self.focal, y / self.focal)
+        return np.stack([x.ravel(), y.ravel(), np.ones(x.size)], -1) @ self.rotation
+
+    def project(self, points: Array) -> tuple[Array, Array]:
+        """World points → pixel positions [P, 2] and depths [P]."""
+        camera = points @ self.rotation.T + self.translation  # [P, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            pixels = self.focal * camera[:, :2] / camera[:, 2:] + 0.5 * np.array([self.width, self.height])
+        return pixels, camera[:, 2]
+
+
+@dataclass(frozen=True)
+class SceneDescription:
+    """What was drawn: surfaces with their true wavelengths, views, and the points that initialise the Gaussians."""
+
+    surfaces: tuple[Surface, ...]
+    """Everything visible."""
+    views: tuple[View, ...]
+    """In file name order; every 8th, from the first, is held out."""
+    points: Array
+    """SfM-like points near the surfaces, world units. [P, 3]"""
+    colours: NDArray[np.uint8]
+    """Colours of the points. [P, 3]"""
+    tracks: NDArray[np.bool_] = field(repr=False)
+    """Which view sees which point. [P, V]"""
+
+    @property
+    def wavelengths(self) -> dict[str, float]:
+        """Wavelength of each textured surface in world units, by the surface's name."""
+        return {surface.name: surface.wavelength for surface in self.surfaces if len(surface.frequencies) > 0}
+
+
+def _box(name: str, centre: tuple[float, float], size: tuple[float, float, float], turn: float, **texture) -> list:
+    """Five faces of a box that stands on the floor; keywords as for `Rectangle`.
+
+    Args:
+        centre: x and y, world units.
+        size: Along the box's own x, y and z, world units.
+        turn: About the vertical, in rad.
+    """
+    x = np.array([np.cos(turn), np.sin(turn), 0.0]) * size[0]
+    y = np.array([-np.sin(turn), np.cos(turn), 0.0]) * size[1]
+    z = np.array([0.0, 0.0, size[2]])
+    low = np.array([*centre, 0.0]) - 0.5 * (x + y)
+    faces = [("front", low, x, z), ("left", low, y, z), ("back", low + y, x, z), ("right", low + x, y, z)]
+    faces.append(("top", low + z, x, y))
+    return [Rectangle(f"{name} {side}", corner, u, v, **texture) for side, corner, u, v in faces]
+
+
+def room_surfaces() -> tuple[Surface, ...]:
+    """The room corner: a floor, two walls, two boxes and a plain sphere. World units; the room is 3 wide, 2.2 high."""
+    x, y, z = np.diag([3.0, 3.0, 2.2])
+    origin = np.zeros(3)
+    return (
+        Rectangle("floor", origin, x, y, (0.25, 0.2, 0.15), (0.85, 0.8, 0.7), "checker", 0.5, 0.4),
+        Rectangle("fine wall", origin, x, z, (0.15, 0.25, 0.45), (0.75, 0.85, 0.95), "grating", 0.15),
+        Rectangle("coarse wall", origin, y, z, (0.5, 0.2, 0.15), (0.95, 0.75, 0.5), "grating", 0.35, 1.0),
+        *_box(
+            "tall box",
+            (0.65, 1.35),
+            (0.5, 0.5, 1.1),
+            0.4,
+            dark=(0.1, 0.3, 0.1),
+            bright=(0.7, 0.9, 0.5),
+            texture="grating",
+            wavelength=0.2,
+            angle=0.5 * np.pi,
+        ),
+        *_box(
+            "faint box",
+            (1.5, 0.6),
+            (0.7, 0.5, 0.5),
+            -0.3,
+            dark=(0.5, 0.42, 0.55),
+            bright=(0.62, 0.54, 0.67),
+            texture="grating",
+            wavelength=0.14,
+            angle=0.6,
+        ),
+        Sphere("sphere", np.array([1.45, 1.5, 0.3]), 0.3, (0.9, 0.5, 0.3)),
+    )
+
+
+def arc_views(count: int, width: int, height: int) -> tuple[View, ...]:
+    """Cameras spread over a patch of a sphere about the room's middle, all looking at it.
+
+    The positions follow a low-discrepancy sequence that starts in the patch's middle, so the held-out views lie between
+    training views, whatever their number.
+    """
+    target = np.array([0.85, 0.85, 0.55])
+    views = []
+    for index in range(count):
+        across, up, away = (0.5 + index * np.array([0.8191725134, 0.6710436067, 0.5497004779])) % 1.0
+        azimuth, elevation = np.radians(14 + 62 * across), np.radians(12 + 33 * up)
+        outward = np.array(
+            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+        )
+        right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        rotation = np.stack([right, np.cross(-outward, right), -outward])
+        position = target + (2.3 + 0.6 * away) * outward
+        views.append(View(f"{index:03d}.png", rotation, -rotation @ position, 0.8 * width, width, height))
+    return tuple(views)
+
+
+def trace(surfaces: Sequence[Surface], origin: Array, directions: Array) -> tuple[NDArray[np.intp], Array]:
+    """First surface that each ray meets.
+
+    Args:
+        origin: [3]
+        directions: [R, 3]
+
+    Returns:
+        Index of the surface, −1 where there is none [R], and the ray parameter, inf where there is none [R].
+    """
+    nearest = np.full(len(directions), np.inf)
+    index = np.full(len(directions), -1)
+    for i, surface in enumerate(surfaces):
+        depth = surface.depth(origin, directions)
+        index = np.where(depth < nearest, i, index)
+        nearest = np.minimum(depth, nearest)
+    return index, nearest
+
+
+def render(surfaces: Sequence[Surface], view: View, supersampling: int = 4) -> NDArray[np.uint8]:
+    """Antialiased image of one view, black where nothing is. [H, W, 3]"""
+    directions = view.rays(supersampling)
+    index, depth = trace(surfaces, view.position, directions)
+    samples = np.tile(np.array(_BLACK), (len(directions), 1))
+    for i, surface in enumerate(surfaces):
+        on = index == i
+        samples[on] = surface.colour(view.position + depth[on, None] * directions[on])
+    samples = samples.reshape(view.height, supersampling, view.width, supersampling, 3)
+    return np.rint(255 * samples.mean(axis=(1, 3))).astype(np.uint8)
+
+
+def expected_wavelength_map(surfaces: Sequence[Surface], view: View) -> NDArray[np.float32]:
+    """The wavelength that the view shows at each pixel, from geometry alone.
+
+    A texture's phase is φ(X) = f·X with X = o + t(p) d(p) on the surface, and t = nᵀ(q − o) / nᵀd. Its gradient over
+    the pixel, t (fᵀd' − fᵀd · nᵀd' / nᵀd), is the frequency in cycles per px: world wavelength times focal length over
+    depth, foreshortened along the grating. Of a checker's two waves the shorter counts.
+
+    Returns:
+        Wavelength in px, NaN where there is no texture. [H, W]
+    """
+    directions = view.rays()
+    index, depth = trace(surfaces, view.position, directions)
+    per_pixel = view.rotation[:2] / view.focal  # derivative of the direction over x and over y. [2, 3]
+    frequency = np.zeros(len(directions))
+    for i, surface in enumerate(surfaces):
+        if not isinstance(surface, Rectangle):
+            continue
+        on = index == i
+        slant = (per_pixel @ surface.normal) / (directions[on] @ surface.normal)[:, None]  # [R, 2]
+        for wave in surface.frequencies:  # [3]
+            gradient = depth[on, None] * (per_pixel @ wave - (directions[on] @ wave)[:, None] * slant)  # [R, 2]
+            frequency[on] = np.maximum(frequency[on], np.hypot(gradient[:, 0], gradient[:, 1]))
+    with np.errstate(divide="ignore"):
+        wavelength = np.where(frequency > 0, 1.0 / frequency, np.nan)
+    return wavelength.reshape(view.height, view.width).astype(np.float32)
+
+
+def _visible(surfaces: Sequence[Surface], view: View, points: Array) -> NDArray[np.bool_]:
+    """Which points on the surfaces the view sees. [P, 3] → [P]"""
+    pixels, depth = view.project(points)
+    inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < [view.width, view.height]).all(1)
+    _, nearest = trace(surfaces, view.position, points - view.position)
+    return inside & (nearest > 1 - 1e-4)  # the ray's parameter is 1 at the point itself
+
+
+def describe_scene(
+    width: int = 160, height: int = 120, views: int = 40, points: int = 800, seed: int = 0
+) -> SceneDescription:
+    """Lay out the scene without drawing it.
+
+    Args:
+        width: Image width in px, at least 16.
+        height: Image height in px, at least 16.
+        views: Training and held-out views together, at least 9.
+        points: Number of initial points, at least 10.
+        seed: Of the points' positions and noise. Surfaces and cameras do not depend on it.
+
+    Returns:
+        SceneDescription. Each point is seen by at least 2 views and lies 0.004 world units (one standard deviation per
+        axis) off its surface, as after a structure-from-motion run.
+
+    Raises:
+        ValueError: If a number is too small.
+    """
+    for name, value, least in (("width", width, 16), ("height", height, 16), ("views", views, 9), ("points", points, 10)):
+        if value < least:
+            raise ValueError(f"the demo scene's {name} is {value}; give at least {least}")
+    rng = np.random.default_rng(seed)
+    surfaces, cameras = room_surfaces(), arc_views(views, width, height)
+    area = np.array([surface.area for surface in surfaces])
+    counts = rng.multinomial(6 * points, area / area.sum())  # enough to drop hidden and unseen places
+    exact = np.concatenate([surface.sample(count, rng) for surface, count in zip(surfaces, counts, strict=True)])
+    colours = np.concatenate(
+        [surface.colour(part) for surface, part in zip(surfaces, np.split(exact, counts.cumsum()[:-1]), strict=True)]
+    )
+    tracks = np.stack([_visible(surfaces, view, exact) for view in cameras], -1)  # [P, V]
+    seen = np.flatnonzero(tracks.sum(1) >= 2)
+    kept = np.sort(rng.permutation(seen)[:points])
+    return SceneDescription(
+        surfaces=surfaces,
+        views=cameras,
+        points=exact[kept] + 0.004 * rng.normal(size=(len(kept), 3)),
+        colours=np.rint(255 * colours[kept]).astype(np.uint8),
+        tracks=tracks[kept],
+    )
+
+
+def _write_colmap(scene: SceneDescription, folder: Path) -> None:
+    """Write cameras, poses, points and their tracks as a binary COLMAP model."""
+    # Imported late: nerfstudio takes seconds, and the geometry above needs none of it.
+    from nerfstudio.data.utils import colmap_parsing_utils as colmap
+
+    first = scene.views[0]
+    intrinsics = np.array([first.focal, first.focal, 0.5 * first.width, 0.5 * first.height])
+    cameras = {1: colmap.Camera(1, "PINHOLE", first.width, first.height, intrinsics)}
+    # A point's place in a view's list of keypoints is its rank among the points which that view sees.
+    rank = scene.tracks.cumsum(0) - 1  # [P, V]
+    images = {}
+    for index, view in enumerate(scene.views):
+        seen = np.flatnonzero(scene.tracks[:, index])
+        pixels, _ = view.project(scene.points[seen])
+        quaternion = colmap.rotmat2qvec(view.rotation)
+        images[index + 1] = colmap.Image(index + 1, quaternion, view.translation, 1, view.name, pixels, seen + 1)
+    points = {}
+    for index, (position, colour) in enumerate(zip(scene.points, scene.colours, strict=True)):
+        seen = np.flatnonzero(scene.tracks[index])
+        points[index + 1] = colmap.Point3D(index + 1, position, colour, 0.5, seen + 1, rank[index, seen])
+    folder.mkdir(parents=True)
+    colmap.write_model(cameras, images, points, str(folder))
+
+
+def _refuse_foreign(folder: Path) -> None:
+    """Raise unless `folder` is absent, empty, or an earlier demo scene."""
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise FileExistsError(f"{folder} is a file; name a new or empty folder for the demo scene")
+    if not any(folder.iterdir()):
+        return
+    try:
+        known = json.loads((folder / _DESCRIPTION_NAME).read_text()).get("format") == _FORMAT
+    except (OSError, ValueError, AttributeError):
+        known = False
+    if not known:
+        raise FileExistsError(f"{folder} holds files that are not a demo scene; name a new or empty folder")
+
+
+def write_scene(
+    folder: Path, width: int = 160, height: int = 120, views: int = 40, points: int = 800, seed: int = 0
+) -> SceneDescription:
+    """Draw the scene and write it as a COLMAP dataset: `images/*.png`, `sparse/0/*.bin` and `scene.json`.
+
+    Everything is written beside the folder first and then renamed, so an interrupted run leaves no half scene.
+
+    Args:
+        folder: Created, with its parents; an earlier demo scene there is replaced.
+        width, height, views, points, seed: As for `describe_scene`.
+
+    Returns:
+        What was drawn.
+
+    Raises:
+        ValueError: If a number is too small.
+        FileExistsError: If `folder` is a file or holds anything but a demo scene.
+    """
+    folder = Path(folder).absolute()
+    _refuse_foreign(folder)
+    scene = describe_scene(width, height, views, points, seed)
+    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    try:
+        (partial / "images").mkdir(parents=True)
+        for view in scene.views:
+            Image.fromarray(render(scene.surfaces, view)).save(partial / "images" / view.name)
+        _write_colmap(scene, partial / SPARSE_FOLDER)
+        description = {
+            "format": _FORMAT,
+            "width": width,
+            "height": height,
+            "views": views,
+            "points": len(scene.points),
+            "seed": seed,
+            "wavelengths": scene.wavelengths,
+        }
+        (partial / _DESCRIPTION_NAME).write_text(json.dumps(description, indent=2) + "\n")
+        if folder.exists():
+            shutil.rmtree(folder)
+        partial.rename(folder)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return scene
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m sadgs_ns.demo.scene", description=write_scene.__doc__.split("\n")[0])
+    parser.add_argument("folder", type=Path, help="where to write the scene")
+    parser.add_argument("--width", type=int, default=160, help="image width in px (default %(default)s)")
+    parser.add_argument("--height", type=int, default=120, help="image height in px (default %(default)s)")
+    parser.add_argument("--views", type=int, default=40, help="training and held-out views (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the initial points (default %(default)s)")
+    given = parser.parse_args(arguments)
+    try:
+        scene = write_scene(given.folder, given.width, given.height, given.views, seed=given.seed)
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(f"{given.folder}: {len(scene.views)} views, {len(scene.points)} points; wavelengths in world units:")
+    for name, wavelength in scene.wavelengths.items():
+        print(f"  {name:16s} {wavelength:g}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,73 @@
+"""Where the first Gaussians go: SfM points and the faces of their bounding box (paper, section 3.6)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+FACE_GRID = 16
+"""Points along each side of a face (released code)."""
+FACE_OPACITY = 0.05
+"""Initial opacity of the points on the faces (released code)."""
+POINT_OPACITY = 0.1
+"""Initial opacity of SfM points (3DGS)."""
+FACE_GREY = 0.5
+"""Colour of the points on the faces in [0, 1] (released code)."""
+
+
+def bounding_box_points(points: Tensor, grid: int = FACE_GRID) -> tuple[Tensor, float]:
+    """Regular grids on the six faces of the axis-aligned bounding box.
+
+    Args:
+        points: SfM points in world units. [P, 3]
+        grid: Points along each side of a face.
+
+    Returns:
+        6·grid² points [6·grid², 3] and the spacing that their scale starts from, mean box extent / grid, world units.
+    """
+    low, high = points.amin(0), points.amax(0)
+    ticks = (torch.arange(grid, device=points.device, dtype=points.dtype) + 0.5) / grid  # cell centres in (0, 1)
+    u, v = torch.meshgrid(ticks, ticks, indexing="ij")
+    faces = []
+    for axis in range(3):
+        for side in (0.0, 1.0):
+            face = torch.stack([u, v], -1).reshape(-1, 2)
+            face = torch.cat([face[:, :axis], torch.full_like(face[:, :1], side), face[:, axis:]], dim=1)
+            faces.append(low + face * (high - low))
+    return torch.cat(faces), float((high - low).mean()) / grid
+
+
+def neighbour_scales(points: Tensor, neighbours: int = 3) -> Tensor:
+    """Initial scale of each point: the mean distance to its nearest neighbours, as splatfacto does.
+
+    Duplicates have distance 0; the scale is then a millionth of the cloud's extent, so that its logarithm is finite.
+
+    Args:
+        points: World units. [P, 3]
+        neighbours: At most this many; fewer where the cloud is smaller.
+
+    Returns:
+        World units, > 0. [P]
+    """
+    from sklearn.neighbors import NearestNeighbors
+
+    extent = float((points.amax(0) - points.amin(0)).norm()) or 1.0
+    k = min(neighbours, len(points) - 1)
+    if k < 1:
+        return torch.full_like(points[:, 0], 0.01 * extent)
+    array = points.detach().cpu().numpy()
+    distances, _ = NearestNeighbors(n_neighbors=k + 1).fit(array).kneighbors(array)
+    return torch.from_numpy(distances[:, 1:].mean(1)).to(points).clamp_min(1e-6 * extent)
+
+
+def camera_extent(positions: Tensor) -> float:
+    """Extent of the cameras as 3DGS defines it: 1.1 times the largest distance from their centre.
+
+    Args:
+        positions: Camera centres in world units. [C, 3]
+
+    Returns:
+        World units; 1 for a single camera or coinciding ones, which have no extent.
+    """
+    extent = 1.1 * float((positions - positions.mean(0)).norm(dim=-1).max())
+    return extent if extent > 0 else 1.0

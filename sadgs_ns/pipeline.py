@@ -1,0 +1,163 @@
+"""nerfstudio glue: several views per iteration, and the structure tensors of the training images."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import torch
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from torch import Tensor
+
+from sadgs_ns.initialization import camera_extent
+from sadgs_ns.model import SadgsModel, SadgsModelConfig
+from sadgs_ns.rasterization import viewmats_from_camera_to_world
+from sadgs_ns.structure_tensor import FREQUENCY_CONSTANT, multiscale_structure_tensor
+
+_PIXELS_PER_BATCH = 4_000_000
+"""Structure tensors are computed for as many images at once as fit this; each pixel takes about 300 bytes."""
+
+
+@dataclass
+class SadgsPipelineConfig(VanillaPipelineConfig):
+    """Full images, several of them per iteration, and their structure tensors."""
+
+    _target: type = field(default_factory=lambda: SadgsPipeline)
+    datamanager: FullImageDatamanagerConfig = field(
+        default_factory=lambda: FullImageDatamanagerConfig(
+            dataparser=NerfstudioDataParserConfig(load_3D_points=True), cache_images_type="uint8"
+        )
+    )
+    """Loads the images; `cache_images` "gpu" means the training device, whatever it is."""
+    model: SadgsModelConfig = field(default_factory=SadgsModelConfig)
+    """The Gaussians and their densification."""
+    views_per_iteration: int = 1
+    """Training views rendered for one optimizer step; the loss is their mean. The paper uses 1 outdoors, 2 indoors."""
+    frequency_constant: float = FREQUENCY_CONSTANT
+    """c of ω_l = c / σ_l: how many times per wavelength unit a Gaussian must fit. Larger splits more."""
+
+
+class SadgsPipeline(VanillaPipeline):
+    """Draws views, renders those of one size together, and feeds the model their structure tensors.
+
+    Raises:
+        ValueError: If views_per_iteration is not positive.
+    """
+
+    config: SadgsPipelineConfig
+    datamanager: FullImageDatamanager
+
+    def __init__(self, config: SadgsPipelineConfig, *args: Any, **kwargs: Any) -> None:
+        if config.views_per_iteration < 1:
+            raise ValueError(f"pipeline.views_per_iteration must be at least 1, got {config.views_per_iteration}.")
+        super().__init__(config, *args, **kwargs)
+        positions = self.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]  # [C, 3]
+        self.scene_extent = camera_extent(positions)
+        self.model.set_scene_extent(self.scene_extent)
+
+    @property
+    def model(self) -> SadgsModel:
+        """The unwrapped model."""
+        return self._model  # type: ignore[return-value]
+
+    @cached_property
+    def train_cameras(self) -> tuple[Tensor, Tensor]:
+        """World-to-camera matrices [C, 4, 4] and intrinsics in px [C, 3, 3] of all training views.
+
+        Made once: asking nerfstudio's cameras for them in each step makes the host wait for the device.
+        """
+        _ = self.datamanager.cached_train  # undistorting the images changes the intrinsics
+        cameras = self.datamanager.train_dataset.cameras
+        viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
+        return viewmats.to(self.device), cameras.get_intrinsics_matrices().to(self.device)
+
+    @cached_property
+    def structure_tensors(self) -> list[Tensor]:
+        """S̄ of every training image, float16 [H, W, 3], where the images are cached; 0 at masked pixels."""
+        by_size = defaultdict(list)
+        for index, data in enumerate(self.datamanager.cached_train):
+            by_size[data["image"].shape[:2]].append(index)
+        tensors: list[Tensor] = [torch.empty(0)] * len(self.datamanager.cached_train)
+        for (height, width), indices in by_size.items():
+            batch_size = max(_PIXELS_PER_BATCH // (height * width), 1)
+            for start in range(0, len(indices), batch_size):
+                batch = indices[start : start + batch_size]
+                for index, tensor in zip(batch, self._structure_tensors_of(batch), strict=True):
+                    tensors[index] = tensor.to(self.datamanager.cached_train[index]["image"].device)
+        return tensors
+
+    def _structure_tensors_of(self, indices: list[int]) -> Tensor:
+        """S̄ of training images of one size, computed on the training device, float16. [B, H, W, 3]"""
+        data = [self.datamanager.cached_train[index] for index in indices]
+        background = self.model.background_color.to(self.device)
+        images = [self.model.composite_with_background(self.model.get_gt_img(d["image"]), background) for d in data]
+        masks = None
+        if any("mask" in d for d in data):
+            masks = torch.stack(
+                [d["mask"][..., 0].to(self.device) if "mask" in d else torch.ones_like(image[..., 0], dtype=torch.bool)
+                 for d, image in zip(data, images, strict=True)]
+            )  # fmt: skip
+        return multiscale_structure_tensor(
+            torch.stack(images).to(self.device), masks, frequency_constant=self.config.frequency_constant
+        ).half()
+
+    def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
+        """Render the iteration's views and return the outputs of the last size, mean losses and mean metrics."""
+        groups: dict[torch.Size, list[tuple[int, dict[str, Any]]]] = defaultdict(list)
+        viewmats, Ks = self.train_cameras
+        corrected: dict[int, Tensor] = {}
+        for _ in range(self.config.views_per_iteration):
+            camera, data = self.datamanager.next_train(step)
+            assert camera.metadata is not None
+            index = camera.metadata["cam_idx"]
+            groups[data["image"].shape].append((index, data))
+            if self.model.camera_optimizer.config.mode != "off":
+                corrected[index] = viewmats_from_camera_to_world(self.model.camera_optimizer.apply_to_camera(camera))[0]
+        losses: dict[str, Tensor] = {}
+        metrics: dict[str, Any] = {}
+        outputs: dict[str, Any] = {}
+        observes = self.model.wants_structure_tensors(step)
+        for (height, width, _), views in groups.items():
+            indices = [index for index, _ in views]
+            batch = {"image": torch.stack([data["image"] for _, data in views])}
+            if any("mask" in data for _, data in views):
+                everything = torch.ones((height, width, 1), dtype=torch.bool, device=self.device)
+                batch["mask"] = torch.stack([data.get("mask", everything).to(self.device) for _, data in views])
+            tensors = None
+            if observes:
+                tensors = torch.stack([self.structure_tensors[index].to(self.device) for index in indices])
+            group_viewmats = torch.stack([corrected.get(index, viewmats[index]) for index in indices])
+            group_Ks = torch.stack([Ks[index] for index in indices])
+            outputs = self.model.get_training_outputs(group_viewmats, group_Ks, width, height, indices, tensors)
+            group_losses = self.model.get_loss_dict(outputs, batch)
+            weight = len(views) / self.config.views_per_iteration
+            for total, part in ((losses, group_losses), (metrics, self.model.get_metrics_dict(outputs, batch))):
+                for name, value in part.items():
+                    total[name] = total.get(name, 0) + weight * value
+        return outputs, losses, metrics
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Random states and the order of the views, so that a resumed run goes on as if never stopped."""
+        state: dict[str, Any] = {
+            "torch": torch.get_rng_state(),
+            "view_order": list(self.datamanager.train_unseen_cameras),
+        }
+        if hasattr(self.datamanager, "random_generator"):
+            state["view_shuffle"] = self.datamanager.random_generator.getstate()
+        if self.device.type == "cuda":
+            state["cuda"] = torch.cuda.get_rng_state(self.device)
+        return state
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_extra_state` saved; the view order only where the data still has that many views."""
+        torch.set_rng_state(state["torch"].cpu())
+        if max(state["view_order"], default=0) < len(self.datamanager.train_dataset):
+            self.datamanager.train_unseen_cameras = list(state["view_order"])
+            if "view_shuffle" in state:
+                self.datamanager.random_generator.setstate(state["view_shuffle"])
+        if "cuda" in state and self.device.type == "cuda":
+            torch.cuda.set_rng_state(state["cuda"].cpu(), self.device)

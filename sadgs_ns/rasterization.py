@@ -1,0 +1,114 @@
+"""The one place where Gaussians are rasterised: gsplat on CUDA, the torch splatter elsewhere."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from sadgs_ns import splatter
+
+
+def rasterize(
+    means: Tensor,  # [N, 3]
+    quats: Tensor,  # [N, 4]
+    scales: Tensor,  # [N, 3]
+    opacities: Tensor,  # [N]
+    colors: Tensor,  # [(C,) N, D] or [(C,) N, K, 3]
+    viewmats: Tensor,  # [C, 4, 4]
+    Ks: Tensor,  # [C, 3, 3]
+    width: int,
+    height: int,
+    *,
+    sh_degree: int | None = None,
+    render_mode: Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"] = "RGB",
+    backgrounds: Tensor | None = None,  # [C, D]
+    absgrad: bool = False,
+    rasterize_mode: Literal["classic", "antialiased"] = "classic",
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Render N Gaussians into C pinhole cameras on the device of `means`, unpacked.
+
+    Args:
+        means: Centres in world space. [N, 3]
+        quats: Rotations as wxyz quaternions; need not have unit length. [N, 4]
+        scales: Standard deviations along the Gaussians' axes, in world units, > 0. [N, 3]
+        opacities: In [0, 1]. [N]
+        colors: Features [(C,) N, D] or, with `sh_degree`, spherical harmonics coefficients [(C,) N, K, 3].
+        viewmats: World-to-camera transforms, OpenCV axes (x right, y down, z forward). [C, 4, 4]
+        Ks: Intrinsics in pixels. [C, 3, 3]
+        width: Image width in pixels.
+        height: Image height in pixels.
+        sh_degree: Degree to evaluate, (sh_degree + 1)^2 <= K; None takes `colors` as they are.
+        render_mode: "RGB" renders colours, "D" accumulated depth, "ED" expected depth; the sums append depth.
+        backgrounds: Colours behind the Gaussians. [C, D]
+        absgrad: Whether `backward` sets `info["means2d"].absgrad`. [C, N, 2]
+        rasterize_mode: "antialiased" compensates opacities for the screen-space blur.
+        near_plane: Gaussians whose centre is nearer are culled, in world units.
+        far_plane: Gaussians whose centre is farther are culled, in world units.
+
+    Returns:
+        Colours [C, height, width, X] with X = D, 1 or D + 1 by `render_mode`, alphas [C, height, width, 1] in [0, 1],
+        and gsplat's `info`, in which `radii` depends on the gsplat version: read it through `visible`.
+
+    Raises:
+        ValueError: From the splatter, if a mode is unknown or a shape does not match. gsplat raises AssertionError.
+    """
+    if means.is_cuda:
+        # Here, so that without a GPU nothing comes near gsplat's kernels, which are compiled when first used.
+        from gsplat.rendering import rasterization
+    else:
+        rasterization = splatter.rasterization
+    return rasterization(
+        means,
+        quats,
+        scales,
+        opacities,
+        colors,
+        viewmats,
+        Ks,
+        width,
+        height,
+        near_plane=near_plane,
+        far_plane=far_plane,
+        sh_degree=sh_degree,
+        packed=False,
+        backgrounds=backgrounds,
+        render_mode=render_mode,
+        absgrad=absgrad,
+        rasterize_mode=rasterize_mode,
+    )
+
+
+def visible(info: dict[str, Any]) -> Tensor:
+    """Which Gaussians were drawn, from an `info` of gsplat 1.4 (one radius) or 1.5 (a radius per axis).
+
+    Args:
+        info: Third value of `rasterize`; `radii` is int [C, N] or [C, N, 2], in pixels, zero where culled.
+
+    Returns:
+        bool [C, N]
+    """
+    drawn = info["radii"] > 0
+    # Comparing ranks also tells packed 1.5 radii [nnz, 2] from unpacked 1.4 radii [C, N].
+    return drawn.all(dim=-1) if drawn.dim() == info["means2d"].dim() else drawn
+
+
+def viewmats_from_camera_to_world(
+    camera_to_worlds: Tensor,  # [C, 3, 4]
+) -> Tensor:
+    """World-to-camera transforms for `rasterize` from nerfstudio's camera poses.
+
+    Args:
+        camera_to_worlds: Camera-to-world poses, OpenGL axes (x right, y up, z backward), orthonormal. [C, 3, 4]
+
+    Returns:
+        World-to-camera, OpenCV axes (x right, y down, z forward). [C, 4, 4]
+    """
+    flip = camera_to_worlds.new_tensor([1.0, -1.0, -1.0])
+    rotations = (camera_to_worlds[:, :, :3] * flip).mT  # [C, 3, 3], the inverse of an orthonormal matrix
+    translations = -rotations @ camera_to_worlds[:, :, 3:]  # [C, 3, 1]
+    bottom = camera_to_worlds.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(camera_to_worlds), 1, 4)
+    return torch.cat([torch.cat([rotations, translations], dim=-1), bottom], dim=-2)

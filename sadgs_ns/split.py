@@ -1,0 +1,123 @@
+"""Statistics → split plan → new parameters (paper, section 3.5, eq. 9 and 10)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import MutableMapping
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from gsplat.strategy.ops import _update_param_with_optimizer
+from gsplat.utils import normalized_quat_to_rotmat
+from torch import Tensor
+
+Params = MutableMapping[str, torch.nn.Parameter] | torch.nn.ParameterDict
+"""gsplat's parameters by name, each with leading dimension N."""
+
+MAX_CHILDREN_PER_AXIS = 8
+"""Bound on n_k, reached at η = 64 with the square root: no parent has more than 8³ = 512 children."""
+VARIANCE_EXTENT = math.sqrt(3.0)
+"""Half-width of the child grid in parent standard deviations that keeps the parent's covariance exactly: n cells over
+[−√3, √3] have variance 1 − 1/n², and each child adds 1/n²."""
+
+
+def children_per_axis(eta_max: Tensor, violates: Tensor, exponent: float = 0.5) -> Tensor:
+    """Split factor n_k = ⌈η_k^p⌉ on the axes that violate consistently, 1 elsewhere (paper, eq. 9).
+
+    Args:
+        eta_max: Largest η observed per axis, ≥ 0. [N, 3]
+        violates: Axes that violate consistently over the views. bool [N, 3]
+        exponent: p; the paper uses 1/2 and compares 1/4 and 3/4.
+
+    Returns:
+        n in 1 … MAX_CHILDREN_PER_AXIS. int64 [N, 3]
+    """
+    bound = float(MAX_CHILDREN_PER_AXIS)
+    # Clamped before the power: η of 1e12 must not overflow on its way to the bound.
+    counts = eta_max.clamp(1.0, bound ** (1.0 / exponent)).pow(exponent).ceil().clamp_max(bound)
+    return torch.where(violates, counts, 1.0).long()
+
+
+def limit_growth(growth: Tensor, priority: Tensor, budget: int) -> Tensor:
+    """Choose which Gaussians may grow so that the hard cap holds, the largest violations first.
+
+    Args:
+        growth: Gaussians that each one would add, ≥ 0. int64 [N]
+        priority: Larger comes first. [N]
+        budget: Gaussians that may be added in all; ≤ 0 allows none.
+
+    Returns:
+        The longest prefix by priority whose growth fits the budget, without those that do not grow. bool [N]
+    """
+    order = torch.argsort(torch.where(growth > 0, priority, -torch.inf), descending=True, stable=True)
+    fits = torch.empty_like(growth, dtype=torch.bool)
+    fits[order] = torch.cumsum(growth[order], 0) <= budget
+    return fits & (growth > 0)
+
+
+def grid_offsets(counts: Tensor, extent: float = VARIANCE_EXTENT) -> tuple[Tensor, Tensor]:
+    """Centred regular grids of n_x × n_y × n_z cell centres.
+
+    Args:
+        counts: n of each parent. int64 [P, 3]
+        extent: Half-width of the grid in parent standard deviations.
+
+    Returns:
+        Index of each child's parent, int64 [Q], and the grid coordinate g in parent standard deviations, float32
+        [Q, 3], children of one parent in a row, the first axis running fastest.
+    """
+    totals = counts.prod(dim=1)  # [P]
+    parents = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), totals)  # [Q]
+    local = torch.arange(len(parents), device=counts.device) - (torch.cumsum(totals, 0) - totals)[parents]  # [Q]
+    n_x, n_y, n_z = counts[parents].unbind(1)
+    cells = torch.stack([local % n_x, local // n_x % n_y, local // (n_x * n_y)], dim=1)  # [Q, 3]
+    n = torch.stack([n_x, n_y, n_z], dim=1)
+    return parents, (2.0 * cells - n + 1) * (extent / n)
+
+
+@torch.no_grad()
+def grid_split(
+    params: Params,
+    optimizers: MutableMapping[str, torch.optim.Optimizer],
+    state: MutableMapping[str, Any],
+    counts: Tensor,
+    extent: float = VARIANCE_EXTENT,
+) -> None:
+    """Replace every Gaussian with more than one child by its grid of children, in place, as gsplat's `split` does.
+
+    μ_child = μ + R (s ⊙ g) and s_child = s ⊘ n (paper, eq. 10); rotation, colour and opacity are copied. The order
+    afterwards is [unsplit, children grouped by parent]. Children start with zero optimizer moments and inherit the
+    parent's rows of every tensor in `state`.
+
+    Args:
+        params: gsplat's parameters: `means`, log `scales`, `quats` and any others with leading dimension N.
+        optimizers: One per parameter.
+        state: The strategy's state; its tensors have leading dimension N.
+        counts: n per axis. int64 [N, 3]
+        extent: Half-width of the child grid in parent standard deviations.
+    """
+    is_split = (counts > 1).any(dim=1)
+    rest = torch.where(~is_split)[0]
+    selected = torch.where(is_split)[0]
+    local_parents, grid = grid_offsets(counts[selected], extent)
+    parents = selected[local_parents]  # [Q]
+    rotmats = normalized_quat_to_rotmat(F.normalize(params["quats"][parents], dim=-1))  # [Q, 3, 3]
+    offsets = torch.einsum("qij,qj->qi", rotmats, params["scales"][parents].exp() * grid)  # [Q, 3]
+    shrink = counts[parents].to(params["scales"].dtype).log()  # [Q, 3]
+
+    def param_fn(name: str, p: Tensor) -> Tensor:
+        children = p[parents]
+        if name == "means":
+            children = children + offsets
+        elif name == "scales":
+            children = children - shrink
+        return torch.nn.Parameter(torch.cat([p[rest], children]), requires_grad=p.requires_grad)
+
+    def optimizer_fn(key: str, v: Tensor) -> Tensor:
+        return torch.cat([v[rest], v.new_zeros((len(parents), *v.shape[1:]))])
+
+    _update_param_with_optimizer(param_fn, optimizer_fn, params, optimizers)  # type: ignore[arg-type]
+    for key, value in state.items():
+        if isinstance(value, Tensor):
+            state[key] = torch.cat([value[rest], value[parents]])

@@ -1,0 +1,251 @@
+"""The densification schedule: a gsplat strategy that needs no nerfstudio (paper, sections 3.4–3.6)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, MutableMapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from gsplat.strategy.base import Strategy
+from gsplat.strategy.ops import _update_param_with_optimizer, remove
+from torch import Tensor
+
+from sadgs_ns.absgs import accumulate_gradients, empty_gradients, grow
+from sadgs_ns.split import VARIANCE_EXTENT, Params, children_per_axis, grid_split, limit_growth
+from sadgs_ns.statistics import consistent, empty_statistics, observe
+
+Info = Mapping[str, Any]
+
+
+@dataclass
+class StructureAwareStrategy(Strategy):
+    """Structure-aware densification: split where η says so, in one step, into an anisotropic grid.
+
+    A gsplat `Strategy`. Iterations are counted from 1: `step` s is iteration s + 1. In a training loop:
+
+        strategy = StructureAwareStrategy()
+        state = strategy.initialize_state(scene_scale)
+        renders, alphas, info = rasterization(..., packed=False, absgrad=strategy.absgrad)
+        info |= {"structure_tensors": ..., "viewmats": ..., "Ks": ...}   # [C, H, W, 3], [C, 4, 4], [C, 3, 3]
+        strategy.step_pre_backward(params, optimizers, state, step, info)
+        loss.backward()                                                  # the mean over the C views
+        strategy.step_post_backward(params, optimizers, state, step, info)
+
+    Views of different sizes are rendered one by one; `info` is then the list of their infos.
+    """
+
+    max_gaussians: int = 4_000_000
+    """Hard cap on the number of Gaussians, never exceeded; the largest violations are split first."""
+    structure_every: int = 500
+    """Iterations between structure-aware split and prune steps; 0 turns them off."""
+    absgs_every: int = 100
+    """Iterations between AbsGS steps, skipped where a structure step falls; 0 turns them off."""
+    refine_start_iter: int = 100
+    """First iteration at which densification may run."""
+    refine_stop_iter: int = 1900
+    """Last iteration at which densification may run; opacities under `final_prune_opacity` are pruned there."""
+    eta_every: int = 1
+    """Iterations between η observations."""
+    directional_eta: bool = False
+    """Measure η along each axis's own direction (paper, eq. 8) instead of against the shortest wavelength (eq. 7)."""
+    eta_min_opacity: float = 0.0
+    """Opacity in [0, 1] from which a Gaussian's η is observed; the paper observes every visible one."""
+    tau_split: float = 0.8
+    """Fraction of observations that must violate (η > 1) before an axis is split."""
+    split_exponent: float = 0.5
+    """p of the split factor n = ⌈η^p⌉."""
+    split_extent: float = VARIANCE_EXTENT
+    """Half-width of the child grid in parent standard deviations; √3 keeps the parent's covariance."""
+    tau_prune: float = 0.8
+    """Fraction of observations that must be low (η < 0.1) on every axis before a faint Gaussian is pruned."""
+    prune_opacity: float = 0.1
+    """Opacity under which a Gaussian with consistently low η is pruned."""
+    clone_grad2d: float = 2e-4
+    """AbsGS: normalised mean screen gradient at which a small Gaussian is cloned."""
+    split_absgrad2d: float = 4e-4
+    """AbsGS: normalised mean absolute screen gradient at which a large Gaussian is split in two."""
+    small_scale: float = 0.001
+    """AbsGS: largest scale, relative to the scene's extent, at which a Gaussian counts as small."""
+    min_opacity: float = 0.005
+    """Opacity under which every densification step prunes."""
+    clamp_opacity: float = 0.8
+    """Structure steps lower opacities to at most this, so that what lies behind gets gradients again; 1 is off."""
+    reset_every: int = 1200
+    """Iterations between opacity resets inside the densification window; 0 turns them off."""
+    reset_factor: float = 0.1
+    """An opacity reset multiplies every opacity by this."""
+    final_prune_opacity: float = 0.1
+    """Opacity under which Gaussians are pruned when densification ends."""
+    verbose: bool = False
+    """Print a line at each densification step."""
+
+    @property
+    def absgrad(self) -> bool:
+        """Whether the rasterizer must provide absolute screen gradients."""
+        return self.absgs_every > 0
+
+    def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
+        """State to pass to the other methods; its tensors are made at the first step.
+
+        Args:
+            scene_scale: Extent of the cameras in world units, as 3DGS defines it.
+        """
+        return {"scene_scale": scene_scale}
+
+    def fit_to_run(self, num_iterations: int) -> None:
+        """Let densification end early enough in a short run: after at most 19/30 of it, as in the paper's 3,000."""
+        self.refine_stop_iter = min(self.refine_stop_iter, num_iterations * 19 // 30)
+
+    def check_sanity(self, params: Params, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
+        """Check names and optimizers.
+
+        Raises:
+            AssertionError: As gsplat's `Strategy.check_sanity`.
+            ValueError: If a parameter that the method needs is missing.
+        """
+        super().check_sanity(params, optimizers)  # type: ignore[arg-type]
+        missing = {"means", "scales", "quats", "opacities"} - set(params)
+        if missing:
+            raise ValueError(f"params lack {sorted(missing)}: StructureAwareStrategy needs them by these names")
+
+    def observes(self, step: int) -> bool:
+        """Whether `step_pre_backward` will measure η at this step, and so needs structure tensors."""
+        return self.structure_every > 0 and step < self.refine_stop_iter and step % self.eta_every == 0
+
+    def step_pre_backward(
+        self,
+        params: Params,
+        optimizers: Mapping[str, torch.optim.Optimizer],
+        state: MutableMapping[str, Any],
+        step: int,
+        info: Info | Sequence[Info],
+    ) -> None:
+        """Keep the screen gradients and observe η, before `loss.backward()`."""
+        if step >= self.refine_stop_iter:
+            return
+        self._ensure_statistics(params, state)
+        for view in _views(info):
+            view["means2d"].retain_grad()
+            if self.observes(step):
+                observe(state, params, view, directional=self.directional_eta, min_opacity=self.eta_min_opacity)
+
+    def step_post_backward(
+        self,
+        params: Params,
+        optimizers: MutableMapping[str, torch.optim.Optimizer],
+        state: MutableMapping[str, Any],
+        step: int,
+        info: Info | Sequence[Info],
+        packed: bool = False,
+    ) -> None:
+        """Accumulate the screen gradients and densify when the schedule says so, after `loss.backward()`.
+
+        Raises:
+            ValueError: If `packed`; η and AbsGS read the unpacked meta.
+        """
+        if packed:
+            raise ValueError("StructureAwareStrategy reads gsplat's unpacked meta: call rasterization(packed=False)")
+        iteration = step + 1
+        if iteration > self.refine_stop_iter:
+            return
+        views = _views(info)
+        if self.absgrad:
+            for view in views:
+                accumulate_gradients(state, view, num_views=sum(v["n_cameras"] for v in views))
+        if iteration >= self.refine_start_iter:
+            if _due(iteration, self.structure_every):
+                self._structure_step(params, optimizers, state, iteration)
+            elif _due(iteration, self.absgs_every):
+                self._absgs_step(params, optimizers, state, iteration)
+            if iteration == self.refine_stop_iter:
+                self._prune(params, optimizers, state, self._opacities(params) < self.final_prune_opacity)
+            elif _due(iteration, self.reset_every):
+                self._map_opacities(params, optimizers, lambda opacities: opacities * self.reset_factor)
+
+    def _structure_step(self, params: Any, optimizers: Any, state: Any, iteration: int) -> None:
+        opacities = self._opacities(params)
+        is_low = consistent(state["n_low"], state["n_total"], self.tau_prune).all(dim=1)
+        n_pruned = self._prune(
+            params, optimizers, state, (opacities < self.min_opacity) | (is_low & (opacities < self.prune_opacity))
+        )
+        if self.clamp_opacity < 1:
+            self._map_opacities(params, optimizers, lambda alpha: alpha.clamp_max(self.clamp_opacity))
+        violates = consistent(state["n_high"], state["n_total"], self.tau_split)
+        counts = children_per_axis(state["eta_max"], violates, self.split_exponent)  # [N, 3]
+        worst = torch.where(violates, state["eta_max"], 0.0).amax(dim=1)  # [N]
+        budget = self.max_gaussians - len(counts)
+        allowed = limit_growth(counts.prod(dim=1) - 1, worst, budget)
+        n_parents, n_wanted = int(allowed.sum()), int((counts > 1).any(dim=1).sum())
+        if n_parents > 0:
+            grid_split(params, optimizers, state, torch.where(allowed[:, None], counts, 1), self.split_extent)
+        # What was learned about parents says nothing about their children.
+        self._clear_statistics(params, state)
+        if self.verbose:
+            print(
+                f"Iteration {iteration}: {n_parents} of {n_wanted} violating Gaussians split, {n_pruned} pruned. "
+                f"Now having {len(params['means'])}."
+            )
+
+    def _absgs_step(self, params: Any, optimizers: Any, state: Any, iteration: int) -> None:
+        n_clone, n_split = grow(
+            params,
+            optimizers,
+            state,
+            clone_threshold=self.clone_grad2d,
+            split_threshold=self.split_absgrad2d,
+            size_threshold=self.small_scale * state["scene_scale"],
+            budget=self.max_gaussians - len(params["means"]),
+        )
+        n_pruned = self._prune(params, optimizers, state, self._opacities(params) < self.min_opacity)
+        for key, value in empty_gradients(len(params["means"]), params["means"].device).items():
+            state[key] = value
+        if self.verbose:
+            print(
+                f"Iteration {iteration}: {n_clone} Gaussians cloned, {n_split} split in two, {n_pruned} pruned. "
+                f"Now having {len(params['means'])}."
+            )
+
+    @staticmethod
+    def _opacities(params: Params) -> Tensor:
+        return torch.sigmoid(params["opacities"].detach().flatten())  # [N]
+
+    @staticmethod
+    def _prune(params: Any, optimizers: Any, state: Any, mask: Tensor) -> int:
+        """Remove Gaussians, unless none would be left to train."""
+        n_prune = int(mask.sum())
+        if n_prune == len(mask):
+            return 0
+        if n_prune > 0:
+            remove(params, optimizers, state, mask)
+        return n_prune
+
+    @staticmethod
+    def _map_opacities(params: Any, optimizers: Any, function: Any) -> None:
+        """Change the opacities (not their logits) and forget their optimizer moments, as gsplat's reset does."""
+
+        def param_fn(name: str, p: Tensor) -> Tensor:
+            changed = torch.logit(function(torch.sigmoid(p)).clamp(1e-6, 1 - 1e-6))
+            return torch.nn.Parameter(changed, requires_grad=p.requires_grad)
+
+        _update_param_with_optimizer(
+            param_fn, lambda key, v: torch.zeros_like(v), params, optimizers, names=["opacities"]
+        )
+
+    @staticmethod
+    def _ensure_statistics(params: Any, state: MutableMapping[str, Any]) -> None:
+        if "n_total" not in state:
+            StructureAwareStrategy._clear_statistics(params, state)
+
+    @staticmethod
+    def _clear_statistics(params: Any, state: MutableMapping[str, Any]) -> None:
+        n, device = len(params["means"]), params["means"].device
+        state.update(empty_statistics(n, device) | empty_gradients(n, device))
+
+
+def _views(info: Info | Sequence[Info]) -> Sequence[Info]:
+    return [info] if isinstance(info, Mapping) else info
+
+
+def _due(iteration: int, every: int) -> bool:
+    return every > 0 and iteration % every == 0

@@ -1,0 +1,173 @@
+"""Image → multi-scale structure tensor map S̄ (paper, section 3.2, eq. 2–5).
+
+Pure tensor functions. Borders and masks are handled in one way, by normalised convolution: every blur is a weighted
+mean over the valid pixels that the kernel reaches, and the derivative is the exact derivative of that mean. Nothing is
+invented outside the image, no edge appears at a mask, and an image may be smaller than the largest kernel.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+NUM_LEVELS = 5
+"""L + 1 levels, l = 0 … L with L = 4 (paper, section 3.2)."""
+SCALE_STEP = 1.5
+"""σ_l = SCALE_STEP^l px (paper, section 3.2)."""
+INTEGRATION_FACTOR = 3.0
+"""ρ_l = INTEGRATION_FACTOR · σ_l px (paper, section 3.2)."""
+GAMMA = 3.0
+"""Exponent of the scale weights E_l^γ (paper, eq. 5)."""
+FREQUENCY_CONSTANT = 1.0
+"""c of ω_l = c / σ_l in 1/px. The paper leaves it open; docs/sweeps.md holds the measurement that settled it."""
+NOISE_FLOOR = 0.02
+"""Amplitude, relative to the image's own contrast, under which structure counts as noise: the ε of eq. 3 and 5."""
+ENERGY_BLUR = 2.0
+"""E_l² is averaged over a Gaussian window of ENERGY_BLUR · σ_l px before its root; 0 is eq. 4 as printed."""
+
+_ROUNDING_FLOOR = 1e-5
+"""Amplitude relative to the brightest pixel under which float32 rounding, not the image, makes the differences."""
+_TRUNCATION = 3.0
+"""Kernels end at this many standard deviations; what is cut off is 0.3 % of the mass."""
+
+
+def gaussian_kernel(sigma: float, order: int = 0, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Sampled 1-D Gaussian, or its derivative, ready for cross-correlation.
+
+    Args:
+        sigma: Standard deviation in px, > 0.
+        order: 0 for the Gaussian (sums to 1), 1 for its first derivative (a unit ramp gives exactly 1).
+
+    Returns:
+        Kernel of odd length 2·⌈3σ⌉ + 1. [K]
+    """
+    radius = math.ceil(_TRUNCATION * sigma)
+    x = torch.arange(-radius, radius + 1, dtype=torch.float64)  # [K]
+    kernel = torch.exp(-0.5 * (x / sigma) ** 2)
+    kernel = kernel / kernel.sum()
+    if order == 1:
+        kernel = x * kernel
+        kernel = kernel / (x * kernel).sum()
+    return kernel.to(dtype)
+
+
+def _convolve(image: Tensor, kernel: Tensor, axis: int) -> Tensor:
+    """Correlate along one image axis with zeros outside.
+
+    Args:
+        image: [B, C, H, W]
+        kernel: [K], K odd.
+        axis: 2 for rows (y), 3 for columns (x).
+    """
+    channels = image.shape[1]
+    kernel = kernel.to(image)
+    size = image.shape[axis]
+    radius = kernel.numel() // 2
+    if radius >= size:  # taps that can only ever meet zeros
+        kernel = kernel[radius - size + 1 : radius + size]
+        radius = size - 1
+    shape = (1, 1, -1, 1) if axis == 2 else (1, 1, 1, -1)
+    padding = (radius, 0) if axis == 2 else (0, radius)
+    weight = kernel.view(shape).expand(channels, -1, -1, -1)
+    return F.conv2d(image, weight, padding=padding, groups=channels)
+
+
+def _blur(image: Tensor, sigma: float) -> Tensor:
+    """Separable Gaussian blur with zeros outside. [B, C, H, W] → [B, C, H, W]"""
+    kernel = gaussian_kernel(sigma, dtype=image.dtype)
+    return _convolve(_convolve(image, kernel, 2), kernel, 3)
+
+
+def _blur_and_gradient(image: Tensor, sigma: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Gaussian blur with zeros outside, and its exact x and y derivatives. Each [B, C, H, W], per px."""
+    smooth = gaussian_kernel(sigma, dtype=image.dtype)
+    derive = gaussian_kernel(sigma, order=1, dtype=image.dtype)
+    rows = _convolve(image, smooth, 2)
+    return _convolve(rows, smooth, 3), _convolve(rows, derive, 3), _convolve(_convolve(image, derive, 2), smooth, 3)
+
+
+def multiscale_structure_tensor(
+    images: Tensor,
+    masks: Tensor | None = None,
+    *,
+    frequency_constant: float = FREQUENCY_CONSTANT,
+    gamma: float = GAMMA,
+    noise_floor: float = NOISE_FLOOR,
+    energy_blur: float = ENERGY_BLUR,
+    num_levels: int = NUM_LEVELS,
+) -> Tensor:
+    """Aggregate the per-scale structure tensors of a batch of images of one size (paper, eq. 2–5).
+
+    S̄ = Σ_l E_l^γ ω_l² Ŝ_l / (Σ_l E_l^γ + ε), with Ŝ_l = S_l / (tr S_l + ε), at full resolution on every level.
+    Both ε are relative to the image's own contrast (`noise_floor`), so S̄ does not depend on exposure. Channels are
+    summed after Di Zenzo. I_{−1} is the unsmoothed image.
+
+    Args:
+        images: Linear in the pixel value, any non-negative range, any floating dtype (computed in at least float32).
+            [B, H, W, C]
+        masks: Valid pixels; the others neither contribute nor receive a tensor. bool [B, H, W] or None for all.
+        frequency_constant: c of ω_l = c / σ_l, in 1/px.
+        gamma: Exponent of the scale weights.
+        noise_floor: Amplitude relative to the image's contrast under which S̄ fades to 0.
+        energy_blur: Window, in multiples of σ_l, over which the band energy E_l² is averaged. E_l crosses zero twice a
+            period; without the window S̄ follows the phase of the texture instead of its frequency.
+        num_levels: L + 1.
+
+    Returns:
+        S̄ as (xx, xy, yy) in 1/px², positive semidefinite, trace ≤ (c / σ_0)², 0 at masked pixels. [B, H, W, 3]
+
+    Raises:
+        ValueError: If the images or masks have another shape or the images are not floating point.
+    """
+    if images.dim() != 4 or not images.is_floating_point():
+        raise ValueError(f"images must be floating point [B, H, W, C], got {images.dtype} {tuple(images.shape)}")
+    if masks is not None and masks.shape != images.shape[:3]:
+        raise ValueError(f"masks must be [B, H, W] = {tuple(images.shape[:3])}, got {tuple(masks.shape)}")
+    image = images.permute(0, 3, 1, 2)  # [B, C, H, W]
+    image = image.to(torch.promote_types(image.dtype, torch.float32))
+    valid = torch.ones_like(image[:, :1]) if masks is None else masks[:, None].to(image)  # [B, 1, H, W]
+    # Without a mask the weights of all images are the same: keep one.
+    weight = valid[:1] if masks is None else valid
+    image = image * valid
+    brightest = image.abs().amax(dim=(1, 2, 3), keepdim=True).clamp_min(torch.finfo(image.dtype).tiny)
+    image = image / brightest  # now in [-1, 1]: HDR and tiny exposures behave alike
+    count = valid.sum(dim=(2, 3), keepdim=True).clamp_min(1)
+    mean = image.sum(dim=(2, 3), keepdim=True) / count
+    # Centring costs nothing (every operator below is blind to a constant) and keeps float32 rounding relative to
+    # the contrast, not to the brightness.
+    image = (image - mean) * valid
+    contrast = (image.square().sum(dim=1, keepdim=True).sum(dim=(2, 3), keepdim=True) / count).sqrt()  # [B, 1, 1, 1]
+    noise = (noise_floor * contrast).clamp_min(_ROUNDING_FLOOR)  # [B, 1, 1, 1]
+
+    numerator = torch.zeros_like(image[:, :1]).repeat(1, 3, 1, 1)  # [B, 3, H, W]
+    denominator = noise**gamma
+    previous = image
+    for level in range(num_levels):
+        sigma = SCALE_STEP**level
+        blurred, blurred_x, blurred_y = _blur_and_gradient(image, sigma)
+        reach, reach_x, reach_y = _blur_and_gradient(weight, sigma)
+        reach = reach.clamp_min(torch.finfo(image.dtype).tiny)
+        smoothed = blurred / reach
+        gradient_x = (blurred_x - smoothed * reach_x) / reach  # derivative of the quotient
+        gradient_y = (blurred_y - smoothed * reach_y) / reach
+        products = torch.stack(
+            [gradient_x.square().sum(1), (gradient_x * gradient_y).sum(1), gradient_y.square().sum(1)], dim=1
+        )  # [B, 3, H, W]
+        rho = INTEGRATION_FACTOR * sigma
+        integrated = _blur(weight, rho).clamp_min(torch.finfo(image.dtype).tiny)
+        tensor = _blur(products * weight, rho) / integrated  # S_l, eq. 2
+        trace = tensor[:, :1] + tensor[:, 2:]
+        normalised = tensor / (trace + (noise / sigma) ** 2)  # Ŝ_l, eq. 3
+        energy = (previous - smoothed).square().sum(1, keepdim=True) * weight  # E_l², eq. 4
+        if energy_blur > 0:
+            energy = _blur(energy, energy_blur * sigma) / _blur(weight, energy_blur * sigma).clamp_min(
+                torch.finfo(image.dtype).tiny
+            )
+        scale_weight = energy.clamp_min(0) ** (0.5 * gamma)  # E_l^γ
+        numerator += scale_weight * (frequency_constant / sigma) ** 2 * normalised
+        denominator = denominator + scale_weight
+        previous = smoothed
+    return (numerator / denominator * valid).permute(0, 2, 3, 1).contiguous()
