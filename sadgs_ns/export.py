@@ -78,7 +78,16 @@ def write_ply(
     if not finite.all():
         print(f"{path}: dropped {count - int(finite.sum())} of {count} Gaussians that are not finite")
         table = table[finite]
-    names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(3 * bands))]
+    names = [
+        "x",
+        "y",
+        "z",
+        "nx",
+        "ny",
+        "nz",
+        *(f"f_dc_{i}" for i in range(3)),
+        *(f"f_rest_{i}" for i in range(3 * bands)),
+    ]
     names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     rows = np.ascontiguousarray(table, dtype="<f4").view([(name, "<f4") for name in names]).reshape(-1)
     with atomic_path(path) as partial:

@@ -5,13 +5,17 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from importlib.resources import files
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import yaml
 from nerfstudio.plugins.types import MethodSpecification
 
 from sadgs_ns.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
 from sadgs_ns.trainer import SadgsTrainerConfig
+
+if TYPE_CHECKING:
+    from importlib.abc import Traversable
 
 
 def load_preset(name: str) -> MethodSpecification:
@@ -28,8 +32,7 @@ def load_preset(name: str) -> MethodSpecification:
         FileNotFoundError: If there is no such preset.
         ValueError: If the preset has an unknown key or a value of another kind.
     """
-    source = files("sadgs_ns.configs") / f"{name}.yaml"
-    values = yaml.safe_load(source.read_text(encoding="utf8"))
+    values = yaml.safe_load((_configs() / f"{name}.yaml").read_text(encoding="utf8"))
     description = values.pop("description")
     optimizers = values.pop("optimizers")
     config = SadgsTrainerConfig(method_name=name, vis="viewer")
@@ -38,6 +41,14 @@ def load_preset(name: str) -> MethodSpecification:
         group: _optimizer(dict(entry), f"{name}.yaml: optimizers.{group}") for group, entry in optimizers.items()
     }
     return MethodSpecification(config=config, description=description)
+
+
+def _configs() -> Traversable:
+    """The folder of presets: installed as `sadgs_ns.configs`, `configs/` beside the package in a checkout."""
+    try:
+        return files("sadgs_ns.configs")
+    except ModuleNotFoundError:
+        return Path(__file__).parents[1] / "configs"
 
 
 def set_fields(config: Any, values: Mapping[str, Any], where: str) -> None:

@@ -10,7 +10,7 @@ from sadgs_ns.bench import results
 from sadgs_ns.bench.results import Result
 
 _HEADER = ("Scene", "Method", "Loop s", "Ratio", "PSNR", "SSIM", "LPIPS", "Gaussians", "Peak GB", "Seeds")
-_NOTHING = "–"  # noqa: RUF001
+_NOTHING = "–"
 
 
 def markdown(rows: Iterable[Result], reference: str | None = None) -> str:

@@ -208,21 +208,20 @@ def draw_wavelength_and_eta(path: Path, scene: SceneDescription, run: Run, index
     truth = expected_wavelength_map(scene.surfaces, next(view for view in scene.views if view.name == name))
     constant = pipeline.config.frequency_constant
     estimate = 2 * torch.pi * constant * wavelength(pipeline.structure_tensors[index].float()).cpu().numpy()
-    figure = Figure(figsize=(14, 3.2), layout="constrained")
+    figure = Figure(figsize=(15, 3.2), layout="constrained")
     image_axes, estimate_axes, truth_axes, eta_axes = figure.subplots(1, 4)
     image_axes.imshow(dataset.get_image_float32(index).cpu().numpy())
     image_axes.set_title(f"training view {name}")
-    for axes, values, title in (
-        (estimate_axes, estimate, "wavelength, estimated (px)"),
-        (truth_axes, truth, "wavelength, true (px)"),
-    ):
+    maps = [(estimate_axes, estimate, "wavelength, estimated (px)"), (truth_axes, truth, "wavelength, true (px)")]
+    for axes, values, title in maps:
         shown = axes.imshow(values, norm="log", vmin=3, vmax=60, cmap="viridis")
         axes.set_title(title)
-    figure.colorbar(shown, ax=[estimate_axes, truth_axes], ticks=[3, 5, 10, 20, 40], format="%d")
+        figure.colorbar(shown, ax=axes, ticks=[3, 5, 10, 20, 40], format="%d").minorticks_off()
     eta_axes.set_title("largest η before the first split")
     if run.before_split.params:
-        shown = eta_axes.imshow(eta_map(pipeline, run.before_split, index), norm="log", vmin=0.1, vmax=10, cmap="coolwarm")
-        figure.colorbar(shown, ax=eta_axes, ticks=[0.1, 1, 10], format="%g")
+        values = eta_map(pipeline, run.before_split, index)
+        shown = eta_axes.imshow(values, norm="log", vmin=1 / 30, vmax=30, cmap="coolwarm")  # white where η = 1
+        figure.colorbar(shown, ax=eta_axes, ticks=[0.1, 1, 10], format="%g").minorticks_off()
     for axes in (image_axes, estimate_axes, truth_axes, eta_axes):
         axes.set_axis_off()
     with atomic_path(path) as partial:
@@ -246,7 +245,9 @@ def demonstrate(output: Path, iterations: int, max_gaussians: int, width: int, h
         raise ValueError(f"--max-num-iterations is {iterations}; give at least 30, or nothing is split")
     console = Console()
     scene = write_scene(output / "scene", width, height, views)
-    console.print(f"Scene: {len(scene.views)} views of {width}×{height} px, {len(scene.points)} points, in {output}/scene")
+    console.print(
+        f"Scene: {len(scene.views)} views of {width}×{height} px, {len(scene.points)} points, in {output}/scene"
+    )
     runs: list[Run] = []
     columns = (TextColumn("{task.description:24s}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     CONSOLE.quiet, was_quiet = True, CONSOLE.quiet  # nerfstudio's console: the demo prints its own few lines
@@ -258,7 +259,9 @@ def demonstrate(output: Path, iterations: int, max_gaussians: int, width: int, h
                 def on_step(iteration: int, count: int, task=task) -> None:
                     progress.update(task, completed=iteration, count=count)
 
-                config = run_config(output / "scene", output, label.replace(" ", "-"), iterations, max_gaussians, densify)
+                config = run_config(
+                    output / "scene", output, label.replace(" ", "-"), iterations, max_gaussians, densify
+                )
                 runs.append(train(config, label, on_step))
     finally:
         CONSOLE.quiet = was_quiet
@@ -267,7 +270,9 @@ def demonstrate(output: Path, iterations: int, max_gaussians: int, width: int, h
     write_ply(output / "splat.ply", **runs[-1].model.gauss_params)
     table = Table("held-out views", "PSNR (dB)", "SSIM", "Gaussians", "seconds")
     for run in runs:
-        table.add_row(run.label, f"{run.psnr():.2f}", f"{run.ssim():.4f}", f"{run.model.num_points}", f"{run.seconds:.0f}")
+        table.add_row(
+            run.label, f"{run.psnr():.2f}", f"{run.ssim():.4f}", f"{run.model.num_points}", f"{run.seconds:.0f}"
+        )
     console.print(table)
     for name in ("side_by_side.png", "wavelength_and_eta.png", "splat.ply"):
         console.print(f"{output / name}")
@@ -277,7 +282,9 @@ def demonstrate(output: Path, iterations: int, max_gaussians: int, width: int, h
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m sadgs_ns.demo", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--output", type=Path, default=Path("demo-output"), help="folder to write (default %(default)s)")
+    parser.add_argument(
+        "--output", type=Path, default=Path("demo-output"), help="folder to write (default %(default)s)"
+    )
     parser.add_argument("--max-num-iterations", type=int, default=300, help="of each run (default %(default)s)")
     parser.add_argument("--max-gaussians", type=int, default=6000, help="cap on their number (default %(default)s)")
     parser.add_argument("--width", type=int, default=160, help="image width in px (default %(default)s)")
@@ -287,9 +294,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # nerfstudio and torch warn about their own internals, which is not what the demo is about.
     warnings.filterwarnings("ignore", module=r"(torch|nerfstudio|torchmetrics)\b")
     try:
-        demonstrate(
-            given.output, given.max_num_iterations, given.max_gaussians, given.width, given.height, given.views
-        )
+        demonstrate(given.output, given.max_num_iterations, given.max_gaussians, given.width, given.height, given.views)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

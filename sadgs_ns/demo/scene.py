@@ -30,7 +30,6 @@ SPARSE_FOLDER = Path("sparse/0")
 
 _DESCRIPTION_NAME = "scene.json"
 _FORMAT = "sadgs_ns demo scene"
-_BLACK = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -322,7 +321,7 @@ def render(surfaces: Sequence[Surface], view: View, supersampling: int = 4) -> N
     """Antialiased image of one view, black where nothing is. [H, W, 3]"""
     directions = view.rays(supersampling)
     index, depth = trace(surfaces, view.position, directions)
-    samples = np.tile(np.array(_BLACK), (len(directions), 1))
+    samples = np.zeros((len(directions), 3))
     for i, surface in enumerate(surfaces):
         on = index == i
         samples[on] = surface.colour(view.position + depth[on, None] * directions[on])
@@ -384,7 +383,12 @@ def describe_scene(
     Raises:
         ValueError: If a number is too small.
     """
-    for name, value, least in (("width", width, 16), ("height", height, 16), ("views", views, 9), ("points", points, 10)):
+    for name, value, least in (
+        ("width", width, 16),
+        ("height", height, 16),
+        ("views", views, 9),
+        ("points", points, 10),
+    ):
         if value < least:
             raise ValueError(f"the demo scene's {name} is {value}; give at least {least}")
     rng = np.random.default_rng(seed)
@@ -494,7 +498,7 @@ def write_scene(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m sadgs_ns.demo.scene", description=write_scene.__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(prog="python -m sadgs_ns.demo.scene", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("folder", type=Path, help="where to write the scene")
     parser.add_argument("--width", type=int, default=160, help="image width in px (default %(default)s)")
     parser.add_argument("--height", type=int, default=120, help="image height in px (default %(default)s)")

@@ -1,1 +1,0 @@
-"""Presets of the methods, installed as `sadgs_ns.configs`."""

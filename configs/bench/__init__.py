@@ -1,1 +1,0 @@
-"""Benchmark protocols, installed as `sadgs_ns.configs.bench`."""
