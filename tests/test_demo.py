@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import filecmp
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -29,10 +32,15 @@ from sadgs_ns.demo.scene import (
 )
 from sadgs_ns.export import atomic_path, write_ply
 
-# Importing nerfstudio's parts scripts a module with what torch deprecates.
-pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
-
 WIDTH, HEIGHT, VIEWS = 48, 36, 9
+
+
+@contextmanager
+def quiet_import() -> Iterator[None]:
+    """Import nerfstudio without the warnings of its own modules and of what they import."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +121,8 @@ def test_every_texture_is_in_sight() -> None:
 
 
 def test_nerfstudio_reads_the_scene(written: tuple[Path, SceneDescription]) -> None:
-    from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+    with quiet_import():
+        from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 
     folder, scene = written
     parser = ColmapDataParserConfig(
@@ -122,7 +131,8 @@ def test_nerfstudio_reads_the_scene(written: tuple[Path, SceneDescription]) -> N
     train, held_out = parser.get_dataparser_outputs("train"), parser.get_dataparser_outputs("val")
     assert [path.name for path in held_out.image_filenames] == ["000.png", "008.png"]
     assert len(train.image_filenames) == VIEWS - 2
-    assert Image.open(train.image_filenames[0]).size == (WIDTH, HEIGHT)
+    with Image.open(train.image_filenames[0]) as image:
+        assert image.size == (WIDTH, HEIGHT)
     assert train.metadata["points3D_xyz"].shape == (200, 3)
     assert (train.metadata["points3D_num_points2D"] >= 2).all()
     # What nerfstudio made of poses and points still projects to the same pixels.
@@ -273,7 +283,8 @@ def test_atomic_path_keeps_the_old_file_on_failure(tmp_path: Path) -> None:
 
 
 def test_demo_refuses_too_few_iterations(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from sadgs_ns.demo.__main__ import main
+    with quiet_import():
+        from sadgs_ns.demo.__main__ import main
 
     assert main(["--output", str(tmp_path / "out"), "--max-num-iterations", "3"]) == 2
     assert capsys.readouterr().err == "error: --max-num-iterations is 3; give at least 30, or nothing is split\n"
