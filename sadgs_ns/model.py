@@ -25,7 +25,14 @@ from pytorch_msssim import SSIM
 from torch import Tensor
 from torchmetrics.image import PeakSignalNoiseRatio
 
-from sadgs_ns.initialization import FACE_GREY, FACE_OPACITY, POINT_OPACITY, bounding_box_points, neighbour_scales
+from sadgs_ns.initialization import (
+    FACE_GREY,
+    FACE_OPACITY,
+    POINT_OPACITY,
+    bounding_box_points,
+    camera_extent,
+    neighbour_scales,
+)
 from sadgs_ns.losses import photometric_loss
 from sadgs_ns.rasterization import rasterize, viewmats_from_camera_to_world
 from sadgs_ns.strategy import StructureAwareStrategy
@@ -70,6 +77,8 @@ class SadgsModelConfig(SplatfactoModelConfig):
     """Weight of the squared error that is added to the loss for faster convergence."""
     bounding_box_points: bool = True
     """Also start from points on the faces of the SfM points' bounding box."""
+    camera_clearance: float = 2.0
+    """Initial Gaussians nearer to a camera than this many of their standard deviations are dropped; 0 keeps all."""
 
 
 class SadgsModel(SplatfactoModel):
@@ -151,9 +160,20 @@ class SadgsModel(SplatfactoModel):
             "opacities": torch.logit(opacities)[:, None],
         }
 
-    def set_scene_extent(self, extent: float) -> None:
-        """Tell the strategy the extent of the training cameras in world units."""
-        self.strategy_state["scene_scale"] = extent
+    def set_cameras(self, positions: Tensor) -> None:
+        """Fit the initial Gaussians and the strategy to the training cameras; call before optimizers are made.
+
+        Initial Gaussians that contain a camera are dropped: they could only become haze in front of it.
+
+        Args:
+            positions: Camera centres in world units. [C, 3]
+        """
+        self.strategy_state["scene_scale"] = camera_extent(positions)
+        radius = self.config.camera_clearance * self.scales.detach().exp().amax(dim=1)  # [N]
+        keep = torch.cdist(self.means.detach(), positions.to(self.means)).amin(dim=1) >= radius  # [N]
+        if keep.any():
+            for parameter in self.gauss_params.values():
+                parameter.data = parameter.data[keep]
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
@@ -200,7 +220,7 @@ class SadgsModel(SplatfactoModel):
             height,
             sh_degree=sh_degree,
             render_mode=render_mode,
-            absgrad=self.training and self.config.densify and self.strategy.absgrad,
+            absgrad=self.training and self.config.densify and self.strategy.needs_absgrad(self.step),
             rasterize_mode=self.config.rasterize_mode,
         )
 

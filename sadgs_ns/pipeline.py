@@ -13,7 +13,6 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from torch import Tensor
 
-from sadgs_ns.initialization import camera_extent
 from sadgs_ns.model import SadgsModel, SadgsModelConfig
 from sadgs_ns.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.structure_tensor import FREQUENCY_CONSTANT, multiscale_structure_tensor
@@ -38,7 +37,7 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     views_per_iteration: int = 1
     """Training views rendered for one optimizer step; the loss is their mean. The paper uses 1 outdoors, 2 indoors."""
     frequency_constant: float = FREQUENCY_CONSTANT
-    """c of ω_l = c / σ_l: how many times per wavelength unit a Gaussian must fit. Larger splits more."""
+    """c of ω_l = c / σ_l in 1/px: the larger, the shorter every wavelength and the more is split."""
 
 
 class SadgsPipeline(VanillaPipeline):
@@ -56,8 +55,7 @@ class SadgsPipeline(VanillaPipeline):
             raise ValueError(f"pipeline.views_per_iteration must be at least 1, got {config.views_per_iteration}.")
         super().__init__(config, *args, **kwargs)
         positions = self.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]  # [C, 3]
-        self.scene_extent = camera_extent(positions)
-        self.model.set_scene_extent(self.scene_extent)
+        self.model.set_cameras(positions)
 
     @property
     def model(self) -> SadgsModel:
@@ -105,17 +103,26 @@ class SadgsPipeline(VanillaPipeline):
             torch.stack(images).to(self.device), masks, frequency_constant=self.config.frequency_constant
         ).half()
 
+    def _next_view(self) -> tuple[int, dict[str, Any]]:
+        """Index and data of the next training view, in nerfstudio's order, without slicing its cameras for it."""
+        datamanager = self.datamanager
+        index = datamanager.train_unseen_cameras.pop(0)
+        if not datamanager.train_unseen_cameras:
+            datamanager.train_unseen_cameras = datamanager.sample_train_cameras()
+        data = datamanager.cached_train[index]
+        return index, {**data, "image": data["image"].to(self.device)}
+
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
         """Render the iteration's views and return the outputs of the last size, mean losses and mean metrics."""
         groups: dict[torch.Size, list[tuple[int, dict[str, Any]]]] = defaultdict(list)
         viewmats, Ks = self.train_cameras
         corrected: dict[int, Tensor] = {}
         for _ in range(self.config.views_per_iteration):
-            camera, data = self.datamanager.next_train(step)
-            assert camera.metadata is not None
-            index = camera.metadata["cam_idx"]
+            index, data = self._next_view()
             groups[data["image"].shape].append((index, data))
             if self.model.camera_optimizer.config.mode != "off":
+                camera = self.datamanager.train_cameras[index : index + 1].to(self.device)
+                camera.metadata = {"cam_idx": index}
                 corrected[index] = viewmats_from_camera_to_world(self.model.camera_optimizer.apply_to_camera(camera))[0]
         losses: dict[str, Tensor] = {}
         metrics: dict[str, Any] = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import torch
@@ -82,7 +83,7 @@ def rasterize(
     )
 
 
-def visible(info: dict[str, Any]) -> Tensor:
+def visible(info: Mapping[str, Any]) -> Tensor:
     """Which Gaussians were drawn, from an `info` of gsplat 1.4 (one radius) or 1.5 (a radius per axis).
 
     Args:

@@ -39,8 +39,8 @@ class SadgsTrainerConfig(TrainerConfig):
     """Steps between metrics of one held-out view, where a logger such as tensorboard is on."""
     steps_per_eval_all_images: int = 0
     """Steps between metrics of all held-out views; 0 is never. `ns-eval` measures them after training."""
-    scale_position_lr: bool = True
-    """Multiply the position learning rate with the extent of the cameras, as 3DGS does and splatfacto does not."""
+    scale_position_lr: bool = False
+    """Multiply the position learning rate with the extent of the cameras, as 3DGS does; nerfstudio scales poses to 1."""
 
 
 class SadgsTrainer(Trainer):
@@ -66,7 +66,7 @@ class SadgsTrainer(Trainer):
             if isinstance(scheduler, RunLengthDecaySchedulerConfig) and scheduler.max_steps is None:
                 scheduler.max_steps = self.config.max_num_iterations
         if self.config.scale_position_lr:
-            optimizers["means"]["optimizer"].lr *= self.pipeline.scene_extent
+            optimizers["means"]["optimizer"].lr *= self.pipeline.model.strategy_state["scene_scale"]
         return Optimizers(optimizers, self.pipeline.get_param_groups())
 
     def train(self) -> None:

@@ -65,6 +65,8 @@ class Run:
     targets: list[Tensor]
     """The same views as they are. [H, W, 3] each"""
     before_split: Snapshot
+    structure_growth: int
+    """Gaussians that the structure steps added, net of what they pruned."""
 
     @property
     def model(self) -> SadgsModel:
@@ -128,14 +130,26 @@ def train(config: SadgsTrainerConfig, label: str, on_step: Callable[[int, int], 
     trainer: SadgsTrainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
     pipeline, snapshot = trainer.pipeline, Snapshot()
+    strategy = pipeline.model.strategy
+    counts: list[int] = []  # before (negative) and after each structure step
+
+    def at_structure_step(step: int) -> bool:
+        return (
+            config.pipeline.model.densify
+            and step < strategy.refine_stop_iter
+            and (step + 1) % strategy.structure_every == 0
+        )
 
     def before_densification(step: int) -> None:
-        strategy = pipeline.model.strategy
+        if at_structure_step(step):
+            counts.append(-pipeline.model.num_points)
         if step + 1 == strategy.structure_every and "eta_max" in pipeline.model.strategy_state:
             snapshot.params = {name: value.detach().clone() for name, value in pipeline.model.gauss_params.items()}
             snapshot.eta_max = pipeline.model.strategy_state["eta_max"].clone()
 
     def after_step(step: int) -> None:
+        if at_structure_step(step):
+            counts.append(pipeline.model.num_points)
         on_step(step + 1, pipeline.model.num_points)
 
     after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
@@ -151,7 +165,7 @@ def train(config: SadgsTrainerConfig, label: str, on_step: Callable[[int, int], 
         outputs = pipeline.model.get_outputs_for_camera(dataset.cameras[index : index + 1])
         renders.append(outputs["rgb"].cpu())
         targets.append(dataset.get_image_float32(index).cpu())
-    return Run(label, pipeline, seconds, renders, targets, snapshot)
+    return Run(label, pipeline, seconds, renders, targets, snapshot, sum(counts))
 
 
 @torch.no_grad()
@@ -220,8 +234,8 @@ def draw_wavelength_and_eta(path: Path, scene: SceneDescription, run: Run, index
     eta_axes.set_title("largest η before the first split")
     if run.before_split.params:
         values = eta_map(pipeline, run.before_split, index)
-        shown = eta_axes.imshow(values, norm="log", vmin=1 / 30, vmax=30, cmap="coolwarm")  # white where η = 1
-        figure.colorbar(shown, ax=eta_axes, ticks=[0.1, 1, 10], format="%g").minorticks_off()
+        shown = eta_axes.imshow(values, norm="log", vmin=1, vmax=30, cmap="magma")  # black: nothing to split
+        figure.colorbar(shown, ax=eta_axes, ticks=[1, 3, 10, 30], format="%g").minorticks_off()
     for axes in (image_axes, estimate_axes, truth_axes, eta_axes):
         axes.set_axis_off()
     with atomic_path(path) as partial:
@@ -274,6 +288,11 @@ def demonstrate(output: Path, iterations: int, max_gaussians: int, width: int, h
             run.label, f"{run.psnr():.2f}", f"{run.ssim():.4f}", f"{run.model.num_points}", f"{run.seconds:.0f}"
         )
     console.print(table)
+    if runs[-1].structure_growth <= 0:
+        console.print(
+            f"Structure steps added no Gaussians within the cap of {max_gaussians}, so the difference above is the "
+            "work of AbsGS, not of structure-aware splits."
+        )
     for name in ("side_by_side.png", "wavelength_and_eta.png", "splat.ply"):
         console.print(f"{output / name}")
     return runs
