@@ -40,7 +40,7 @@ class SadgsTrainerConfig(TrainerConfig):
     steps_per_eval_all_images: int = 0
     """Steps between metrics of all held-out views; 0 is never. `ns-eval` measures them after training."""
     scale_position_lr: bool = False
-    """Multiply the position learning rate with the extent of the cameras, as 3DGS does; nerfstudio scales poses to 1."""
+    """Multiply the position learning rate with the cameras' extent, as 3DGS does; nerfstudio scales poses to 1."""
 
 
 class SadgsTrainer(Trainer):
