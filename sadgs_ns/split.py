@@ -56,16 +56,19 @@ def limit_growth(growth: Tensor, priority: Tensor, budget: int) -> Tensor:
     return fits & (growth > 0)
 
 
-def grid_offsets(counts: Tensor, extent: float = VARIANCE_EXTENT) -> tuple[Tensor, Tensor]:
+def grid_offsets(
+    counts: Tensor, extent: float = VARIANCE_EXTENT, dtype: torch.dtype = torch.float32
+) -> tuple[Tensor, Tensor]:
     """Centred regular grids of n_x × n_y × n_z cell centres.
 
     Args:
         counts: n of each parent. int64 [P, 3]
         extent: Half-width of the grid in parent standard deviations.
+        dtype: Of the coordinates.
 
     Returns:
-        Index of each child's parent, int64 [Q], and the grid coordinate g in parent standard deviations, float32
-        [Q, 3], children of one parent in a row, the first axis running fastest.
+        Index of each child's parent, int64 [Q], and the grid coordinate g in parent standard deviations [Q, 3],
+        children of one parent in a row, the first axis running fastest.
     """
     totals = counts.prod(dim=1)  # [P]
     parents = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), totals)  # [Q]
@@ -73,7 +76,7 @@ def grid_offsets(counts: Tensor, extent: float = VARIANCE_EXTENT) -> tuple[Tenso
     n_x, n_y, n_z = counts[parents].unbind(1)
     cells = torch.stack([local % n_x, local // n_x % n_y, local // (n_x * n_y)], dim=1)  # [Q, 3]
     n = torch.stack([n_x, n_y, n_z], dim=1)
-    return parents, (2.0 * cells - n + 1) * (extent / n)
+    return parents, (2 * cells - n + 1).to(dtype) * (extent / n.to(dtype))
 
 
 @torch.no_grad()
@@ -100,7 +103,7 @@ def grid_split(
     is_split = (counts > 1).any(dim=1)
     rest = torch.where(~is_split)[0]
     selected = torch.where(is_split)[0]
-    local_parents, grid = grid_offsets(counts[selected], extent)
+    local_parents, grid = grid_offsets(counts[selected], extent, params["scales"].dtype)
     parents = selected[local_parents]  # [Q]
     rotmats = normalized_quat_to_rotmat(F.normalize(params["quats"][parents], dim=-1))  # [Q, 3, 3]
     offsets = torch.einsum("qij,qj->qi", rotmats, params["scales"][parents].exp() * grid)  # [Q, 3]

@@ -36,7 +36,7 @@ def reference_structure_tensor(image: Tensor, gamma: float = 3.0, energy_blur: f
     noise = max(NOISE_FLOOR * contrast, 1e-5)
     numerator, denominator, previous = 0.0, noise**gamma, array
 
-    def blur(values, sigma, order=0):  # scipy's taps: truncated where ours are
+    def blur(values, sigma, order=""):  # scipy's taps: truncated where ours are
         radius = math.ceil(3 * sigma)
         taps_0, taps_1 = (gaussian_kernel(sigma, o, torch.float64).numpy() for o in (0, 1))
         assert len(taps_0) == 2 * radius + 1

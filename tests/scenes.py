@@ -1,0 +1,40 @@
+"""Small random scenes for tests."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def random_params(n: int, seed: int = 0, dtype: torch.dtype = torch.float32) -> dict[str, torch.nn.Parameter]:
+    """Gaussians in gsplat's parameters, about 4 units in front of a camera at the origin."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def rand(*shape: int) -> Tensor:
+        return torch.rand(shape, generator=generator, dtype=dtype)
+
+    params = {
+        "means": (rand(n, 3) - 0.5) * 2 + torch.tensor([0.0, 0.0, 4.0], dtype=dtype),
+        "scales": torch.log(0.05 + 0.2 * rand(n, 3)),
+        "quats": rand(n, 4) - 0.5,
+        "opacities": torch.logit(0.2 + 0.7 * rand(n)),
+        "features_dc": rand(n, 3),
+    }
+    return {name: torch.nn.Parameter(value) for name, value in params.items()}
+
+
+def adam(params: dict[str, torch.nn.Parameter], lr: float = 1e-3) -> dict[str, torch.optim.Optimizer]:
+    """One Adam per parameter with one step taken, so that every optimizer has a state."""
+    optimizers: dict[str, torch.optim.Optimizer] = {name: torch.optim.Adam([p], lr=lr) for name, p in params.items()}
+    for parameter in params.values():
+        parameter.grad = torch.ones_like(parameter)
+    for optimizer in optimizers.values():
+        optimizer.step()
+        optimizer.zero_grad()
+    return optimizers
+
+
+def camera(width: int = 64, height: int = 48, focal: float = 60.0, dtype: torch.dtype = torch.float32):
+    """viewmats [1, 4, 4] and Ks [1, 3, 3] of a camera at the origin."""
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=dtype)
+    return torch.eye(4, dtype=dtype)[None], K[None]
