@@ -1,4 +1,4 @@
-"""η at the visible Gaussians: projected axes against the local wavelength (paper, section 3.3, eq. 1, 7, 8).
+"""η at the visible Gaussians: projected axes against the local wavelength (paper, section 3.3, eq. 1, 6, 7).
 
 Pure tensor functions over the observations of one training step. An observation is a pair (camera, Gaussian) that the
 forward pass found visible; M is their number.
@@ -128,7 +128,7 @@ def sample_map(structure_tensors: Tensor, camera_ids: Tensor, points: Tensor) ->
 
 
 def eta(axes: Tensor, structure_tensor: Tensor, directional: bool = False) -> Tensor:
-    """Frequency violation of each axis: η_k = ‖v_k‖ / Λ_min (paper, eq. 7), or η^(proj) (eq. 8).
+    """Frequency violation of each axis: η_k = ‖v_k‖ / Λ_min (paper, eq. 6), or η^(proj) (eq. 7).
 
     Args:
         axes: v_k in px. [M, 3, 2]

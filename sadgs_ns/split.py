@@ -1,4 +1,4 @@
-"""Statistics → split plan → new parameters (paper, section 3.5, eq. 9 and 10)."""
+"""Statistics → split plan → new parameters (paper, section 3.5, eq. 8 and 9)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ VARIANCE_EXTENT = math.sqrt(3.0)
 
 
 def children_per_axis(eta_max: Tensor, violates: Tensor, exponent: float = 0.5) -> Tensor:
-    """Split factor n_k = ⌈η_k^p⌉ on the axes that violate consistently, 1 elsewhere (paper, eq. 9).
+    """Split factor n_k = ⌈η_k^p⌉ on the axes that violate consistently, 1 elsewhere (paper, eq. 8).
 
     Args:
         eta_max: Largest η observed per axis, ≥ 0. [N, 3]
@@ -89,7 +89,7 @@ def grid_split(
 ) -> None:
     """Replace every Gaussian with more than one child by its grid of children, in place, as gsplat's `split` does.
 
-    μ_child = μ + R (s ⊙ g) and s_child = s ⊘ n (paper, eq. 10); rotation, colour and opacity are copied. The order
+    μ_child = μ + R (s ⊙ g) and s_child = s ⊘ n (paper, eq. 9); rotation, colour and opacity are copied. The order
     afterwards is [unsplit, children grouped by parent]. Children start with zero optimizer moments and inherit the
     parent's rows of every tensor in `state`.
 

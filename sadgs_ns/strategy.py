@@ -48,7 +48,7 @@ class StructureAwareStrategy(Strategy):
     eta_every: int = 10
     """Iterations between η observations; the paper observes at every one, which costs time and changes nothing."""
     directional_eta: bool = False
-    """Measure η along each axis's own direction (paper, eq. 8) instead of against the shortest wavelength (eq. 7)."""
+    """Measure η along each axis's own direction (paper, eq. 7) instead of against the shortest wavelength (eq. 6)."""
     eta_min_opacity: float = 0.3
     """Opacity in [0, 1] from which a Gaussian's η is observed; 0 observes every visible one, as the paper does."""
     tau_split: float = 0.8

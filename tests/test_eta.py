@@ -1,4 +1,4 @@
-"""η at Gaussians: eq. 1 against finite differences, eq. 7 and 8 against brute force over the footprint."""
+"""η at Gaussians: eq. 1 against finite differences, eq. 6 and 7 against brute force over the footprint."""
 
 from __future__ import annotations
 
