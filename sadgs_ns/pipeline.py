@@ -15,7 +15,12 @@ from torch import Tensor
 
 from sadgs_ns.model import SadgsModel, SadgsModelConfig
 from sadgs_ns.rasterization import viewmats_from_camera_to_world
-from sadgs_ns.structure_tensor import FREQUENCY_CONSTANT, multiscale_structure_tensor
+from sadgs_ns.structure_tensor import (
+    ENERGY_BLUR,
+    FREQUENCY_CONSTANT,
+    NOISE_FLOOR,
+    multiscale_structure_tensor,
+)
 
 _PIXELS_PER_BATCH = 4_000_000
 """Structure tensors are computed for as many images at once as fit this; each pixel takes about 300 bytes."""
@@ -38,6 +43,10 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     """Training views rendered for one optimizer step; the loss is their mean. The paper uses 1 outdoors, 2 indoors."""
     frequency_constant: float = FREQUENCY_CONSTANT
     """c of ω_l = c / σ_l in 1/px: the larger, the shorter every wavelength and the more is split."""
+    noise_floor: float = NOISE_FLOOR
+    """Amplitude, relative to an image's contrast, under which its structure counts as noise."""
+    energy_blur: float = ENERGY_BLUR
+    """Window, in multiples of σ_l, over which the energy of a scale is averaged; 0 measures it per pixel (eq. 4)."""
 
 
 class SadgsPipeline(VanillaPipeline):
@@ -100,7 +109,11 @@ class SadgsPipeline(VanillaPipeline):
                  for d, image in zip(data, images, strict=True)]
             )  # fmt: skip
         return multiscale_structure_tensor(
-            torch.stack(images).to(self.device), masks, frequency_constant=self.config.frequency_constant
+            torch.stack(images).to(self.device),
+            masks,
+            frequency_constant=self.config.frequency_constant,
+            noise_floor=self.config.noise_floor,
+            energy_blur=self.config.energy_blur,
         ).half()
 
     def _next_view(self) -> tuple[int, dict[str, Any]]:
