@@ -52,8 +52,9 @@ WITHOUT_EFFECT = {
     "split_screen_size": "nothing: η compares sizes with the texture instead",
     "stop_screen_size_at": "nothing: sadgs has no screen-size rule",
     "stop_split_at": "strategy.refine_stop_iter",
+    "output_depth_during_training": "nothing: no loss of this method reads depth",
 }
-"""Fields inherited from splatfacto that steer its own densification, and what replaces each here."""
+"""Fields inherited from splatfacto that this method does not read, and what replaces each here."""
 
 
 @dataclass

@@ -80,10 +80,13 @@ class SadgsTrainer(Trainer):
             self.config.max_num_iterations = total
 
     def save_checkpoint(self, step: int) -> None:
-        """Save under a temporary name, then rename: a killed save leaves the previous checkpoint as it was."""
+        """Save under a temporary name, then rename: a killed save leaves the previous checkpoint as it was.
+
+        The temporary file lies beside the folder of checkpoints: nerfstudio takes every file inside for one.
+        """
         self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
         path: Path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
-        partial = path.with_suffix(".partial")
+        partial = self.checkpoint_dir.with_name(f"{self.checkpoint_dir.name}.partial")
         try:
             torch.save(
                 {

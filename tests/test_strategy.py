@@ -161,7 +161,13 @@ def gradient_state(grad: list[float], absgrad: list[float]) -> dict[str, torch.T
 
 def grow_with(params, state, budget: int = 1000) -> tuple[int, int]:
     return grow(
-        params, adam(params, lr=0.0), state, clone_threshold=2e-4, split_threshold=4e-4, size_threshold=0.1, budget=budget
+        params,
+        adam(params, lr=0.0),
+        state,
+        clone_threshold=2e-4,
+        split_threshold=4e-4,
+        size_threshold=0.1,
+        budget=budget,
     )
 
 

@@ -1,0 +1,34 @@
+"""Third-party warnings that the project's "error" filter lets pass: named, so that ours still fail a test."""
+
+from __future__ import annotations
+
+import pytest
+
+THIRD_PARTY_WARNINGS = (
+    # nerfstudio's activations still use torch.cuda.amp's decorators.
+    "ignore:`torch.cuda.amp.custom_(fwd|bwd):FutureWarning",
+    # nerfstudio's trainer makes a torch.cuda.amp.GradScaler, which says that there is no CUDA.
+    "ignore:`torch.cuda.amp.GradScaler:FutureWarning",
+    "ignore:torch.cuda.amp.GradScaler is enabled, but CUDA is not available:UserWarning",
+    # nerfstudio's trainer enters torch.autocast("cpu", enabled=False), whose default dtype it does not name.
+    "ignore:In CPU autocast:UserWarning",
+    # nerfstudio's cameras index a tensor with a list.
+    "ignore:Using a non-tuple sequence for multidimensional indexing:UserWarning",
+    # Modules that nerfstudio imports are compiled with torch.jit, which Python 3.14 will not have.
+    r"ignore:`torch.jit.\w+` is deprecated:DeprecationWarning",
+    # viser imports websockets' old names.
+    "ignore:websockets.connection was renamed:DeprecationWarning",
+    "ignore:websockets.legacy is deprecated:DeprecationWarning",
+    # nerfstudio's writer logs the loss as it is, with its graph.
+    "ignore:Converting a tensor with requires_grad=True to a scalar:UserWarning",
+    # nerfstudio's OrientedBox copies tensors with torch.tensor.
+    "ignore:To copy construct from a tensor:UserWarning",
+    # torchmetrics makes AlexNet for LPIPS with torchvision's old arguments.
+    "ignore:The parameter 'pretrained' is deprecated:UserWarning",
+    "ignore:Arguments other than a weight enum:UserWarning",
+)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    for warning in THIRD_PARTY_WARNINGS:
+        config.addinivalue_line("filterwarnings", warning)

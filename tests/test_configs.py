@@ -1,0 +1,222 @@
+"""The configuration: its documentation, the presets and how nerfstudio finds them."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+import re
+import subprocess
+import sys
+import textwrap
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import tyro
+from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
+
+import sadgs_ns.model
+from sadgs_ns import presets
+from sadgs_ns.model import WITHOUT_EFFECT, SadgsModel, SadgsModelConfig
+from sadgs_ns.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
+from sadgs_ns.pipeline import SadgsPipelineConfig
+from sadgs_ns.presets import load_preset
+from sadgs_ns.strategy import StructureAwareStrategy
+from sadgs_ns.trainer import SadgsTrainerConfig
+
+CHECKOUT = Path(__file__).parents[1]
+METHODS = ("sadgs", "sadgs-indoor", "sadgs-large")
+CONFIG_CLASSES = (
+    SadgsTrainerConfig,
+    SadgsPipelineConfig,
+    SadgsModelConfig,
+    StructureAwareStrategy,
+    FusedAdamOptimizerConfig,
+    RunLengthDecaySchedulerConfig,
+)
+WITHOUT_NERFSTUDIO = (
+    "strategy",
+    "structure_tensor",
+    "eta",
+    "split",
+    "statistics",
+    "absgs",
+    "splatter",
+    "rasterization",
+    "losses",
+    "initialization",
+)
+
+
+def body_of(cls: type) -> list[ast.stmt]:
+    """The statements of a class, as written."""
+    (definition,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
+    assert isinstance(definition, ast.ClassDef)
+    return definition.body
+
+
+def is_string(statement: ast.stmt) -> bool:
+    return isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
+
+
+def python(code: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", code], cwd=cwd, capture_output=True, text=True, timeout=60)
+
+
+def changed(value: Any) -> Any:
+    """Another value of the same type."""
+    return not value if isinstance(value, bool) else value + 1
+
+
+def model(config: SadgsModelConfig) -> SadgsModel:
+    return config.setup(scene_box=SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3])), num_train_data=1, seed_points=None)
+
+
+@pytest.mark.parametrize("cls", CONFIG_CLASSES)
+def test_every_public_field_is_followed_by_a_docstring(cls: type):
+    body = body_of(cls)
+    undocumented = [
+        ast.unparse(statement.target)
+        for statement, following in zip(body, [*body[1:], ast.Pass()], strict=True)
+        if isinstance(statement, ast.AnnAssign)
+        and not ast.unparse(statement.target).startswith("_")
+        and not is_string(following)
+    ]
+    assert is_string(body[0]) and undocumented == []
+
+
+@pytest.mark.parametrize("cls", CONFIG_CLASSES)
+def test_every_class_attribute_is_a_dataclass_field(cls: type):
+    body = body_of(cls)
+    assert not [ast.unparse(statement) for statement in body if isinstance(statement, ast.Assign)]
+    annotated = {ast.unparse(statement.target) for statement in body if isinstance(statement, ast.AnnAssign)}
+    assert annotated and annotated <= {field.name for field in dataclasses.fields(cls)}
+
+
+def test_nerfstudio_finds_the_three_methods_through_their_entry_points():
+    installed = {point.name: point.value for point in entry_points(group="nerfstudio.method_configs")}
+    assert set(METHODS) <= set(installed)
+    for name in METHODS:
+        assert installed[name].startswith("sadgs_ns.presets:")
+        assert isinstance(all_methods[name], SadgsTrainerConfig)
+        assert all_methods[name].method_name == name
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_presets_load_under_their_own_names_with_every_optimizer(name: str):
+    method = load_preset(name)
+    assert method.config.method_name == name
+    assert method.description.startswith("Structure-aware densification")
+    groups = set(model(dataclasses.replace(SadgsModelConfig(), num_random=10, use_bilateral_grid=True)).gauss_params)
+    assert set(method.config.optimizers) == groups | {"camera_opt", "bilateral_grid"}
+
+
+def test_presets_differ_where_their_comments_say():
+    views = [load_preset(name).config.pipeline.views_per_iteration for name in METHODS]  # type: ignore[attr-defined]
+    assert views == [1, 2, 1]
+    assert [load_preset(name).config.max_num_iterations for name in METHODS] == [3000, 3000, 7000]
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("max_iterations: 3", r"p\.yaml: unknown key 'max_iterations'; known are .*max_num_iterations.*\."),
+        ("pipeline: {model: {tau: 1}}", r"p\.yaml: pipeline: model: unknown key 'tau'; known are .*\."),
+        ("max_num_iterations: 3.5", r"p\.yaml: max_num_iterations must be of type int, got float 3\.5\."),
+        ("max_num_iterations: true", r"p\.yaml: max_num_iterations must be of type int, got bool True\."),
+        ("pipeline: 3", r"p\.yaml: pipeline must be of type SadgsPipelineConfig, got int 3\."),
+    ],
+)
+def test_preset_errors_are_one_sentence_that_names_file_key_and_value(
+    text: str, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "p.yaml").write_text(f"description: A preset.\noptimizers: {{}}\n{text}\n")
+    monkeypatch.setattr(presets, "_configs", lambda: tmp_path)
+    with pytest.raises(ValueError) as error:
+        load_preset("p")
+    assert re.fullmatch(sentence, str(error.value))
+
+
+def test_an_unknown_optimizer_option_names_its_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "p.yaml").write_text("description: A preset.\noptimizers: {means: {schedule: {final: 1.0}}}\n")
+    monkeypatch.setattr(presets, "_configs", lambda: tmp_path)
+    with pytest.raises(ValueError, match=r"p\.yaml: optimizers\.means\.schedule: unknown key 'final'"):
+        load_preset("p")
+
+
+def test_a_missing_preset_is_named():
+    with pytest.raises(FileNotFoundError, match=r"sadgs-none\.yaml"):
+        load_preset("sadgs-none")
+
+
+@pytest.mark.parametrize("name", WITHOUT_EFFECT)
+def test_inherited_fields_without_effect_are_refused(name: str):
+    config = SadgsModelConfig(num_random=10)
+    setattr(config, name, changed(getattr(config, name)))
+    with pytest.raises(ValueError, match=rf"pipeline\.model\.{name} has no effect on this method; use \w"):
+        model(config)
+
+
+def test_training_at_reduced_resolution_is_refused():
+    with pytest.raises(ValueError, match=r"num_downscales must be 0"):
+        model(SadgsModelConfig(num_random=10, num_downscales=2))
+
+
+def test_every_inherited_splatfacto_field_is_read_or_refused():
+    ours = inspect.getsource(sadgs_ns.model)
+    overridden = set(vars(SadgsModel)) - set(re.findall(r"super\(\)\.(\w+)", ours))
+    methods = [m for name, m in vars(SplatfactoModel).items() if inspect.isfunction(m) and name not in overridden]
+    read = set(re.findall(r"config\.(\w+)", ours + "".join(inspect.getsource(method) for method in methods)))
+    inherited = {name for name in SplatfactoModelConfig.__annotations__ if not name.startswith("_")}
+    assert inherited - read == set(WITHOUT_EFFECT) - read
+
+
+@pytest.mark.parametrize("method", ["sadgs", "sadgs-indoor"])
+def test_the_help_of_ns_train_shows_the_docstrings(method: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as stopped:
+        tyro.cli(AnnotatedBaseConfigUnion, args=[method, "--help"])
+    assert stopped.value.code == 0
+    shown = " ".join(re.sub(r"[^\w\s.-]", " ", capsys.readouterr().out).split())
+    assert "--pipeline.model.strategy.max-gaussians" in shown
+    assert "Hard cap on the number of Gaussians" in shown
+    assert "Training views rendered for one optimizer step" in shown
+
+
+def test_the_device_is_the_cpu_where_there_is_no_cuda(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert load_preset("sadgs").config.machine.device_type == "cpu"
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert load_preset("sadgs").config.machine.device_type == "cuda"
+
+
+def test_the_strategy_and_all_it_needs_import_without_nerfstudio(tmp_path: Path):
+    names = ", ".join(f"sadgs_ns.{name}" for name in WITHOUT_NERFSTUDIO)
+    result = python(f"import sys; sys.modules['nerfstudio'] = None; import {names}; print('done')", tmp_path)
+    assert result.stdout.strip() == "done", result.stderr
+
+
+def test_presets_are_found_in_a_checkout_that_is_not_installed(monkeypatch: pytest.MonkeyPatch):
+    def not_installed(package: str) -> Path:
+        raise ModuleNotFoundError(package)
+
+    monkeypatch.setattr(presets, "files", not_installed)
+    assert presets._configs() == CHECKOUT / "configs"
+    assert load_preset("sadgs").config.method_name == "sadgs"
+
+
+def test_an_installation_holds_every_preset_where_the_package_looks_for_it(tmp_path: Path):
+    source, installed = tmp_path / "source", tmp_path / "installed"
+    source.mkdir()
+    for name in ("sadgs_ns", "configs", "pyproject.toml", "README.md", "LICENSE"):
+        (source / name).symlink_to(CHECKOUT / name)
+    build = python(f"import setuptools; setuptools.setup(script_args=['build_py', '-d', {str(installed)!r}])", source)
+    assert build.returncode == 0, build.stderr
+    for path in CHECKOUT.glob("configs/**/*.yaml"):
+        assert (installed / "sadgs_ns" / path.relative_to(CHECKOUT)).read_bytes() == path.read_bytes()
+    look = "from importlib.resources import files; print(files('sadgs_ns.configs') / 'sadgs.yaml')"
+    assert python(look, installed).stdout.strip() == str(installed / "sadgs_ns" / "configs" / "sadgs.yaml")

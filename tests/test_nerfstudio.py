@@ -1,0 +1,574 @@
+"""Training, resuming, evaluating and exporting through nerfstudio, on the CPU and a tiny drawn scene."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import json
+import os
+import random
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.models.splatfacto import SplatfactoModel
+from nerfstudio.scripts.eval import ComputePSNR
+from PIL import Image
+from plyfile import PlyData
+
+from sadgs_ns.demo.scene import SPARSE_FOLDER, arc_views, render, room_surfaces, write_scene
+from sadgs_ns.model import SadgsModel
+from sadgs_ns.presets import load_preset
+from sadgs_ns.trainer import SadgsTrainer, SadgsTrainerConfig
+
+WIDTH, HEIGHT, VIEWS, POINTS = 48, 36, 10, 300
+TRAIN_VIEWS = 8
+"""Of 10, the parser holds out the first and the ninth."""
+ITERATIONS = 24
+SCHEDULE = {
+    "structure_every": 6,
+    "absgs_every": 3,
+    "refine_start_iter": 1,
+    "refine_stop_iter": 15,
+    "eta_every": 1,
+    "eta_min_opacity": 0.0,
+    "reset_every": 0,
+    "final_prune_opacity": 0.01,
+}
+"""Densification for the few iterations of these tests."""
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A COLMAP dataset."""
+    folder = tmp_path_factory.mktemp("colmap") / "scene"
+    write_scene(folder, WIDTH, HEIGHT, VIEWS, POINTS)
+    return folder
+
+
+@pytest.fixture
+def colmap(scene: Path) -> ColmapDataParserConfig:
+    return ColmapDataParserConfig(
+        data=scene, colmap_path=SPARSE_FOLDER, downscale_factor=1, eval_mode="interval", eval_interval=8
+    )
+
+
+@pytest.fixture(scope="module")
+def finished(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a run that `ns-train sadgs` made."""
+    output = tmp_path_factory.mktemp("cli")
+    options = {
+        "output-dir": output,
+        "experiment-name": "room",
+        "timestamp": "run",
+        "vis": "tensorboard",
+        "max-num-iterations": ITERATIONS,
+        "pipeline.views-per-iteration": 2,
+        **{f"pipeline.model.strategy.{name.replace('_', '-')}": value for name, value in SCHEDULE.items()},
+    }
+    parser = {
+        "data": scene,
+        "colmap-path": SPARSE_FOLDER,
+        "downscale-factor": 1,
+        "eval-mode": "interval",
+        "eval-interval": 8,
+    }
+    command = [str(Path(sys.executable).with_name("ns-train")), "sadgs"]
+    command += [word for name, value in options.items() for word in (f"--{name}", str(value))] + ["colmap"]
+    command += [word for name, value in parser.items() for word in (f"--{name}", str(value))]
+    environment = {name: value for name, value in os.environ.items() if name != "TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD"}
+    result = subprocess.run(command, capture_output=True, text=True, timeout=100, env=environment)
+    assert result.returncode == 0, result.stdout + result.stderr
+    return output / "room" / "sadgs" / "run"
+
+
+def configure(output: Path, parser: DataParserConfig, iterations: int = 6, **strategy: Any) -> SadgsTrainerConfig:
+    """The preset on other data, with the tests' schedule, without viewer and evaluation."""
+    config: SadgsTrainerConfig = copy.deepcopy(load_preset("sadgs").config)  # type: ignore[assignment]
+    config.output_dir, config.experiment_name, config.timestamp = output, "test", "run"
+    config.vis = "tensorboard"
+    config.max_num_iterations = iterations
+    config.steps_per_save = config.steps_per_eval_image = 0
+    config.logging.local_writer.enable = False
+    config.pipeline.datamanager.dataparser = parser
+    config.pipeline.model.bounding_box_points = False
+    config.pipeline.model.num_random = POINTS
+    config.pipeline.model.strategy = dataclasses.replace(config.pipeline.model.strategy, **{**SCHEDULE, **strategy})
+    return config
+
+
+def set_up(config: SadgsTrainerConfig) -> SadgsTrainer:
+    """The trainer, seeded as `ns-train` does it, before its first iteration."""
+    random.seed(config.machine.seed)
+    np.random.seed(config.machine.seed)
+    torch.manual_seed(config.machine.seed)
+    trainer: SadgsTrainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    return trainer
+
+
+def train(config: SadgsTrainerConfig, after_step: Callable[[SadgsTrainer], None] | None = None) -> SadgsTrainer:
+    """Train to the end, calling `after_step` after each iteration's densification."""
+    trainer = set_up(config)
+    if after_step is not None:
+        location = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+        trainer.callbacks.append(TrainingCallback(location, lambda step: after_step(trainer)))
+    trainer.train()
+    return trainer
+
+
+def checkpoint(trainer: SadgsTrainer, step: int) -> dict[str, Any]:
+    """A checkpoint, read as torch reads files that it does not trust."""
+    return torch.load(trainer.checkpoint_dir / f"step-{step:09d}.ckpt", weights_only=True)
+
+
+def differences(a: Any, b: Any, where: str = "") -> list[str]:
+    """Places where two nested checkpoints are not bitwise equal."""
+    if type(a) is not type(b):
+        return [where]
+    if isinstance(a, dict):
+        if a.keys() != b.keys():
+            return [where]
+        return [place for key in a for place in differences(a[key], b[key], f"{where}/{key}")]
+    if isinstance(a, list | tuple):
+        if len(a) != len(b):
+            return [where]
+        return [place for i, pair in enumerate(zip(a, b, strict=True)) for place in differences(*pair, f"{where}/{i}")]
+    equal = torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
+    return [] if equal else [where]
+
+
+def is_finite(model: SadgsModel) -> bool:
+    return all(bool(value.isfinite().all()) for value in model.gauss_params.values())
+
+
+def frames(
+    folder: Path, sizes: Sequence[tuple[int, int]], alpha: bool = False, masks: bool = False
+) -> list[dict[str, Any]]:
+    """Draw views of the room, the i-th of size i modulo `sizes` (width, height), and describe them to nerfstudio.
+
+    With `alpha` the left half of every image is transparent; with `masks` the left half is masked out.
+    """
+    (folder / "images").mkdir(parents=True)
+    described = []
+    for index, view in enumerate(arc_views(VIEWS, WIDTH, HEIGHT)):
+        width, height = sizes[index % len(sizes)]
+        view = dataclasses.replace(view, width=width, height=height)
+        right_half = np.where(np.arange(width) < width // 2, 0, 255).astype(np.uint8)[None].repeat(height, 0)
+        image = render(room_surfaces(), view, supersampling=1)
+        if alpha:
+            image = np.dstack([image, right_half])
+        Image.fromarray(image).save(folder / "images" / view.name)
+        pose = np.eye(4)
+        pose[:3, :3] = view.rotation.T * [1, -1, -1]  # OpenCV's camera axes to OpenGL's
+        pose[:3, 3] = view.position
+        frame = {"file_path": f"images/{view.name}", "transform_matrix": pose.tolist(), "w": width, "h": height}
+        frame |= {"fl_x": view.focal, "fl_y": view.focal, "cx": width / 2, "cy": height / 2}
+        if masks:
+            Image.fromarray(right_half).save(folder / "images" / f"mask_{view.name}")
+            frame["mask_path"] = f"images/mask_{view.name}"
+        described.append(frame)
+    return described
+
+
+def nerfstudio_data(
+    folder: Path, sizes: Sequence[tuple[int, int]] = ((WIDTH, HEIGHT),), **options: bool
+) -> NerfstudioDataParserConfig:
+    """A dataset as ns-process-data writes it, without SfM points."""
+    described = frames(folder, sizes, **options)
+    (folder / "transforms.json").write_text(json.dumps({"camera_model": "OPENCV", "frames": described}))
+    return NerfstudioDataParserConfig(data=folder, load_3D_points=True, downscale_factor=1)
+
+
+def blender_data(folder: Path, alpha_color: str | None) -> BlenderDataParserConfig:
+    """A synthetic dataset as NeRF's, with transparent images."""
+    described = [
+        {"file_path": f"./{frame['file_path'].removesuffix('.png')}", "transform_matrix": frame["transform_matrix"]}
+        for frame in frames(folder, [(WIDTH, HEIGHT)], alpha=True)
+    ]
+    angle = 2 * np.arctan(0.5 / 0.8)  # the room's focal length is 0.8 of the width
+    for split, part in (("train", described[2:]), ("val", described[:2]), ("test", described[:2])):
+        text = json.dumps({"camera_angle_x": angle, "frames": part})
+        (folder / f"transforms_{split}.json").write_text(text)
+    return BlenderDataParserConfig(data=folder, alpha_color=alpha_color)
+
+
+# --- the command line ---
+
+
+def test_ns_train_leaves_one_checkpoint_of_the_last_iteration_that_loads_safely(finished: Path):
+    (path,) = (finished / "nerfstudio_models").iterdir()
+    assert path.name == f"step-{ITERATIONS - 1:09d}.ckpt"
+    state = torch.load(path, weights_only=True)
+    assert state["step"] == ITERATIONS - 1
+    means = state["pipeline"]["_model.gauss_params.means"]
+    assert len(means) > POINTS and means.isfinite().all()
+
+
+def test_ns_eval_reports_psnr_and_ssim_and_says_once_why_lpips_is_missing(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.delenv("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", raising=False)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "no weights"))
+    for name in ("http_proxy", "https_proxy", "HTTP_PROXY", "HTTPS_PROXY"):
+        monkeypatch.setenv(name, "http://127.0.0.1:9")  # where nothing listens
+    ComputePSNR(load_config=finished / "config.yml", output_path=tmp_path / "output.json").main()
+    results = json.loads((tmp_path / "output.json").read_text())["results"]
+    assert 5 < results["psnr"] < 60 and 0 < results["ssim"] <= 1
+    assert not [name for name in results if "lpips" in name]
+    printed = capsys.readouterr().out
+    assert printed.count("LPIPS is not reported") == 1
+    assert "urlopen" in printed  # not for any other reason
+
+
+def test_ns_export_writes_every_gaussian_that_can_be_seen(finished: Path, tmp_path: Path):
+    try:
+        from nerfstudio.scripts.exporter import ExportGaussianSplat
+    except (ImportError, OSError) as error:
+        pytest.skip(f"nerfstudio's exporter needs open3d, which cannot be imported here: {error}")
+    ExportGaussianSplat(load_config=finished / "config.yml", output_dir=tmp_path).main()
+    (path,) = (finished / "nerfstudio_models").iterdir()
+    opacities = torch.load(path, weights_only=True)["pipeline"]["_model.gauss_params.opacities"]
+    vertices = PlyData.read(tmp_path / "splat.ply")["vertex"]
+    assert len(vertices["x"]) == int((opacities >= -5.5373).sum()) > 0
+    assert {"f_dc_0", "f_rest_44", "opacity", "scale_2", "rot_3"} <= set(vertices.data.dtype.names)
+
+
+# --- training ---
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_each_iteration_takes_its_number_of_views_in_nerfstudio_s_order(
+    views: int, colmap: ColmapDataParserConfig, tmp_path: Path
+):
+    config = configure(tmp_path, colmap, iterations=3)
+    config.pipeline.views_per_iteration = views
+    trainer = set_up(config)
+    order = list(trainer.pipeline.datamanager.train_unseen_cameras)
+    assert len(order) == TRAIN_VIEWS
+    trainer.train()
+    assert trainer.pipeline.datamanager.train_unseen_cameras == order[3 * views :]
+
+
+def test_no_view_at_all_per_iteration_is_refused(colmap: ColmapDataParserConfig, tmp_path: Path):
+    config = configure(tmp_path, colmap)
+    config.pipeline.views_per_iteration = 0
+    with pytest.raises(ValueError, match=r"views_per_iteration must be at least 1, got 0\."):
+        set_up(config)
+
+
+def test_training_makes_the_training_views_more_alike(colmap: ColmapDataParserConfig, tmp_path: Path):
+    psnr: list[float] = []
+    config = configure(tmp_path, colmap, iterations=ITERATIONS)
+
+    def measure(trainer: SadgsTrainer) -> None:
+        if trainer.step in (0, ITERATIONS - 1):
+            with torch.no_grad():
+                trainer.pipeline.eval()
+                metrics = [
+                    trainer.pipeline.model.get_metrics_dict(trainer.pipeline.model.get_outputs(camera), batch)["psnr"]
+                    for camera, batch in (trainer.pipeline.datamanager.next_train(0) for _ in range(TRAIN_VIEWS))
+                ]
+            psnr.append(float(sum(metrics)) / TRAIN_VIEWS)
+
+    train(config, measure)
+    assert psnr[1] > psnr[0] + 0.5
+
+
+def test_a_resumed_run_equals_one_that_was_never_stopped(colmap: ColmapDataParserConfig, tmp_path: Path):
+    middle, last = 7, 15  # after the structure step of iteration 6, before AbsGS at 9, and beyond the last of them
+    config = configure(tmp_path / "whole", colmap, iterations=last + 1)
+    config.pipeline.views_per_iteration = 2
+    config.steps_per_save, config.save_only_latest_checkpoint = middle, False
+    whole = train(config)
+    stopped, expected = checkpoint(whole, middle), checkpoint(whole, last)
+    numbers = [len(state["pipeline"]["_model.gauss_params.means"]) for state in (stopped, expected)]
+    assert POINTS < numbers[0] != numbers[1]
+
+    resumed_config = configure(tmp_path / "resumed", copy.deepcopy(colmap), iterations=last + 1)
+    resumed_config.pipeline.views_per_iteration = 2
+    resumed_config.load_dir, resumed_config.load_step = whole.checkpoint_dir, middle
+    steps: list[int] = []
+    resumed = train(resumed_config, lambda trainer: steps.append(trainer.step))
+
+    assert steps == list(range(middle + 1, last + 1))
+    assert differences(checkpoint(resumed, last), expected) == []
+    assert differences(stopped, expected) != []
+
+
+def test_resuming_a_finished_run_trains_no_further(finished: Path, colmap: ColmapDataParserConfig, tmp_path: Path):
+    config = configure(tmp_path, colmap, iterations=ITERATIONS)
+    config.load_dir = finished / "nerfstudio_models"
+    steps: list[int] = []
+    trainer = train(config, lambda trainer: steps.append(trainer.step))
+    (path,) = config.load_dir.iterdir()
+    saved = torch.load(path, weights_only=True)
+    assert steps == []
+    assert differences(checkpoint(trainer, ITERATIONS - 1)["pipeline"], saved["pipeline"]) == []
+
+
+def test_max_gaussians_is_never_exceeded(colmap: ColmapDataParserConfig, tmp_path: Path):
+    cap = POINTS + 20
+    numbers: list[int] = []
+    config = configure(tmp_path, colmap, iterations=ITERATIONS, max_gaussians=cap, clone_grad2d=0.0)
+    train(config, lambda trainer: numbers.append(trainer.pipeline.model.num_points))
+    assert max(numbers) == cap
+
+
+def test_more_initial_points_than_max_gaussians_are_thinned_out(
+    colmap: ColmapDataParserConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    trainer = set_up(configure(tmp_path, colmap, max_gaussians=50))
+    assert trainer.pipeline.model.num_points == 50
+    assert "Keeping a random 50 of 300 initial points" in capsys.readouterr().out
+
+
+def test_without_densification_the_number_of_gaussians_stays(colmap: ColmapDataParserConfig, tmp_path: Path):
+    config = configure(tmp_path, colmap, iterations=ITERATIONS)
+    config.pipeline.model.densify = False
+    trainer = set_up(config)
+    before = trainer.pipeline.model.means.detach().clone()
+    trainer.train()
+    assert trainer.pipeline.model.means.shape == before.shape
+    assert not torch.equal(trainer.pipeline.model.means, before)
+
+
+@pytest.mark.parametrize("iterations", [5, 12])
+def test_the_position_rate_ends_at_a_hundredth_whatever_the_length_of_the_run(
+    iterations: int, colmap: ColmapDataParserConfig, tmp_path: Path
+):
+    config = configure(tmp_path, colmap, iterations)
+    rates: list[float] = []
+    trainer = set_up(config)
+    rate = trainer.optimizers.schedulers["means"].get_last_lr
+    rates += rate()
+    trainer.train()
+    rates += rate()
+    assert rates == pytest.approx([1.6e-4, 1.6e-6])
+
+
+def test_the_position_rate_grows_with_the_cameras_extent_on_request(colmap: ColmapDataParserConfig, tmp_path: Path):
+    config = configure(tmp_path, colmap)
+    config.scale_position_lr = True
+    trainer = set_up(config)
+    extent = trainer.pipeline.model.strategy_state["scene_scale"]
+    assert extent != pytest.approx(1.0)
+    assert trainer.optimizers.schedulers["means"].get_last_lr() == pytest.approx([1.6e-4 * extent])
+
+
+def test_optimized_camera_poses_move(colmap: ColmapDataParserConfig, tmp_path: Path):
+    config = configure(tmp_path, colmap, iterations=4)
+    config.pipeline.model.camera_optimizer.mode = "SO3xR3"
+    trainer = train(config)
+    seen = trainer.pipeline.model.camera_optimizer.pose_adjustment.detach().abs().amax(dim=1) > 0
+    assert int(seen.sum()) == 4  # one view per iteration
+    assert is_finite(trainer.pipeline.model)
+
+
+def test_bilateral_grids_of_the_seen_views_are_trained(colmap: ColmapDataParserConfig, tmp_path: Path):
+    config = configure(tmp_path, colmap, iterations=2)
+    config.pipeline.views_per_iteration = 2
+    config.pipeline.model.use_bilateral_grid = True
+    trainer = set_up(config)
+    seen = trainer.pipeline.datamanager.train_unseen_cameras[:4]
+    before = trainer.pipeline.model.bil_grids.grids.detach().clone()
+    trainer.train()
+    change = (trainer.pipeline.model.bil_grids.grids - before).abs().amax(dim=(1, 2, 3, 4))
+    assert change[seen].min() > 1e-4
+    assert is_finite(trainer.pipeline.model)
+
+
+def test_several_devices_are_refused(colmap: ColmapDataParserConfig, tmp_path: Path):
+    with pytest.raises(ValueError, match=r"sadgs trains on one device"):
+        configure(tmp_path, colmap).setup(local_rank=0, world_size=2)
+
+
+# --- checkpoints ---
+
+
+def test_a_save_that_fails_leaves_the_previous_checkpoint_alone(
+    colmap: ColmapDataParserConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    trainer = set_up(configure(tmp_path, colmap))
+    trainer.save_checkpoint(1)
+
+    def full_disk(state: Any, path: Path) -> None:
+        path.write_bytes(b"half a checkpoint")
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(torch, "save", full_disk)
+    with pytest.raises(OSError, match="no space left"):
+        trainer.save_checkpoint(2)
+    assert [path.name for path in trainer.checkpoint_dir.iterdir()] == ["step-000000001.ckpt"]
+    assert list(tmp_path.rglob("*.partial")) == []
+    assert checkpoint(trainer, 1)["step"] == 1
+
+
+def test_what_a_killed_save_leaves_does_not_hinder_resuming(colmap: ColmapDataParserConfig, tmp_path: Path):
+    config = configure(tmp_path, colmap)
+    trainer = set_up(config)
+    trainer.save_checkpoint(1)
+    code = f"""
+import os, signal, torch
+from pathlib import Path
+from types import SimpleNamespace as Space
+from sadgs_ns.trainer import SadgsTrainer
+def killed(state, path):
+    path.write_bytes(b"half a checkpoint")
+    os.kill(os.getpid(), signal.SIGKILL)
+torch.save = killed
+part = Space(state_dict=dict)
+trainer = Space(checkpoint_dir=Path({str(trainer.checkpoint_dir)!r}), pipeline=part, grad_scaler=part,
+                optimizers=Space(optimizers={{}}, schedulers={{}}))
+SadgsTrainer.save_checkpoint(trainer, 2)
+"""
+    assert subprocess.run([sys.executable, "-W", "ignore", "-c", code], timeout=60).returncode == -9
+    assert len(list(tmp_path.rglob("*.partial"))) == 1
+    config.load_dir = trainer.checkpoint_dir
+    resumed = set_up(config)
+    assert resumed._start_step == 2
+    resumed.save_checkpoint(3)
+    assert list(tmp_path.rglob("*.partial")) == []
+
+
+# --- other data ---
+
+
+def test_views_of_two_sizes_train_together(tmp_path: Path):
+    sizes = [(WIDTH, HEIGHT), (40, 30)]
+    config = configure(tmp_path / "out", nerfstudio_data(tmp_path / "data", sizes), iterations=13)
+    config.pipeline.views_per_iteration = 2
+    numbers_of_sizes: list[int] = []
+    trainer = set_up(config)
+    pipeline = trainer.pipeline
+    get_loss, render_views = pipeline.get_train_loss_dict, pipeline.model.get_training_outputs
+    rendered: list[tuple[int, int]] = []
+
+    def count_sizes(step: int) -> Any:
+        rendered.clear()
+        result = get_loss(step)
+        numbers_of_sizes.append(len(rendered))
+        return result
+
+    def note_size(viewmats: Any, Ks: Any, width: int, height: int, *rest: Any) -> Any:
+        rendered.append((width, height))
+        return render_views(viewmats, Ks, width, height, *rest)
+
+    pipeline.get_train_loss_dict, pipeline.model.get_training_outputs = count_sizes, note_size  # type: ignore
+    trainer.train()
+    assert set(numbers_of_sizes) == {1, 2}
+    assert {tuple(tensor.shape[:2]) for tensor in pipeline.structure_tensors} == {(HEIGHT, WIDTH), (30, 40)}
+    assert is_finite(pipeline.model)
+
+
+def test_masked_pixels_have_no_structure_and_no_part_in_the_loss(tmp_path: Path):
+    config = configure(tmp_path / "out", nerfstudio_data(tmp_path / "data", masks=True), iterations=7)
+    config.pipeline.views_per_iteration = 2
+    trainer = train(config)
+    pipeline = trainer.pipeline
+    for tensor in pipeline.structure_tensors:
+        assert (tensor[:, : WIDTH // 2] == 0).all()
+        assert tensor[:, WIDTH // 2 :].amax() > 0
+    data = pipeline.datamanager.cached_train[0]
+    background = torch.zeros(3)
+
+    def loss(rgb: torch.Tensor) -> torch.Tensor:
+        return pipeline.model.get_loss_dict({"rgb": rgb, "background": background}, data)["main_loss"]
+
+    rgb = torch.rand(HEIGHT, WIDTH, 3)
+    left, right = rgb.clone(), rgb.clone()
+    left[:, : WIDTH // 2] += 0.3
+    right[:, WIDTH // 2 :] += 0.3
+    assert loss(left) == loss(rgb) != loss(right)
+    assert is_finite(pipeline.model)
+
+
+def test_transparent_images_train_in_front_of_the_background(tmp_path: Path):
+    config = configure(tmp_path / "out", blender_data(tmp_path / "data", alpha_color=None), iterations=7)
+    config.pipeline.model.background_color = "white"
+    config.pipeline.model.random_init = True
+    trainer = set_up(config)
+    data = trainer.pipeline.datamanager.cached_train[0]
+    assert data["image"].shape[-1] == 4
+    target = trainer.pipeline.model.composite_with_background(data["image"] / 255, torch.ones(3))
+    assert (target[:, : WIDTH // 2] == 1).all() and target[:, WIDTH // 2 :].amin() < 1
+    trainer.train()
+    assert is_finite(trainer.pipeline.model)
+
+
+def test_blender_data_train_with_the_alpha_colour_that_its_parser_gives_them(tmp_path: Path):
+    trainer = train(configure(tmp_path / "out", blender_data(tmp_path / "data", alpha_color="white")))
+    image = trainer.pipeline.datamanager.cached_train[0]["image"]
+    assert image.shape[-1] == 3 and (image[:, : WIDTH // 2] == 255).all()
+    assert is_finite(trainer.pipeline.model)
+
+
+def test_data_without_sfm_points_start_from_random_ones_and_say_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    trainer = set_up(configure(tmp_path / "out", nerfstudio_data(tmp_path / "data")))
+    assert 0 < trainer.pipeline.model.num_points <= POINTS
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "The data has no SfM points: starting from 300 random ones in a cube of side 10.0." in printed
+
+
+def test_random_points_on_request_need_no_warning(
+    colmap: ColmapDataParserConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    config = configure(tmp_path, colmap)
+    config.pipeline.model.random_init = True
+    set_up(config)
+    assert "no SfM points" not in capsys.readouterr().out
+
+
+# --- rendering ---
+
+
+@pytest.fixture(scope="module")
+def trained(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> SadgsTrainer:
+    """A few iterations, ready to render."""
+    parser = ColmapDataParserConfig(data=scene, colmap_path=SPARSE_FOLDER, downscale_factor=1, eval_mode="interval")
+    trainer = train(configure(tmp_path_factory.mktemp("trained"), parser))
+    trainer.pipeline.eval()
+    return trainer
+
+
+@torch.no_grad()
+def test_held_out_cameras_render_as_nerfstudio_expects(trained: SadgsTrainer):
+    pipeline = trained.pipeline
+    assert isinstance(pipeline.model, SplatfactoModel)  # what the viewer and the exporter ask for
+    assert len(pipeline.datamanager.eval_dataset) == VIEWS - TRAIN_VIEWS
+    for index in range(VIEWS - TRAIN_VIEWS):
+        camera = pipeline.datamanager.eval_dataset.cameras[index : index + 1]
+        outputs = pipeline.model.get_outputs_for_camera(camera)
+        channels = {"rgb": 3, "depth": 1, "accumulation": 1, "background": 3}
+        assert {name: tuple(value.shape) for name, value in outputs.items()} == {
+            name: (HEIGHT, WIDTH, count) for name, count in channels.items()
+        }
+        assert 0 <= outputs["rgb"].min() < outputs["rgb"].max() <= 1
+        assert outputs["depth"].min() > 0
+
+
+@torch.no_grad()
+def test_a_crop_box_hides_what_lies_outside(trained: SadgsTrainer):
+    model, camera = trained.pipeline.model, trained.pipeline.datamanager.eval_dataset.cameras[:1]
+
+    def accumulation(side: float, centre: float) -> torch.Tensor:
+        box = OrientedBox(R=torch.eye(3), T=torch.full((3,), centre), S=torch.full((3,), side))
+        return model.get_outputs_for_camera(camera, obb_box=box)["accumulation"]
+
+    everything = model.get_outputs_for_camera(camera)["accumulation"]
+    assert torch.equal(accumulation(1000.0, 0.0), everything)
+    middle = float(model.means.median())
+    assert 0 < accumulation(0.5, middle).sum() < everything.sum()
+    assert torch.equal(accumulation(0.5, 100.0), torch.zeros(HEIGHT, WIDTH, 1))
+    assert torch.equal(model.get_outputs_for_camera(camera)["accumulation"], everything)
