@@ -33,9 +33,11 @@ def accumulate_gradients(gradients: MutableMapping[str, Tensor], info: Mapping[s
     """
     means2d = info["means2d"]
     seen = visible(info)  # [C, N]
-    half_size = means2d.new_tensor([info["width"] / 2.0, info["height"] / 2.0]) * num_views
+    # Python numbers: a tensor made of them here would make the host wait for its copy to the device.
+    scale_x, scale_y = info["width"] / 2.0 * num_views, info["height"] / 2.0 * num_views
     for key, gradient in (("grad2d", means2d.grad), ("absgrad2d", means2d.absgrad)):
-        gradients[key] += torch.where(seen, (gradient * half_size).norm(dim=-1), 0.0).sum(0)
+        norm = torch.hypot(gradient[..., 0] * scale_x, gradient[..., 1] * scale_y)  # [C, N]
+        gradients[key] += torch.where(seen, norm, 0.0).sum(0)
     gradients["grad_count"] += seen.sum(0)
 
 

@@ -91,19 +91,20 @@ def sample_footprint(means2d: Tensor, conics: Tensor, generator: torch.Generator
     Returns:
         Points in px, pixel centres at half-integers. [M, 2]
     """
-    a, b, c = conics.unbind(-1)
-    determinant = a * c - b * b
+    a, b, c = conics.double().unbind(-1)  # the determinant of a long thin Gaussian cancels in float32
+    determinant = (a * c - b * b).clamp_min(torch.finfo(torch.float32).tiny)
     xx = (c / determinant - SCREEN_BLUR).clamp_min(0)
     yy = (a / determinant - SCREEN_BLUR).clamp_min(0)
     xy = -b / determinant
     # Cholesky factor of Σ2D, with xy limited to what a positive semidefinite matrix allows.
     factor_xx = xx.sqrt()
     factor_xy = torch.where(xx > 0, xy / factor_xx, 0.0)
+    factor_xy = torch.maximum(torch.minimum(factor_xy, yy.sqrt()), -yy.sqrt())
     factor_yy = (yy - factor_xy**2).clamp_min(0).sqrt()
     jitter = torch.rand((len(means2d), 2), generator=generator, dtype=means2d.dtype, device=means2d.device)
     radius, angle = 2.0 * jitter[:, 0].sqrt(), 2.0 * torch.pi * jitter[:, 1]
     u, v = radius * angle.cos(), radius * angle.sin()
-    return means2d + torch.stack([factor_xx * u, factor_xy * u + factor_yy * v], -1)
+    return means2d + torch.stack([factor_xx * u, factor_xy * u + factor_yy * v], -1).to(means2d.dtype)
 
 
 def sample_map(structure_tensors: Tensor, camera_ids: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:

@@ -170,8 +170,12 @@ class SadgsModel(SplatfactoModel):
             positions: Camera centres in world units. [C, 3]
         """
         self.strategy_state["scene_scale"] = camera_extent(positions)
+        if self.config.camera_clearance == 0:
+            return
         radius = self.config.camera_clearance * self.scales.detach().exp().amax(dim=1)  # [N]
-        keep = torch.cdist(self.means.detach(), positions.to(self.means)).amin(dim=1) >= radius  # [N]
+        positions = positions.to(self.means)
+        chunks = self.means.detach().split(65_536)  # all distances at once would take gigabytes on a large capture
+        keep = torch.cat([torch.cdist(means, positions).amin(dim=1) for means in chunks]) >= radius  # [N]
         if keep.any():
             for parameter in self.gauss_params.values():
                 parameter.data = parameter.data[keep]
@@ -181,7 +185,14 @@ class SadgsModel(SplatfactoModel):
     ) -> list[TrainingCallback]:
         """Splatfacto's two callbacks, after fitting the schedule to the length of the run."""
         if training_callback_attributes.trainer is not None:
-            self.strategy.fit_to_run(training_callback_attributes.trainer.config.max_num_iterations)
+            iterations = training_callback_attributes.trainer.config.max_num_iterations
+            self.strategy.fit_to_run(iterations)
+            if self.config.densify and self.strategy.refine_stop_iter < self.strategy.structure_every:
+                CONSOLE.print(
+                    f"[yellow]{iterations} iterations are too few for a structure-aware split: densification ends at "
+                    f"{self.strategy.refine_stop_iter}, the first split would come at {self.strategy.structure_every}. "
+                    "Train longer or lower pipeline.model.strategy.structure-every.[/]"
+                )
         return super().get_training_callbacks(training_callback_attributes)
 
     def step_post_backward(self, step: int) -> None:
@@ -202,7 +213,7 @@ class SadgsModel(SplatfactoModel):
         """Rasterize the Gaussians inside the crop box, if there is one. viewmats [C, 4, 4], Ks [C, 3, 3]"""
         params: Mapping[str, Tensor] = dict(self.gauss_params.items())
         if self.crop_box is not None and not self.training:
-            inside = self.crop_box.within(self.means).squeeze(-1)
+            inside = self.crop_box.within(self.means)
             params = {name: value[inside] for name, value in params.items()}
         if self.config.sh_degree > 0:
             colors = torch.cat([params["features_dc"][:, None], params["features_rest"]], dim=1)  # [N, K, 3]

@@ -11,6 +11,7 @@ import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from sadgs_ns.model import SadgsModel, SadgsModelConfig
@@ -63,6 +64,14 @@ class SadgsPipeline(VanillaPipeline):
         if config.views_per_iteration < 1:
             raise ValueError(f"pipeline.views_per_iteration must be at least 1, got {config.views_per_iteration}.")
         super().__init__(config, *args, **kwargs)
+        if self.device.type == "cpu":
+            self.datamanager.config.cache_images = "gpu"  # means the training device; "cpu" would pin memory for CUDA
+        parsed_on = getattr(self.datamanager.dataparser.config, "alpha_color", None)
+        if parsed_on is not None and parsed_on != config.model.background_color:
+            CONSOLE.print(
+                f"[yellow]The images were put on {parsed_on}, the Gaussians lie on {config.model.background_color}: "
+                f"consider --pipeline.model.background-color {parsed_on}.[/]"
+            )
         positions = self.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]  # [C, 3]
         self.model.set_cameras(positions)
 
@@ -161,7 +170,10 @@ class SadgsPipeline(VanillaPipeline):
         return outputs, losses, metrics
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Random states and the order of the views, so that a resumed run goes on as if never stopped."""
+        """Random states and the order of the views, so that a resumed run goes on as if never stopped.
+
+        With nerfstudio's farthest-point sampling of views, the order after the present round is drawn anew.
+        """
         state: dict[str, Any] = {
             "torch": torch.get_rng_state(),
             "view_order": list(self.datamanager.train_unseen_cameras),
@@ -177,7 +189,7 @@ class SadgsPipeline(VanillaPipeline):
         torch.set_rng_state(state["torch"].cpu())
         if max(state["view_order"], default=0) < len(self.datamanager.train_dataset):
             self.datamanager.train_unseen_cameras = list(state["view_order"])
-            if "view_shuffle" in state:
+            if "view_shuffle" in state and hasattr(self.datamanager, "random_generator"):
                 self.datamanager.random_generator.setstate(state["view_shuffle"])
         if "cuda" in state and self.device.type == "cuda":
             torch.cuda.set_rng_state(state["cuda"].cpu(), self.device)

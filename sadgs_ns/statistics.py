@@ -75,7 +75,10 @@ def observe(
         )  # [N, 3, 2]
         # An unseen Gaussian's projection is garbage; its sample is moved to a place where nothing can overflow.
         means2d = torch.where(seen[camera, :, None], info["means2d"][camera], -1.0)
-        conics = torch.where(seen[camera, :, None], info["conics"][camera], info["conics"].new_tensor([1.0, 0.0, 1.0]))
+        conics = info["conics"][camera].unbind(-1)  # Python numbers: a tensor of them would make the host wait
+        conics = torch.stack(
+            [torch.where(seen[camera], c, v) for c, v in zip(conics, (1.0, 0.0, 1.0), strict=True)], -1
+        )
         points = sample_footprint(means2d, conics, generator)
         sampled, inside = sample_map(info["structure_tensors"], camera_ids, points)
         observed = (seen[camera] & inside)[:, None]  # [N, 1]

@@ -50,7 +50,8 @@ class StructureAwareStrategy(Strategy):
     directional_eta: bool = False
     """Measure η along each axis's own direction (paper, eq. 7) instead of against the shortest wavelength (eq. 6)."""
     eta_min_opacity: float = 0.3
-    """Opacity in [0, 1] from which a Gaussian's η is observed; 0 observes every visible one, as the paper does."""
+    """Opacity in [0, 1] from which a Gaussian's η is observed, high or low; 0 observes every visible one, as the paper
+    does. Pruning by low η then only concerns Gaussians that were this opaque since the last structure step."""
     tau_split: float = 0.8
     """Fraction of observations that must violate (η > 1) before an axis is split."""
     split_exponent: float = 0.5
@@ -94,7 +95,7 @@ class StructureAwareStrategy(Strategy):
         return {"scene_scale": scene_scale}
 
     def fit_to_run(self, num_iterations: int) -> None:
-        """Let densification end early enough in a short run: after at most 19/30 of it, as in the paper's 3,000."""
+        """Let densification end early enough in a short run: after at most 19/30 of it, as in the released code."""
         self.refine_stop_iter = min(self.refine_stop_iter, num_iterations * 19 // 30)
 
     def check_sanity(self, params: Params, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
@@ -167,7 +168,10 @@ class StructureAwareStrategy(Strategy):
                 self._absgs_step(params, optimizers, state, iteration)
             if iteration == self.refine_stop_iter:
                 self._prune(params, optimizers, state, self._opacities(params) < self.final_prune_opacity)
-            elif _due(iteration, self.reset_every):
+                for key in empty_statistics(0, torch.device("cpu")) | empty_gradients(0, torch.device("cpu")):
+                    state.pop(key, None)  # nobody reads them any more: neither memory nor checkpoints should hold them
+            elif _due(iteration, self.reset_every) and iteration <= self.refine_stop_iter - self.reset_every // 4:
+                # A reset just before the final prune would leave nothing that had time to recover.
                 self._map_opacities(params, optimizers, lambda opacities: opacities * self.reset_factor)
 
     def _structure_step(self, params: Any, optimizers: Any, state: Any, iteration: int) -> None:

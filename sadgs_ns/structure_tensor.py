@@ -72,7 +72,9 @@ def _convolve(image: Tensor, kernel: Tensor, axis: int) -> Tensor:
     shape = (1, 1, -1, 1) if axis == 2 else (1, 1, 1, -1)
     padding = (radius, 0) if axis == 2 else (0, radius)
     weight = kernel.view(shape).expand(channels, -1, -1, -1)
-    return F.conv2d(image, weight, padding=padding, groups=channels)
+    # Full float32, and no search for the fastest algorithm: each of dozens of kernel sizes is used a few times only.
+    with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=False, allow_tf32=False):
+        return F.conv2d(image, weight, padding=padding, groups=channels)
 
 
 def _blur(image: Tensor, sigma: float) -> Tensor:
@@ -126,7 +128,7 @@ def multiscale_structure_tensor(
         raise ValueError(f"images must be floating point [B, H, W, C], got {images.dtype} {tuple(images.shape)}")
     if masks is not None and masks.shape != images.shape[:3]:
         raise ValueError(f"masks must be [B, H, W] = {tuple(images.shape[:3])}, got {tuple(masks.shape)}")
-    image = images.permute(0, 3, 1, 2)  # [B, C, H, W]
+    image = images.permute(0, 3, 1, 2).contiguous()  # [B, C, H, W]; with channels-last strides cuDNN is slower
     image = image.to(torch.promote_types(image.dtype, torch.float32))
     valid = torch.ones_like(image[:, :1]) if masks is None else masks[:, None].to(image)  # [B, 1, H, W]
     # Without a mask the weights of all images are the same: keep one.

@@ -23,10 +23,6 @@ THIRD_PARTY_WARNINGS = (
     "ignore:Converting a tensor with requires_grad=True to a scalar:UserWarning",
     # nerfstudio's OrientedBox copies tensors with torch.tensor.
     "ignore:To copy construct from a tensor:UserWarning",
-    # nerfstudio's writer logs losses without detaching them.
-    "ignore:Converting a tensor with requires_grad=True to a scalar:UserWarning",
-    # nerfstudio's crop box copies tensors with torch.tensor.
-    "ignore:To copy construct from a tensor:UserWarning:nerfstudio.data.scene_box",
     # torchmetrics makes AlexNet for LPIPS with torchvision's old arguments.
     "ignore:The parameter 'pretrained' is deprecated:UserWarning",
     "ignore:Arguments other than a weight enum:UserWarning",

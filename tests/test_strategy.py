@@ -78,7 +78,7 @@ def short(**changes: Any) -> StructureAwareStrategy:
 @pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
 @pytest.mark.parametrize("views", [1, 2])
 def test_drops_into_a_plain_gsplat_loop(per_axis_radii: bool, views: int):
-    _, state, counts = train(short(max_gaussians=3000), 26, per_axis_radii=per_axis_radii, views=views)
+    _, state, counts = train(short(max_gaussians=3000), 22, per_axis_radii=per_axis_radii, views=views)
     assert counts[-1] > 120, "a fine checker under coarse Gaussians must be split"
     assert {"n_high", "n_low", "eta_max", "n_total", "grad2d", "absgrad2d", "grad_count"} <= set(state)
 
@@ -123,10 +123,22 @@ def test_opacity_schedule():
         return torch.sigmoid(params["opacities"]).detach()
 
     plain = opacities()
-    reset = opacities(reset_every=20)
+    reset = opacities(reset_every=20, refine_stop_iter=30)
     torch.testing.assert_close(reset, 0.1 * plain, rtol=1e-4, atol=1e-5)
     clamped, _, _ = train(short(absgs_every=0, tau_split=1.0, clamp_opacity=0.5), 10)
     assert torch.sigmoid(clamped["opacities"]).max() <= 0.5 + 1e-6
+
+
+def test_no_reset_so_late_that_the_final_prune_takes_everything():
+    """1,900 iterations end densification at 1203: a reset at 1200 would leave no time to recover."""
+    late, _, _ = train(short(absgs_every=0, structure_every=0, reset_every=20, refine_stop_iter=21), 20)
+    plain, _, _ = train(short(absgs_every=0, structure_every=0), 20)
+    torch.testing.assert_close(late["opacities"], plain["opacities"])
+
+
+def test_statistics_end_with_densification():
+    _, state, _ = train(short(max_gaussians=3000), 26)
+    assert set(state) == {"scene_scale"}
 
 
 def test_final_prune_removes_the_faint_once():
