@@ -75,10 +75,10 @@ def observe(
         )  # [N, 3, 2]
         # An unseen Gaussian's projection is garbage; its sample is moved to a place where nothing can overflow.
         means2d = torch.where(seen[camera, :, None], info["means2d"][camera], -1.0)
-        conics = info["conics"][camera].unbind(-1)  # Python numbers: a tensor of them would make the host wait
-        conics = torch.stack(
-            [torch.where(seen[camera], c, v) for c, v in zip(conics, (1.0, 0.0, 1.0), strict=True)], -1
-        )
+        a, b, c = info["conics"][camera].unbind(-1)
+        # Python numbers: a tensor made of them here would make the host wait for its copy to the device.
+        a, b, c = (torch.where(seen[camera], *pair) for pair in ((a, 1.0), (b, 0.0), (c, 1.0)))
+        conics = torch.stack([a, b, c], -1)
         points = sample_footprint(means2d, conics, generator)
         sampled, inside = sample_map(info["structure_tensors"], camera_ids, points)
         observed = (seen[camera] & inside)[:, None]  # [N, 1]
