@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
+
+from sadgs_ns.splatter import rasterization
 
 
 def random_params(n: int, seed: int = 0, dtype: torch.dtype = torch.float32) -> dict[str, torch.nn.Parameter]:
@@ -38,3 +42,20 @@ def camera(width: int = 64, height: int = 48, focal: float = 60.0, dtype: torch.
     """viewmats [1, 4, 4] and Ks [1, 3, 3] of a camera at the origin."""
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=dtype)
     return torch.eye(4, dtype=dtype)[None], K[None]
+
+
+def splat(params: dict[str, torch.nn.Parameter], viewmats: Tensor, Ks: Tensor, width: int, height: int, **options: Any):
+    """The splatter's colours [C, H, W, 3], alphas [C, H, W, 1] and info of `random_params`' parameters."""
+    return rasterization(
+        params["means"],
+        params["quats"],
+        params["scales"].exp(),
+        torch.sigmoid(params["opacities"]),
+        params["features_dc"],
+        viewmats,
+        Ks,
+        width,
+        height,
+        packed=False,
+        **options,
+    )

@@ -7,9 +7,8 @@ import math
 import pytest
 import torch
 from gsplat.utils import normalized_quat_to_rotmat
-from scenes import adam, camera, random_params
+from scenes import adam, camera, random_params, splat
 
-from sadgs_ns.rasterization import rasterize
 from sadgs_ns.split import (
     MAX_CHILDREN_PER_AXIS,
     VARIANCE_EXTENT,
@@ -100,17 +99,7 @@ def test_split_nearly_keeps_the_render():
     params["opacities"].data = torch.logit(torch.tensor([0.1]))
 
     def alpha() -> torch.Tensor:
-        return rasterize(
-            params["means"],
-            params["quats"],
-            params["scales"].exp(),
-            torch.sigmoid(params["opacities"]),
-            params["features_dc"],
-            viewmats,
-            Ks,
-            64,
-            64,
-        )[1].detach()
+        return splat(params, viewmats, Ks, 64, 64)[1].detach()
 
     before = alpha()
     grid_split(params, adam(params, lr=0.0), {}, torch.tensor([[2, 2, 1]]))

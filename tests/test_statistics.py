@@ -6,9 +6,8 @@ from typing import Any
 
 import pytest
 import torch
-from scenes import camera, random_params
+from scenes import camera, random_params, splat
 
-from sadgs_ns.splatter import rasterization
 from sadgs_ns.statistics import consistent, empty_statistics, observe
 
 WIDTH, HEIGHT = 64, 48
@@ -17,19 +16,7 @@ WIDTH, HEIGHT = 64, 48
 def forward(params, structure_tensor: list[float], per_axis_radii: bool, views: int = 1) -> dict[str, Any]:
     """gsplat's info of a forward pass in front of images of uniform S̄."""
     viewmats, Ks = (matrix.repeat(views, 1, 1) for matrix in camera(WIDTH, HEIGHT))
-    _, _, info = rasterization(
-        params["means"],
-        params["quats"],
-        params["scales"].exp(),
-        torch.sigmoid(params["opacities"]),
-        params["features_dc"],
-        viewmats,
-        Ks,
-        WIDTH,
-        HEIGHT,
-        packed=False,
-        per_axis_radii=per_axis_radii,
-    )
+    _, _, info = splat(params, viewmats, Ks, WIDTH, HEIGHT, per_axis_radii=per_axis_radii)
     tensors = torch.tensor(structure_tensor).expand(views, HEIGHT, WIDTH, 3)
     return {**info, "viewmats": viewmats, "Ks": Ks, "structure_tensors": tensors}
 

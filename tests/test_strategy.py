@@ -6,10 +6,9 @@ from typing import Any
 
 import pytest
 import torch
-from scenes import adam, camera, random_params
+from scenes import adam, camera, random_params, splat
 
 from sadgs_ns.absgs import accumulate_gradients, empty_gradients, grow
-from sadgs_ns.splatter import rasterization
 from sadgs_ns.statistics import empty_statistics
 from sadgs_ns.strategy import StructureAwareStrategy
 from sadgs_ns.structure_tensor import multiscale_structure_tensor
@@ -38,19 +37,8 @@ def train(strategy: StructureAwareStrategy, steps: int, *, per_axis_radii: bool 
     viewmats[:, 0, 3] = torch.linspace(-0.2, 0.2, views)
     counts = []
     for step in range(steps):
-        renders, _, info = rasterization(
-            params["means"],
-            params["quats"],
-            params["scales"].exp(),
-            torch.sigmoid(params["opacities"]),
-            params["features_dc"],
-            viewmats,
-            Ks,
-            WIDTH,
-            HEIGHT,
-            packed=False,
-            absgrad=strategy.absgrad,
-            per_axis_radii=per_axis_radii,
+        renders, _, info = splat(
+            params, viewmats, Ks, WIDTH, HEIGHT, absgrad=strategy.absgrad, per_axis_radii=per_axis_radii
         )
         info |= {"structure_tensors": tensors, "viewmats": viewmats, "Ks": Ks}
         strategy.step_pre_backward(params, optimizers, state, step, info)
