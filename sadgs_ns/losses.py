@@ -9,15 +9,20 @@ from pytorch_msssim import ssim
 from pytorch_msssim.ssim import _fspecial_gauss_1d
 from torch import Tensor
 
+from sadgs_ns import kernels
+
+WINDOW = 11
+"""Width of SSIM's window in px."""
+
 
 @lru_cache(maxsize=8)
 def _window(device: torch.device, dtype: torch.dtype) -> Tensor:
-    """SSIM's window of 11 px, σ 1.5 px, where the images are: made anew in each step, its copy would stop the host."""
-    return _fspecial_gauss_1d(11, 1.5).repeat(3, 1, 1, 1).to(device, dtype)
+    """SSIM's window, σ 1.5 px, where the images are: made anew in each step, its copy would stop the host."""
+    return _fspecial_gauss_1d(WINDOW, 1.5).repeat(3, 1, 1, 1).to(device, dtype)
 
 
 def photometric_loss(
-    predicted: Tensor, target: Tensor, *, ssim_lambda: float = 0.2, l2_lambda: float = 2.0
+    predicted: Tensor, target: Tensor, *, ssim_lambda: float = 0.2, l2_lambda: float = 2.0, fused: bool = True
 ) -> tuple[Tensor, Tensor]:
     """(1 − λ) L1 + λ (1 − SSIM) + λ_2 ℓ2, each a mean over views, pixels and channels.
 
@@ -28,10 +33,16 @@ def photometric_loss(
         target: Training views in [0, 1]. [C, H, W, 3]
         ssim_lambda: λ in [0, 1].
         l2_lambda: λ_2 ≥ 0.
+        fused: Take the Triton kernels where they run and hold: CUDA, float32, views of at least 11×11 px.
 
     Returns:
         The loss and the mean squared error, both scalars.
     """
+    suits = predicted.dtype == target.dtype == torch.float32 and min(predicted.shape[1:3]) >= WINDOW
+    if fused and suits and kernels.available(predicted.device):
+        from sadgs_ns.kernels.photometric import photometric_loss as fused_photometric_loss
+
+        return fused_photometric_loss(predicted, target, ssim_lambda=ssim_lambda, l2_lambda=l2_lambda)
     difference = predicted - target
     l1, l2 = difference.abs().mean(), difference.square().mean()
     # Contiguous: with channels-last strides cuDNN convolves, above all backwards, at a third of the speed.

@@ -76,6 +76,8 @@ class SadgsModelConfig(SplatfactoModelConfig):
     """Weight of SSIM against L1 in the loss."""
     l2_lambda: float = 2.0
     """Weight of the squared error that is added to the loss for faster convergence."""
+    fused: bool = True
+    """Use the Triton kernels where they run (CUDA); without them, the torch code that they are tested against."""
     bounding_box_points: bool = True
     """Also start from points on the faces of the SfM points' bounding box."""
     camera_clearance: float = 2.0
@@ -338,6 +340,7 @@ class SadgsModel(SplatfactoModel):
             target.reshape(-1, height, width, 3),
             ssim_lambda=self.config.ssim_lambda,
             l2_lambda=self.config.l2_lambda,
+            fused=self.config.fused,
         )
         losses = {"main_loss": loss}
         if self.training:

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
+import torch
+
+if not torch.cuda.is_available():
+    os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel is defined: they then run on the CPU, slowly
 
 THIRD_PARTY_WARNINGS = (
     # nerfstudio's activations still use torch.cuda.amp's decorators.

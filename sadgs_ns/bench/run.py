@@ -164,12 +164,14 @@ def run_row(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> dict[s
     pipeline, datamanager, model = trainer.pipeline, trainer.pipeline.datamanager, trainer.pipeline.model
     with timed("load"):  # else the first iteration decodes all images
         train_images, _ = datamanager.cached_train, datamanager.cached_eval
-    with timed("warmup"):  # gsplat's kernels and torch.compile build at the first call, once per machine
-        camera = datamanager.eval_dataset.cameras[:1].to(trainer.device)
+    with timed("warmup"):  # gsplat's, Triton's and torch.compile's kernels build at the first call, once per machine
+        camera = datamanager.train_dataset.cameras[:1].to(trainer.device)
         pipeline.eval()
-        for gradients in (True, False):
-            with torch.set_grad_enabled(gradients):
-                model.get_outputs(camera)
+        outputs = model.get_outputs(camera)
+        losses = model.get_loss_dict(outputs, train_images[0]).values()
+        torch.stack(list(losses)).sum().backward()  # the first step forgets the gradients
+        with torch.no_grad():
+            model.get_outputs(camera)
         pipeline.train()
     # Looked up on the class: on the instance hasattr would already compute it.
     if hasattr(type(pipeline), "structure_tensors"):
