@@ -236,6 +236,7 @@ class SadgsModel(SplatfactoModel):
             render_mode=render_mode,
             absgrad=self.training and self.config.densify and self.strategy.needs_absgrad(self.step),
             rasterize_mode=self.config.rasterize_mode,
+            fused=self.config.fused,
         )
 
     def get_training_outputs(

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from sadgs_ns import splatter
+from sadgs_ns import kernels, splatter
 
 
 def rasterize(
@@ -29,6 +29,7 @@ def rasterize(
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
     near_plane: float = 0.01,
     far_plane: float = 1e10,
+    fused: bool = True,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians into C pinhole cameras on the device of `means`, unpacked.
 
@@ -49,6 +50,8 @@ def rasterize(
         rasterize_mode: "antialiased" compensates opacities for the screen-space blur.
         near_plane: Gaussians whose centre is nearer are culled, in world units.
         far_plane: Gaussians whose centre is farther are culled, in world units.
+        fused: On CUDA, list in each tile only the Gaussians that reach it, with Triton kernels; what is drawn is the
+            same. Assumes rigid viewmats.
 
     Returns:
         Colours [C, height, width, X] with X = D, 1 or D + 1 by `render_mode`, alphas [C, height, width, 1] in [0, 1],
@@ -59,7 +62,10 @@ def rasterize(
     """
     if means.is_cuda:
         # Here, so that without a GPU nothing comes near gsplat's kernels, which are compiled when first used.
-        from gsplat.rendering import rasterization
+        if fused and kernels.available(means.device):
+            from sadgs_ns.kernels.rasterization import rasterization
+        else:
+            from gsplat.rendering import rasterization
     else:
         rasterization = splatter.rasterization
     return rasterization(

@@ -29,6 +29,8 @@ THIRD_PARTY_WARNINGS = (
     "ignore:Converting a tensor with requires_grad=True to a scalar:UserWarning",
     # nerfstudio's OrientedBox copies tensors with torch.tensor.
     "ignore:To copy construct from a tensor:UserWarning",
+    # Triton's interpreter makes Python numbers of arrays with one element.
+    "ignore:Conversion of an array with ndim:DeprecationWarning",
     # torchmetrics makes AlexNet for LPIPS with torchvision's old arguments.
     "ignore:The parameter 'pretrained' is deprecated:UserWarning",
     "ignore:Arguments other than a weight enum:UserWarning",

@@ -1,7 +1,8 @@
 """How far the torch splatter is from gsplat: `python -m sadgs_ns.bench.rasterizers` on a CUDA machine.
 
-Renders one random scene with gsplat on CUDA in float32 and with the splatter on the CPU in float32 and float64, and
-prints the largest deviations of the images, projections and gradients from gsplat's as a markdown table.
+Renders one random scene with gsplat on CUDA in float32, with gsplat's parts and our tile lists, and with the splatter
+on the CPU in float32 and float64, and prints the largest deviations of the images, projections and gradients from
+gsplat's as a markdown table.
 """
 
 from __future__ import annotations
@@ -49,13 +50,16 @@ def random_scene(gaussians: int, size: int, seed: int) -> dict[str, Tensor]:
     return {name: tensor.float().double() for name, tensor in scene.items()}
 
 
-def render_with_gradients(scene: dict[str, Tensor], device: str, dtype: torch.dtype) -> dict[str, Tensor]:
+def render_with_gradients(
+    scene: dict[str, Tensor], device: str, dtype: torch.dtype, fused: bool = False
+) -> dict[str, Tensor]:
     """Images, projections and gradients of mean(weights * colour^2), as float64 CPU tensors.
 
     Args:
         scene: From `random_scene`.
         device: "cuda" renders with gsplat, "cpu" with the splatter.
         dtype: Floating-point type to render in; gsplat needs float32.
+        fused: On CUDA, give gsplat exact tile lists.
 
     Returns:
         `visible` bool [1, N]; `colour`, `alpha`, `means2d`, `conics`, `absgrad`, and `gradient of ...` per parameter.
@@ -65,7 +69,9 @@ def render_with_gradients(scene: dict[str, Tensor], device: str, dtype: torch.dt
     for name in _PARAMETERS:
         arguments[name].requires_grad_()
     height, width = weights.shape[1:3]
-    colors, alphas, info = rasterize(**arguments, width=width, height=height, sh_degree=3, absgrad=True)
+    colors, alphas, info = rasterize(
+        **arguments, width=width, height=height, sh_degree=3, absgrad=True, fused=fused
+    )  # fmt: skip
     (weights * colors.square()).mean().backward()
     results = {"colour": colors, "alpha": alphas, "means2d": info["means2d"], "conics": info["conics"]}
     results |= {f"gradient of {name}": arguments[name].grad for name in _PARAMETERS}
@@ -86,24 +92,28 @@ def main() -> None:
 
     scene = random_scene(options.gaussians, options.size, options.seed)
     reference = render_with_gradients(scene, "cuda", torch.float32)
-    splatted = {dtype: render_with_gradients(scene, "cpu", dtype) for dtype in (torch.float32, torch.float64)}
+    others = {
+        "splatter, float32": render_with_gradients(scene, "cpu", torch.float32),
+        "splatter, float64": render_with_gradients(scene, "cpu", torch.float64),
+        "exact lists": render_with_gradients(scene, "cuda", torch.float32, fused=True),
+    }
     print(f"gsplat {gsplat.__version__}, torch {torch.__version__}, {torch.cuda.get_device_name()}; ", end="")
     print(f"{options.gaussians} Gaussians, {options.size} x {options.size} px, seed {options.seed}. ", end="")
-    changed = {dtype: int((one["visible"] != reference["visible"]).sum()) for dtype, one in splatted.items()}
-    print(f"Gaussians visible in one only: {changed[torch.float32]} (float32), {changed[torch.float64]} (float64).\n")
-    print("Largest deviation from gsplat; the relative one is divided by gsplat's largest absolute value.\n")
-    print("| quantity | float32, absolute | float32, relative | float64, absolute | float64, relative |")
-    print("| --- | --- | --- | --- | --- |")
+    changed = (f"{int((one['visible'] != reference['visible']).sum())} ({name})" for name, one in others.items())
+    print(f"Gaussians visible in one only: {'; '.join(changed)}.\n")
+    print("Largest deviation from gsplat, absolute and divided by gsplat's largest absolute value.\n")
+    print(f"| quantity | {' | '.join(others)} |")
+    print(f"| --- |{' --- |' * len(others)}")
     for name in [key for key in reference if key != "visible"]:
         cells = []
-        for one in splatted.values():
+        for one in others.values():
             expected, actual = reference[name], one[name]
             if name in ("means2d", "conics"):
                 # gsplat leaves these uninitialised for culled Gaussians.
                 drawn = reference["visible"] & one["visible"]
                 expected, actual = expected[drawn], actual[drawn]
             deviation = (actual - expected).abs().max().item()
-            cells += [f"{deviation:.1e}", f"{deviation / expected.abs().max().item():.1e}"]
+            cells.append(f"{deviation:.1e}, {deviation / expected.abs().max().item():.1e}")
         print(f"| {name} | {' | '.join(cells)} |")
 
 

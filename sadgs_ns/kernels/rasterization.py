@@ -1,0 +1,118 @@
+"""gsplat's `rasterization`, assembled from its own parts with exact tile lists in between."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any, Literal
+
+import torch
+from gsplat.cuda._wrapper import fully_fused_projection, rasterize_to_pixels, spherical_harmonics
+from torch import Tensor
+
+from sadgs_ns.kernels.tiles import intersect_tiles
+
+TILE_SIZE = 8
+"""px. gsplat's default of 16 saves list entries; with exact lists, pixels saved weigh more (docs/measurements.md)."""
+
+
+def rasterization(
+    means: Tensor,  # [N, 3]
+    quats: Tensor,  # [N, 4]
+    scales: Tensor,  # [N, 3]
+    opacities: Tensor,  # [N]
+    colors: Tensor,  # [(C,) N, D] or [(C,) N, K, 3]
+    viewmats: Tensor,  # [C, 4, 4]
+    Ks: Tensor,  # [C, 3, 3]
+    width: int,
+    height: int,
+    *,
+    near_plane: float,
+    far_plane: float,
+    sh_degree: int | None,
+    packed: bool,
+    backgrounds: Tensor | None,  # [C, D]
+    render_mode: Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"],
+    absgrad: bool,
+    rasterize_mode: Literal["classic", "antialiased"],
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Render as the installed `gsplat.rasterization(..., tile_size=TILE_SIZE)` does; see `rasterization.rasterize`.
+
+    Raises:
+        ValueError: If `packed`.
+    """
+    if packed:
+        raise ValueError("exact tile lists are made of unpacked projections: packed=False")
+    num_views = len(viewmats)
+    # gsplat 1.5 takes opacities to bound the radii.
+    bound: dict[str, Any] = (
+        {"opacities": opacities} if "opacities" in inspect.signature(fully_fused_projection).parameters else {}
+    )
+    radii, means2d, depths, conics, compensations = fully_fused_projection(
+        means,
+        None,
+        quats,
+        scales,
+        viewmats,
+        Ks,
+        width,
+        height,
+        near_plane=near_plane,
+        far_plane=far_plane,
+        calc_compensations=rasterize_mode == "antialiased",
+        **bound,
+    )
+    opacities = opacities.expand(num_views, -1)
+    if compensations is not None:
+        opacities = opacities * compensations
+    if sh_degree is None:
+        colors = colors.expand(num_views, -1, -1)
+    else:
+        # gsplat inverts the matrices, which makes the host wait for the device.
+        positions = -viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:]  # [C, 3, 1]
+        directions = means - positions.mT  # [C, N, 3]
+        drawn = radii > 0 if radii.dim() == 2 else (radii > 0).all(dim=-1)
+        colors = spherical_harmonics(sh_degree, directions, colors.expand(num_views, -1, -1, -1), masks=drawn)
+        colors = torch.clamp_min(colors + 0.5, 0.0)
+    if render_mode in ("RGB+D", "RGB+ED"):
+        colors = torch.cat([colors, depths[..., None]], dim=-1)
+        if backgrounds is not None:
+            backgrounds = torch.cat([backgrounds, backgrounds.new_zeros((num_views, 1))], dim=-1)
+    elif render_mode in ("D", "ED"):
+        colors = depths[..., None]
+        backgrounds = None if backgrounds is None else backgrounds.new_zeros((num_views, 1))
+    isect_offsets, flatten_ids = intersect_tiles(
+        means2d, radii, depths, conics, opacities, width, height, TILE_SIZE
+    )  # fmt: skip
+    renders, alphas = rasterize_to_pixels(
+        means2d,
+        conics,
+        colors,
+        opacities,
+        width,
+        height,
+        TILE_SIZE,
+        isect_offsets,
+        flatten_ids,
+        backgrounds=backgrounds,
+        absgrad=absgrad,
+    )
+    if render_mode in ("ED", "RGB+ED"):
+        renders = torch.cat([renders[..., :-1], renders[..., -1:] / alphas.clamp_min(1e-10)], dim=-1)
+    info = {
+        "camera_ids": None,
+        "gaussian_ids": None,
+        "radii": radii,
+        "means2d": means2d,
+        "depths": depths,
+        "conics": conics,
+        "opacities": opacities,
+        "tile_width": isect_offsets.shape[2],
+        "tile_height": isect_offsets.shape[1],
+        "flatten_ids": flatten_ids,
+        "isect_offsets": isect_offsets,
+        "width": width,
+        "height": height,
+        "tile_size": TILE_SIZE,
+        "n_cameras": num_views,
+    }
+    return renders, alphas, info

@@ -1,0 +1,163 @@
+"""Which Gaussians reach which tile of the image, exactly: the lists that gsplat's `rasterize_to_pixels` walks through.
+
+gsplat lists a Gaussian in every tile that its 3σ square (1.4) or rectangle (1.5) touches. Most of a long, thin or faint
+Gaussian's square lies outside the ellipse in which it is at least 1/255 opaque, and there the rasterizer skips it pixel
+by pixel, forward and backward. Here a tile is listed only if the ellipse meets the rectangle of its pixel centres. What
+is drawn stays the same, bit for bit.
+"""
+
+# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false
+# (Triton's launch syntax, kernel[grid](...), and its functions are not in its types.)
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+_LANES = 32  # Gaussians a program handles: one warp, so that a large one holds up only 31 others
+
+
+@triton.jit
+def _load_ellipse(means2d, radii, conics, opacities, g, exists, tile_width, tile_height, TILE: tl.constexpr):
+    """Centre, conic, level 2 ln(255 α), reach in y, and the tile rows and columns that gsplat would list."""
+    rx = tl.load(radii + 2 * g, exists, 0).to(tl.float32)
+    ry = tl.load(radii + 2 * g + 1, exists, 0).to(tl.float32)
+    opacity = 255.0 * tl.load(opacities + g, exists, 0.0)
+    drawn = exists & (rx > 0) & (ry > 0) & (opacity >= 1)  # gsplat leaves the rest of what it culls unwritten
+    x, y = tl.load(means2d + 2 * g, drawn, 0.0), tl.load(means2d + 2 * g + 1, drawn, 0.0)
+    a = tl.load(conics + 3 * g, drawn, 1.0)
+    b = tl.load(conics + 3 * g + 1, drawn, 0.0)
+    c = tl.load(conics + 3 * g + 2, drawn, 1.0)
+    level = 2 * tl.log(tl.where(drawn, opacity, 1.0))
+    # The determinant of a thin Gaussian's conic cancels in float32, and so does its exponent in gsplat: the level is
+    # raised by what rounding may add there.
+    determinant = (a.to(tl.float64) * c.to(tl.float64) - b.to(tl.float64) * b.to(tl.float64)).to(tl.float32)
+    level = level * (1 + 1e-6 * a * c / determinant) + 1e-4
+    proper = (determinant > 0) & (level < 1e30)  # otherwise every tile of gsplat's
+    first_column = tl.minimum(tl.maximum(tl.floor((x - rx) / TILE), 0), tile_width).to(tl.int32)
+    last_column = tl.minimum(tl.maximum(tl.ceil((x + rx) / TILE), 0), tile_width).to(tl.int32)
+    first_row = tl.minimum(tl.maximum(tl.floor((y - ry) / TILE), 0), tile_height)
+    last_row = tl.minimum(tl.maximum(tl.ceil((y + ry) / TILE), 0), tile_height)
+    reach = tl.sqrt(level * a / determinant) + 0.01
+    first_row = tl.where(proper, tl.maximum(first_row, tl.ceil((y - reach + 0.5) / TILE) - 1), first_row).to(tl.int32)
+    last_row = tl.where(proper, tl.minimum(last_row, tl.floor((y + reach - 0.5) / TILE) + 1), last_row).to(tl.int32)
+    last_row = tl.where(drawn, last_row, first_row)
+    return x, y, a, b, c, level, determinant, proper, first_column, last_column, first_row, last_row
+
+
+@triton.jit
+def _columns_of_row(row, x, y, a, b, c, level, determinant, proper, first_column, last_column, TILE: tl.constexpr):
+    """First and one past the last tile of a row that the ellipse meets."""
+    low = row * TILE + 0.5 - y  # of pixel centres
+    high = low + (TILE - 1)
+    reach_x = tl.sqrt(level * c / determinant)
+    rightmost = tl.minimum(tl.maximum(-b / c * reach_x, low), high)  # where the ellipse within the row extends furthest
+    leftmost = tl.minimum(tl.maximum(b / c * reach_x, low), high)
+    right = (-b * rightmost + tl.sqrt(tl.maximum(a * level - determinant * rightmost * rightmost, 0.0))) / a + 0.01
+    left = (-b * leftmost - tl.sqrt(tl.maximum(a * level - determinant * leftmost * leftmost, 0.0))) / a - 0.01
+    first = tl.maximum(tl.ceil((x + left + 0.5) / TILE) - 1, first_column.to(tl.float32))
+    last = tl.minimum(tl.floor((x + right - 0.5) / TILE) + 1, last_column.to(tl.float32))
+    return tl.where(proper, first, first_column).to(tl.int32), tl.where(proper, last, last_column).to(tl.int32)
+
+
+@triton.jit(do_not_specialize=["n", "tile_width", "tile_height"])
+def _count(
+    means2d, radii, conics, opacities, counts, n, tile_width, tile_height, TILE: tl.constexpr, LANES: tl.constexpr
+):
+    """Number of tiles per Gaussian and view."""
+    g = tl.program_id(0) * LANES + tl.arange(0, LANES)
+    x, y, a, b, c, level, determinant, proper, first_column, last_column, first_row, last_row = _load_ellipse(
+        means2d, radii, conics, opacities, g, g < n, tile_width, tile_height, TILE
+    )
+    count = tl.zeros([LANES], tl.int32)
+    for i in range(tl.max(last_row - first_row)):
+        row = first_row + i
+        first, last = _columns_of_row(
+            row, x, y, a, b, c, level, determinant, proper, first_column, last_column, TILE
+        )  # fmt: skip
+        count += tl.where(row < last_row, tl.maximum(last - first, 0), 0)
+    tl.store(counts + g, count, g < n)
+
+
+@triton.jit(do_not_specialize=["n", "num_gaussians", "tile_width", "tile_height"])
+def _list(
+    means2d, radii, conics, opacities, order, ends, tiles, ids, n, num_gaussians, tile_width, tile_height,
+    TILE: tl.constexpr, LANES: tl.constexpr,
+):  # fmt: skip
+    """Tile and Gaussian of each pair, nearest Gaussians first."""
+    lane = tl.program_id(0) * LANES + tl.arange(0, LANES)
+    exists = lane < n
+    g = tl.load(order + lane, exists, 0).to(tl.int32)
+    at = tl.load(ends + lane - 1, exists & (lane > 0), 0)
+    x, y, a, b, c, level, determinant, proper, first_column, last_column, first_row, last_row = _load_ellipse(
+        means2d, radii, conics, opacities, g, exists, tile_width, tile_height, TILE
+    )
+    view = g // num_gaussians * tile_height
+    for i in range(tl.max(last_row - first_row)):
+        row = first_row + i
+        first, last = _columns_of_row(
+            row, x, y, a, b, c, level, determinant, proper, first_column, last_column, TILE
+        )  # fmt: skip
+        last = tl.where(row < last_row, last, first)
+        for j in range(tl.max(last - first)):
+            listed = first + j < last
+            tile = (view + row) * tile_width + first + j
+            tl.store(tiles + at, (tile - 32768).to(tiles.dtype.element_ty), listed)
+            tl.store(ids + at, g, listed)
+            at += listed.to(at.dtype)
+
+
+@torch.no_grad()
+def intersect_tiles(
+    means2d: Tensor,
+    radii: Tensor,
+    depths: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+) -> tuple[Tensor, Tensor]:
+    """List the Gaussians of each tile from front to back; in place of gsplat's `isect_tiles` and `isect_offset_encode`.
+
+    Args:
+        means2d: px. [C, N, 2]
+        radii: px, of gsplat 1.4 [C, N] or 1.5 [C, N, 2]; not positive where culled.
+        depths: Along the viewing axis. [C, N]
+        conics: (a, b, c) of the inverse of the blurred Σ2D, in 1/px². [C, N, 3]
+        opacities: In [0, 1]. [C, N]
+        width: px.
+        height: px.
+        tile_size: px, a power of two.
+
+    Returns:
+        Where each tile's list starts, int32 [C, tile rows, tile columns], and the indices in C·N that the lists hold,
+        int32 [number of pairs].
+    """
+    num_views, num_gaussians = means2d.shape[:2]
+    tile_width, tile_height = triton.cdiv(width, tile_size), triton.cdiv(height, tile_size)
+    if radii.dim() == 2:
+        radii = radii[..., None].expand(-1, -1, 2)
+    ellipses = [value.contiguous() for value in (means2d, radii, conics, opacities)]
+    n, device = num_views * num_gaussians, means2d.device
+    programs = (triton.cdiv(n, _LANES),)
+    counts = torch.empty(n, dtype=torch.int32, device=device)
+    _count[programs](*ellipses, counts, n, tile_width, tile_height, tile_size, _LANES, num_warps=1)
+    # Sorting the Gaussians by depth and then their pairs by tile, 16 bits in most cases, moves a fraction of the bytes
+    # that sorting pairs by both in 64 bits does. Both sorts are stable, as gsplat's is.
+    order = depths.flatten().argsort(stable=True)
+    ends = counts[order].cumsum(0)
+    num_pairs = int(ends[-1])  # waits for the device, as gsplat does
+    num_tiles = num_views * tile_height * tile_width
+    # Tiles are numbered from -2^15, so that 16 bits tell 65,536 of them apart.
+    tiles = torch.empty(num_pairs, dtype=torch.int16 if num_tiles <= 2**16 else torch.int32, device=device)
+    ids = torch.empty(num_pairs, dtype=torch.int32, device=device)
+    _list[programs](
+        *ellipses, order, ends, tiles, ids, n, num_gaussians, tile_width, tile_height, tile_size, _LANES, num_warps=1
+    )
+    tiles, by_tile = tiles.sort(stable=True)
+    numbers = torch.arange(-(2**15), num_tiles - 2**15, dtype=tiles.dtype, device=device)
+    starts = torch.searchsorted(tiles, numbers, out_int32=True)
+    return starts.reshape(num_views, tile_height, tile_width), ids[by_tile]
