@@ -15,7 +15,7 @@ WAVELENGTH_EPSILON = 1e-5
 """ε of Λ_min = 1 / (√λ_1 + ε) in 1/px: a textureless region has a wavelength of 10⁵ px, not infinity."""
 SCREEN_BLUR = 0.3
 """px²; gsplat adds this to the diagonal of Σ2D before it inverts it (its `eps2d`)."""
-_FRUSTUM_MARGIN = 0.3
+FRUSTUM_MARGIN = 0.3
 """gsplat evaluates the projection Jacobian at most this fraction of half the image beyond the image's border."""
 
 
@@ -68,7 +68,7 @@ def projected_axes(
     rotation = viewmats[:, :3, :3]  # W [M, 3, 3]
     x, y, z = (torch.einsum("mij,mj->mi", rotation, means) + viewmats[:, :3, 3]).unbind(-1)  # [M] each
     fx, fy, cx, cy = Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2]
-    margin_x, margin_y = _FRUSTUM_MARGIN * 0.5 * width / fx, _FRUSTUM_MARGIN * 0.5 * height / fy
+    margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
     x = z * torch.maximum(torch.minimum(x / z, (width - cx) / fx + margin_x), -cx / fx - margin_x)
     y = z * torch.maximum(torch.minimum(y / z, (height - cy) / fy + margin_y), -cy / fy - margin_y)
     zero = torch.zeros_like(z)
@@ -77,8 +77,8 @@ def projected_axes(
     return (jacobian @ rotation @ axes).transpose(1, 2)
 
 
-def sample_footprint(means2d: Tensor, conics: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """One uniformly jittered point in each Gaussian's footprint.
+def sample_footprint(means2d: Tensor, conics: Tensor, jitter: Tensor) -> Tensor:
+    """One point in each Gaussian's footprint, uniformly distributed where the jitter is.
 
     The footprint is the 2σ ellipse of Σ2D: a uniform point in it has mean μ_2D and covariance Σ2D. gsplat's conic
     contains its screen-space blur, which is taken out again; what rounding makes negative is set to 0.
@@ -86,7 +86,7 @@ def sample_footprint(means2d: Tensor, conics: Tensor, generator: torch.Generator
     Args:
         means2d: px. [M, 2]
         conics: (a, b, c) of the inverse of Σ2D + SCREEN_BLUR·I, in 1/px². [M, 3]
-        generator: Source of the jitter.
+        jitter: In [0, 1). [M, 2]
 
     Returns:
         Points in px, pixel centres at half-integers. [M, 2]
@@ -101,7 +101,6 @@ def sample_footprint(means2d: Tensor, conics: Tensor, generator: torch.Generator
     factor_xy = torch.where(xx > 0, xy / factor_xx, 0.0)
     factor_xy = torch.maximum(torch.minimum(factor_xy, yy.sqrt()), -yy.sqrt())
     factor_yy = (yy - factor_xy**2).clamp_min(0).sqrt()
-    jitter = torch.rand((len(means2d), 2), generator=generator, dtype=means2d.dtype, device=means2d.device)
     radius, angle = 2.0 * jitter[:, 0].sqrt(), 2.0 * torch.pi * jitter[:, 1]
     u, v = radius * angle.cos(), radius * angle.sin()
     return means2d + torch.stack([factor_xx * u, factor_xy * u + factor_yy * v], -1).to(means2d.dtype)

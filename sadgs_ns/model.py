@@ -106,6 +106,7 @@ class SadgsModel(SplatfactoModel):
         config = self.config
         _refuse_fields_without_effect(config)
         self.strategy = copy.deepcopy(config.strategy)
+        self.strategy.fused &= config.fused
         self.strategy_state = self.strategy.initialize_state()
         self.gauss_params = torch.nn.ParameterDict(
             {name: torch.nn.Parameter(value) for name, value in self._initial_gaussians().items()}
@@ -218,7 +219,7 @@ class SadgsModel(SplatfactoModel):
             inside = self.crop_box.within(self.means)
             params = {name: value[inside] for name, value in params.items()}
         if self.config.sh_degree > 0:
-            colors = torch.cat([params["features_dc"][:, None], params["features_rest"]], dim=1)  # [N, K, 3]
+            colors: Tensor | tuple[Tensor, Tensor] = (params["features_dc"], params["features_rest"])
             sh_degree = min(self.step // self.config.sh_degree_interval, self.config.sh_degree)
         else:
             colors, sh_degree = torch.sigmoid(params["features_dc"]), None  # [N, 3]

@@ -2,20 +2,74 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
+import torch
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
+
+from sadgs_ns import kernels
+
+
+class FusedAdam(torch.optim.Adam):
+    """torch's Adam, updated by our Triton kernel where that runs; state and results are torch's.
+
+    Args:
+        params: Parameters, all on one device.
+        fused: Use the Triton kernel on CUDA, torch's fused implementation elsewhere.
+        **options: As torch's.
+    """
+
+    def __init__(self, params: Iterable[torch.Tensor], *, fused: bool = True, **options: Any) -> None:
+        parameters = list(params)
+        self._triton = fused and kernels.available(parameters[0].device) and not options.get("weight_decay")
+        # torch's own keeps the step count on the device, which would make the host wait for it.
+        super().__init__(parameters, fused=fused and not self._triton, **options)
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
+        """Update the parameters that have a gradient."""
+        if not self._triton:
+            return super().step(closure)
+        from sadgs_ns.kernels.adam import adam_step
+
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                if parameter.grad is None:
+                    continue
+                state = self.state[parameter]
+                if not state:
+                    state["step"] = torch.tensor(0.0)
+                    state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+                state["step"] = state["step"].cpu() + 1
+                adam_step(
+                    parameter,
+                    parameter.grad.contiguous(),
+                    state["exp_avg"],
+                    state["exp_avg_sq"],
+                    step=int(state["step"]),
+                    lr=group["lr"],
+                    betas=group["betas"],
+                    eps=group["eps"],
+                )
+        return loss
 
 
 @dataclass
 class FusedAdamOptimizerConfig(AdamOptimizerConfig):
     """Adam in one kernel per parameter."""
 
+    _target: type = FusedAdam
     fused: bool = True
-    """Update each parameter in a single kernel; half the time of torch's default on a GPU."""
+    """Update each parameter in a single kernel: ours on CUDA, torch's elsewhere."""
 
 
 @dataclass

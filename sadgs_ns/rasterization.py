@@ -16,7 +16,7 @@ def rasterize(
     quats: Tensor,  # [N, 4]
     scales: Tensor,  # [N, 3]
     opacities: Tensor,  # [N]
-    colors: Tensor,  # [(C,) N, D] or [(C,) N, K, 3]
+    colors: Tensor | tuple[Tensor, Tensor],  # [(C,) N, D], [(C,) N, K, 3] or [N, 3] and [N, K - 1, 3]
     viewmats: Tensor,  # [C, 4, 4]
     Ks: Tensor,  # [C, 3, 3]
     width: int,
@@ -38,7 +38,8 @@ def rasterize(
         quats: Rotations as wxyz quaternions; need not have unit length. [N, 4]
         scales: Standard deviations along the Gaussians' axes, in world units, > 0. [N, 3]
         opacities: In [0, 1]. [N]
-        colors: Features [(C,) N, D] or, with `sh_degree`, spherical harmonics coefficients [(C,) N, K, 3].
+        colors: Features [(C,) N, D] or, with `sh_degree`, spherical harmonics coefficients: [(C,) N, K, 3], or the pair
+            of those of degree 0 [N, 3] and of the others [N, K − 1, 3].
         viewmats: World-to-camera transforms, OpenCV axes (x right, y down, z forward). [C, 4, 4]
         Ks: Intrinsics in pixels. [C, 3, 3]
         width: Image width in pixels.
@@ -60,14 +61,15 @@ def rasterize(
     Raises:
         ValueError: From the splatter, if a mode is unknown or a shape does not match. gsplat raises AssertionError.
     """
-    if means.is_cuda:
-        # Here, so that without a GPU nothing comes near gsplat's kernels, which are compiled when first used.
-        if fused and kernels.available(means.device):
-            from sadgs_ns.kernels.rasterization import rasterization
-        else:
-            from gsplat.rendering import rasterization
-    else:
-        rasterization = splatter.rasterization
+    rasterization: Any = splatter.rasterization
+    fused = fused and kernels.available(means.device)
+    # Imported here, so that without a GPU nothing comes near gsplat's kernels, which are compiled when first used.
+    if fused:
+        from sadgs_ns.kernels.rasterization import rasterization
+    elif means.is_cuda:
+        from gsplat.rendering import rasterization
+    if isinstance(colors, tuple) and not fused:
+        colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
     return rasterization(
         means,
         quats,

@@ -6,13 +6,23 @@ removes Gaussians keeps them in step with the parameters.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, MutableMapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from sadgs_ns.eta import eta, projected_axes, sample_footprint, sample_map
+from sadgs_ns import kernels
+from sadgs_ns.eta import (
+    FRUSTUM_MARGIN,
+    SCREEN_BLUR,
+    WAVELENGTH_EPSILON,
+    eta,
+    projected_axes,
+    sample_footprint,
+    sample_map,
+)
 from sadgs_ns.rasterization import visible
 from sadgs_ns.split import Params
 
@@ -42,6 +52,7 @@ def observe(
     directional: bool = False,
     min_opacity: float = 0.0,
     generator: torch.Generator | None = None,
+    fused: bool = True,
 ) -> None:
     """Add one forward pass: one jittered sample per visible Gaussian and view, counted in place.
 
@@ -55,8 +66,29 @@ def observe(
         directional: Use η^(proj) (paper, eq. 7).
         min_opacity: Only Gaussians at least this opaque are observed.
         generator: Source of the jitter.
+        fused: Use the Triton kernel where it runs: CUDA, float32.
     """
     seen = visible(info)  # [C, N]
+    jitter = torch.rand((*seen.shape, 2), generator=generator, device=seen.device)  # [C, N, 2]
+    if fused and kernels.available(seen.device) and params["means"].dtype == torch.float32:
+        from sadgs_ns.kernels.observation import observe_views
+
+        observe_views(
+            (statistics["n_high"], statistics["n_low"], statistics["eta_max"], statistics["n_total"]),
+            (params["means"], params["quats"], params["scales"], params["opacities"]),
+            seen,
+            info["means2d"],
+            info["conics"],
+            jitter,
+            info["structure_tensors"],
+            info["viewmats"],
+            info["Ks"],
+            min_logit=math.log(min_opacity / (1 - min_opacity)) if 0 < min_opacity < 1 else -math.inf,
+            directional=directional,
+            thresholds=(HIGH_ETA, LOW_ETA),
+            constants=(SCREEN_BLUR, FRUSTUM_MARGIN, WAVELENGTH_EPSILON),
+        )
+        return
     if min_opacity > 0:
         seen = seen & (torch.sigmoid(params["opacities"].flatten()) >= min_opacity)
     num_cameras, num_gaussians = seen.shape
@@ -79,7 +111,7 @@ def observe(
         # Python numbers: a tensor made of them here would make the host wait for its copy to the device.
         a, b, c = (torch.where(seen[camera], *pair) for pair in ((a, 1.0), (b, 0.0), (c, 1.0)))
         conics = torch.stack([a, b, c], -1)
-        points = sample_footprint(means2d, conics, generator)
+        points = sample_footprint(means2d, conics, jitter[camera])
         sampled, inside = sample_map(info["structure_tensors"], camera_ids, points)
         observed = (seen[camera] & inside)[:, None]  # [N, 1]
         violation = torch.where(observed, eta(axes, sampled, directional), 0.0)  # [N, 3]

@@ -78,6 +78,8 @@ class StructureAwareStrategy(Strategy):
     """An opacity reset multiplies every opacity by this."""
     final_prune_opacity: float = 0.1
     """Opacity under which Gaussians are pruned when densification ends."""
+    fused: bool = True
+    """Measure η in one Triton kernel where that runs (CUDA)."""
     verbose: bool = False
     """Print a line at each densification step."""
 
@@ -136,7 +138,14 @@ class StructureAwareStrategy(Strategy):
         for view in _views(info):
             view["means2d"].retain_grad()
             if self.observes(step):
-                observe(state, params, view, directional=self.directional_eta, min_opacity=self.eta_min_opacity)
+                observe(
+                    state,
+                    params,
+                    view,
+                    directional=self.directional_eta,
+                    min_opacity=self.eta_min_opacity,
+                    fused=self.fused,
+                )
 
     def step_post_backward(
         self,

@@ -111,7 +111,11 @@ def test_footprint_samples_have_the_gaussian_s_mean_and_covariance():
     covariance = torch.tensor([[9.0, 4.0], [4.0, 6.0]])
     inverse = torch.linalg.inv(covariance + SCREEN_BLUR * torch.eye(2))
     conics = torch.stack([inverse[0, 0], inverse[0, 1], inverse[1, 1]]).expand(200_000, 3)
-    points = sample_footprint(torch.tensor([20.0, 30.0]).expand(200_000, 2), conics, torch.Generator().manual_seed(0))
+    points = sample_footprint(
+        torch.tensor([20.0, 30.0]).expand(200_000, 2),
+        conics,
+        torch.rand((200_000, 2), generator=torch.Generator().manual_seed(0)),
+    )
     torch.testing.assert_close(points.mean(0), torch.tensor([20.0, 30.0]), rtol=0, atol=0.03)
     torch.testing.assert_close(points.T.cov(), covariance, rtol=0.02, atol=0.05)
     offset = points - torch.tensor([20.0, 30.0])
@@ -121,7 +125,7 @@ def test_footprint_samples_have_the_gaussian_s_mean_and_covariance():
 
 def test_footprint_of_a_gaussian_thinner_than_the_blur_is_a_line_or_a_point():
     conics = torch.tensor([[1 / (4.0 + SCREEN_BLUR), 0.0, 1 / SCREEN_BLUR], [1 / SCREEN_BLUR, 0.0, 1 / SCREEN_BLUR]])
-    points = sample_footprint(torch.zeros(2, 2), conics, torch.Generator().manual_seed(0))
+    points = sample_footprint(torch.zeros(2, 2), conics, torch.rand((2, 2), generator=torch.Generator().manual_seed(0)))
     assert points.isfinite().all()
     assert abs(points[0, 1]) < 1e-2 and points[1].abs().max() < 1e-2
 
@@ -146,7 +150,7 @@ def test_eta_equals_the_brute_force_footprint_average():
     inverse = torch.linalg.inv(covariance + SCREEN_BLUR * torch.eye(2))
     n = 40_000
     conics = torch.stack([inverse[0, 0], inverse[0, 1], inverse[1, 1]]).expand(n, 3)
-    points = sample_footprint(mean.expand(n, 2), conics, torch.Generator().manual_seed(1))
+    points = sample_footprint(mean.expand(n, 2), conics, torch.rand((n, 2), generator=torch.Generator().manual_seed(1)))
     sampled, inside = sample_map(tensors, torch.zeros(n, dtype=torch.long), points)
     assert inside.all()
     axes = torch.tensor([[[3.0, 0.0], [0.0, 4.0], [1.0, 1.0]]])

@@ -5,12 +5,19 @@ from __future__ import annotations
 import math
 
 import pytest
+import scenes
 import torch
+from gsplat.cuda._torch_impl import _spherical_harmonics
 from torch import Tensor
 
 from sadgs_ns import kernels, losses
 from sadgs_ns.bench.rasterizers import random_scene
+from sadgs_ns.optimizers import FusedAdam
+from sadgs_ns.statistics import empty_statistics, observe
 
+adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
+harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")
+observation = pytest.importorskip("sadgs_ns.kernels.observation", reason="Triton is not installed")
 photometric = pytest.importorskip("sadgs_ns.kernels.photometric", reason="Triton is not installed")
 tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not installed")
 
@@ -53,6 +60,109 @@ def test_mean_squared_error_carries_no_gradient():
 
 def test_kernels_are_for_cuda_only():
     assert not kernels.available(torch.device("cpu"))
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_colours_and_gradients_equal_gsplats_float64_harmonics(degree):
+    generator = torch.Generator().manual_seed(degree)
+    shapes = (90, 3), (90, 3), (90, 15, 3), (3, 1, 3), (3, 90, 3)
+    *values, positions, weights = (torch.randn(shape, generator=generator) for shape in shapes)
+    drawn = torch.rand((3, 90), generator=generator) > 0.2
+    fast = [value.to(DEVICE, copy=True).requires_grad_() for value in values]
+    colors = harmonics.colors_from_harmonics(degree, *fast, positions.to(DEVICE), drawn.to(DEVICE))
+    (colors * (weights * drawn[..., None]).to(DEVICE)).sum().backward()
+    slow = means, first, rest = [value.double().requires_grad_() for value in values]
+    coefficients = torch.cat([first[:, None], rest], dim=1).expand(3, -1, -1, -1)
+    expected = (_spherical_harmonics(degree, means - positions, coefficients) + 0.5).clamp_min(0)
+    (expected * weights * drawn[..., None]).sum().backward()
+    torch.testing.assert_close(colors[drawn.to(DEVICE)].double().cpu(), expected[drawn], atol=2e-6, rtol=2e-6)
+    assert (expected == 0).any() and (expected > 0).any()
+    for actual, reference in zip(fast, slow, strict=True):
+        assert actual.grad is not None
+        gradient = torch.zeros_like(reference) if reference.grad is None else reference.grad
+        torch.testing.assert_close(actual.grad.double().cpu(), gradient, atol=2e-5, rtol=2e-5)
+
+
+@pytest.mark.parametrize("directional", [False, True])
+@pytest.mark.parametrize("min_opacity", [0.0, 0.5])
+def test_observation_equals_the_reference(monkeypatch, directional, min_opacity):
+    n, width, height = 150, 40, 30
+    params = {name: p.detach() for name, p in scenes.random_params(n).items()}
+    params["opacities"] = params["opacities"][:, None]
+    params["scales"][::9] += 3  # reaches over the border
+    params["means"][::13, 2] = -1  # behind the camera
+    viewmats, Ks = scenes.camera(width, height, focal=40.0)
+    viewmats, Ks = viewmats.repeat(2, 1, 1), Ks.repeat(2, 1, 1)
+    viewmats[1, :3, :3] = torch.linalg.qr(torch.eye(3) + 0.1)[0]
+    viewmats[1, :3, 3] = torch.tensor([0.1, -0.2, 0.5])
+    flat = {name: torch.nn.Parameter(p.flatten() if name == "opacities" else p) for name, p in params.items()}
+    _, _, info = scenes.splat(flat, viewmats, Ks, width, height)
+    generator = torch.Generator().manual_seed(0)
+    factors = torch.randn((2, height, width, 2, 2), generator=generator)
+    tensors = factors @ factors.mT
+    info |= {"viewmats": viewmats, "Ks": Ks}
+    info["structure_tensors"] = torch.stack([tensors[..., 0, 0], tensors[..., 0, 1], tensors[..., 1, 1]], -1).half()
+    results = []
+    for fused in (False, True):
+        monkeypatch.setattr(kernels, "available", lambda device: True)
+        statistics = {k: v.to(DEVICE) for k, v in empty_statistics(n, torch.device("cpu")).items()}
+        for seed in (1, 2):
+            observe(
+                statistics,
+                {name: torch.nn.Parameter(value.to(DEVICE)) for name, value in params.items()},
+                {
+                    name: value.detach().to(DEVICE) if isinstance(value, Tensor) else value
+                    for name, value in info.items()
+                },
+                directional=directional,
+                min_opacity=min_opacity,
+                generator=torch.Generator(DEVICE).manual_seed(seed),
+                fused=fused,
+            )
+        results.append(statistics)
+    reference, fast = results
+    assert reference["n_total"].sum() > n / 2 and reference["n_low"].sum() > 0 and reference["n_high"].sum() > 0
+    assert (reference["n_total"] == 0).any()
+    for name in ("n_total", "n_high", "n_low"):
+        assert torch.equal(fast[name], reference[name]), name
+    torch.testing.assert_close(fast["eta_max"], reference["eta_max"], atol=1e-6, rtol=2e-5)
+
+
+def test_adam_equals_torchs():
+    generator = torch.Generator().manual_seed(0)
+    start = torch.randn((37, 45), generator=generator)
+    expected = torch.nn.Parameter(start.double())
+    optimizer = torch.optim.Adam([expected], lr=0.1, eps=1e-15)
+    actual = start.to(DEVICE).clone()
+    moments = torch.zeros_like(actual), torch.zeros_like(actual)
+    for step in range(1, 6):
+        gradient = torch.randn(start.shape, generator=generator)
+        expected.grad = gradient.double()
+        optimizer.step()
+        adam.adam_step(actual, gradient.to(DEVICE), *moments, step=step, lr=0.1, betas=(0.9, 0.999), eps=1e-15)
+    torch.testing.assert_close(actual.double().cpu(), expected.detach(), atol=1e-5, rtol=1e-5)
+
+
+def test_optimizer_keeps_torchs_state_while_it_runs_the_kernel(monkeypatch):
+    states = []
+    for triton in (False, True):
+        monkeypatch.setattr(kernels, "available", lambda device, triton=triton: triton)
+        parameters = [torch.nn.Parameter(torch.linspace(-1, 1, 50)), torch.nn.Parameter(torch.zeros(3))]
+        optimizer = FusedAdam(parameters, lr=0.01)
+        for _ in range(3):
+            parameters[0].grad = parameters[0].detach().clone()  # the other parameter has no gradient
+            optimizer.step()
+        restored = FusedAdam([torch.nn.Parameter(p.detach().clone()) for p in parameters], lr=0.01)
+        restored.load_state_dict(optimizer.state_dict())
+        restored.param_groups[0]["params"][0].grad = torch.ones(50)
+        restored.step()
+        states.append((parameters, optimizer.state_dict()["state"], restored.param_groups[0]["params"]))
+    (slow, slow_state, slow_on), (fast, fast_state, fast_on) = states
+    for one, other in zip([*slow, *slow_on], [*fast, *fast_on], strict=True):
+        torch.testing.assert_close(other, one, atol=1e-7, rtol=1e-6)
+    assert slow_state.keys() == fast_state.keys() == {0}
+    assert slow_state[0].keys() == fast_state[0].keys()
+    assert float(fast_state[0]["step"]) == 3
 
 
 def projected_gaussians(num_views: int, n: int, width: int, height: int) -> dict[str, Tensor]:

@@ -64,7 +64,7 @@ def render_with_gradients(
     Returns:
         `visible` bool [1, N]; `colour`, `alpha`, `means2d`, `conics`, `absgrad`, and `gradient of ...` per parameter.
     """
-    arguments: dict[str, Any] = {name: tensor.to(device, dtype) for name, tensor in scene.items()}
+    arguments: dict[str, Any] = {name: tensor.to(device, dtype, copy=True) for name, tensor in scene.items()}
     weights = arguments.pop("weights")  # [1, S, S, 3]
     for name in _PARAMETERS:
         arguments[name].requires_grad_()

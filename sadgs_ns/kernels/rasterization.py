@@ -9,6 +9,7 @@ import torch
 from gsplat.cuda._wrapper import fully_fused_projection, rasterize_to_pixels, spherical_harmonics
 from torch import Tensor
 
+from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
 from sadgs_ns.kernels.tiles import intersect_tiles
 
 TILE_SIZE = 8
@@ -20,7 +21,7 @@ def rasterization(
     quats: Tensor,  # [N, 4]
     scales: Tensor,  # [N, 3]
     opacities: Tensor,  # [N]
-    colors: Tensor,  # [(C,) N, D] or [(C,) N, K, 3]
+    colors: Tensor | tuple[Tensor, Tensor],  # [(C,) N, D], [(C,) N, K, 3] or [N, 3] and [N, K - 1, 3]
     viewmats: Tensor,  # [C, 4, 4]
     Ks: Tensor,  # [C, 3, 3]
     width: int,
@@ -64,15 +65,20 @@ def rasterization(
     opacities = opacities.expand(num_views, -1)
     if compensations is not None:
         opacities = opacities * compensations
-    if sh_degree is None:
-        colors = colors.expand(num_views, -1, -1)
+    drawn = radii > 0 if radii.dim() == 2 else (radii > 0).all(dim=-1)  # [C, N]
+    # gsplat inverts the matrices, which makes the host wait for the device.
+    positions = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:]).mT  # [C, 1, 3]
+    if isinstance(colors, tuple) and sh_degree is not None and sh_degree <= MAX_DEGREE and not viewmats.requires_grad:
+        colors = colors_from_harmonics(sh_degree, means, *colors, positions, drawn)
     else:
-        # gsplat inverts the matrices, which makes the host wait for the device.
-        positions = -viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:]  # [C, 3, 1]
-        directions = means - positions.mT  # [C, N, 3]
-        drawn = radii > 0 if radii.dim() == 2 else (radii > 0).all(dim=-1)
-        colors = spherical_harmonics(sh_degree, directions, colors.expand(num_views, -1, -1, -1), masks=drawn)
-        colors = torch.clamp_min(colors + 0.5, 0.0)
+        if isinstance(colors, tuple):
+            colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
+        if sh_degree is None:
+            colors = colors.expand(num_views, -1, -1)
+        else:
+            coefficients = colors.expand(num_views, -1, -1, -1)
+            colors = spherical_harmonics(sh_degree, means - positions, coefficients, masks=drawn)
+            colors = torch.clamp_min(colors + 0.5, 0.0)
     if render_mode in ("RGB+D", "RGB+ED"):
         colors = torch.cat([colors, depths[..., None]], dim=-1)
         if backgrounds is not None:

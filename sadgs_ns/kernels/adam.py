@@ -1,0 +1,55 @@
+"""Adam, one kernel per parameter; torch's fused one reaches a third of the memory's bandwidth on Gaussians."""
+
+# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
+# (Triton's launch syntax, kernel[grid](...), is not in its types.)
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+from torch import Tensor
+
+_BLOCK = 1024
+
+
+@triton.jit(do_not_specialize=["n"])
+def _update(
+    parameter, gradient, mean, square, n, rate, scale, beta1, beta2, eps, BLOCK: tl.constexpr
+):  # fmt: skip
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    exists = i < n
+    g = tl.load(gradient + i, exists, 0.0)
+    m = beta1 * tl.load(mean + i, exists, 0.0) + (1 - beta1) * g
+    v = beta2 * tl.load(square + i, exists, 0.0) + (1 - beta2) * g * g
+    p = tl.load(parameter + i, exists, 0.0) - rate * m / (tl.sqrt(v) * scale + eps)
+    tl.store(mean + i, m, exists)
+    tl.store(square + i, v, exists)
+    tl.store(parameter + i, p, exists)
+
+
+def adam_step(
+    parameter: Tensor,
+    gradient: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    *,
+    step: int,
+    lr: float,
+    betas: tuple[float, float],
+    eps: float,
+) -> None:
+    """Update a parameter and its moments in place, as torch's Adam without weight decay.
+
+    Args:
+        parameter: Contiguous float32, any shape.
+        gradient: Contiguous, of the same shape; so are the moments.
+        exp_avg: Running mean of the gradient.
+        exp_avg_sq: Running mean of its square.
+        step: Which update this is, from 1.
+        lr: Learning rate.
+        betas: Decay of the two running means, in [0, 1).
+        eps: Added to the denominator.
+    """
+    rate, scale = lr / (1 - betas[0] ** step), (1 - betas[1] ** step) ** -0.5
+    grid = (triton.cdiv(parameter.numel(), _BLOCK),)
+    _update[grid](parameter, gradient, exp_avg, exp_avg_sq, parameter.numel(), rate, scale, *betas, eps, _BLOCK)

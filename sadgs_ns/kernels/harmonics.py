@@ -1,0 +1,257 @@
+"""Colours from spherical harmonics, read and differentiated in place; in place of gsplat's `spherical_harmonics`.
+
+gsplat takes all coefficients in one tensor, once per view; the parameters are two tensors, which the views share. Here
+nothing is concatenated or expanded, and the gradients arrive summed over the views.
+"""
+
+# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false
+# (Triton's launch syntax, kernel[grid](...), and its functions are not in its types.)
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+MAX_DEGREE = 3
+"""Highest degree that the kernels know."""
+_LANES, _BACKWARD_LANES = 128, 32  # Gaussians a program handles; with four threads for each backwards
+_VIEWS = 2  # how many views' gradients are summed in registers
+
+
+@triton.jit
+def _direction(means, positions, view, g, exists):
+    """Unit vector from the camera to the Gaussian, and the inverse of its length."""
+    x = tl.load(means + 3 * g, exists, 1.0) - tl.load(positions + 3 * view)
+    y = tl.load(means + 3 * g + 1, exists, 0.0) - tl.load(positions + 3 * view + 1)
+    z = tl.load(means + 3 * g + 2, exists, 0.0) - tl.load(positions + 3 * view + 2)
+    inverse = 1 / tl.maximum(tl.sqrt(x * x + y * y + z * z), 1e-30)
+    return x * inverse, y * inverse, z * inverse, inverse
+
+
+@triton.jit
+def _basis(x, y, z):
+    """Harmonics 1 … 15 of a unit vector, as 3DGS orders and signs them."""
+    planar, mixed = x * x - y * y, 2 * x * y
+    ring = -2.285228997322329 * z * z + 0.4570457994644658
+    return (
+        -0.48860251190292 * y,
+        0.48860251190292 * z,
+        -0.48860251190292 * x,
+        0.5462742152960395 * mixed,
+        -1.092548430592079 * y * z,
+        0.9461746957575601 * z * z - 0.3153915652525201,
+        -1.092548430592079 * x * z,
+        0.5462742152960395 * planar,
+        -0.5900435899266435 * (x * mixed + y * planar),
+        1.445305721320277 * z * mixed,
+        ring * y,
+        z * (1.865881662950577 * z * z - 1.119528997770346),
+        ring * x,
+        1.445305721320277 * z * planar,
+        -0.5900435899266435 * (x * planar - y * mixed),
+    )
+
+
+@triton.jit
+def _slopes(x, y, z):
+    """Derivatives of the polynomials in `_basis` by x, by y and by z."""
+    zero = x * 0
+    planar, mixed = x * x - y * y, 2 * x * y
+    ring = -2.285228997322329 * z * z + 0.4570457994644658
+    by_x = (
+        zero,
+        zero,
+        zero - 0.48860251190292,
+        1.092548430592079 * y,
+        zero,
+        zero,
+        -1.092548430592079 * z,
+        1.092548430592079 * x,
+        -1.7701307697799304 * mixed,
+        2.890611442640554 * y * z,
+        zero,
+        zero,
+        ring,
+        2.890611442640554 * x * z,
+        -1.7701307697799304 * planar,
+    )
+    by_y = (
+        zero - 0.48860251190292,
+        zero,
+        zero,
+        1.092548430592079 * x,
+        -1.092548430592079 * z,
+        zero,
+        zero,
+        -1.092548430592079 * y,
+        -1.7701307697799304 * planar,
+        2.890611442640554 * x * z,
+        ring,
+        zero,
+        zero,
+        -2.890611442640554 * y * z,
+        1.7701307697799304 * mixed,
+    )
+    by_z = (
+        zero,
+        zero + 0.48860251190292,
+        zero,
+        zero,
+        -1.092548430592079 * y,
+        1.8923493915151202 * z,
+        -1.092548430592079 * x,
+        zero,
+        zero,
+        1.445305721320277 * mixed,
+        -4.570457994644658 * z * y,
+        5.597644988851731 * z * z - 1.119528997770346,
+        -4.570457994644658 * z * x,
+        1.445305721320277 * planar,
+        zero,
+    )
+    return by_x, by_y, by_z
+
+
+@triton.jit(do_not_specialize=["n", "used", "stride"])
+def _forward(means, positions, first, rest, drawn, colors, n, used, stride, LANES: tl.constexpr):
+    g = tl.program_id(0) * LANES + tl.arange(0, LANES)
+    view = tl.program_id(1)
+    at = view * n + g
+    exists = tl.load(drawn + at, g < n, 0) != 0
+    x, y, z, _ = _direction(means, positions, view, g, exists)
+    basis = _basis(x, y, z)
+    red = 0.2820947917738781 * tl.load(first + 3 * g, exists, 0.0) + 0.5
+    green = 0.2820947917738781 * tl.load(first + 3 * g + 1, exists, 0.0) + 0.5
+    blue = 0.2820947917738781 * tl.load(first + 3 * g + 2, exists, 0.0) + 0.5
+    for k in tl.static_range(15):
+        read = exists & (k < used)
+        red += basis[k] * tl.load(rest + stride * g + 3 * k, read, 0.0)
+        green += basis[k] * tl.load(rest + stride * g + 3 * k + 1, read, 0.0)
+        blue += basis[k] * tl.load(rest + stride * g + 3 * k + 2, read, 0.0)
+    tl.store(colors + 3 * at, tl.maximum(red, 0.0), g < n)
+    tl.store(colors + 3 * at + 1, tl.maximum(green, 0.0), g < n)
+    tl.store(colors + 3 * at + 2, tl.maximum(blue, 0.0), g < n)
+
+
+@triton.jit
+def _add(sums, basis, v):
+    return (
+        sums[0] + basis[0][:, None] * v,
+        sums[1] + basis[1][:, None] * v,
+        sums[2] + basis[2][:, None] * v,
+        sums[3] + basis[3][:, None] * v,
+        sums[4] + basis[4][:, None] * v,
+        sums[5] + basis[5][:, None] * v,
+        sums[6] + basis[6][:, None] * v,
+        sums[7] + basis[7][:, None] * v,
+        sums[8] + basis[8][:, None] * v,
+        sums[9] + basis[9][:, None] * v,
+        sums[10] + basis[10][:, None] * v,
+        sums[11] + basis[11][:, None] * v,
+        sums[12] + basis[12][:, None] * v,
+        sums[13] + basis[13][:, None] * v,
+        sums[14] + basis[14][:, None] * v,
+    )
+
+
+@triton.jit(do_not_specialize=["n", "start", "num_views", "used", "stride"])
+def _backward(
+    means, positions, rest, drawn, colors, v_colors, v_means, v_first, v_rest, n, start, num_views, used, stride,
+    LANES: tl.constexpr, VIEWS: tl.constexpr,
+):  # fmt: skip
+    """Gradients from VIEWS views, added to those from the views before `start`.
+
+    A Gaussian's three channels lie in neighbouring threads, as in memory; the fourth does nothing.
+    """
+    g = tl.program_id(0) * LANES + tl.arange(0, LANES)
+    channel = tl.arange(0, 4)[None, :]
+    mine = (g < n)[:, None] & (channel < 3)  # [LANES, 4]
+    earlier = mine & (start > 0)
+    v_sum = tl.zeros([LANES, 4], tl.float32)
+    v_x = tl.load(v_means + 3 * g, (g < n) & (start > 0), 0.0)
+    v_y = tl.load(v_means + 3 * g + 1, (g < n) & (start > 0), 0.0)
+    v_z = tl.load(v_means + 3 * g + 2, (g < n) & (start > 0), 0.0)
+    sums = (v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum)
+    for i in tl.static_range(VIEWS):
+        view = tl.minimum(start + i, num_views - 1)
+        at = view * n + g
+        exists = tl.load(drawn + at, (g < n) & (start + i < num_views), 0) != 0
+        x, y, z, inverse = _direction(means, positions, view, g, exists)
+        seen = exists[:, None] & mine
+        of = 3 * at[:, None] + channel
+        # A colour that was clamped to 0 passes no gradient on.
+        v = tl.where(tl.load(colors + of, seen, 0.0) > 0, tl.load(v_colors + of, seen, 0.0), 0.0)
+        v_sum += v
+        sums = _add(sums, _basis(x, y, z), v)
+        by_x, by_y, by_z = _slopes(x, y, z)
+        dx = tl.zeros([LANES], tl.float32)
+        dy, dz = dx, dx
+        for k in tl.static_range(15):
+            shade = tl.sum(v * tl.load(rest + stride * g[:, None] + 3 * k + channel, seen & (k < used), 0.0), 1)
+            dx, dy, dz = dx + by_x[k] * shade, dy + by_y[k] * shade, dz + by_z[k] * shade
+        along = dx * x + dy * y + dz * z
+        v_x += (dx - along * x) * inverse
+        v_y += (dy - along * y) * inverse
+        v_z += (dz - along * z) * inverse
+    at_first = 3 * g[:, None] + channel
+    v_sum = 0.2820947917738781 * v_sum + tl.load(v_first + at_first, earlier, 0.0)
+    tl.store(v_first + at_first, v_sum, mine)
+    for k in tl.static_range(15):
+        at_rest = v_rest + stride * g[:, None] + 3 * k + channel
+        value = tl.where(k < used, sums[k], 0.0) + tl.load(at_rest, earlier & (3 * k < stride), 0.0)
+        tl.store(at_rest, value, mine & (3 * k < stride))
+    tl.store(v_means + 3 * g, v_x, g < n)
+    tl.store(v_means + 3 * g + 1, v_y, g < n)
+    tl.store(v_means + 3 * g + 2, v_z, g < n)
+
+
+class _Colors(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, first: Tensor, rest: Tensor, positions: Tensor, drawn: Tensor, used: int
+    ) -> Tensor:
+        num_views, n = drawn.shape
+        colors = means.new_empty((num_views, n, 3))
+        grid = (triton.cdiv(n, _LANES), num_views)
+        _forward[grid](means, positions, first, rest, drawn, colors, n, used, rest.shape[1] * 3, _LANES)
+        ctx.save_for_backward(means, rest, positions, drawn, colors)
+        ctx.used = used
+        return colors
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, v_colors: Tensor) -> tuple[Tensor | None, ...]:
+        means, rest, positions, drawn, colors = ctx.saved_tensors
+        num_views, n = drawn.shape
+        v_means, v_first, v_rest = torch.empty_like(means), torch.empty_like(means), torch.empty_like(rest)
+        v_colors, stride = v_colors.contiguous(), rest.shape[1] * 3
+        for start in range(0, num_views, _VIEWS):
+            _backward[triton.cdiv(n, _BACKWARD_LANES),](
+                means, positions, rest, drawn, colors, v_colors, v_means, v_first, v_rest,
+                n, start, num_views, ctx.used, stride, _BACKWARD_LANES, _VIEWS,
+            )  # fmt: skip
+        return v_means, v_first, v_rest, None, None, None
+
+
+def colors_from_harmonics(
+    degree: int, means: Tensor, first: Tensor, rest: Tensor, positions: Tensor, drawn: Tensor
+) -> Tensor:
+    """max(Σ_k Y_k(direction) · coefficient_k + 0.5, 0), the colours that 3DGS gives Gaussians seen from cameras.
+
+    Args:
+        degree: Highest degree to use, 0 … 3.
+        means: Centres in world space, float32. [N, 3]
+        first: Coefficient of degree 0. [N, 3]
+        rest: The others, at least those that `degree` needs. [N, K − 1, 3]
+        positions: Camera centres, which get no gradient. [C, 3]
+        drawn: Which Gaussians are seen; the colours of others mean nothing. bool [C, N]
+
+    Returns:
+        [C, N, 3]
+    """
+    tensors = (value.contiguous() for value in (means, first, rest, positions, drawn))
+    return _Colors.apply(*tensors, (degree + 1) ** 2 - 1)  # type: ignore[return-value]
