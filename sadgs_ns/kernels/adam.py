@@ -12,19 +12,31 @@ from torch import Tensor
 _BLOCK = 1024
 
 
+@triton.jit
+def _moments_and_step(g, m, v, rate, scale, beta1, beta2, eps):
+    m = beta1 * m + (1 - beta1) * g
+    v = beta2 * v + (1 - beta2) * g * g
+    return m, v, rate * m / (tl.sqrt(v) * scale + eps)
+
+
 @triton.jit(do_not_specialize=["n"])
 def _update(
     parameter, gradient, mean, square, n, rate, scale, beta1, beta2, eps, BLOCK: tl.constexpr
 ):  # fmt: skip
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    exists = i < n
-    g = tl.load(gradient + i, exists, 0.0)
-    m = beta1 * tl.load(mean + i, exists, 0.0) + (1 - beta1) * g
-    v = beta2 * tl.load(square + i, exists, 0.0) + (1 - beta2) * g * g
-    p = tl.load(parameter + i, exists, 0.0) - rate * m / (tl.sqrt(v) * scale + eps)
-    tl.store(mean + i, m, exists)
-    tl.store(square + i, v, exists)
-    tl.store(parameter + i, p, exists)
+    if (tl.program_id(0) + 1).to(tl.int64) * BLOCK <= n:  # without a mask, memory is read in wide words
+        g, m, v = tl.load(gradient + i), tl.load(mean + i), tl.load(square + i)
+        m, v, change = _moments_and_step(g, m, v, rate, scale, beta1, beta2, eps)
+        tl.store(mean + i, m)
+        tl.store(square + i, v)
+        tl.store(parameter + i, tl.load(parameter + i) - change)
+    else:
+        exists = i < n
+        g, m, v = tl.load(gradient + i, exists), tl.load(mean + i, exists), tl.load(square + i, exists)
+        m, v, change = _moments_and_step(g, m, v, rate, scale, beta1, beta2, eps)
+        tl.store(mean + i, m, exists)
+        tl.store(square + i, v, exists)
+        tl.store(parameter + i, tl.load(parameter + i, exists) - change, exists)
 
 
 def adam_step(

@@ -15,7 +15,7 @@ _LANES = 128
 @triton.jit
 def _hypot(a, b):
     a, b = tl.abs(a), tl.abs(b)
-    large = tl.maximum(tl.maximum(a, b), 1e-38)
+    large = tl.maximum(tl.maximum(a, b), 1e-37)
     small = tl.minimum(a, b) / large
     return large * tl.sqrt(1 + small * small)
 
