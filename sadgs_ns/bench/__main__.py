@@ -79,7 +79,12 @@ def launcher(root: Path) -> Launch:
         with (folder / "log").open("wb") as log:
             # A session of its own, so that a compiler the run started can be ended with it.
             return subprocess.Popen(
-                command, stdout=log, stderr=subprocess.STDOUT, env=environment, start_new_session=True
+                command,
+                stdin=subprocess.DEVNULL,  # no prompt of nerfstudio's may wait for somebody
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=environment,
+                start_new_session=True,
             )
 
     return launch
@@ -147,9 +152,10 @@ def line(result: Result) -> str:
 
 def _selected(arguments: argparse.Namespace) -> list[Job]:
     """The protocol's jobs that are asked for, all checked before the first one runs."""
-    from sadgs_ns.bench.run import build_config
+    from sadgs_ns.bench.datasets import runnable
 
-    jobs = protocol.load(arguments.protocol).jobs()
+    chosen = protocol.load(arguments.protocol)
+    jobs = chosen.jobs()
     try:
         jobs = [job for job in jobs if re.search(arguments.only, f"{job.scene.name}/{job.row.label}/{job.seed}")]
     except re.error as error:
@@ -158,9 +164,7 @@ def _selected(arguments: argparse.Namespace) -> list[Job]:
         raise ValueError(f"--only {arguments.only!r} leaves no run; it is searched for in scene/label/seed.")
     if arguments.jobs_per_gpu < 1:
         raise ValueError(f"--jobs-per-gpu must be 1 or more, not {arguments.jobs_per_gpu}.")
-    for job in {(job.scene.name, job.row.label): job for job in jobs}.values():
-        build_config(job.scene, job.row, job.seed, arguments.scenes, Path("unused"))
-    return jobs
+    return runnable(jobs, arguments.scenes, chosen.source, arguments.skip_missing)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -177,6 +181,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--jobs-per-gpu", type=int, default=1, help="times are only comparable with 1, the default")
     parser.add_argument("--only", default="", metavar="REGEX", help="only runs whose scene/label/seed match")
     parser.add_argument("--time-limit", type=float, default=float("inf"), metavar="SECONDS", help="then start no run")
+    parser.add_argument("--skip-missing", action="store_true", help="run the scenes that are there")
     parser.add_argument("--reference", metavar="LABEL", help="row whose loop seconds are 1 in the column Ratio")
     arguments = parser.parse_args(argv)
     try:
