@@ -1,4 +1,4 @@
-# From a bare checkout with Python 3.10-3.12, a C compiler and make: `make demo`, `make test`, `make lint`.
+# From a bare checkout with Python 3.10-3.12, a C compiler and make: `make demo`, `make test`, `make gate`, `make lint`.
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -8,13 +8,20 @@ JOBS ?= 0
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test lint clean
+.PHONY: demo test gate lint clean
 
 demo: $(STAMP)
 	$(BIN)/python -m sadgs_ns.demo
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n $(JOBS)
+
+# On the CPU, with one thread a run (results depend on their number), and without LPIPS, whose weights are a download.
+gate: $(STAMP)
+	rm -rf gate-output
+	$(BIN)/python -m sadgs_ns.demo.scene gate-output/demo --width 80 --height 60 --views 24
+	CUDA_VISIBLE_DEVICES= OMP_NUM_THREADS=1 TORCH_HOME=/dev/null $(BIN)/sadgs-bench configs/bench/demo-gate.yaml \
+	  --scenes gate-output --output gate-output/gate.jsonl --jobs-per-gpu 2 --gate configs/bench/baselines/demo-gate.json
 
 lint: $(STAMP)
 	$(BIN)/ruff check sadgs_ns tests
@@ -31,5 +38,5 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) demo-output outputs build *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) demo-output gate-output outputs build *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find sadgs_ns tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -216,7 +216,8 @@ def test_an_installation_holds_every_preset_where_the_package_looks_for_it(tmp_p
         (source / name).symlink_to(CHECKOUT / name)
     build = python(f"import setuptools; setuptools.setup(script_args=['build_py', '-d', {str(installed)!r}])", source)
     assert build.returncode == 0, build.stderr
-    for path in CHECKOUT.glob("configs/**/*.yaml"):
+    shipped = [*CHECKOUT.glob("configs/**/*.yaml"), *CHECKOUT.glob("configs/bench/baselines/*.json")]
+    for path in shipped:
         assert (installed / "sadgs_ns" / path.relative_to(CHECKOUT)).read_bytes() == path.read_bytes()
     look = "from importlib.resources import files; print(files('sadgs_ns.configs') / 'sadgs.yaml')"
     assert python(look, installed).stdout.strip() == str(installed / "sadgs_ns" / "configs" / "sadgs.yaml")

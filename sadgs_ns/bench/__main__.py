@@ -21,7 +21,7 @@ from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from sadgs_ns.bench import protocol, results
+from sadgs_ns.bench import gate, protocol, results
 from sadgs_ns.bench.protocol import Job
 from sadgs_ns.bench.results import Result
 from sadgs_ns.bench.table import markdown
@@ -79,7 +79,12 @@ def launcher(root: Path) -> Launch:
         with (folder / "log").open("wb") as log:
             # A session of its own, so that a compiler the run started can be ended with it.
             return subprocess.Popen(
-                command, stdout=log, stderr=subprocess.STDOUT, env=environment, start_new_session=True
+                command,
+                stdin=subprocess.DEVNULL,  # no prompt of nerfstudio's may wait for somebody
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=environment,
+                start_new_session=True,
             )
 
     return launch
@@ -147,9 +152,10 @@ def line(result: Result) -> str:
 
 def _selected(arguments: argparse.Namespace) -> list[Job]:
     """The protocol's jobs that are asked for, all checked before the first one runs."""
-    from sadgs_ns.bench.run import build_config
+    from sadgs_ns.bench.datasets import runnable
 
-    jobs = protocol.load(arguments.protocol).jobs()
+    chosen = protocol.load(arguments.protocol)
+    jobs = chosen.jobs()
     try:
         jobs = [job for job in jobs if re.search(arguments.only, f"{job.scene.name}/{job.row.label}/{job.seed}")]
     except re.error as error:
@@ -158,16 +164,14 @@ def _selected(arguments: argparse.Namespace) -> list[Job]:
         raise ValueError(f"--only {arguments.only!r} leaves no run; it is searched for in scene/label/seed.")
     if arguments.jobs_per_gpu < 1:
         raise ValueError(f"--jobs-per-gpu must be 1 or more, not {arguments.jobs_per_gpu}.")
-    for job in {(job.scene.name, job.row.label): job for job in jobs}.values():
-        build_config(job.scene, job.row, job.seed, arguments.scenes, Path("unused"))
-    return jobs
+    return runnable(jobs, arguments.scenes, chosen.source, arguments.skip_missing)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a benchmark.
 
     Returns:
-        Exit code: 0, 1 if a run failed, 2 if the input is wrong, 130 after an interrupt.
+        Exit code: 0, 1 if a run failed or the gate found a regression, 2 if the input is wrong, 130 after an interrupt.
     """
     parser = argparse.ArgumentParser(prog="sadgs-bench", description="Run a benchmark, or what is left of it.")
     parser.add_argument("protocol", type=Path, help="YAML file of scenes, rows and seeds")
@@ -177,9 +181,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--jobs-per-gpu", type=int, default=1, help="times are only comparable with 1, the default")
     parser.add_argument("--only", default="", metavar="REGEX", help="only runs whose scene/label/seed match")
     parser.add_argument("--time-limit", type=float, default=float("inf"), metavar="SECONDS", help="then start no run")
+    parser.add_argument("--skip-missing", action="store_true", help="run the scenes that are there")
+    group = parser.add_mutually_exclusive_group()
+    group.add_argument("--gate", type=Path, metavar="BASELINE.json", help="exit with 1 if results are worse than these")
+    group.add_argument("--update-baseline", type=Path, metavar="BASELINE.json", help="write the results' values there")
     parser.add_argument("--reference", metavar="LABEL", help="row whose loop seconds are 1 in the column Ratio")
     arguments = parser.parse_args(argv)
     try:
+        for baseline in (arguments.gate, arguments.update_baseline):
+            if baseline is not None and (baseline == arguments.gate or baseline.exists()):
+                gate.read(baseline)  # its errors now rather than after hours
         jobs = _selected(arguments)
     except ValueError as error:
         print(f"sadgs-bench: {error}", file=sys.stderr)
@@ -209,7 +220,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     latest = {result["key"]: result for result in results.read(arguments.output)}
     rows = [latest[job.key] for job in jobs if job.key in latest]
     print(markdown(rows, arguments.reference))
-    return int(any(row["status"] != "ok" for row in rows))
+    bad = any(row["status"] != "ok" for row in rows)
+    if arguments.gate is not None:
+        bad |= not gate.judge(arguments.gate, jobs, rows)
+    if arguments.update_baseline is not None:
+        try:
+            gate.renew(arguments.update_baseline, jobs, rows)
+        except ValueError as error:
+            print(f"sadgs-bench: {error}", file=sys.stderr)
+            bad = True
+    return int(bad)
 
 
 if __name__ == "__main__":

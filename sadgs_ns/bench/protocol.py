@@ -7,6 +7,7 @@
       - {label: ours, method: sadgs, overrides: {max_num_iterations: 3000}}
 
 A row may name its own `scenes` and `seeds`, and `sweep: {dotted.path: [a, b]}` makes one row of each combination.
+Rows of different scenes may share a label. `source` says where the scenes come from, for whoever lacks them.
 """
 
 from __future__ import annotations
@@ -75,6 +76,8 @@ class Protocol:
     scenes: dict[str, Scene]
     rows: tuple[Row, ...]
     seeds: tuple[int, ...] = (0, 1)
+    source: str | None = None
+    """What the scenes are called and where they come from."""
 
     def jobs(self) -> list[Job]:
         """All runs: rows in their order, then scenes, then seeds."""
@@ -108,18 +111,20 @@ def parse(content: object) -> Protocol:
     Raises:
         ValueError: As `load`, without the file's name.
     """
-    top = _mapping(content, "the protocol", required={"scenes", "rows"}, optional={"seeds"})
+    top = _mapping(content, "the protocol", required={"scenes", "rows"}, optional={"seeds", "source"})
     scenes = {str(name): _scene(str(name), value) for name, value in _mapping(top["scenes"], "scenes").items()}
     if not scenes:
         raise ValueError("scenes is empty; name at least one scene.")
     rows = tuple(
         row for i, value in enumerate(_list(top["rows"], "rows")) for row in _rows(value, f"rows[{i}]", scenes)
     )
-    labels = [row.label for row in rows]
-    for label in labels:
-        if labels.count(label) > 1:
-            raise ValueError(f"two rows have the label {label!r}; give each its own.")
-    return Protocol(scenes, rows, _seeds(top.get("seeds", [0, 1]), "seeds"))
+    seen = set()
+    for label, scene in [(row.label, scene) for row in rows for scene in row.scenes or scenes]:
+        if (label, scene) in seen:
+            raise ValueError(f"two rows have the label {label!r} for {scene}; give each its own.")
+        seen.add((label, scene))
+    source = None if top.get("source") is None else _text(top["source"], "source")
+    return Protocol(scenes, rows, _seeds(top.get("seeds", [0, 1]), "seeds"), source)
 
 
 def set_dotted(config: Any, path: str, value: Any) -> None:
