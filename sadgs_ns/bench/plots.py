@@ -6,6 +6,7 @@ hatch, so that none needs the colour. 7.2 in wide with text of 8 pt and more: tr
 
 from __future__ import annotations
 
+import io
 import itertools
 import math
 import textwrap
@@ -222,15 +223,23 @@ def _stacked_bars(figure: SubFigure, groups: Groups, names: dict[str, str], titl
     _legend(figure, [Patch(**look, label=names[name]) for name, look in looks.items()], 2.5)
 
 
+@_styled
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG (200 dpi) and as SVG, the same bytes for the same figure.
+    """Write a figure as PNG (200 dpi) and as SVG.
 
     Args:
         path: Without suffix.
     """
-    with matplotlib.rc_context(_RC):
-        figure.savefig(path.with_suffix(".png"), dpi=200, metadata={"Software": None})
-        figure.savefig(path.with_suffix(".svg"), metadata={"Date": None})
+    figure.savefig(path.with_suffix(".png"), dpi=200, metadata={"Software": None})
+    path.with_suffix(".svg").write_text(svg(figure), encoding="utf-8")
+
+
+@_styled
+def svg(figure: Figure) -> str:
+    """A figure as SVG, the same text for the same results."""
+    written = io.StringIO()
+    figure.savefig(written, format="svg", metadata={"Date": None})
+    return written.getvalue()
 
 
 def _scenes(groups: Groups) -> list[str]:
@@ -311,6 +320,9 @@ def _finish(panels: dict[tuple[str, str], Axes], form: Formatter) -> None:
         if not axes.lines:
             axes.text(0.5, 0.5, "not measured", transform=axes.transAxes, ha="center", va="center", color=_GREY)
             axes.set_yticks([])
+        if not any(panel.lines for panel in axes.get_shared_x_axes().get_siblings(axes)):
+            axes.set_xticks([])
+            continue
         axes.set_xscale("log")
         low, high = axes.get_xlim()
         widening = max(1.0, math.sqrt(_LEAST_RATIO / (high / low)))
@@ -347,7 +359,7 @@ def _legend(figure: Figure | SubFigure, handles: Sequence[Artist], length: float
     """
     labels = [textwrap.fill(str(handle.get_label()), 60) for handle in handles]
     height = 0.0
-    for lines in range(math.ceil(len(labels) / 6), len(labels) + 1):
+    for lines in range(max(math.ceil(len(labels) / 6), 1), len(labels) + 1):
         # The texts are set afterwards: matplotlib would leave labels out that start with an underscore.
         names, columns = [str(i) for i in range(len(labels))], math.ceil(len(labels) / lines)
         legend = figure.legend(handles, names, loc="outside upper left", ncols=columns, handlelength=length)
