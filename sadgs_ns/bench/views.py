@@ -135,6 +135,6 @@ def _overview(picture: Image.Image, box: Box) -> Image.Image:
     )
     left, top, right, bottom = (round(edge * scale) for edge in box)
     draw = ImageDraw.Draw(small)
-    draw.rectangle((left - 2, top - 2, right + 1, bottom + 1), outline="black")
+    draw.rectangle((left - 3, top - 3, right + 2, bottom + 2), outline="black", width=6)
     draw.rectangle((left - 1, top - 1, right, bottom), outline="white", width=2)
     return small
