@@ -352,6 +352,19 @@ def test_a_method_without_an_image_is_left_out_of_the_view(tmp_path: Path):
     assert [[p.label for p in view.pictures[1:]] for view in shown] == [["faithful"], ["faithful", "blurred"]]
 
 
+def test_a_photograph_with_alpha_lies_over_the_renderings_background(tmp_path: Path):
+    faithful, _ = write_views(tmp_path)
+    rendered = np.full((*SIZE, 3), (250, 240, 230), np.uint8)
+    rendered[40:120, 60:180] = (10, 20, 30)
+    truth = np.zeros((*SIZE, 4), np.uint8)
+    truth[40:120, 60:180] = (10, 20, 30, 255)
+    Image.fromarray(rendered).save(tmp_path / faithful[0])
+    Image.fromarray(truth).save(tmp_path / "fox" / "truth" / "a.png")
+    shown = views.compare(table.groups([result(images=faithful[:1])]), tmp_path, tmp_path / "out", count=1)
+    whole, ours = (Image.open(tmp_path / "out" / picture.overview) for picture in shown[0].pictures)
+    assert np.array_equal(np.asarray(whole), np.asarray(ours))
+
+
 def test_images_that_cannot_be_compared_are_named(tmp_path: Path):
     faithful, _ = write_views(tmp_path)
     groups = table.groups([result(images=faithful)])

@@ -108,6 +108,10 @@ def _write(scene: str, name: str, paths: dict[str, Path], output: Path, prefix: 
         if picture.size != pictures[TRUTH].size:
             sizes = [f"{width}×{height}" for width, height in (picture.size, pictures[TRUTH].size)]
             raise ValueError(f"{paths[label]} has {sizes[0]} pixels, but its photograph has {sizes[1]}.")
+    truth, *rendered = pictures.values()
+    pictures = {label: picture.convert("RGB") for label, picture in pictures.items()}
+    if truth.has_transparency_data:
+        pictures[TRUTH] = _opaque(truth.convert("RGBA"), [np.asarray(image.convert("RGB")) for image in rendered])
     arrays = [np.asarray(picture, np.float32) / 255 for picture in pictures.values()]
     box = crop_window(arrays[0], arrays[1:])
     written = []
@@ -122,9 +126,18 @@ def _write(scene: str, name: str, paths: dict[str, Path], output: Path, prefix: 
 def _read(path: Path) -> Image.Image:
     try:
         with Image.open(path) as image:
-            return image.convert("RGB")
+            image.load()
+            return image
     except (OSError, UnidentifiedImageError) as error:
         raise ValueError(f"{path} is not an image that can be read ({error}).") from error
+
+
+def _opaque(truth: Image.Image, rendered: Sequence[NDArray[np.uint8]]) -> Image.Image:
+    """A photograph with alpha over the background that the renderings show where it is transparent."""
+    clear = np.asarray(truth)[..., 3] == 0
+    shown = np.concatenate([image[clear] for image in rendered])
+    color = np.median(shown, 0).round().astype(int).tolist() if len(shown) else [0, 0, 0]
+    return Image.alpha_composite(Image.new("RGBA", truth.size, (*color, 255)), truth).convert("RGB")
 
 
 def _overview(picture: Image.Image, box: Box) -> Image.Image:
