@@ -9,7 +9,7 @@ from pathlib import Path
 from sadgs_ns.bench import results
 from sadgs_ns.bench.results import Result
 
-_HEADER = ("Scene", "Method", "Loop s", "Ratio", "PSNR", "SSIM", "LPIPS", "Gaussians", "Peak GB", "Seeds")
+HEADER = ("Scene", "Method", "Loop s", "Ratio", "PSNR", "SSIM", "LPIPS", "Gaussians", "Peak GB", "Seeds")
 _NOTHING = "–"
 
 
@@ -23,53 +23,76 @@ def markdown(rows: Iterable[Result], reference: str | None = None) -> str:
     Returns:
         The table, and under it what is wrong with it, if anything.
     """
-    latest = {(row["scene"], row["label"], row["seed"]): row for row in rows}.values()
-    groups: dict[tuple[str, str], list[Result]] = {}
-    for row in latest:
-        if row["status"] == "ok":
-            groups.setdefault((row["scene"], row["label"]), []).append(row)
-    lines = [_HEADER, ("---", "---", *["---:"] * (len(_HEADER) - 2))]
-    for scene in dict.fromkeys(scene for scene, _ in groups):
-        for label in [label for s, label in groups if s == scene]:
-            group = groups[scene, label]
-            base = _mean(groups.get((scene, reference or ""), []), "loop_seconds")
-            loop = _mean(group, "loop_seconds")
-            lines.append(
-                (
-                    scene,
-                    label,
-                    _cell(group, "loop_seconds", ".1f"),
-                    _NOTHING if base is None or loop is None else f"{loop / base:.3f}",
-                    _cell(group, "psnr", ".2f"),
-                    _cell(group, "ssim", ".4f"),
-                    _cell(group, "lpips", ".4f"),
-                    _cell(group, "gaussians", ",.0f"),
-                    _cell(group, "peak_gb", ".2f"),
-                    str(len(group)),
-                )
-            )
+    rows = list(rows)
+    lines = [HEADER, ("---", "---", *["---:"] * (len(HEADER) - 2)), *cells(rows, reference)]
     text = "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
-    notes = [f"- {r['scene']}, {r['label']}, seed {r['seed']} failed: {r['error']}" for r in latest if r["error"]]
-    if any(row.get("jobs_per_gpu", 1) > 1 for row in latest):
-        notes.append("- Some runs shared a GPU: their times are not comparable.")
-    return text + ("\n\n" + "\n".join(notes) if notes else "")
+    return "\n".join([text, *([""] if notes(rows) else []), *(f"- {note}" for note in notes(rows))])
 
 
-def _values(group: list[Result], name: str) -> list[float]:
+def latest(rows: Iterable[Result]) -> list[Result]:
+    """Of several results with one scene, label and seed the last."""
+    return list({(row["scene"], row["label"], row["seed"]): row for row in rows}.values())
+
+
+def groups(rows: Iterable[Result]) -> dict[tuple[str, str], list[Result]]:
+    """The latest results that are ok by scene and label, a list of seeds each; scene by scene, as they first appear."""
+    found: dict[tuple[str, str], list[Result]] = {}
+    for row in latest(rows):
+        if row["status"] == "ok":
+            found.setdefault((row["scene"], row["label"]), []).append(row)
+    scenes = list(dict.fromkeys(scene for scene, _ in found))
+    return dict(sorted(found.items(), key=lambda item: scenes.index(item[0][0])))
+
+
+def cells(rows: Iterable[Result], reference: str | None = None) -> list[tuple[str, ...]]:
+    """The table's lines below `HEADER`; arguments as for `markdown`."""
+    grouped = groups(rows)
+    lines = []
+    for (scene, label), group in grouped.items():
+        base = mean(grouped.get((scene, reference or ""), []), "loop_seconds")
+        loop = mean(group, "loop_seconds")
+        lines.append(
+            (
+                scene,
+                label,
+                _cell(group, "loop_seconds", ".1f"),
+                _NOTHING if base is None or loop is None else f"{loop / base:.3f}",
+                _cell(group, "psnr", ".2f"),
+                _cell(group, "ssim", ".4f"),
+                _cell(group, "lpips", ".4f"),
+                _cell(group, "gaussians", ",.0f"),
+                _cell(group, "peak_gb", ".2f"),
+                str(len(group)),
+            )
+        )
+    return lines
+
+
+def notes(rows: Iterable[Result]) -> list[str]:
+    """What is wrong with the table, a sentence each: runs that failed, times that do not compare."""
+    last = latest(rows)
+    sentences = [f"{r['scene']}, {r['label']}, seed {r['seed']} failed: {r['error']}" for r in last if r.get("error")]
+    if any(row.get("jobs_per_gpu", 1) > 1 for row in last):
+        sentences.append("Some runs shared a GPU: their times are not comparable.")
+    return sentences
+
+
+def _values(group: Iterable[Result], name: str) -> list[float]:
     return [row[name] for row in group if row.get(name) is not None]
 
 
-def _mean(group: list[Result], name: str) -> float | None:
+def mean(group: Iterable[Result], name: str) -> float | None:
+    """Mean of a field over the results that have it; None if none does."""
     values = _values(group, name)
     return sum(values) / len(values) if values else None
 
 
 def _cell(group: list[Result], name: str, form: str) -> str:
-    values, mean = _values(group, name), _mean(group, name)
-    if mean is None:
+    values, average = _values(group, name), mean(group, name)
+    if average is None:
         return _NOTHING
     spread = f" ± {(max(values) - min(values)) / 2:{form}}" if len(values) > 1 else ""
-    return f"{mean:{form}}{spread}"
+    return f"{average:{form}}{spread}"
 
 
 def main() -> None:
