@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from sadgs_ns.bench import results
-from sadgs_ns.bench.eta_errors import demo_training_set, footprint_rows, interval_rows, random_footprints
+from sadgs_ns.bench.eta_errors import RUNS, demo_training_set, footprint_rows, interval_rows, random_footprints
 from sadgs_ns.bench.tensor_errors import AXIS_LENGTHS, Image, Row, batch, robustness_rows, structure_tensor_rows
 from sadgs_ns.demo.scene import describe_scene, render
 from sadgs_ns.strategy import StructureAwareStrategy
@@ -75,7 +75,7 @@ TABLES = {
     "interval": Table(
         "η: every k-th iteration",
         "Ratio: |Δ N_high / N_total| over the axes, in [0, 1]. Flips: axes whose decision to split changes. The last "
-        "row is what chance alone changes.",
+        f"row is what chance alone changes. Means over {RUNS} runs.",
         {
             "mean": ("Ratio, mean", _number),
             "p95": ("Ratio, 95 %", _number),
