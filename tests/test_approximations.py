@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -81,6 +82,12 @@ def test_time_is_the_median_after_a_first_call():
 
     result, ms = timed(function, CPU, repeats=3)
     assert result == 1 and len(calls) == 4 and ms >= 0
+
+
+def test_time_on_a_cpu_is_the_processor_s():
+    _, asleep = timed(lambda: time.sleep(0.05), CPU, repeats=1)
+    _, awake = timed(lambda: sum(range(1_000_000)), CPU, repeats=1)
+    assert asleep < 10 and awake > 1
 
 
 def test_spread_are_numpy_s_percentiles():

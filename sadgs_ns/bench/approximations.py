@@ -1,7 +1,8 @@
 """`sadgs-bench-kernels`: what each shortcut in the frequency analysis gets wrong, beside what it costs.
 
 Four tables: how S̄ is computed and stored, how many samples a footprint gets, how often η is observed, and how S̄ reacts
-to image perturbations as in the paper's supplement. Errors are against float64 or brute force; times are medians.
+to image perturbations as in the paper's supplement. Errors are against float64 or brute force; times are medians, on a
+CPU of processor time.
 """
 
 from __future__ import annotations
