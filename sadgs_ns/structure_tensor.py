@@ -27,24 +27,28 @@ NOISE_FLOOR = 0.02
 """Amplitude, relative to the image's own contrast, under which structure counts as noise: the ε of eq. 3 and 5."""
 ENERGY_BLUR = 2.0
 """E_l² is averaged over a Gaussian window of ENERGY_BLUR · σ_l px before its root; 0 is eq. 4 as printed."""
+TRUNCATION = 3.0
+"""Kernels end at this many standard deviations; what is cut off is 0.3 % of the mass."""
 
 _ROUNDING_FLOOR = 1e-5
 """Amplitude relative to the brightest pixel under which float32 rounding, not the image, makes the differences."""
-_TRUNCATION = 3.0
-"""Kernels end at this many standard deviations; what is cut off is 0.3 % of the mass."""
 
 
-def gaussian_kernel(sigma: float, order: int = 0, dtype: torch.dtype = torch.float32) -> Tensor:
+def gaussian_kernel(
+    sigma: float, order: int = 0, dtype: torch.dtype = torch.float32, truncation: float = TRUNCATION
+) -> Tensor:
     """Sampled 1-D Gaussian, or its derivative, ready for cross-correlation.
 
     Args:
         sigma: Standard deviation in px, > 0.
         order: 0 for the Gaussian (sums to 1), 1 for its first derivative (a unit ramp gives exactly 1).
+        dtype: Of the kernel, which is computed in float64.
+        truncation: Radius in standard deviations, > 0.
 
     Returns:
-        Kernel of odd length 2·⌈3σ⌉ + 1. [K]
+        Kernel of odd length 2·⌈truncation · σ⌉ + 1. [K]
     """
-    radius = math.ceil(_TRUNCATION * sigma)
+    radius = math.ceil(truncation * sigma)
     x = torch.arange(-radius, radius + 1, dtype=torch.float64)  # [K]
     kernel = torch.exp(-0.5 * (x / sigma) ** 2)
     kernel = kernel / kernel.sum()
@@ -77,16 +81,16 @@ def _convolve(image: Tensor, kernel: Tensor, axis: int) -> Tensor:
         return F.conv2d(image, weight, padding=padding, groups=channels)
 
 
-def _blur(image: Tensor, sigma: float) -> Tensor:
+def _blur(image: Tensor, sigma: float, truncation: float) -> Tensor:
     """Separable Gaussian blur with zeros outside. [B, C, H, W] → [B, C, H, W]"""
-    kernel = gaussian_kernel(sigma, dtype=image.dtype)
+    kernel = gaussian_kernel(sigma, dtype=image.dtype, truncation=truncation)
     return _convolve(_convolve(image, kernel, 2), kernel, 3)
 
 
-def _blur_and_gradient(image: Tensor, sigma: float) -> tuple[Tensor, Tensor, Tensor]:
+def _blur_and_gradient(image: Tensor, sigma: float, truncation: float) -> tuple[Tensor, Tensor, Tensor]:
     """Gaussian blur with zeros outside, and its exact x and y derivatives. Each [B, C, H, W], per px."""
-    smooth = gaussian_kernel(sigma, dtype=image.dtype)
-    derive = gaussian_kernel(sigma, order=1, dtype=image.dtype)
+    smooth = gaussian_kernel(sigma, dtype=image.dtype, truncation=truncation)
+    derive = gaussian_kernel(sigma, order=1, dtype=image.dtype, truncation=truncation)
     rows = _convolve(image, smooth, 2)
     return _convolve(rows, smooth, 3), _convolve(rows, derive, 3), _convolve(_convolve(image, derive, 2), smooth, 3)
 
@@ -100,6 +104,8 @@ def multiscale_structure_tensor(
     noise_floor: float = NOISE_FLOOR,
     energy_blur: float = ENERGY_BLUR,
     num_levels: int = NUM_LEVELS,
+    truncation: float = TRUNCATION,
+    incremental: bool = False,
 ) -> Tensor:
     """Aggregate the per-scale structure tensors of a batch of images of one size (paper, eq. 2–5).
 
@@ -117,6 +123,9 @@ def multiscale_structure_tensor(
         energy_blur: Window, in multiples of σ_l, over which the band energy E_l² is averaged. E_l crosses zero twice a
             period; without the window S̄ follows the phase of the texture instead of its frequency.
         num_levels: L + 1.
+        truncation: Radius of every kernel, in multiples of its standard deviation.
+        incremental: Blur level l − 1 by √(σ_l² − σ_{l−1}²) instead of the image by σ_l: shorter kernels, but each
+            level inherits what the one before it lost at borders and by truncation.
 
     Returns:
         S̄ as (xx, xy, yy) in 1/px², positive semidefinite, trace ≤ (c / σ_0)², 0 at masked pixels. [B, H, W, 3]
@@ -149,8 +158,11 @@ def multiscale_structure_tensor(
     previous = image
     for level in range(num_levels):
         sigma = SCALE_STEP**level
-        blurred, blurred_x, blurred_y = _blur_and_gradient(image, sigma)
-        reach, reach_x, reach_y = _blur_and_gradient(weight, sigma)
+        source, step = image, sigma
+        if incremental and level > 0:
+            source, step = previous * valid, math.sqrt(sigma**2 - SCALE_STEP ** (2 * level - 2))
+        blurred, blurred_x, blurred_y = _blur_and_gradient(source, step, truncation)
+        reach, reach_x, reach_y = _blur_and_gradient(weight, step, truncation)
         reach = reach.clamp_min(torch.finfo(image.dtype).tiny)
         smoothed = blurred / reach
         gradient_x = (blurred_x - smoothed * reach_x) / reach  # derivative of the quotient
@@ -159,15 +171,15 @@ def multiscale_structure_tensor(
             [gradient_x.square().sum(1), (gradient_x * gradient_y).sum(1), gradient_y.square().sum(1)], dim=1
         )  # [B, 3, H, W]
         rho = INTEGRATION_FACTOR * sigma
-        integrated = _blur(weight, rho).clamp_min(torch.finfo(image.dtype).tiny)
-        tensor = _blur(products * weight, rho) / integrated  # S_l, eq. 2
+        integrated = _blur(weight, rho, truncation).clamp_min(torch.finfo(image.dtype).tiny)
+        tensor = _blur(products * weight, rho, truncation) / integrated  # S_l, eq. 2
         trace = tensor[:, :1] + tensor[:, 2:]
         normalised = tensor / (trace + (noise / sigma) ** 2)  # Ŝ_l, eq. 3
         energy = (previous - smoothed).square().sum(1, keepdim=True) * weight  # E_l², eq. 4
         if energy_blur > 0:
-            energy = _blur(energy, energy_blur * sigma) / _blur(weight, energy_blur * sigma).clamp_min(
-                torch.finfo(image.dtype).tiny
-            )
+            window = energy_blur * sigma
+            total = _blur(weight, window, truncation).clamp_min(torch.finfo(image.dtype).tiny)
+            energy = _blur(energy, window, truncation) / total
         scale_weight = energy.clamp_min(0) ** (0.5 * gamma)  # E_l^γ
         numerator += scale_weight * (frequency_constant / sigma) ** 2 * normalised
         denominator = denominator + scale_weight
