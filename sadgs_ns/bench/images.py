@@ -21,7 +21,7 @@ MAX_VIEWS = 4
 
 def file_name(text: str) -> str:
     """A text as the name of a file or folder; different texts get different names."""
-    safe = re.sub(r"^\.+|[^A-Za-z0-9._-]+", "_", text)
+    safe = re.sub(r"^\.+|^$|[^A-Za-z0-9._-]+", "_", text)
     return safe if safe == text else f"{safe}-{hashlib.sha256(text.encode()).hexdigest()[:6]}"
 
 
