@@ -233,7 +233,7 @@ def test_samples_that_do_not_spread_are_detected(monkeypatch: pytest.MonkeyPatch
     tensors = multiscale_structure_tensor(texture())
     footprints = random_footprints(400, tensors)
     right = list(footprint_rows(tensors, footprints, repeats=1))[-1]
-    monkeypatch.setattr(eta_errors, "sample_footprint", lambda means2d, conics, generator: means2d)
+    monkeypatch.setattr(eta_errors, "sample_footprint", lambda means2d, conics, jitter: means2d)
     wrong = list(footprint_rows(tensors, footprints, repeats=1))[-1]
     assert wrong["p95"] > 2 * right["p95"]
 

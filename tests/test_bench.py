@@ -65,7 +65,10 @@ def test_sweep_makes_a_row_of_each_combination():
     [
         ([], "the protocol must be a mapping"),
         ({"rows": []}, "the protocol lacks 'scenes'"),
-        (content(speed=1), "the protocol has an unknown key 'speed'; it takes rows, scenes, seeds, source."),
+        (
+            content(speed=1),
+            "the protocol has an unknown key 'speed'; it takes curve_every, rows, scenes, seeds, source.",
+        ),
         (content(scenes={}), "scenes is empty"),
         (content(scenes={"fox": {"data": "fox", "dataparser": "colmap", "eval": 8}}), "unknown key 'eval'"),
         (content(scenes={"fox": {"data": 3, "dataparser": "colmap"}}), "scenes.fox.data must be text, not 3"),

@@ -18,8 +18,17 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from sadgs_ns.bench import gate, protocol, results
 from sadgs_ns.bench.protocol import Job
@@ -69,11 +78,12 @@ class _Run:
             self.process.wait()
 
 
-def launcher(root: Path) -> Launch:
-    """Starts jobs with `sadgs_ns.bench.run`, on scenes in a folder."""
+def launcher(root: Path, images: Path | None = None) -> Launch:
+    """Starts jobs with `sadgs_ns.bench.run`, on scenes in a folder, with another for images of held-out views."""
 
     def launch(job: Job, gpu: str | None, folder: Path) -> subprocess.Popen[bytes]:
-        spec = json.dumps({**dataclasses.asdict(job), "root": str(root)}, default=str)
+        folders = {"root": str(root), "images": None if images is None else str(images)}
+        spec = json.dumps({**dataclasses.asdict(job), **folders}, default=str)
         command = [sys.executable, "-m", "sadgs_ns.bench.run", "--spec", spec, "--out", str(folder / "result.json")]
         environment = dict(os.environ) if gpu is None else {**os.environ, "CUDA_VISIBLE_DEVICES": gpu}
         with (folder / "log").open("wb") as log:
@@ -150,6 +160,24 @@ def line(result: Result) -> str:
     )
 
 
+def progress_bar(total: int, done: int, **options: Any) -> tuple[Progress, TaskID]:
+    """A bar over all runs, and its task.
+
+    The time left is estimated from the runs that have ended since it was made, on all GPUs together.
+
+    Args:
+        done: Runs that had ended before.
+        options: Of rich's Progress.
+    """
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    left = (TextColumn("left"), TimeRemainingColumn())
+    # rich would estimate from the last 30 s, in which at most one run ends.
+    progress = Progress(*columns, *left, speed_estimate_period=float("inf"), **options)
+    task = progress.add_task("Runs", total=total, completed=done)
+    progress.advance(task, 0)  # the moment from which the first run counts
+    return progress, task
+
+
 def _selected(arguments: argparse.Namespace) -> list[Job]:
     """The protocol's jobs that are asked for, all checked before the first one runs."""
     from sadgs_ns.bench.datasets import runnable
@@ -162,6 +190,8 @@ def _selected(arguments: argparse.Namespace) -> list[Job]:
         raise ValueError(f"--only {arguments.only!r} is not a regular expression ({error}).") from error
     if not jobs:
         raise ValueError(f"--only {arguments.only!r} leaves no run; it is searched for in scene/label/seed.")
+    if arguments.images is not None and arguments.images.exists() and not arguments.images.is_dir():
+        raise ValueError(f"--images {arguments.images} is a file; give a folder.")
     if arguments.jobs_per_gpu < 1:
         raise ValueError(f"--jobs-per-gpu must be 1 or more, not {arguments.jobs_per_gpu}.")
     return runnable(jobs, arguments.scenes, chosen.source, arguments.skip_missing)
@@ -181,6 +211,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--jobs-per-gpu", type=int, default=1, help="times are only comparable with 1, the default")
     parser.add_argument("--only", default="", metavar="REGEX", help="only runs whose scene/label/seed match")
     parser.add_argument("--time-limit", type=float, default=float("inf"), metavar="SECONDS", help="then start no run")
+    parser.add_argument("--images", type=Path, metavar="FOLDER", help="write some held-out views of each run as PNG")
     parser.add_argument("--skip-missing", action="store_true", help="run the scenes that are there")
     group = parser.add_mutually_exclusive_group()
     group.add_argument("--gate", type=Path, metavar="BASELINE.json", help="exit with 1 if results are worse than these")
@@ -197,11 +228,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
 
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    todo = unfinished(jobs, results.read(arguments.output))
+    done = results.read(arguments.output)
+    todo = unfinished(jobs, done)
+    if arguments.images is not None:
+        keys = {job.key for job in jobs} - {job.key for job in todo}
+        without = sum("images" not in result for result in done if result["key"] in keys)
+        if without:
+            print(f"{without} finished runs have no images; delete their lines to run them again.", flush=True)
     log = arguments.output.with_suffix(".log")
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, disable=not sys.stdout.isatty()) as progress:
-        task = progress.add_task("Runs", total=len(jobs), completed=len(jobs) - len(todo))
+    progress, task = progress_bar(len(jobs), len(jobs) - len(todo), disable=not sys.stdout.isatty())
+    with progress:
 
         def finished(result: Result) -> None:
             results.append(arguments.output, result)
@@ -210,7 +246,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         arguments.output.parent.mkdir(parents=True, exist_ok=True)
         gpus = arguments.gpus.split(",") if arguments.gpus else (None,)
-        launch = launcher(arguments.scenes.resolve())
+        images = None if arguments.images is None else arguments.images.resolve()
+        launch = launcher(arguments.scenes.resolve(), images)
         try:
             left = run_all(todo, launch, finished, log, gpus, arguments.jobs_per_gpu, arguments.time_limit)
         except KeyboardInterrupt:

@@ -105,9 +105,8 @@ def sampled_average(
     """
     total, count = torch.zeros_like(conics), torch.zeros_like(conics[:, 0])
     for _ in range(samples):
-        values, inside = sample_map(
-            tensors, footprints.image_ids, sample_footprint(footprints.means2d, conics, generator)
-        )
+        jitter = torch.rand(footprints.means2d.shape, generator=generator, device=conics.device)
+        values, inside = sample_map(tensors, footprints.image_ids, sample_footprint(footprints.means2d, conics, jitter))
         total += values
         count += inside
     return total / count.clamp_min(1)[:, None], count > 0

@@ -7,7 +7,8 @@
       - {label: ours, method: sadgs, overrides: {max_num_iterations: 3000}}
 
 A row may name its own `scenes` and `seeds`, and `sweep: {dotted.path: [a, b]}` makes one row of each combination.
-Rows of different scenes may share a label. `source` says where the scenes come from, for whoever lacks them.
+Rows of different scenes may share a label. `source` says where the scenes come from, for whoever lacks them;
+`curve_every: 500` also measures the held-out views every 500 iterations of each run.
 """
 
 from __future__ import annotations
@@ -60,11 +61,15 @@ class Job:
     scene: Scene
     row: Row
     seed: int
+    curve_every: int | None = None
+    """Iterations between measurements of the held-out views within the run; None makes none."""
 
     @property
     def key(self) -> str:
         """Identifies the run in a results file: scene, label, seed and a hash of everything that sets it up."""
-        settings = [self.row.method, self.row.overrides, dataclasses.asdict(self.scene)]
+        settings: list[Any] = [self.row.method, self.row.overrides, dataclasses.asdict(self.scene)]
+        if self.curve_every is not None:  # a finished run without the curve is not what is asked for
+            settings.append(self.curve_every)
         digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()[:12]
         return f"{self.scene.name}/{self.row.label}/{self.seed}/{digest}"
 
@@ -78,11 +83,13 @@ class Protocol:
     seeds: tuple[int, ...] = (0, 1)
     source: str | None = None
     """What the scenes are called and where they come from."""
+    curve_every: int | None = None
+    """As in `Job`."""
 
     def jobs(self) -> list[Job]:
         """All runs: rows in their order, then scenes, then seeds."""
         return [
-            Job(self.scenes[name], row, seed)
+            Job(self.scenes[name], row, seed, self.curve_every)
             for row in self.rows
             for name in (self.scenes if row.scenes is None else row.scenes)
             for seed in (self.seeds if row.seeds is None else row.seeds)
@@ -111,7 +118,8 @@ def parse(content: object) -> Protocol:
     Raises:
         ValueError: As `load`, without the file's name.
     """
-    top = _mapping(content, "the protocol", required={"scenes", "rows"}, optional={"seeds", "source"})
+    optional = {"seeds", "source", "curve_every"}
+    top = _mapping(content, "the protocol", required={"scenes", "rows"}, optional=optional)
     scenes = {str(name): _scene(str(name), value) for name, value in _mapping(top["scenes"], "scenes").items()}
     if not scenes:
         raise ValueError("scenes is empty; name at least one scene.")
@@ -124,7 +132,10 @@ def parse(content: object) -> Protocol:
             raise ValueError(f"two rows have the label {label!r} for {scene}; give each its own.")
         seen.add((label, scene))
     source = None if top.get("source") is None else _text(top["source"], "source")
-    return Protocol(scenes, rows, _seeds(top.get("seeds", [0, 1]), "seeds"), source)
+    curve_every = top.get("curve_every")
+    if curve_every is not None and (type(curve_every) is not int or curve_every < 1):
+        raise ValueError(f"curve_every must be a whole number of iterations from 1, not {curve_every!r}.")
+    return Protocol(scenes, rows, _seeds(top.get("seeds", [0, 1]), "seeds"), source, curve_every)
 
 
 def set_dotted(config: Any, path: str, value: Any) -> None:

@@ -1,6 +1,7 @@
 """One training run, measured, in a process of its own: `python -m sadgs_ns.bench.run --spec JSON --out FILE`.
 
-The spec is a `protocol.Job` as a dict, with "root", the folder that holds all scenes. Nothing heavy is imported before
+The spec is a `protocol.Job` as a dict, with "root", the folder that holds all scenes, and "images", the folder for
+renderings or null. Nothing heavy is imported before
 the clock runs.
 """
 
@@ -17,7 +18,7 @@ import tempfile
 import time
 import traceback
 import urllib.error
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -83,57 +84,31 @@ def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> T
     return config
 
 
-class LoopTimer:
-    """Times the training loop, and nothing else, from two of the trainer's callbacks.
-
-    The GPU is waited for at the first and at the last iteration only.
-    """
-
-    def __init__(self) -> None:
-        self.seconds: float | None = None
-        self.peak_gb: float | None = None
-        """Largest memory that tensors took in the loop, in 10⁹ bytes; None without a GPU."""
-        self._start = 0.0
-
-    def attach(self, trainer: Any) -> None:
-        """Register with a nerfstudio Trainer that is set up."""
-        from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-
-        last = trainer.config.max_num_iterations - 1
-        before, after = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN_ITERATION
-        trainer.callbacks.insert(0, TrainingCallback([before], self._begin, iters=(0,)))
-        trainer.callbacks.append(TrainingCallback([after], self._end, iters=(last,)))
-
-    def _begin(self, step: int) -> None:
-        import torch
-
-        from sadgs_ns.bench.evaluate import now
-
-        if torch.cuda.is_available():
-            torch.cuda.reset_peak_memory_stats()
-        self._start = now()
-
-    def _end(self, step: int) -> None:
-        import torch
-
-        from sadgs_ns.bench.evaluate import now
-
-        self.seconds = now() - self._start
-        if torch.cuda.is_available():
-            self.peak_gb = torch.cuda.max_memory_allocated() / 1e9
-
-
-def run_row(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> dict[str, Any]:
+def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dict[str, Any]:
     """Train once and measure.
 
     Args:
         root: Folder that holds all scenes.
         work: Folder for what nerfstudio writes; the caller deletes it.
+        images: Folder for renderings of held-out views; None makes none.
 
     Returns:
-        JSON-ready: `loop_seconds` and the other times in s (`wall_seconds`: all of them, from the first import to the
-        saved checkpoint), `psnr`, `ssim`, `lpips` (None without weights) over the held-out views, `train_psnr`, `fps`,
-        `gaussians`, `peak_gb`, and what the machine and the software were.
+        JSON-ready. Times in s:
+            import_seconds, setup_seconds, initialization_seconds, load_seconds, warmup_seconds,
+            structure_tensor_seconds: One after the other, before the loop. `initialization` makes the model from the
+                points (with splatfacto it also loads LPIPS); `setup` is parsing the data and all else that nerfstudio
+                builds; `structure_tensor` is there only where the method has them.
+            loop_seconds: The training loop, nothing else.
+            train_seconds: The loop and the checkpoint after it.
+            wall_seconds: Everything from the first import to the saved checkpoint.
+            evaluation_seconds: After it.
+        Over the held-out views: `psnr` in dB, `ssim`, `ssim_padded`, `lpips`, `lpips_vgg` (None without weights; see
+        `evaluate`); and `train_psnr` over some training views, `fps`, `gaussians`, `peak_gb`, how many views there
+        were, the machine's `gpu`.
+            phases: Milliseconds a step, by phase; see `phases.measure`.
+            curve: Only if the job asks for it: the points of `curve.Curve`, the last one being the finished run.
+                None of the times above contains its evaluations.
+            images: Only with `images`: the renderings' paths in that folder.
 
     Raises:
         ValueError: As `build_config`.
@@ -146,7 +121,10 @@ def run_row(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> dict[s
     # ns-train's own module: importing it also sets cuDNN as in a user's run.
     from nerfstudio.scripts.train import _set_random_seed
 
-    from sadgs_ns.bench import evaluate
+    from sadgs_ns.bench import evaluate, phases
+    from sadgs_ns.bench import images as pictures
+    from sadgs_ns.bench.curve import Curve, point
+    from sadgs_ns.bench.timer import LoopTimer
 
     seconds["import_seconds"] = time.perf_counter() - start
 
@@ -156,11 +134,20 @@ def run_row(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> dict[s
         yield
         seconds[f"{name}_seconds"] = evaluate.now() - begin
 
+    def timed_initialization(populate_modules: Callable[[Any], None]) -> Callable[[Any], None]:
+        def populate(model: Any) -> None:
+            with timed("initialization"):
+                populate_modules(model)
+
+        return populate
+
     with timed("setup"):
-        config = build_config(scene, row, seed, root, work)
-        _set_random_seed(seed)
+        config = build_config(job.scene, job.row, job.seed, root, work)
+        _set_random_seed(job.seed)
         trainer: Any = config.setup(local_rank=0, world_size=1)
-        trainer.setup(test_mode="test")  # "val" would evaluate on blender's validation views
+        with phases.replaced(config.pipeline.model._target, "populate_modules", timed_initialization):
+            trainer.setup(test_mode="test")  # "val" would evaluate on blender's validation views
+    seconds["setup_seconds"] -= seconds["initialization_seconds"]
     pipeline, datamanager, model = trainer.pipeline, trainer.pipeline.datamanager, trainer.pipeline.model
     with timed("load"):  # else the first iteration decodes all images
         train_images, _ = datamanager.cached_train, datamanager.cached_eval
@@ -178,24 +165,29 @@ def run_row(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> dict[s
         with timed("structure_tensor"):
             _ = pipeline.structure_tensors
 
-    timer = LoopTimer()
+    timer, curve = LoopTimer(), None
+    if job.curve_every is not None:
+        curve = Curve(job.curve_every, timer)
+        curve.attach(trainer)
     timer.attach(trainer)
-    with timed("train"):  # the loop and the checkpoint after it
+    with timed("train"):
         trainer.train()
-    wall = time.perf_counter() - start
-    if timer.seconds is None:
+    seconds["train_seconds"] -= timer.stopped_seconds
+    wall = time.perf_counter() - start - timer.stopped_seconds
+    if not timer.finished:
         raise RuntimeError("the training loop stopped before its last iteration.")
 
     pipeline.eval()
     views = datamanager.fixed_indices_eval_dataloader
     with timed("evaluation"):
-        held_out = evaluate.quality(model, views, evaluate.load_lpips(trainer.device))
+        networks = {"lpips": evaluate.load_lpips(), "lpips_vgg": evaluate.load_lpips_vgg()}
+        held_out = evaluate.quality(model, views, networks)
         indices = torch.linspace(0, len(train_images) - 1, TRAIN_VIEWS).long().unique().tolist()
         train_cameras = datamanager.train_dataset.cameras
         train_views = [(train_cameras[i : i + 1].to(trainer.device), train_images[i]) for i in indices]
-        train_psnr = evaluate.quality(model, train_views, None)["psnr"]
+        train_psnr = evaluate.quality(model, train_views, {})["psnr"]
         fps = evaluate.frames_per_second(model, [camera for camera, _ in views])
-    return {
+    record = {
         "iterations": config.max_num_iterations,
         "loop_seconds": timer.seconds,
         **seconds,
@@ -209,6 +201,15 @@ def run_row(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> dict[s
         "eval_views": len(views),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
     }
+    if curve is not None:
+        end = point(config.max_num_iterations, timer.seconds, held_out, int(model.num_points))
+        record["curve"] = [*curve.points, end]
+    if images is not None:
+        names = [Path(path).stem for path in datamanager.eval_dataset.image_filenames]
+        where = (images, job.scene.name, job.row.label, job.seed)
+        record["images"] = pictures.save(model, views, names, *where)
+    record["phases"] = phases.measure(trainer)  # last: it goes on training the model
+    return record
 
 
 def software() -> dict[str, str | None]:
@@ -255,7 +256,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     arguments = parser.parse_args()
     spec = json.loads(arguments.spec)
-    job = Job(Scene(**spec["scene"]), Row(**spec["row"]), spec["seed"])
+    job = Job(Scene(**spec["scene"]), Row(**spec["row"]), spec["seed"], spec["curve_every"])
+    images = None if spec["images"] is None else Path(spec["images"])
     record = {
         "status": "ok",
         "error": None,
@@ -264,7 +266,7 @@ def main() -> None:
     }
     with tempfile.TemporaryDirectory(dir=arguments.out.parent) as work:
         try:
-            record |= run_row(job.scene, job.row, job.seed, Path(spec["root"]), Path(work))
+            record |= run_row(job, Path(spec["root"]), Path(work), images)
         except Exception as error:
             traceback.print_exc()
             record |= {"status": "failed", "error": describe(error)}

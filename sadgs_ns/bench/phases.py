@@ -1,0 +1,212 @@
+"""Where the time of a training step goes.
+
+A step is taken apart at seams that every splatting model of nerfstudio has: its rendering, its losses, autograd's
+backward pass and the optimizers. Whatever lies between them is the rest, so the phases always add up to the step.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import sadgs_ns.strategy
+
+PHASES: tuple[str, ...] = ("rasterize_forward", "rasterize_backward", "loss", "eta", "optimizer", "rest")
+STEPS = 30
+"""Steps that are measured, at least."""
+WARMUP = 3
+"""Steps before them."""
+
+_SCHEDULE = ("refine_every", "reset_every", "structure_every", "absgs_every", "refine_stop_iter")
+"""Fields of a strategy, gsplat's or ours, that say when it densifies."""
+
+
+@contextlib.contextmanager
+def replaced(owner: Any, name: str, wrap: Callable[[Callable[..., Any]], Callable[..., Any]]) -> Iterator[None]:
+    """For the duration, calls of a function of a module, class or object go to `wrap(function)`."""
+    own = vars(owner).get(name)
+    setattr(owner, name, wrap(getattr(owner, name)))
+    try:
+        yield
+    finally:
+        if own is None:
+            delattr(owner, name)  # it was the class's
+        else:
+            setattr(owner, name, own)
+
+
+class Stopwatch:
+    """Books the time between marks under phases.
+
+    On CUDA a mark is an event in the GPU's own queue, so that neither waits for the other and the steps take as long as
+    they always do; elsewhere it is the clock's time. Time in which the GPU waits for the host counts for the phase that
+    it waits in.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._marks: list[tuple[str, Any]] = []  # the phase that begins, and when
+
+    @property
+    def phase(self) -> str:
+        """What time is booked under now."""
+        return self._marks[-1][0] if self._marks else "rest"
+
+    def restart(self) -> None:
+        """Forget what was booked."""
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+        self._marks.clear()
+        self.begin("rest")
+
+    def begin(self, phase: str) -> None:
+        """Book the time from now on under a phase."""
+        if self._device.type == "cuda":
+            event = torch.cuda.Event(enable_timing=True)
+            event.record(torch.cuda.current_stream(self._device))
+            self._marks.append((phase, event))
+        else:
+            self._marks.append((phase, time.perf_counter()))
+
+    def seconds(self) -> dict[str, float]:
+        """Seconds of each phase since `restart`; they add up to all of the time since then."""
+        self.begin(self.phase)
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+        total = dict.fromkeys(PHASES, 0.0)
+        for (phase, start), (_, end) in zip(self._marks[:-1], self._marks[1:], strict=True):
+            total[phase] += start.elapsed_time(end) / 1000 if self._device.type == "cuda" else end - start
+        return total
+
+    def during(self, phase: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+        """A decorator: the function's time is booked under a phase, and what follows as what came before."""
+
+        def wrap(function: Callable[..., Any]) -> Callable[..., Any]:
+            @functools.wraps(function)
+            def booked(*args: Any, **kwargs: Any) -> Any:
+                before = self.phase
+                self.begin(phase)
+                try:
+                    return function(*args, **kwargs)
+                finally:
+                    self.begin(before)
+
+            return booked
+
+        return wrap
+
+    def when_gradient_arrives(self, tensor: Any, phase: str) -> None:
+        """In the backward pass, book the time from the tensor's gradient on under a phase."""
+        if isinstance(tensor, Tensor) and tensor.requires_grad:
+
+            def hook(_: Tensor) -> None:
+                self.begin(phase)
+
+            tensor.register_hook(hook)
+
+
+@contextlib.contextmanager
+def booked(trainer: Any, watch: Stopwatch) -> Iterator[None]:
+    """For the duration, a nerfstudio Trainer's steps are booked by phase."""
+    model, optimizers = trainer.pipeline.model, trainer.optimizers
+
+    def rendering(function: Callable[..., Any]) -> Callable[..., Any]:
+        def render(*args: Any, **kwargs: Any) -> Any:
+            outputs = watch.during("rasterize_forward")(function)(*args, **kwargs)
+            watch.when_gradient_arrives(outputs["rgb"], "rasterize_backward")
+            return outputs
+
+        return render
+
+    def losing(function: Callable[..., Any]) -> Callable[..., Any]:
+        def lose(*args: Any, **kwargs: Any) -> Any:
+            losses = watch.during("loss")(function)(*args, **kwargs)
+            for loss in losses.values():  # with several renderings a step, this one's backward pass begins here
+                watch.when_gradient_arrives(loss, "loss")
+            return losses
+
+        return lose
+
+    # sadgs trains on several views at once, which nerfstudio's method cannot express.
+    render = "get_training_outputs" if hasattr(model, "get_training_outputs") else "get_outputs"
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(replaced(model, render, rendering))
+        stack.enter_context(replaced(model, "get_loss_dict", losing))
+        stack.enter_context(replaced(torch.Tensor, "backward", watch.during("loss")))
+        stack.enter_context(replaced(sadgs_ns.strategy, "observe", watch.during("eta")))
+        for name in ("zero_grad_some", "optimizer_scaler_step_some", "scheduler_step_all"):
+            stack.enter_context(replaced(optimizers, name, watch.during("optimizer")))
+        yield
+
+
+@contextlib.contextmanager
+def within_densification(strategy: Any) -> Iterator[None]:
+    """For the duration, a strategy collects its statistics as before it stopped, and never acts on them.
+
+    Its window is opened and the next clone, split, prune and reset is put out of reach; what is off (0) stays off.
+    """
+    schedule = {name: getattr(strategy, name) for name in _SCHEDULE if getattr(strategy, name, 0) > 0}
+    try:
+        for name in schedule:
+            setattr(strategy, name, sys.maxsize)
+        yield
+    finally:
+        for name, value in schedule.items():
+            setattr(strategy, name, value)
+
+
+def measure(trainer: Any, steps: int = STEPS) -> dict[str, float]:
+    """Train some steps beyond the end of a run and take their time apart.
+
+    What is measured is a step with the trained model's Gaussians as within the densification window: the strategy
+    observes η and gathers gradients as it did then, but densifies nothing. It therefore takes longer than the run's
+    mean step: most of those had fewer Gaussians or no statistics to keep.
+
+    Phases:
+        rasterize_forward: From the parameters to the image, activations and background included, η excluded.
+        rasterize_backward: From the image's gradient to the parameters' gradients.
+        loss: From the image and the photograph to the loss, and from there to the image's gradient.
+        eta: Observing η. It is due every `eta_every` steps; this is its share of each. 0 without such a strategy.
+        optimizer: Zeroing gradients, the optimizers, and the learning rates' schedules.
+        rest: Choosing views, metrics, gathering structure tensors and gradient statistics, nerfstudio's overhead.
+
+    Args:
+        trainer: A nerfstudio Trainer after `train`; its model goes on training.
+        steps: How many, rounded up to a multiple of `eta_every`.
+
+    Returns:
+        Milliseconds of each phase in a step, the mean over the steps; their sum is the step's wall time.
+    """
+    model = trainer.pipeline.model
+    strategy = getattr(model, "strategy", None)
+    every = getattr(strategy, "eta_every", 1)
+    steps = -(-steps // every) * every
+    first = trainer.config.max_num_iterations
+    watch = Stopwatch(torch.device(model.device))
+    with within_densification(strategy), booked(trainer, watch):
+        for step in range(first, first + WARMUP + steps):
+            if step == first + WARMUP:
+                watch.restart()
+            _step(trainer, step)
+        seconds = watch.seconds()
+    return {phase: 1000 * value / steps for phase, value in seconds.items()}
+
+
+def _step(trainer: Any, step: int) -> None:
+    """One turn of nerfstudio's training loop."""
+    from nerfstudio.engine.callbacks import TrainingCallbackLocation
+
+    trainer.step = step
+    trainer.pipeline.train()
+    for callback in trainer.callbacks:
+        callback.run_callback_at_location(step, location=TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
+    trainer.train_iteration(step)
+    for callback in trainer.callbacks:
+        callback.run_callback_at_location(step, location=TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
