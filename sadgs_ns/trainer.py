@@ -39,8 +39,8 @@ class SadgsTrainerConfig(TrainerConfig):
     """Steps between metrics of one held-out view, where a logger such as tensorboard is on."""
     steps_per_eval_all_images: int = 0
     """Steps between metrics of all held-out views; 0 is never. `ns-eval` measures them after training."""
-    scale_position_lr: bool = False
-    """Multiply the position learning rate with the cameras' extent, as 3DGS does; nerfstudio scales poses to 1."""
+    scale_position_lr: bool = True
+    """Multiply the position learning rate with the cameras' extent, as 3DGS does; splatfacto does not."""
 
 
 class SadgsTrainer(Trainer):

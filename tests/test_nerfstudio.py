@@ -350,6 +350,7 @@ def test_the_position_rate_ends_at_a_hundredth_whatever_the_length_of_the_run(
     iterations: int, colmap: ColmapDataParserConfig, tmp_path: Path
 ):
     config = configure(tmp_path, colmap, iterations)
+    config.scale_position_lr = False
     rates: list[float] = []
     trainer = set_up(config)
     rate = trainer.optimizers.schedulers["means"].get_last_lr
@@ -359,10 +360,8 @@ def test_the_position_rate_ends_at_a_hundredth_whatever_the_length_of_the_run(
     assert rates == pytest.approx([1.6e-4, 1.6e-6])
 
 
-def test_the_position_rate_grows_with_the_cameras_extent_on_request(colmap: ColmapDataParserConfig, tmp_path: Path):
-    config = configure(tmp_path, colmap)
-    config.scale_position_lr = True
-    trainer = set_up(config)
+def test_the_position_rate_grows_with_the_cameras_extent(colmap: ColmapDataParserConfig, tmp_path: Path):
+    trainer = set_up(configure(tmp_path, colmap))
     extent = trainer.pipeline.model.strategy_state["scene_scale"]
     assert extent != pytest.approx(1.0)
     assert trainer.optimizers.schedulers["means"].get_last_lr() == pytest.approx([1.6e-4 * extent])
