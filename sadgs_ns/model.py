@@ -77,7 +77,8 @@ class SadgsModelConfig(SplatfactoModelConfig):
     l2_lambda: float = 2.0
     """Weight of the squared error that is added to the loss for faster convergence."""
     fused: bool = True
-    """Use the Triton kernels where they run (CUDA); without them, the torch code that they are tested against."""
+    """Train with Triton kernels where they run (CUDA), instead of the torch and gsplat code that they are tested
+    against: rasterization's tile lists and harmonics, loss, η and Adam."""
     bounding_box_points: bool = True
     """Also start from points on the faces of the SfM points' bounding box."""
     camera_clearance: float = 2.0

@@ -14,6 +14,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from sadgs_ns import kernels
 from sadgs_ns.model import SadgsModel, SadgsModelConfig
 from sadgs_ns.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.structure_tensor import (
@@ -71,6 +72,10 @@ class SadgsPipeline(VanillaPipeline):
             CONSOLE.print(
                 f"[yellow]The images were put on {parsed_on}, the Gaussians lie on {config.model.background_color}: "
                 f"consider --pipeline.model.background-color {parsed_on}.[/]"
+            )
+        if config.model.fused and self.device.type == "cuda" and not kernels.available(self.device):
+            CONSOLE.print(
+                "[yellow]Triton does not run here: without its kernels training takes about twice as long.[/]"
             )
         positions = self.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]  # [C, 3]
         self.model.set_cameras(positions)

@@ -13,7 +13,7 @@ from nerfstudio.configs.base_config import MachineConfig
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
-from sadgs_ns.optimizers import RunLengthDecaySchedulerConfig
+from sadgs_ns.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
 from sadgs_ns.pipeline import SadgsPipeline, SadgsPipelineConfig
 
 
@@ -59,10 +59,12 @@ class SadgsTrainer(Trainer):
         super().__init__(config, local_rank, world_size)
 
     def setup_optimizers(self) -> Optimizers:
-        """Build the optimizers with schedules as long as the run."""
+        """Build the optimizers with schedules as long as the run, fused where the model is."""
         optimizers: dict[str, Any] = copy.deepcopy(dict(self.config.optimizers))
         for group in optimizers.values():
-            scheduler = group["scheduler"]
+            scheduler, optimizer = group["scheduler"], group["optimizer"]
+            if isinstance(optimizer, FusedAdamOptimizerConfig):
+                optimizer.fused &= self.config.pipeline.model.fused
             if isinstance(scheduler, RunLengthDecaySchedulerConfig) and scheduler.max_steps is None:
                 scheduler.max_steps = self.config.max_num_iterations
         if self.config.scale_position_lr:

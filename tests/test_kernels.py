@@ -62,6 +62,17 @@ def test_kernels_are_for_cuda_only():
     assert not kernels.available(torch.device("cpu"))
 
 
+def test_a_triton_that_compiles_is_found_and_one_that_does_not_is_told_once(monkeypatch):
+    assert kernels._compiles.__wrapped__(DEVICE)
+
+    def fail(device):
+        raise RuntimeError("Failed to find C compiler.\nPlease specify via CC")
+
+    monkeypatch.setattr("sadgs_ns.kernels.probe.probe", fail)
+    with pytest.warns(UserWarning, match=r"do not run here: Failed to find C compiler\.$"):
+        assert not kernels._compiles.__wrapped__(DEVICE)
+
+
 @pytest.mark.parametrize("degree", range(4))
 def test_colours_and_gradients_equal_gsplats_float64_harmonics(degree):
     generator = torch.Generator().manual_seed(degree)

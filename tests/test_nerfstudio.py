@@ -360,6 +360,14 @@ def test_the_position_rate_ends_at_a_hundredth_whatever_the_length_of_the_run(
     assert rates == pytest.approx([1.6e-4, 1.6e-6])
 
 
+def test_one_switch_takes_all_kernels_out(colmap: ColmapDataParserConfig, tmp_path: Path):
+    config = configure(tmp_path, colmap)
+    config.pipeline.model.fused = False
+    trainer = set_up(config)
+    assert not trainer.pipeline.model.strategy.fused
+    assert not any(optimizer.defaults["fused"] for optimizer in trainer.optimizers.optimizers.values())
+
+
 def test_the_position_rate_grows_with_the_cameras_extent(colmap: ColmapDataParserConfig, tmp_path: Path):
     trainer = set_up(configure(tmp_path, colmap))
     extent = trainer.pipeline.model.strategy_state["scene_scale"]

@@ -2,11 +2,29 @@
 
 from __future__ import annotations
 
+import warnings
+from functools import cache
 from importlib.util import find_spec
 
 import torch
 
 
 def available(device: torch.device) -> bool:
-    """Whether tensors on this device can go through the kernels: it is CUDA, and Triton came with torch."""
-    return device.type == "cuda" and find_spec("triton") is not None
+    """Whether the kernels run on this device: it is CUDA, and Triton, which comes with torch, compiles for it."""
+    return device.type == "cuda" and _compiles(device)
+
+
+@cache
+def _compiles(device: torch.device) -> bool:
+    """Try a small kernel once: Triton also needs a C compiler, Python's headers and a GPU that it knows."""
+    if find_spec("triton") is None:
+        return False
+    try:
+        from sadgs_ns.kernels.probe import probe
+
+        probe(device)
+    except Exception as error:
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        warnings.warn(f"Triton's kernels do not run here: {reason}", stacklevel=3)
+        return False
+    return True
