@@ -128,6 +128,7 @@ class SadgsPipeline(VanillaPipeline):
             frequency_constant=self.config.frequency_constant,
             noise_floor=self.config.noise_floor,
             energy_blur=self.config.energy_blur,
+            fused=self.config.model.fused,
         ).half()
 
     def _next_view(self) -> tuple[int, dict[str, Any]]:
