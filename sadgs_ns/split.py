@@ -106,7 +106,8 @@ def grid_split(
     local_parents, grid = grid_offsets(counts[selected], extent, params["scales"].dtype)
     parents = selected[local_parents]  # [Q]
     rotmats = normalized_quat_to_rotmat(F.normalize(params["quats"][parents], dim=-1))  # [Q, 3, 3]
-    offsets = torch.einsum("qij,qj->qi", rotmats, params["scales"][parents].exp() * grid)  # [Q, 3]
+    # Not a batched matrix product: cuBLAS takes 3×3 matrices 65,535 at a time.
+    offsets = (rotmats * (params["scales"][parents].exp() * grid)[:, None]).sum(dim=-1)  # [Q, 3]
     shrink = counts[parents].to(params["scales"].dtype).log()  # [Q, 3]
 
     def param_fn(name: str, p: Tensor) -> Tensor:

@@ -7,7 +7,8 @@ Adam with its moments. Each part is timed by itself, then the whole step, a spli
 from __future__ import annotations
 
 import argparse
-import statistics as mean_of
+import statistics
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -28,17 +29,16 @@ ETA_EVERY = 10
 
 
 def milliseconds(function: Callable[[], object]) -> float:
-    """Median time of a call on the device, after three to warm up."""
+    """Time of a call among calls that follow each other, as in training: the median of five rounds, after one."""
     times = []
-    for repeat in range(REPEATS + 3):
-        start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
-        start.record()
-        function()
-        end.record()
+    for _ in range(6):
         torch.cuda.synchronize()
-        if repeat >= 3:
-            times.append(start.elapsed_time(end))
-    return mean_of.median(times)
+        start = time.perf_counter()
+        for _ in range(REPEATS):
+            function()
+        torch.cuda.synchronize()
+        times.append((time.perf_counter() - start) / REPEATS * 1e3)
+    return statistics.median(times[1:])
 
 
 class Step:
@@ -172,19 +172,20 @@ def compare_parts(gaussians: int, width: int, height: int) -> None:
 
 
 def time_split(parents: int) -> None:
-    """Print what a split into four children each costs."""
-    step = Step(parents, 64, 64, True)
-    step.optimize()
-    step.gradients = []
-    step.forget_gradients()
-    counts = torch.tensor([[2, 2, 1]], device="cuda").expand(parents, 3)
-    torch.cuda.synchronize()
-    torch.cuda.reset_peak_memory_stats()
-    start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
-    start.record()
-    grid_split(step.params, step.optimizers, step.state, counts)  # type: ignore[arg-type]
-    end.record()
-    torch.cuda.synchronize()
+    """Print what a split into four children each costs, the second time: the first loads kernels."""
+    for _ in range(2):
+        step = Step(parents, 64, 64, True)
+        step.optimize()
+        step.gradients = []
+        step.forget_gradients()
+        counts = torch.tensor([[2, 2, 1]], device="cuda").expand(parents, 3)
+        torch.cuda.synchronize()
+        torch.cuda.reset_peak_memory_stats()
+        start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+        start.record()
+        grid_split(step.params, step.optimizers, step.state, counts)  # type: ignore[arg-type]
+        end.record()
+        torch.cuda.synchronize()
     result = 3 * sum(p.numel() for p in step.params.values()) * 4  # with both moments
     print(f"\nSplit of {parents:,} into {len(step.params['means']):,}: {start.elapsed_time(end):.0f} ms; ", end="")
     print(f"memory at its peak {torch.cuda.max_memory_allocated() / result:.2f} times that of the resulting ", end="")
