@@ -1,4 +1,4 @@
-"""What surrounds rasterization in a training step, with and without our kernels: `python -m sadgs_ns.bench.step`.
+"""What surrounds rasterization in a training step, with and without our kernels: `sadgs-bench step`.
 
 A synthetic scene on a CUDA device: Gaussians on a spherical shell in front of one camera, an image to compare with,
 Adam with its moments. Each part is timed by itself, then the whole step, a split, and the structure tensors of images.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gsplat
@@ -218,16 +218,18 @@ def time_structure_tensors(images: int, width: int, height: int) -> None:
     print(f"working memory; the images take {pictures.numel() / 1e9:.2f} GB, the tensors in float16 twice that.")
 
 
-def main() -> None:
-    """Print the tables; exit with status 1 where there is no CUDA device."""
-    parser = argparse.ArgumentParser(description="Time the parts of a training step with and without our kernels.")
+def main(argv: Sequence[str] | None = None) -> int:
+    """Print the tables; returns the exit code, 1 where there is no CUDA device."""
+    parser = argparse.ArgumentParser(
+        prog="sadgs-bench step", description="Time the parts of a training step with and without our kernels."
+    )
     parser.add_argument("--gaussians", type=int, nargs="+", default=[500_000, 4_000_000])
     parser.add_argument("--width", type=int, default=1600, help="px")
     parser.add_argument("--height", type=int, default=1060, help="px")
-    options = parser.parse_args()
+    options = parser.parse_args(argv)
     if not torch.cuda.is_available():
         print("This comparison needs a CUDA device, and torch finds none.")
-        raise SystemExit(1)
+        return 1
     print(
         f"gsplat {gsplat.__version__}, torch {torch.__version__}, {torch.cuda.get_device_name()}, medians of {REPEATS}."
     )
@@ -235,7 +237,8 @@ def main() -> None:
         compare_parts(gaussians, options.width, options.height)
     time_split(500_000)
     time_structure_tensors(200, options.width, options.height)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())
