@@ -10,12 +10,16 @@ from typing import Any
 import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
 from torch import Tensor
 
 from sadgs_ns import kernels
+from sadgs_ns.finite import NonFiniteLog
 from sadgs_ns.model import SadgsModel, SadgsModelConfig
+from sadgs_ns.optimizers import FusedAdam
 from sadgs_ns.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.structure_tensor import (
     ENERGY_BLUR,
@@ -26,6 +30,10 @@ from sadgs_ns.structure_tensor import (
 
 _PIXELS_PER_BATCH = 4_000_000
 """Structure tensors are computed for as many images at once as fit this; each pixel takes about 300 bytes."""
+
+
+_NAMED_STEPS = 5
+"""Iterations of which a report of what was not finite names the images."""
 
 
 @dataclass
@@ -79,6 +87,7 @@ class SadgsPipeline(VanillaPipeline):
             )
         positions = self.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]  # [C, 3]
         self.model.set_cameras(positions)
+        self.log = NonFiniteLog(self.device)
 
     @property
     def model(self) -> SadgsModel:
@@ -140,6 +149,29 @@ class SadgsPipeline(VanillaPipeline):
         data = datamanager.cached_train[index]
         return index, {**data, "image": data["image"].to(self.device)}
 
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Those of data and model, and at the end a last look at what was not finite."""
+        optimizers = training_callback_attributes.optimizers
+        for optimizer in optimizers.optimizers.values() if optimizers is not None else ():
+            if isinstance(optimizer, FusedAdam):
+                optimizer.log = self.log
+        last = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self._report_nonfinite())
+        return [*super().get_training_callbacks(training_callback_attributes), last]
+
+    def _report_nonfinite(self) -> None:
+        """Say in which of the last iterations, and with which images, a loss or gradient was not finite."""
+        wrong = self.log.read()
+        files = self.datamanager.train_dataset.image_filenames
+        for step, views, what in wrong[:_NAMED_STEPS]:
+            names = escape(" and ".join(files[view].name for view in views))
+            CONSOLE.print(
+                f"[yellow]Iteration {step + 1}, {names}: {what}; such gradients counted as 0, training goes on.[/]"
+            )
+        if len(wrong) > _NAMED_STEPS:
+            CONSOLE.print(f"[yellow]The same in {len(wrong) - _NAMED_STEPS} more of the last iterations.[/]")
+
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
         """Render the iteration's views and return the outputs of the last size, mean losses and mean metrics."""
         groups: dict[torch.Size, list[tuple[int, dict[str, Any]]]] = defaultdict(list)
@@ -173,6 +205,9 @@ class SadgsPipeline(VanillaPipeline):
             for total, part in ((losses, group_losses), (metrics, self.model.get_metrics_dict(outputs, batch))):
                 for name, value in part.items():
                     total[name] = total.get(name, 0) + weight * value
+        if self.log.full:
+            self._report_nonfinite()
+        self.log.begin_step(step, [index for views in groups.values() for index, _ in views], losses["main_loss"])
         return outputs, losses, metrics
 
     def get_extra_state(self) -> dict[str, Any]:

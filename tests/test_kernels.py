@@ -173,12 +173,14 @@ def test_adam_equals_torchs():
     optimizer = torch.optim.Adam([expected], lr=0.1, eps=1e-15)
     actual = start.to(DEVICE).clone()
     moments = torch.zeros_like(actual), torch.zeros_like(actual)
+    noted = torch.zeros(1, device=DEVICE)
     for step in range(1, 6):
         gradient = torch.randn(start.shape, generator=generator)
         expected.grad = gradient.double()
         optimizer.step()
-        adam.adam_step(actual, gradient.to(DEVICE), *moments, step=step, lr=0.1, betas=(0.9, 0.999), eps=1e-15)
+        adam.adam_step(actual, gradient.to(DEVICE), *moments, noted, step=step, lr=0.1, betas=(0.9, 0.999), eps=1e-15)
     torch.testing.assert_close(actual.double().cpu(), expected.detach(), atol=1e-5, rtol=1e-5)
+    assert float(noted) == 0
 
 
 def test_optimizer_keeps_torchs_state_while_it_runs_the_kernel(monkeypatch):
