@@ -20,7 +20,7 @@ import sadgs_ns.kernels as package
 CONSTANTS = {
     "GAUSSIAN": (0.25, 0.5, 0.25), "STRIP": 1024, "ROWS": 16, "COLUMNS": 64, "TILE": 8, "LANES": 32, "VIEWS": 2,
     "BLOCK": 1024, "HIGH": 1.0, "LOW": 0.1, "BLUR": 0.3, "MARGIN": 0.3, "EPSILON": 1e-5, "DIRECTIONAL": False,
-    "VERTICAL": False,
+    "VERTICAL": False, "MAX": 1e18,
 }
 INTEGERS = "n row height width taps num_gaussians num_views tile_width tile_height used stride start".split()
 FLOATS = "rate scale beta1 beta2 eps min_logit l1_weight ssim_weight l2_weight".split()
