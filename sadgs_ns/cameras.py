@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
+
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
@@ -37,4 +40,28 @@ def refuse_unsupported_cameras(cameras: Cameras) -> None:
         raise ValueError(
             f"Camera {index} is {camera_type.name}, which sadgs cannot render: it renders PERSPECTIVE cameras only. "
             "Make perspective images of it (ns-process-data does so with --camera-type equirectangular)."
+        )
+
+
+def refuse_failed_undistortion(cameras: Cameras, names: Sequence[Path]) -> None:
+    """Refuse fisheye images that nerfstudio's undistortion lost.
+
+    Near a field of view of 180° OpenCV's new intrinsics have a focal length of almost 0, or their centre far outside
+    the image, which is then black.
+
+    Args:
+        cameras: After their images were undistorted, shape [C].
+        names: Their image files, C of them.
+
+    Raises:
+        ValueError: If there is one; it names the file and the remedy.
+    """
+    sizes = torch.cat([cameras.width, cameras.height], dim=-1)  # [C, 2] px
+    focals, centers = torch.cat([cameras.fx, cameras.fy], dim=-1), torch.cat([cameras.cx, cameras.cy], dim=-1)
+    fits = (focals > 0.01 * sizes) & (centers > 0) & (centers < sizes)  # 1 % is a field of view of 179°
+    of_fisheye = (cameras.camera_type == torch.tensor([t.value for t in _UNDISTORTED]).to(cameras.camera_type)).any(-1)
+    for index in (of_fisheye & ~fits.all(dim=-1)).nonzero().flatten().tolist():
+        raise ValueError(
+            f"{names[index]} is a FISHEYE image that nerfstudio could not undistort, for its field of view is "
+            "too close to 180°: crop it, or undistort it yourself."
         )

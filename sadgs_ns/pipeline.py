@@ -15,7 +15,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from sadgs_ns import kernels
-from sadgs_ns.cameras import refuse_unsupported_cameras
+from sadgs_ns.cameras import refuse_failed_undistortion, refuse_unsupported_cameras
 from sadgs_ns.model import SadgsModel, SadgsModelConfig
 from sadgs_ns.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.structure_tensor import (
@@ -102,7 +102,8 @@ class SadgsPipeline(VanillaPipeline):
         Made once: asking nerfstudio's cameras for them in each step makes the host wait for the device.
 
         Raises:
-            ValueError: If a training image holds NaN or infinite pixels, masked or not: the loss multiplies by masks.
+            ValueError: If a training image holds NaN or infinite pixels, masked or not: the loss multiplies by masks;
+                or if undistorting it failed.
         """
         dataset = self.datamanager.train_dataset
         for index, data in enumerate(self.datamanager.cached_train):  # undistorting the images changes the intrinsics
@@ -110,6 +111,7 @@ class SadgsPipeline(VanillaPipeline):
                 name = dataset.image_filenames[index]
                 raise ValueError(f"{name} holds NaN or infinite pixels: replace them, or leave the image out.")
         cameras = dataset.cameras
+        refuse_failed_undistortion(cameras, dataset.image_filenames)
         viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
         return viewmats.to(self.device), cameras.get_intrinsics_matrices().to(self.device)
 
