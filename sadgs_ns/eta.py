@@ -69,10 +69,10 @@ def projected_axes(
     x, y, z = (torch.einsum("mij,mj->mi", rotation, means) + viewmats[:, :3, 3]).unbind(-1)  # [M] each
     fx, fy, cx, cy = Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2]
     margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
-    x = z * torch.maximum(torch.minimum(x / z, (width - cx) / fx + margin_x), -cx / fx - margin_x)
-    y = z * torch.maximum(torch.minimum(y / z, (height - cy) / fy + margin_y), -cy / fy - margin_y)
-    zero = torch.zeros_like(z)
-    jacobian = torch.stack([fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2], -1).view(-1, 2, 3)
+    tangent_x = torch.maximum(torch.minimum(x / z, (width - cx) / fx + margin_x), -cx / fx - margin_x)
+    tangent_y = torch.maximum(torch.minimum(y / z, (height - cy) / fy + margin_y), -cy / fy - margin_y)
+    zero, jxx, jyy = torch.zeros_like(z), fx / z, fy / z  # never z², which underflows long before z does
+    jacobian = torch.stack([jxx, zero, -jxx * tangent_x, zero, jyy, -jyy * tangent_y], -1).view(-1, 2, 3)
     axes = normalized_quat_to_rotmat(F.normalize(quats, dim=-1)) * scales[:, None, :]  # R S [M, 3, 3]
     return (jacobian @ rotation @ axes).transpose(1, 2)
 
@@ -81,7 +81,9 @@ def sample_footprint(means2d: Tensor, conics: Tensor, jitter: Tensor) -> Tensor:
     """One point in each Gaussian's footprint, uniformly distributed where the jitter is.
 
     The footprint is the 2σ ellipse of Σ2D: a uniform point in it has mean μ_2D and covariance Σ2D. gsplat's conic
-    contains its screen-space blur, which is taken out again; what rounding makes negative is set to 0.
+    contains its screen-space blur, which is taken out again; what rounding makes negative is set to 0. Rounded to
+    float32, a conic tells its determinant from 0 only above ε a c: footprints longer than that (thousands of px) are
+    cut to it.
 
     Args:
         means2d: px. [M, 2]
@@ -89,10 +91,13 @@ def sample_footprint(means2d: Tensor, conics: Tensor, jitter: Tensor) -> Tensor:
         jitter: In [0, 1). [M, 2]
 
     Returns:
-        Points in px, pixel centres at half-integers. [M, 2]
+        Points in px, pixel centres at half-integers; NaN where the conic is NaN or infinite. [M, 2]
     """
     a, b, c = conics.double().unbind(-1)  # the determinant of a long thin Gaussian cancels in float32
-    determinant = (a * c - b * b).clamp_min(torch.finfo(torch.float32).tiny)
+    determinant = a * c - b * b  # of float32 numbers it cannot overflow: it is finite where they are
+    known = torch.maximum(determinant, torch.finfo(conics.dtype).eps * a * c)
+    # The conic of a Gaussian too large for float32 is 0.
+    determinant = torch.where(determinant.isfinite(), known.clamp_min(torch.finfo(known.dtype).tiny), torch.nan)
     xx = (c / determinant - SCREEN_BLUR).clamp_min(0)
     yy = (a / determinant - SCREEN_BLUR).clamp_min(0)
     xy = -b / determinant
@@ -138,8 +143,9 @@ def eta(axes: Tensor, structure_tensor: Tensor, directional: bool = False) -> Te
     Returns:
         η ≥ 0; above 1 the axis is longer than the local wavelength. [M, 3]
     """
+    length = torch.hypot(axes[..., 0], axes[..., 1])  # [M, 3]
     if directional:
-        u, v = axes.unbind(-1)  # [M, 3] each
         xx, xy, yy = structure_tensor[:, None].unbind(-1)  # [M, 1] each
-        return (xx * u**2 + 2 * xy * u * v + yy * v**2).clamp_min(0).sqrt()
-    return torch.hypot(axes[..., 0], axes[..., 1]) / wavelength(structure_tensor)[:, None]
+        u, v = (axes / length.clamp_min(torch.finfo(length.dtype).tiny)[..., None]).unbind(-1)  # lengths² overflow
+        return length * (xx * u**2 + 2 * xy * u * v + yy * v**2).clamp_min(0).sqrt()
+    return length / wavelength(structure_tensor)[:, None]

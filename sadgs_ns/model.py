@@ -25,6 +25,7 @@ from pytorch_msssim import SSIM
 from torch import Tensor
 from torchmetrics.image import PeakSignalNoiseRatio
 
+from sadgs_ns.cameras import refuse_unsupported_cameras
 from sadgs_ns.initialization import (
     FACE_GREY,
     FACE_OPACITY,
@@ -287,7 +288,11 @@ class SadgsModel(SplatfactoModel):
 
         Returns:
             `rgb` [H, W, 3] in [0, 1], `depth` [H, W, 1], `accumulation` [H, W, 1], `background` [H, W, 3].
+
+        Raises:
+            ValueError: If the camera is no pinhole.
         """
+        refuse_unsupported_cameras(camera)
         width, height = int(camera.width.item()), int(camera.height.item())
         background = self._get_background_color()
         if self.crop_box is not None and not self.crop_box.within(self.means).any():

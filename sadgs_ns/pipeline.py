@@ -17,6 +17,7 @@ from rich.markup import escape
 from torch import Tensor
 
 from sadgs_ns import kernels
+from sadgs_ns.cameras import refuse_failed_undistortion, refuse_unsupported_cameras
 from sadgs_ns.finite import NonFiniteLog
 from sadgs_ns.model import SadgsModel, SadgsModelConfig
 from sadgs_ns.optimizers import FusedAdam
@@ -30,6 +31,8 @@ from sadgs_ns.structure_tensor import (
 
 _PIXELS_PER_BATCH = 4_000_000
 """Structure tensors are computed for as many images at once as fit this; each pixel takes about 300 bytes."""
+_MAX_FREQUENCY_CONSTANT = 255
+"""S̄ is at most c²/px², which float16, in which it is kept, must hold."""
 
 
 _NAMED_STEPS = 5
@@ -63,7 +66,7 @@ class SadgsPipeline(VanillaPipeline):
     """Draws views, renders those of one size together, and feeds the model their structure tensors.
 
     Raises:
-        ValueError: If views_per_iteration is not positive.
+        ValueError: If views_per_iteration or frequency_constant is out of range, or a camera is no pinhole.
     """
 
     config: SadgsPipelineConfig
@@ -72,7 +75,14 @@ class SadgsPipeline(VanillaPipeline):
     def __init__(self, config: SadgsPipelineConfig, *args: Any, **kwargs: Any) -> None:
         if config.views_per_iteration < 1:
             raise ValueError(f"pipeline.views_per_iteration must be at least 1, got {config.views_per_iteration}.")
+        if not 0 < config.frequency_constant <= _MAX_FREQUENCY_CONSTANT:
+            raise ValueError(
+                f"pipeline.frequency_constant must be in (0, {_MAX_FREQUENCY_CONSTANT}], "
+                f"got {config.frequency_constant}."
+            )
         super().__init__(config, *args, **kwargs)
+        for dataset in (self.datamanager.train_dataset, self.datamanager.eval_dataset):
+            refuse_unsupported_cameras(dataset.cameras)
         if self.device.type == "cpu":
             self.datamanager.config.cache_images = "gpu"  # means the training device; "cpu" would pin memory for CUDA
         parsed_on = getattr(self.datamanager.dataparser.config, "alpha_color", None)
@@ -99,9 +109,18 @@ class SadgsPipeline(VanillaPipeline):
         """World-to-camera matrices [C, 4, 4] and intrinsics in px [C, 3, 3] of all training views.
 
         Made once: asking nerfstudio's cameras for them in each step makes the host wait for the device.
+
+        Raises:
+            ValueError: If a training image holds NaN or infinite pixels, masked or not: the loss multiplies by masks;
+                or if undistorting it failed.
         """
-        _ = self.datamanager.cached_train  # undistorting the images changes the intrinsics
-        cameras = self.datamanager.train_dataset.cameras
+        dataset = self.datamanager.train_dataset
+        for index, data in enumerate(self.datamanager.cached_train):  # undistorting the images changes the intrinsics
+            if data["image"].is_floating_point() and not data["image"].isfinite().all():
+                name = dataset.image_filenames[index]
+                raise ValueError(f"{name} holds NaN or infinite pixels: replace them, or leave the image out.")
+        cameras = dataset.cameras
+        refuse_failed_undistortion(cameras, dataset.image_filenames)
         viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
         return viewmats.to(self.device), cameras.get_intrinsics_matrices().to(self.device)
 

@@ -229,6 +229,10 @@ def _project(
     # Culled Gaussians are projected from somewhere harmless, or dividing by their depth could put NaN in gradients.
     means_c = torch.where(valid[..., None], means_c, means_c.new_tensor([0.0, 0.0, 1.0]))
     means2d, covars2d = _persp_proj(means_c, covars_c, Ks, width, height)
+    # So are those too large for the determinant's range (billions of px), which have no inverse.
+    a, b, c = covars2d[..., 0, 0].detach(), covars2d[..., 0, 1].detach(), covars2d[..., 1, 1].detach()
+    valid = valid & (a * c - b * b).isfinite()
+    covars2d = torch.where(valid[..., None, None], covars2d, torch.eye(2, dtype=means.dtype, device=means.device))
 
     det_sharp = covars2d[..., 0, 0] * covars2d[..., 1, 1] - covars2d[..., 0, 1] * covars2d[..., 1, 0]
     covars2d = covars2d + eps2d * torch.eye(2, dtype=means.dtype, device=means.device)

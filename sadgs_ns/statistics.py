@@ -6,7 +6,6 @@ removes Gaussians keeps them in step with the parameters.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, MutableMapping
 from typing import Any
 
@@ -56,7 +55,8 @@ def observe(
 ) -> None:
     """Add one forward pass: one jittered sample per visible Gaussian and view, counted in place.
 
-    A Gaussian is observed in a view when the rasterizer drew it there and its sample lies inside the image.
+    A Gaussian is observed in a view when the rasterizer drew it there, its sample lies inside the image, and its η is
+    finite on all axes: NaN and infinities of the projection or of S̄ are no observation.
 
     Args:
         statistics: As made by `empty_statistics`.
@@ -83,7 +83,7 @@ def observe(
             info["structure_tensors"],
             info["viewmats"],
             info["Ks"],
-            min_logit=math.log(min_opacity / (1 - min_opacity)) if 0 < min_opacity < 1 else -math.inf,
+            min_logit=float(torch.logit(torch.tensor(min_opacity, dtype=torch.float64).clamp(0, 1))),
             directional=directional,
             thresholds=(HIGH_ETA, LOW_ETA),
             constants=(SCREEN_BLUR, FRUSTUM_MARGIN, WAVELENGTH_EPSILON),
@@ -113,8 +113,9 @@ def observe(
         conics = torch.stack([a, b, c], -1)
         points = sample_footprint(means2d, conics, jitter[camera])
         sampled, inside = sample_map(info["structure_tensors"], camera_ids, points)
-        observed = (seen[camera] & inside)[:, None]  # [N, 1]
-        violation = torch.where(observed, eta(axes, sampled, directional), 0.0)  # [N, 3]
+        violation = eta(axes, sampled, directional)  # [N, 3]
+        observed = (seen[camera] & inside & violation.isfinite().all(dim=1))[:, None]  # [N, 1]
+        violation = torch.where(observed, violation, 0.0)
         statistics["n_high"] += violation > HIGH_ETA
         statistics["n_low"] += observed & (violation < LOW_ETA)
         statistics["n_total"] += observed[:, 0]

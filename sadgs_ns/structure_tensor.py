@@ -139,7 +139,8 @@ def multiscale_structure_tensor(
     Args:
         images: Linear in the pixel value, any non-negative range, any floating dtype (computed in at least float32).
             [B, H, W, C]
-        masks: Valid pixels; the others neither contribute nor receive a tensor. bool [B, H, W] or None for all.
+        masks: Valid pixels; the others, which may hold anything, NaN too, neither contribute nor receive a tensor.
+            bool [B, H, W] or None for all.
         frequency_constant: c of ω_l = c / σ_l, in 1/px.
         gamma: Exponent of the scale weights.
         noise_floor: Amplitude relative to the image's contrast under which S̄ fades to 0.
@@ -155,10 +156,13 @@ def multiscale_structure_tensor(
         S̄ as (xx, xy, yy) in 1/px², positive semidefinite, trace ≤ (c / σ_0)², 0 at masked pixels. [B, H, W, 3]
 
     Raises:
-        ValueError: If the images or masks have another shape or the images are not floating point.
+        ValueError: If the images or masks have another shape, the images are empty or not floating point, or a valid
+            pixel is NaN or infinite.
     """
     if images.dim() != 4 or not images.is_floating_point():
         raise ValueError(f"images must be floating point [B, H, W, C], got {images.dtype} {tuple(images.shape)}")
+    if 0 in images.shape:
+        raise ValueError(f"images must have pixels and channels, got [B, H, W, C] = {tuple(images.shape)}")
     if masks is not None and masks.shape != images.shape[:3]:
         raise ValueError(f"masks must be [B, H, W] = {tuple(images.shape[:3])}, got {tuple(masks.shape)}")
     image = images.permute(0, 3, 1, 2).contiguous()  # [B, C, H, W]; with channels-last strides cuDNN is slower
@@ -166,7 +170,10 @@ def multiscale_structure_tensor(
     valid = torch.ones_like(image[:, :1]) if masks is None else masks[:, None].to(image)  # [B, 1, H, W]
     # Without a mask the weights of all images are the same: keep one.
     weight = valid[:1] if masks is None else valid
-    image = image * valid
+    image = torch.where(valid > 0, image, 0.0)  # a product would let NaN through
+    if not image.isfinite().all():  # one would spread over the whole image: its contrast scales everything
+        broken = (~image.isfinite()).flatten(1).any(dim=1).nonzero().flatten().tolist()
+        raise ValueError(f"images {broken} of the batch hold NaN or infinite pixels; mask or replace those")
     brightest = image.abs().amax(dim=(1, 2, 3), keepdim=True).clamp_min(torch.finfo(image.dtype).tiny)
     image = image / brightest  # now in [-1, 1]: HDR and tiny exposures behave alike
     count = valid.sum(dim=(2, 3), keepdim=True).clamp_min(1)

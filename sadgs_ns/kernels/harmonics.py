@@ -132,9 +132,10 @@ def _forward(means, positions, first, rest, drawn, colors, n, used, stride, LANE
         red += basis[k] * tl.load(rest + stride * g + 3 * k, read, 0.0)
         green += basis[k] * tl.load(rest + stride * g + 3 * k + 1, read, 0.0)
         blue += basis[k] * tl.load(rest + stride * g + 3 * k + 2, read, 0.0)
-    tl.store(colors + 3 * at, tl.maximum(red, 0.0), g < n)
-    tl.store(colors + 3 * at + 1, tl.maximum(green, 0.0), g < n)
-    tl.store(colors + 3 * at + 2, tl.maximum(blue, 0.0), g < n)
+    # A broken coefficient must show in the image, where it is found; a maximum that drops NaN would paint it black.
+    tl.store(colors + 3 * at, tl.maximum(red, 0.0, tl.PropagateNan.ALL), g < n)
+    tl.store(colors + 3 * at + 1, tl.maximum(green, 0.0, tl.PropagateNan.ALL), g < n)
+    tl.store(colors + 3 * at + 2, tl.maximum(blue, 0.0, tl.PropagateNan.ALL), g < n)
 
 
 @triton.jit

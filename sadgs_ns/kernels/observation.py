@@ -37,11 +37,13 @@ def _screen_axis(viewmat, x, y, z, scale, jxx, jxz, jyy, jyz):
 
 @triton.jit
 def _eta(u, v, xx, xy, yy, EPSILON: tl.constexpr, DIRECTIONAL: tl.constexpr):
+    length = _hypot(u, v)
     if DIRECTIONAL:
-        return tl.sqrt(tl.maximum(xx * u * u + 2 * xy * u * v + yy * v * v, 0.0))
+        u, v = u / length, v / length  # lengths² overflow
+        return length * tl.sqrt(tl.maximum(xx * u * u + 2 * xy * u * v + yy * v * v, 0.0))
     else:
         largest = 0.5 * (xx + yy) + _hypot(0.5 * (xx - yy), xy)
-        return _hypot(u, v) * (tl.sqrt(tl.maximum(largest, 0.0)) + EPSILON)
+        return length * (tl.sqrt(tl.maximum(largest, 0.0)) + EPSILON)
 
 
 @triton.jit
@@ -80,7 +82,10 @@ def _observe(
         a = tl.load(conics + 3 * at, seen, 1.0).to(tl.float64)
         b = tl.load(conics + 3 * at + 1, seen, 0.0).to(tl.float64)
         c = tl.load(conics + 3 * at + 2, seen, 1.0).to(tl.float64)
-        inverse = 1 / tl.maximum(a * c - b * b, 1.1754943508222875e-38)
+        determinant = a * c - b * b
+        # Triton's maximum drops NaN, so what is not finite is told by comparison, here and of η.
+        seen = seen & (tl.abs(determinant) < float("inf"))
+        inverse = 1 / tl.maximum(tl.maximum(determinant, 1.1920928955078125e-07 * a * c), 2.2250738585072014e-308)
         xx = tl.maximum(c * inverse - BLUR, 0.0)
         yy = tl.sqrt(tl.maximum(a * inverse - BLUR, 0.0))
         factor_xx = tl.sqrt(xx)
@@ -123,9 +128,11 @@ def _observe(
             viewmat, 2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy),
             scale2, jxx, jxz, jyy, jyz,
         )  # fmt: skip
-        eta0 = tl.where(observed, _eta(u0, v0, s_xx, s_xy, s_yy, EPSILON, DIRECTIONAL), 0.0)
-        eta1 = tl.where(observed, _eta(u1, v1, s_xx, s_xy, s_yy, EPSILON, DIRECTIONAL), 0.0)
-        eta2 = tl.where(observed, _eta(u2, v2, s_xx, s_xy, s_yy, EPSILON, DIRECTIONAL), 0.0)
+        eta0 = _eta(u0, v0, s_xx, s_xy, s_yy, EPSILON, DIRECTIONAL)
+        eta1 = _eta(u1, v1, s_xx, s_xy, s_yy, EPSILON, DIRECTIONAL)
+        eta2 = _eta(u2, v2, s_xx, s_xy, s_yy, EPSILON, DIRECTIONAL)
+        observed = observed & (eta0 < float("inf")) & (eta1 < float("inf")) & (eta2 < float("inf"))
+        eta0, eta1, eta2 = tl.where(observed, eta0, 0.0), tl.where(observed, eta1, 0.0), tl.where(observed, eta2, 0.0)
         high0, high1, high2 = high0 + (eta0 > HIGH), high1 + (eta1 > HIGH), high2 + (eta2 > HIGH)
         low0 += observed & (eta0 < LOW)
         low1 += observed & (eta1 < LOW)

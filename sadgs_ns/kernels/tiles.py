@@ -27,15 +27,19 @@ def _load_ellipse(means2d, radii, conics, opacities, g, exists, tile_width, tile
     opacity = 255.0 * tl.load(opacities + g, exists, 0.0)
     drawn = exists & (rx > 0) & (ry > 0) & (opacity >= 1)  # gsplat leaves the rest of what it culls unwritten
     x, y = tl.load(means2d + 2 * g, drawn, 0.0), tl.load(means2d + 2 * g + 1, drawn, 0.0)
+    drawn = drawn & (tl.abs(x) < float("inf")) & (tl.abs(y) < float("inf"))
+    x, y = tl.where(drawn, x, 0.0), tl.where(drawn, y, 0.0)
     a = tl.load(conics + 3 * g, drawn, 1.0)
     b = tl.load(conics + 3 * g + 1, drawn, 0.0)
     c = tl.load(conics + 3 * g + 2, drawn, 1.0)
-    level = 2 * tl.log(tl.where(drawn, opacity, 1.0))
     # The determinant of a thin Gaussian's conic cancels in float32, and so does its exponent in gsplat: the level is
     # raised by what rounding may add there.
     determinant = (a.to(tl.float64) * c.to(tl.float64) - b.to(tl.float64) * b.to(tl.float64)).to(tl.float32)
-    level = level * (1 + 1e-6 * a * c / determinant) + 1e-4
-    proper = (determinant > 0) & (level < 1e30)  # otherwise every tile of gsplat's
+    proper = (determinant > 1e-30) & (determinant < float("inf"))  # otherwise every tile of gsplat's
+    a, b, c = tl.where(proper, a, 1.0), tl.where(proper, b, 0.0), tl.where(proper, c, 1.0)
+    determinant = tl.where(proper, determinant, 1.0)
+    level = 2 * tl.log(tl.where(drawn, opacity, 1.0)) * (1 + 1e-6 * a * c / determinant) + 1e-4
+    proper = proper & (level < 1e30)
     first_column = tl.minimum(tl.maximum(tl.floor((x - rx) / TILE), 0), tile_width).to(tl.int32)
     last_column = tl.minimum(tl.maximum(tl.ceil((x + rx) / TILE), 0), tile_width).to(tl.int32)
     first_row = tl.minimum(tl.maximum(tl.floor((y - ry) / TILE), 0), tile_height)
@@ -57,8 +61,10 @@ def _columns_of_row(row, x, y, a, b, c, level, determinant, proper, first_column
     leftmost = tl.minimum(tl.maximum(b / c * reach_x, low), high)
     right = (-b * rightmost + tl.sqrt(tl.maximum(a * level - determinant * rightmost * rightmost, 0.0))) / a + 0.01
     left = (-b * leftmost - tl.sqrt(tl.maximum(a * level - determinant * leftmost * leftmost, 0.0))) / a - 0.01
-    first = tl.maximum(tl.ceil((x + left + 0.5) / TILE) - 1, first_column.to(tl.float32))
-    last = tl.minimum(tl.floor((x + right - 0.5) / TILE) + 1, last_column.to(tl.float32))
+    # Clipped on both sides: an ellipse of billions of px must not overflow integers.
+    low, high = first_column.to(tl.float32), last_column.to(tl.float32)
+    first = tl.minimum(tl.maximum(tl.ceil((x + left + 0.5) / TILE) - 1, low), high)
+    last = tl.minimum(tl.maximum(tl.floor((x + right - 0.5) / TILE) + 1, low), high)
     return tl.where(proper, first, first_column).to(tl.int32), tl.where(proper, last, last_column).to(tl.int32)
 
 

@@ -1,0 +1,67 @@
+"""Which of nerfstudio's cameras this method renders right: pinholes, and fisheyes that nerfstudio undistorts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+
+_UNDISTORTED = (CameraType.FISHEYE, CameraType.FISHEYE624)
+"""Types whose images nerfstudio's FullImageDatamanager turns into pinhole images, if they have distortion."""
+
+
+def refuse_unsupported_cameras(cameras: Cameras) -> None:
+    """Let pass what is, or is made, a pinhole camera.
+
+    nerfstudio gives full images of any camera type to a splatting model, and undistorts those of perspective and
+    fisheye cameras that have a distortion coefficient other than 0. The others would be rendered, wrongly, as pinholes.
+
+    Args:
+        cameras: Of one or several images, shape [C].
+
+    Raises:
+        ValueError: If one of them is neither; it names the type, the first such camera and the remedy.
+    """
+    types = cameras.camera_type.flatten().cpu()  # [C]
+    distorted = torch.zeros_like(types, dtype=torch.bool)
+    if cameras.distortion_params is not None:
+        distorted = (cameras.distortion_params.reshape(len(types), -1) != 0).any(dim=1).cpu()
+    for index, (number, undistorts) in enumerate(zip(types.tolist(), distorted.tolist(), strict=True)):
+        camera_type = CameraType(number)
+        if camera_type is CameraType.PERSPECTIVE or (camera_type in _UNDISTORTED and undistorts):
+            continue
+        if camera_type in _UNDISTORTED:
+            raise ValueError(
+                f"Camera {index} is {camera_type.name} with all distortion coefficients 0, and nerfstudio undistorts "
+                "no such image: undistort the images yourself, or give one coefficient a tiny value (k1 = 1e-9)."
+            )
+        raise ValueError(
+            f"Camera {index} is {camera_type.name}, which sadgs cannot render: it renders PERSPECTIVE cameras only. "
+            "Make perspective images of it (ns-process-data does so with --camera-type equirectangular)."
+        )
+
+
+def refuse_failed_undistortion(cameras: Cameras, names: Sequence[Path]) -> None:
+    """Refuse fisheye images that nerfstudio's undistortion lost.
+
+    Near a field of view of 180° OpenCV's new intrinsics have a focal length of almost 0, or their centre far outside
+    the image, which is then black.
+
+    Args:
+        cameras: After their images were undistorted, shape [C].
+        names: Their image files, C of them.
+
+    Raises:
+        ValueError: If there is one; it names the file and the remedy.
+    """
+    sizes = torch.cat([cameras.width, cameras.height], dim=-1)  # [C, 2] px
+    focals, centers = torch.cat([cameras.fx, cameras.fy], dim=-1), torch.cat([cameras.cx, cameras.cy], dim=-1)
+    fits = (focals > 0.01 * sizes) & (centers > 0) & (centers < sizes)  # 1 % is a field of view of 179°
+    of_fisheye = (cameras.camera_type == torch.tensor([t.value for t in _UNDISTORTED]).to(cameras.camera_type)).any(-1)
+    for index in (of_fisheye & ~fits.all(dim=-1)).nonzero().flatten().tolist():
+        raise ValueError(
+            f"{names[index]} is a FISHEYE image that nerfstudio could not undistort, for its field of view is "
+            "too close to 180°: crop it, or undistort it yourself."
+        )
