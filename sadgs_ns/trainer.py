@@ -27,6 +27,11 @@ _LESS_MEMORY = (
 )
 
 
+def _memory(error: torch.cuda.OutOfMemoryError) -> str:
+    """How much memory was asked for, and of whom: the first two of torch's many sentences."""
+    return ". ".join(reason(error).split(". ")[:2]).rstrip(".")
+
+
 def available_machine() -> MachineConfig:
     """CUDA where there is a device, the CPU elsewhere."""
     return MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu")
@@ -93,7 +98,7 @@ class SadgsTrainer(Trainer):
         try:
             super().setup(*args, **kwargs)
         except torch.cuda.OutOfMemoryError as error:
-            raise RunError(f"The GPU's memory is too small to start ({reason(error)}): {_LESS_MEMORY}.") from error
+            raise RunError(f"The GPU's memory is too small to start ({_memory(error)}): {_LESS_MEMORY}.") from error
 
     def _load_checkpoint(self) -> None:
         """Load the checkpoint that was asked for; raises InputError if there is none or it is not of this method."""
@@ -104,7 +109,7 @@ class SadgsTrainer(Trainer):
         except torch.cuda.OutOfMemoryError:
             raise
         except InputError as error:
-            raise InputError(f"{path} cannot be continued: {error} Instead, {remedy}.") from error
+            raise InputError(f"{path} cannot be continued: {str(error).rstrip('.')}; {remedy}.") from error
         except Exception as error:  # torch.load raises whatever the bytes of a foreign file lead to
             what = f"{type(error).__name__}: {reason(error)}"
             raise InputError(f"{path} is not a checkpoint of this version of sadgs ({what}): {remedy}.") from error
@@ -135,8 +140,12 @@ class SadgsTrainer(Trainer):
         try:
             super().train()
         except torch.cuda.OutOfMemoryError as error:
-            out_of_memory = reason(error)  # raised below, when the failed step's tensors are gone
-        except WriteError as error:
+            out_of_memory = _memory(error)  # raised below, when the failed step's tensors are gone
+        except OSError as error:
+            if error.errno is None and not isinstance(error, WriteError):
+                raise  # not from the disk
+            if not isinstance(error, WriteError):  # of a logger, such as tensorboard's
+                error = WriteError(Path(error.filename or self.base_dir), error)
             raise RunError(str(error)) from error
         finally:
             self.config.max_num_iterations = total
