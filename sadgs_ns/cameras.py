@@ -8,6 +8,8 @@ from pathlib import Path
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
+from sadgs_ns.errors import InputError
+
 _UNDISTORTED = (CameraType.FISHEYE, CameraType.FISHEYE624)
 """Types whose images nerfstudio's FullImageDatamanager turns into pinhole images, if they have distortion."""
 
@@ -26,18 +28,18 @@ def refuse_unsupported_cameras(cameras: Cameras) -> None:
     """
     types = cameras.camera_type.flatten().cpu()  # [C]
     distorted = torch.zeros_like(types, dtype=torch.bool)
-    if cameras.distortion_params is not None:
+    if cameras.distortion_params is not None and len(types) > 0:
         distorted = (cameras.distortion_params.reshape(len(types), -1) != 0).any(dim=1).cpu()
     for index, (number, undistorts) in enumerate(zip(types.tolist(), distorted.tolist(), strict=True)):
         camera_type = CameraType(number)
         if camera_type is CameraType.PERSPECTIVE or (camera_type in _UNDISTORTED and undistorts):
             continue
         if camera_type in _UNDISTORTED:
-            raise ValueError(
+            raise InputError(
                 f"Camera {index} is {camera_type.name} with all distortion coefficients 0, and nerfstudio undistorts "
                 "no such image: undistort the images yourself, or give one coefficient a tiny value (k1 = 1e-9)."
             )
-        raise ValueError(
+        raise InputError(
             f"Camera {index} is {camera_type.name}, which sadgs cannot render: it renders PERSPECTIVE cameras only. "
             "Make perspective images of it (ns-process-data does so with --camera-type equirectangular)."
         )
@@ -61,7 +63,7 @@ def refuse_failed_undistortion(cameras: Cameras, names: Sequence[Path]) -> None:
     fits = (focals > 0.01 * sizes) & (centers > 0) & (centers < sizes)  # 1 % is a field of view of 179°
     of_fisheye = (cameras.camera_type == torch.tensor([t.value for t in _UNDISTORTED]).to(cameras.camera_type)).any(-1)
     for index in (of_fisheye & ~fits.all(dim=-1)).nonzero().flatten().tolist():
-        raise ValueError(
+        raise InputError(
             f"{names[index]} is a FISHEYE image that nerfstudio could not undistort, for its field of view is "
             "too close to 180°: crop it, or undistort it yourself."
         )

@@ -517,12 +517,13 @@ def test_a_fisheye_of_180_degrees_that_nerfstudio_makes_black_is_refused(tmp_pat
         SadgsPipeline.train_cameras.func(SimpleNamespace(datamanager=datamanager))  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize(("camera_model", "name"), [("OPENCV_FISHEYE", "FISHEYE"), ("ORTHOPHOTO", "ORTHOPHOTO")])
-def test_training_refuses_such_cameras_before_it_reads_an_image(tmp_path: Path, camera_model: str, name: str):
+@pytest.mark.parametrize(
+    ("camera_model", "sentence"),
+    [("OPENCV_FISHEYE", "^Camera 0 is FISHEYE"), ("ORTHOPHOTO", "camera model 'ORTHOPHOTO': give one of")],
+)
+def test_training_refuses_such_cameras(tmp_path: Path, camera_model: str, sentence: str):
     config = SadgsPipelineConfig(datamanager=fisheye_data(tmp_path, k1=0.0, camera_model=camera_model))
-    for path in (tmp_path / "images").iterdir():
-        path.write_bytes(b"")  # only the first is opened, for nothing
-    with pytest.raises(ValueError, match=f"^Camera 0 is {name}"):
+    with pytest.raises(ValueError, match=sentence):
         SadgsPipeline(config, device="cpu")
 
 
