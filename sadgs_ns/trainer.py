@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import copy
 import os
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
-from nerfstudio.configs.base_config import MachineConfig
+from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.utils.rich_utils import CONSOLE
 
+from sadgs_ns import checkpoints
+from sadgs_ns.interrupts import Interrupted, Interrupts, resume_command
 from sadgs_ns.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
 from sadgs_ns.pipeline import SadgsPipeline, SadgsPipelineConfig
 
@@ -31,6 +35,8 @@ class SadgsTrainerConfig(TrainerConfig):
     """Machine; the device is CUDA where there is one."""
     pipeline: SadgsPipelineConfig = field(default_factory=SadgsPipelineConfig)
     """Data and model."""
+    viewer: ViewerConfig = field(default_factory=lambda: ViewerConfig(websocket_host="127.0.0.1"))
+    """The viewer. It listens on this machine only; a websocket_host of 0.0.0.0 opens it to the network."""
     max_num_iterations: int = 3000
     """Length of the run in optimizer steps; schedules stretch to it."""
     steps_per_eval_batch: int = 0
@@ -57,6 +63,10 @@ class SadgsTrainer(Trainer):
         if world_size > 1:
             raise ValueError(f"sadgs trains on one device; set machine.num_devices to 1, not {world_size}.")
         super().__init__(config, local_rank, world_size)
+        self._stepping = False
+        self._completed_step = self._saved_step = -1
+        # Paused or done, nerfstudio waits for the viewer's user.
+        self._interrupts = Interrupts(waiting=lambda: self.training_state != "training" and not self._stepping)
 
     def setup_optimizers(self) -> Optimizers:
         """Build the optimizers with schedules as long as the run, fused where the model is."""
@@ -72,14 +82,80 @@ class SadgsTrainer(Trainer):
         return Optimizers(optimizers, self.pipeline.get_param_groups())
 
     def train(self) -> None:
-        """Train up to `max_num_iterations` in all; nerfstudio 1.1.5 trains that many more after resuming."""
+        """Train up to `max_num_iterations` in all; nerfstudio 1.1.5 trains that many more after resuming.
+
+        Raises:
+            SystemExit: SIGINT or SIGTERM came: with a checkpoint saved, a line printed that says how to go on, and the
+                exit code that shells give these signals.
+        """
         total = self.config.max_num_iterations
         self.step = max(self._start_step - 1, 0)  # names the checkpoint when nothing is left to do
+        self._completed_step = self._saved_step = self._start_step - 1
         self.config.max_num_iterations = max(total - self._start_step, 0)
         try:
-            super().train()
+            with self._interrupts:
+                super().train()
+        except Interrupted as interrupted:
+            self._stop(interrupted, total)
         finally:
             self.config.max_num_iterations = total
+
+    def train_iteration(self, step: int) -> Any:
+        """nerfstudio's; from here to `_update_viewer_state` no signal may stop the run."""
+        self._stepping = True
+        return super().train_iteration(step)
+
+    def _update_viewer_state(self, step: int) -> None:
+        """nerfstudio calls this after every step, when densification is done."""
+        self._completed_step, self._stepping = step, False
+        self._interrupts.poll()
+        super()._update_viewer_state(step)
+
+    def _train_complete_viewer(self) -> None:
+        """nerfstudio waits here for the viewer's user, for ever."""
+        self._interrupts.poll()
+        super()._train_complete_viewer()
+
+    def _stop(self, interrupted: Interrupted, total: int) -> None:
+        """Save what was trained and leave; a run that had only its viewer left just ends."""
+        if self._completed_step > self._saved_step:
+            self.save_checkpoint(self._completed_step)
+        done = self._completed_step + 1
+        if done >= total:
+            return
+        if done == self._start_step:
+            text = f"{interrupted}: stopped before an iteration was done; the same command starts again."
+        else:
+            command = resume_command(sys.argv, self.config.method_name or "", self.checkpoint_dir)
+            text = f"{interrupted}: stopped and saved after {done} of {total} iterations; resume with: {command}"
+        CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
+        raise SystemExit(128 + interrupted.number)
+
+    def _load_checkpoint(self) -> None:
+        """Resume as nerfstudio does, but with the safe loader, and from an earlier checkpoint if the latest is damaged.
+
+        Raises:
+            ValueError: No checkpoint can be read, in one sentence.
+        """
+        config = self.config
+        if config.load_dir is None and config.load_checkpoint is None:
+            return super()._load_checkpoint()
+        if config.load_dir is not None and config.load_step is None:
+            path, state = checkpoints.read_latest(config.load_dir)
+        elif config.load_dir is not None:
+            path = config.load_dir / f"step-{config.load_step:09d}.ckpt"
+            state = checkpoints.read(path)
+        else:
+            path = config.load_checkpoint
+            assert path is not None
+            state = checkpoints.read(path)
+        self._start_step = state["step"] + 1
+        self.pipeline.load_pipeline(state["pipeline"], state["step"])
+        self.optimizers.load_optimizers(state["optimizers"])
+        if "schedulers" in state and config.load_scheduler:
+            self.optimizers.load_schedulers(state["schedulers"])
+        self.grad_scaler.load_state_dict(state["scalers"])
+        CONSOLE.print(f"Resuming after step {state['step']} of {path}", markup=False, soft_wrap=True)
 
     def save_checkpoint(self, step: int) -> None:
         """Save under a temporary name, then rename: a killed save leaves the previous checkpoint as it was.
@@ -89,6 +165,7 @@ class SadgsTrainer(Trainer):
         self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
         path: Path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
         partial = self.checkpoint_dir.with_name(f"{self.checkpoint_dir.name}.partial")
+        others = [other for other in self.checkpoint_dir.glob("*.ckpt") if other != path]
         try:
             torch.save(
                 {
@@ -100,10 +177,13 @@ class SadgsTrainer(Trainer):
                 },
                 partial,
             )
+            if others:  # about to be deleted: the new one must be on the disk, lest a power cut takes both
+                with partial.open("rb+") as file:
+                    os.fsync(file.fileno())
             os.replace(partial, path)
         finally:
             partial.unlink(missing_ok=True)
+        self._saved_step = step
         if self.config.save_only_latest_checkpoint:
-            for other in self.checkpoint_dir.glob("*.ckpt"):
-                if other != path:
-                    other.unlink()
+            for other in others:
+                other.unlink()
