@@ -15,6 +15,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from sadgs_ns import kernels
+from sadgs_ns.datamanager import SadgsDatamanagerConfig
 from sadgs_ns.model import SadgsModel, SadgsModelConfig
 from sadgs_ns.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.structure_tensor import (
@@ -34,7 +35,7 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
 
     _target: type = field(default_factory=lambda: SadgsPipeline)
     datamanager: FullImageDatamanagerConfig = field(
-        default_factory=lambda: FullImageDatamanagerConfig(
+        default_factory=lambda: SadgsDatamanagerConfig(
             dataparser=NerfstudioDataParserConfig(load_3D_points=True), cache_images_type="uint8"
         )
     )
