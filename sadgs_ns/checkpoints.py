@@ -10,7 +10,9 @@ from typing import Any
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
-_NAME = re.compile(r"step-(\d+)\.ckpt")
+from sadgs_ns.errors import InputError, reason
+
+_REMEDY = "give --load-step an earlier one, or train from scratch"
 _PARTS = ("step", "pipeline", "optimizers", "scalers")
 
 
@@ -18,48 +20,46 @@ def read(path: Path) -> dict[str, Any]:
     """Read one checkpoint into the CPU's memory, with torch's safe loader whatever its version and environment say.
 
     Raises:
-        ValueError: There is no such file, it is cut off or damaged, or it holds anything but a checkpoint's tensors and
-            plain values; one sentence that names it.
+        InputError: It is cut off or damaged, or it holds anything but a checkpoint's tensors and plain values.
     """
-    if not path.is_file():
-        raise ValueError(f"{path} is not there; give --load-dir the folder nerfstudio_models of a run.")
     try:
         with zipfile.ZipFile(path) as file:  # torch itself does not look at the checksums
             if (damaged := file.testzip()) is not None:
                 raise zipfile.BadZipFile(f"wrong checksum of {damaged}")
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # zip, pickle and tensors each raise their own
-        reason = re.split(r"(?<=[a-z])[.:]\s|\n", str(error).strip(), maxsplit=1)[0] or type(error).__name__
-        raise ValueError(f"{path} is cut off, damaged or not of tensors and plain values alone ({reason}).") from error
+        # Without torch's advice after it, to load the file unsafely.
+        what = re.split(r"(?<=[a-z])[.:]\s", reason(error), maxsplit=1)[0]
+        raise InputError(
+            f"{path} is cut off, damaged or not of tensors and plain values alone ({what}): {_REMEDY}."
+        ) from error
     if not isinstance(state, dict) or not all(part in state for part in _PARTS) or type(state["step"]) is not int:
-        raise ValueError(f"{path} is not a checkpoint that nerfstudio's trainer wrote.")
+        raise InputError(f"{path} is not a checkpoint that nerfstudio's trainer wrote: {_REMEDY}.")
     return state
 
 
-def read_latest(folder: Path) -> tuple[Path, dict[str, Any]]:
-    """Read the checkpoint of the latest step; for each that cannot be read, say so and take the one before it.
+def read_or_earlier(path: Path) -> tuple[Path, dict[str, Any]]:
+    """Read the latest checkpoint of a folder; while one cannot be read, say so and take the one before it.
 
-    Other files in the folder, such as those of a save that was killed, are ignored.
+    Args:
+        path: The latest.
 
     Returns:
-        Its path and its content.
+        Its path, or that of an earlier one in its folder, and the content.
 
     Raises:
-        ValueError: There is no checkpoint in the folder, or none that can be read; one sentence.
+        InputError: As `read`, of the latest, if none can be read.
     """
-    steps = {int(match[1]): path for path in folder.glob("*") if (match := _NAME.fullmatch(path.name))}
-    if not steps:
-        raise ValueError(f"{folder} holds no checkpoint (step-*.ckpt); give --load-dir a run's nerfstudio_models.")
-    reasons = []
-    for step in sorted(steps, reverse=True):
+    latest = None
+    for candidate in sorted(path.parent.glob("step-*.ckpt"), key=lambda p: int(p.stem[5:]), reverse=True):
         try:
-            state = read(steps[step])
-        except ValueError as error:
-            reasons.append(str(error))
+            state = read(candidate)
+        except InputError as error:
+            latest = latest or error
+            CONSOLE.print(f"{error}", style="yellow", markup=False, soft_wrap=True)
             continue
-        for reason in reasons:
-            CONSOLE.print(f"{reason} Going on from step {step} instead.", style="yellow", markup=False, soft_wrap=True)
-        return steps[step], state
-    raise ValueError(
-        f"{reasons[0]} {folder} holds no other that can be read: train from the start, without --load-dir."
-    )
+        if latest is not None:
+            CONSOLE.print(f"Going on from {candidate} instead.", style="yellow", markup=False, soft_wrap=True)
+        return candidate, state
+    assert latest is not None
+    raise latest

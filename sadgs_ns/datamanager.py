@@ -1,4 +1,4 @@
-"""nerfstudio glue: nerfstudio's loader of whole images, behind checks of what the data ask it to do."""
+"""nerfstudio glue: nerfstudio's loader of whole images, behind checks of the names in the data."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 
-from sadgs_ns import colmap_model
+from sadgs_ns import colmap, paths
 
 
 @dataclass
@@ -20,18 +20,21 @@ class SadgsDatamanagerConfig(FullImageDatamanagerConfig):
 
 
 class SadgsDatamanager(FullImageDatamanager[InputDataset]):
-    """Checks a COLMAP model before nerfstudio reads it, and where its images lie.
+    """Checks what the data's images are called, and where they lie.
 
     Here rather than in the pipeline, because `ns-render dataset` makes a datamanager of its own.
 
     Raises:
-        ValueError: As `colmap_model.check` and `colmap_model.check_paths`.
+        InputError: As `colmap.read_poses`, `paths.check_names` and `paths.check_paths`.
     """
 
     def __init__(self, config: FullImageDatamanagerConfig, *args: Any, **kwargs: Any) -> None:
         parser = config.dataparser
-        if isinstance(parser, ColmapDataParserConfig):
-            colmap_model.check((config.data or parser.data) / parser.colmap_path)
+        if isinstance(parser, ColmapDataParserConfig):  # before it offers to make smaller images
+            model = (config.data or parser.data) / parser.colmap_path
+            kind = "txt" if (model / "cameras.txt").exists() else "bin"
+            if (source := model / f"images.{kind}").is_file():
+                paths.check_names((name for name, _, _ in colmap.read_poses(source)), source)
         super().__init__(config, *args, **kwargs)  # type: ignore[arg-type]
         for dataset in (self.train_dataset, self.eval_dataset):
-            colmap_model.check_paths(dataset.image_filenames)
+            paths.check_paths(dataset.image_filenames)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -12,18 +12,27 @@ import torch
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
+from sadgs_ns.errors import WriteError
+
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its name when the block ends well, and vanishes when it raises."""
+    """A temporary path beside `path` that takes its name when the block ends well, and vanishes when it raises.
+
+    Raises:
+        WriteError: If the disk is full or the folder cannot be written.
+    """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         yield partial
         partial.replace(path)
+    except OSError as error:
+        raise WriteError(path, error) from error
     finally:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):  # where even the folder could not be made
+            partial.unlink(missing_ok=True)
 
 
 def write_ply(
@@ -55,6 +64,7 @@ def write_ply(
 
     Raises:
         ValueError: If a tensor has another shape than the number of means asks for, naming it.
+        WriteError: If the file could not be written.
     """
     count = len(means)
     bands = features_rest.shape[1] if features_rest.dim() == 3 else 0

@@ -25,6 +25,7 @@ from pytorch_msssim import SSIM
 from torch import Tensor
 from torchmetrics.image import PeakSignalNoiseRatio
 
+from sadgs_ns.errors import InputError
 from sadgs_ns.initialization import (
     FACE_GREY,
     FACE_OPACITY,
@@ -102,7 +103,7 @@ class SadgsModel(SplatfactoModel):
         Overrides splatfacto's, which needs CUDA and LPIPS weights. LPIPS is loaded when it is first asked for.
 
         Raises:
-            ValueError: If a field that has no effect on this method was set.
+            InputError: If a field that has no effect on this method was set.
         """
         config = self.config
         _refuse_fields_without_effect(config)
@@ -400,9 +401,9 @@ def _refuse_fields_without_effect(config: SadgsModelConfig) -> None:
     defaults = {f.name: f.default for f in fields(SplatfactoModelConfig)}
     for name, replacement in WITHOUT_EFFECT.items():
         if getattr(config, name) != defaults[name]:
-            raise ValueError(f"pipeline.model.{name} has no effect on this method; use {replacement}.")
+            raise InputError(f"pipeline.model.{name} has no effect on this method; use {replacement}.")
     if config.num_downscales != 0:
-        raise ValueError(
+        raise InputError(
             "pipeline.model.num_downscales must be 0: this method trains at full resolution from the start."
         )
 

@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
+from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.utils import dataparsers_utils as splits
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
 from torch import Tensor
 
-from sadgs_ns import kernels
+from sadgs_ns import checks, kernels
 from sadgs_ns.datamanager import SadgsDatamanagerConfig
+from sadgs_ns.errors import InputError
 from sadgs_ns.model import SadgsModel, SadgsModelConfig
 from sadgs_ns.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.structure_tensor import (
@@ -56,7 +64,7 @@ class SadgsPipeline(VanillaPipeline):
     """Draws views, renders those of one size together, and feeds the model their structure tensors.
 
     Raises:
-        ValueError: If views_per_iteration is not positive.
+        InputError: If views_per_iteration is not positive, or the data cannot be trained on.
     """
 
     config: SadgsPipelineConfig
@@ -64,7 +72,11 @@ class SadgsPipeline(VanillaPipeline):
 
     def __init__(self, config: SadgsPipelineConfig, *args: Any, **kwargs: Any) -> None:
         if config.views_per_iteration < 1:
-            raise ValueError(f"pipeline.views_per_iteration must be at least 1, got {config.views_per_iteration}.")
+            raise InputError(f"pipeline.views_per_iteration must be at least 1, got {config.views_per_iteration}.")
+        # Rendering new views ("inference") opens no image.
+        for finding in refuse_bad_data(config.datamanager, open_images=kwargs.get("test_mode") != "inference"):
+            if finding.severity == "warning":
+                CONSOLE.print(f"[yellow]{escape(finding.sentence)}[/]")
         super().__init__(config, *args, **kwargs)
         if self.device.type == "cpu":
             self.datamanager.config.cache_images = "gpu"  # means the training device; "cpu" would pin memory for CUDA
@@ -175,6 +187,28 @@ class SadgsPipeline(VanillaPipeline):
                     total[name] = total.get(name, 0) + weight * value
         return outputs, losses, metrics
 
+    def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
+        """Load a checkpoint's parameters and states.
+
+        nerfstudio would pass over missing ones: another method's checkpoint would go on from a mixture.
+
+        Raises:
+            InputError: If the checkpoint is of another method, or of other settings of the model.
+        """
+        loaded = {key.removeprefix("module."): value for key, value in loaded_state.items()}
+        for name, parameter in self.model.gauss_params.items():
+            value = loaded.get(f"_model.gauss_params.{name}")
+            if value is None:
+                raise InputError(f"The checkpoint has no {name} of Gaussians, so another method made it.")
+            if value.shape[1:] != parameter.shape[1:]:
+                raise InputError(
+                    f"The checkpoint's {name} have the shape {list(value.shape[1:])}, the model's "
+                    f"{list(parameter.shape[1:])}: set pipeline.model.sh-degree as it was."
+                )
+        if not {"_extra_state", "_model._extra_state"} <= loaded.keys():
+            raise InputError("The checkpoint lacks the state of structure-aware densification, so splatfacto made it.")
+        super().load_pipeline(loaded_state, step)
+
     def get_extra_state(self) -> dict[str, Any]:
         """Random states and the order of the views, so that a resumed run goes on as if never stopped.
 
@@ -199,3 +233,60 @@ class SadgsPipeline(VanillaPipeline):
                 self.datamanager.random_generator.setstate(state["view_shuffle"])
         if "cuda" in state and self.device.type == "cuda":
             torch.cuda.set_rng_state(state["cuda"].cpu(), self.device)
+
+
+def refuse_bad_data(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[checks.Finding]:
+    """Check the data before nerfstudio parses them; parsers other than its three common ones are not checked.
+
+    Returns:
+        Findings that do not stop training.
+
+    Raises:
+        InputError: With the first finding that does.
+    """
+    parser = config.dataparser
+    data = Path(config.data or parser.data)
+    if isinstance(parser, ColmapDataParserConfig):
+        findings = checks.check_colmap(
+            data,
+            images_path=parser.images_path,
+            colmap_path=parser.colmap_path,
+            masks_path=parser.masks_path,
+            downscale_factor=parser.downscale_factor,
+            rounding=parser.downscale_rounding_mode,
+            load_points=parser.load_3D_points,
+            training_images=_training_images(parser),
+            open_images=open_images,
+        )
+    elif isinstance(parser, NerfstudioDataParserConfig):
+        findings = checks.check_nerfstudio(
+            data,
+            downscale_factor=parser.downscale_factor,
+            load_points=parser.load_3D_points,
+            training_images=_training_images(parser),
+            open_images=open_images,
+        )
+    elif isinstance(parser, BlenderDataParserConfig):
+        findings = checks.check_blender(data, open_images=open_images)
+    else:
+        findings = []
+    checks.refuse(findings, data)
+    return findings
+
+
+def _training_images(parser: ColmapDataParserConfig | NerfstudioDataParserConfig) -> Callable[[int], int] | None:
+    """How many of so many views the parser trains on; None if that depends on their names."""
+    if parser.eval_mode == "filename":
+        return None
+
+    def count(views: int) -> int:
+        names: list[Any] = [None] * views
+        if parser.eval_mode == "fraction":
+            chosen, _ = splits.get_train_eval_split_fraction(names, parser.train_split_fraction)
+        elif parser.eval_mode == "interval":
+            chosen, _ = splits.get_train_eval_split_interval(names, parser.eval_interval)
+        else:
+            chosen = np.arange(views)
+        return len(chosen)
+
+    return count

@@ -13,6 +13,7 @@ import yaml
 from nerfstudio.plugins.types import MethodSpecification
 from typeguard import CollectionCheckStrategy, TypeCheckError, check_type
 
+from sadgs_ns.errors import InputError
 from sadgs_ns.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
 from sadgs_ns.trainer import SadgsTrainerConfig
 
@@ -159,6 +160,14 @@ def _optimizer(entry: Any, where: str) -> dict[str, Any]:
     return {"optimizer": optimizer, "scheduler": scheduler}
 
 
-sadgs = load_preset("sadgs")
-sadgs_indoor = load_preset("sadgs-indoor")
-sadgs_large = load_preset("sadgs-large")
+def _registered(name: str) -> MethodSpecification:
+    """A preset for nerfstudio's commands, which then end with one sentence if it has a mistake."""
+    try:
+        return load_preset(name)
+    except ValueError as error:
+        raise InputError(f"{_configs() / f'{name}.yaml'} has a mistake: {error}") from error
+
+
+sadgs = _registered("sadgs")
+sadgs_indoor = _registered("sadgs-indoor")
+sadgs_large = _registered("sadgs-large")

@@ -10,15 +10,24 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from sadgs_ns import checkpoints
+from sadgs_ns.checks import checkpoint_path
+from sadgs_ns.errors import InputError, RunError, WriteError, reason
+from sadgs_ns.export import atomic_path
 from sadgs_ns.interrupts import Interrupted, Interrupts, resume_command
 from sadgs_ns.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
-from sadgs_ns.pipeline import SadgsPipeline, SadgsPipelineConfig
+from sadgs_ns.pipeline import SadgsPipeline, SadgsPipelineConfig, refuse_bad_data
+
+_LESS_MEMORY = (
+    "lower --pipeline.model.strategy.max-gaussians, or take smaller images (`--downscale-factor 2` after "
+    "`nerfstudio-data` or `colmap`)"
+)
 
 
 def available_machine() -> MachineConfig:
@@ -48,12 +57,27 @@ class SadgsTrainerConfig(TrainerConfig):
     scale_position_lr: bool = True
     """Multiply the position learning rate with the cameras' extent, as 3DGS does; splatfacto does not."""
 
+    def save_config(self) -> None:
+        """Write `config.yml`, the first file of a run: not before the data and the output folder are found to be good.
+
+        Raises:
+            InputError: If they are not; nothing is written then.
+        """
+        refuse_bad_data(self.pipeline.datamanager)
+        path = self.get_base_dir() / "config.yml"
+        CONSOLE.log(f"Saving config to: {path}")
+        try:
+            with atomic_path(path) as partial:
+                partial.write_text(yaml.dump(self), "utf8")
+        except WriteError as error:
+            raise InputError(str(error)) from error
+
 
 class SadgsTrainer(Trainer):
     """Trains one model on one device.
 
     Raises:
-        ValueError: If several devices are asked for.
+        InputError: If several devices are asked for.
     """
 
     config: SadgsTrainerConfig
@@ -61,12 +85,53 @@ class SadgsTrainer(Trainer):
 
     def __init__(self, config: SadgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         if world_size > 1:
-            raise ValueError(f"sadgs trains on one device; set machine.num_devices to 1, not {world_size}.")
+            raise InputError(f"sadgs trains on one device; set machine.num_devices to 1, not {world_size}.")
         super().__init__(config, local_rank, world_size)
         self._stepping = False
         self._completed_step = self._saved_step = -1
         # Paused or done, nerfstudio waits for the viewer's user.
         self._interrupts = Interrupts(waiting=lambda: self.training_state != "training" and not self._stepping)
+
+    def setup(self, *args: Any, **kwargs: Any) -> None:
+        """Load data, model and checkpoint.
+
+        Raises:
+            InputError: If one of them cannot be used.
+            RunError: If they do not fit the GPU's memory.
+        """
+        try:
+            super().setup(*args, **kwargs)
+        except torch.cuda.OutOfMemoryError as error:
+            raise RunError(f"The GPU's memory is too small to start ({reason(error)}): {_LESS_MEMORY}.") from error
+
+    def _load_checkpoint(self) -> None:
+        """Resume as nerfstudio does, but with the safe loader, and from an earlier checkpoint if the latest is damaged.
+
+        Raises:
+            InputError: If there is none, none can be read, or it is not of this method.
+        """
+        config = self.config
+        path = checkpoint_path(config.load_dir, config.load_step, config.load_checkpoint)
+        if path is None:
+            return super()._load_checkpoint()
+        latest = config.load_dir is not None and config.load_step is None
+        path, state = checkpoints.read_or_earlier(path) if latest else (path, checkpoints.read(path))
+        remedy = "give --load-dir the folder nerfstudio_models of a run of sadgs, or train from scratch"
+        try:
+            self._start_step = state["step"] + 1
+            self.pipeline.load_pipeline(state["pipeline"], state["step"])
+            self.optimizers.load_optimizers(state["optimizers"])
+            if "schedulers" in state and config.load_scheduler:
+                self.optimizers.load_schedulers(state["schedulers"])
+            self.grad_scaler.load_state_dict(state["scalers"])
+        except torch.cuda.OutOfMemoryError:
+            raise
+        except InputError as error:
+            raise InputError(f"{path} cannot be continued: {error} Instead, {remedy}.") from error
+        except Exception as error:  # a foreign file's parts lead to whatever they lead to
+            what = f"{type(error).__name__}: {reason(error)}"
+            raise InputError(f"{path} is not a checkpoint of this version of sadgs ({what}): {remedy}.") from error
+        CONSOLE.print(f"Resuming after step {state['step']} of {path}", markup=False, soft_wrap=True)
 
     def setup_optimizers(self) -> Optimizers:
         """Build the optimizers with schedules as long as the run, fused where the model is."""
@@ -85,6 +150,7 @@ class SadgsTrainer(Trainer):
         """Train up to `max_num_iterations` in all; nerfstudio 1.1.5 trains that many more after resuming.
 
         Raises:
+            RunError: If the GPU's memory is full or a checkpoint could not be saved.
             SystemExit: SIGINT or SIGTERM came: with a checkpoint saved, a line printed that says how to go on, and the
                 exit code that shells give these signals.
         """
@@ -92,13 +158,43 @@ class SadgsTrainer(Trainer):
         self.step = max(self._start_step - 1, 0)  # names the checkpoint when nothing is left to do
         self._completed_step = self._saved_step = self._start_step - 1
         self.config.max_num_iterations = max(total - self._start_step, 0)
+        out_of_memory = ""
         try:
-            with self._interrupts:
-                super().train()
-        except Interrupted as interrupted:
-            self._stop(interrupted, total)
+            try:
+                with self._interrupts:
+                    super().train()
+            except Interrupted as interrupted:
+                self._stop(interrupted, total)
+        except torch.cuda.OutOfMemoryError as error:
+            out_of_memory = reason(error)  # raised below, when the failed step's tensors are gone
+        except WriteError as error:
+            raise RunError(str(error)) from error
         finally:
             self.config.max_num_iterations = total
+        if out_of_memory:
+            raise RunError(self._rescue(out_of_memory))
+
+    def _rescue(self, out_of_memory: str) -> str:
+        """Save the state before the present step, if it is whole; returns what to tell the user."""
+        torch.cuda.empty_cache()
+        model = self.pipeline.model
+        lengths = {len(parameter) for parameter in model.gauss_params.values()}
+        for name in model.gauss_params:
+            for state in self.optimizers.optimizers[name].state.values():
+                lengths |= {len(value) for value in state.values() if isinstance(value, torch.Tensor) and value.dim()}
+        lengths |= {len(v) for v in model.strategy_state.values() if isinstance(v, torch.Tensor) and v.dim()}
+        if len(lengths) > 1 or self.step <= self._start_step:
+            kept = "nothing newer than the last checkpoint could be saved"
+        else:
+            try:
+                self.save_checkpoint(self.step - 1)
+                kept = f"what was trained is saved and goes on with --load-dir {self.checkpoint_dir}"
+            except WriteError as error:
+                kept = f"what was trained is lost, since {error}"
+        return (
+            f"The GPU's memory was full at iteration {self.step} with {model.num_points} Gaussians ({out_of_memory}): "
+            f"{_LESS_MEMORY}; {kept}."
+        )
 
     def train_iteration(self, step: int) -> Any:
         """nerfstudio's; from here to `_update_viewer_state` no signal may stop the run."""
@@ -131,42 +227,19 @@ class SadgsTrainer(Trainer):
         CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
         raise SystemExit(128 + interrupted.number)
 
-    def _load_checkpoint(self) -> None:
-        """Resume as nerfstudio does, but with the safe loader, and from an earlier checkpoint if the latest is damaged.
-
-        Raises:
-            ValueError: No checkpoint can be read, in one sentence.
-        """
-        config = self.config
-        if config.load_dir is None and config.load_checkpoint is None:
-            return super()._load_checkpoint()
-        if config.load_dir is not None and config.load_step is None:
-            path, state = checkpoints.read_latest(config.load_dir)
-        elif config.load_dir is not None:
-            path = config.load_dir / f"step-{config.load_step:09d}.ckpt"
-            state = checkpoints.read(path)
-        else:
-            path = config.load_checkpoint
-            assert path is not None
-            state = checkpoints.read(path)
-        self._start_step = state["step"] + 1
-        self.pipeline.load_pipeline(state["pipeline"], state["step"])
-        self.optimizers.load_optimizers(state["optimizers"])
-        if "schedulers" in state and config.load_scheduler:
-            self.optimizers.load_schedulers(state["schedulers"])
-        self.grad_scaler.load_state_dict(state["scalers"])
-        CONSOLE.print(f"Resuming after step {state['step']} of {path}", markup=False, soft_wrap=True)
-
     def save_checkpoint(self, step: int) -> None:
         """Save under a temporary name, then rename: a killed save leaves the previous checkpoint as it was.
 
         The temporary file lies beside the folder of checkpoints: nerfstudio takes every file inside for one.
+
+        Raises:
+            WriteError: If the disk is full or the folder cannot be written.
         """
-        self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
         path: Path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
         partial = self.checkpoint_dir.with_name(f"{self.checkpoint_dir.name}.partial")
         others = [other for other in self.checkpoint_dir.glob("*.ckpt") if other != path]
         try:
+            self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
             torch.save(
                 {
                     "step": step,
@@ -181,6 +254,8 @@ class SadgsTrainer(Trainer):
                 with partial.open("rb+") as file:
                     os.fsync(file.fileno())
             os.replace(partial, path)
+        except (OSError, RuntimeError) as error:  # torch's writer has a RuntimeError for a full disk
+            raise WriteError(path, error) from error
         finally:
             partial.unlink(missing_ok=True)
         self._saved_step = step

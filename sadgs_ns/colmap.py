@@ -1,0 +1,196 @@
+"""COLMAP's reconstructions, text and binary, read only as far as it takes to check them.
+
+nerfstudio's readers trust the files: a corrupt length makes them ask for terabytes, and pycolmap ends the process.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sadgs_ns.errors import InputError, reason
+
+CAMERA_PARAMETERS = {
+    "SIMPLE_PINHOLE": 3,
+    "PINHOLE": 4,
+    "SIMPLE_RADIAL": 4,
+    "RADIAL": 5,
+    "OPENCV": 8,
+    "OPENCV_FISHEYE": 8,
+    "FULL_OPENCV": 12,
+    "FOV": 5,
+    "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5,
+    "THIN_PRISM_FISHEYE": 12,
+}
+"""COLMAP's camera models in the order of their numbers, and how many parameters each has."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics, as COLMAP stores them."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+def camera_centre(pose: np.ndarray) -> np.ndarray:
+    """Camera centre in the world of a COLMAP pose: wxyz quaternion and translation, world to camera. [7] → [3]"""
+    w, x, y, z = pose[:4]
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    return -rotation.T @ pose[4:]
+
+
+class _Binary:
+    """A COLMAP binary file, read item by item; its end comes as an InputError."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.offset = path, 0
+        try:
+            with path.open("rb") as file:
+                self.content: mmap.mmap | bytes = (
+                    mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if path.stat().st_size else b""
+                )
+        except OSError as error:
+            raise InputError(f"{path} cannot be read ({reason(error)}): copy the whole reconstruction.") from error
+
+    def corrupt(self, detail: str) -> InputError:
+        return InputError(f"{self.path} is cut off or corrupt ({detail}): copy it again, or run COLMAP's mapper again.")
+
+    def take(self, layout: struct.Struct) -> tuple[Any, ...]:
+        """The next values."""
+        self.skip(layout.size)
+        return layout.unpack_from(self.content, self.offset - layout.size)
+
+    def skip(self, size: int) -> None:
+        """Pass over bytes, which have to be there."""
+        if self.offset + size > len(self.content):
+            raise self.corrupt(f"it ends after {len(self.content)} bytes, in the middle of an item")
+        self.offset += size
+
+    def text(self) -> str:
+        """The next string, which ends with a zero byte."""
+        end = self.content.find(b"\0", self.offset, self.offset + 4096)
+        if end < 0:
+            raise self.corrupt(f"at byte {self.offset} there is no image's name")
+        raw, self.offset = self.content[self.offset : end], end + 1
+        try:
+            return raw.decode("utf8")
+        except UnicodeDecodeError:
+            raise self.corrupt(f"at byte {end - len(raw)} there is no image's name") from None
+
+
+_COUNT = struct.Struct("<Q")
+_CAMERA = struct.Struct("<iiQQ")
+_POSE = struct.Struct("<i7di")
+_POINT = struct.Struct("<Q3d3BdQ")
+
+
+def _read_binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
+    file = _Binary(path)
+    for _ in range(file.take(_COUNT)[0]):
+        camera_id, model_id, width, height = file.take(_CAMERA)
+        if not 0 <= model_id < len(CAMERA_PARAMETERS):
+            raise file.corrupt(f"camera {camera_id} has the unknown model {model_id}")
+        model = list(CAMERA_PARAMETERS)[model_id]
+        params = file.take(struct.Struct(f"<{CAMERA_PARAMETERS[model]}d"))
+        yield camera_id, Camera(model, width, height, params)
+
+
+def _read_binary_poses(path: Path) -> Iterator[tuple[str, int, np.ndarray]]:
+    """Name, camera and pose (wxyz quaternion, translation) [7] of each image."""
+    file = _Binary(path)
+    for _ in range(file.take(_COUNT)[0]):
+        _, *pose, camera_id = file.take(_POSE)
+        name = file.text()
+        file.skip(24 * file.take(_COUNT)[0])  # keypoints
+        yield name, camera_id, np.array(pose)
+
+
+def _read_binary_points(path: Path) -> Iterator[tuple[float, float, float]]:
+    file = _Binary(path)
+    for _ in range(file.take(_COUNT)[0]):
+        _, x, y, z, _, _, _, _, track = file.take(_POINT)
+        file.skip(8 * track)
+        yield x, y, z
+
+
+def _read_text(path: Path, minimum: int) -> Iterator[tuple[list[str], Iterator[str]]]:
+    """Fields of each line that is neither empty nor a comment, and the lines after it."""
+    try:
+        with path.open(encoding="utf8") as file:
+            for line in file:
+                if line.strip() and not line.lstrip().startswith("#"):
+                    fields = line.split()
+                    if len(fields) < minimum:
+                        raise ValueError(f"{minimum} fields expected in {line.strip()[:60]!r}")
+                    yield fields, file
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({reason(error)}): copy the whole reconstruction.") from error
+    except ValueError as error:
+        raise _not_colmap(path, error) from error
+
+
+def _not_colmap(path: Path, error: ValueError) -> InputError:
+    return InputError(f"{path} is not COLMAP's text ({reason(error)}): copy it again, or run COLMAP's mapper again.")
+
+
+def _read_text_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
+    for fields, _ in _read_text(path, 5):
+        try:
+            params = tuple(float(value) for value in fields[4:])
+            camera = Camera(fields[1], int(fields[2]), int(fields[3]), params)
+            yield int(fields[0]), camera
+        except ValueError as error:
+            raise _not_colmap(path, error) from error
+
+
+def _read_text_poses(path: Path) -> Iterator[tuple[str, int, np.ndarray]]:
+    """Name, camera and pose (wxyz quaternion, translation) [7] of each image."""
+    for fields, following in _read_text(path, 10):
+        try:
+            next(following, None)  # the image's keypoints, on a line of their own that may be empty
+            yield fields[9], int(fields[8]), np.array(fields[1:8], dtype=np.float64)
+        except ValueError as error:
+            raise _not_colmap(path, error) from error
+
+
+def _read_text_points(path: Path) -> Iterator[tuple[float, float, float]]:
+    for fields, _ in _read_text(path, 8):
+        try:
+            yield float(fields[1]), float(fields[2]), float(fields[3])
+        except ValueError as error:
+            raise _not_colmap(path, error) from error
+
+
+def read_cameras(path: Path) -> dict[int, Camera]:
+    """Cameras of a `cameras.bin` or `cameras.txt` by their ids.
+
+    Raises:
+        InputError: If the file cannot be read, is cut off or corrupt; so do the functions below.
+    """
+    return dict((_read_binary_cameras if path.suffix == ".bin" else _read_text_cameras)(path))
+
+
+def read_poses(path: Path) -> list[tuple[str, int, np.ndarray]]:
+    """Name, camera id and pose (wxyz quaternion and translation, world to camera) [7] of the images of `images.*`."""
+    return list((_read_binary_poses if path.suffix == ".bin" else _read_text_poses)(path))
+
+
+def read_points(path: Path) -> Iterator[tuple[float, float, float]]:
+    """Positions of the points of `points3D.*`, one by one."""
+    return (_read_binary_points if path.suffix == ".bin" else _read_text_points)(path)
