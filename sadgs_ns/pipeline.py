@@ -24,6 +24,7 @@ from torch import Tensor
 
 from sadgs_ns import checks, kernels
 from sadgs_ns.cameras import refuse_failed_undistortion, refuse_unsupported_cameras
+from sadgs_ns.datamanager import SadgsDatamanagerConfig
 from sadgs_ns.errors import InputError
 from sadgs_ns.finite import NonFiniteLog
 from sadgs_ns.model import SadgsModel, SadgsModelConfig
@@ -52,7 +53,7 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
 
     _target: type = field(default_factory=lambda: SadgsPipeline)
     datamanager: FullImageDatamanagerConfig = field(
-        default_factory=lambda: FullImageDatamanagerConfig(
+        default_factory=lambda: SadgsDatamanagerConfig(
             dataparser=NerfstudioDataParserConfig(load_3D_points=True), cache_images_type="uint8"
         )
     )

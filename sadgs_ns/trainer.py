@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import copy
 import os
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 import yaml
-from nerfstudio.configs.base_config import MachineConfig
+from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from sadgs_ns import checkpoints
 from sadgs_ns.checks import checkpoint_path
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
 from sadgs_ns.export import atomic_path
+from sadgs_ns.interrupts import Interrupted, Interrupts, resume_command
 from sadgs_ns.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
 from sadgs_ns.pipeline import SadgsPipeline, SadgsPipelineConfig, refuse_bad_data
 
@@ -46,6 +49,8 @@ class SadgsTrainerConfig(TrainerConfig):
     """Machine; the device is CUDA where there is one."""
     pipeline: SadgsPipelineConfig = field(default_factory=SadgsPipelineConfig)
     """Data and model."""
+    viewer: ViewerConfig = field(default_factory=lambda: ViewerConfig(websocket_host="127.0.0.1"))
+    """The viewer. It listens on this machine only; a websocket_host of 0.0.0.0 opens it to the network."""
     max_num_iterations: int = 3000
     """Length of the run in optimizer steps; schedules stretch to it."""
     steps_per_eval_batch: int = 0
@@ -87,6 +92,10 @@ class SadgsTrainer(Trainer):
         if world_size > 1:
             raise InputError(f"sadgs trains on one device; set machine.num_devices to 1, not {world_size}.")
         super().__init__(config, local_rank, world_size)
+        self._stepping = False
+        self._completed_step = self._saved_step = -1
+        # Paused or done, nerfstudio waits for the viewer's user.
+        self._interrupts = Interrupts(waiting=lambda: self.training_state != "training" and not self._stepping)
 
     def setup(self, *args: Any, **kwargs: Any) -> None:
         """Load data, model and checkpoint.
@@ -101,18 +110,33 @@ class SadgsTrainer(Trainer):
             raise RunError(f"The GPU's memory is too small to start ({_memory(error)}): {_LESS_MEMORY}.") from error
 
     def _load_checkpoint(self) -> None:
-        """Load the checkpoint that was asked for; raises InputError if there is none or it is not of this method."""
-        path = checkpoint_path(self.config.load_dir, self.config.load_step, self.config.load_checkpoint)
+        """Resume as nerfstudio does, but with the safe loader, and from an earlier checkpoint if the latest is damaged.
+
+        Raises:
+            InputError: If there is none, none can be read, or it is not of this method.
+        """
+        config = self.config
+        path = checkpoint_path(config.load_dir, config.load_step, config.load_checkpoint)
+        if path is None:
+            return super()._load_checkpoint()
+        latest = config.load_dir is not None and config.load_step is None
+        path, state = checkpoints.read_or_earlier(path) if latest else (path, checkpoints.read(path))
         remedy = "give --load-dir the folder nerfstudio_models of a run of sadgs, or train from scratch"
         try:
-            super()._load_checkpoint()
+            self._start_step = state["step"] + 1
+            self.pipeline.load_pipeline(state["pipeline"], state["step"])
+            self.optimizers.load_optimizers(state["optimizers"])
+            if "schedulers" in state and config.load_scheduler:
+                self.optimizers.load_schedulers(state["schedulers"])
+            self.grad_scaler.load_state_dict(state["scalers"])
         except torch.cuda.OutOfMemoryError:
             raise
         except InputError as error:
             raise InputError(f"{path} cannot be continued: {str(error).rstrip('.')}; {remedy}.") from error
-        except Exception as error:  # torch.load raises whatever the bytes of a foreign file lead to
+        except Exception as error:  # a foreign file's parts lead to whatever they lead to
             what = f"{type(error).__name__}: {reason(error)}"
             raise InputError(f"{path} is not a checkpoint of this version of sadgs ({what}): {remedy}.") from error
+        CONSOLE.print(f"Resuming after step {state['step']} of {path}", markup=False, soft_wrap=True)
 
     def setup_optimizers(self) -> Optimizers:
         """Build the optimizers with schedules as long as the run, fused where the model is."""
@@ -132,13 +156,20 @@ class SadgsTrainer(Trainer):
 
         Raises:
             RunError: If the GPU's memory is full or a checkpoint could not be saved.
+            SystemExit: SIGINT or SIGTERM came: with a checkpoint saved, a line printed that says how to go on, and the
+                exit code that shells give these signals.
         """
         total = self.config.max_num_iterations
         self.step = max(self._start_step - 1, 0)  # names the checkpoint when nothing is left to do
+        self._completed_step = self._saved_step = self._start_step - 1
         self.config.max_num_iterations = max(total - self._start_step, 0)
         out_of_memory = ""
         try:
-            super().train()
+            try:
+                with self._interrupts:
+                    super().train()
+            except Interrupted as interrupted:
+                self._stop(interrupted, total)
         except torch.cuda.OutOfMemoryError as error:
             out_of_memory = _memory(error)  # raised below, when the failed step's tensors are gone
         except OSError as error:
@@ -174,6 +205,37 @@ class SadgsTrainer(Trainer):
             f"{_LESS_MEMORY}; {kept}."
         )
 
+    def train_iteration(self, step: int) -> Any:
+        """nerfstudio's; from here to `_update_viewer_state` no signal may stop the run."""
+        self._stepping = True
+        return super().train_iteration(step)
+
+    def _update_viewer_state(self, step: int) -> None:
+        """nerfstudio calls this after every step, when densification is done."""
+        self._completed_step, self._stepping = step, False
+        self._interrupts.poll()
+        super()._update_viewer_state(step)
+
+    def _train_complete_viewer(self) -> None:
+        """nerfstudio waits here for the viewer's user, for ever."""
+        self._interrupts.poll()
+        super()._train_complete_viewer()
+
+    def _stop(self, interrupted: Interrupted, total: int) -> None:
+        """Save what was trained and leave; a run that had only its viewer left just ends."""
+        if self._completed_step > self._saved_step:
+            self.save_checkpoint(self._completed_step)
+        done = self._completed_step + 1
+        if done >= total:
+            return
+        if done == self._start_step:
+            text = f"{interrupted}: stopped before an iteration was done; the same command starts again."
+        else:
+            command = resume_command(sys.argv, self.config.method_name or "", self.checkpoint_dir)
+            text = f"{interrupted}: stopped and saved after {done} of {total} iterations; resume with: {command}"
+        CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
+        raise SystemExit(128 + interrupted.number)
+
     def save_checkpoint(self, step: int) -> None:
         """Save under a temporary name, then rename: a killed save leaves the previous checkpoint as it was.
 
@@ -184,6 +246,7 @@ class SadgsTrainer(Trainer):
         """
         path: Path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
         partial = self.checkpoint_dir.with_name(f"{self.checkpoint_dir.name}.partial")
+        others = [other for other in self.checkpoint_dir.glob("*.ckpt") if other != path]
         try:
             self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
             torch.save(
@@ -196,12 +259,15 @@ class SadgsTrainer(Trainer):
                 },
                 partial,
             )
+            if others:  # about to be deleted: the new one must be on the disk, lest a power cut takes both
+                with partial.open("rb+") as file:
+                    os.fsync(file.fileno())
             os.replace(partial, path)
         except (OSError, RuntimeError) as error:  # torch's writer has a RuntimeError for a full disk
             raise WriteError(path, error) from error
         finally:
             partial.unlink(missing_ok=True)
+        self._saved_step = step
         if self.config.save_only_latest_checkpoint:
-            for other in self.checkpoint_dir.glob("*.ckpt"):
-                if other != path:
-                    other.unlink()
+            for other in others:
+                other.unlink()

@@ -6,7 +6,6 @@ import copy
 import dataclasses
 import json
 import os
-import random
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from kill_and_resume import differences, set_up
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
@@ -108,16 +108,6 @@ def configure(output: Path, parser: DataParserConfig, iterations: int = 6, **str
     return config
 
 
-def set_up(config: SadgsTrainerConfig) -> SadgsTrainer:
-    """The trainer, seeded as `ns-train` does it, before its first iteration."""
-    random.seed(config.machine.seed)
-    np.random.seed(config.machine.seed)
-    torch.manual_seed(config.machine.seed)
-    trainer: SadgsTrainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
-    return trainer
-
-
 def train(config: SadgsTrainerConfig, after_step: Callable[[SadgsTrainer], None] | None = None) -> SadgsTrainer:
     """Train to the end, calling `after_step` after each iteration's densification."""
     trainer = set_up(config)
@@ -131,22 +121,6 @@ def train(config: SadgsTrainerConfig, after_step: Callable[[SadgsTrainer], None]
 def checkpoint(trainer: SadgsTrainer, step: int) -> dict[str, Any]:
     """A checkpoint, read as torch reads files that it does not trust."""
     return torch.load(trainer.checkpoint_dir / f"step-{step:09d}.ckpt", weights_only=True)
-
-
-def differences(a: Any, b: Any, where: str = "") -> list[str]:
-    """Places where two nested checkpoints are not bitwise equal."""
-    if type(a) is not type(b):
-        return [where]
-    if isinstance(a, dict):
-        if a.keys() != b.keys():
-            return [where]
-        return [place for key in a for place in differences(a[key], b[key], f"{where}/{key}")]
-    if isinstance(a, list | tuple):
-        if len(a) != len(b):
-            return [where]
-        return [place for i, pair in enumerate(zip(a, b, strict=True)) for place in differences(*pair, f"{where}/{i}")]
-    equal = torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
-    return [] if equal else [where]
 
 
 def is_finite(model: SadgsModel) -> bool:

@@ -81,6 +81,11 @@ def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> T
         config.machine.device_type = "cpu"
         datamanager.cache_images = "gpu"  # "the model's device"; "cpu" pins memory, which needs CUDA
     config.set_timestamp()
+    base = config.get_base_dir()
+    written = (config.get_checkpoint_dir(), base / config.logging.relative_log_dir)
+    for path in (*written, base / config.viewer.relative_log_filename):
+        if not path.resolve().is_relative_to(work.resolve()):
+            raise ValueError(f"row {row.label!r} on {scene.name!r}: it would write {path}, outside the run's folder.")
     return config
 
 

@@ -1,0 +1,65 @@
+"""Which checkpoint a run resumes from, read so that nothing in the file is executed."""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from sadgs_ns.errors import InputError, reason
+
+_REMEDY = "give --load-step an earlier one, or train from scratch"
+_PARTS = ("step", "pipeline", "optimizers", "scalers")
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Read one checkpoint into the CPU's memory, with torch's safe loader whatever its version and environment say.
+
+    Raises:
+        InputError: It is cut off or damaged, or it holds anything but a checkpoint's tensors and plain values.
+    """
+    try:
+        with zipfile.ZipFile(path) as file:  # torch itself does not look at the checksums
+            if (damaged := file.testzip()) is not None:
+                raise zipfile.BadZipFile(f"wrong checksum of {damaged}")
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # zip, pickle and tensors each raise their own
+        # Without torch's advice after it, to load the file unsafely.
+        what = re.split(r"(?<=[a-z])[.:]\s", reason(error), maxsplit=1)[0]
+        raise InputError(
+            f"{path} is cut off, damaged or not of tensors and plain values alone ({what}): {_REMEDY}."
+        ) from error
+    if not isinstance(state, dict) or not all(part in state for part in _PARTS) or type(state["step"]) is not int:
+        raise InputError(f"{path} is not a checkpoint that nerfstudio's trainer wrote: {_REMEDY}.")
+    return state
+
+
+def read_or_earlier(path: Path) -> tuple[Path, dict[str, Any]]:
+    """Read the latest checkpoint of a folder; while one cannot be read, say so and take the one before it.
+
+    Args:
+        path: The latest.
+
+    Returns:
+        Its path, or that of an earlier one in its folder, and the content.
+
+    Raises:
+        InputError: As `read`, of the latest, if none can be read.
+    """
+    latest = None
+    for candidate in sorted(path.parent.glob("step-*.ckpt"), key=lambda p: int(p.stem[5:]), reverse=True):
+        try:
+            state = read(candidate)
+        except InputError as error:
+            latest = latest or error
+            CONSOLE.print(f"{error}", style="yellow", markup=False, soft_wrap=True)
+            continue
+        if latest is not None:
+            CONSOLE.print(f"Going on from {candidate} instead.", style="yellow", markup=False, soft_wrap=True)
+        return candidate, state
+    assert latest is not None
+    raise latest

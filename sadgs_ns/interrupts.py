@@ -1,0 +1,91 @@
+"""SIGINT and SIGTERM that wait until a training step is whole, and the command that goes on from there."""
+
+from __future__ import annotations
+
+import shlex
+import signal
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_LOADING = ("load-dir", "load-step", "load-checkpoint")
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal asked the run to stop, and no step is half done."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+class Interrupts:
+    """While entered, the first SIGINT or SIGTERM makes `poll` raise; a second one acts as it did before.
+
+    Signals are left alone outside the main thread, which cannot handle them, and where the program has a handler of its
+    own for SIGTERM.
+
+    Args:
+        waiting: Whether the program only waits for somebody, so that nobody polls: the signal then raises at once.
+    """
+
+    def __init__(self, waiting: Callable[[], bool]) -> None:
+        self._waiting = waiting
+        self._previous: dict[int, Any] = {}
+        self._received: int | None = None
+
+    def __enter__(self) -> Interrupts:
+        self._received = None
+        if threading.current_thread() is threading.main_thread():
+            default = (signal.SIG_DFL, signal.default_int_handler)
+            self._previous = {s: old for s in SIGNALS if (old := signal.getsignal(s)) in default}
+            for number in self._previous:
+                signal.signal(number, self._handle)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._restore()
+
+    def poll(self) -> None:
+        """Raise Interrupted if a signal has come."""
+        if self._received is not None:
+            raise Interrupted(self._received)
+
+    def _handle(self, number: int, frame: object) -> None:
+        self._restore()
+        self._received = number
+        if self._waiting():
+            self.poll()
+
+    def _restore(self) -> None:
+        for number, previous in self._previous.items():
+            signal.signal(number, previous)
+        self._previous = {}
+
+
+def resume_command(argv: Sequence[str], method: str, folder: Path) -> str:
+    """The `ns-train` command that goes on from a folder of checkpoints, with all options of the one that was stopped.
+
+    Args:
+        argv: The stopped program's arguments, its own name first.
+        method: The method's name, ns-train's first argument.
+        folder: Of the checkpoints.
+
+    Returns:
+        The command; for any other program, the setting that does the same.
+    """
+    program, *words = argv
+    if Path(program).stem != "ns-train" or words[:1] != [method] or any(w.startswith("--load-config") for w in words):
+        return f"load_dir = {str(folder)!r}"  # a --load-config overrules the other options
+    kept, skip = [], False
+    for word in words[1:]:
+        option = word.partition("=")[0].removeprefix("--").replace("_", "-") if word.startswith("--") else None
+        if not skip and option not in _LOADING:
+            kept.append(word)
+        skip = not skip and option in _LOADING and "=" not in word
+    return shlex.join(["ns-train", method, "--load-dir", str(folder), *kept])
