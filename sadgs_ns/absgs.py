@@ -24,7 +24,7 @@ def accumulate_gradients(gradients: MutableMapping[str, Tensor], info: Mapping[s
     """Add the screen-space gradients of one backward pass, in place.
 
     Gradients are normalised as in 3DGS: by half the image size, so that 1 is the gradient per half image, and by the
-    number of views, since the loss is a mean over views.
+    number of views, since the loss is a mean over views. One that is NaN adds nothing.
 
     Args:
         gradients: As made by `empty_gradients`.
@@ -37,7 +37,7 @@ def accumulate_gradients(gradients: MutableMapping[str, Tensor], info: Mapping[s
     scale_x, scale_y = info["width"] / 2.0 * num_views, info["height"] / 2.0 * num_views
     for key, gradient in (("grad2d", means2d.grad), ("absgrad2d", means2d.absgrad)):
         norm = torch.hypot(gradient[..., 0] * scale_x, gradient[..., 1] * scale_y)  # [C, N]
-        gradients[key] += torch.where(seen, norm, 0.0).sum(0)
+        gradients[key] += torch.where(seen, norm, 0.0).nansum(0)
     gradients["grad_count"] += seen.sum(0)
 
 
@@ -50,7 +50,7 @@ def grow(
     clone_threshold: float,
     split_threshold: float,
     size_threshold: float,
-    budget: int,
+    budget: float,
 ) -> tuple[int, int]:
     """Clone small Gaussians by their mean gradient, split large ones in two by their absolute gradient.
 
@@ -71,7 +71,8 @@ def grow(
     clone_ratio = state["grad2d"] / count / clone_threshold
     split_ratio = state["absgrad2d"] / count / split_threshold
     steepness = torch.where(is_small, clone_ratio, split_ratio)  # ≥ 1 grows
-    chosen = limit_growth((steepness >= 1).long(), steepness, budget)
+    grows = (steepness >= 1) & steepness.isfinite()  # a sum that overflowed says nothing
+    chosen = limit_growth(grows.long(), steepness, budget)
     is_clone, is_split = chosen & is_small, chosen & ~is_small
     n_clone, n_split = int(is_clone.sum()), int(is_split.sum())
     if n_clone > 0:

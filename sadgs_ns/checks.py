@@ -30,7 +30,7 @@ UNSUPPORTED_CAMERAS = {"FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"}
 _PLY_BYTES = {"short": 2, "ushort": 2, "int16": 2, "uint16": 2, "int": 4, "uint": 4, "int32": 4, "uint32": 4,
               "float": 4, "float32": 4, "double": 8, "float64": 8}  # fmt: skip
-_GIVE_POSES = "compute poses with `ns-process-data images --data IMAGES --output-dir FOLDER`"
+_GIVE_POSES = "compute poses with `sadgs-process PHOTOS FOLDER` or `ns-process-data`"
 
 
 @dataclass(frozen=True)

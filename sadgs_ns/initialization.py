@@ -24,8 +24,11 @@ def bounding_box_points(points: Tensor, grid: int = FACE_GRID) -> tuple[Tensor, 
 
     Returns:
         6·grid² points [6·grid², 3] and the spacing that their scale starts from, mean box extent / grid, world units.
+        Where the box is flat, faces coincide and every place has one point; where it is a single point there are none.
     """
     low, high = points.amin(0), points.amax(0)
+    if (low == high).all():
+        return points[:0], 1.0
     ticks = (torch.arange(grid, device=points.device, dtype=points.dtype) + 0.5) / grid  # cell centres in (0, 1)
     u, v = torch.meshgrid(ticks, ticks, indexing="ij")
     faces = []
@@ -34,7 +37,10 @@ def bounding_box_points(points: Tensor, grid: int = FACE_GRID) -> tuple[Tensor, 
             face = torch.stack([u, v], -1).reshape(-1, 2)
             face = torch.cat([face[:, :axis], torch.full_like(face[:, :1], side), face[:, axis:]], dim=1)
             faces.append(low + face * (high - low))
-    return torch.cat(faces), float((high - low).mean()) / grid
+    placed = torch.cat(faces)
+    if (low == high).any():
+        placed = placed.unique(dim=0)
+    return placed, float((high - low).mean()) / grid
 
 
 def neighbour_scales(points: Tensor, neighbours: int = 3) -> Tensor:
@@ -48,9 +54,14 @@ def neighbour_scales(points: Tensor, neighbours: int = 3) -> Tensor:
 
     Returns:
         World units, > 0. [P]
+
+    Raises:
+        ValueError: If there is no point.
     """
     from sklearn.neighbors import NearestNeighbors
 
+    if len(points) == 0:
+        raise ValueError("There are no points to start from: give SfM points, or set pipeline.model.random-init True.")
     extent = float((points.amax(0) - points.amin(0)).norm()) or 1.0
     k = min(neighbours, len(points) - 1)
     if k < 1:

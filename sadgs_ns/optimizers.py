@@ -13,10 +13,13 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from sadgs_ns import kernels
+from sadgs_ns.finite import NonFiniteLog, leave_out_nonfinite
 
 
 class FusedAdam(torch.optim.Adam):
     """torch's Adam, updated by our Triton kernel where that runs; state and results are torch's.
+
+    Gradients that are NaN, infinite or beyond `finite.MAX_GRADIENT` count as 0: parameters and moments stay finite.
 
     Args:
         params: Parameters, all on one device.
@@ -29,18 +32,26 @@ class FusedAdam(torch.optim.Adam):
         self._triton = fused and kernels.available(parameters[0].device) and not options.get("weight_decay")
         # torch's own keeps the step count on the device, which would make the host wait for it.
         super().__init__(parameters, fused=fused and not self._triton, **options)
+        self.log = NonFiniteLog(parameters[0].device, capacity=1)
+        """Where it is noted that a gradient was left out; the pipeline puts its own here."""
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
         """Update the parameters that have a gradient."""
-        if not self._triton:
-            return super().step(closure)
-        from sadgs_ns.kernels.adam import adam_step
-
         loss = None
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
+        noted = self.log.gradients
+        if not self._triton:
+            for group in self.param_groups:
+                for parameter in group["params"]:
+                    if parameter.grad is not None:
+                        leave_out_nonfinite(parameter.grad, noted)
+            super().step()
+            return loss
+        from sadgs_ns.kernels.adam import adam_step
+
         for group in self.param_groups:
             for parameter in group["params"]:
                 if parameter.grad is None:
@@ -55,6 +66,7 @@ class FusedAdam(torch.optim.Adam):
                     parameter.grad.contiguous(),
                     state["exp_avg"],
                     state["exp_avg_sq"],
+                    noted,
                     step=int(state["step"]),
                     lr=group["lr"],
                     betas=group["betas"],

@@ -16,6 +16,7 @@ from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConf
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.utils import dataparsers_utils as splits
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
@@ -24,7 +25,9 @@ from torch import Tensor
 from sadgs_ns import checks, kernels
 from sadgs_ns.datamanager import SadgsDatamanagerConfig
 from sadgs_ns.errors import InputError
+from sadgs_ns.finite import NonFiniteLog
 from sadgs_ns.model import SadgsModel, SadgsModelConfig
+from sadgs_ns.optimizers import FusedAdam
 from sadgs_ns.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.structure_tensor import (
     ENERGY_BLUR,
@@ -35,6 +38,10 @@ from sadgs_ns.structure_tensor import (
 
 _PIXELS_PER_BATCH = 4_000_000
 """Structure tensors are computed for as many images at once as fit this; each pixel takes about 300 bytes."""
+
+
+_NAMED_STEPS = 5
+"""Iterations of which a report of what was not finite names the images."""
 
 
 @dataclass
@@ -92,6 +99,7 @@ class SadgsPipeline(VanillaPipeline):
             )
         positions = self.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]  # [C, 3]
         self.model.set_cameras(positions)
+        self.log = NonFiniteLog(self.device)
 
     @property
     def model(self) -> SadgsModel:
@@ -141,6 +149,7 @@ class SadgsPipeline(VanillaPipeline):
             frequency_constant=self.config.frequency_constant,
             noise_floor=self.config.noise_floor,
             energy_blur=self.config.energy_blur,
+            fused=self.config.model.fused,
         ).half()
 
     def _next_view(self) -> tuple[int, dict[str, Any]]:
@@ -151,6 +160,29 @@ class SadgsPipeline(VanillaPipeline):
             datamanager.train_unseen_cameras = datamanager.sample_train_cameras()
         data = datamanager.cached_train[index]
         return index, {**data, "image": data["image"].to(self.device)}
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Those of data and model, and at the end a last look at what was not finite."""
+        optimizers = training_callback_attributes.optimizers
+        for optimizer in optimizers.optimizers.values() if optimizers is not None else ():
+            if isinstance(optimizer, FusedAdam):
+                optimizer.log = self.log
+        last = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self._report_nonfinite())
+        return [*super().get_training_callbacks(training_callback_attributes), last]
+
+    def _report_nonfinite(self) -> None:
+        """Say in which of the last iterations, and with which images, a loss or gradient was not finite."""
+        wrong = self.log.read()
+        files = self.datamanager.train_dataset.image_filenames
+        for step, views, what in wrong[:_NAMED_STEPS]:
+            names = escape(" and ".join(files[view].name for view in views))
+            CONSOLE.print(
+                f"[yellow]Iteration {step + 1}, {names}: {what}; such gradients counted as 0, training goes on.[/]"
+            )
+        if len(wrong) > _NAMED_STEPS:
+            CONSOLE.print(f"[yellow]The same in {len(wrong) - _NAMED_STEPS} more of the last iterations.[/]")
 
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
         """Render the iteration's views and return the outputs of the last size, mean losses and mean metrics."""
@@ -185,6 +217,9 @@ class SadgsPipeline(VanillaPipeline):
             for total, part in ((losses, group_losses), (metrics, self.model.get_metrics_dict(outputs, batch))):
                 for name, value in part.items():
                     total[name] = total.get(name, 0) + weight * value
+        if self.log.full:
+            self._report_nonfinite()
+        self.log.begin_step(step, [index for views in groups.values() for index, _ in views], losses["main_loss"])
         return outputs, losses, metrics
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:

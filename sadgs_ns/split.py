@@ -26,7 +26,7 @@ def children_per_axis(eta_max: Tensor, violates: Tensor, exponent: float = 0.5) 
     """Split factor n_k = ⌈η_k^p⌉ on the axes that violate consistently, 1 elsewhere (paper, eq. 8).
 
     Args:
-        eta_max: Largest η observed per axis, ≥ 0. [N, 3]
+        eta_max: Largest η observed per axis, ≥ 0; one that is no number splits nothing. [N, 3]
         violates: Axes that violate consistently over the views. bool [N, 3]
         exponent: p; the paper uses 1/2 and compares 1/4 and 3/4.
 
@@ -36,11 +36,15 @@ def children_per_axis(eta_max: Tensor, violates: Tensor, exponent: float = 0.5) 
     bound = float(MAX_CHILDREN_PER_AXIS)
     # Clamped before the power: η of 1e12 must not overflow on its way to the bound.
     counts = eta_max.clamp(1.0, bound ** (1.0 / exponent)).pow(exponent).ceil().clamp_max(bound)
-    return torch.where(violates, counts, 1.0).long()
+    # NaN is no violation: as an integer it could be anything.
+    return torch.where(violates & (counts >= 1), counts, 1.0).long()
 
 
-def limit_growth(growth: Tensor, priority: Tensor, budget: int) -> Tensor:
+def limit_growth(growth: Tensor, priority: Tensor, budget: float) -> Tensor:
     """Choose which Gaussians may grow so that the hard cap holds, the largest violations first.
+
+    By priority, each one is taken that fits what those before it left over. One that does not fit is passed over:
+    otherwise a single parent of 512 children would block all others near the cap.
 
     Args:
         growth: Gaussians that each one would add, ≥ 0. int64 [N]
@@ -48,12 +52,21 @@ def limit_growth(growth: Tensor, priority: Tensor, budget: int) -> Tensor:
         budget: Gaussians that may be added in all; ≤ 0 allows none.
 
     Returns:
-        The longest prefix by priority whose growth fits the budget, without those that do not grow. bool [N]
+        The chosen ones, among them none that does not grow. bool [N]
     """
-    order = torch.argsort(torch.where(growth > 0, priority, -torch.inf), descending=True, stable=True)
-    fits = torch.empty_like(growth, dtype=torch.bool)
-    fits[order] = torch.cumsum(growth[order], 0) <= budget
-    return fits & (growth > 0)
+    allowed = torch.zeros_like(growth, dtype=torch.bool)
+    order = torch.argsort(priority, descending=True, stable=True)
+    order = order[growth[order] > 0]
+    # A pass takes all up to the first that does not fit, and drops all that are as large as that one: there are no more
+    # passes than sizes, and a single one where the budget suffices.
+    while len(order) > 0:
+        fits = torch.cumsum(growth[order], 0) <= budget
+        taken = order[fits]
+        allowed[taken] = True
+        budget -= int(growth[taken].sum())
+        order = order[~fits]
+        order = order[growth[order] <= budget]
+    return allowed
 
 
 def grid_offsets(
@@ -106,7 +119,8 @@ def grid_split(
     local_parents, grid = grid_offsets(counts[selected], extent, params["scales"].dtype)
     parents = selected[local_parents]  # [Q]
     rotmats = normalized_quat_to_rotmat(F.normalize(params["quats"][parents], dim=-1))  # [Q, 3, 3]
-    offsets = torch.einsum("qij,qj->qi", rotmats, params["scales"][parents].exp() * grid)  # [Q, 3]
+    # Not a batched matrix product: cuBLAS takes 3×3 matrices 65,535 at a time.
+    offsets = (rotmats * (params["scales"][parents].exp() * grid)[:, None]).sum(dim=-1)  # [Q, 3]
     shrink = counts[parents].to(params["scales"].dtype).log()  # [Q, 3]
 
     def param_fn(name: str, p: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,6 +13,7 @@ from gsplat.strategy.ops import _update_param_with_optimizer, remove
 from torch import Tensor
 
 from sadgs_ns.absgs import accumulate_gradients, empty_gradients, grow
+from sadgs_ns.memory import affordable_growth, free_bytes
 from sadgs_ns.split import VARIANCE_EXTENT, Params, children_per_axis, grid_split, limit_growth
 from sadgs_ns.statistics import consistent, empty_statistics, observe
 
@@ -36,7 +38,8 @@ class StructureAwareStrategy(Strategy):
     """
 
     max_gaussians: int = 4_000_000
-    """Hard cap on the number of Gaussians, never exceeded; the largest violations are split first."""
+    """Hard cap on the number of Gaussians, never exceeded; the largest violations are split first. On CUDA fewer are
+    added, with a warning, where the device's memory would not hold them."""
     structure_every: int = 500
     """Iterations between structure-aware split and prune steps; 0 turns them off."""
     absgs_every: int = 100
@@ -93,7 +96,12 @@ class StructureAwareStrategy(Strategy):
 
         Args:
             scene_scale: Extent of the cameras in world units, as 3DGS defines it.
+
+        Raises:
+            ValueError: If `max_gaussians` allows none.
         """
+        if self.max_gaussians < 1:
+            raise ValueError(f"strategy.max_gaussians must be at least 1, got {self.max_gaussians}.")
         return {"scene_scale": scene_scale}
 
     def fit_to_run(self, num_iterations: int) -> None:
@@ -194,9 +202,12 @@ class StructureAwareStrategy(Strategy):
         violates = consistent(state["n_high"], state["n_total"], self.tau_split)
         counts = children_per_axis(state["eta_max"], violates, self.split_exponent)  # [N, 3]
         worst = torch.where(violates, state["eta_max"], 0.0).amax(dim=1)  # [N]
-        budget = self.max_gaussians - len(counts)
-        allowed = limit_growth(counts.prod(dim=1) - 1, worst, budget)
+        growth = counts.prod(dim=1) - 1  # [N]
+        under_cap, in_memory = self._room(params, state)
+        allowed = limit_growth(growth, worst, min(under_cap, in_memory))
         n_parents, n_wanted = int(allowed.sum()), int((counts > 1).any(dim=1).sum())
+        if in_memory < min(int(growth.sum()), under_cap):
+            _warn_of_memory(iteration, in_memory)
         if n_parents > 0:
             grid_split(params, optimizers, state, torch.where(allowed[:, None], counts, 1), self.split_extent)
         # What was learned about parents says nothing about their children.
@@ -208,6 +219,7 @@ class StructureAwareStrategy(Strategy):
             )
 
     def _absgs_step(self, params: Any, optimizers: Any, state: Any, iteration: int) -> None:
+        under_cap, in_memory = self._room(params, state)
         n_clone, n_split = grow(
             params,
             optimizers,
@@ -215,8 +227,10 @@ class StructureAwareStrategy(Strategy):
             clone_threshold=self.clone_grad2d,
             split_threshold=self.split_absgrad2d,
             size_threshold=self.small_scale * state["scene_scale"],
-            budget=self.max_gaussians - len(params["means"]),
+            budget=min(under_cap, in_memory),
         )
+        if in_memory <= n_clone + n_split < under_cap:
+            _warn_of_memory(iteration, in_memory)
         n_pruned = self._prune(params, optimizers, state, self._opacities(params) < self.min_opacity)
         for key, value in empty_gradients(len(params["means"]), params["means"].device).items():
             state[key] = value
@@ -225,6 +239,11 @@ class StructureAwareStrategy(Strategy):
                 f"Iteration {iteration}: {n_clone} Gaussians cloned, {n_split} split in two, {n_pruned} pruned. "
                 f"Now having {len(params['means'])}."
             )
+
+    def _room(self, params: Params, state: Mapping[str, Any]) -> tuple[int, float]:
+        """How many Gaussians may be added under the cap, and how many fit in the device's memory."""
+        free = free_bytes(params["means"].device)
+        return self.max_gaussians - len(params["means"]), affordable_growth(params, state, free)
 
     @staticmethod
     def _opacities(params: Params) -> Tensor:
@@ -265,6 +284,14 @@ class StructureAwareStrategy(Strategy):
 
 def _views(info: Info | Sequence[Info]) -> Sequence[Info]:
     return [info] if isinstance(info, Mapping) else info
+
+
+def _warn_of_memory(iteration: int, in_memory: float) -> None:
+    warnings.warn(
+        f"Iteration {iteration}: the device's memory holds {in_memory} more Gaussians, so at most these are added. "
+        "Lower max_gaussians, use smaller images, or end other programs on the device.",
+        stacklevel=2,
+    )
 
 
 def _due(iteration: int, every: int) -> bool:

@@ -8,10 +8,14 @@ invented outside the image, no edge appears at a mask, and an image may be small
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from sadgs_ns import kernels
 
 NUM_LEVELS = 5
 """L + 1 levels, l = 0 … L with L = 4 (paper, section 3.2)."""
@@ -58,41 +62,59 @@ def gaussian_kernel(
     return kernel.to(dtype)
 
 
-def _convolve(image: Tensor, kernel: Tensor, axis: int) -> Tensor:
-    """Correlate along one image axis with zeros outside.
-
-    Args:
-        image: [B, C, H, W]
-        kernel: [K], K odd.
-        axis: 2 for rows (y), 3 for columns (x).
-    """
-    channels = image.shape[1]
-    kernel = kernel.to(image)
-    size = image.shape[axis]
-    radius = kernel.numel() // 2
-    if radius >= size:  # taps that can only ever meet zeros
-        kernel = kernel[radius - size + 1 : radius + size]
-        radius = size - 1
-    shape = (1, 1, -1, 1) if axis == 2 else (1, 1, 1, -1)
-    padding = (radius, 0) if axis == 2 else (0, radius)
-    weight = kernel.view(shape).expand(channels, -1, -1, -1)
-    # Full float32, and no search for the fastest algorithm: each of dozens of kernel sizes is used a few times only.
-    with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=False, allow_tf32=False):
-        return F.conv2d(image, weight, padding=padding, groups=channels)
+@lru_cache(maxsize=256)
+def _kernel(sigma: float, order: int, dtype: torch.dtype, device: torch.device, truncation: float) -> Tensor:
+    """`gaussian_kernel`, kept on the device: made anew for each batch of images, it would take most of the time."""
+    return gaussian_kernel(sigma, order, dtype, truncation).to(device)
 
 
-def _blur(image: Tensor, sigma: float, truncation: float) -> Tensor:
-    """Separable Gaussian blur with zeros outside. [B, C, H, W] → [B, C, H, W]"""
-    kernel = gaussian_kernel(sigma, dtype=image.dtype, truncation=truncation)
-    return _convolve(_convolve(image, kernel, 2), kernel, 3)
+@dataclass(frozen=True)
+class _Filters:
+    """Separable filters with zeros outside the image."""
 
+    truncation: float
+    """Radius of every kernel, in multiples of its standard deviation."""
+    fused: bool
+    """Convolve with our Triton kernel where it runs: CUDA, float32."""
 
-def _blur_and_gradient(image: Tensor, sigma: float, truncation: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Gaussian blur with zeros outside, and its exact x and y derivatives. Each [B, C, H, W], per px."""
-    smooth = gaussian_kernel(sigma, dtype=image.dtype, truncation=truncation)
-    derive = gaussian_kernel(sigma, order=1, dtype=image.dtype, truncation=truncation)
-    rows = _convolve(image, smooth, 2)
-    return _convolve(rows, smooth, 3), _convolve(rows, derive, 3), _convolve(_convolve(image, derive, 2), smooth, 3)
+    def convolve(self, image: Tensor, sigma: float, order: int, axis: int) -> Tensor:
+        """Correlate with a Gaussian or its derivative along one image axis.
+
+        Args:
+            image: [B, C, H, W]
+            sigma: px.
+            order: 0 or 1.
+            axis: 2 for rows (y), 3 for columns (x).
+        """
+        kernel = _kernel(sigma, order, image.dtype, image.device, self.truncation)
+        if self.fused and image.dtype == torch.float32 and kernels.available(image.device):
+            from sadgs_ns.kernels.convolution import correlate
+
+            return correlate(image, kernel, axis)
+        channels, size, radius = image.shape[1], image.shape[axis], kernel.numel() // 2
+        if radius >= size:  # taps that can only ever meet zeros
+            kernel = kernel[radius - size + 1 : radius + size]
+            radius = size - 1
+        shape = (1, 1, -1, 1) if axis == 2 else (1, 1, 1, -1)
+        padding = (radius, 0) if axis == 2 else (0, radius)
+        weight = kernel.view(shape).expand(channels, -1, -1, -1)
+        # Full float32, and no search for the fastest algorithm: each of dozens of kernel sizes is used a few times.
+        with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=False, allow_tf32=False):
+            return F.conv2d(image, weight, padding=padding, groups=channels)
+
+    def blur(self, image: Tensor, sigma: float) -> Tensor:
+        """Separable Gaussian blur. [B, C, H, W] → [B, C, H, W]"""
+        return self.convolve(self.convolve(image, sigma, 0, 2), sigma, 0, 3)
+
+    def blur_and_gradient(self, image: Tensor, sigma: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Gaussian blur, and its exact x and y derivatives. Each [B, C, H, W], per px."""
+        rows = self.convolve(image, sigma, 0, 2)
+        derived_rows = self.convolve(image, sigma, 1, 2)
+        return (
+            self.convolve(rows, sigma, 0, 3),
+            self.convolve(rows, sigma, 1, 3),
+            self.convolve(derived_rows, sigma, 0, 3),
+        )
 
 
 def multiscale_structure_tensor(
@@ -106,6 +128,7 @@ def multiscale_structure_tensor(
     num_levels: int = NUM_LEVELS,
     truncation: float = TRUNCATION,
     incremental: bool = False,
+    fused: bool = True,
 ) -> Tensor:
     """Aggregate the per-scale structure tensors of a batch of images of one size (paper, eq. 2–5).
 
@@ -126,6 +149,7 @@ def multiscale_structure_tensor(
         truncation: Radius of every kernel, in multiples of its standard deviation.
         incremental: Blur level l − 1 by √(σ_l² − σ_{l−1}²) instead of the image by σ_l: shorter kernels, but each
             level inherits what the one before it lost at borders and by truncation.
+        fused: Convolve with our Triton kernel where it runs: CUDA, float32.
 
     Returns:
         S̄ as (xx, xy, yy) in 1/px², positive semidefinite, trace ≤ (c / σ_0)², 0 at masked pixels. [B, H, W, 3]
@@ -153,6 +177,7 @@ def multiscale_structure_tensor(
     contrast = (image.square().sum(dim=1, keepdim=True).sum(dim=(2, 3), keepdim=True) / count).sqrt()  # [B, 1, 1, 1]
     noise = (noise_floor * contrast).clamp_min(_ROUNDING_FLOOR)  # [B, 1, 1, 1]
 
+    filters = _Filters(truncation, fused)
     numerator = torch.zeros_like(image[:, :1]).repeat(1, 3, 1, 1)  # [B, 3, H, W]
     denominator = noise**gamma
     previous = image
@@ -161,8 +186,8 @@ def multiscale_structure_tensor(
         source, step = image, sigma
         if incremental and level > 0:
             source, step = previous * valid, math.sqrt(sigma**2 - SCALE_STEP ** (2 * level - 2))
-        blurred, blurred_x, blurred_y = _blur_and_gradient(source, step, truncation)
-        reach, reach_x, reach_y = _blur_and_gradient(weight, step, truncation)
+        blurred, blurred_x, blurred_y = filters.blur_and_gradient(source, step)
+        reach, reach_x, reach_y = filters.blur_and_gradient(weight, step)
         reach = reach.clamp_min(torch.finfo(image.dtype).tiny)
         smoothed = blurred / reach
         gradient_x = (blurred_x - smoothed * reach_x) / reach  # derivative of the quotient
@@ -171,15 +196,15 @@ def multiscale_structure_tensor(
             [gradient_x.square().sum(1), (gradient_x * gradient_y).sum(1), gradient_y.square().sum(1)], dim=1
         )  # [B, 3, H, W]
         rho = INTEGRATION_FACTOR * sigma
-        integrated = _blur(weight, rho, truncation).clamp_min(torch.finfo(image.dtype).tiny)
-        tensor = _blur(products * weight, rho, truncation) / integrated  # S_l, eq. 2
+        integrated = filters.blur(weight, rho).clamp_min(torch.finfo(image.dtype).tiny)
+        tensor = filters.blur(products * weight, rho) / integrated  # S_l, eq. 2
         trace = tensor[:, :1] + tensor[:, 2:]
         normalised = tensor / (trace + (noise / sigma) ** 2)  # Ŝ_l, eq. 3
         energy = (previous - smoothed).square().sum(1, keepdim=True) * weight  # E_l², eq. 4
         if energy_blur > 0:
             window = energy_blur * sigma
-            total = _blur(weight, window, truncation).clamp_min(torch.finfo(image.dtype).tiny)
-            energy = _blur(energy, window, truncation) / total
+            total = filters.blur(weight, window).clamp_min(torch.finfo(image.dtype).tiny)
+            energy = filters.blur(energy, window) / total
         scale_weight = energy.clamp_min(0) ** (0.5 * gamma)  # E_l^γ
         numerator += scale_weight * (frequency_constant / sigma) ** 2 * normalised
         denominator = denominator + scale_weight

@@ -30,6 +30,11 @@ _LESS_MEMORY = (
 )
 
 
+def _memory(error: torch.cuda.OutOfMemoryError) -> str:
+    """How much memory was asked for, and of whom: the first two of torch's many sentences."""
+    return ". ".join(reason(error).split(". ")[:2]).rstrip(".")
+
+
 def available_machine() -> MachineConfig:
     """CUDA where there is a device, the CPU elsewhere."""
     return MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu")
@@ -102,7 +107,7 @@ class SadgsTrainer(Trainer):
         try:
             super().setup(*args, **kwargs)
         except torch.cuda.OutOfMemoryError as error:
-            raise RunError(f"The GPU's memory is too small to start ({reason(error)}): {_LESS_MEMORY}.") from error
+            raise RunError(f"The GPU's memory is too small to start ({_memory(error)}): {_LESS_MEMORY}.") from error
 
     def _load_checkpoint(self) -> None:
         """Resume as nerfstudio does, but with the safe loader, and from an earlier checkpoint if the latest is damaged.
@@ -116,7 +121,6 @@ class SadgsTrainer(Trainer):
             return super()._load_checkpoint()
         latest = config.load_dir is not None and config.load_step is None
         path, state = checkpoints.read_or_earlier(path) if latest else (path, checkpoints.read(path))
-        remedy = "give --load-dir the folder nerfstudio_models of a run of sadgs, or train from scratch"
         try:
             self._start_step = state["step"] + 1
             self.pipeline.load_pipeline(state["pipeline"], state["step"])
@@ -127,10 +131,12 @@ class SadgsTrainer(Trainer):
         except torch.cuda.OutOfMemoryError:
             raise
         except InputError as error:
-            raise InputError(f"{path} cannot be continued: {error} Instead, {remedy}.") from error
+            raise InputError(f"{path} cannot be continued: {str(error).rstrip('.')}; {checkpoints.REMEDY}.") from error
         except Exception as error:  # a foreign file's parts lead to whatever they lead to
             what = f"{type(error).__name__}: {reason(error)}"
-            raise InputError(f"{path} is not a checkpoint of this version of sadgs ({what}): {remedy}.") from error
+            raise InputError(
+                f"{path} is not a checkpoint of this version of sadgs ({what}): {checkpoints.REMEDY}."
+            ) from error
         CONSOLE.print(f"Resuming after step {state['step']} of {path}", markup=False, soft_wrap=True)
 
     def setup_optimizers(self) -> Optimizers:
@@ -166,8 +172,12 @@ class SadgsTrainer(Trainer):
             except Interrupted as interrupted:
                 self._stop(interrupted, total)
         except torch.cuda.OutOfMemoryError as error:
-            out_of_memory = reason(error)  # raised below, when the failed step's tensors are gone
-        except WriteError as error:
+            out_of_memory = _memory(error)  # raised below, when the failed step's tensors are gone
+        except OSError as error:
+            if error.errno is None and not isinstance(error, WriteError):
+                raise  # not from the disk
+            if not isinstance(error, WriteError):  # of a logger, such as tensorboard's
+                error = WriteError(Path(error.filename or self.base_dir), error)
             raise RunError(str(error)) from error
         finally:
             self.config.max_num_iterations = total

@@ -374,7 +374,7 @@ def test_wrong_input_gets_one_sentence(
     (tmp_path / "folder").mkdir()
     assert main([*arguments, "--output", "rows.jsonl"] if "--output" not in arguments else arguments) == 2
     printed = capsys.readouterr()
-    assert printed.err.startswith(f"sadgs-bench-kernels: {sentence}") and printed.err.count("\n") == 1
+    assert printed.err.startswith(f"sadgs-bench kernels: {sentence}") and printed.err.count("\n") == 1
     assert printed.out == "" and not (tmp_path / "rows.jsonl").exists()
 
 

@@ -363,3 +363,13 @@ def test_a_finished_run_is_one_line():
     )
     assert bench.line(result(lpips=None, peak_gb=None)).endswith("SSIM 0.9000, 1,000 Gaussians")
     assert bench.line(result(status="failed", error="no data.")) == "fox ours seed 0: failed: no data."
+
+
+def test_other_commands_are_told_and_reached(capsys: pytest.CaptureFixture[str]):
+    for arguments in (["--help"], *([name, "--help"] for name in bench.COMMANDS)):
+        with pytest.raises(SystemExit, match="0"):
+            bench.main(arguments)
+        printed = capsys.readouterr().out
+        assert printed.startswith(f"usage: sadgs-bench {arguments[0] if len(arguments) == 2 else '['}")
+        if len(arguments) == 1:
+            assert all(f"  {name}: " in printed for name in bench.COMMANDS)

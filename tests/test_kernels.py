@@ -14,8 +14,10 @@ from sadgs_ns import kernels, losses
 from sadgs_ns.bench.rasterizers import random_scene
 from sadgs_ns.optimizers import FusedAdam
 from sadgs_ns.statistics import empty_statistics, observe
+from sadgs_ns.structure_tensor import multiscale_structure_tensor
 
 adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
+convolution = pytest.importorskip("sadgs_ns.kernels.convolution", reason="Triton is not installed")
 harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")
 observation = pytest.importorskip("sadgs_ns.kernels.observation", reason="Triton is not installed")
 photometric = pytest.importorskip("sadgs_ns.kernels.photometric", reason="Triton is not installed")
@@ -71,6 +73,31 @@ def test_a_triton_that_compiles_is_found_and_one_that_does_not_is_told_once(monk
     monkeypatch.setattr("sadgs_ns.kernels.probe.probe", fail)
     with pytest.warns(UserWarning, match=r"do not run here: Failed to find C compiler\.$"):
         assert not kernels._compiles.__wrapped__(DEVICE)
+
+
+@pytest.mark.parametrize("shape", [(2, 3, 21, 34), (1, 1, 1, 40), (1, 2, 5, 3)], ids=str)
+@pytest.mark.parametrize("axis", [2, 3])
+def test_convolution_equals_torchs_in_float64(shape, axis):
+    generator = torch.Generator().manual_seed(0)
+    image, kernel = torch.randn(shape, generator=generator), torch.randn(9, generator=generator)
+    actual = convolution.correlate(image.to(DEVICE), kernel.to(DEVICE), axis)
+    weight = kernel.double().view((1, 1, -1, 1) if axis == 2 else (1, 1, 1, -1)).expand(shape[1], -1, -1, -1)
+    padding = (4, 0) if axis == 2 else (0, 4)
+    expected = torch.nn.functional.conv2d(image.double(), weight, padding=padding, groups=shape[1])
+    torch.testing.assert_close(actual.cpu().double(), expected, atol=1e-5, rtol=1e-5)
+
+
+def test_structure_tensors_are_the_same_with_the_kernel(monkeypatch):
+    images = torch.rand((2, 9, 14, 3), generator=torch.Generator().manual_seed(0)).to(DEVICE)
+    masks = torch.ones((2, 9, 14), dtype=torch.bool, device=DEVICE)
+    masks[0, 3:6, 5:7] = False
+    expected = multiscale_structure_tensor(images.double(), masks, num_levels=2)
+    monkeypatch.setattr(kernels, "available", lambda device: True)
+    calls = []
+    monkeypatch.setattr(convolution, "correlate", lambda *a, run=convolution.correlate: calls.append(a) or run(*a))
+    actual = multiscale_structure_tensor(images, masks, num_levels=2)
+    assert calls
+    torch.testing.assert_close(actual.double(), expected, atol=1e-5 * float(expected.abs().max()), rtol=1e-4)
 
 
 @pytest.mark.parametrize("degree", range(4))
@@ -146,12 +173,14 @@ def test_adam_equals_torchs():
     optimizer = torch.optim.Adam([expected], lr=0.1, eps=1e-15)
     actual = start.to(DEVICE).clone()
     moments = torch.zeros_like(actual), torch.zeros_like(actual)
+    noted = torch.zeros(1, device=DEVICE)
     for step in range(1, 6):
         gradient = torch.randn(start.shape, generator=generator)
         expected.grad = gradient.double()
         optimizer.step()
-        adam.adam_step(actual, gradient.to(DEVICE), *moments, step=step, lr=0.1, betas=(0.9, 0.999), eps=1e-15)
+        adam.adam_step(actual, gradient.to(DEVICE), *moments, noted, step=step, lr=0.1, betas=(0.9, 0.999), eps=1e-15)
     torch.testing.assert_close(actual.double().cpu(), expected.detach(), atol=1e-5, rtol=1e-5)
+    assert float(noted) == 0
 
 
 def test_optimizer_keeps_torchs_state_while_it_runs_the_kernel(monkeypatch):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import importlib
 import json
 import os
 import re
@@ -38,6 +39,14 @@ from sadgs_ns.bench.table import markdown
 POLL_SECONDS = 0.2
 KILL_SECONDS = 10.0
 """How long a run may take to end when it is asked to, before it is killed."""
+
+COMMANDS = {
+    "report": ("report", "the plots and the page of a results file"),
+    "kernels": ("approximations", "what each shortcut in the frequency analysis gets wrong, beside what it costs"),
+    "step": ("step", "the parts of a training step, with and without our Triton kernels (CUDA)"),
+    "rasterizers": ("rasterizers", "how far the CPU splatter and our tile lists are from gsplat (CUDA)"),
+}
+"""What `sadgs-bench` does besides running a protocol, and the module that does it."""
 
 Launch = Callable[[Job, "str | None", Path], "subprocess.Popen[bytes]"]
 """Starts a job on a GPU (None: whatever is visible) in a folder: `result.json` and `log` appear there."""
@@ -203,7 +212,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         Exit code: 0, 1 if a run failed or the gate found a regression, 2 if the input is wrong, 130 after an interrupt.
     """
-    parser = argparse.ArgumentParser(prog="sadgs-bench", description="Run a benchmark, or what is left of it.")
+    argv = sys.argv[1:] if argv is None else argv
+    if argv and argv[0] in COMMANDS:
+        return importlib.import_module(f"sadgs_ns.bench.{COMMANDS[argv[0]][0]}").main(argv[1:])
+    parser = argparse.ArgumentParser(
+        prog="sadgs-bench",
+        description="Run a benchmark, or what is left of it.",
+        epilog="\n".join(
+            ["other commands, each with --help:", *(f"  {n}: {what}" for n, (_, what) in COMMANDS.items())]
+        ),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("protocol", type=Path, help="YAML file of scenes, rows and seeds")
     parser.add_argument("--scenes", type=Path, required=True, metavar="ROOT", help="folder that holds the scenes")
     parser.add_argument("--output", type=Path, required=True, help="JSON-lines file; runs already in it are skipped")

@@ -1,4 +1,4 @@
-"""`sadgs-bench-kernels`: what each shortcut in the frequency analysis gets wrong, beside what it costs.
+"""`sadgs-bench kernels`: what each shortcut in the frequency analysis gets wrong, beside what it costs.
 
 Four tables: how S̄ is computed and stored, how many samples a footprint gets, how often η is observed, and how S̄ reacts
 to image perturbations as in the paper's supplement. Errors are against float64 or brute force; times are medians, on a
@@ -198,7 +198,7 @@ def _device_name(device: torch.device) -> str:
 def main(argv: Sequence[str] | None = None) -> int:
     """Print the tables; returns the exit code, 2 if the input is wrong."""
     default = Workload()
-    parser = argparse.ArgumentParser(prog="sadgs-bench-kernels", description=(__doc__ or "").split("\n\n")[1])
+    parser = argparse.ArgumentParser(prog="sadgs-bench kernels", description=(__doc__ or "").split("\n\n")[1])
     parser.add_argument("--image", type=Path, metavar="FILE", help="a photo (default: images of the demo scene)")
     parser.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N (default %(default)s)")
     parser.add_argument("--repeats", type=int, default=default.repeats, help="timed calls (default %(default)s)")
@@ -221,7 +221,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         device = find_device(given.device)
         photo = None if given.image is None else read_image(given.image, given.longest_side or 1600)
     except ValueError as error:
-        print(f"sadgs-bench-kernels: {error}", file=sys.stderr)
+        print(f"sadgs-bench kernels: {error}", file=sys.stderr)
         return 2
 
     workload = Workload(given.repeats, given.longest_side, given.gaussians)

@@ -1,4 +1,4 @@
-"""How far the torch splatter is from gsplat: `python -m sadgs_ns.bench.rasterizers` on a CUDA machine.
+"""How far the torch splatter is from gsplat: `sadgs-bench rasterizers` on a CUDA machine.
 
 Renders one random scene with gsplat on CUDA in float32, with gsplat's parts and our tile lists, and with the splatter
 on the CPU in float32 and float64, and prints the largest deviations of the images, projections and gradients from
@@ -8,6 +8,7 @@ gsplat's as a markdown table.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from typing import Any
 
 import gsplat
@@ -79,16 +80,18 @@ def render_with_gradients(
     return {"visible": visible(info).cpu()} | {name: value.detach().cpu().double() for name, value in results.items()}
 
 
-def main() -> None:
-    """Print the table; exit with status 1 where there is no CUDA device."""
-    parser = argparse.ArgumentParser(description="Compare the torch splatter with gsplat on CUDA.")
+def main(argv: Sequence[str] | None = None) -> int:
+    """Print the table; returns the exit code, 1 where there is no CUDA device."""
+    parser = argparse.ArgumentParser(
+        prog="sadgs-bench rasterizers", description="Compare the torch splatter with gsplat on CUDA."
+    )
     parser.add_argument("--gaussians", type=int, default=3000)
     parser.add_argument("--size", type=int, default=128, help="width and height of the image in pixels")
     parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
+    options = parser.parse_args(argv)
     if not torch.cuda.is_available():
         print("This comparison needs a CUDA device for gsplat, and torch finds none.")
-        raise SystemExit(1)
+        return 1
 
     scene = random_scene(options.gaussians, options.size, options.seed)
     reference = render_with_gradients(scene, "cuda", torch.float32)
@@ -115,7 +118,8 @@ def main() -> None:
             deviation = (actual - expected).abs().max().item()
             cells.append(f"{deviation:.1e}, {deviation / expected.abs().max().item():.1e}")
         print(f"| {name} | {' | '.join(cells)} |")
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())

@@ -1,4 +1,4 @@
-"""`sadgs-bench-report RESULTS.jsonl --output FOLDER`: the plots and the page of a results file."""
+"""`sadgs-bench report RESULTS.jsonl --output FOLDER`: the plots and the page of a results file."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit code: 0, or 2 if the input is wrong.
     """
     argv = sys.argv[1:] if argv is None else argv
-    parser = argparse.ArgumentParser(prog="sadgs-bench-report", description="Draw a results file: plots and a page.")
+    parser = argparse.ArgumentParser(prog="sadgs-bench report", description="Draw a results file: plots and a page.")
     parser.add_argument("results", type=Path, help="JSON-lines file that sadgs-bench wrote")
     parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="takes report.html and the plots")
     parser.add_argument("--images", type=Path, metavar="FOLDER", help="held-out views that the runs wrote, to compare")
@@ -177,14 +177,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--title", default="Benchmark", help="heading of the page")
     parser.add_argument("--command", metavar="TEXT", help="command that made the results, to be shown on the page")
     arguments = parser.parse_args(argv)
-    commands = [*([arguments.command] if arguments.command else []), shlex.join(["sadgs-bench-report", *argv])]
+    commands = [*([arguments.command] if arguments.command else []), shlex.join(["sadgs-bench", "report", *argv])]
     try:
         if arguments.views < 1:
             raise ValueError(f"--views must be 1 or more, not {arguments.views}.")
         rows = load(arguments.results, arguments.reference)
         write(rows, arguments.output, arguments.images, arguments.reference, arguments.title, commands, arguments.views)
     except (ValueError, OSError) as error:
-        print(f"sadgs-bench-report: {error}", file=sys.stderr)
+        print(f"sadgs-bench report: {error}", file=sys.stderr)
         return 2
     print(arguments.output / "report.html")
     return 0

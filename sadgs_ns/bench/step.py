@@ -1,4 +1,4 @@
-"""What surrounds rasterization in a training step, with and without our kernels: `python -m sadgs_ns.bench.step`.
+"""What surrounds rasterization in a training step, with and without our kernels: `sadgs-bench step`.
 
 A synthetic scene on a CUDA device: Gaussians on a spherical shell in front of one camera, an image to compare with,
 Adam with its moments. Each part is timed by itself, then the whole step, a split, and the structure tensors of images.
@@ -7,8 +7,9 @@ Adam with its moments. Each part is timed by itself, then the whole step, a spli
 from __future__ import annotations
 
 import argparse
-import statistics as mean_of
-from collections.abc import Callable
+import statistics
+import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gsplat
@@ -28,17 +29,16 @@ ETA_EVERY = 10
 
 
 def milliseconds(function: Callable[[], object]) -> float:
-    """Median time of a call on the device, after three to warm up."""
+    """Time of a call among calls that follow each other, as in training: the median of five rounds, after one."""
     times = []
-    for repeat in range(REPEATS + 3):
-        start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
-        start.record()
-        function()
-        end.record()
+    for _ in range(6):
         torch.cuda.synchronize()
-        if repeat >= 3:
-            times.append(start.elapsed_time(end))
-    return mean_of.median(times)
+        start = time.perf_counter()
+        for _ in range(REPEATS):
+            function()
+        torch.cuda.synchronize()
+        times.append((time.perf_counter() - start) / REPEATS * 1e3)
+    return statistics.median(times[1:])
 
 
 class Step:
@@ -172,19 +172,20 @@ def compare_parts(gaussians: int, width: int, height: int) -> None:
 
 
 def time_split(parents: int) -> None:
-    """Print what a split into four children each costs."""
-    step = Step(parents, 64, 64, True)
-    step.optimize()
-    step.gradients = []
-    step.forget_gradients()
-    counts = torch.tensor([[2, 2, 1]], device="cuda").expand(parents, 3)
-    torch.cuda.synchronize()
-    torch.cuda.reset_peak_memory_stats()
-    start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
-    start.record()
-    grid_split(step.params, step.optimizers, step.state, counts)  # type: ignore[arg-type]
-    end.record()
-    torch.cuda.synchronize()
+    """Print what a split into four children each costs, the second time: the first loads kernels."""
+    for _ in range(2):
+        step = Step(parents, 64, 64, True)
+        step.optimize()
+        step.gradients = []
+        step.forget_gradients()
+        counts = torch.tensor([[2, 2, 1]], device="cuda").expand(parents, 3)
+        torch.cuda.synchronize()
+        torch.cuda.reset_peak_memory_stats()
+        start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+        start.record()
+        grid_split(step.params, step.optimizers, step.state, counts)  # type: ignore[arg-type]
+        end.record()
+        torch.cuda.synchronize()
     result = 3 * sum(p.numel() for p in step.params.values()) * 4  # with both moments
     print(f"\nSplit of {parents:,} into {len(step.params['means']):,}: {start.elapsed_time(end):.0f} ms; ", end="")
     print(f"memory at its peak {torch.cuda.max_memory_allocated() / result:.2f} times that of the resulting ", end="")
@@ -217,16 +218,18 @@ def time_structure_tensors(images: int, width: int, height: int) -> None:
     print(f"working memory; the images take {pictures.numel() / 1e9:.2f} GB, the tensors in float16 twice that.")
 
 
-def main() -> None:
-    """Print the tables; exit with status 1 where there is no CUDA device."""
-    parser = argparse.ArgumentParser(description="Time the parts of a training step with and without our kernels.")
+def main(argv: Sequence[str] | None = None) -> int:
+    """Print the tables; returns the exit code, 1 where there is no CUDA device."""
+    parser = argparse.ArgumentParser(
+        prog="sadgs-bench step", description="Time the parts of a training step with and without our kernels."
+    )
     parser.add_argument("--gaussians", type=int, nargs="+", default=[500_000, 4_000_000])
     parser.add_argument("--width", type=int, default=1600, help="px")
     parser.add_argument("--height", type=int, default=1060, help="px")
-    options = parser.parse_args()
+    options = parser.parse_args(argv)
     if not torch.cuda.is_available():
         print("This comparison needs a CUDA device, and torch finds none.")
-        raise SystemExit(1)
+        return 1
     print(
         f"gsplat {gsplat.__version__}, torch {torch.__version__}, {torch.cuda.get_device_name()}, medians of {REPEATS}."
     )
@@ -234,7 +237,8 @@ def main() -> None:
         compare_parts(gaussians, options.width, options.height)
     time_split(500_000)
     time_structure_tensors(200, options.width, options.height)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())

@@ -1,0 +1,79 @@
+"""Losses and gradients that are not finite: noted on the device in each step and read now and then, so none waits."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+MAX_GRADIENT = 1e18
+"""A gradient at least this large counts as not finite: its square overflows in Adam's second moment for good."""
+
+
+class NonFiniteLog:
+    """What happened in the training steps since it was last read.
+
+    Args:
+        device: Where losses and gradients are.
+        capacity: Steps it holds.
+    """
+
+    def __init__(self, device: torch.device | str, capacity: int = 100) -> None:
+        self._losses = torch.zeros(capacity, device=device)
+        # NaN where one was left out. Rows of 16 bytes: Triton would compile Adam anew for a less aligned one.
+        self._gradients = torch.zeros((capacity, 4), device=device)
+        self._steps: list[tuple[int, list[int]]] = []
+
+    @property
+    def full(self) -> bool:
+        """Whether it must be read before it can hold another step."""
+        return len(self._steps) == len(self._losses)
+
+    def begin_step(self, step: int, views: list[int], loss: Tensor) -> None:
+        """Note a step's loss, in one small copy on the device.
+
+        Args:
+            step: Counted from 0.
+            views: Indices of the step's training views.
+            loss: Scalar.
+        """
+        self._losses[len(self._steps)] = loss.detach()
+        self._steps.append((step, views))
+
+    @property
+    def gradients(self) -> Tensor:
+        """Where the present step notes, with NaN, that a gradient was not finite. float32 [1]"""
+        slot = max(len(self._steps) - 1, 0)
+        return self._gradients[slot, :1]
+
+    def read(self) -> list[tuple[int, list[int], str]]:
+        """Steps in which something was not finite, and forget all; waits for the device.
+
+        Returns:
+            Step, its views, and what was wrong: "the loss was nan" or "gradients were not finite".
+        """
+        wrong = []
+        for (step, views), loss, gradient in zip(
+            self._steps, self._losses.tolist(), self._gradients[:, 0].tolist(), strict=False
+        ):
+            if not math.isfinite(loss):
+                wrong.append((step, views, f"the loss was {loss}"))
+            elif not math.isfinite(gradient):
+                wrong.append((step, views, "gradients were not finite"))
+        self._steps.clear()
+        self._gradients.zero_()
+        return wrong
+
+
+@torch.no_grad()
+def leave_out_nonfinite(gradient: Tensor, noted: Tensor) -> None:
+    """Set gradients of which Adam could not recover to 0, in place, without waiting for the device.
+
+    Args:
+        gradient: Any shape.
+        noted: Becomes NaN if there was one. [1]
+    """
+    wrong = ~(gradient.abs() < MAX_GRADIENT)  # NaN compares as False
+    gradient.masked_fill_(wrong, 0.0)
+    noted.masked_fill_(wrong.any(), torch.nan)

@@ -1,0 +1,410 @@
+"""`sadgs-process PHOTOS_OR_VIDEO OUT`: from photos to a scene that `ns-train sadgs --data OUT` reads, with pycolmap.
+
+Four stages, each of which goes on where an earlier run was interrupted: find features, match them, reconstruct cameras
+and points, undistort. OUT holds `images/`, `transforms.json`, `sparse_pc.ply` and COLMAP's model in `sparse/0`; what is
+only needed to go on lies in `OUT/work`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import io
+import itertools
+import json
+import shutil
+import sqlite3
+import sys
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+import pycolmap
+from PIL import ExifTags, Image
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
+VIDEO_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"}
+EXHAUSTIVE_LIMIT = 200
+"""Photos up to which every pair is matched; twice the photos take four times as long."""
+FEW_FEATURES = 500
+"""Keypoints under which a photo counts as blurred or empty."""
+Matching = Literal["auto", "exhaustive", "sequential", "spatial", "vocabulary"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Summary:
+    """What became of the photos."""
+
+    photos: int
+    registered: int
+    points: int
+    reprojection_error: float
+    """Mean over all observations, px."""
+    left_out: dict[str, str]
+    """Photos that were not registered, and why."""
+
+    def __str__(self) -> str:
+        lines = [
+            f"{self.registered} of {self.photos} photos registered, {self.points:,} points, "
+            f"mean reprojection error {self.reprojection_error:.2f} px."
+        ]
+        return "\n".join(lines + [f"  {name}: {why}" for name, why in sorted(self.left_out.items())])
+
+
+def sequential_pairs(names: Sequence[str], overlap: int = 10) -> list[tuple[str, str]]:
+    """Each frame with the next ones, and with ever fewer of those farther on, which close loops.
+
+    Args:
+        names: In the order of the film.
+        overlap: How many neighbours.
+    """
+    steps = sorted({*range(1, overlap + 1), *(2**k for k in range(4, 10))})
+    return [(names[i], names[i + step]) for i in range(len(names)) for step in steps if i + step < len(names)]
+
+
+def sharpest_frames(video: Path, count: int) -> Iterator[tuple[int, np.ndarray]]:
+    """The sharpest frame of each of `count` stretches of a video, by the variance of its Laplacian.
+
+    Raises:
+        ValueError: If OpenCV cannot read the video.
+    """
+    capture = cv2.VideoCapture(str(video))
+    total = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    if not capture.isOpened() or total < 1:
+        raise ValueError(f"{video} cannot be read as a video; convert it to MP4 with H.264.")
+    stretch = max(total / count, 1.0)
+    best: tuple[float, np.ndarray] | None = None
+    for i in itertools.count():
+        read, frame = capture.read()
+        number = int(i / stretch)
+        if best is not None and (not read or int((i - 1) / stretch) != number):
+            yield int((i - 1) / stretch), best[1]
+            best = None
+        if not read:
+            return
+        grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+        sharpness = float(cv2.Laplacian(grey, cv2.CV_64F).var())
+        if best is None or sharpness > best[0]:
+            best = (sharpness, frame)
+
+
+def find_photos(source: Path, work: Path, frames: int) -> tuple[Path, list[str]]:
+    """The folder of photos and their names; a video's sharpest frames are written first.
+
+    Raises:
+        ValueError: If there are fewer than three photos.
+    """
+    folder = source
+    if source.is_file():
+        if source.suffix.lower() not in VIDEO_SUFFIXES:
+            raise ValueError(
+                f"{source} is neither a folder of photos nor a video ({', '.join(sorted(VIDEO_SUFFIXES))})."
+            )
+        folder = work / "frames"
+        done = work / "frames.json"
+        if not done.exists():
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True)
+            for number, frame in sharpest_frames(source, frames):
+                cv2.imwrite(str(folder / f"{number:05d}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, 97])
+            done.write_text(json.dumps({"video": source.name, "frames": frames}))
+    elif not source.is_dir():
+        raise ValueError(f"{source} does not exist; give a folder of photos or a video.")
+    names = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES)
+    if len(names) < 3:
+        raise ValueError(f"{source} holds {len(names)} photos; a reconstruction needs at least 3, better 30 or more.")
+    return folder, names
+
+
+def photos_by_camera(photos: Path, names: Sequence[str]) -> list[list[str]]:
+    """Photos that one camera at one focal length took, as far as their size and EXIF tell.
+
+    Raises:
+        ValueError: If a photo cannot be read.
+    """
+    groups: dict[tuple, list[str]] = defaultdict(list)
+    for name in names:
+        try:
+            with Image.open(photos / name) as image:
+                exif = image.getexif()
+                lens = exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLength)
+                groups[image.size, exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model), lens].append(name)
+        except OSError as error:
+            raise ValueError(f"{photos / name} cannot be read as an image ({error}); remove or replace it.") from error
+    return list(groups.values())
+
+
+def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, progress: Progress) -> None:
+    """Find SIFT features in the photos that have none yet; each group of photos shares a camera."""
+    task = progress.add_task("features", total=sum(map(len, groups)))
+    with ThreadPoolExecutor(1) as pool:
+        for group in groups:
+            reader = pycolmap.ImageReaderOptions(camera_model="OPENCV")
+            if database.exists():
+                with pycolmap.Database.open(database) as opened:  # an interrupted run has made the camera
+                    known = {image.name: image.camera_id for image in opened.read_all_images()}
+                reader.existing_camera_id = next((known[name] for name in group if name in known), -1)
+            extraction = pool.submit(
+                pycolmap.extract_features, database, photos, list(group), pycolmap.CameraMode.SINGLE, reader
+            )
+            while not extraction.done():
+                wait([extraction], timeout=0.5)
+                with contextlib.suppress(sqlite3.Error), contextlib.closing(_reading(database)) as connection:
+                    progress.update(task, completed=connection.execute("SELECT COUNT(*) FROM keypoints").fetchone()[0])
+            extraction.result()
+    progress.update(task, completed=sum(map(len, groups)))
+
+
+def _reading(database: Path) -> sqlite3.Connection:
+    """A connection that takes no lock, for COLMAP aborts where it meets one; what it reads may be torn."""
+    return sqlite3.connect(f"{database.resolve().as_uri()}?immutable=1", uri=True)
+
+
+def match(
+    names: Sequence[str], database: Path, work: Path, matching: Matching, is_video: bool, progress: Progress
+) -> None:
+    """Match features between photos; pairs that an earlier run matched are skipped.
+
+    Raises:
+        ValueError: If a way of matching cannot work on these photos.
+    """
+    if matching == "auto":
+        if is_video:
+            matching = "sequential"
+        elif len(names) <= EXHAUSTIVE_LIMIT:
+            matching = "exhaustive"
+        else:
+            matching = "spatial" if _all_have_positions(database, len(names)) else "vocabulary"
+    if matching in ("spatial", "vocabulary"):
+        task = progress.add_task(f"matches ({matching})", total=1)
+        if matching == "spatial":
+            if not _all_have_positions(database, len(names)):
+                raise ValueError(
+                    "--matching spatial needs a GPS position in every photo; use vocabulary or exhaustive."
+                )
+            pycolmap.match_spatial(database)
+        else:
+            try:
+                pycolmap.match_vocabtree(database)
+            except Exception as error:  # it downloads a vocabulary at its first use
+                raise ValueError(f"--matching vocabulary failed ({_first_line(error)}); use exhaustive.") from error
+        progress.advance(task)
+        return
+    pairs = sequential_pairs(names) if matching == "sequential" else list(itertools.combinations(names, 2))
+    task = progress.add_task(f"matches ({matching})", total=len(pairs))
+    for start in range(0, len(pairs), 50):
+        chunk = pairs[start : start + 50]
+        listed = work / "pairs.txt"
+        listed.write_text("".join(f"{a} {b}\n" for a, b in chunk))
+        pycolmap.match_image_pairs(database, pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed))
+        progress.advance(task, len(chunk))
+
+
+def _all_have_positions(database: Path, photos: int) -> bool:
+    with pycolmap.Database.open(database) as opened:
+        return opened.num_pose_priors() == photos
+
+
+def reconstruct(photos: Path, names: Sequence[str], database: Path, work: Path, progress: Progress) -> Path:
+    """Estimate cameras and points; of several disconnected models the one with the most photos is kept.
+
+    Returns:
+        The model's folder.
+
+    Raises:
+        ValueError: If no two photos could be related.
+    """
+    model = work / "model"
+    task = progress.add_task("cameras", total=len(names))
+    if (model / "images.bin").exists():
+        progress.advance(task, len(names))
+        return model
+    attempts = work / "models"
+    shutil.rmtree(attempts, ignore_errors=True)
+    attempts.mkdir()
+    options = pycolmap.IncrementalPipelineOptions(min_model_size=3)
+    models = pycolmap.incremental_mapping(
+        database,
+        photos,
+        attempts,
+        options,
+        initial_image_pair_callback=lambda: progress.advance(task, 2),
+        next_image_callback=lambda: progress.advance(task),
+    )
+    if not models:
+        raise ValueError(
+            "no two photos could be related to each other; take more of them, with at least two thirds of overlap, "
+            "sharp, and of a scene with texture."
+        )
+    best = max(models.values(), key=lambda candidate: candidate.num_reg_images())
+    partial = work / "model.partial"
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir()
+    best.write(partial)
+    partial.rename(model)
+    progress.update(task, completed=len(names))
+    return model
+
+
+def undistort(photos: Path, model: Path, out: Path, work: Path, max_size: int, progress: Progress) -> None:
+    """Write undistorted photos, the model that fits them, and what nerfstudio reads."""
+    from nerfstudio.process_data.colmap_utils import colmap_to_json
+
+    task = progress.add_task("undistorted photos", total=1)
+    partial = work / "undistorted"
+    shutil.rmtree(partial, ignore_errors=True)
+    options = pycolmap.UndistortCameraOptions(max_image_size=max_size)
+    pycolmap.undistort_images(partial, model, photos, undistort_options=options, jpeg_quality=95)
+    sparse = partial / "sparse"
+    (sparse / "0").mkdir()
+    for file in sparse.glob("*.bin"):
+        file.rename(sparse / "0" / file.name)
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints all cameras where there are several
+        colmap_to_json(sparse / "0", partial)
+    for name in ("images", "sparse"):
+        shutil.rmtree(out / name, ignore_errors=True)
+    for name in ("images", "sparse", "sparse_pc.ply", "transforms.json"):  # the last one says that all are there
+        (partial / name).rename(out / name)
+    progress.advance(task)
+
+
+def summarize(names: Sequence[str], model: Path, database: Path) -> Summary:
+    """Count what was registered, and find out why the rest was not."""
+    reconstruction = pycolmap.Reconstruction(model)
+    registered = {image.name for image in reconstruction.images.values() if image.has_pose}
+    left_out = {}
+    with pycolmap.Database.open(database) as opened:
+        identities = {image.name: image.image_id for image in opened.read_all_images()}
+        pair_ids, inliers = opened.read_two_view_geometry_num_inliers()
+        matches = dict.fromkeys(identities.values(), 0)
+        for pair, count in zip(pair_ids, inliers, strict=True):
+            for identity in pycolmap.pair_id_to_image_pair(pair):
+                matches[identity] = max(matches[identity], count)
+        for name in set(names) - registered:
+            identity = identities.get(name)
+            if identity is None:
+                left_out[name] = "could not be read"
+            elif opened.num_keypoints_for_image(identity) < FEW_FEATURES:
+                count = opened.num_keypoints_for_image(identity)
+                left_out[name] = f"only {count} features: blurred, dark or without texture"
+            elif matches[identity] < 30:
+                left_out[name] = "matches no other photo: too little overlap"
+            else:
+                left_out[name] = "matches other photos, but its pose stayed ambiguous"
+    return Summary(
+        len(names),
+        len(registered),
+        reconstruction.num_points3D(),
+        reconstruction.compute_mean_reprojection_error(),
+        left_out,
+    )
+
+
+def process(
+    source: Path,
+    out: Path,
+    *,
+    matching: Matching = "auto",
+    frames: int = 200,
+    max_size: int = 1600,
+    camera_per_photo: bool = False,
+) -> Summary:
+    """Make a scene of photos or a video.
+
+    Args:
+        source: A folder of photos, searched with its subfolders, or a video.
+        out: Folder for the scene; made if it does not exist, continued if an earlier run was interrupted.
+        matching: Which pairs are matched; auto is sequential for videos, exhaustive up to `EXHAUSTIVE_LIMIT` photos,
+            beyond that by GPS positions or a vocabulary.
+        frames: How many frames of a video are taken.
+        max_size: Longest side of the undistorted photos in px; 0 keeps them as they are.
+        camera_per_photo: Every photo has a focal length of its own. Otherwise those of one size share a camera, unless
+            EXIF tells of several cameras or focal lengths.
+
+    Returns:
+        What was registered and what was not.
+
+    Raises:
+        ValueError: One sentence that names the input and the remedy.
+    """
+    work = out / "work"
+    settings = {"source": str(source.resolve()), "camera_per_photo": camera_per_photo}
+    noted = work / "settings.json"
+    if out.exists() and any(out.iterdir()) and not noted.exists():
+        raise ValueError(f"{out} exists and is not a scene that sadgs-process began; give another folder.")
+    if noted.exists() and json.loads(noted.read_text()) != settings:
+        raise ValueError(f"{out} was begun with other photos or settings; give another folder or delete it.")
+    is_video = source.is_file()
+    photos, names = find_photos(source, work, frames)
+    work.mkdir(parents=True, exist_ok=True)
+    noted.write_text(json.dumps(settings))
+    groups = [[name] for name in names] if camera_per_photo else photos_by_camera(photos, names)
+    database = work / "database.db"
+    columns = (TextColumn("{task.description:>24}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, int(pycolmap.logging.ERROR)
+    try:
+        with Progress(*columns) as progress:
+            extract(photos, groups, database, progress)
+            match(names, database, work, matching, is_video, progress)
+            model = reconstruct(photos, names, database, work, progress)
+            undistort(photos, model, out, work, max_size or -1, progress)
+    finally:
+        pycolmap.logging.minloglevel = level
+    return summarize(names, model, database)
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Make a scene; returns the exit code, 2 if the input is wrong, 130 after an interrupt."""
+    parser = argparse.ArgumentParser(prog="sadgs-process", description="From photos or a video to a scene for sadgs.")
+    parser.add_argument("source", type=Path, help="folder of photos, or a video")
+    parser.add_argument("out", type=Path, help="folder for the scene; an interrupted run goes on in it")
+    parser.add_argument(
+        "--matching",
+        default="auto",
+        choices=["auto", "exhaustive", "sequential", "spatial", "vocabulary"],
+        help="which photos are compared (default %(default)s, by their kind and number)",
+    )
+    parser.add_argument("--frames", type=int, default=200, help="frames to take of a video (default %(default)s)")
+    parser.add_argument(
+        "--max-size", type=int, default=1600, metavar="PX", help="longest side of the result, 0 for all (%(default)s)"
+    )
+    parser.add_argument(
+        "--camera-per-photo", action="store_true", help="every photo has its own zoom, and EXIF does not tell"
+    )
+    options = parser.parse_args(argv)
+    if options.frames < 3:
+        parser.error("--frames must be at least 3")
+    try:
+        summary = process(
+            options.source,
+            options.out,
+            matching=options.matching,
+            frames=options.frames,
+            max_size=options.max_size,
+            camera_per_photo=options.camera_per_photo,
+        )
+    except ValueError as error:
+        print(f"sadgs-process: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("sadgs-process: stopped; the same command goes on.", file=sys.stderr)
+        return 130
+    print(summary)
+    if summary.registered < 0.5 * summary.photos:
+        print("Fewer than half of the photos registered: more overlap between them would help.")
+    print(f"\nns-train sadgs --data {options.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

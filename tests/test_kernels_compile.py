@@ -1,0 +1,65 @@
+"""Every Triton kernel compiles for NVIDIA's GPUs, which the interpreter does not show; no GPU is needed for that."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+pytest.importorskip("triton", reason="Triton is not installed")
+
+COMPILE = """
+import importlib, pkgutil, sys
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+import sadgs_ns.kernels as package
+
+CONSTANTS = {
+    "GAUSSIAN": (0.25, 0.5, 0.25), "STRIP": 1024, "ROWS": 16, "COLUMNS": 64, "TILE": 8, "LANES": 32, "VIEWS": 2,
+    "BLOCK": 1024, "HIGH": 1.0, "LOW": 0.1, "BLUR": 0.3, "MARGIN": 0.3, "EPSILON": 1e-5, "DIRECTIONAL": False,
+    "VERTICAL": False, "MAX": 1e18,
+}
+INTEGERS = "n row height width taps num_gaussians num_views tile_width tile_height used stride start".split()
+FLOATS = "rate scale beta1 beta2 eps min_logit l1_weight ssim_weight l2_weight".split()
+POINTERS = {
+    "radii": "*i32", "counts": "*i32", "order": "*i64", "ends": "*i64", "tiles": "*i16", "ids": "*i32", "drawn": "*i1",
+    "structure_tensors": "*fp16",
+}
+
+compiled = []
+for module in pkgutil.iter_modules(package.__path__):
+    kernels = vars(importlib.import_module(f"sadgs_ns.kernels.{module.name}"))
+    for name, kernel in kernels.items():
+        # Kernels are launched from Python; the functions that they call return values and are compiled with them.
+        if not isinstance(kernel, triton.JITFunction) or "tl.program_id(" not in kernel.src and name != "_write_one":
+            continue
+        signature, constants = {}, {}
+        for i, parameter in enumerate(kernel.params):
+            if parameter.is_constexpr:
+                signature[parameter.name], constants[(i,)] = "constexpr", CONSTANTS[parameter.name]
+            elif parameter.name in INTEGERS:
+                signature[parameter.name] = "i32"
+            elif parameter.name in FLOATS:
+                signature[parameter.name] = "fp32"
+            else:
+                signature[parameter.name] = POINTERS.get(parameter.name, "*fp32")
+        triton.compile(ASTSource(kernel, signature, constants), target=GPUTarget("cuda", int(sys.argv[1]), 32))
+        compiled.append(name)
+print(" ".join(compiled))
+"""
+
+
+@pytest.mark.parametrize("capability", [80, 90], ids=["A100", "H200"])
+def test_every_kernel_compiles(capability, tmp_path):
+    environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
+    environment["TRITON_CACHE_DIR"] = str(tmp_path)
+    run = subprocess.run(
+        [sys.executable, "-c", COMPILE, str(capability)], env=environment, capture_output=True, text=True
+    )
+    assert run.returncode == 0, run.stderr[-3000:]
+    expected = {"_blur_along_rows", "_similarity", "_spread_along_rows", "_gradient", "_count", "_list", "_observe"}
+    expected |= {"_forward", "_backward", "_update", "_correlate", "_write_one"}
+    assert set(run.stdout.split()) == expected
