@@ -12,7 +12,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from sadgs_ns.errors import InputError, reason
 
-_REMEDY = "give --load-step an earlier one, or train from scratch"
+REMEDY = "give --load-dir the folder nerfstudio_models of a run of sadgs, or train from scratch"
+"""For a checkpoint that cannot be used."""
 _PARTS = ("step", "pipeline", "optimizers", "scalers")
 
 
@@ -31,10 +32,12 @@ def read(path: Path) -> dict[str, Any]:
         # Without torch's advice after it, to load the file unsafely.
         what = re.split(r"(?<=[a-z])[.:]\s", reason(error), maxsplit=1)[0]
         raise InputError(
-            f"{path} is cut off, damaged or not of tensors and plain values alone ({what}): {_REMEDY}."
+            f"{path} is cut off, damaged or not of tensors and plain values alone ({what}): {REMEDY}."
         ) from error
-    if not isinstance(state, dict) or not all(part in state for part in _PARTS) or type(state["step"]) is not int:
-        raise InputError(f"{path} is not a checkpoint that nerfstudio's trainer wrote: {_REMEDY}.")
+    missing = [part for part in _PARTS if not isinstance(state, dict) or part not in state]
+    if missing or type(state["step"]) is not int:
+        what = f"it has no {missing[0]}" if missing else "its step is no number"
+        raise InputError(f"{path} is not a checkpoint that nerfstudio's trainer wrote ({what}): {REMEDY}.")
     return state
 
 
@@ -50,16 +53,15 @@ def read_or_earlier(path: Path) -> tuple[Path, dict[str, Any]]:
     Raises:
         InputError: As `read`, of the latest, if none can be read.
     """
-    latest = None
+    errors = []
     for candidate in sorted(path.parent.glob("step-*.ckpt"), key=lambda p: int(p.stem[5:]), reverse=True):
         try:
             state = read(candidate)
         except InputError as error:
-            latest = latest or error
-            CONSOLE.print(f"{error}", style="yellow", markup=False, soft_wrap=True)
+            errors.append(error)
             continue
-        if latest is not None:
-            CONSOLE.print(f"Going on from {candidate} instead.", style="yellow", markup=False, soft_wrap=True)
+        for error in errors:
+            text = f"{error} Going on from {candidate} instead."
+            CONSOLE.print(text, style="yellow", markup=False, soft_wrap=True)
         return candidate, state
-    assert latest is not None
-    raise latest
+    raise errors[0]

@@ -121,7 +121,6 @@ class SadgsTrainer(Trainer):
             return super()._load_checkpoint()
         latest = config.load_dir is not None and config.load_step is None
         path, state = checkpoints.read_or_earlier(path) if latest else (path, checkpoints.read(path))
-        remedy = "give --load-dir the folder nerfstudio_models of a run of sadgs, or train from scratch"
         try:
             self._start_step = state["step"] + 1
             self.pipeline.load_pipeline(state["pipeline"], state["step"])
@@ -132,10 +131,12 @@ class SadgsTrainer(Trainer):
         except torch.cuda.OutOfMemoryError:
             raise
         except InputError as error:
-            raise InputError(f"{path} cannot be continued: {str(error).rstrip('.')}; {remedy}.") from error
+            raise InputError(f"{path} cannot be continued: {str(error).rstrip('.')}; {checkpoints.REMEDY}.") from error
         except Exception as error:  # a foreign file's parts lead to whatever they lead to
             what = f"{type(error).__name__}: {reason(error)}"
-            raise InputError(f"{path} is not a checkpoint of this version of sadgs ({what}): {remedy}.") from error
+            raise InputError(
+                f"{path} is not a checkpoint of this version of sadgs ({what}): {checkpoints.REMEDY}."
+            ) from error
         CONSOLE.print(f"Resuming after step {state['step']} of {path}", markup=False, soft_wrap=True)
 
     def setup_optimizers(self) -> Optimizers:

@@ -6,6 +6,9 @@ import os
 
 import pytest
 import torch
+from hypothesis import settings
+
+settings.register_profile("long", max_examples=5000)  # pytest --hypothesis-profile=long
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel is defined: they then run on the CPU, slowly
