@@ -171,8 +171,8 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
             _ = pipeline.structure_tensors
 
     timer, curve = LoopTimer(), None
-    if job.curve_every is not None:
-        curve = Curve(job.curve_every, timer)
+    if job.row.curve_every is not None:
+        curve = Curve(job.row.curve_every, timer)
         curve.attach(trainer)
     timer.attach(trainer)
     with timed("train"):
@@ -261,7 +261,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     arguments = parser.parse_args()
     spec = json.loads(arguments.spec)
-    job = Job(Scene(**spec["scene"]), Row(**spec["row"]), spec["seed"], spec["curve_every"])
+    job = Job(Scene(**spec["scene"]), Row(**spec["row"]), spec["seed"])
     images = None if spec["images"] is None else Path(spec["images"])
     record = {
         "status": "ok",
