@@ -14,6 +14,7 @@ import datetime
 import importlib.metadata
 import json
 import subprocess
+import sys
 import tempfile
 import time
 import traceback
@@ -218,11 +219,12 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
 
 
 def software() -> dict[str, str | None]:
-    """Installed versions, and the git commit if this package runs from a checkout."""
+    """Versions, of what was imported where it tells its own, and the git commit if this package runs from a checkout."""
     versions: dict[str, str | None] = {}
     for name in ("torch", "gsplat", "nerfstudio", "sadgs_ns"):
         try:
-            versions[name] = importlib.metadata.version(name)
+            # Two installations in one folder have two metadata, of which the first need not be what runs.
+            versions[name] = getattr(sys.modules.get(name), "__version__", None) or importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             versions[name] = None
     return {**versions, "commit": _commit(Path(__file__).resolve().parents[2])}
@@ -267,7 +269,6 @@ def main() -> None:
         "status": "ok",
         "error": None,
         "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
-        "versions": software(),
     }
     with tempfile.TemporaryDirectory(dir=arguments.out.parent) as work:
         try:
@@ -275,6 +276,7 @@ def main() -> None:
         except Exception as error:
             traceback.print_exc()
             record |= {"status": "failed", "error": describe(error)}
+    record["versions"] = software()
     arguments.out.write_text(json.dumps(record))
 
 
