@@ -219,7 +219,7 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
 
 
 def software() -> dict[str, str | None]:
-    """Versions, of what was imported where it tells its own, and the git commit if this package runs from a checkout."""
+    """Versions, of what was imported where that tells its own, and the git commit if this package is a checkout."""
     versions: dict[str, str | None] = {}
     for name in ("torch", "gsplat", "nerfstudio", "sadgs_ns"):
         try:
