@@ -30,6 +30,7 @@ from sadgs_ns.finite import NonFiniteLog
 from sadgs_ns.model import SadgsModel, SadgsModelConfig
 from sadgs_ns.optimizers import FusedAdam
 from sadgs_ns.rasterization import viewmats_from_camera_to_world
+from sadgs_ns.storage import HIGHEST_FREQUENCY, encode
 from sadgs_ns.structure_tensor import (
     ENERGY_BLUR,
     FREQUENCY_CONSTANT,
@@ -39,8 +40,6 @@ from sadgs_ns.structure_tensor import (
 
 _PIXELS_PER_BATCH = 4_000_000
 """Structure tensors are computed for as many images at once as fit this; each pixel takes about 300 bytes."""
-_MAX_FREQUENCY_CONSTANT = 255
-"""S̄ is at most c²/px², which float16, in which it is kept, must hold."""
 
 
 _NAMED_STEPS = 5
@@ -83,10 +82,9 @@ class SadgsPipeline(VanillaPipeline):
     def __init__(self, config: SadgsPipelineConfig, *args: Any, **kwargs: Any) -> None:
         if config.views_per_iteration < 1:
             raise InputError(f"pipeline.views_per_iteration must be at least 1, got {config.views_per_iteration}.")
-        if not 0 < config.frequency_constant <= _MAX_FREQUENCY_CONSTANT:
+        if not 0 < config.frequency_constant <= HIGHEST_FREQUENCY:
             raise InputError(
-                f"pipeline.frequency_constant must be in (0, {_MAX_FREQUENCY_CONSTANT}], "
-                f"got {config.frequency_constant}."
+                f"pipeline.frequency_constant must be in (0, {HIGHEST_FREQUENCY:g}], got {config.frequency_constant}."
             )
         # Rendering new views ("inference") opens no image.
         for finding in refuse_bad_data(config.datamanager, open_images=kwargs.get("test_mode") != "inference"):
@@ -138,7 +136,7 @@ class SadgsPipeline(VanillaPipeline):
 
     @cached_property
     def structure_tensors(self) -> list[Tensor]:
-        """S̄ of every training image, float16 [H, W, 3], where the images are cached; 0 at masked pixels."""
+        """Codes (`storage.encode`) of S̄ of every training image, uint8 [H, W, 3], where the images are cached."""
         by_size = defaultdict(list)
         for index, data in enumerate(self.datamanager.cached_train):
             by_size[data["image"].shape[:2]].append(index)
@@ -152,7 +150,7 @@ class SadgsPipeline(VanillaPipeline):
         return tensors
 
     def _structure_tensors_of(self, indices: list[int]) -> Tensor:
-        """S̄ of training images of one size, computed on the training device, float16. [B, H, W, 3]"""
+        """Codes of S̄ of training images of one size, computed on the training device. uint8 [B, H, W, 3]"""
         data = [self.datamanager.cached_train[index] for index in indices]
         background = self.model.background_color.to(self.device)
         images = [self.model.composite_with_background(self.model.get_gt_img(d["image"]), background) for d in data]
@@ -162,14 +160,15 @@ class SadgsPipeline(VanillaPipeline):
                 [d["mask"][..., 0].to(self.device) if "mask" in d else torch.ones_like(image[..., 0], dtype=torch.bool)
                  for d, image in zip(data, images, strict=True)]
             )  # fmt: skip
-        return multiscale_structure_tensor(
+        tensors = multiscale_structure_tensor(
             torch.stack(images).to(self.device),
             masks,
             frequency_constant=self.config.frequency_constant,
             noise_floor=self.config.noise_floor,
             energy_blur=self.config.energy_blur,
             fused=self.config.model.fused,
-        ).half()
+        )
+        return encode(tensors)
 
     def _next_view(self) -> tuple[int, dict[str, Any]]:
         """Index and data of the next training view, in nerfstudio's order, without slicing its cameras for it."""

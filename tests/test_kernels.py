@@ -14,6 +14,7 @@ from sadgs_ns import kernels, losses
 from sadgs_ns.bench.rasterizers import random_scene
 from sadgs_ns.optimizers import FusedAdam
 from sadgs_ns.statistics import empty_statistics, observe
+from sadgs_ns.storage import encode
 from sadgs_ns.structure_tensor import multiscale_structure_tensor
 
 adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
@@ -130,7 +131,8 @@ def test_colours_and_gradients_equal_gsplats_float64_harmonics(degree):
 
 @pytest.mark.parametrize("directional", [False, True])
 @pytest.mark.parametrize("min_opacity", [0.0, 0.5])
-def test_observation_equals_the_reference(monkeypatch, directional, min_opacity):
+@pytest.mark.parametrize("kept", [Tensor.half, encode], ids=["float16", "8 bits"])
+def test_observation_equals_the_reference(monkeypatch, directional, min_opacity, kept):
     n, width, height = 150, 40, 30
     params = {name: p.detach() for name, p in scenes.random_params(n).items()}
     params["opacities"] = params["opacities"][:, None]
@@ -146,7 +148,7 @@ def test_observation_equals_the_reference(monkeypatch, directional, min_opacity)
     factors = torch.randn((2, height, width, 2, 2), generator=generator)
     tensors = factors @ factors.mT
     info |= {"viewmats": viewmats, "Ks": Ks}
-    info["structure_tensors"] = torch.stack([tensors[..., 0, 0], tensors[..., 0, 1], tensors[..., 1, 1]], -1).half()
+    info["structure_tensors"] = kept(torch.stack([tensors[..., 0, 0], tensors[..., 0, 1], tensors[..., 1, 1]], -1))
     results = []
     for fused in (False, True):
         monkeypatch.setattr(kernels, "available", lambda device: True)

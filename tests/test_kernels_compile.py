@@ -20,14 +20,14 @@ import sadgs_ns.kernels as package
 CONSTANTS = {
     "GAUSSIAN": (0.25, 0.5, 0.25), "STRIP": 1024, "ROWS": 16, "COLUMNS": 64, "TILE": 8, "LANES": 32, "VIEWS": 2,
     "BLOCK": 1024, "HIGH": 1.0, "LOW": 0.1, "BLUR": 0.3, "MARGIN": 0.3, "EPSILON": 1e-5, "DIRECTIONAL": False,
-    "VERTICAL": False, "MAX": 1e18, "PIXELS": 1024, "TINY": 1e-38,
+    "VERTICAL": False, "MAX": 1e18, "PIXELS": 1024, "TINY": 1e-38, "HIGHEST": 4.0, "OCTAVES": 12.0,
 }
 INTEGERS = "n row height width taps num_gaussians num_views tile_width tile_height used stride start".split()
 INTEGERS += "channels weight_stride".split()
 FLOATS = "exponent frequency sigma rate scale beta1 beta2 eps min_logit l1_weight ssim_weight l2_weight".split()
 POINTERS = {
     "radii": "*i32", "counts": "*i32", "order": "*i64", "ends": "*i64", "tiles": "*i16", "ids": "*i32", "drawn": "*i1",
-    "structure_tensors": "*fp16",
+    "structure_tensors": "*u8",
 }
 
 compiled = []

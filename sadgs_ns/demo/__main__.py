@@ -36,6 +36,7 @@ from sadgs_ns.model import SadgsModel
 from sadgs_ns.pipeline import SadgsPipeline
 from sadgs_ns.presets import load_preset
 from sadgs_ns.rasterization import rasterize
+from sadgs_ns.storage import decode
 from sadgs_ns.strategy import StructureAwareStrategy
 from sadgs_ns.trainer import SadgsTrainer, SadgsTrainerConfig
 
@@ -250,7 +251,7 @@ def draw_wavelength_and_eta(path: Path, scene: SceneDescription, run: Run, index
     name = dataset.image_filenames[index].name
     truth = expected_wavelength_map(scene.surfaces, next(view for view in scene.views if view.name == name))
     constant = pipeline.config.frequency_constant
-    estimate = 2 * torch.pi * constant * wavelength(pipeline.structure_tensors[index].float()).cpu().numpy()
+    estimate = 2 * torch.pi * constant * wavelength(decode(pipeline.structure_tensors[index])).cpu().numpy()
     figure = Figure(figsize=(15, 3.2), layout="constrained")
     image_axes, estimate_axes, truth_axes, eta_axes = figure.subplots(1, 4)
     image_axes.imshow(dataset.get_image_float32(index).cpu().numpy())
