@@ -24,9 +24,8 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.data.utils import colmap_parsing_utils
 from nerfstudio.engine.trainer import Trainer
 from PIL import Image, ImageFile
+from scenes import HEIGHT, WIDTH
 from test_nerfstudio import (
-    HEIGHT,
-    WIDTH,
     blender_data,
     checkpoint,
     configure,

@@ -22,26 +22,13 @@ from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.scripts.train import main as resume
+from scenes import ITERATIONS
 
-from sadgs_ns.demo.scene import SPARSE_FOLDER, write_scene
+from sadgs_ns.demo.scene import SPARSE_FOLDER
 from sadgs_ns.interrupts import resume_command
 from sadgs_ns.trainer import SadgsTrainer, SadgsTrainerConfig
 
-ITERATIONS = 12
 SCRIPT = Path(__file__).with_name("kill_and_resume.py")
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("demo") / "scene"
-    write_scene(folder, 48, 36, 10, 200)
-    return folder
-
-
-@pytest.fixture
-def config(scene: Path, tmp_path: Path) -> SadgsTrainerConfig:
-    """A run of a few iterations that saves only at its end."""
-    return configure(scene, tmp_path, ITERATIONS, save_every=0)
 
 
 def after(trainer: SadgsTrainer, at: int, act: Callable[[], None]) -> None:
