@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -89,7 +90,7 @@ class SadgsPipeline(VanillaPipeline):
                 f"got {config.frequency_constant}."
             )
         # Rendering new views ("inference") opens no image.
-        for finding in refuse_bad_data(config.datamanager, open_images=kwargs.get("test_mode") != "inference"):
+        for finding in _findings_of(config.datamanager, open_images=kwargs.get("test_mode") != "inference"):
             if finding.severity == "warning":
                 CONSOLE.print(f"[yellow]{escape(finding.sentence)}[/]")
         super().__init__(config, *args, **kwargs)
@@ -287,6 +288,29 @@ class SadgsPipeline(VanillaPipeline):
                 self.datamanager.random_generator.setstate(state["view_shuffle"])
         if "cuda" in state and self.device.type == "cuda":
             torch.cuda.set_rng_state(state["cuda"].cpu(), self.device)
+
+
+_checked: list[tuple[FullImageDatamanagerConfig, list[checks.Finding]]] = []
+"""At most one: settings whose data were just found good, and the findings that do not stop training."""
+
+
+def check_ahead(config: FullImageDatamanagerConfig) -> None:
+    """Check the data of the pipeline that will be made next; with these settings it then does not check them again.
+
+    Raises:
+        InputError: As `refuse_bad_data`.
+    """
+    _checked.clear()
+    _checked.append((copy.deepcopy(config), refuse_bad_data(config)))
+
+
+def _findings_of(config: FullImageDatamanagerConfig, open_images: bool) -> list[checks.Finding]:
+    """Those of `check_ahead`, once, or of a check now."""
+    while _checked:
+        settings, findings = _checked.pop()
+        if settings == config:
+            return findings
+    return refuse_bad_data(config, open_images)
 
 
 def refuse_bad_data(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[checks.Finding]:

@@ -22,7 +22,7 @@ from sadgs_ns.errors import InputError, RunError, WriteError, reason
 from sadgs_ns.export import atomic_path
 from sadgs_ns.interrupts import Interrupted, Interrupts, resume_command
 from sadgs_ns.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
-from sadgs_ns.pipeline import SadgsPipeline, SadgsPipelineConfig, refuse_bad_data
+from sadgs_ns.pipeline import SadgsPipeline, SadgsPipelineConfig, check_ahead
 
 _LESS_MEMORY = (
     "lower --pipeline.model.strategy.max-gaussians, or take smaller images (`--downscale-factor 2` after "
@@ -68,7 +68,7 @@ class SadgsTrainerConfig(TrainerConfig):
         Raises:
             InputError: If they are not; nothing is written then.
         """
-        refuse_bad_data(self.pipeline.datamanager)
+        check_ahead(self.pipeline.datamanager)
         path = self.get_base_dir() / "config.yml"
         CONSOLE.log(f"Saving config to: {path}")
         try:

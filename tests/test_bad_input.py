@@ -404,6 +404,33 @@ def test_good_data_have_no_error_and_no_warning(layout: str, captures: Path):
     assert [finding for finding in checks.check_data(captures / layout) if finding.severity != "note"] == []
 
 
+def test_a_run_checks_its_data_once_and_other_ways_to_a_pipeline_check_them_too(
+    captures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    checked: list[Path] = []
+    check_colmap = checks.check_colmap
+    monkeypatch.setattr(checks, "check_colmap", lambda data, **kw: (checked.append(data), check_colmap(data, **kw))[1])
+    first = Path(shutil.copytree(captures / "colmap", tmp_path / "first"))
+    second = Path(shutil.copytree(captures / "colmap", tmp_path / "second"))
+    config = configure(tmp_path / "out", parser_of(first))
+    config.save_config()
+    set_up(config)
+    assert checked == [first]  # ns-train
+    set_up(config)
+    assert checked == [first, first]  # a program, ns-eval, sadgs-bench
+    config.save_config()
+    config.pipeline.datamanager.data = second
+    (second / FIRST).unlink()
+    with pytest.raises(InputError, match="does not exist"):
+        set_up(config)  # other settings than were checked
+    config.pipeline.datamanager.data = None
+    (first / FIRST).unlink()
+    with pytest.raises(InputError, match="does not exist"):
+        config.save_config()
+    with pytest.raises(InputError, match="does not exist"):
+        set_up(config)  # what was good before does not count
+
+
 def test_several_problems_of_one_kind_are_one_finding_and_other_kinds_are_counted(captures: Path, tmp_path: Path):
     data = Path(shutil.copytree(captures / "nerfstudio", tmp_path / "nerfstudio"))
     for index in (2, 5, 7):
