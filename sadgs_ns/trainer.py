@@ -246,28 +246,22 @@ class SadgsTrainer(Trainer):
             WriteError: If the disk is full or the folder cannot be written.
         """
         path: Path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
-        partial = self.checkpoint_dir.with_name(f"{self.checkpoint_dir.name}.partial")
         others = [other for other in self.checkpoint_dir.glob("*.ckpt") if other != path]
-        try:
-            self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
-            torch.save(
-                {
-                    "step": step,
-                    "pipeline": self.pipeline.state_dict(),
-                    "optimizers": {name: o.state_dict() for name, o in self.optimizers.optimizers.items()},
-                    "schedulers": {name: s.state_dict() for name, s in self.optimizers.schedulers.items()},
-                    "scalers": self.grad_scaler.state_dict(),
-                },
-                partial,
-            )
+        state = {
+            "step": step,
+            "pipeline": self.pipeline.state_dict(),
+            "optimizers": {name: o.state_dict() for name, o in self.optimizers.optimizers.items()},
+            "schedulers": {name: s.state_dict() for name, s in self.optimizers.schedulers.items()},
+            "scalers": self.grad_scaler.state_dict(),
+        }
+        with atomic_path(path, beside=self.checkpoint_dir) as partial:
+            try:
+                torch.save(state, partial)
+            except RuntimeError as error:  # so torch's writer calls a full disk
+                raise OSError(reason(error)) from error
             if others:  # about to be deleted: the new one must be on the disk, lest a power cut takes both
                 with partial.open("rb+") as file:
                     os.fsync(file.fileno())
-            os.replace(partial, path)
-        except (OSError, RuntimeError) as error:  # torch's writer has a RuntimeError for a full disk
-            raise WriteError(path, error) from error
-        finally:
-            partial.unlink(missing_ok=True)
         self._saved_step = step
         if self.config.save_only_latest_checkpoint:
             for other in others:

@@ -662,7 +662,7 @@ def test_a_full_disk_leaves_the_previous_checkpoint_and_ends_training_with_one_s
     trainer = set_up(config)
     trainer.save_checkpoint(1)
     before = checkpoint(trainer, 1)
-    partial = trainer.checkpoint_dir.with_name("nerfstudio_models.partial")
+    partial = trainer.checkpoint_dir.with_name(".nerfstudio_models.partial")
     fill_disk(partial)
     with pytest.raises(
         WriteError, match=r"step-000000002\.ckpt could not be written \(.+ GB free there\): make room or"
@@ -707,7 +707,7 @@ def test_a_full_disk_leaves_the_previous_export(tmp_path: Path):
 
     write(10)
     before = (tmp_path / "splat.ply").read_bytes()
-    fill_disk(tmp_path / f".splat.{os.getpid()}.partial.ply")
+    fill_disk(tmp_path / ".splat.partial.ply")
     with pytest.raises(WriteError, match=r"splat\.ply could not be written \(.+ GB free there\): make room or "):
         write(10_000)
     assert [path.name for path in tmp_path.iterdir()] == ["splat.ply"]
