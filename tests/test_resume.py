@@ -41,14 +41,6 @@ def send(number: int) -> None:
     os.kill(os.getpid(), number)
 
 
-@pytest.fixture(autouse=True)
-def default_signals():
-    """As in a fresh process: sadgs-bench's main, which other tests call, leaves a handler of its own for SIGTERM."""
-    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    yield
-    signal.signal(signal.SIGTERM, before)
-
-
 def checkpoints(trainer: SadgsTrainer) -> list[str]:
     return sorted(path.name for path in trainer.checkpoint_dir.glob("*"))
 
