@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+import math
 import os
 import sys
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -30,6 +32,10 @@ _LESS_MEMORY = (
 )
 
 
+_SAVING_SHARE = 0.01
+"""The most of the time from one of the clock's checkpoints to the next that the saving may take."""
+
+
 def _memory(error: torch.cuda.OutOfMemoryError) -> str:
     """How much memory was asked for, and of whom: the first two of torch's many sentences."""
     return ". ".join(reason(error).split(". ")[:2]).rstrip(".")
@@ -53,6 +59,11 @@ class SadgsTrainerConfig(TrainerConfig):
     """The viewer. It listens on this machine only; a websocket_host of 0.0.0.0 opens it to the network."""
     max_num_iterations: int = 3000
     """Length of the run in optimizer steps; schedules stretch to it."""
+    steps_per_save: int = 0
+    """Steps between checkpoints; 0 leaves them to the clock. One is always made at the end."""
+    seconds_per_save: float = 60.0
+    """Where steps_per_save is 0: seconds from one checkpoint to the next, or 100 times what the last one took, if that
+    is longer; 0 makes none before the end."""
     steps_per_eval_batch: int = 0
     """Steps between losses on a held-out view; 0 is never."""
     steps_per_eval_image: int = 500
@@ -94,6 +105,7 @@ class SadgsTrainer(Trainer):
         super().__init__(config, local_rank, world_size)
         self._stepping = False
         self._completed_step = self._saved_step = -1
+        self._save_due = math.inf
         # Paused or done, nerfstudio waits for the viewer's user.
         self._interrupts = Interrupts(waiting=lambda: self.training_state != "training" and not self._stepping)
 
@@ -165,6 +177,7 @@ class SadgsTrainer(Trainer):
         self._completed_step = self._saved_step = self._start_step - 1
         self.config.max_num_iterations = max(total - self._start_step, 0)
         out_of_memory = ""
+        self._set_clock(0.0)
         try:
             try:
                 with self._interrupts:
@@ -215,12 +228,21 @@ class SadgsTrainer(Trainer):
         """nerfstudio calls this after every step, when densification is done."""
         self._completed_step, self._stepping = step, False
         self._interrupts.poll()
+        if time.monotonic() >= self._save_due:
+            self.save_checkpoint(step)
         super()._update_viewer_state(step)
 
     def _train_complete_viewer(self) -> None:
         """nerfstudio waits here for the viewer's user, for ever."""
         self._interrupts.poll()
         super()._train_complete_viewer()
+
+    def _set_clock(self, took: float) -> None:
+        """Say when the next checkpoint is due, after one that took so many seconds."""
+        config = self.config
+        by_clock = config.steps_per_save == 0 and config.seconds_per_save > 0
+        wait = max(config.seconds_per_save, took / _SAVING_SHARE) if by_clock else math.inf
+        self._save_due = time.monotonic() + wait
 
     def _stop(self, interrupted: Interrupted, total: int) -> None:
         """Save what was trained and leave; a run that had only its viewer left just ends."""
@@ -245,6 +267,7 @@ class SadgsTrainer(Trainer):
         Raises:
             WriteError: If the disk is full or the folder cannot be written.
         """
+        start = time.monotonic()
         path: Path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
         others = [other for other in self.checkpoint_dir.glob("*.ckpt") if other != path]
         state = {
@@ -266,3 +289,4 @@ class SadgsTrainer(Trainer):
         if self.config.save_only_latest_checkpoint:
             for other in others:
                 other.unlink()
+        self._set_clock(time.monotonic() - start)

@@ -183,7 +183,8 @@ def test_shipped_protocols_fit_the_real_configs(name: str, tmp_path: Path):
     jobs = protocol.load(CONFIGS / f"{name}.yaml").jobs()
     for job in jobs:
         (tmp_path / job.scene.data).mkdir(exist_ok=True)
-        build_config(job.scene, job.row, job.seed, tmp_path, tmp_path)
+        config = build_config(job.scene, job.row, job.seed, tmp_path, tmp_path)
+        assert config.steps_per_save == getattr(config, "seconds_per_save", 0) == 0  # none within the measured loop
 
 
 @pytest.mark.usefixtures("nerfstudio")
