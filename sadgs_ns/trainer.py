@@ -19,12 +19,12 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from sadgs_ns import checkpoints
-from sadgs_ns.checks import checkpoint_path
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
 from sadgs_ns.export import atomic_path
 from sadgs_ns.interrupts import Interrupted, Interrupts, resume_command
 from sadgs_ns.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
-from sadgs_ns.pipeline import SadgsPipeline, SadgsPipelineConfig, check_ahead
+from sadgs_ns.pipeline import SadgsPipeline, SadgsPipelineConfig
+from sadgs_ns.preflight import check_ahead
 
 _LESS_MEMORY = (
     "lower --pipeline.model.strategy.max-gaussians, or take smaller images (`--downscale-factor 2` after "
@@ -128,7 +128,7 @@ class SadgsTrainer(Trainer):
             InputError: If there is none, none can be read, or it is not of this method.
         """
         config = self.config
-        path = checkpoint_path(config.load_dir, config.load_step, config.load_checkpoint)
+        path = checkpoints.checkpoint_path(config.load_dir, config.load_step, config.load_checkpoint)
         if path is None:
             return super()._load_checkpoint()
         latest = config.load_dir is not None and config.load_step is None

@@ -36,7 +36,7 @@ from test_nerfstudio import (
     train,
 )
 
-from sadgs_ns import checks, colmap, doctor, presets
+from sadgs_ns import checkpoints, checks, colmap, doctor, presets
 from sadgs_ns.demo.scene import SPARSE_FOLDER, write_scene
 from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.export import write_ply
@@ -797,11 +797,12 @@ def test_a_checkpoint_that_cannot_be_continued_is_refused_in_one_sentence(
 
 def test_a_step_or_file_without_a_checkpoint_is_named(saved: Path, tmp_path: Path):
     with pytest.raises(InputError, match=r"no checkpoint of step 3: give --load-step one of 5\."):
-        checks.checkpoint_path(saved.parent, 3, None)
+        checkpoints.checkpoint_path(saved.parent, 3, None)
     with pytest.raises(InputError, match=r"\S+/none\.ckpt does not exist: give --load-checkpoint a file"):
-        checks.checkpoint_path(None, None, tmp_path / "none.ckpt")
-    assert checks.checkpoint_path(saved.parent, None, None) == checks.checkpoint_path(saved.parent, 5, None) == saved
-    assert checks.checkpoint_path(None, None, None) is None
+        checkpoints.checkpoint_path(None, None, tmp_path / "none.ckpt")
+    for step in (None, 5):
+        assert checkpoints.checkpoint_path(saved.parent, step, None) == saved
+    assert checkpoints.checkpoint_path(None, None, None) is None
 
 
 # --- the GPU's memory ---
