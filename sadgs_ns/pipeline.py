@@ -36,8 +36,6 @@ _PIXELS_PER_BATCH = 4_000_000
 """Structure tensors are computed for as many images at once as fit this; each pixel takes about 300 bytes."""
 _MAX_FREQUENCY_CONSTANT = 255
 """S̄ is at most c²/px², which float16, in which it is kept, must hold."""
-
-
 _NAMED_STEPS = 5
 """Iterations of which a report of what was not finite names the images."""
 

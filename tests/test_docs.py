@@ -14,11 +14,11 @@ CHECKOUT = Path(__file__).parents[1]
 
 @cache
 def names_in(file: str) -> tuple[set[str], set[str]]:
-    """Names of a module's test functions, and the keys of its dictionary CASES."""
+    """Names of a module's test functions, and the keys of its dictionaries."""
     tree = ast.parse((CHECKOUT / file).read_text("utf8")).body
     tests = {node.name for node in tree if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")}
-    dicts = [node.value for node in tree if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "CASES"]
-    return tests, {ast.literal_eval(key) for cases in dicts for key in getattr(cases, "keys", ()) if key is not None}
+    dicts = [node.value for node in tree if isinstance(node, ast.Assign) and isinstance(node.value, ast.Dict)]
+    return tests, {str(key.value) for cases in dicts for key in cases.keys if isinstance(key, ast.Constant)}
 
 
 def rows_of_hard_cases(document: str) -> list[tuple[str, str]]:
