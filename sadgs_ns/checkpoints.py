@@ -65,3 +65,27 @@ def read_or_earlier(path: Path) -> tuple[Path, dict[str, Any]]:
             CONSOLE.print(text, style="yellow", markup=False, soft_wrap=True)
         return candidate, state
     raise errors[0]
+
+
+def checkpoint_path(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> Path | None:
+    """The checkpoint that nerfstudio's trainer will load for these options, or None.
+
+    Raises:
+        InputError: If there is none, or the folder holds something else, too.
+    """
+    if load_dir is None:
+        if load_checkpoint is not None and not load_checkpoint.is_file():
+            raise InputError(f"{load_checkpoint} does not exist: give --load-checkpoint a file step-*.ckpt of a run.")
+        return load_checkpoint
+    steps = {}
+    for path in sorted(load_dir.iterdir()) if load_dir.is_dir() else []:
+        match = re.fullmatch(r"step-(\d+)\.ckpt", path.name)
+        if match is None:
+            raise InputError(f"{path} lies among the checkpoints and is none: move it elsewhere.")
+        steps[int(match[1])] = path
+    if not steps:
+        raise InputError(f"{load_dir} holds no checkpoint: give --load-dir the folder nerfstudio_models of a run.")
+    if load_step is not None and load_step not in steps:
+        there = ", ".join(map(str, sorted(steps)))
+        raise InputError(f"{load_dir} holds no checkpoint of step {load_step}: give --load-step one of {there}.")
+    return steps[max(steps) if load_step is None else load_step]

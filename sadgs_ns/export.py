@@ -16,18 +16,25 @@ from sadgs_ns.errors import WriteError
 
 
 @contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its name when the block ends well, and vanishes when it raises.
+def atomic_path(path: Path, beside: Path | None = None) -> Iterator[Path]:
+    """A temporary path that becomes `path` when the block ends well, and vanishes when it raises.
+
+    It is named after `beside` and the same each time, so that the next write replaces what a killed one left.
+
+    Args:
+        path: Made with its folder, or replaced.
+        beside: A neighbour of the temporary path: `path` itself, unless its folder takes no other files.
 
     Raises:
         WriteError: If the disk is full or the folder cannot be written.
     """
     path = Path(path)
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    neighbour = path if beside is None else beside
+    partial = neighbour.with_name(f".{neighbour.stem}.partial{neighbour.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield partial
-        partial.replace(path)
+        os.replace(partial, path)
     except OSError as error:
         raise WriteError(path, error) from error
     finally:

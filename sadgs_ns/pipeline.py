@@ -3,32 +3,27 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
-from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
-from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from nerfstudio.data.utils import dataparsers_utils as splits
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 from torch import Tensor
 
-from sadgs_ns import checks, kernels
+from sadgs_ns import kernels
 from sadgs_ns.cameras import refuse_failed_undistortion, refuse_unsupported_cameras
 from sadgs_ns.datamanager import SadgsDatamanagerConfig
 from sadgs_ns.errors import InputError
 from sadgs_ns.finite import NonFiniteLog
 from sadgs_ns.model import SadgsModel, SadgsModelConfig
 from sadgs_ns.optimizers import FusedAdam
+from sadgs_ns.preflight import findings_of
 from sadgs_ns.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.storage import HIGHEST_FREQUENCY, encode
 from sadgs_ns.structure_tensor import (
@@ -40,8 +35,6 @@ from sadgs_ns.structure_tensor import (
 
 _PIXELS_PER_BATCH = 4_000_000
 """Structure tensors are computed for as many images at once as fit this; each pixel takes about 300 bytes."""
-
-
 _NAMED_STEPS = 5
 """Iterations of which a report of what was not finite names the images."""
 
@@ -87,7 +80,7 @@ class SadgsPipeline(VanillaPipeline):
                 f"pipeline.frequency_constant must be in (0, {HIGHEST_FREQUENCY:g}], got {config.frequency_constant}."
             )
         # Rendering new views ("inference") opens no image.
-        for finding in refuse_bad_data(config.datamanager, open_images=kwargs.get("test_mode") != "inference"):
+        for finding in findings_of(config.datamanager, open_images=kwargs.get("test_mode") != "inference"):
             if finding.severity == "warning":
                 CONSOLE.print(f"[yellow]{escape(finding.sentence)}[/]")
         super().__init__(config, *args, **kwargs)
@@ -286,60 +279,3 @@ class SadgsPipeline(VanillaPipeline):
                 self.datamanager.random_generator.setstate(state["view_shuffle"])
         if "cuda" in state and self.device.type == "cuda":
             torch.cuda.set_rng_state(state["cuda"].cpu(), self.device)
-
-
-def refuse_bad_data(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[checks.Finding]:
-    """Check the data before nerfstudio parses them; parsers other than its three common ones are not checked.
-
-    Returns:
-        Findings that do not stop training.
-
-    Raises:
-        InputError: With the first finding that does.
-    """
-    parser = config.dataparser
-    data = Path(config.data or parser.data)
-    if isinstance(parser, ColmapDataParserConfig):
-        findings = checks.check_colmap(
-            data,
-            images_path=parser.images_path,
-            colmap_path=parser.colmap_path,
-            masks_path=parser.masks_path,
-            downscale_factor=parser.downscale_factor,
-            rounding=parser.downscale_rounding_mode,
-            load_points=parser.load_3D_points,
-            training_images=_training_images(parser),
-            open_images=open_images,
-        )
-    elif isinstance(parser, NerfstudioDataParserConfig):
-        findings = checks.check_nerfstudio(
-            data,
-            downscale_factor=parser.downscale_factor,
-            load_points=parser.load_3D_points,
-            training_images=_training_images(parser),
-            open_images=open_images,
-        )
-    elif isinstance(parser, BlenderDataParserConfig):
-        findings = checks.check_blender(data, open_images=open_images)
-    else:
-        findings = []
-    checks.refuse(findings, data)
-    return findings
-
-
-def _training_images(parser: ColmapDataParserConfig | NerfstudioDataParserConfig) -> Callable[[int], int] | None:
-    """How many of so many views the parser trains on; None if that depends on their names."""
-    if parser.eval_mode == "filename":
-        return None
-
-    def count(views: int) -> int:
-        names: list[Any] = [None] * views
-        if parser.eval_mode == "fraction":
-            chosen, _ = splits.get_train_eval_split_fraction(names, parser.train_split_fraction)
-        elif parser.eval_mode == "interval":
-            chosen, _ = splits.get_train_eval_split_interval(names, parser.eval_interval)
-        else:
-            chosen = np.arange(views)
-        return len(chosen)
-
-    return count

@@ -26,14 +26,14 @@ from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.scripts.eval import ComputePSNR
 from PIL import Image
 from plyfile import PlyData
+from scenes import HEIGHT, POINTS, VIEWS, WIDTH
 
-from sadgs_ns.demo.scene import SPARSE_FOLDER, arc_views, render, room_surfaces, write_scene
+from sadgs_ns.demo.scene import SPARSE_FOLDER, arc_views, render, room_surfaces
 from sadgs_ns.model import SadgsModel
 from sadgs_ns.presets import load_preset
 from sadgs_ns.storage import decode
 from sadgs_ns.trainer import SadgsTrainer, SadgsTrainerConfig
 
-WIDTH, HEIGHT, VIEWS, POINTS = 48, 36, 10, 300
 TRAIN_VIEWS = 8
 """Of 10, the parser holds out the first and the ninth."""
 ITERATIONS = 24
@@ -48,21 +48,6 @@ SCHEDULE = {
     "final_prune_opacity": 0.01,
 }
 """Densification for the few iterations of these tests."""
-
-
-@pytest.fixture(scope="session")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A COLMAP dataset."""
-    folder = tmp_path_factory.mktemp("colmap") / "scene"
-    write_scene(folder, WIDTH, HEIGHT, VIEWS, POINTS)
-    return folder
-
-
-@pytest.fixture
-def colmap(scene: Path) -> ColmapDataParserConfig:
-    return ColmapDataParserConfig(
-        data=scene, colmap_path=SPARSE_FOLDER, downscale_factor=1, eval_mode="interval", eval_interval=8
-    )
 
 
 @pytest.fixture(scope="module")

@@ -48,6 +48,8 @@ def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> T
     from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
     from nerfstudio.engine.trainer import TrainerConfig
 
+    from sadgs_ns.trainer import SadgsTrainerConfig
+
     config = copy.deepcopy(all_methods.get(row.method))
     if not isinstance(config, TrainerConfig):
         raise ValueError(f"row {row.label!r}: nerfstudio has no method {row.method!r}; install its package.")
@@ -74,6 +76,8 @@ def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> T
     config.logging.local_writer.enable = False
     config.logging.profiler = "none"
     config.steps_per_save = 0
+    if isinstance(config, SadgsTrainerConfig):
+        config.seconds_per_save = 0
     config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 0
     config.output_dir = work
     config.machine.seed = seed
