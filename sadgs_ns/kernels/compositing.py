@@ -2,7 +2,7 @@
 
 gsplat's backward pass sums nine quantities per Gaussian over the lanes of a warp, which takes most of its instructions.
 All nine are linear in two numbers per Gaussian and pixel: the weight of the Gaussian's colour, and the gradient of its
-exponent σ. The gradient of a colour is the weights times the pixels' gradients; those of centre, conic and opacity follow
+exponent σ. A colour's gradient is the weights times the pixels' gradients; those of centre, conic and opacity follow
 from the moments of σ's gradient over the tile. Both are products of [Gaussians, pixels] matrices.
 """
 
@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
 import triton
 import triton.language as tl
 from gsplat.cuda import _wrapper
@@ -23,25 +22,10 @@ from torch.autograd.function import once_differentiable
 TILE_SIZE = 8
 """px. Two pixels for each lane of the one warp that a tile gets."""
 PRECISION = "tf32x2"
-"""How float32 is multiplied. "tf32x2" splits it into two numbers of 11 bits (22 remain), which is enough, because the
-other factor, the moments, has few bits; "tf32" is the first of them alone; "tf32x3" and "ieee" are Triton's."""
+"""How float32 is multiplied. "tf32x2" splits it into two numbers of 11 bits, so that 22 of 24 remain, and the factors
+need no more; "tf32" takes the first of them alone; "tf32x3" and "ieee" are Triton's. Long, thin Gaussians need it."""
 _GAUSSIANS, _WARPS = 16, 1
-_COLUMNS = 12  # gradients of centre 2, conic 3, opacity 1, colour 3; absolute gradient of the centre 2; 1 unused
-
-
-if triton.knobs.runtime.interpret:
-
-    @triton.jit
-    def _reciprocal(value):
-        return 1 / value
-else:
-
-    @triton.jit
-    def _reciprocal(value):
-        """One instruction; Triton's division spends four more on denormals."""
-        return tl.inline_asm_elementwise(
-            "rcp.approx.ftz.f32 $0, $1;", "=r,r", [value], tl.float32, is_pure=True, pack=1
-        )  # fmt: skip
+_STRIDE = 12  # gradients of centre 2, conic 3, opacity 1, colour 3; absolute gradient of the centre 2; 1 unused
 
 
 @triton.jit
@@ -52,6 +36,21 @@ def _add(one, other):
 @triton.jit
 def _multiply(one, other):
     return one * other
+
+
+if isinstance(_add, triton.JITFunction):
+
+    @triton.jit
+    def _reciprocal(value):
+        """One instruction; Triton's division spends four more on denormals."""
+        return tl.inline_asm_elementwise(
+            "rcp.approx.ftz.f32 $0, $1;", "=r,r", [value], tl.float32, is_pure=True, pack=1
+        )  # fmt: skip
+else:  # Triton's interpreter, which knows no PTX
+
+    @triton.jit
+    def _reciprocal(value):
+        return 1 / value
 
 
 @triton.jit
@@ -69,8 +68,8 @@ def _coarse(values):
 
 @triton.jit
 def _rounded(values):
-    """Rounded where tensor cores would cut off, so that errors average out."""
-    return (values.to(tl.int32, bitcast=True) + 4096).to(tl.float32, bitcast=True)
+    """To the nearest that tensor cores read, so that errors average out."""
+    return ((values.to(tl.int32, bitcast=True) + 4096) & -8192).to(tl.float32, bitcast=True)
 
 
 @triton.jit
@@ -127,17 +126,17 @@ def _load_gaussians(means2d, conics, colors, opacities, g):
 def _composite_backward(
     means2d, conics, colors, opacities, starts, ids, alphas, last_ids, backgrounds, v_renders, v_alphas, gradients,
     num_pairs, height, width, tile_width, tile_height,
-    TILE: tl.constexpr, GAUSSIANS: tl.constexpr, COLUMNS: tl.constexpr, BACKGROUND: tl.constexpr,
+    TILE: tl.constexpr, GAUSSIANS: tl.constexpr, STRIDE: tl.constexpr, BACKGROUND: tl.constexpr,
     ABSGRAD: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Add one tile's share to the gradients [C * N, COLUMNS].
+    """Add one tile's share to the gradients [C * N, STRIDE].
 
-    Blocks are [Gaussians, pixels], from the back. With one warp, a thread holds all Gaussians of its two pixels, so that
+    Blocks are [Gaussians, pixels], from the back. With one warp, a thread holds all Gaussians of its two pixels, and
     what accumulates from Gaussian to Gaussian stays in its registers.
     """
     PIXELS: tl.constexpr = TILE * TILE
-    FAINTEST: tl.constexpr = 0x3B808081  # bits of 1/255
-    SCALE: tl.constexpr = 0.8493218002880191  # √(log2(e) / 2): of offsets, so that exp(-σ) is exp2 of a plain polynomial
+    FAINTEST = tl.constexpr(0x3B808081)  # bits of 1/255
+    SCALE = tl.constexpr(0.8493218002880191)  # √(log2(e) / 2), of offsets: exp(-σ) is then exp2 of a plain polynomial
     tile = tl.program_id(0)
     view = tile // (tile_height * tile_width)
     row, column = tile // tile_width % tile_height, tile % tile_width
@@ -160,8 +159,8 @@ def _composite_backward(
     green = tl.load(v_renders + 3 * at + 1, inside, 0.0)
     blue = tl.load(v_renders + 3 * at + 2, inside, 0.0)
     v_alpha = tl.load(v_alphas + at, inside, 0.0)
-    # In a matrix product 0 * NaN would reach all Gaussians of the batch. A pixel whose gradient is not finite counts 2^100
-    # in the colours' sums and 0 elsewhere; sums that large become NaN below, in the Gaussians that it sees.
+    # In a matrix product 0 * NaN would reach all Gaussians of the batch. A pixel whose gradient is not finite counts as
+    # 2^100 in the colours' sums and as 0 elsewhere; sums that large become NaN below, in the Gaussians that it sees.
     finite = tl.maximum(tl.maximum(tl.abs(red), tl.abs(green)), tl.maximum(tl.abs(blue), tl.abs(v_alpha))) < 1e18
     finite = finite & (red == red) & (green == green) & (blue == blue) & (v_alpha == v_alpha)
     red, green, blue = tl.where(finite, red, 0.0), tl.where(finite, green, 0.0), tl.where(finite, blue, 0.0)
@@ -240,15 +239,15 @@ def _composite_backward(
         r, g_, b_ = r + fine_r, g_ + fine_g, b_ + fine_b
         s, sx, sy, sxx, sxy, syy, _, _ = _split8(by_moment)
         nan = tl.where(tl.maximum(tl.abs(r), tl.maximum(tl.abs(g_), tl.abs(b_))) < 1e18, 0.0, float("nan"))
-        # Moments of the offset from pixel to centre, mean - (x, y). The conic is applied to the small part and to the mean
-        # apart: far from the centre of a long, thin Gaussian the sums would cancel.
+        # Moments of the offset from pixel to centre, mean - (x, y). The conic is applied to mean and (x, y) apart: far
+        # from the centre of a long, thin Gaussian the sums would cancel.
         v_x = (a * mean_x + b * mean_y) * s - (a * sx + b * sy)
         v_y = (b * mean_x + c * mean_y) * s - (b * sx + c * sy)
         v_a = 0.5 * (mean_x * (mean_x * s - 2 * sx) + sxx)
         v_b = mean_x * (mean_y * s - sy) - mean_y * sx + sxy
         v_c = 0.5 * (mean_y * (mean_y * s - 2 * sy) + syy)
         v_opacity = -s / tl.maximum(opacity, 1 / 255)
-        at_row = gradients + (g * COLUMNS)[:, None] + tl.arange(0, 4)[None, :]
+        at_row = gradients + (g * STRIDE)[:, None] + tl.arange(0, 4)[None, :]
         exists = (position >= start)[:, None]
         tl.atomic_add(at_row, _join4(v_x + nan, v_y + nan, v_a + nan, v_b + nan), exists, sem="relaxed")
         tl.atomic_add(at_row + 4, _join4(v_c + nan, v_opacity + nan, r + nan, g_ + nan), exists, sem="relaxed")
@@ -269,9 +268,9 @@ def composite_backward(
     v_alphas: Tensor,
     absgrad: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]:
-    """Gradients of gsplat's compositing of three channels in tiles of TILE_SIZE; all tensors contiguous, floats float32.
+    """Gradients of gsplat's compositing of three channels in tiles of TILE_SIZE. Tensors are contiguous, in float32.
 
-    Pixels whose gradient is not finite or at least 1e18 make the gradients of the Gaussians that they see NaN, and those
+    A pixel whose gradient is not finite, or at least 1e18, makes the gradients of the Gaussians that it sees NaN, and
     of no others.
 
     Args:
@@ -292,14 +291,14 @@ def composite_backward(
         Gradients of means2d, conics, colors and opacities, in their shapes, and the absolute gradient [C, N, 2]: parts
         of the rows of one tensor.
     """
-    gradients = means2d.new_zeros((*opacities.shape, _COLUMNS))
+    gradients = means2d.new_zeros((*opacities.shape, _STRIDE))
     if len(flatten_ids):
         height, width = last_ids.shape[1:]
         _composite_backward[(isect_offsets.numel(),)](
             means2d, conics, colors, opacities, isect_offsets, flatten_ids, alphas, last_ids,
             means2d if backgrounds is None else backgrounds, v_renders, v_alphas, gradients,
             len(flatten_ids), height, width, isect_offsets.shape[2], isect_offsets.shape[1],
-            TILE_SIZE, _GAUSSIANS, _COLUMNS, backgrounds is not None, absgrad, PRECISION,
+            TILE_SIZE, _GAUSSIANS, _STRIDE, backgrounds is not None, absgrad, PRECISION,
             num_warps=_WARPS, num_stages=1,
         )  # fmt: skip
     v_means2d, v_conics, v_opacities, v_colors, v_absolute, _ = gradients.split([2, 3, 1, 3, 2, 1], dim=-1)
