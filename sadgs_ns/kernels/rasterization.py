@@ -9,10 +9,13 @@ import torch
 from gsplat.cuda._wrapper import fully_fused_projection, rasterize_to_pixels, spherical_harmonics
 from torch import Tensor
 
+from sadgs_ns.kernels import compositing
 from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
 from sadgs_ns.kernels.tiles import intersect_tiles
 
-TILE_SIZE = 8
+BACKWARD: Literal["moments", "gsplat"] = "moments"
+"""Who differentiates the compositing of three channels: our kernel (compositing.py) or gsplat's, its reference."""
+TILE_SIZE = compositing.TILE_SIZE
 """px. gsplat's default of 16 saves list entries; with exact lists, pixels saved weigh more (docs/measurements.md)."""
 
 
@@ -89,19 +92,13 @@ def rasterization(
     isect_offsets, flatten_ids = intersect_tiles(
         means2d, radii, depths, conics, opacities, width, height, TILE_SIZE
     )  # fmt: skip
-    renders, alphas = rasterize_to_pixels(
-        means2d,
-        conics,
-        colors,
-        opacities,
-        width,
-        height,
-        TILE_SIZE,
-        isect_offsets,
-        flatten_ids,
-        backgrounds=backgrounds,
-        absgrad=absgrad,
-    )
+    splats = (means2d, conics, colors, opacities, width, height)
+    if BACKWARD == "moments" and colors.shape[-1] == 3:
+        renders, alphas = compositing.rasterize_to_pixels(*splats, isect_offsets, flatten_ids, backgrounds, absgrad)
+    else:
+        renders, alphas = rasterize_to_pixels(
+            *splats, TILE_SIZE, isect_offsets, flatten_ids, backgrounds=backgrounds, absgrad=absgrad
+        )
     if render_mode in ("ED", "RGB+ED"):
         renders = torch.cat([renders[..., :-1], renders[..., -1:] / alphas.clamp_min(1e-10)], dim=-1)
     info = {
