@@ -39,12 +39,11 @@ class StructureAwareStrategy(Strategy):
     """
 
     max_gaussians: int = 4_000_000
-    """Hard cap on the number of Gaussians, never exceeded; the largest violations are split first. On CUDA fewer are
-    added, with a warning, where the device's memory would not hold them."""
+    """Hard cap on the number of Gaussians, never exceeded; the largest violations are split first.
+    On CUDA fewer are added, with a warning, where the device's memory would not hold them."""
     memory_budget_gb: float | None = None
-    """Memory of the GPU, in 10⁹ bytes, that training may take: where it holds fewer Gaussians than `max_gaussians`,
-    `ns-train` lowers that at the start and says so. None is 80 % of what is free, unless `max_gaussians` was changed,
-    which then stays."""
+    """Memory of the GPU, in 10⁹ bytes, that training may take; `ns-train` lowers `max_gaussians` to it at the start.
+    None is 80 % of what is free, unless `max_gaussians` was changed, which then stays."""
     structure_every: int = 500
     """Iterations between structure-aware split and prune steps; 0 turns them off."""
     absgs_every: int = 100
@@ -58,8 +57,8 @@ class StructureAwareStrategy(Strategy):
     directional_eta: bool = False
     """Measure η along each axis's own direction (paper, eq. 7) instead of against the shortest wavelength (eq. 6)."""
     eta_min_opacity: float = 0.3
-    """Opacity in [0, 1] from which a Gaussian's η is observed, high or low; 0 observes every visible one, as the paper
-    does. Pruning by low η then only concerns Gaussians that were this opaque since the last structure step."""
+    """Opacity in [0, 1] from which a Gaussian's η is observed, high or low; 0, as in the paper, takes all visible ones.
+    Pruning by low η then only concerns Gaussians that were this opaque since the last structure step."""
     tau_split: float = 0.8
     """Fraction of observations that must violate (η > 1) before an axis is split."""
     split_exponent: float = 0.5

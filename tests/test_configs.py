@@ -22,7 +22,7 @@ from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
 
 import sadgs_ns.model
 from sadgs_ns import presets
-from sadgs_ns.model import WITHOUT_EFFECT, SadgsModel, SadgsModelConfig
+from sadgs_ns.model import OF_RAYS, WITHOUT_EFFECT, SadgsModel, SadgsModelConfig
 from sadgs_ns.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
 from sadgs_ns.pipeline import SadgsPipelineConfig
 from sadgs_ns.presets import load_preset
@@ -185,6 +185,27 @@ def test_the_help_of_ns_train_shows_the_docstrings(method: str, capsys: pytest.C
     assert "--pipeline.model.strategy.max-gaussians" in shown
     assert "Hard cap on the number of Gaussians" in shown
     assert "Training views rendered for one optimizer step" in shown
+
+
+@pytest.mark.parametrize("cls", CONFIG_CLASSES)
+def test_help_texts_break_their_lines_between_sentences_as_tyro_does_not_join_them(cls: type):
+    texts = [s.value.value for s in body_of(cls)[1:] if is_string(s)]  # type: ignore[attr-defined]
+    assert texts and not [text for text in texts if not all(line.endswith(".") for line in text.strip().splitlines())]
+
+
+def test_the_help_says_what_replaces_splatfacto_s_options_and_explains_every_other(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit):
+        tyro.cli(AnnotatedBaseConfigUnion, args=["sadgs", "--help"])
+    lines = [line.strip("│ ") for line in re.sub(r"\x1b\[[\d;]*m", "", capsys.readouterr().out).splitlines()]
+    texts = {line.split()[0]: lines[i + 1 : i + 5] for i, line in enumerate(lines) if re.match("--[a-z]", line)}
+    for name, replacement in WITHOUT_EFFECT.items():
+        text = " ".join(texts[f"--pipeline.model.{name.replace('_', '-')}"])
+        assert text.startswith("Splatfacto's, refused here: ") and replacement.removeprefix("nothing: ") in text
+    assert "--pipeline.model.strategy.tau-split" in texts
+    assert not [option for option in texts for name in OF_RAYS if name.replace("_", "-") in option]
+    unexplained = [option for option, text in texts.items() if text[0].startswith("(default:")]
+    # nerfstudio keeps optimizers in a dictionary, whose entries have no documentation.
+    assert [option for option in unexplained if not re.fullmatch(r"--optimizers\.[\w-]+\.scheduler", option)] == []
 
 
 def test_the_device_is_the_cpu_where_there_is_no_cuda(monkeypatch: pytest.MonkeyPatch):
