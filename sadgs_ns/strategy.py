@@ -33,9 +33,11 @@ class StructureAwareStrategy(Strategy):
         info |= {"structure_tensors": ..., "viewmats": ..., "Ks": ...}   # [C, H, W, 3], [C, 4, 4], [C, 3, 3]
         strategy.step_pre_backward(params, optimizers, state, step, info)
         loss.backward()                                                  # the mean over the C views
+        ...                                                              # the optimizers step
         strategy.step_post_backward(params, optimizers, state, step, info)
 
-    Views of different sizes are rendered one by one; `info` is then the list of their infos.
+    The README holds the whole loop. Views of different sizes are rendered one by one; `info` is then the list of their
+    infos.
     """
 
     max_gaussians: int = 4_000_000
