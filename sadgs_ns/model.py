@@ -24,7 +24,6 @@ from nerfstudio.utils.colors import get_color
 from nerfstudio.utils.rich_utils import CONSOLE
 from pytorch_msssim import SSIM
 from torch import Tensor
-from torchmetrics.image import PeakSignalNoiseRatio
 
 from sadgs_ns.cameras import refuse_unsupported_cameras
 from sadgs_ns.errors import InputError
@@ -128,7 +127,6 @@ class SadgsModel(SplatfactoModel):
             {name: torch.nn.Parameter(value) for name, value in self._initial_gaussians().items()}
         )
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
-        self.psnr = PeakSignalNoiseRatio(data_range=1.0)
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
         self._lpips: list[torch.nn.Module | None] = []  # a list, so that its weights stay out of the checkpoint
         self.step = 0
@@ -375,6 +373,13 @@ class SadgsModel(SplatfactoModel):
             if self.config.use_bilateral_grid:
                 losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
         return losses
+
+    def psnr(self, predicted: Tensor, target: Tensor) -> Tensor:
+        """PSNR in dB of images in [0, 1]."""
+        # A second of imports that training does not need.
+        from torchmetrics.functional.image import peak_signal_noise_ratio
+
+        return peak_signal_noise_ratio(predicted, target, data_range=1.0)
 
     def lpips(self, predicted: Tensor, target: Tensor) -> Tensor:
         """LPIPS (AlexNet) of images [1, 3, H, W] in [0, 1], NaN where its weights cannot be loaded.

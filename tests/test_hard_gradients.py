@@ -293,6 +293,7 @@ def run(folder: Path, parser: ColmapDataParserConfig, seed: int) -> dict[str, An
     return checkpoint(train(config), ITERATIONS - 1)
 
 
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU adds up gradients in no fixed order")
 def test_two_cpu_runs_with_one_seed_are_bitwise_equal(colmap: ColmapDataParserConfig, tmp_path: Path):  # noqa: F811
     first, second = (run(tmp_path / name, colmap, seed=42) for name in ("first", "second"))
     assert len(first["pipeline"]["_model.gauss_params.means"]) > 300

@@ -434,7 +434,7 @@ def test_an_image_that_makes_nan_is_named_and_does_not_poison_the_model(
         if bad in cam_indices:
             hit.append(trainer.step + 1)
             if where == "gradient":
-                rows = torch.arange(len(cam_indices)) == cam_indices.index(bad)
+                rows = torch.arange(len(cam_indices), device=viewmats.device) == cam_indices.index(bad)
                 outputs["rgb"].register_hook(lambda g: torch.where(rows[:, None, None, None], torch.nan, g))
         return outputs
 

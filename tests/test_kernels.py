@@ -18,6 +18,7 @@ from sadgs_ns.structure_tensor import multiscale_structure_tensor
 
 adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
 convolution = pytest.importorskip("sadgs_ns.kernels.convolution", reason="Triton is not installed")
+scale_space = pytest.importorskip("sadgs_ns.kernels.scale_space", reason="Triton is not installed")
 harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")
 observation = pytest.importorskip("sadgs_ns.kernels.observation", reason="Triton is not installed")
 photometric = pytest.importorskip("sadgs_ns.kernels.photometric", reason="Triton is not installed")
@@ -87,16 +88,22 @@ def test_convolution_equals_torchs_in_float64(shape, axis):
     torch.testing.assert_close(actual.cpu().double(), expected, atol=1e-5, rtol=1e-5)
 
 
-def test_structure_tensors_are_the_same_with_the_kernel(monkeypatch):
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("energy_blur", [0.0, 2.0])
+def test_structure_tensors_are_the_same_with_the_kernels(monkeypatch, masked, energy_blur):
     images = torch.rand((2, 9, 14, 3), generator=torch.Generator().manual_seed(0)).to(DEVICE)
-    masks = torch.ones((2, 9, 14), dtype=torch.bool, device=DEVICE)
-    masks[0, 3:6, 5:7] = False
-    expected = multiscale_structure_tensor(images.double(), masks, num_levels=2)
+    masks = torch.ones((2, 9, 14), dtype=torch.bool, device=DEVICE) if masked else None
+    if masks is not None:
+        masks[0, 3:6, 5:7] = False
+    options = {"num_levels": 2, "energy_blur": energy_blur, "gamma": 2.5}
+    expected = multiscale_structure_tensor(images.double(), masks, **options)
     monkeypatch.setattr(kernels, "available", lambda device: True)
     calls = []
-    monkeypatch.setattr(convolution, "correlate", lambda *a, run=convolution.correlate: calls.append(a) or run(*a))
-    actual = multiscale_structure_tensor(images, masks, num_levels=2)
-    assert calls
+    for module, name in ((convolution, "correlate"), (scale_space, "differentiate"), (scale_space, "accumulate")):
+        run = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *a, name=name, run=run: calls.append(name) or run(*a))
+    actual = multiscale_structure_tensor(images, masks, **options)
+    assert set(calls) == {"correlate", "differentiate", "accumulate"}
     torch.testing.assert_close(actual.double(), expected, atol=1e-5 * float(expected.abs().max()), rtol=1e-4)
 
 

@@ -83,7 +83,7 @@ def _observe(
         b = tl.load(conics + 3 * at + 1, seen, 0.0).to(tl.float64)
         c = tl.load(conics + 3 * at + 2, seen, 1.0).to(tl.float64)
         determinant = a * c - b * b
-        # Triton's maximum drops NaN, so what is not finite is told by comparison, here and of η.
+        # Triton's maximum drops NaN on a GPU, so what is not finite is told by comparison, here, of S̄ and of η.
         seen = seen & (tl.abs(determinant) < float("inf"))
         inverse = 1 / tl.maximum(tl.maximum(determinant, 1.1920928955078125e-07 * a * c), 2.2250738585072014e-308)
         xx = tl.maximum(c * inverse - BLUR, 0.0)
@@ -104,6 +104,7 @@ def _observe(
         s_xx = tl.load(pixel, observed, 0.0).to(tl.float32)
         s_xy = tl.load(pixel + 1, observed, 0.0).to(tl.float32)
         s_yy = tl.load(pixel + 2, observed, 0.0).to(tl.float32)
+        observed = observed & (tl.abs(s_xx) + tl.abs(s_xy) + tl.abs(s_yy) < float("inf"))
         # The Jacobian of gsplat's forward pass, with its clamp near the frustum's border.
         viewmat, K = viewmats + 16 * view, Ks + 9 * view
         depth = _matrix_row(viewmat, 2, x, y, z) + tl.load(viewmat + 11)
