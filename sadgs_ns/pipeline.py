@@ -21,6 +21,7 @@ from sadgs_ns.cameras import refuse_failed_undistortion, refuse_unsupported_came
 from sadgs_ns.datamanager import SadgsDatamanagerConfig
 from sadgs_ns.errors import InputError
 from sadgs_ns.finite import NonFiniteLog
+from sadgs_ns.memory import STEP_BYTES
 from sadgs_ns.model import SadgsModel, SadgsModelConfig
 from sadgs_ns.optimizers import FusedAdam
 from sadgs_ns.preflight import findings_of
@@ -102,6 +103,18 @@ class SadgsPipeline(VanillaPipeline):
         self.model.set_cameras(positions)
         self.log = NonFiniteLog(self.device)
 
+    def _image_bytes(self) -> float:
+        """Memory of the training device that images, structure tensors and a step's pictures will take, in bytes."""
+        config, train = self.datamanager.config, self.datamanager.train_dataset.cameras
+        pixels = train.height * train.width  # [C, 1]
+        needed = STEP_BYTES * self.config.views_per_iteration * float(pixels.max())
+        if config.cache_images == "gpu":
+            held_out = self.datamanager.eval_dataset.cameras
+            cached = float(pixels.sum() + (held_out.height * held_out.width).sum())
+            needed += 3 * (1 if config.cache_images_type == "uint8" else 4) * cached
+            needed += 3 * torch.finfo(torch.float16).bits / 8 * float(pixels.sum())  # S̄
+        return needed
+
     @property
     def model(self) -> SadgsModel:
         """The unwrapped model."""
@@ -175,7 +188,18 @@ class SadgsPipeline(VanillaPipeline):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Those of data and model, and at the end a last look at what was not finite."""
+        """Those of data and model, and at the end a last look at what was not finite.
+
+        Raises:
+            InputError: If `memory_budget_gb` leaves no room for Gaussians.
+        """
+        if self.config.model.densify:
+            try:
+                line = self.model.strategy.fit_to_memory(self.model.gauss_params, self._image_bytes())
+            except ValueError as error:
+                raise InputError(f"pipeline.model.{error}") from error
+            if line is not None:
+                CONSOLE.print(line, highlight=False, soft_wrap=True)
         optimizers = training_callback_attributes.optimizers
         for optimizer in optimizers.optimizers.values() if optimizers is not None else ():
             if isinstance(optimizer, FusedAdam):

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import tyro
 import yaml
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import Optimizers
@@ -87,6 +88,9 @@ class SadgsTrainerConfig(TrainerConfig):
                 partial.write_text(yaml.dump(self), "utf8")
         except WriteError as error:
             raise InputError(str(error)) from error
+
+
+SadgsTrainerConfig.__annotations__["prompt"] = tyro.conf.Suppress[str | None]  # hidden from help: for text to NeRF
 
 
 class SadgsTrainer(Trainer):
@@ -173,7 +177,7 @@ class SadgsTrainer(Trainer):
                 exit code that shells give these signals.
         """
         total = self.config.max_num_iterations
-        self.step = max(self._start_step - 1, 0)  # names the checkpoint when nothing is left to do
+        self.step: int = max(self._start_step - 1, 0)  # names the checkpoint when nothing is left to do
         self._completed_step = self._saved_step = self._start_step - 1
         self.config.max_num_iterations = max(total - self._start_step, 0)
         out_of_memory = ""

@@ -95,7 +95,7 @@ def test_a_logger_s_full_disk_is_one_sentence_and_other_errors_of_reading_are_th
 
 def test_a_full_disk_leaves_the_previous_export(tmp_path: Path):
     def write(count: int) -> None:
-        parts = {name: torch.zeros(count, 3) for name in ("means", "scales", "features_dc")}
+        parts: dict[str, Any] = {name: torch.zeros(count, 3) for name in ("means", "scales", "features_dc")}
         write_ply(
             tmp_path / "splat.ply",
             **parts,
