@@ -174,7 +174,7 @@ class SadgsPipeline(VanillaPipeline):
             energy_blur=self.config.energy_blur,
             fused=self.config.model.fused,
         )
-        return encode(tensors)
+        return encode(tensors, self.config.model.fused)
 
     def _next_view(self) -> tuple[int, dict[str, Any]]:
         """Index and data of the next training view, in nerfstudio's order, without slicing its cameras for it."""

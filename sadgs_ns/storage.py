@@ -5,13 +5,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from sadgs_ns import kernels
+
 HIGHEST_FREQUENCY = 4.0
 """1/px. S̄'s trace is at most c²/px² by construction, so this is the largest c that can be stored."""
 OCTAVES = 12.0
 """Frequencies down to 2⁻¹² of the highest one have a code of their own: wavelengths of 0.25 to 1,024 px."""
 
 
-def encode(tensor: Tensor) -> Tensor:
+def encode(tensor: Tensor, fused: bool = True) -> Tensor:
     """√xx and √yy on a logarithmic scale, and the correlation xy / √(xx yy).
 
     A logarithm keeps the relative error of every wavelength the same (at most 1.7 %), and a correlation within ±1 keeps
@@ -19,10 +21,15 @@ def encode(tensor: Tensor) -> Tensor:
 
     Args:
         tensor: S̄ as (xx, xy, yy) in 1/px², finite. [..., 3]
+        fused: Use our Triton kernel where it runs: CUDA, float32.
 
     Returns:
         uint8 [..., 3]
     """
+    if fused and tensor.dtype == torch.float32 and kernels.available(tensor.device):
+        from sadgs_ns.kernels import codes as kernel
+
+        return kernel.encode(tensor, HIGHEST_FREQUENCY, OCTAVES)
     xx, xy, yy = tensor.unbind(-1)
     frequencies = torch.stack([xx, yy], -1).clamp_min(0).sqrt()  # [..., 2] in 1/px
     logarithms = 1 + (frequencies / HIGHEST_FREQUENCY).log2() / OCTAVES  # (−∞, 1]

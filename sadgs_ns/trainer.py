@@ -63,8 +63,8 @@ class SadgsTrainerConfig(TrainerConfig):
     steps_per_save: int = 0
     """Steps between checkpoints; 0 leaves them to the clock. One is always made at the end."""
     seconds_per_save: float = 60.0
-    """Where steps_per_save is 0: seconds from one checkpoint to the next, or 100 times what the last one took, if that
-    is longer; 0 makes none before the end."""
+    """Seconds from one checkpoint to the next where steps_per_save is 0; 0 makes none before the end.
+    If 100 times what the last one took is longer, that is waited."""
     steps_per_eval_batch: int = 0
     """Steps between losses on a held-out view; 0 is never."""
     steps_per_eval_image: int = 500

@@ -57,7 +57,7 @@ def make_scene(kind: str, num_views: int = 1, n: int = 60, width: int = 21, heig
     radii = torch.full((num_views, n), 10**6, dtype=torch.int32, device=DEVICE)
     scene["starts"], scene["ids"] = tiles.intersect_tiles(
         scene["means2d"], radii, scene["depths"], scene["conics"], scene["opacities"], width, height, 8
-    )
+    ).lists()
     return scene
 
 
@@ -180,7 +180,7 @@ def test_tiles_without_gaussians_stay_out_of_the_others_lists():
     scene["starts"], scene["ids"] = tiles.intersect_tiles(
         scene["means2d"].fill_(20.0), torch.full((1, 1), 4, dtype=torch.int32, device=DEVICE), scene["depths"],
         scene["conics"], scene["opacities"].fill_(0.9), 40, 40, 8,
-    )  # fmt: skip
+    ).lists()  # fmt: skip
     assert 0 < len(scene["ids"]) < 10
     expected, alphas, last_ids = reference(scene, background=False)
     gradients = gradients_of(scene, alphas, last_ids, False)
@@ -214,26 +214,29 @@ def test_autograd_gets_what_the_kernel_returns(monkeypatch):
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat's kernels need CUDA")
 @pytest.mark.parametrize("kind", TOLERANCES)
-def test_gradients_equal_gsplats(kind):
+def test_gradients_are_as_close_to_float64_as_gsplats(kind):
+    """As norms: rounding moves a few pairs over a cut-off, in either's passes, and single values with them."""
     from gsplat.cuda._wrapper import rasterize_to_pixels
 
-    scene = make_scene(kind, num_views=2, n=2000, width=213, height=150)
-    results = []
+    scene = make_scene(kind, num_views=2, n=300, width=93, height=70)
+    expected, _, _ = reference(scene, background=True)
+    errors = []
     for ours in (True, False):
-        inputs: list[Any] = [scene[name].clone().requires_grad_() for name in (*NAMES[:4], "backgrounds")]
-        gaussians = (inputs[0], inputs[1], inputs[2], inputs[3])
+        means2d, conics, colors, opacities = inputs = [scene[name].clone().requires_grad_() for name in NAMES[:4]]
+        lists = scene["starts"], scene["ids"]
         if ours:
             outputs = compositing.rasterize_to_pixels(
-                *gaussians, 213, 150, scene["starts"], scene["ids"], inputs[4], True
+                means2d, conics, colors, opacities, 93, 70, *lists, scene["backgrounds"], True
             )
         else:
             outputs = rasterize_to_pixels(
-                *gaussians, 213, 150, 8, scene["starts"], scene["ids"], backgrounds=inputs[4], absgrad=True
-            )
+                means2d, conics, colors, opacities, 93, 70, 8, *lists, backgrounds=scene["backgrounds"], absgrad=True
+            )  # fmt: skip
         torch.autograd.backward(outputs, [scene["v_renders"], scene["v_alphas"]])
-        gradients = [value.grad for value in inputs] + [inputs[0].absgrad]
-        results.append(dict(zip((*NAMES[:4], "backgrounds", "absgrad"), gradients, strict=True)))
-    for name, value in results[1].items():
-        # Rounding moves a few pairs over a cut-off, so single values may differ by more than rounding: compare norms.
-        error = (results[0][name] - value).norm() / value.norm()
-        assert error < (5e-4 if name == "absgrad" else max(TOLERANCES[kind], 1e-4)), (name, float(error))
+        gradients: dict[str, Any] = dict(
+            zip(NAMES, [*(value.grad for value in inputs), means2d.absgrad], strict=True)
+        )  # fmt: skip
+        errors.append({k: float((gradients[k].double().cpu() - v).norm() / v.norm()) for k, v in expected.items()})
+    print(kind, *errors)
+    for name, error in errors[0].items():
+        assert error < max(2 * errors[1][name], 1e-4 if name == "absgrad" else 1e-5), (name, error, errors[1][name])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from pathlib import Path
 from typing import Any
@@ -349,7 +348,7 @@ def test_a_full_disk_leaves_the_file_that_was_there(tmp_path: Path, monkeypatch:
     run = write_run(tmp_path / "run", gaussians(3))
     output = tmp_path / "a.ply"
     output.write_text("earlier")
-    partial = tmp_path / f".a.{os.getpid()}.partial.ply"
+    partial = tmp_path / ".a.partial.ply"
     partial.symlink_to("/dev/full")
     with pytest.raises(SystemExit, match=r"a\.ply could not be written \(No space left on device; .*"):
         export.main([str(run), "--output", str(output)])

@@ -108,6 +108,16 @@ def test_structure_tensors_are_the_same_with_the_kernels(monkeypatch, masked, en
     torch.testing.assert_close(actual.double(), expected, atol=1e-5 * float(expected.abs().max()), rtol=1e-4)
 
 
+def test_codes_are_the_references_or_their_neighbours(monkeypatch):
+    tensor = torch.rand((3, 100, 3), generator=torch.Generator().manual_seed(0)) ** 8 * torch.tensor([16.0, 1.0, 16.0])
+    tensor[0, :4] = torch.tensor([[0.0, 0, 0], [64, 0, 1e-12], [0, 0.1, 1], [8, -9, 8]])
+    expected = encode(tensor, fused=False).int()
+    monkeypatch.setattr(kernels, "available", lambda device: True)
+    actual = encode(tensor.to(DEVICE)).cpu().int()
+    assert (actual - expected).abs().max() <= 1 and (actual != expected).float().mean() < 0.01
+    assert torch.equal(actual[0, :4], expected[0, :4])
+
+
 @pytest.mark.parametrize("degree", range(4))
 def test_colours_and_gradients_equal_gsplats_float64_harmonics(degree):
     generator = torch.Generator().manual_seed(degree)
@@ -249,7 +259,7 @@ def test_tiles_list_the_gaussians_that_reach_them_and_hardly_more(tile_size, rad
         gaussians["radii"] = gaussians["radii"][..., None] * torch.tensor([1, 2], dtype=torch.int32)
         radii = gaussians["radii"].float()
     on_device = {name: value.to(DEVICE) for name, value in gaussians.items()}
-    starts, ids = tiles.intersect_tiles(**on_device, width=width, height=height, tile_size=tile_size)
+    starts, ids = tiles.intersect_tiles(**on_device, width=width, height=height, tile_size=tile_size).lists()
     rows, columns = math.ceil(height / tile_size), math.ceil(width / tile_size)
     assert starts.shape == (2, rows, columns)
     lists = ids.cpu().tensor_split(starts.cpu().flatten().tolist()[1:])
@@ -280,7 +290,7 @@ def test_no_gaussian_in_sight_makes_empty_lists():
     gaussians = projected_gaussians(1, 5, 32, 32)
     gaussians["radii"] = torch.zeros_like(gaussians["radii"])
     on_device = {name: value.to(DEVICE) for name, value in gaussians.items()}
-    starts, ids = tiles.intersect_tiles(**on_device, width=32, height=32, tile_size=16)
+    starts, ids = tiles.intersect_tiles(**on_device, width=32, height=32, tile_size=16).lists()
     assert len(ids) == 0 and (starts == 0).all()
 
 

@@ -68,6 +68,8 @@ def rasterization(
     opacities = opacities.expand(num_views, -1)
     if compensations is not None:
         opacities = opacities * compensations
+    # The host waits for the lists' length: the colours are computed meanwhile.
+    pending_tiles = intersect_tiles(means2d, radii, depths, conics, opacities, width, height, TILE_SIZE)
     drawn = radii > 0 if radii.dim() == 2 else (radii > 0).all(dim=-1)  # [C, N]
     # gsplat inverts the matrices, which makes the host wait for the device.
     positions = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:]).mT  # [C, 1, 3]
@@ -89,9 +91,7 @@ def rasterization(
     elif render_mode in ("D", "ED"):
         colors = depths[..., None]
         backgrounds = None if backgrounds is None else backgrounds.new_zeros((num_views, 1))
-    isect_offsets, flatten_ids = intersect_tiles(
-        means2d, radii, depths, conics, opacities, width, height, TILE_SIZE
-    )  # fmt: skip
+    isect_offsets, flatten_ids = pending_tiles.lists()
     splats = (means2d, conics, colors, opacities, width, height)
     if BACKWARD == "moments" and colors.shape[-1] == 3:
         renders, alphas = compositing.rasterize_to_pixels(*splats, isect_offsets, flatten_ids, backgrounds, absgrad)
