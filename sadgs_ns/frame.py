@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from sadgs_ns.errors import InputError, reason
@@ -66,6 +65,8 @@ class Similarity:
     def rotations(self, quats: Array) -> Array:
         """Rotations of Gaussians in the new frame; a Gaussian is its own point reflection. wxyz [N, 4] → [N, 4]"""
         rotation = self.orthogonal * np.sign(np.linalg.det(self.orthogonal))
+        import pycolmap  # not above: training comes by here, and never needs it
+
         x, y, z, w = pycolmap.Rotation3d(rotation).quat
         product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
         return quats @ product.T
