@@ -1,0 +1,14 @@
+"""What `ns-train` does not import: every run waits for it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+LATER = ("pycolmap", "torchmetrics", "matplotlib.pyplot", "open3d", "jinja2.sandbox")
+
+
+def test_the_methods_import_nothing_that_training_does_not_need():
+    code = f"import sys, sadgs_ns.presets; print([name for name in {LATER} if name in sys.modules])"
+    run = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"
