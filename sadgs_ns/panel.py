@@ -9,6 +9,7 @@ import math
 import threading
 import time
 import weakref
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -92,24 +93,29 @@ def nearest_view(cameras: Tensor, camera: Tensor, extent: float) -> int:
 
 
 class ViewerMarkdown(ViewerElement[str]):
-    """A text in the viewer; unlike a parameter's, its changes call nobody."""
+    """A text in the viewer; unlike a parameter's, its changes call nobody.
 
-    def __init__(self, name: str, text: str) -> None:
+    Args:
+        name: Of the element.
+        text: Makes the text, when it is installed and at every `refresh`.
+    """
+
+    def __init__(self, name: str, text: Callable[[], str]) -> None:
         super().__init__(name)
         self.text = text
+        self._shown = ""
 
     def _create_gui_handle(self, viser_server: ViserServer) -> None:
-        self.gui_handle: Any = viser_server.gui.add_markdown(self.text)
+        self._shown = self.text()
+        self.gui_handle: Any = viser_server.gui.add_markdown(self._shown)
 
     def install(self, viser_server: ViserServer) -> None:
         self._create_gui_handle(viser_server)
 
-    def show(self, text: str) -> None:
-        """Replace the text; sends nothing if it is the same."""
-        if text != self.text:
-            self.text = text
-            if self.gui_handle is not None:
-                self.gui_handle.content = text
+    def refresh(self) -> None:
+        """Send the text if it is another than before and there is a viewer."""
+        if self.gui_handle is not None and (text := self.text()) != self._shown:
+            self._shown = self.gui_handle.content = text
 
 
 class StructurePanel(torch.nn.Module):
@@ -141,7 +147,7 @@ class StructurePanel(torch.nn.Module):
         self.set_tau_split = self._slider(
             "tau_split", "Share of observations that must violate, at the next structure step"
         )
-        self.table = ViewerMarkdown("counts", self._describe())
+        self.table = ViewerMarkdown("counts", self._describe)
         self.viewer = ViewerControl()
 
     def _slider(self, name: str, hint: str) -> ViewerSlider[float]:
@@ -175,14 +181,14 @@ class StructurePanel(torch.nn.Module):
         except ValueError as error:
             CONSOLE.print(f"[yellow]{error}[/]")
             element.value = getattr(strategy, name)
-        self.table.show(self._describe())
+        self.table.refresh()
 
     def refresh(self) -> None:
         """Show the present numbers, at most once a second; without a viewer this costs nothing."""
         now = time.monotonic()
         if self.table.gui_handle is not None and now - self._refreshed > 1.0:
             self._refreshed = now
-            self.table.show(self._describe())
+            self.table.refresh()
 
     def statistics(self) -> dict[str, Tensor] | None:
         """The run's own observations since its last structure step; if there are none, those of `observe_now`."""

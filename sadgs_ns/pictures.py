@@ -304,19 +304,20 @@ def annotate(picture: Picture, text: str, scale: Scale | None = None) -> Picture
     if height < 120 or width < 160:
         return picture
     size = max(min(height // 30, width // 40), 9)
+    size = max(min(size, int(size * (width - 2 * size) / _font(size).getlength(text))), 6)  # the whole text is seen
     strip = 4 * size if scale is not None else 2 * size
     image = Image.fromarray(picture)
     image.paste((20, 20, 20), (0, height - strip, width, height))
     pen, font, x0 = ImageDraw.Draw(image), _font(size), size
     pen.text((x0, height - strip + size // 3), text, fill="white", font=font)
     if scale is None:
-        return np.asarray(image)
+        return np.array(image)
     length = width - 4 * size
     image.paste(_bar(scale, length, size // 2), (x0, height - 2 * size - size // 3))
     for tick in scale.ticks:
         x = x0 + float(scale.norm(tick)) * length
         pen.text((x, height - size - size // 2), f"{tick:g}", fill="white", font=font, anchor="ma")
-    return np.asarray(image)
+    return np.array(image)
 
 
 @dataclass(frozen=True)

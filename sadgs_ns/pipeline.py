@@ -204,6 +204,7 @@ class SadgsPipeline(VanillaPipeline):
         Returns:
             As `statistics.empty_statistics`.
         """
+        self.model.set_crop(None)  # the viewer's, which sets it anew whenever it renders
         strategy, params = self.model.strategy, self.model.gauss_params
         generator = torch.Generator(self.device).manual_seed(0)
         statistics = empty_statistics(self.model.num_points, self.device)
