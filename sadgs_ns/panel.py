@@ -193,11 +193,10 @@ class StructurePanel(torch.nn.Module):
     def statistics(self) -> dict[str, Tensor] | None:
         """The run's own observations since its last structure step; if there are none, those of `observe_now`."""
         model = self._pipeline.model
-        for statistics in (model.strategy_state, self._observed):
-            seen = statistics.get("n_total")
-            if seen is not None and len(seen) == model.num_points and bool((seen > 0).any()):
-                return statistics
-        return None
+        live, n = model.strategy_state, model.num_points
+        if "n_total" in live and len(live["n_total"]) == n and bool((live["n_total"] > 0).any()):
+            return live
+        return self._observed if len(self._observed.get("n_total", ())) == n else None
 
     def observe_now(self) -> None:
         """Observe all training views with the present Gaussians."""

@@ -296,9 +296,9 @@ def _bar(scale: Scale, width: int, height: int) -> Image.Image:
 
 
 def annotate(picture: Picture, text: str, scale: Scale | None = None) -> Picture:
-    """A picture with a line of text, and the scale's colours and numbers, at its lower edge.
+    """A picture with a line of text, and the scale's colours and numbers, at its upper edge.
 
-    For the viewer, whose pictures have no margin; tiny ones stay as they are.
+    For the viewer, whose pictures have no margin, and whose axes lie at the lower edge; tiny ones stay as they are.
     """
     height, width = picture.shape[:2]
     if height < 120 or width < 160:
@@ -307,16 +307,16 @@ def annotate(picture: Picture, text: str, scale: Scale | None = None) -> Picture
     size = max(min(size, int(size * (width - 2 * size) / _font(size).getlength(text))), 6)  # the whole text is seen
     strip = 4 * size if scale is not None else 2 * size
     image = Image.fromarray(picture)
-    image.paste((20, 20, 20), (0, height - strip, width, height))
+    image.paste((20, 20, 20), (0, 0, width, strip))
     pen, font, x0 = ImageDraw.Draw(image), _font(size), size
-    pen.text((x0, height - strip + size // 3), text, fill="white", font=font)
+    pen.text((x0, size // 3), text, fill="white", font=font)
     if scale is None:
         return np.array(image)
     length = width - 4 * size
-    image.paste(_bar(scale, length, size // 2), (x0, height - 2 * size - size // 3))
+    image.paste(_bar(scale, length, size // 2), (x0, 2 * size - size // 4))
     for tick in scale.ticks:
         x = x0 + float(scale.norm(tick)) * length
-        pen.text((x, height - size - size // 2), f"{tick:g}", fill="white", font=font, anchor="ma")
+        pen.text((x, strip - size - size // 2), f"{tick:g}", fill="white", font=font, anchor="ma")
     return np.array(image)
 
 

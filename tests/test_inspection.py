@@ -273,6 +273,17 @@ def test_a_finished_run_is_observed_when_eta_is_asked_for(panel: StructurePanel)
     assert panel.statistics() is None, "they are of other Gaussians"
 
 
+def test_where_no_gaussian_is_opaque_enough_the_panel_says_that_none_was_observed(panel: StructurePanel):
+    pipeline = pipeline_of(panel)
+    pipeline.model.strategy.eta_min_opacity = 1.0
+    panel.choice.value = "η"
+    panel.choose()
+    statistics = panel.statistics()
+    assert statistics is not None and not (statistics["n_total"] > 0).any()
+    picture = panel.picture("η", a_camera(pipeline), torch.zeros(HEIGHT, WIDTH, 3))
+    assert (picture == 128).all(), "grey"
+
+
 def test_sliders_reach_the_strategy_and_the_plan(panel: StructurePanel):
     pipeline = pipeline_of(panel)
     strategy, statistics = pipeline.model.strategy, pipeline.observe_training_views()
