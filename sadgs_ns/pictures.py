@@ -315,7 +315,8 @@ def annotate(picture: Picture, text: str, scale: Scale | None = None) -> Picture
     length = width - 4 * size
     image.paste(_bar(scale, length, size // 2), (x0, 2 * size - size // 4))
     for tick in scale.ticks:
-        x = x0 + float(scale.norm(tick)) * length
+        half = font.getlength(f"{tick:g}") / 2
+        x = max(x0 + float(scale.norm(tick)) * length, half + 1)
         pen.text((x, strip - size - size // 2), f"{tick:g}", fill="white", font=font, anchor="ma")
     return np.array(image)
 
