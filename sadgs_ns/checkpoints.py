@@ -17,8 +17,13 @@ REMEDY = "give --load-dir the folder nerfstudio_models of a run of sadgs, or tra
 _PARTS = ("step", "pipeline", "optimizers", "scalers")
 
 
-def read(path: Path) -> dict[str, Any]:
+def read(path: Path, remedy: str = REMEDY, mmap: bool = False) -> dict[str, Any]:
     """Read one checkpoint into the CPU's memory, with torch's safe loader whatever its version and environment say.
+
+    Args:
+        path: The file.
+        remedy: What errors advise.
+        mmap: Whether tensors stay in the file until they are used; for those who read a part of them.
 
     Raises:
         InputError: It is cut off or damaged, or it holds anything but a checkpoint's tensors and plain values.
@@ -27,25 +32,26 @@ def read(path: Path) -> dict[str, Any]:
         with zipfile.ZipFile(path) as file:  # torch itself does not look at the checksums
             if (damaged := file.testzip()) is not None:
                 raise zipfile.BadZipFile(f"wrong checksum of {damaged}")
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        state = torch.load(path, map_location="cpu", weights_only=True, mmap=mmap or None)
     except Exception as error:  # zip, pickle and tensors each raise their own
         # Without torch's advice after it, to load the file unsafely.
         what = re.split(r"(?<=[a-z])[.:]\s", reason(error), maxsplit=1)[0]
         raise InputError(
-            f"{path} is cut off, damaged or not of tensors and plain values alone ({what}): {REMEDY}."
+            f"{path} is cut off, damaged or not of tensors and plain values alone ({what}): {remedy}."
         ) from error
     missing = [part for part in _PARTS if not isinstance(state, dict) or part not in state]
     if missing or type(state["step"]) is not int:
         what = f"it has no {missing[0]}" if missing else "its step is no number"
-        raise InputError(f"{path} is not a checkpoint that nerfstudio's trainer wrote ({what}): {REMEDY}.")
+        raise InputError(f"{path} is not a checkpoint that nerfstudio's trainer wrote ({what}): {remedy}.")
     return state
 
 
-def read_or_earlier(path: Path) -> tuple[Path, dict[str, Any]]:
+def read_or_earlier(path: Path, remedy: str = REMEDY, mmap: bool = False) -> tuple[Path, dict[str, Any]]:
     """Read the latest checkpoint of a folder; while one cannot be read, say so and take the one before it.
 
     Args:
         path: The latest.
+        remedy, mmap: As for `read`.
 
     Returns:
         Its path, or that of an earlier one in its folder, and the content.
@@ -56,7 +62,7 @@ def read_or_earlier(path: Path) -> tuple[Path, dict[str, Any]]:
     errors = []
     for candidate in sorted(path.parent.glob("step-*.ckpt"), key=lambda p: int(p.stem[5:]), reverse=True):
         try:
-            state = read(candidate)
+            state = read(candidate, remedy, mmap)
         except InputError as error:
             errors.append(error)
             continue
@@ -65,3 +71,27 @@ def read_or_earlier(path: Path) -> tuple[Path, dict[str, Any]]:
             CONSOLE.print(text, style="yellow", markup=False, soft_wrap=True)
         return candidate, state
     raise errors[0]
+
+
+def checkpoint_path(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> Path | None:
+    """The checkpoint that nerfstudio's trainer will load for these options, or None.
+
+    Raises:
+        InputError: If there is none, or the folder holds something else, too.
+    """
+    if load_dir is None:
+        if load_checkpoint is not None and not load_checkpoint.is_file():
+            raise InputError(f"{load_checkpoint} does not exist: give --load-checkpoint a file step-*.ckpt of a run.")
+        return load_checkpoint
+    steps = {}
+    for path in sorted(load_dir.iterdir()) if load_dir.is_dir() else []:
+        match = re.fullmatch(r"step-(\d+)\.ckpt", path.name)
+        if match is None:
+            raise InputError(f"{path} lies among the checkpoints and is none: move it elsewhere.")
+        steps[int(match[1])] = path
+    if not steps:
+        raise InputError(f"{load_dir} holds no checkpoint: give --load-dir the folder nerfstudio_models of a run.")
+    if load_step is not None and load_step not in steps:
+        there = ", ".join(map(str, sorted(steps)))
+        raise InputError(f"{load_dir} holds no checkpoint of step {load_step}: give --load-step one of {there}.")
+    return steps[max(steps) if load_step is None else load_step]

@@ -1,25 +1,23 @@
 """Looks at a data folder before nerfstudio parses it, and says in one sentence each what would go wrong.
 
-Only headers are read where that suffices, so a few hundred images take about a second. Nothing here needs torch.
+A few hundred images take under a second. Nothing here needs torch.
 """
 
 from __future__ import annotations
 
+import functools
 import json
 import math
-import re
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, ParamSpec
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
 
 from sadgs_ns import colmap
 from sadgs_ns.errors import InputError, reason
+from sadgs_ns.image_checks import Frame, Size, image_problems, image_size, images_in, unused_images
 
 MAX_AUTO_RESOLUTION = 1600
 """px; nerfstudio looks for smaller copies of images that are larger than this."""
@@ -27,7 +25,7 @@ COLMAP_FOLDERS = ("colmap/sparse/0", "sparse/0", "sparse", "colmap")
 """Where a reconstruction is looked for; nerfstudio's default is the first."""
 UNSUPPORTED_CAMERAS = {"FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}
 """COLMAP's camera models that nerfstudio cannot read."""
-IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"}
+Rounding = Literal["floor", "round", "ceil"]
 _PLY_BYTES = {"short": 2, "ushort": 2, "int16": 2, "uint16": 2, "int": 4, "uint": 4, "int32": 4, "uint32": 4,
               "float": 4, "float32": 4, "double": 8, "float64": 8}  # fmt: skip
 _GIVE_POSES = "compute poses with `sadgs-process PHOTOS FOLDER` or `ns-process-data`"
@@ -43,26 +41,20 @@ class Finding:
     """Names the file and the remedy."""
 
 
-@dataclass(frozen=True)
-class _Frame:
-    """An image with what its camera says."""
-
-    image: Path
-    size: tuple[int, int] | None
-    """Width and height in px; None where the image itself decides."""
-    mask: Path | None = None
+_Arguments = ParamSpec("_Arguments")
 
 
-@dataclass(frozen=True)
-class _Image:
-    """What a look at an image file told."""
+def _findings(check: Callable[_Arguments, Iterator[Finding]]) -> Callable[_Arguments, list[Finding]]:
+    """The findings of a check, or of one that gave up with an InputError this alone."""
 
-    size: tuple[int, int] = (0, 0)
-    """Width and height in px; zeros where they are unknown."""
-    mode: str = ""
-    """Pillow's name for the kind of pixels."""
-    problem: str = ""
-    """The rest of a sentence that starts with the file; empty for a good image."""
+    @functools.wraps(check)
+    def findings(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> list[Finding]:
+        try:
+            return list(check(*args, **kwargs))
+        except InputError as error:
+            return [Finding("error", str(error))]
+
+    return findings
 
 
 # --- whole folders ---
@@ -79,67 +71,6 @@ def check_data(data: Path) -> list[Finding]:
     return [Finding("error", _no_layout(data))]
 
 
-def check_nerfstudio(
-    data: Path,
-    *,
-    downscale_factor: int | None = None,
-    load_points: bool = True,
-    training_images: Callable[[int], int] | None = lambda count: math.ceil(0.9 * count),
-    open_images: bool = True,
-) -> list[Finding]:
-    """Findings for a `transforms.json`, as `ns-process-data` writes it.
-
-    Args:
-        data: The folder, or the file itself.
-        downscale_factor: As of nerfstudio's parser: None chooses by size.
-        load_points: Whether the SfM points will be read.
-        training_images: How many of so many views are trained on; None if that depends on names.
-        open_images: Whether to look into the images, too.
-    """
-    try:
-        return list(_check_nerfstudio(data, downscale_factor, load_points, training_images, open_images))
-    except InputError as error:
-        return [Finding("error", str(error))]
-
-
-def check_colmap(
-    data: Path,
-    *,
-    images_path: Path = Path("images"),
-    colmap_path: Path = Path(COLMAP_FOLDERS[0]),
-    masks_path: Path | None = None,
-    downscale_factor: int | None = None,
-    rounding: Literal["floor", "round", "ceil"] = "floor",
-    load_points: bool = True,
-    training_images: Callable[[int], int] | None = lambda count: count - math.ceil(count / 8),
-    open_images: bool = True,
-) -> list[Finding]:
-    """Findings for a COLMAP reconstruction, binary or text.
-
-    Args:
-        data: The folder that the other paths are relative to.
-        images_path, colmap_path, masks_path, downscale_factor, rounding: As of nerfstudio's parser.
-        load_points, training_images, open_images: As for `check_nerfstudio`.
-    """
-    try:
-        return list(
-            _check_colmap(
-                data, data / images_path, data / colmap_path, None if masks_path is None else data / masks_path,
-                downscale_factor, rounding, load_points, training_images, open_images,
-            )
-        )  # fmt: skip
-    except InputError as error:
-        return [Finding("error", str(error))]
-
-
-def check_blender(data: Path, *, open_images: bool = True) -> list[Finding]:
-    """Findings for a synthetic scene in the layout of NeRF's: `transforms_train.json` and its siblings."""
-    try:
-        return list(_check_blender(data, open_images))
-    except InputError as error:
-        return [Finding("error", str(error))]
-
-
 def refuse(findings: Sequence[Finding], data: Path) -> None:
     """Raise the first error among findings.
 
@@ -150,30 +81,6 @@ def refuse(findings: Sequence[Finding], data: Path) -> None:
     if errors:
         more = f" (`sadgs-doctor {data}` shows {len(errors) - 1} more.)" if len(errors) > 1 else ""
         raise InputError(errors[0] + more)
-
-
-def checkpoint_path(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> Path | None:
-    """The checkpoint that nerfstudio's trainer will load for these options, or None.
-
-    Raises:
-        InputError: If there is none, or the folder holds something else, too.
-    """
-    if load_dir is None:
-        if load_checkpoint is not None and not load_checkpoint.is_file():
-            raise InputError(f"{load_checkpoint} does not exist: give --load-checkpoint a file step-*.ckpt of a run.")
-        return load_checkpoint
-    steps = {}
-    for path in sorted(load_dir.iterdir()) if load_dir.is_dir() else []:
-        match = re.fullmatch(r"step-(\d+)\.ckpt", path.name)
-        if match is None:
-            raise InputError(f"{path} lies among the checkpoints and is none: move it elsewhere.")
-        steps[int(match[1])] = path
-    if not steps:
-        raise InputError(f"{load_dir} holds no checkpoint: give --load-dir the folder nerfstudio_models of a run.")
-    if load_step is not None and load_step not in steps:
-        there = ", ".join(map(str, sorted(steps)))
-        raise InputError(f"{load_dir} holds no checkpoint of step {load_step}: give --load-step one of {there}.")
-    return steps[max(steps) if load_step is None else load_step]
 
 
 def find_reconstruction(data: Path) -> Path | None:
@@ -188,7 +95,7 @@ def _no_layout(data: Path) -> str:
     """The sentence for a folder without poses."""
     if not data.exists():
         return f"{data} does not exist: give --data the folder of a capture."
-    images = _images_in(data) or _images_in(data / "images")
+    images = images_in(data) or images_in(data / "images")
     if images:
         return f"{data} holds {len(images)} images but no camera poses: {_GIVE_POSES}."
     return (
@@ -200,13 +107,24 @@ def _no_layout(data: Path) -> str:
 # --- nerfstudio's transforms.json ---
 
 
-def _check_nerfstudio(
+@_findings
+def check_nerfstudio(
     data: Path,
-    downscale_factor: int | None,
-    load_points: bool,
-    training_images: Callable[[int], int] | None,
-    open_images: bool,
+    *,
+    downscale_factor: int | None = None,
+    load_points: bool = True,
+    training_images: Callable[[int], int] | None = lambda count: math.ceil(0.9 * count),
+    open_images: bool = True,
 ) -> Iterator[Finding]:
+    """Findings for a `transforms.json`, as `ns-process-data` writes it.
+
+    Args:
+        data: The folder, or the file itself.
+        downscale_factor: As of nerfstudio's parser: None chooses by size.
+        load_points: Whether the SfM points will be read.
+        training_images: How many of so many views are trained on; None if that depends on names.
+        open_images: Whether to look into the images, too.
+    """
     path = data if data.suffix == ".json" else data / "transforms.json"
     folder = path.parent
     if not path.is_file():
@@ -227,14 +145,13 @@ def _check_nerfstudio(
         factor = _smaller_copies(folder, Path(described[0]["file_path"])) if open_images else 1
     frames = []
     for frame in described:
-        image = Path(frame["file_path"])
-        _check_intrinsics({**frame, **meta}, f"{path}: frame {image}", ("fl_x", "fl_y", "cx", "cy", "w", "h"))
-        size = tuple(_scaled(int({**frame, **meta}[side]), factor, "floor") for side in ("w", "h"))
+        image, values = Path(frame["file_path"]), {**frame, **meta}
+        _check_intrinsics(values, f"{path}: frame {image}", ("fl_x", "fl_y", "cx", "cy", "w", "h"))
         mask = frame.get("mask_path")
         frames.append(
-            _Frame(
+            Frame(
                 folder / (f"images_{factor}/{image.name}" if factor > 1 else image),
-                (size[0], size[1]),
+                _scaled((int(values["w"]), int(values["h"])), factor, "floor"),
                 None if mask is None else folder / (f"masks_{factor}/{Path(mask).name}" if factor > 1 else mask),
             )
         )
@@ -246,9 +163,7 @@ def _check_nerfstudio(
     yield from _check_number(len(frames), count, path)
     yield from _check_positions(np.array([frame["transform_matrix"] for frame in described])[:, :3, 3], path)
     if open_images:
-        yield from _check_images(frames, path)
-        if factor == 1:
-            yield from _check_unused(frames, path)
+        yield from _check_images(frames, path, look_for_unused=factor == 1)
     if load_points:
         yield from _check_ply(meta, path)
 
@@ -338,7 +253,7 @@ def _ply_problem(content: bytes) -> str | None:
 
 def _smaller_copies(folder: Path, image: Path) -> int:
     """The factor that nerfstudio's own parser chooses: it takes smaller copies only where they exist."""
-    factor, size = 1, _inspect_image(folder / image).size
+    factor, size = 1, image_size(folder / image)
     while max(size) / factor > MAX_AUTO_RESOLUTION and (folder / f"images_{2 * factor}" / image.name).exists():
         factor *= 2
     return factor
@@ -347,17 +262,27 @@ def _smaller_copies(folder: Path, image: Path) -> int:
 # --- COLMAP ---
 
 
-def _check_colmap(
+@_findings
+def check_colmap(
     data: Path,
-    images_folder: Path,
-    model_folder: Path,
-    masks_folder: Path | None,
-    downscale_factor: int | None,
-    rounding: Literal["floor", "round", "ceil"],
-    load_points: bool,
-    training_images: Callable[[int], int] | None,
-    open_images: bool,
+    *,
+    images_path: Path = Path("images"),
+    colmap_path: Path = Path(COLMAP_FOLDERS[0]),
+    masks_path: Path | None = None,
+    downscale_factor: int | None = None,
+    rounding: Rounding = "floor",
+    load_points: bool = True,
+    training_images: Callable[[int], int] | None = lambda count: count - math.ceil(count / 8),
+    open_images: bool = True,
 ) -> Iterator[Finding]:
+    """Findings for a COLMAP reconstruction, binary or text.
+
+    Args:
+        data: The folder that the other paths are relative to.
+        images_path, colmap_path, masks_path, downscale_factor, rounding: As of nerfstudio's parser.
+        load_points, training_images, open_images: As for `check_nerfstudio`.
+    """
+    images_folder, model_folder = data / images_path, data / colmap_path
     kind = next((kind for kind in ("txt", "bin") if (model_folder / f"cameras.{kind}").is_file()), None)
     if kind is None:
         if (found := find_reconstruction(data)) is not None:
@@ -403,10 +328,10 @@ def _check_colmap(
         return
     factor = downscale_factor
     if factor is None:
-        factor, size = 1, _inspect_image(images_folder / poses[0][0]).size
+        factor, size = 1, image_size(images_folder / poses[0][0])
         while max(size) / factor > MAX_AUTO_RESOLUTION:
             factor *= 2
-    smaller = images_folder.with_name(f"{images_folder.name}_{factor}") if factor > 1 else images_folder
+    smaller = _smaller_folder(images_folder, factor)
     if not all((smaller / name).parent.exists() for name, _, _ in poses):
         yield Finding(
             "warning",
@@ -416,15 +341,12 @@ def _check_colmap(
         factor, smaller = 1, images_folder
     frames = []
     for name, camera_id, _ in poses:
-        size = tuple(_scaled(side, factor, rounding) for side in (used[camera_id].width, used[camera_id].height))
+        size = _scaled((used[camera_id].width, used[camera_id].height), factor, rounding)
         mask = None
-        if masks_folder is not None:
-            masks = masks_folder.with_name(f"{masks_folder.name}_{factor}") if factor > 1 else masks_folder
-            mask = (masks / name).with_suffix(".png")
-        frames.append(_Frame(smaller / name, (size[0], size[1]), mask))
-    yield from _check_images(frames, poses_path)
-    if factor == 1:
-        yield from _check_unused(frames, poses_path)
+        if masks_path is not None:
+            mask = (_smaller_folder(data / masks_path, factor) / name).with_suffix(".png")
+        frames.append(Frame(smaller / name, size, mask))
+    yield from _check_images(frames, poses_path, look_for_unused=factor == 1)
 
 
 def _check_camera(camera: colmap.Camera, where: str) -> None:
@@ -467,7 +389,9 @@ def _check_points(model_folder: Path) -> Iterator[Finding]:
 # --- Blender ---
 
 
-def _check_blender(data: Path, open_images: bool) -> Iterator[Finding]:
+@_findings
+def check_blender(data: Path, *, open_images: bool = True) -> Iterator[Finding]:
+    """Findings for a synthetic scene in the layout of NeRF's: `transforms_train.json` and its siblings."""
     if not (data / "transforms_train.json").is_file():
         raise InputError(_no_layout(data))
     for split in ("train", "val", "test"):
@@ -482,8 +406,8 @@ def _check_blender(data: Path, open_images: bool) -> Iterator[Finding]:
         if split == "train":
             yield from _check_number(len(images), len(images), path)
         if open_images:
-            size = _inspect_image(images[0]).size  # that of all cameras
-            yield from _check_images([_Frame(image, size if any(size) else None) for image in images], path)
+            size = image_size(images[0])  # that of all cameras
+            yield from _check_images([Frame(image, size if any(size) else None) for image in images], path)
 
 
 # --- what all layouts share ---
@@ -513,98 +437,21 @@ def _check_positions(centres: np.ndarray, source: Path) -> Iterator[Finding]:
         )
 
 
-def _scaled(side: int, factor: int, rounding: Literal["floor", "round", "ceil"]) -> int:
-    """A camera's width or height after nerfstudio scaled it down, in its float32."""
-    value = float(np.float32(side) * np.float32(1.0 / factor))
-    return {"floor": math.floor(value), "round": math.floor(value + 0.5), "ceil": math.ceil(value)}[rounding]
+def _scaled(size: Size, factor: int, rounding: Rounding) -> Size:
+    """A camera's width and height after nerfstudio scaled them down, in its float32."""
+    width, height = (float(np.float32(side) * np.float32(1.0 / factor)) for side in size)
+    to_int = {"floor": math.floor, "round": lambda value: math.floor(value + 0.5), "ceil": math.ceil}[rounding]
+    return to_int(width), to_int(height)
 
 
-def _inspect_image(path: Path) -> _Image:
-    """Read an image's header, and decode it only where the file's end does not tell that it is whole."""
-    again = "copy it again, or leave it out of the reconstruction"
-    try:
-        if path.stat().st_size == 0:
-            return _Image(problem=f"has 0 bytes: {again}")
-        with Image.open(path) as image:
-            size, mode = image.size, image.mode
-            whole = _ends_well(path, image)
-        if not whole:
-            with Image.open(path) as image:
-                image.load()
-    except FileNotFoundError:
-        return _Image(problem="does not exist: put it there, or leave it out of the reconstruction")
-    except UnidentifiedImageError:
-        return _Image(problem=f"is no image that Pillow knows: {again}")
-    except Exception as error:  # decoders raise whatever they stumble over: OSError, SyntaxError, struct.error, …
-        return _Image(problem=f"cannot be read as an image ({reason(error)}): {again}")
-    return _Image(size, mode)
+def _smaller_folder(folder: Path, factor: int) -> Path:
+    """Where nerfstudio keeps a folder's images scaled down."""
+    return folder.with_name(f"{folder.name}_{factor}") if factor > 1 else folder
 
 
-def _ends_well(path: Path, image: Image.Image) -> bool:
-    """Whether an image that opened is surely whole, found without decoding it; if not, decoding it tells."""
-    if image.format == "JPEG":
-        with path.open("rb") as file:
-            file.seek(-2, 2)
-            return file.read() == b"\xff\xd9"
-    if image.format == "PNG":
-        try:
-            image.verify()  # its checksums
-        except Exception:  # as above; a file without its last bytes fails here and decodes well
-            return False
-        return True
-    return False
-
-
-def _check_images(frames: Sequence[_Frame], source: Path) -> Iterator[Finding]:
-    """One finding for each kind of problem with images and masks, naming the first that has it."""
-
-    def problem(frame: _Frame) -> tuple[str, Path, str] | None:
-        """Kind, file and the rest of the sentence."""
-        image = _inspect_image(frame.image)
-        if image.problem:
-            return image.problem.split(" (")[0], frame.image, image.problem
-        if image.mode not in ("RGB", "RGBA", "L"):
-            return "mode", frame.image, f"has pixels of Pillow's mode {image.mode}: convert it to 8-bit RGB"
-        if frame.size not in (None, image.size):
-            sizes = "{} × {} px, but its camera in {} {} × {}".format(*image.size, source, *frame.size)
-            return "size", frame.image, f"has {sizes}: use the images that the poses were computed from"
-        if frame.mask is not None:
-            mask = _inspect_image(frame.mask)
-            if mask.problem:
-                return mask.problem.split(" (")[0], frame.mask, mask.problem
-            if mask.size != image.size:
-                return "mask", frame.mask, f"is a mask of another size than {frame.image}: resize it"
-        return None
-
-    problems: dict[str, list[tuple[Path, str]]] = defaultdict(list)
-    with ThreadPoolExecutor() as pool:
-        for found in pool.map(problem, frames):
-            if found is not None:
-                problems[found[0]].append(found[1:])
-    for same in problems.values():
-        path, text = same[0]
-        yield Finding("error", f"{_and_more(path, len(same))} {text}.")
-
-
-def _and_more(path: Path, count: int) -> str:
-    """The first of some paths, and how many others there are."""
-    return f"{path} (and {count - 1} more)" if count > 1 else f"{path}"
-
-
-def _check_unused(frames: Sequence[_Frame], source: Path) -> Iterator[Finding]:
-    """A finding for images beside the used ones that have no pose."""
-    used = {path.resolve() for frame in frames for path in (frame.image, frame.mask) if path is not None}
-    folders = sorted({frame.image.parent for frame in frames})
-    unused = [path for folder in folders for path in _images_in(folder) if path.resolve() not in used]
-    if unused:
-        yield Finding(
-            "warning",
-            f"{_and_more(unused[0], len(unused))} has no pose in {source} and is not used: reconstruct again if it "
-            "matters.",
-        )
-
-
-def _images_in(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        return []
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+def _check_images(frames: Sequence[Frame], source: Path, look_for_unused: bool = False) -> Iterator[Finding]:
+    """Findings for the frames' images and masks and, on demand, for images beside them."""
+    for sentence in image_problems(frames, source):
+        yield Finding("error", sentence)
+    if look_for_unused and (unused := unused_images(frames, source)) is not None:
+        yield Finding("warning", unused)

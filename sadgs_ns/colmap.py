@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sadgs_ns.errors import InputError, reason
 
@@ -42,7 +43,7 @@ class Camera:
     params: tuple[float, ...]
 
 
-def camera_centre(pose: np.ndarray) -> np.ndarray:
+def camera_centre(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """Camera centre in the world of a COLMAP pose: wxyz quaternion and translation, world to camera. [7] → [3]"""
     w, x, y, z = pose[:4]
     rotation = np.array(
@@ -111,7 +112,7 @@ def _read_binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
         yield camera_id, Camera(model, width, height, params)
 
 
-def _read_binary_poses(path: Path) -> Iterator[tuple[str, int, np.ndarray]]:
+def _read_binary_poses(path: Path) -> Iterator[tuple[str, int, NDArray[np.float64]]]:
     """Name, camera and pose (wxyz quaternion, translation) [7] of each image."""
     file = _Binary(path)
     for _ in range(file.take(_COUNT)[0]):
@@ -159,7 +160,7 @@ def _read_text_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
             raise _not_colmap(path, error) from error
 
 
-def _read_text_poses(path: Path) -> Iterator[tuple[str, int, np.ndarray]]:
+def _read_text_poses(path: Path) -> Iterator[tuple[str, int, NDArray[np.float64]]]:
     """Name, camera and pose (wxyz quaternion, translation) [7] of each image."""
     for fields, following in _read_text(path, 10):
         try:
@@ -186,7 +187,7 @@ def read_cameras(path: Path) -> dict[int, Camera]:
     return dict((_read_binary_cameras if path.suffix == ".bin" else _read_text_cameras)(path))
 
 
-def read_poses(path: Path) -> list[tuple[str, int, np.ndarray]]:
+def read_poses(path: Path) -> list[tuple[str, int, NDArray[np.float64]]]:
     """Name, camera id and pose (wxyz quaternion and translation, world to camera) [7] of the images of `images.*`."""
     return list((_read_binary_poses if path.suffix == ".bin" else _read_text_poses)(path))
 

@@ -13,7 +13,7 @@ from pathlib import Path
 class _OneSentence(SystemExit):
     def __init__(self, message: str) -> None:
         super().__init__(message)
-        self.code = f"error: {message}"  # what Python prints; str() stays the message
+        self.code: str = f"error: {message}"  # what Python prints; str() stays the message
 
 
 class InputError(_OneSentence, ValueError):

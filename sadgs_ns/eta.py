@@ -11,6 +11,8 @@ import torch.nn.functional as F
 from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 
+from sadgs_ns.storage import decode
+
 WAVELENGTH_EPSILON = 1e-5
 """ε of Λ_min = 1 / (√λ_1 + ε) in 1/px: a textureless region has a wavelength of 10⁵ px, not infinity."""
 SCREEN_BLUR = 0.3
@@ -115,7 +117,7 @@ def sample_map(structure_tensors: Tensor, camera_ids: Tensor, points: Tensor) ->
     """Read S̄ at the pixel under each point.
 
     Args:
-        structure_tensors: S̄ of each camera's image, any floating dtype. [C, H, W, 3]
+        structure_tensors: S̄ of each camera's image, any floating dtype, or its codes of `storage.encode`. [C, H, W, 3]
         camera_ids: Which image. [M]
         points: px. [M, 2]
 
@@ -128,7 +130,8 @@ def sample_map(structure_tensors: Tensor, camera_ids: Tensor, points: Tensor) ->
     column = torch.where(inside, x, 0).long()
     row = torch.where(inside, y, 0).long()
     values = structure_tensors[camera_ids, row, column]
-    values = values.to(torch.promote_types(values.dtype, torch.float32))
+    is_code = values.dtype == torch.uint8
+    values = decode(values) if is_code else values.to(torch.promote_types(values.dtype, torch.float32))
     return values * inside[:, None], inside
 
 

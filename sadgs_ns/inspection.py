@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.progress import track
 from torch import Tensor
 
-from sadgs_ns import checkpoints, checks, pictures
+from sadgs_ns import checkpoints, pictures
 from sadgs_ns.absgs import accumulate_gradients, empty_gradients, grow
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.model import SadgsModel
@@ -30,6 +30,7 @@ from sadgs_ns.pictures import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
 from sadgs_ns.pipeline import SadgsPipeline
 from sadgs_ns.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.split import grid_split
+from sadgs_ns.storage import decode
 from sadgs_ns.trainer import SadgsTrainerConfig
 
 SEED = 0
@@ -93,7 +94,7 @@ def load_run(path: Path, load_step: int | None = None) -> tuple[SadgsPipeline, i
         raise InputError(
             f"{folder} holds no checkpoint yet: train to the end, or with --steps-per-save 500 to look on the way."
         )
-    checkpoint = checks.checkpoint_path(folder, load_step, None)
+    checkpoint = checkpoints.checkpoint_path(folder, load_step, None)
     assert checkpoint is not None
     _, state = checkpoints.read_or_earlier(checkpoint) if load_step is None else (None, checkpoints.read(checkpoint))
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -123,7 +124,7 @@ def get_view(pipeline: SadgsPipeline, index: int, split: Literal["train", "eval"
     return View(
         name=dataset.image_filenames[index].name,
         photo=pipeline.photo(data),
-        structure_tensor=pipeline.structure_tensors_of([data])[0].float(),
+        structure_tensor=decode(pipeline.structure_tensors_of([data])[0]),
         viewmat=(
             pipeline.train_viewmat(index)
             if split == "train"

@@ -5,9 +5,10 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, get_type_hints
 
 import torch
+import tyro
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
@@ -23,7 +24,6 @@ from nerfstudio.utils.colors import get_color
 from nerfstudio.utils.rich_utils import CONSOLE
 from pytorch_msssim import SSIM
 from torch import Tensor
-from torchmetrics.image import PeakSignalNoiseRatio
 
 from sadgs_ns.cameras import refuse_unsupported_cameras
 from sadgs_ns.errors import InputError
@@ -58,6 +58,9 @@ WITHOUT_EFFECT = {
 }
 """Fields inherited from splatfacto that this method does not read, and what replaces each here."""
 
+OF_RAYS = ("enable_collider", "collider_params", "loss_coefficients", "eval_num_rays_per_chunk", "prompt")
+"""Fields that nerfstudio gives every model, and that no model of Gaussians reads."""
+
 
 @dataclass
 class SadgsModelConfig(SplatfactoModelConfig):
@@ -79,12 +82,21 @@ class SadgsModelConfig(SplatfactoModelConfig):
     l2_lambda: float = 2.0
     """Weight of the squared error that is added to the loss for faster convergence."""
     fused: bool = True
-    """Train with Triton kernels where they run (CUDA), instead of the torch and gsplat code that they are tested
-    against: rasterization's tile lists and harmonics, loss, η and Adam."""
+    """Train with Triton kernels where they run (CUDA): tile lists, harmonics, loss, η and Adam.
+    Without, torch and gsplat compute the same, more slowly."""
     bounding_box_points: bool = True
     """Also start from points on the faces of the SfM points' bounding box."""
     camera_clearance: float = 2.0
     """Initial Gaussians nearer to a camera than this many of their standard deviations are dropped; 0 keeps all."""
+
+
+# tyro reads these for `ns-train sadgs --help`, which would repeat splatfacto's texts.
+for _name, _hint in get_type_hints(SplatfactoModelConfig).items():
+    if _name in WITHOUT_EFFECT:
+        _text = f"Splatfacto's, refused here: use {WITHOUT_EFFECT[_name]}.".replace("use nothing: ", "")
+        SadgsModelConfig.__annotations__[_name] = Annotated[_hint, tyro.conf.arg(help=_text)]
+    elif _name in OF_RAYS:
+        SadgsModelConfig.__annotations__[_name] = tyro.conf.Suppress[_hint]
 
 
 class SadgsModel(SplatfactoModel):
@@ -115,7 +127,6 @@ class SadgsModel(SplatfactoModel):
             {name: torch.nn.Parameter(value) for name, value in self._initial_gaussians().items()}
         )
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
-        self.psnr = PeakSignalNoiseRatio(data_range=1.0)
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
         self._lpips: list[torch.nn.Module | None] = []  # a list, so that its weights stay out of the checkpoint
         self.step = 0
@@ -379,6 +390,13 @@ class SadgsModel(SplatfactoModel):
             if self.config.use_bilateral_grid:
                 losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
         return losses
+
+    def psnr(self, predicted: Tensor, target: Tensor) -> Tensor:
+        """PSNR in dB of images in [0, 1]."""
+        # A second of imports that training does not need.
+        from torchmetrics.functional.image import peak_signal_noise_ratio
+
+        return peak_signal_noise_ratio(predicted, target, data_range=1.0)
 
     def lpips(self, predicted: Tensor, target: Tensor) -> Tensor:
         """LPIPS (AlexNet) of images [1, 3, H, W] in [0, 1], NaN where its weights cannot be loaded.

@@ -32,6 +32,7 @@ from torch import Tensor
 from sadgs_ns import pictures
 from sadgs_ns.pictures import CHILDREN, ETA, LOW, PERIOD, Picture, to_picture
 from sadgs_ns.rasterization import viewmats_from_camera_to_world
+from sadgs_ns.storage import decode
 from sadgs_ns.strategy import StructureAwareStrategy
 
 if TYPE_CHECKING:
@@ -253,7 +254,7 @@ class StructurePanel(torch.nn.Module):
             extent = float(pipeline.model.strategy_state["scene_scale"])
             index = nearest_view(cameras, camera.camera_to_worlds[0].to(cameras), extent)
             photo = to_picture(pipeline.photo(pipeline.datamanager.cached_train[index]))
-            tensor = pipeline.structure_tensors[index].float()
+            tensor = decode(pipeline.structure_tensors[index])
             name = f"the nearest training view, {pipeline.datamanager.train_dataset.image_filenames[index].name}"
         scale = min(height / photo.shape[0], width / photo.shape[1])
         size = max(round(scale * photo.shape[0]), 1), max(round(scale * photo.shape[1]), 1)

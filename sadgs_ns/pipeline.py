@@ -6,32 +6,30 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
-from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
-from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from nerfstudio.data.utils import dataparsers_utils as splits
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 from torch import Tensor
 
-from sadgs_ns import checks, kernels
+from sadgs_ns import kernels
 from sadgs_ns.cameras import refuse_failed_undistortion, refuse_unsupported_cameras
 from sadgs_ns.datamanager import SadgsDatamanagerConfig
 from sadgs_ns.errors import InputError
 from sadgs_ns.finite import NonFiniteLog
+from sadgs_ns.memory import STEP_BYTES
 from sadgs_ns.model import SadgsModel, SadgsModelConfig
 from sadgs_ns.optimizers import FusedAdam
 from sadgs_ns.panel import StructurePanel
+from sadgs_ns.preflight import findings_of
 from sadgs_ns.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.statistics import empty_statistics, observe
+from sadgs_ns.storage import HIGHEST_FREQUENCY, encode
 from sadgs_ns.structure_tensor import (
     ENERGY_BLUR,
     FREQUENCY_CONSTANT,
@@ -41,10 +39,6 @@ from sadgs_ns.structure_tensor import (
 
 _PIXELS_PER_BATCH = 4_000_000
 """Structure tensors are computed for as many images at once as fit this; each pixel takes about 300 bytes."""
-_MAX_FREQUENCY_CONSTANT = 255
-"""S̄ is at most c²/px², which float16, in which it is kept, must hold."""
-
-
 _NAMED_STEPS = 5
 """Iterations of which a report of what was not finite names the images."""
 
@@ -85,13 +79,12 @@ class SadgsPipeline(VanillaPipeline):
     def __init__(self, config: SadgsPipelineConfig, *args: Any, **kwargs: Any) -> None:
         if config.views_per_iteration < 1:
             raise InputError(f"pipeline.views_per_iteration must be at least 1, got {config.views_per_iteration}.")
-        if not 0 < config.frequency_constant <= _MAX_FREQUENCY_CONSTANT:
+        if not 0 < config.frequency_constant <= HIGHEST_FREQUENCY:
             raise InputError(
-                f"pipeline.frequency_constant must be in (0, {_MAX_FREQUENCY_CONSTANT}], "
-                f"got {config.frequency_constant}."
+                f"pipeline.frequency_constant must be in (0, {HIGHEST_FREQUENCY:g}], got {config.frequency_constant}."
             )
         # Rendering new views ("inference") opens no image.
-        for finding in refuse_bad_data(config.datamanager, open_images=kwargs.get("test_mode") != "inference"):
+        for finding in findings_of(config.datamanager, open_images=kwargs.get("test_mode") != "inference"):
             if finding.severity == "warning":
                 CONSOLE.print(f"[yellow]{escape(finding.sentence)}[/]")
         super().__init__(config, *args, **kwargs)
@@ -114,6 +107,18 @@ class SadgsPipeline(VanillaPipeline):
         self.log = NonFiniteLog(self.device)
         self.structure = StructurePanel(self)
         self.model.viewer_outputs = self.structure.outputs
+
+    def _image_bytes(self) -> float:
+        """Memory of the training device that images, structure tensors and a step's pictures will take, in bytes."""
+        config, train = self.datamanager.config, self.datamanager.train_dataset.cameras
+        pixels = train.height * train.width  # [C, 1]
+        needed = STEP_BYTES * self.config.views_per_iteration * float(pixels.max())
+        if config.cache_images == "gpu":
+            held_out = self.datamanager.eval_dataset.cameras
+            cached = float(pixels.sum() + (held_out.height * held_out.width).sum())
+            needed += 3 * (1 if config.cache_images_type == "uint8" else 4) * cached
+            needed += 3 * torch.finfo(torch.float16).bits / 8 * float(pixels.sum())  # S̄
+        return needed
 
     @property
     def model(self) -> SadgsModel:
@@ -142,7 +147,7 @@ class SadgsPipeline(VanillaPipeline):
 
     @cached_property
     def structure_tensors(self) -> list[Tensor]:
-        """S̄ of every training image, float16 [H, W, 3], where the images are cached; 0 at masked pixels."""
+        """Codes (`storage.encode`) of S̄ of every training image, uint8 [H, W, 3], where the images are cached."""
         by_size = defaultdict(list)
         for index, data in enumerate(self.datamanager.cached_train):
             by_size[data["image"].shape[:2]].append(index)
@@ -162,7 +167,7 @@ class SadgsPipeline(VanillaPipeline):
         return self.model.composite_with_background(self.model.get_gt_img(data["image"]), background).to(self.device)
 
     def structure_tensors_of(self, data: list[dict[str, Any]]) -> Tensor:
-        """S̄ of the datamanager's images of one size, computed on the training device, float16. [B, H, W, 3]"""
+        """Codes of S̄ of the datamanager's images of one size, on the training device. uint8 [B, H, W, 3]"""
         images = torch.stack([self.photo(d) for d in data])
         masks = None
         if any("mask" in d for d in data):
@@ -170,7 +175,7 @@ class SadgsPipeline(VanillaPipeline):
                 [d["mask"][..., 0].to(self.device) if "mask" in d else torch.ones_like(image[..., 0], dtype=torch.bool)
                  for d, image in zip(data, images, strict=True)]
             )  # fmt: skip
-        return self.structure_tensors_of_images(images, masks).half()
+        return encode(self.structure_tensors_of_images(images, masks), self.config.model.fused)
 
     def structure_tensors_of_images(self, images: Tensor, masks: Tensor | None = None) -> Tensor:
         """S̄ with this run's settings. [B, H, W, 3] in [0, 1], bool [B, H, W] or None → [B, H, W, 3]"""
@@ -235,7 +240,19 @@ class SadgsPipeline(VanillaPipeline):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Those of data and model, and at the end a last look at what was not finite."""
+        """Those of data and model, and at the end a last look at what was not finite.
+
+        Raises:
+            InputError: If `memory_budget_gb` leaves no room for Gaussians.
+        """
+        if self.config.model.densify:
+            try:
+                line = self.model.strategy.fit_to_memory(self.model.gauss_params, self._image_bytes())
+            except ValueError as error:
+                raise InputError(f"pipeline.model.{error}") from error
+            if line is not None:
+                CONSOLE.print(line, highlight=False, soft_wrap=True)
+            self.structure.set_max_gaussians.value = self.model.strategy.max_gaussians
         optimizers = training_callback_attributes.optimizers
         for optimizer in optimizers.optimizers.values() if optimizers is not None else ():
             if isinstance(optimizer, FusedAdam):
@@ -336,60 +353,3 @@ class SadgsPipeline(VanillaPipeline):
                 self.datamanager.random_generator.setstate(state["view_shuffle"])
         if "cuda" in state and self.device.type == "cuda":
             torch.cuda.set_rng_state(state["cuda"].cpu(), self.device)
-
-
-def refuse_bad_data(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[checks.Finding]:
-    """Check the data before nerfstudio parses them; parsers other than its three common ones are not checked.
-
-    Returns:
-        Findings that do not stop training.
-
-    Raises:
-        InputError: With the first finding that does.
-    """
-    parser = config.dataparser
-    data = Path(config.data or parser.data)
-    if isinstance(parser, ColmapDataParserConfig):
-        findings = checks.check_colmap(
-            data,
-            images_path=parser.images_path,
-            colmap_path=parser.colmap_path,
-            masks_path=parser.masks_path,
-            downscale_factor=parser.downscale_factor,
-            rounding=parser.downscale_rounding_mode,
-            load_points=parser.load_3D_points,
-            training_images=_training_images(parser),
-            open_images=open_images,
-        )
-    elif isinstance(parser, NerfstudioDataParserConfig):
-        findings = checks.check_nerfstudio(
-            data,
-            downscale_factor=parser.downscale_factor,
-            load_points=parser.load_3D_points,
-            training_images=_training_images(parser),
-            open_images=open_images,
-        )
-    elif isinstance(parser, BlenderDataParserConfig):
-        findings = checks.check_blender(data, open_images=open_images)
-    else:
-        findings = []
-    checks.refuse(findings, data)
-    return findings
-
-
-def _training_images(parser: ColmapDataParserConfig | NerfstudioDataParserConfig) -> Callable[[int], int] | None:
-    """How many of so many views the parser trains on; None if that depends on their names."""
-    if parser.eval_mode == "filename":
-        return None
-
-    def count(views: int) -> int:
-        names: list[Any] = [None] * views
-        if parser.eval_mode == "fraction":
-            chosen, _ = splits.get_train_eval_split_fraction(names, parser.train_split_fraction)
-        elif parser.eval_mode == "interval":
-            chosen, _ = splits.get_train_eval_split_interval(names, parser.eval_interval)
-        else:
-            chosen = np.arange(views)
-        return len(chosen)
-
-    return count

@@ -168,6 +168,6 @@ def _registered(name: str) -> MethodSpecification:
         raise InputError(f"{_configs() / f'{name}.yaml'} has a mistake: {error}") from error
 
 
-sadgs = _registered("sadgs")
-sadgs_indoor = _registered("sadgs-indoor")
-sadgs_large = _registered("sadgs-large")
+sadgs: MethodSpecification = _registered("sadgs")
+sadgs_indoor: MethodSpecification = _registered("sadgs-indoor")
+sadgs_large: MethodSpecification = _registered("sadgs-large")

@@ -28,7 +28,8 @@ import pycolmap
 from PIL import ExifTags, Image
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
+from sadgs_ns.image_checks import IMAGE_SUFFIXES
+
 VIDEO_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"}
 EXHAUSTIVE_LIMIT = 200
 """Photos up to which every pair is matched; twice the photos take four times as long."""
@@ -109,8 +110,7 @@ def find_photos(source: Path, work: Path, frames: int) -> tuple[Path, list[str]]
         folder = work / "frames"
         done = work / "frames.json"
         if not done.exists():
-            shutil.rmtree(folder, ignore_errors=True)
-            folder.mkdir(parents=True)
+            _empty_folder(folder)
             for number, frame in sharpest_frames(source, frames):
                 cv2.imwrite(str(folder / f"{number:05d}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, 97])
             done.write_text(json.dumps({"video": source.name, "frames": frames}))
@@ -120,6 +120,13 @@ def find_photos(source: Path, work: Path, frames: int) -> tuple[Path, list[str]]
     if len(names) < 3:
         raise ValueError(f"{source} holds {len(names)} photos; a reconstruction needs at least 3, better 30 or more.")
     return folder, names
+
+
+def _empty_folder(folder: Path) -> Path:
+    """Make a folder, without what an interrupted run left in it."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    return folder
 
 
 def photos_by_camera(photos: Path, names: Sequence[str]) -> list[list[str]]:
@@ -225,9 +232,7 @@ def reconstruct(photos: Path, names: Sequence[str], database: Path, work: Path, 
     if (model / "images.bin").exists():
         progress.advance(task, len(names))
         return model
-    attempts = work / "models"
-    shutil.rmtree(attempts, ignore_errors=True)
-    attempts.mkdir()
+    attempts = _empty_folder(work / "models")
     options = pycolmap.IncrementalPipelineOptions(min_model_size=3)
     models = pycolmap.incremental_mapping(
         database,
@@ -243,9 +248,7 @@ def reconstruct(photos: Path, names: Sequence[str], database: Path, work: Path, 
             "sharp, and of a scene with texture."
         )
     best = max(models.values(), key=lambda candidate: candidate.num_reg_images())
-    partial = work / "model.partial"
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir()
+    partial = _empty_folder(work / "model.partial")
     best.write(partial)
     partial.rename(model)
     progress.update(task, completed=len(names))
@@ -290,8 +293,7 @@ def summarize(names: Sequence[str], model: Path, database: Path) -> Summary:
             identity = identities.get(name)
             if identity is None:
                 left_out[name] = "could not be read"
-            elif opened.num_keypoints_for_image(identity) < FEW_FEATURES:
-                count = opened.num_keypoints_for_image(identity)
+            elif (count := opened.num_keypoints_for_image(identity)) < FEW_FEATURES:
                 left_out[name] = f"only {count} features: blurred, dark or without texture"
             elif matches[identity] < 30:
                 left_out[name] = "matches no other photo: too little overlap"
@@ -385,14 +387,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if options.frames < 3:
         parser.error("--frames must be at least 3")
     try:
-        summary = process(
-            options.source,
-            options.out,
-            matching=options.matching,
-            frames=options.frames,
-            max_size=options.max_size,
-            camera_per_photo=options.camera_per_photo,
-        )
+        summary = process(**vars(options))
     except ValueError as error:
         print(f"sadgs-process: {error}", file=sys.stderr)
         return 2

@@ -230,19 +230,23 @@ def _project(
     means_c = torch.where(valid[..., None], means_c, means_c.new_tensor([0.0, 0.0, 1.0]))
     means2d, covars2d = _persp_proj(means_c, covars_c, Ks, width, height)
     # So are those too large for the determinant's range (billions of px), which have no inverse.
-    a, b, c = covars2d[..., 0, 0].detach(), covars2d[..., 0, 1].detach(), covars2d[..., 1, 1].detach()
-    valid = valid & (a * c - b * b).isfinite()
+    valid = valid & _determinant(covars2d.detach()).isfinite()
     covars2d = torch.where(valid[..., None, None], covars2d, torch.eye(2, dtype=means.dtype, device=means.device))
 
-    det_sharp = covars2d[..., 0, 0] * covars2d[..., 1, 1] - covars2d[..., 0, 1] * covars2d[..., 1, 0]
+    det_sharp = _determinant(covars2d)
     covars2d = covars2d + eps2d * torch.eye(2, dtype=means.dtype, device=means.device)
-    det = covars2d[..., 0, 0] * covars2d[..., 1, 1] - covars2d[..., 0, 1] * covars2d[..., 1, 0]
+    det = _determinant(covars2d)
     valid = valid & (det > 0)
     det = torch.where(valid, det, 1.0)
     conics = torch.stack([covars2d[..., 1, 1], -covars2d[..., 0, 1], covars2d[..., 0, 0]], dim=-1) / det[..., None]
     # The floor keeps the square root's gradient finite for flat Gaussians seen edge-on; it is itself invisible.
     compensations = (det_sharp / det).clamp_min(1e-12).sqrt()
     return means2d, depths, conics, compensations, covars2d, valid
+
+
+def _determinant(matrices: Tensor) -> Tensor:
+    """[..., 2, 2] → [...]; torch.linalg.det goes through an LU decomposition."""
+    return matrices[..., 0, 0] * matrices[..., 1, 1] - matrices[..., 0, 1] * matrices[..., 1, 0]
 
 
 @torch.no_grad()
@@ -263,8 +267,7 @@ def _extents(
         extents = (sigmas[..., None] * covars2d.diagonal(dim1=-2, dim2=-1).sqrt()).ceil()
     else:
         half_trace = 0.5 * (covars2d[..., 0, 0] + covars2d[..., 1, 1])
-        det = covars2d[..., 0, 0] * covars2d[..., 1, 1] - covars2d[..., 0, 1] * covars2d[..., 1, 0]
-        long_axis = half_trace + (half_trace.square() - det).clamp_min(0.01).sqrt()
+        long_axis = half_trace + (half_trace.square() - _determinant(covars2d)).clamp_min(0.01).sqrt()
         extents = (3.0 * long_axis.sqrt()).ceil()[..., None].expand_as(means2d)
     image = extents.new_tensor([width, height])
     on_screen = ((means2d + extents > 0) & (means2d - extents < image)).all(dim=-1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from gsplat.strategy.ops import _update_param_with_optimizer, remove
 from torch import Tensor
 
 from sadgs_ns.absgs import accumulate_gradients, empty_gradients, grow
-from sadgs_ns.memory import affordable_growth, free_bytes
+from sadgs_ns.memory import PLANNED_SHARE, affordable_growth, available_bytes, free_bytes, gaussian_bytes
 from sadgs_ns.split import VARIANCE_EXTENT, Params, children_per_axis, grid_split, limit_growth
 from sadgs_ns.statistics import consistent, empty_statistics, observe
 
@@ -32,14 +33,19 @@ class StructureAwareStrategy(Strategy):
         info |= {"structure_tensors": ..., "viewmats": ..., "Ks": ...}   # [C, H, W, 3], [C, 4, 4], [C, 3, 3]
         strategy.step_pre_backward(params, optimizers, state, step, info)
         loss.backward()                                                  # the mean over the C views
+        ...                                                              # the optimizers step
         strategy.step_post_backward(params, optimizers, state, step, info)
 
-    Views of different sizes are rendered one by one; `info` is then the list of their infos.
+    The README holds the whole loop. Views of different sizes are rendered one by one; `info` is then the list of their
+    infos.
     """
 
     max_gaussians: int = 4_000_000
-    """Hard cap on the number of Gaussians, never exceeded; the largest violations are split first. On CUDA fewer are
-    added, with a warning, where the device's memory would not hold them."""
+    """Hard cap on the number of Gaussians, never exceeded; the largest violations are split first.
+    On CUDA fewer are added, with a warning, where the device's memory would not hold them."""
+    memory_budget_gb: float | None = None
+    """Memory of the GPU, in 10⁹ bytes, that training may take; `ns-train` lowers `max_gaussians` to it at the start.
+    None is 80 % of what is free, unless `max_gaussians` was changed, which then stays."""
     structure_every: int = 500
     """Iterations between structure-aware split and prune steps; 0 turns them off."""
     absgs_every: int = 100
@@ -53,8 +59,8 @@ class StructureAwareStrategy(Strategy):
     directional_eta: bool = False
     """Measure η along each axis's own direction (paper, eq. 7) instead of against the shortest wavelength (eq. 6)."""
     eta_min_opacity: float = 0.3
-    """Opacity in [0, 1] from which a Gaussian's η is observed, high or low; 0 observes every visible one, as the paper
-    does. Pruning by low η then only concerns Gaussians that were this opaque since the last structure step."""
+    """Opacity in [0, 1] from which a Gaussian's η is observed, high or low; 0, as in the paper, takes all visible ones.
+    Pruning by low η then only concerns Gaussians that were this opaque since the last structure step."""
     tau_split: float = 0.8
     """Fraction of observations that must violate (η > 1) before an axis is split."""
     split_exponent: float = 0.5
@@ -109,6 +115,46 @@ class StructureAwareStrategy(Strategy):
     def fit_to_run(self, num_iterations: int) -> None:
         """Let densification end early enough in a short run: after at most 19/30 of it, as in the released code."""
         self.refine_stop_iter = min(self.refine_stop_iter, num_iterations * 19 // 30)
+
+    def fit_to_memory(self, params: Params, other_bytes: float) -> str | None:
+        """Lower `max_gaussians` to what the budget, or the device's free memory, holds; call before the first step.
+
+        The estimate errs on the safe side (`memory.WORKING_BYTES`). A cap under the present number of Gaussians adds
+        none and takes none away.
+
+        Args:
+            params: The initial Gaussians, on the device of training.
+            other_bytes: What images and rendering will take besides the Gaussians.
+
+        Returns:
+            A line for the user, None without CUDA, where nothing is changed.
+
+        Raises:
+            ValueError: If `memory_budget_gb` leaves no room for Gaussians.
+        """
+        device = params["means"].device
+        free, total = available_bytes(device)
+        if math.isinf(free):
+            return None
+        each = gaussian_bytes(params, self._empty_state(0, device))
+        why = ""
+        if self.memory_budget_gb is not None or self.max_gaussians == StructureAwareStrategy.max_gaussians:
+            given = self.memory_budget_gb
+            budget = PLANNED_SHARE * free if given is None else min(1e9 * given, free)
+            affordable = math.floor((budget - other_bytes) / each)
+            if given is not None and affordable < 1:
+                raise ValueError(
+                    f"strategy.memory_budget_gb is {given:g} and leaves no room for Gaussians: images and rendering "
+                    f"take {other_bytes / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; raise it, or take fewer or "
+                    "smaller images."
+                )
+            if affordable < self.max_gaussians:
+                self.max_gaussians = max(affordable, 1)
+                why = f"; {free / 1e9:.1f} GB are free" if given is None else f"; memory_budget_gb is {given:g}"
+                if self.max_gaussians < (n := len(params["means"])):
+                    why += f", which holds no more than the {n:,} at the start: none will be added"
+        need = (other_bytes + each * max(self.max_gaussians, len(params["means"]))) / 1e9
+        return f"At most {self.max_gaussians:,} Gaussians: {need:.1f} GB of the card's {total / 1e9:.1f} GB{why}."
 
     def check_sanity(self, params: Params, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
         """Check names and optimizers.
@@ -187,7 +233,7 @@ class StructureAwareStrategy(Strategy):
                 self._absgs_step(params, optimizers, state, iteration)
             if iteration == self.refine_stop_iter:
                 self._prune(params, optimizers, state, self._opacities(params) < self.final_prune_opacity)
-                for key in empty_statistics(0, torch.device("cpu")) | empty_gradients(0, torch.device("cpu")):
+                for key in self._empty_state(0, torch.device("cpu")):
                     state.pop(key, None)  # nobody reads them any more: neither memory nor checkpoints should hold them
             elif _due(iteration, self.reset_every) and iteration <= self.refine_stop_iter - self.reset_every // 4:
                 # A reset just before the final prune would leave nothing that had time to recover.
@@ -307,8 +353,11 @@ class StructureAwareStrategy(Strategy):
 
     @staticmethod
     def _clear_statistics(params: Any, state: MutableMapping[str, Any]) -> None:
-        n, device = len(params["means"]), params["means"].device
-        state.update(empty_statistics(n, device) | empty_gradients(n, device))
+        state.update(StructureAwareStrategy._empty_state(len(params["means"]), params["means"].device))
+
+    @staticmethod
+    def _empty_state(n: int, device: torch.device) -> dict[str, Tensor]:
+        return empty_statistics(n, device) | empty_gradients(n, device)
 
 
 def _views(info: Info | Sequence[Info]) -> Sequence[Info]:

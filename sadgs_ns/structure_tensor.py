@@ -75,7 +75,7 @@ class _Filters:
     truncation: float
     """Radius of every kernel, in multiples of its standard deviation."""
     fused: bool
-    """Convolve with our Triton kernel where it runs: CUDA, float32."""
+    """Convolve with our Triton kernel."""
 
     def convolve(self, image: Tensor, sigma: float, order: int, axis: int) -> Tensor:
         """Correlate with a Gaussian or its derivative along one image axis.
@@ -87,7 +87,7 @@ class _Filters:
             axis: 2 for rows (y), 3 for columns (x).
         """
         kernel = _kernel(sigma, order, image.dtype, image.device, self.truncation)
-        if self.fused and image.dtype == torch.float32 and kernels.available(image.device):
+        if self.fused:
             from sadgs_ns.kernels.convolution import correlate
 
             return correlate(image, kernel, axis)
@@ -115,6 +115,40 @@ class _Filters:
             self.convolve(rows, sigma, 1, 3),
             self.convolve(derived_rows, sigma, 0, 3),
         )
+
+
+@dataclass(frozen=True)
+class _Reach:
+    """What the filters make of the pixels' weights, by which their results are divided."""
+
+    filters: _Filters
+    weight: Tensor
+    """[B, 1, H, W], or [1, 1, H, W] of ones without masks."""
+    masked: bool
+
+    def blur(self, sigma: float) -> Tensor:
+        """Of `_Filters.blur`, positive. [1 or B, 1, H, W]"""
+        if self.masked:
+            blurred = self.filters.blur(self.weight, sigma)
+        else:  # a row of ones and a column tell all
+            blurred = self._along(sigma, 0, 2) * self._along(sigma, 0, 3)
+        return blurred.clamp_min(torch.finfo(blurred.dtype).tiny)
+
+    def blur_and_gradient(self, sigma: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Of `_Filters.blur_and_gradient`, the blur positive. Each [1 or B, 1, H, W]"""
+        if self.masked:
+            blurred, blurred_x, blurred_y = self.filters.blur_and_gradient(self.weight, sigma)
+        else:
+            down, across = self._along(sigma, 0, 2), self._along(sigma, 0, 3)
+            blurred, blurred_x, blurred_y = (
+                down * across,
+                down * self._along(sigma, 1, 3),
+                self._along(sigma, 1, 2) * across,
+            )
+        return blurred.clamp_min(torch.finfo(blurred.dtype).tiny), blurred_x, blurred_y
+
+    def _along(self, sigma: float, order: int, axis: int) -> Tensor:
+        return self.filters.convolve(self.weight[..., :1] if axis == 2 else self.weight[..., :1, :], sigma, order, axis)
 
 
 def multiscale_structure_tensor(
@@ -150,7 +184,7 @@ def multiscale_structure_tensor(
         truncation: Radius of every kernel, in multiples of its standard deviation.
         incremental: Blur level l − 1 by √(σ_l² − σ_{l−1}²) instead of the image by σ_l: shorter kernels, but each
             level inherits what the one before it lost at borders and by truncation.
-        fused: Convolve with our Triton kernel where it runs: CUDA, float32.
+        fused: Use our Triton kernels where they run: CUDA, float32.
 
     Returns:
         S̄ as (xx, xy, yy) in 1/px², positive semidefinite, trace ≤ (c / σ_0)², 0 at masked pixels. [B, H, W, 3]
@@ -184,36 +218,49 @@ def multiscale_structure_tensor(
     contrast = (image.square().sum(dim=1, keepdim=True).sum(dim=(2, 3), keepdim=True) / count).sqrt()  # [B, 1, 1, 1]
     noise = (noise_floor * contrast).clamp_min(_ROUNDING_FLOOR)  # [B, 1, 1, 1]
 
+    fused = fused and image.dtype == torch.float32 and kernels.available(image.device)
     filters = _Filters(truncation, fused)
+    reach = _Reach(filters, weight, masks is not None)
     numerator = torch.zeros_like(image[:, :1]).repeat(1, 3, 1, 1)  # [B, 3, H, W]
-    denominator = noise**gamma
+    denominator = (noise**gamma).expand_as(valid).contiguous()  # [B, 1, H, W]
     previous = image
     for level in range(num_levels):
         sigma = SCALE_STEP**level
         source, step = image, sigma
         if incremental and level > 0:
             source, step = previous * valid, math.sqrt(sigma**2 - SCALE_STEP ** (2 * level - 2))
-        blurred, blurred_x, blurred_y = filters.blur_and_gradient(source, step)
-        reach, reach_x, reach_y = filters.blur_and_gradient(weight, step)
-        reach = reach.clamp_min(torch.finfo(image.dtype).tiny)
-        smoothed = blurred / reach
-        gradient_x = (blurred_x - smoothed * reach_x) / reach  # derivative of the quotient
-        gradient_y = (blurred_y - smoothed * reach_y) / reach
-        products = torch.stack(
-            [gradient_x.square().sum(1), (gradient_x * gradient_y).sum(1), gradient_y.square().sum(1)], dim=1
-        )  # [B, 3, H, W]
-        rho = INTEGRATION_FACTOR * sigma
-        integrated = filters.blur(weight, rho).clamp_min(torch.finfo(image.dtype).tiny)
-        tensor = filters.blur(products * weight, rho) / integrated  # S_l, eq. 2
-        trace = tensor[:, :1] + tensor[:, 2:]
-        normalised = tensor / (trace + (noise / sigma) ** 2)  # Ŝ_l, eq. 3
-        energy = (previous - smoothed).square().sum(1, keepdim=True) * weight  # E_l², eq. 4
+        blurs, reaches = filters.blur_and_gradient(source, step), reach.blur_and_gradient(step)
+        if fused:
+            from sadgs_ns.kernels.scale_space import differentiate
+
+            smoothed, products, energy = differentiate(blurs, reaches, weight, previous)
+        else:
+            smoothed = blurs[0] / reaches[0]
+            # The derivative of the quotient.
+            gradient_x = (blurs[1] - smoothed * reaches[1]) / reaches[0]
+            gradient_y = (blurs[2] - smoothed * reaches[2]) / reaches[0]
+            products = torch.stack(
+                [gradient_x.square().sum(1), (gradient_x * gradient_y).sum(1), gradient_y.square().sum(1)], dim=1
+            )  # [B, 3, H, W]
+            products = products * weight
+            energy = (previous - smoothed).square().sum(1, keepdim=True) * weight
+        rho, window = INTEGRATION_FACTOR * sigma, energy_blur * sigma
+        products, integrated = filters.blur(products, rho), reach.blur(rho)
+        total = torch.ones_like(weight)
         if energy_blur > 0:
-            window = energy_blur * sigma
-            total = filters.blur(weight, window).clamp_min(torch.finfo(image.dtype).tiny)
-            energy = filters.blur(energy, window) / total
-        scale_weight = energy.clamp_min(0) ** (0.5 * gamma)  # E_l^γ
-        numerator += scale_weight * (frequency_constant / sigma) ** 2 * normalised
-        denominator = denominator + scale_weight
+            energy, total = filters.blur(energy, window), reach.blur(window)
+        if fused:
+            from sadgs_ns.kernels.scale_space import accumulate
+
+            sums = numerator, denominator
+            accumulate(
+                (products, integrated), (energy, total), noise, sums, gamma / 2, frequency_constant / sigma, sigma
+            )
+        else:
+            tensor = products / integrated  # S_l, eq. 2
+            normalised = tensor / (tensor[:, :1] + tensor[:, 2:] + (noise / sigma) ** 2)  # Ŝ_l, eq. 3
+            scale_weight = (energy / total).clamp_min(0) ** (0.5 * gamma)  # E_l^γ, eq. 4
+            numerator += scale_weight * (frequency_constant / sigma) ** 2 * normalised
+            denominator += scale_weight
         previous = smoothed
     return (numerator / denominator * valid).permute(0, 2, 3, 1).contiguous()

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import copy
+import math
 import os
 import sys
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
+import tyro
 import yaml
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import Optimizers
@@ -17,17 +20,21 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from sadgs_ns import checkpoints
-from sadgs_ns.checks import checkpoint_path
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
 from sadgs_ns.export import atomic_path
 from sadgs_ns.interrupts import Interrupted, Interrupts, resume_command
 from sadgs_ns.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
-from sadgs_ns.pipeline import SadgsPipeline, SadgsPipelineConfig, refuse_bad_data
+from sadgs_ns.pipeline import SadgsPipeline, SadgsPipelineConfig
+from sadgs_ns.preflight import check_ahead
 
 _LESS_MEMORY = (
     "lower --pipeline.model.strategy.max-gaussians, or take smaller images (`--downscale-factor 2` after "
     "`nerfstudio-data` or `colmap`)"
 )
+
+
+_SAVING_SHARE = 0.01
+"""The most of the time from one of the clock's checkpoints to the next that the saving may take."""
 
 
 def _memory(error: torch.cuda.OutOfMemoryError) -> str:
@@ -53,6 +60,11 @@ class SadgsTrainerConfig(TrainerConfig):
     """The viewer. It listens on this machine only; a websocket_host of 0.0.0.0 opens it to the network."""
     max_num_iterations: int = 3000
     """Length of the run in optimizer steps; schedules stretch to it."""
+    steps_per_save: int = 0
+    """Steps between checkpoints; 0 leaves them to the clock. One is always made at the end."""
+    seconds_per_save: float = 60.0
+    """Seconds from one checkpoint to the next where steps_per_save is 0; 0 makes none before the end.
+    If 100 times what the last one took is longer, that is waited."""
     steps_per_eval_batch: int = 0
     """Steps between losses on a held-out view; 0 is never."""
     steps_per_eval_image: int = 500
@@ -68,7 +80,7 @@ class SadgsTrainerConfig(TrainerConfig):
         Raises:
             InputError: If they are not; nothing is written then.
         """
-        refuse_bad_data(self.pipeline.datamanager)
+        check_ahead(self.pipeline.datamanager)
         path = self.get_base_dir() / "config.yml"
         CONSOLE.log(f"Saving config to: {path}")
         try:
@@ -76,6 +88,9 @@ class SadgsTrainerConfig(TrainerConfig):
                 partial.write_text(yaml.dump(self), "utf8")
         except WriteError as error:
             raise InputError(str(error)) from error
+
+
+SadgsTrainerConfig.__annotations__["prompt"] = tyro.conf.Suppress[str | None]  # hidden from help: for text to NeRF
 
 
 class SadgsTrainer(Trainer):
@@ -94,6 +109,7 @@ class SadgsTrainer(Trainer):
         super().__init__(config, local_rank, world_size)
         self._stepping = False
         self._completed_step = self._saved_step = -1
+        self._save_due = math.inf
         # Paused or done, nerfstudio waits for the viewer's user.
         self._interrupts = Interrupts(waiting=lambda: self.training_state != "training" and not self._stepping)
 
@@ -116,7 +132,7 @@ class SadgsTrainer(Trainer):
             InputError: If there is none, none can be read, or it is not of this method.
         """
         config = self.config
-        path = checkpoint_path(config.load_dir, config.load_step, config.load_checkpoint)
+        path = checkpoints.checkpoint_path(config.load_dir, config.load_step, config.load_checkpoint)
         if path is None:
             return super()._load_checkpoint()
         latest = config.load_dir is not None and config.load_step is None
@@ -161,10 +177,11 @@ class SadgsTrainer(Trainer):
                 exit code that shells give these signals.
         """
         total = self.config.max_num_iterations
-        self.step = max(self._start_step - 1, 0)  # names the checkpoint when nothing is left to do
+        self.step: int = max(self._start_step - 1, 0)  # names the checkpoint when nothing is left to do
         self._completed_step = self._saved_step = self._start_step - 1
         self.config.max_num_iterations = max(total - self._start_step, 0)
         out_of_memory = ""
+        self._set_clock(0.0)
         try:
             try:
                 with self._interrupts:
@@ -215,12 +232,21 @@ class SadgsTrainer(Trainer):
         """nerfstudio calls this after every step, when densification is done."""
         self._completed_step, self._stepping = step, False
         self._interrupts.poll()
+        if time.monotonic() >= self._save_due:
+            self.save_checkpoint(step)
         super()._update_viewer_state(step)
 
     def _train_complete_viewer(self) -> None:
         """nerfstudio waits here for the viewer's user, for ever."""
         self._interrupts.poll()
         super()._train_complete_viewer()
+
+    def _set_clock(self, took: float) -> None:
+        """Say when the next checkpoint is due, after one that took so many seconds."""
+        config = self.config
+        by_clock = config.steps_per_save == 0 and config.seconds_per_save > 0
+        wait = max(config.seconds_per_save, took / _SAVING_SHARE) if by_clock else math.inf
+        self._save_due = time.monotonic() + wait
 
     def _stop(self, interrupted: Interrupted, total: int) -> None:
         """Save what was trained and leave; a run that had only its viewer left just ends."""
@@ -245,30 +271,26 @@ class SadgsTrainer(Trainer):
         Raises:
             WriteError: If the disk is full or the folder cannot be written.
         """
+        start = time.monotonic()
         path: Path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
-        partial = self.checkpoint_dir.with_name(f"{self.checkpoint_dir.name}.partial")
         others = [other for other in self.checkpoint_dir.glob("*.ckpt") if other != path]
-        try:
-            self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
-            torch.save(
-                {
-                    "step": step,
-                    "pipeline": self.pipeline.state_dict(),
-                    "optimizers": {name: o.state_dict() for name, o in self.optimizers.optimizers.items()},
-                    "schedulers": {name: s.state_dict() for name, s in self.optimizers.schedulers.items()},
-                    "scalers": self.grad_scaler.state_dict(),
-                },
-                partial,
-            )
+        state = {
+            "step": step,
+            "pipeline": self.pipeline.state_dict(),
+            "optimizers": {name: o.state_dict() for name, o in self.optimizers.optimizers.items()},
+            "schedulers": {name: s.state_dict() for name, s in self.optimizers.schedulers.items()},
+            "scalers": self.grad_scaler.state_dict(),
+        }
+        with atomic_path(path, beside=self.checkpoint_dir) as partial:
+            try:
+                torch.save(state, partial)
+            except RuntimeError as error:  # so torch's writer calls a full disk
+                raise OSError(reason(error)) from error
             if others:  # about to be deleted: the new one must be on the disk, lest a power cut takes both
                 with partial.open("rb+") as file:
                     os.fsync(file.fileno())
-            os.replace(partial, path)
-        except (OSError, RuntimeError) as error:  # torch's writer has a RuntimeError for a full disk
-            raise WriteError(path, error) from error
-        finally:
-            partial.unlink(missing_ok=True)
         self._saved_step = step
         if self.config.save_only_latest_checkpoint:
             for other in others:
                 other.unlink()
+        self._set_clock(time.monotonic() - start)

@@ -1,8 +1,12 @@
-"""Third-party warnings that the project's "error" filter lets pass: named, so that ours still fail a test."""
+"""Fixtures that several modules share, and the third-party warnings that the project's "error" filter lets pass: named,
+so that ours still fail a test.
+"""
 
 from __future__ import annotations
 
 import os
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 import torch
@@ -12,6 +16,11 @@ settings.register_profile("long", max_examples=5000)  # pytest --hypothesis-prof
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel is defined: they then run on the CPU, slowly
+
+if TYPE_CHECKING:  # imported by the fixtures alone: nerfstudio takes seconds
+    from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+
+    from sadgs_ns.trainer import SadgsTrainerConfig
 
 THIRD_PARTY_WARNINGS = (
     # nerfstudio's activations still use torch.cuda.amp's decorators.
@@ -43,3 +52,32 @@ THIRD_PARTY_WARNINGS = (
 def pytest_configure(config: pytest.Config) -> None:
     for warning in THIRD_PARTY_WARNINGS:
         config.addinivalue_line("filterwarnings", warning)
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small drawn COLMAP dataset, to be read only."""
+    from scenes import HEIGHT, POINTS, VIEWS, WIDTH
+
+    from sadgs_ns.demo.scene import write_scene
+
+    folder = tmp_path_factory.mktemp("colmap") / "scene"
+    write_scene(folder, WIDTH, HEIGHT, VIEWS, POINTS)
+    return folder
+
+
+@pytest.fixture
+def colmap(scene: Path) -> ColmapDataParserConfig:
+    """The scene's parser, with every 8th view held out."""
+    from kill_and_resume import parser_of
+
+    return parser_of(scene)
+
+
+@pytest.fixture
+def config(scene: Path, tmp_path: Path) -> SadgsTrainerConfig:
+    """A run on the scene of a few iterations that saves only at its end."""
+    from kill_and_resume import configure
+    from scenes import ITERATIONS
+
+    return configure(scene, tmp_path, ITERATIONS, save_every=0)

@@ -50,6 +50,17 @@ class Kill:
     """Time after the first iteration, "from outside"."""
 
 
+def parser_of(scene: Path) -> ColmapDataParserConfig:
+    """For a drawn scene."""
+    return ColmapDataParserConfig(
+        data=scene,
+        colmap_path=SPARSE_FOLDER,
+        downscale_factor=1,
+        eval_mode="interval",
+        eval_interval=EVAL_INTERVAL,
+    )
+
+
 def configure(scene: Path, output: Path, iterations: int, save_every: int, seed: int = 42) -> SadgsTrainerConfig:
     """The demo's settings, with checkpoints on the way and all attempts in one folder."""
     config: SadgsTrainerConfig = copy.deepcopy(load_preset("sadgs").config)  # type: ignore[assignment]
@@ -59,13 +70,7 @@ def configure(scene: Path, output: Path, iterations: int, save_every: int, seed:
     config.max_num_iterations, config.steps_per_save = iterations, save_every
     config.steps_per_eval_image = 0
     config.logging.local_writer.enable, config.logging.profiler = False, "none"
-    config.pipeline.datamanager.dataparser = ColmapDataParserConfig(
-        data=scene,
-        colmap_path=Path(SPARSE_FOLDER),
-        downscale_factor=1,
-        eval_mode="interval",
-        eval_interval=EVAL_INTERVAL,
-    )
+    config.pipeline.datamanager.dataparser = parser_of(scene)
     config.pipeline.model.strategy = dataclasses.replace(config.pipeline.model.strategy)
     fit_schedule(config.pipeline.model.strategy, iterations, max_gaussians=2000)
     return config

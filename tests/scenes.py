@@ -1,4 +1,4 @@
-"""Small random scenes for tests."""
+"""Small random scenes for tests, a training step on them, and the sizes of the drawn one."""
 
 from __future__ import annotations
 
@@ -8,6 +8,12 @@ import torch
 from torch import Tensor
 
 from sadgs_ns.splatter import rasterization
+from sadgs_ns.strategy import StructureAwareStrategy
+
+WIDTH, HEIGHT, VIEWS, POINTS = 48, 36, 10, 300
+"""Of the drawn scene that the fixture `scene` is."""
+ITERATIONS = 12
+"""Of the run on it that the fixture `config` describes."""
 
 
 def random_params(n: int, seed: int = 0, dtype: torch.dtype = torch.float32) -> dict[str, torch.nn.Parameter]:
@@ -59,3 +65,27 @@ def splat(params: dict[str, torch.nn.Parameter], viewmats: Tensor, Ks: Tensor, w
         packed=False,
         **options,
     )
+
+
+def training_step(
+    strategy: StructureAwareStrategy,
+    params: dict[str, torch.nn.Parameter],
+    optimizers: dict[str, torch.optim.Optimizer],
+    state: dict[str, Any],
+    step: int,
+    images: Tensor,
+    structure_tensors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    **options: Any,
+) -> None:
+    """An iteration of a plain gsplat loop with the strategy, on images [C, H, W, 3]."""
+    height, width = images.shape[1:3]
+    renders, _, info = splat(params, viewmats, Ks, width, height, absgrad=strategy.absgrad, **options)
+    info |= {"structure_tensors": structure_tensors, "viewmats": viewmats, "Ks": Ks}
+    strategy.step_pre_backward(params, optimizers, state, step, info)
+    (renders - images).abs().mean().backward()
+    for optimizer in optimizers.values():
+        optimizer.step()
+        optimizer.zero_grad(set_to_none=True)
+    strategy.step_post_backward(params, optimizers, state, step, info)

@@ -35,17 +35,14 @@ from sadgs_ns.bench.tensor_errors import (
     TRUNCATIONS,
     ConvolutionPrecision,
     batch,
-    from_8_bits,
     map_errors,
     perturbations,
     relative_change,
     spread,
     structure_tensor_rows,
     timed,
-    to_8_bits,
 )
 from sadgs_ns.demo.scene import describe_scene, render
-from sadgs_ns.eta import principal_eigenvalue
 from sadgs_ns.structure_tensor import multiscale_structure_tensor
 
 CPU = torch.device("cpu")
@@ -169,22 +166,6 @@ def test_convolutions_are_rounded_only_inside_the_context(dtype: torch.dtype):
     assert rounded.dtype == torch.float32 and torch.equal(rounded, rounded.to(dtype).float())
     assert 0 < (rounded / plain - 1).abs().max() < 2 * torch.finfo(dtype).eps
     assert torch.equal(torch.conv2d(image, weight), plain)
-
-
-def test_8_bits_keep_every_wavelength_and_stay_semidefinite():
-    tensor = multiscale_structure_tensor(texture())
-    codes = to_8_bits(tensor)
-    decoded = from_8_bits(codes)
-    assert codes.dtype == torch.uint8 and codes.shape == tensor.shape
-    xx, xy, yy = decoded.unbind(-1)
-    assert (xx * yy - xy * xy).min() >= -1e-9
-    # Half a code is 2^(10/254/2), 1.4 %, of either frequency; the correlation's half code of 1/254 adds 0.2 %.
-    ratio = (principal_eigenvalue(decoded) / principal_eigenvalue(tensor)).sqrt()
-    assert (ratio - 1).abs().max() < 0.0165
-    nothing = to_8_bits(torch.zeros(1, 3))
-    assert nothing.tolist() == [[0, 127, 0]] and from_8_bits(nothing).eq(0).all()
-    ends = torch.tensor([[0.16, 0.0, 0.16 * 2.0**-20], [0.08, -0.08, 0.08]])  # the largest, the smallest, and a line
-    torch.testing.assert_close(from_8_bits(to_8_bits(ends)), ends, rtol=0.03, atol=0)
 
 
 # η: samples

@@ -16,21 +16,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.utils import colmap_parsing_utils
-from nerfstudio.engine.trainer import Trainer
 from PIL import Image, ImageFile
+from scenes import HEIGHT, WIDTH
 from test_nerfstudio import (
-    HEIGHT,
-    WIDTH,
     blender_data,
-    checkpoint,
     configure,
-    differences,
     is_finite,
     nerfstudio_data,
     set_up,
@@ -39,9 +34,7 @@ from test_nerfstudio import (
 
 from sadgs_ns import checks, colmap, doctor, presets
 from sadgs_ns.demo.scene import SPARSE_FOLDER, write_scene
-from sadgs_ns.errors import InputError, RunError, WriteError
-from sadgs_ns.export import write_ply
-from sadgs_ns.trainer import SadgsTrainer, SadgsTrainerConfig
+from sadgs_ns.errors import InputError, RunError
 
 CHECKOUT = Path(__file__).parents[1]
 PLY = "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
@@ -64,6 +57,16 @@ def parser_of(data: Path) -> DataParserConfig:
     if data.name == "blender":
         return BlenderDataParserConfig(data=data)
     return ColmapDataParserConfig(data=data, colmap_path=SPARSE_FOLDER, downscale_factor=1)
+
+
+@pytest.fixture
+def copied(captures: Path, tmp_path: Path) -> Callable[[str], Path]:
+    """Copies the capture of a layout."""
+    return lambda layout: Path(shutil.copytree(captures / layout, tmp_path / layout))
+
+
+def errors(data: Path) -> list[str]:
+    return [finding.sentence for finding in checks.check_data(data) if finding.severity == "error"]
 
 
 # --- ways to spoil a capture ---
@@ -164,170 +167,101 @@ def flip_middle_byte(name: str) -> Callable[[Path], None]:
 SPARSE = str(SPARSE_FOLDER)
 FIRST = "images/000.png"
 
-CASES = {
-    # COLMAP: images
-    "image-missing": ("colmap", remove(FIRST), r"\S+/000\.png does not exist: put it there, or leave it out of .*\."),
-    "image-empty": ("colmap", overwrite(FIRST, ""), r"\S+/000\.png has 0 bytes: copy it again, or leave .*\."),
-    "image-truncated": (
-        "colmap",
-        cut(FIRST, 0.6),
-        r"\S+/000\.png cannot be read as an image \(.+\): copy it again.*\.",
-    ),
-    "image-corrupt": (
-        "colmap",
-        flip_middle_byte(FIRST),
-        r"\S+/000\.png cannot be read as an image \(.+\): copy it.*\.",
-    ),
-    "image-not-one": ("colmap", overwrite(FIRST, "hello"), r"\S+/000\.png is no image that Pillow knows: copy it.*\."),
+COLMAP = {
+    # images
+    "image-missing": (remove(FIRST), r"\S+/000\.png does not exist: put it there, or leave it out of .*\."),
+    "image-empty": (overwrite(FIRST, ""), r"\S+/000\.png has 0 bytes: copy it again, or leave .*\."),
+    "image-truncated": (cut(FIRST, 0.6), r"\S+/000\.png cannot be read as an image \(.+\): copy it again.*\."),
+    "image-corrupt": (flip_middle_byte(FIRST), r"\S+/000\.png cannot be read as an image \(.+\): copy it.*\."),
+    "image-not-one": (overwrite(FIRST, "hello"), r"\S+/000\.png is no image that Pillow knows: copy it.*\."),
     "image-size": (
-        "colmap",
         picture(FIRST, (40, 30)),
         r"\S+/000\.png has 40 × 30 px, but its camera in \S+/images\.bin 48 × 36: use the images that .*\.",
     ),
-    "image-mode": ("colmap", picture(FIRST, mode="P"), r"\S+/000\.png has pixels of Pillow's mode P: convert it .*\."),
-    # COLMAP: poses
-    "no-poses": ("colmap", remove("sparse"), r"\S+ holds 10 images but no camera poses: .*ns-process-data.*\."),
+    "image-mode": (picture(FIRST, mode="P"), r"\S+/000\.png has pixels of Pillow's mode P: convert it .*\."),
+    # poses
+    "no-poses": (remove("sparse"), r"\S+ holds 10 images but no camera poses: .*ns-process-data.*\."),
     "no-images": (
-        "colmap",
         model(lambda cameras, images, points: images.clear()),
         r"\S+/images\.bin holds no pose, so there is no image to train on: run COLMAP's mapper again\.",
     ),
-    "no-image-folder": (
-        "colmap",
-        remove("images"),
-        r"\S+ has poses of 10 images, but there is no folder \S+/images: .*",
-    ),
-    "nan-pose": (
-        "colmap",
-        patch(f"{SPARSE}/images.bin", 12, "<d", np.nan),
-        r"\S+: image 000\.png has NaN or .* pose.*",
-    ),
+    "no-image-folder": (remove("images"), r"\S+ has poses of 10 images, but there is no folder \S+/images: .*"),
+    "nan-pose": (patch(f"{SPARSE}/images.bin", 12, "<d", np.nan), r"\S+: image 000\.png has NaN or .* pose.*"),
     "no-rotation": (
-        "colmap",
         model(lambda cameras, images, points: images.update({1: images[1]._replace(qvec=np.zeros(4))})),
         r"\S+: image 000\.png has a rotation that is no unit quaternion: run COLMAP's mapper again\.",
     ),
     "camera-unknown": (
-        "colmap",
         model(lambda cameras, images, points: images.update({1: images[1]._replace(camera_id=7)})),
         r"\S+: image 000\.png has camera 7, which \S+/cameras\.bin lacks: .*\.",
     ),
-    "cameras-mixed-fisheye": ("colmap", model(fisheye), r"\S+/cameras\.bin mixes fisheye and other cameras, .*\."),
+    "cameras-mixed-fisheye": (model(fisheye), r"\S+/cameras\.bin mixes fisheye and other cameras, .*\."),
     "camera-unsupported": (
-        "colmap",
         model(lambda cameras, images, points: cameras.update({1: cameras[1]._replace(model="FOV", params=np.ones(5))})),
         r"\S+: camera 1 has the model FOV, which nerfstudio cannot read: undistort the images with .*\.",
     ),
     "camera-focal": (
-        "colmap",
         patch(f"{SPARSE}/cameras.bin", 32, "<d", -5.0),
         r"\S+: camera 1 has focal length x = -5\.0, which must be positive: correct it\.",
     ),
     "one-view": (
-        "colmap",
         model(lambda cameras, images, points: [images.pop(i) for i in range(2, 11)]),
         r"\S+ has 1 view, which shows no depth: take at least 2 images, .*\.",
     ),
-    # COLMAP: files
-    "cameras-truncated": ("colmap", cut(f"{SPARSE}/cameras.bin", 0.5), r"\S+/cameras\.bin is cut off or corrupt \(.*"),
-    "cameras-empty": ("colmap", overwrite(f"{SPARSE}/cameras.bin", ""), r"\S+/cameras\.bin is cut off or corrupt \(.*"),
+    # files
+    "cameras-truncated": (cut(f"{SPARSE}/cameras.bin", 0.5), r"\S+/cameras\.bin is cut off or corrupt \(.*"),
+    "cameras-empty": (overwrite(f"{SPARSE}/cameras.bin", ""), r"\S+/cameras\.bin is cut off or corrupt \(.*"),
     "cameras-corrupt": (
-        "colmap",
         patch(f"{SPARSE}/cameras.bin", 12, "<i", 99),
         r"\S+/cameras\.bin is cut off or corrupt \(camera 1 has the unknown model 99\): copy it again, or .*\.",
     ),
-    "images-missing": ("colmap", remove(f"{SPARSE}/images.bin"), r"\S+/images\.bin cannot be read \(No such file.*"),
-    "images-truncated": ("colmap", cut(f"{SPARSE}/images.bin", 0.5), r"\S+/images\.bin is cut off or corrupt \(.*"),
+    "images-missing": (remove(f"{SPARSE}/images.bin"), r"\S+/images\.bin cannot be read \(No such file.*"),
+    "images-truncated": (cut(f"{SPARSE}/images.bin", 0.5), r"\S+/images\.bin is cut off or corrupt \(.*"),
+    # keypoints of the first image: an exabyte
     "images-corrupt-count": (
-        "colmap",
-        patch(f"{SPARSE}/images.bin", 8 + 64 + 8, "<Q", 2**60),  # keypoints of the first image: an exabyte
+        patch(f"{SPARSE}/images.bin", 8 + 64 + 8, "<Q", 2**60),
         r"\S+/images\.bin is cut off or corrupt \(it ends after \d+ bytes, .*\): copy it again, or .*\.",
     ),
-    "points-missing": (
-        "colmap",
-        remove(f"{SPARSE}/points3D.bin"),
-        r"\S+ has no points3D\.bin or \.txt: .*random points\.",
-    ),
+    "points-missing": (remove(f"{SPARSE}/points3D.bin"), r"\S+ has no points3D\.bin or \.txt: .*random points\."),
     "points-empty": (
-        "colmap",
         model(lambda cameras, images, points: points.clear()),
         r"\S+/points3D\.bin holds no SfM point: .*--load-3D-points False.*\.",
     ),
-    "points-truncated": ("colmap", cut(f"{SPARSE}/points3D.bin", 0.9), r"\S+/points3D\.bin is cut off or corrupt \(.*"),
+    "points-truncated": (cut(f"{SPARSE}/points3D.bin", 0.9), r"\S+/points3D\.bin is cut off or corrupt \(.*"),
     "points-nan": (
-        "colmap",
         model(lambda cameras, images, points: points.update({1: points[1]._replace(xyz=np.full(3, np.nan))})),
         r"\S+/points3D\.bin has NaN or infinity in a point: .*\.",
     ),
     "text-corrupt": (
-        "colmap",
         lambda data: (
             model(lambda *parts: None, ".txt")(data),
             overwrite(f"{SPARSE}/images.txt", "1 0.1 zero 0 0 0 0 0 1 000.png\n\n")(data),
         ),
         r"\S+/images\.txt is not COLMAP's text \(.*'zero'.*\): copy it again, or run COLMAP's mapper again\.",
     ),
-    # nerfstudio's transforms.json
-    "folder-missing": (
-        "nerfstudio",
-        lambda data: shutil.rmtree(data),
-        r"\S+ does not exist: give --data the folder .*",
-    ),
-    "json-missing": ("nerfstudio", remove("transforms.json"), r"\S+ holds 10 images but no camera poses: .*"),
-    "json-corrupt": (
-        "nerfstudio",
-        cut("transforms.json", 0.5),
-        r"\S+/transforms\.json is not readable JSON \(.*line.*\): .*",
-    ),
-    "json-list": ("nerfstudio", overwrite("transforms.json", "[]"), r"\S+ holds a list instead of an object with .*\."),
-    "json-no-frames": (
-        "nerfstudio",
-        meta(lambda m: m.update(frames=[])),
-        r"\S+ lists no frames, so there is no image .*",
-    ),
-    "json-nan-pose": (
-        "nerfstudio",
-        meta(set_pose(3, 0, 0, np.nan)),
-        r"\S+: frame images/003\.png has NaN or infinity.*",
-    ),
+}
+NERFSTUDIO = {
+    "folder-missing": (shutil.rmtree, r"\S+ does not exist: give --data the folder .*"),
+    "json-missing": (remove("transforms.json"), r"\S+ holds 10 images but no camera poses: .*"),
+    "json-corrupt": (cut("transforms.json", 0.5), r"\S+/transforms\.json is not readable JSON \(.*line.*\): .*"),
+    "json-list": (overwrite("transforms.json", "[]"), r"\S+ holds a list instead of an object with .*\."),
+    "json-no-frames": (meta(lambda m: m.update(frames=[])), r"\S+ lists no frames, so there is no image .*"),
+    "json-nan-pose": (meta(set_pose(3, 0, 0, np.nan)), r"\S+: frame images/003\.png has NaN or infinity.*"),
     "json-short-pose": (
-        "nerfstudio",
         meta(lambda m: m["frames"][2].update(transform_matrix=[[1, 0, 0, 0]])),
         r"\S+: frame images/002\.png has no pose of 4 × 4 numbers: .*\.",
     ),
-    "json-no-focal": (
-        "nerfstudio",
-        meta(lambda m: m["frames"][1].pop("fl_x")),
-        r"\S+: frame images/001\.png has no fl_x: .*",
-    ),
-    "json-camera-model": (
-        "nerfstudio",
-        meta(lambda m: m.update(camera_model="LENS")),
-        r"\S+ has the camera model 'LENS'.*",
-    ),
-    "json-one-place": (
-        "nerfstudio",
-        meta(in_one_place),
-        r"\S+ has all 10 cameras in one place, which shows no depth: .*",
-    ),
-    "json-one-view": (
-        "nerfstudio",
-        meta(keep(1)),
-        r"\S+ has 1 view, which shows no depth: take at least 2 images, .*\.",
-    ),
-    "json-size": (
-        "nerfstudio",
-        picture(FIRST, (36, 48)),
-        r"\S+/000\.png has 36 × 48 px, but its camera in \S+ 48 × 36: .*",
-    ),
-    "json-image-missing": ("nerfstudio", remove("images/004.png"), r"\S+/images/004\.png does not exist: .*"),
+    "json-no-focal": (meta(lambda m: m["frames"][1].pop("fl_x")), r"\S+: frame images/001\.png has no fl_x: .*"),
+    "json-camera-model": (meta(lambda m: m.update(camera_model="LENS")), r"\S+ has the camera model 'LENS'.*"),
+    "json-one-place": (meta(in_one_place), r"\S+ has all 10 cameras in one place, which shows no depth: .*"),
+    "json-one-view": (meta(keep(1)), r"\S+ has 1 view, which shows no depth: take at least 2 images, .*\."),
+    "json-size": (picture(FIRST, (36, 48)), r"\S+/000\.png has 36 × 48 px, but its camera in \S+ 48 × 36: .*"),
+    "json-image-missing": (remove("images/004.png"), r"\S+/images/004\.png does not exist: .*"),
     "json-some-masks": (
-        "nerfstudio",
         meta(lambda m: m["frames"][0].update(mask_path="images/001.png")),
         r"\S+ names masks for 1 of 10 frames: give all of them one, or none\.",
     ),
     "json-mask-size": (
-        "nerfstudio",
         lambda data: (
             picture("mask.png", (10, 10), "L")(data),
             meta(lambda m: [frame.update(mask_path="mask.png") for frame in m["frames"]])(data),
@@ -335,12 +269,10 @@ CASES = {
         r"\S+/mask\.png \(and 9 more\) is a mask of another size than \S+/000\.png: resize it\.",
     ),
     "ply-missing": (
-        "nerfstudio",
         meta(lambda m: m.update(ply_file_path="points.ply")),
         r"\S+/points\.ply should hold the SfM points but cannot be read \(No such file .*\): .*random points\.",
     ),
     "ply-empty": (
-        "nerfstudio",
         lambda data: (
             overwrite("p.ply", PLY.format(0))(data),
             meta(lambda m: m.update(ply_file_path="p.ply"))(data),
@@ -348,7 +280,6 @@ CASES = {
         r"\S+/p\.ply should hold the SfM points but is empty: .*\.",
     ),
     "ply-truncated": (
-        "nerfstudio",
         lambda data: (
             overwrite("p.ply", PLY.format(3) + "0 0 0\n1 1 1\n")(data),
             meta(lambda m: m.update(ply_file_path="p.ply"))(data),
@@ -356,35 +287,33 @@ CASES = {
         r"\S+/p\.ply should hold the SfM points but is cut off: its header promises 3 points: .*\.",
     ),
     "ply-not-one": (
-        "nerfstudio",
-        lambda data: meta(lambda m: m.update(ply_file_path=FIRST))(data),
+        meta(lambda m: m.update(ply_file_path=FIRST)),
         r"\S+/000\.png should hold the SfM points but is not a PLY file of points: .*\.",
     ),
-    # Blender's
-    "blender-no-val": (
-        "blender",
-        remove("transforms_val.json"),
-        r"\S+/transforms_val\.json does not exist: restore it.*",
-    ),
-    "blender-nan": (
-        "blender",
-        meta(set_pose(0, 1, 3, np.inf), "transforms_train.json"),
-        r"\S+: frame \S+ has NaN or inf.*",
-    ),
-    "blender-size": (
-        "blender",
-        picture("images/005.png", (40, 30), "RGBA"),
-        r"\S+/005\.png has 40 × 30 px, but its .*",
-    ),
 }
+BLENDER = {
+    "blender-no-val": (remove("transforms_val.json"), r"\S+/transforms_val\.json does not exist: restore it.*"),
+    "blender-nan": (meta(set_pose(0, 1, 3, np.inf), "transforms_train.json"), r"\S+: frame \S+ has NaN or inf.*"),
+    "blender-size": (picture("images/005.png", (40, 30), "RGBA"), r"\S+/005\.png has 40 × 30 px, but its .*"),
+}
+CASES = {
+    **{name: ("colmap", *case) for name, case in COLMAP.items()},
+    **{name: ("nerfstudio", *case) for name, case in NERFSTUDIO.items()},
+    **{name: ("blender", *case) for name, case in BLENDER.items()},
+}
+"""A layout, how to spoil it, and the sentence that says so."""
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_bad_data_are_refused_in_one_sentence_by_training_and_doctor_alike(
-    case: str, captures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    case: str,
+    copied: Callable[[str], Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ):
     layout, spoil, sentence = CASES[case]
-    data = Path(shutil.copytree(captures / layout, tmp_path / layout))
+    data = copied(layout)
     spoil(data)
     config = configure(tmp_path / "out", parser_of(data))
     with pytest.raises(InputError) as refused:
@@ -405,8 +334,35 @@ def test_good_data_have_no_error_and_no_warning(layout: str, captures: Path):
     assert [finding for finding in checks.check_data(captures / layout) if finding.severity != "note"] == []
 
 
-def test_several_problems_of_one_kind_are_one_finding_and_other_kinds_are_counted(captures: Path, tmp_path: Path):
-    data = Path(shutil.copytree(captures / "nerfstudio", tmp_path / "nerfstudio"))
+def test_a_run_checks_its_data_once_and_other_ways_to_a_pipeline_check_them_too(
+    captures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    checked: list[Path] = []
+    check_colmap = checks.check_colmap
+    monkeypatch.setattr(checks, "check_colmap", lambda data, **kw: (checked.append(data), check_colmap(data, **kw))[1])
+    first = Path(shutil.copytree(captures / "colmap", tmp_path / "first"))
+    second = Path(shutil.copytree(captures / "colmap", tmp_path / "second"))
+    config = configure(tmp_path / "out", parser_of(first))
+    config.save_config()
+    set_up(config)
+    assert checked == [first]  # ns-train
+    set_up(config)
+    assert checked == [first, first]  # a program, ns-eval, sadgs-bench
+    config.save_config()
+    config.pipeline.datamanager.data = second
+    (second / FIRST).unlink()
+    with pytest.raises(InputError, match="does not exist"):
+        set_up(config)  # other settings than were checked
+    config.pipeline.datamanager.data = None
+    (first / FIRST).unlink()
+    with pytest.raises(InputError, match="does not exist"):
+        config.save_config()
+    with pytest.raises(InputError, match="does not exist"):
+        set_up(config)  # what was good before does not count
+
+
+def test_several_problems_of_one_kind_are_one_finding_and_other_kinds_are_counted(copied: Callable[[str], Path]):
+    data = copied("nerfstudio")
     for index in (2, 5, 7):
         (data / f"images/00{index}.png").write_bytes(b"")
     (data / "images/003.png").unlink()
@@ -421,35 +377,35 @@ def test_several_problems_of_one_kind_are_one_finding_and_other_kinds_are_counte
 # --- what looks bad and is not ---
 
 
-def test_a_jpeg_with_bytes_after_its_end_is_good_and_one_cut_off_is_not(captures: Path, tmp_path: Path):
-    data = Path(shutil.copytree(captures / "nerfstudio", tmp_path / "nerfstudio"))
+def test_a_jpeg_with_bytes_after_its_end_is_good_and_one_cut_off_is_not(copied: Callable[[str], Path]):
+    data = copied("nerfstudio")
     path = data / FIRST  # the name does not matter to Pillow
     Image.fromarray(np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)).save(path, "JPEG")
     content = path.read_bytes()
     path.write_bytes(content + b"trailing data of a phone's camera")
-    assert [finding for finding in checks.check_data(data) if finding.severity == "error"] == []
+    assert errors(data) == []
     path.write_bytes(content[:-20])
-    (finding,) = [finding for finding in checks.check_data(data) if finding.severity == "error"]
-    assert "000.png cannot be read as an image (image file is truncated" in finding.sentence
+    (sentence,) = errors(data)
+    assert "000.png cannot be read as an image (image file is truncated" in sentence
 
 
-def test_a_png_that_lacks_only_its_last_chunk_is_good_as_it_is_to_nerfstudio(captures: Path, tmp_path: Path):
-    data = Path(shutil.copytree(captures / "nerfstudio", tmp_path / "nerfstudio"))
+def test_a_png_that_lacks_only_its_last_chunk_is_good_as_it_is_to_nerfstudio(copied: Callable[[str], Path]):
+    data = copied("nerfstudio")
     content = (data / FIRST).read_bytes()
     (data / FIRST).write_bytes(content[:-12])
-    assert [finding for finding in checks.check_data(data) if finding.severity == "error"] == []
+    assert errors(data) == []
 
 
-def test_images_without_poses_beside_others_are_a_warning(captures: Path, tmp_path: Path):
-    data = Path(shutil.copytree(captures / "colmap", tmp_path / "colmap"))
+def test_images_without_poses_beside_others_are_a_warning(copied: Callable[[str], Path]):
+    data = copied("colmap")
     model(lambda cameras, images, points: (images.pop(3), images.pop(5)))(data)
     (finding,) = checks.check_data(data)
     assert finding.severity == "warning"
     assert re.fullmatch(r"\S+/002\.png \(and 1 more\) has no pose in \S+ and is not used: .*\.", finding.sentence)
 
 
-def test_cameras_of_several_models_and_sizes_train_together(captures: Path, tmp_path: Path):
-    data = Path(shutil.copytree(captures / "colmap", tmp_path / "colmap"))
+def test_cameras_of_several_models_and_sizes_train_together(copied: Callable[[str], Path], tmp_path: Path):
+    data = copied("colmap")
 
     def second_camera(cameras: dict, images: dict, points: dict) -> None:
         params = np.array([30.0, 20.0, 15.0, 0.01])
@@ -472,9 +428,14 @@ def test_cameras_of_several_models_and_sizes_train_together(captures: Path, tmp_
 
 @pytest.mark.parametrize(("layout", "views", "training"), [("nerfstudio", 2, 2), ("colmap", 2, 1)])
 def test_one_or_two_training_views_train_with_a_warning(
-    layout: str, views: int, training: int, captures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    layout: str,
+    views: int,
+    training: int,
+    copied: Callable[[str], Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ):
-    data = Path(shutil.copytree(captures / layout, tmp_path / layout))
+    data = copied(layout)
     if layout == "colmap":
         model(lambda cameras, images, points: [images.pop(index) for index in range(views + 1, 11)])(data)
     else:
@@ -494,8 +455,10 @@ def test_colmap_s_camera_models_are_those_that_nerfstudio_knows():
     assert dict(enumerate(colmap.CAMERA_PARAMETERS.items())) == theirs
 
 
-def test_colmap_s_text_and_binary_models_read_alike_and_as_nerfstudio_reads_them(captures: Path, tmp_path: Path):
-    data = Path(shutil.copytree(captures / "colmap", tmp_path / "colmap"))
+def test_colmap_s_text_and_binary_models_read_alike_and_as_nerfstudio_reads_them(
+    copied: Callable[[str], Path], tmp_path: Path
+):
+    data = copied("colmap")
     binary = data / SPARSE_FOLDER
     theirs = colmap_parsing_utils.read_model(str(binary), ".bin")
     assert theirs is not None
@@ -518,8 +481,10 @@ def test_colmap_s_text_and_binary_models_read_alike_and_as_nerfstudio_reads_them
 
 
 @pytest.mark.parametrize("factor", [2, 3])
-def test_scaled_down_images_are_compared_with_scaled_down_cameras(factor: int, captures: Path, tmp_path: Path):
-    data = Path(shutil.copytree(captures / "nerfstudio", tmp_path / "nerfstudio"))
+def test_scaled_down_images_are_compared_with_scaled_down_cameras(
+    factor: int, copied: Callable[[str], Path], tmp_path: Path
+):
+    data = copied("nerfstudio")
     meta(lambda m: [frame.update(w=47, h=35) for frame in m["frames"]])(data)
     (data / f"images_{factor}").mkdir()
     for path in (data / "images").iterdir():
@@ -528,8 +493,8 @@ def test_scaled_down_images_are_compared_with_scaled_down_cameras(factor: int, c
     assert [finding for finding in findings if finding.severity == "error"] == []
     parser = NerfstudioDataParserConfig(data=data, load_3D_points=True, downscale_factor=factor)
     train(configure(tmp_path / "out", parser, iterations=1))  # nerfstudio agrees
-    (wrong,) = [finding for finding in checks.check_data(data) if finding.severity == "error"]
-    assert "has 48 × 36 px, but its camera" in wrong.sentence
+    (sentence,) = errors(data)
+    assert "has 48 × 36 px, but its camera" in sentence
 
 
 def test_two_hundred_photographs_are_not_decoded_and_take_under_a_second(
@@ -573,8 +538,8 @@ def test_uncaught_errors_print_one_sentence_and_exit_with_1(tmp_path: Path):
         assert issubclass(kind, ordinary) and str(kind("Nothing.")) == "Nothing."
 
 
-def test_ns_train_on_bad_data_ends_with_the_sentence_alone(captures: Path, tmp_path: Path):
-    data = Path(shutil.copytree(captures / "colmap", tmp_path / "colmap"))
+def test_ns_train_on_bad_data_ends_with_the_sentence_alone(copied: Callable[[str], Path], tmp_path: Path):
+    data = copied("colmap")
     (data / FIRST).write_bytes(b"")
     command = [str(Path(sys.executable).with_name("ns-train")), "sadgs", "--output-dir", str(tmp_path / "out")]
     command += ["--data", str(data), "--vis", "tensorboard", "colmap", "--colmap-path", SPARSE]
@@ -596,245 +561,3 @@ def test_a_preset_with_an_unknown_key_ends_nerfstudio_s_commands_with_one_senten
         rf"{re.escape(str(tmp_path))}/p\.yaml has a mistake: p\.yaml: unknown key 'max_iterations'; known are .*\.",
         str(refused.value),
     )
-
-
-# --- output ---
-
-
-def fill_disk(partial: Path) -> None:
-    """Let what is written under this temporary name meet a full disk."""
-    if not Path("/dev/full").exists():
-        pytest.skip("only Linux has /dev/full")
-    partial.symlink_to("/dev/full")
-
-
-@pytest.fixture
-def config(captures: Path, tmp_path: Path) -> SadgsTrainerConfig:
-    return configure(tmp_path / "out", parser_of(captures / "colmap"), iterations=6)
-
-
-def test_an_output_folder_that_cannot_be_made_is_named_before_anything_is_written(
-    config: SadgsTrainerConfig, tmp_path: Path
-):
-    (tmp_path / "file").write_text("in the way")
-    config.output_dir = tmp_path / "file" / "out"
-    with pytest.raises(InputError, match=r"/file/out/\S+/config\.yml could not be written \(Not a directory; .*name "):
-        config.save_config()
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
-
-
-def test_a_read_only_output_folder_is_named(config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch):
-    def denied(path: Path, *args: Any, **kwargs: Any) -> None:
-        raise PermissionError(13, "Permission denied", str(path))  # root, as in containers, may write everywhere
-
-    monkeypatch.setattr(Path, "mkdir", denied)
-    with pytest.raises(InputError, match=r"config\.yml could not be written \(Permission denied; .*can be written;"):
-        config.save_config()
-
-
-def test_a_full_disk_leaves_the_previous_checkpoint_and_ends_training_with_one_sentence(config: SadgsTrainerConfig):
-    trainer = set_up(config)
-    trainer.save_checkpoint(1)
-    before = checkpoint(trainer, 1)
-    partial = trainer.checkpoint_dir.with_name("nerfstudio_models.partial")
-    fill_disk(partial)
-    with pytest.raises(
-        WriteError, match=r"step-000000002\.ckpt could not be written \(.+ GB free there\): make room or"
-    ):
-        trainer.save_checkpoint(2)
-    fill_disk(partial)
-    with pytest.raises(
-        RunError, match=r"^\S+/step-000000005\.ckpt could not be written \(.+\): make room or [^\n]+\.$"
-    ):
-        trainer.train()
-    assert [path.name for path in trainer.checkpoint_dir.iterdir()] == ["step-000000001.ckpt"]
-    assert differences(checkpoint(trainer, 1), before) == []
-    assert list(config.output_dir.rglob("*.partial")) == []
-
-
-def test_a_logger_s_full_disk_is_one_sentence_and_other_errors_of_reading_are_themselves(config: SadgsTrainerConfig):
-    def failing(error: OSError) -> SadgsTrainer:
-        trainer = set_up(config)
-
-        def fail(step: int) -> None:
-            raise error
-
-        trainer.pipeline.get_train_loss_dict = fail  # type: ignore[assignment]
-        return trainer
-
-    with pytest.raises(RunError, match=r"^/x/events could not be written \(No space left on device; [^\n]+\.$"):
-        failing(OSError(28, "No space left on device", "/x/events")).train()
-    with pytest.raises(OSError, match=r"^broken data stream$"):
-        failing(OSError("broken data stream")).train()
-
-
-def test_a_full_disk_leaves_the_previous_export(tmp_path: Path):
-    def write(count: int) -> None:
-        parts = {name: torch.zeros(count, 3) for name in ("means", "scales", "features_dc")}
-        write_ply(
-            tmp_path / "splat.ply",
-            **parts,
-            quats=torch.ones(count, 4),
-            opacities=torch.zeros(count, 1),
-            features_rest=torch.zeros(count, 0, 3),
-        )
-
-    write(10)
-    before = (tmp_path / "splat.ply").read_bytes()
-    fill_disk(tmp_path / f".splat.{os.getpid()}.partial.ply")
-    with pytest.raises(WriteError, match=r"splat\.ply could not be written \(.+ GB free there\): make room or "):
-        write(10_000)
-    assert [path.name for path in tmp_path.iterdir()] == ["splat.ply"]
-    assert (tmp_path / "splat.ply").read_bytes() == before
-
-
-# --- checkpoints ---
-
-
-@pytest.fixture(scope="module")
-def saved(captures: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A checkpoint after a few iterations."""
-    output = tmp_path_factory.mktemp("saved")
-    trainer = train(configure(output, parser_of(captures / "colmap")))
-    (path,) = trainer.checkpoint_dir.iterdir()
-    return path
-
-
-def rewrite(change: Callable[[dict[str, Any]], Any]) -> Callable[[Path], None]:
-    def spoil(path: Path) -> None:
-        state = torch.load(path, weights_only=True)
-        change(state)
-        torch.save(state, path)
-
-    return spoil
-
-
-def drop(state: dict[str, Any], part: str) -> None:
-    for key in [key for key in state if part in key]:
-        del state[key]
-
-
-def fewer_harmonics(state: dict[str, Any]) -> None:
-    key = "_model.gauss_params.features_rest"
-    state["pipeline"][key] = state["pipeline"][key][:, :8]
-
-
-CHECKPOINTS = {
-    "not-one": (
-        lambda path: path.write_bytes(b"hello"),
-        r"\S+5\.ckpt is cut off, damaged or not of tensors .* \(File is not a zip file\): give --load-dir .*\.",
-    ),
-    "truncated": (
-        lambda path: path.write_bytes(path.read_bytes()[:5000]),
-        r"\S+5\.ckpt is cut off, damaged or not of tensors .* \(File is not a zip file\): give --load-dir .*\.",
-    ),
-    "no-pipeline": (
-        rewrite(lambda state: state.pop("pipeline")),
-        r"\S+5\.ckpt is not a checkpoint that nerfstudio's trainer wrote \(it has no pipeline\): give --load-dir .*\.",
-    ),
-    "another-method": (
-        rewrite(lambda state: drop(state["pipeline"], "gauss_params")),
-        r"\S+ cannot be continued: The checkpoint has no features_dc of Gaussians, so another method made it; .*\.",
-    ),
-    "splatfacto": (
-        rewrite(lambda state: drop(state["pipeline"], "_extra_state")),
-        r"\S+ cannot be continued: The checkpoint lacks the state of structure-aware .*, so splatfacto made it; .*\.",
-    ),
-    "other-degree": (
-        rewrite(fewer_harmonics),
-        r"\S+ cannot be continued: The checkpoint's features_rest have the shape \[8, 3\], the model's \[15, 3\]: .*\.",
-    ),
-    "other-version": (
-        rewrite(lambda state: state["pipeline"]["_model._extra_state"].pop("strategy_state")),
-        r"\S+ is not a checkpoint of this version of sadgs \(KeyError: 'strategy_state'\): .*\.",
-    ),
-    "other-file": (
-        lambda path: path.with_name("notes.txt").write_text("mine"),
-        r"\S+/notes\.txt lies among the checkpoints and is none: move it elsewhere\.",
-    ),
-    "empty-folder": (lambda path: path.unlink(), r"\S+ holds no checkpoint: give --load-dir the folder .*\."),
-}
-
-
-@pytest.mark.parametrize("case", CHECKPOINTS)
-def test_a_checkpoint_that_cannot_be_continued_is_refused_in_one_sentence(
-    case: str, saved: Path, config: SadgsTrainerConfig, tmp_path: Path
-):
-    spoil, sentence = CHECKPOINTS[case]
-    (tmp_path / "models").mkdir()
-    spoil(Path(shutil.copy(saved, tmp_path / "models")))
-    config.load_dir = tmp_path / "models"
-    with pytest.raises(InputError) as refused:
-        set_up(config)
-    assert re.fullmatch(sentence, str(refused.value)), str(refused.value)
-
-
-def test_a_step_or_file_without_a_checkpoint_is_named(saved: Path, tmp_path: Path):
-    with pytest.raises(InputError, match=r"no checkpoint of step 3: give --load-step one of 5\."):
-        checks.checkpoint_path(saved.parent, 3, None)
-    with pytest.raises(InputError, match=r"\S+/none\.ckpt does not exist: give --load-checkpoint a file"):
-        checks.checkpoint_path(None, None, tmp_path / "none.ckpt")
-    assert checks.checkpoint_path(saved.parent, None, None) == checks.checkpoint_path(saved.parent, 5, None) == saved
-    assert checks.checkpoint_path(None, None, None) is None
-
-
-# --- the GPU's memory ---
-
-FULL = torch.cuda.OutOfMemoryError(
-    "CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has a total capacity of 8 GiB of which 1 MiB is free."
-)
-
-
-def fail_at(trainer: SadgsTrainer, step: int) -> None:
-    """Let the memory be full in the forward pass of this iteration."""
-    get_loss = trainer.pipeline.get_train_loss_dict
-
-    def full(step_: int | None = None, **kwargs: Any) -> Any:
-        number = kwargs.get("step", step_)
-        if number == step:
-            raise FULL
-        return get_loss(number)
-
-    trainer.pipeline.get_train_loss_dict = full  # type: ignore[method-assign]
-
-
-def test_full_memory_saves_what_was_trained_and_says_what_helps(config: SadgsTrainerConfig, tmp_path: Path):
-    trainer = set_up(config)
-    fail_at(trainer, 4)
-    with pytest.raises(RunError) as stopped:
-        trainer.train()
-    assert re.fullmatch(
-        r"The GPU's memory was full at iteration 4 with \d+ Gaussians \(CUDA out of memory\. Tried to allocate 2\.00 "
-        r"GiB\): lower --pipeline\.model\.strategy\.max-gaussians, or take smaller images .*; what was trained is "
-        r"saved and goes on with --load-dir \S+/nerfstudio_models\.",
-        str(stopped.value),
-    )
-    state = checkpoint(trainer, 3)
-    parameters = {name: value.detach() for name, value in trainer.pipeline.model.gauss_params.items()}
-    assert all(torch.equal(state["pipeline"][f"_model.gauss_params.{k}"], v) for k, v in parameters.items())
-    config.load_dir, config.output_dir = trainer.checkpoint_dir, tmp_path / "resumed"
-    resumed = train(config)
-    assert checkpoint(resumed, 5)["step"] == 5 and is_finite(resumed.pipeline.model)
-
-
-def test_full_memory_in_the_middle_of_densification_saves_no_torn_state(config: SadgsTrainerConfig):
-    def tear(trainer: SadgsTrainer) -> None:
-        if trainer.step == 3:
-            means = trainer.pipeline.model.gauss_params["means"]
-            means.data = means.data[:-1]
-            raise FULL
-
-    with pytest.raises(RunError, match=r"nothing newer than the last checkpoint could be saved\.$"):
-        train(config, tear)
-    assert list(config.output_dir.rglob("*.ckpt")) == []
-
-
-def test_full_memory_at_the_start_is_one_sentence(config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch):
-    def full(*args: Any, **kwargs: Any) -> None:
-        raise FULL
-
-    monkeypatch.setattr(Trainer, "setup", full)
-    with pytest.raises(
-        RunError, match=r"^The GPU's memory is too small to start \(CUDA out of memory\. .*GiB\): lower"
-    ):
-        set_up(config)

@@ -5,9 +5,12 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import json
+import os
 import re
+import signal
 import subprocess
 import sys
+import threading
 import time
 import warnings
 from pathlib import Path
@@ -180,7 +183,8 @@ def test_shipped_protocols_fit_the_real_configs(name: str, tmp_path: Path):
     jobs = protocol.load(CONFIGS / f"{name}.yaml").jobs()
     for job in jobs:
         (tmp_path / job.scene.data).mkdir(exist_ok=True)
-        build_config(job.scene, job.row, job.seed, tmp_path, tmp_path)
+        config = build_config(job.scene, job.row, job.seed, tmp_path, tmp_path)
+        assert config.steps_per_save == getattr(config, "seconds_per_save", 0) == 0  # none within the measured loop
 
 
 @pytest.mark.usefixtures("nerfstudio")
@@ -304,6 +308,30 @@ def test_an_interrupt_ends_the_running_processes(tmp_path: Path):
     with pytest.raises(KeyboardInterrupt):
         bench.run_all(some_jobs("ab"), launch, interrupt, tmp_path / "log", gpus=["0", "1"])
     assert processes[0].poll() is not None and time.monotonic() - start < 5
+
+
+@pytest.mark.usefixtures("nerfstudio")
+def test_sigterm_ends_the_runs_and_its_handler_is_the_program_s_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    processes: list[subprocess.Popen[bytes]] = []
+
+    def launch(job: Job, gpu: str | None, folder: Path) -> subprocess.Popen[bytes]:
+        processes.append(subprocess.Popen(["sleep", "60"], start_new_session=True))
+        threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM)).start()
+        return processes[-1]
+
+    fox = {"data": "fox", "dataparser": "nerfstudio-data"}
+    (tmp_path / "p.yaml").write_text(json.dumps(content(scenes={"fox": fox})))
+    (tmp_path / "fox").mkdir()
+    arguments = [str(tmp_path / "p.yaml"), "--scenes", str(tmp_path), "--output", str(tmp_path / "r.jsonl")]
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(bench, "launcher", lambda root, images: launch)
+    with pytest.raises(SystemExit) as stopped:
+        bench.main(arguments)
+    assert stopped.value.code == 143 and processes[0].poll() is not None
+    assert signal.getsignal(signal.SIGTERM) == before
+    monkeypatch.setattr(bench, "launcher", lambda root, images: FakeRunner(crashes={"ours"}))
+    assert bench.main(arguments) == 1
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_a_half_written_line_is_ignored_and_swallows_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import json
 import random
@@ -132,7 +133,7 @@ def runs(request: pytest.FixtureRequest, root: Path, tmp_path_factory: pytest.Te
         replace_gsplat(patch)
         for name, every in (("with", 5), ("without", None)):
             work = tmp_path_factory.mktemp(name)
-            record = run.run_row(Job(SCENE, request.param, 0, every), root, work)
+            record = run.run_row(Job(SCENE, dataclasses.replace(request.param, curve_every=every), 0), root, work)
             made[name] = record, checkpoint(work)
     return made
 
@@ -485,7 +486,10 @@ def test_curve_every_is_part_of_the_key_only_where_it_is_given():
     (plain, _), (measured, _), (finer, _) = (
         protocol.parse(content(**changes)).jobs() for changes in ({}, {"curve_every": 500}, {"curve_every": 250})
     )
-    assert (plain.curve_every, measured.curve_every) == (None, 500)
+    assert (plain.row.curve_every, measured.row.curve_every) == (None, 500)
+    rows = [{"label": label, "method": "sadgs", "curve_every": every} for label, every in (("a", 100), ("b", None))]
+    one, _, none, _ = protocol.parse(content(curve_every=500, rows=rows)).jobs()
+    assert (one.row.curve_every, none.row.curve_every) == (100, None), "a row's own comes first"
     assert len({plain.key, measured.key, finer.key}) == 3
     # The key of a row that docs/results holds: files of before continue.
     bonsai = Scene(
@@ -494,8 +498,8 @@ def test_curve_every_is_part_of_the_key_only_where_it_is_given():
         "colmap",
         {"colmap_path": "sparse/0", "downscale_factor": 1, "eval_mode": "interval", "eval_interval": 8},
     )
-    job = Job(bonsai, Row("sadgs-indoor", "sadgs-indoor"), 0)
-    assert job.key in (Path(__file__).parents[1] / "docs" / "results" / "ours.jsonl").read_text()
+    job = Job(bonsai, Row("full", "sadgs-indoor"), 0)
+    assert job.key in (Path(__file__).parents[1] / "docs" / "results" / "ablations.jsonl").read_text()
 
 
 @pytest.mark.parametrize("wrong", [0, -5, 1.5, "500", True])

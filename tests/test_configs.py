@@ -9,25 +9,31 @@ import re
 import subprocess
 import sys
 import textwrap
-from importlib.metadata import entry_points
+from importlib.metadata import entry_points, packages_distributions, requires
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 import tyro
+import yaml
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
 
 import sadgs_ns.model
 from sadgs_ns import presets
-from sadgs_ns.model import WITHOUT_EFFECT, SadgsModel, SadgsModelConfig
+from sadgs_ns.model import OF_RAYS, WITHOUT_EFFECT, SadgsModel, SadgsModelConfig
 from sadgs_ns.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
 from sadgs_ns.pipeline import SadgsPipelineConfig
 from sadgs_ns.presets import load_preset
 from sadgs_ns.strategy import StructureAwareStrategy
 from sadgs_ns.trainer import SadgsTrainerConfig
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 CHECKOUT = Path(__file__).parents[1]
 METHODS = ("sadgs", "sadgs-indoor", "sadgs-large")
@@ -187,6 +193,27 @@ def test_the_help_of_ns_train_shows_the_docstrings(method: str, capsys: pytest.C
     assert "Training views rendered for one optimizer step" in shown
 
 
+@pytest.mark.parametrize("cls", CONFIG_CLASSES)
+def test_help_texts_break_their_lines_between_sentences_as_tyro_does_not_join_them(cls: type):
+    texts = [s.value.value for s in body_of(cls)[1:] if is_string(s)]  # type: ignore[attr-defined]
+    assert texts and not [text for text in texts if not all(line.endswith(".") for line in text.strip().splitlines())]
+
+
+def test_the_help_says_what_replaces_splatfacto_s_options_and_explains_every_other(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit):
+        tyro.cli(AnnotatedBaseConfigUnion, args=["sadgs", "--help"])
+    lines = [line.strip("│ ") for line in re.sub(r"\x1b\[[\d;]*m", "", capsys.readouterr().out).splitlines()]
+    texts = {line.split()[0]: lines[i + 1 : i + 5] for i, line in enumerate(lines) if re.match("--[a-z]", line)}
+    for name, replacement in WITHOUT_EFFECT.items():
+        text = " ".join(texts[f"--pipeline.model.{name.replace('_', '-')}"])
+        assert text.startswith("Splatfacto's, refused here: ") and replacement.removeprefix("nothing: ") in text
+    assert "--pipeline.model.strategy.tau-split" in texts
+    assert not [option for option in texts for name in OF_RAYS if name.replace("_", "-") in option]
+    unexplained = [option for option, text in texts.items() if text[0].startswith("(default:")]
+    # nerfstudio keeps optimizers in a dictionary, whose entries have no documentation.
+    assert [option for option in unexplained if not re.fullmatch(r"--optimizers\.[\w-]+\.scheduler", option)] == []
+
+
 def test_the_device_is_the_cpu_where_there_is_no_cuda(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert load_preset("sadgs").config.machine.device_type == "cpu"
@@ -212,12 +239,65 @@ def test_presets_are_found_in_a_checkout_that_is_not_installed(monkeypatch: pyte
 def test_an_installation_holds_every_preset_where_the_package_looks_for_it(tmp_path: Path):
     source, installed = tmp_path / "source", tmp_path / "installed"
     source.mkdir()
-    for name in ("sadgs_ns", "configs", "pyproject.toml", "README.md", "LICENSE"):
+    for name in ("sadgs_ns", "configs", "README.md", "LICENSE"):
         (source / name).symlink_to(CHECKOUT / name)
+    # setuptools before 77, as Python 3.11 brings it, knows no license of PEP 639; pip fetches a later one.
+    lines = (CHECKOUT / "pyproject.toml").read_text().splitlines()
+    (source / "pyproject.toml").write_text("\n".join(line for line in lines if not line.startswith("license")))
     build = python(f"import setuptools; setuptools.setup(script_args=['build_py', '-d', {str(installed)!r}])", source)
     assert build.returncode == 0, build.stderr
     shipped = [*CHECKOUT.glob("configs/**/*.yaml"), *CHECKOUT.glob("configs/bench/baselines/*.json")]
     for path in shipped:
         assert (installed / "sadgs_ns" / path.relative_to(CHECKOUT)).read_bytes() == path.read_bytes()
     look = "from importlib.resources import files; print(files('sadgs_ns.configs') / 'sadgs.yaml')"
+    assert (installed / "sadgs_ns" / "py.typed").is_file()
     assert python(look, installed).stdout.strip() == str(installed / "sadgs_ns" / "configs" / "sadgs.yaml")
+
+
+def requirements(lines: list[str]) -> set[str]:
+    """Distribution names of requirements, normalised."""
+    return {re.split(r"[^\w.-]", line)[0].lower().replace("_", "-") for line in lines if "extra ==" not in line}
+
+
+def test_everything_imported_is_required_by_us_or_by_nerfstudio():
+    project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]
+    ours = requirements(project["dependencies"]) | requirements(requires("nerfstudio") or [])
+    ours |= {"triton"}  # of torch, where there is one; looked for before it is imported
+    for_tests = ours | requirements(project["optional-dependencies"]["dev"])
+    local = {"sadgs_ns", *(path.stem for path in (CHECKOUT / "tests").glob("*.py"))}
+    distributions = packages_distributions()
+    undeclared = []
+    for path in [*CHECKOUT.glob("sadgs_ns/**/*.py"), *CHECKOUT.glob("tests/*.py")]:
+        allowed = ours if path.is_relative_to(CHECKOUT / "sadgs_ns") else for_tests
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
+            for module in {name.partition(".")[0] for name in names} - sys.stdlib_module_names - local:
+                of = {name.lower().replace("_", "-") for name in distributions.get(module, [module])}
+                undeclared += [] if of & allowed else [f"{path.name}: {module}"]
+    assert undeclared == []
+
+
+def test_the_changelog_begins_with_the_version_and_so_does_the_citation():
+    version = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]["version"]
+    first = re.search(r"^## \[(.+?)\] - (unreleased|\d{4}-\d\d-\d\d)$", (CHECKOUT / "CHANGELOG.md").read_text(), re.M)
+    assert first is not None and first[1] == version
+    assert f"\nversion: {version}\n" in (CHECKOUT / "CITATION.cff").read_text()
+
+
+def test_continuous_integration_runs_what_ci_run_does_on_every_python():
+    workflow = yaml.safe_load((CHECKOUT / ".github" / "workflows" / "tests.yml").read_text())
+    job = workflow["jobs"]["tests"]
+    assert [step["run"] for step in job["steps"] if "run" in step] == [".ci/run"]
+    project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]
+    named = [line.rpartition(" ")[2] for line in project["classifiers"] if re.search(r":: 3\.\d+$", line)]
+    assert job["strategy"]["matrix"]["python-version"] == named == ["3.10", "3.11", "3.12"]
+
+
+def test_pre_commit_checks_what_make_lint_does():
+    hooks = yaml.safe_load((CHECKOUT / ".pre-commit-config.yaml").read_text())["repos"][0]["hooks"]
+    lint = (CHECKOUT / "Makefile").read_text().partition("\nlint:")[2].partition("\n\n")[0]
+    assert [" ".join(hook["entry"].split()[:2]) for hook in hooks] == [
+        ".venv/bin/ruff check", ".venv/bin/ruff format", ".venv/bin/pyright --pythonpath"
+    ]  # fmt: skip
+    assert re.findall(r"\$\(BIN\)/(\w+ \S+)", lint) == ["ruff check", "ruff format", "pyright --pythonpath"]

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -216,7 +217,7 @@ def test_an_earlier_scene_is_replaced_and_a_failed_one_leaves_nothing(
     assert len(list((folder / "images").iterdir())) == 9
 
 
-def gaussians(count: int, bands: int) -> dict[str, torch.Tensor]:
+def gaussians(count: int, bands: int) -> dict[str, Any]:
     generator = torch.Generator().manual_seed(0)
     shapes: dict[str, tuple[int, ...]] = {
         "means": (3,),

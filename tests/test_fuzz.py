@@ -26,7 +26,7 @@ from sadgs_ns import presets
 from sadgs_ns.datamanager import SadgsDatamanagerConfig
 from sadgs_ns.demo.scene import SPARSE_FOLDER, write_scene
 from sadgs_ns.errors import InputError
-from sadgs_ns.pipeline import refuse_bad_data
+from sadgs_ns.preflight import refuse_bad_data
 from sadgs_ns.presets import OPTIMIZER_GROUPS, load_preset
 
 FEW = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])

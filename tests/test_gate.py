@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import re
 import subprocess
 import warnings
@@ -123,7 +124,7 @@ def test_an_update_from_incomplete_results_changes_nothing(baseline: Path, resul
 
 def test_a_failed_write_leaves_the_old_file(baseline: Path, monkeypatch: pytest.MonkeyPatch):
     before = baseline.read_bytes()
-    monkeypatch.setattr(Path, "replace", lambda *_: (_ for _ in ()).throw(OSError("full")))
+    monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(OSError("full")))
     with pytest.raises(OSError, match="full"):
         gate.renew(baseline, [job()], [result(job(), psnr=1.0)])
     assert baseline.read_bytes() == before and len(list(baseline.parent.iterdir())) == 1

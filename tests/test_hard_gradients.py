@@ -11,7 +11,7 @@ import pytest
 import torch
 from gsplat.cuda._torch_impl import _spherical_harmonics
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
-from test_nerfstudio import checkpoint, colmap, configure, differences, scene, train  # noqa: F401
+from test_nerfstudio import checkpoint, configure, differences, train
 from torch import Tensor
 
 from sadgs_ns import kernels, losses, splatter
@@ -293,7 +293,8 @@ def run(folder: Path, parser: ColmapDataParserConfig, seed: int) -> dict[str, An
     return checkpoint(train(config), ITERATIONS - 1)
 
 
-def test_two_cpu_runs_with_one_seed_are_bitwise_equal(colmap: ColmapDataParserConfig, tmp_path: Path):  # noqa: F811
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU adds up gradients in no fixed order")
+def test_two_cpu_runs_with_one_seed_are_bitwise_equal(colmap: ColmapDataParserConfig, tmp_path: Path):
     first, second = (run(tmp_path / name, colmap, seed=42) for name in ("first", "second"))
     assert len(first["pipeline"]["_model.gauss_params.means"]) > 300
     assert differences(first, second) == []

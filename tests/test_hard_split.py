@@ -10,8 +10,8 @@ import pytest
 import torch
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.scene_box import SceneBox
-from scenes import adam, camera, random_params, splat
-from test_nerfstudio import colmap, configure, is_finite, scene, set_up  # noqa: F401
+from scenes import adam, camera, random_params, training_step
+from test_nerfstudio import configure, is_finite, set_up
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -46,17 +46,11 @@ def train(strategy: StructureAwareStrategy, params: dict[str, torch.nn.Parameter
     state = strategy.initialize_state()
     y, x = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
     image = (0.25 + 0.5 * ((x // 3 + y // 3) % 2).float())[None, ..., None].repeat(1, 1, 1, 3)
+    tensors = multiscale_structure_tensor(image)
     viewmats, Ks = camera(WIDTH, HEIGHT, focal=30.0)
     numbers = []
     for step in range(steps):
-        rgb, _, info = splat(params, viewmats, Ks, WIDTH, HEIGHT, absgrad=strategy.absgrad)
-        info |= {"structure_tensors": multiscale_structure_tensor(image), "viewmats": viewmats, "Ks": Ks}
-        strategy.step_pre_backward(params, optimizers, state, step, info)
-        (rgb - image).abs().mean().backward()
-        for optimizer in optimizers.values():
-            optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
-        strategy.step_post_backward(params, optimizers, state, step, info)
+        training_step(strategy, params, optimizers, state, step, image, tensors, viewmats, Ks)
         numbers.append(len(params["means"]))
     return numbers
 
@@ -416,7 +410,7 @@ ITERATIONS = 16
 def test_an_image_that_makes_nan_is_named_and_does_not_poison_the_model(
     where: str,
     views: int,
-    colmap: ColmapDataParserConfig,  # noqa: F811
+    colmap: ColmapDataParserConfig,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ):
@@ -434,7 +428,7 @@ def test_an_image_that_makes_nan_is_named_and_does_not_poison_the_model(
         if bad in cam_indices:
             hit.append(trainer.step + 1)
             if where == "gradient":
-                rows = torch.arange(len(cam_indices)) == cam_indices.index(bad)
+                rows = torch.arange(len(cam_indices), device=viewmats.device) == cam_indices.index(bad)
                 outputs["rgb"].register_hook(lambda g: torch.where(rows[:, None, None, None], torch.nan, g))
         return outputs
 
@@ -459,7 +453,7 @@ def test_an_image_that_makes_nan_is_named_and_does_not_poison_the_model(
 
 
 def test_many_bad_iterations_are_summed_up(
-    colmap: ColmapDataParserConfig,  # noqa: F811
+    colmap: ColmapDataParserConfig,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ):
@@ -472,7 +466,7 @@ def test_many_bad_iterations_are_summed_up(
 
 
 def test_the_log_is_read_before_it_overflows(
-    colmap: ColmapDataParserConfig,  # noqa: F811
+    colmap: ColmapDataParserConfig,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ):

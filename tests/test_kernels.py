@@ -14,10 +14,12 @@ from sadgs_ns import kernels, losses
 from sadgs_ns.bench.rasterizers import random_scene
 from sadgs_ns.optimizers import FusedAdam
 from sadgs_ns.statistics import empty_statistics, observe
+from sadgs_ns.storage import encode
 from sadgs_ns.structure_tensor import multiscale_structure_tensor
 
 adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
 convolution = pytest.importorskip("sadgs_ns.kernels.convolution", reason="Triton is not installed")
+scale_space = pytest.importorskip("sadgs_ns.kernels.scale_space", reason="Triton is not installed")
 harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")
 observation = pytest.importorskip("sadgs_ns.kernels.observation", reason="Triton is not installed")
 photometric = pytest.importorskip("sadgs_ns.kernels.photometric", reason="Triton is not installed")
@@ -87,17 +89,33 @@ def test_convolution_equals_torchs_in_float64(shape, axis):
     torch.testing.assert_close(actual.cpu().double(), expected, atol=1e-5, rtol=1e-5)
 
 
-def test_structure_tensors_are_the_same_with_the_kernel(monkeypatch):
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("energy_blur", [0.0, 2.0])
+def test_structure_tensors_are_the_same_with_the_kernels(monkeypatch, masked, energy_blur):
     images = torch.rand((2, 9, 14, 3), generator=torch.Generator().manual_seed(0)).to(DEVICE)
-    masks = torch.ones((2, 9, 14), dtype=torch.bool, device=DEVICE)
-    masks[0, 3:6, 5:7] = False
-    expected = multiscale_structure_tensor(images.double(), masks, num_levels=2)
+    masks = torch.ones((2, 9, 14), dtype=torch.bool, device=DEVICE) if masked else None
+    if masks is not None:
+        masks[0, 3:6, 5:7] = False
+    options = {"num_levels": 2, "energy_blur": energy_blur, "gamma": 2.5}
+    expected = multiscale_structure_tensor(images.double(), masks, **options)
     monkeypatch.setattr(kernels, "available", lambda device: True)
     calls = []
-    monkeypatch.setattr(convolution, "correlate", lambda *a, run=convolution.correlate: calls.append(a) or run(*a))
-    actual = multiscale_structure_tensor(images, masks, num_levels=2)
-    assert calls
+    for module, name in ((convolution, "correlate"), (scale_space, "differentiate"), (scale_space, "accumulate")):
+        run = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *a, name=name, run=run: calls.append(name) or run(*a))
+    actual = multiscale_structure_tensor(images, masks, **options)
+    assert set(calls) == {"correlate", "differentiate", "accumulate"}
     torch.testing.assert_close(actual.double(), expected, atol=1e-5 * float(expected.abs().max()), rtol=1e-4)
+
+
+def test_codes_are_the_references_or_their_neighbours(monkeypatch):
+    tensor = torch.rand((3, 100, 3), generator=torch.Generator().manual_seed(0)) ** 8 * torch.tensor([16.0, 1.0, 16.0])
+    tensor[0, :4] = torch.tensor([[0.0, 0, 0], [64, 0, 1e-12], [0, 0.1, 1], [8, -9, 8]])
+    expected = encode(tensor, fused=False).int()
+    monkeypatch.setattr(kernels, "available", lambda device: True)
+    actual = encode(tensor.to(DEVICE)).cpu().int()
+    assert (actual - expected).abs().max() <= 1 and (actual != expected).float().mean() < 0.01
+    assert torch.equal(actual[0, :4], expected[0, :4])
 
 
 @pytest.mark.parametrize("degree", range(4))
@@ -123,7 +141,8 @@ def test_colours_and_gradients_equal_gsplats_float64_harmonics(degree):
 
 @pytest.mark.parametrize("directional", [False, True])
 @pytest.mark.parametrize("min_opacity", [0.0, 0.5])
-def test_observation_equals_the_reference(monkeypatch, directional, min_opacity):
+@pytest.mark.parametrize("kept", [Tensor.half, encode], ids=["float16", "8 bits"])
+def test_observation_equals_the_reference(monkeypatch, directional, min_opacity, kept):
     n, width, height = 150, 40, 30
     params = {name: p.detach() for name, p in scenes.random_params(n).items()}
     params["opacities"] = params["opacities"][:, None]
@@ -139,7 +158,7 @@ def test_observation_equals_the_reference(monkeypatch, directional, min_opacity)
     factors = torch.randn((2, height, width, 2, 2), generator=generator)
     tensors = factors @ factors.mT
     info |= {"viewmats": viewmats, "Ks": Ks}
-    info["structure_tensors"] = torch.stack([tensors[..., 0, 0], tensors[..., 0, 1], tensors[..., 1, 1]], -1).half()
+    info["structure_tensors"] = kept(torch.stack([tensors[..., 0, 0], tensors[..., 0, 1], tensors[..., 1, 1]], -1))
     results = []
     for fused in (False, True):
         monkeypatch.setattr(kernels, "available", lambda device: True)
@@ -240,7 +259,7 @@ def test_tiles_list_the_gaussians_that_reach_them_and_hardly_more(tile_size, rad
         gaussians["radii"] = gaussians["radii"][..., None] * torch.tensor([1, 2], dtype=torch.int32)
         radii = gaussians["radii"].float()
     on_device = {name: value.to(DEVICE) for name, value in gaussians.items()}
-    starts, ids = tiles.intersect_tiles(**on_device, width=width, height=height, tile_size=tile_size)
+    starts, ids = tiles.intersect_tiles(**on_device, width=width, height=height, tile_size=tile_size).lists()
     rows, columns = math.ceil(height / tile_size), math.ceil(width / tile_size)
     assert starts.shape == (2, rows, columns)
     lists = ids.cpu().tensor_split(starts.cpu().flatten().tolist()[1:])
@@ -271,7 +290,7 @@ def test_no_gaussian_in_sight_makes_empty_lists():
     gaussians = projected_gaussians(1, 5, 32, 32)
     gaussians["radii"] = torch.zeros_like(gaussians["radii"])
     on_device = {name: value.to(DEVICE) for name, value in gaussians.items()}
-    starts, ids = tiles.intersect_tiles(**on_device, width=32, height=32, tile_size=16)
+    starts, ids = tiles.intersect_tiles(**on_device, width=32, height=32, tile_size=16).lists()
     assert len(ids) == 0 and (starts == 0).all()
 
 

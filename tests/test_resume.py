@@ -11,7 +11,9 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -22,26 +24,13 @@ from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.scripts.train import main as resume
+from scenes import ITERATIONS
 
-from sadgs_ns.demo.scene import SPARSE_FOLDER, write_scene
+from sadgs_ns.demo.scene import SPARSE_FOLDER
 from sadgs_ns.interrupts import resume_command
 from sadgs_ns.trainer import SadgsTrainer, SadgsTrainerConfig
 
-ITERATIONS = 12
 SCRIPT = Path(__file__).with_name("kill_and_resume.py")
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("demo") / "scene"
-    write_scene(folder, 48, 36, 10, 200)
-    return folder
-
-
-@pytest.fixture
-def config(scene: Path, tmp_path: Path) -> SadgsTrainerConfig:
-    """A run of a few iterations that saves only at its end."""
-    return configure(scene, tmp_path, ITERATIONS, save_every=0)
 
 
 def after(trainer: SadgsTrainer, at: int, act: Callable[[], None]) -> None:
@@ -52,14 +41,6 @@ def after(trainer: SadgsTrainer, at: int, act: Callable[[], None]) -> None:
 
 def send(number: int) -> None:
     os.kill(os.getpid(), number)
-
-
-@pytest.fixture(autouse=True)
-def default_signals():
-    """As in a fresh process: sadgs-bench's main, which other tests call, leaves a handler of its own for SIGTERM."""
-    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    yield
-    signal.signal(signal.SIGTERM, before)
 
 
 def checkpoints(trainer: SadgsTrainer) -> list[str]:
@@ -100,6 +81,82 @@ def test_a_run_killed_ten_times_ends_bitwise_equal_to_one_that_nothing_disturbed
     printed = kill_and_resume(tmp_path, "--kills", 10)
     assert printed.count("exit -9") == 10
     assert "bitwise equal; left over: []" in printed
+
+
+# --- checkpoints by the clock ---
+
+
+@dataclass
+class Clock:
+    """Stands in for the trainer's clock: an iteration takes 25 s, a checkpoint 2 s."""
+
+    now: float = 1000.0
+    saved: list[int] = field(default_factory=list)
+
+    def attach(self, trainer: SadgsTrainer, monkeypatch: pytest.MonkeyPatch, seconds: float = 25.0) -> None:
+        save = torch.save
+
+        def slow_save(state: dict[str, Any], path: Path) -> None:
+            save(state, path)
+            self.saved.append(state["step"])
+            self.now += 2
+
+        def tick(step: int) -> None:
+            self.now += seconds
+
+        trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], tick))
+        monkeypatch.setattr(torch, "save", slow_save)
+        monkeypatch.setattr("sadgs_ns.trainer.time", SimpleNamespace(monotonic=lambda: self.now))
+
+
+def test_the_clock_makes_checkpoints_that_change_nothing_and_resume_to_the_same_model(
+    scene: Path, config: SadgsTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    assert (config.steps_per_save, config.seconds_per_save) == (0, 60)
+    config.save_only_latest_checkpoint = False
+    trainer = set_up(config)
+    with monkeypatch.context() as patched:
+        (clock := Clock()).attach(trainer, patched)
+        trainer.train()
+    # Due after 60 s, and then after 200 s, since a checkpoint takes 2 s.
+    assert clock.saved == [2, 10, ITERATIONS - 1]
+    assert checkpoints(trainer) == [f"step-{step:09d}.ckpt" for step in clock.saved]
+
+    without = set_up(configure(scene, tmp_path / "without", ITERATIONS, save_every=0))
+    without.train()
+    resumed_config = configure(scene, tmp_path / "resumed", ITERATIONS, save_every=0)
+    resumed_config.load_dir, resumed_config.load_step = trainer.checkpoint_dir, 2
+    resumed = set_up(resumed_config)
+    resumed.train()
+    assert checkpoints(without) == checkpoints(resumed) == [f"step-{ITERATIONS - 1:09d}.ckpt"]
+    ends = [
+        torch.load(t.checkpoint_dir / checkpoints(without)[0], weights_only=True) for t in (trainer, without, resumed)
+    ]
+    assert differences(ends[0], ends[1]) == differences(ends[0], ends[2]) == []
+
+
+@pytest.mark.parametrize(
+    ("settings", "seconds", "saved"),
+    [
+        ({}, 4.0, [ITERATIONS - 1]),
+        ({"seconds_per_save": 0.0}, 1000.0, [ITERATIONS - 1]),
+        ({"steps_per_save": 5}, 1000.0, [5, 10, ITERATIONS - 1]),
+        ({"steps_per_save": 5, "seconds_per_save": 1.0}, 1000.0, [5, 10, ITERATIONS - 1]),
+    ],
+)
+def test_the_clock_gives_way_to_steps_and_makes_nothing_in_a_short_run(
+    settings: dict[str, Any],
+    seconds: float,
+    saved: list[int],
+    config: SadgsTrainerConfig,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    for name, value in settings.items():
+        setattr(config, name, value)
+    trainer = set_up(config)
+    (clock := Clock()).attach(trainer, monkeypatch, seconds)
+    trainer.train()
+    assert clock.saved == saved
 
 
 # --- interrupted ---

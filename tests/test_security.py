@@ -14,7 +14,7 @@ import torch
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
-from kill_and_resume import configure, set_up
+from kill_and_resume import set_up
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
@@ -31,7 +31,7 @@ from sadgs_ns.bench import protocol, run
 from sadgs_ns.bench.images import file_name
 from sadgs_ns.bench.protocol import Row, Scene
 from sadgs_ns.datamanager import SadgsDatamanagerConfig
-from sadgs_ns.demo.scene import SPARSE_FOLDER, write_scene
+from sadgs_ns.demo.scene import SPARSE_FOLDER
 from sadgs_ns.presets import load_preset
 from sadgs_ns.trainer import SadgsTrainerConfig
 
@@ -49,18 +49,6 @@ class Payload:
 def yaml_payload(path: Path) -> str:
     """YAML that creates a folder when it is loaded by PyYAML's full loader."""
     return f"!!python/object/apply:os.mkdir [{str(path)!r}]\n"
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("demo") / "scene"
-    write_scene(folder, 32, 24, 10, 50)
-    return folder
-
-
-@pytest.fixture
-def config(scene: Path, tmp_path: Path) -> SadgsTrainerConfig:
-    return configure(scene, tmp_path, 12, save_every=0)
 
 
 # --- what executes code ---

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from scenes import adam, camera, random_params, splat
+from scenes import adam, camera, random_params, training_step
 
 from sadgs_ns.absgs import accumulate_gradients, empty_gradients, grow
 from sadgs_ns.statistics import empty_statistics
@@ -37,16 +37,9 @@ def train(strategy: StructureAwareStrategy, steps: int, *, per_axis_radii: bool 
     viewmats[:, 0, 3] = torch.linspace(-0.2, 0.2, views)
     counts = []
     for step in range(steps):
-        renders, _, info = splat(
-            params, viewmats, Ks, WIDTH, HEIGHT, absgrad=strategy.absgrad, per_axis_radii=per_axis_radii
+        training_step(
+            strategy, params, optimizers, state, step, images, tensors, viewmats, Ks, per_axis_radii=per_axis_radii
         )
-        info |= {"structure_tensors": tensors, "viewmats": viewmats, "Ks": Ks}
-        strategy.step_pre_backward(params, optimizers, state, step, info)
-        (renders - images).abs().mean().backward()
-        for optimizer in optimizers.values():
-            optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
-        strategy.step_post_backward(params, optimizers, state, step, info)
         counts.append(len(params["means"]))
         assert counts[-1] <= strategy.max_gaussians
         assert all(len(value) == counts[-1] for value in state.values() if isinstance(value, torch.Tensor))

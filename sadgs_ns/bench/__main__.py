@@ -6,6 +6,7 @@ Every run is a process of its own, so that none inherits another's memory, cache
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import importlib
 import json
@@ -17,7 +18,7 @@ import sys
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -206,6 +207,16 @@ def _selected(arguments: argparse.Namespace) -> list[Job]:
     return runnable(jobs, arguments.scenes, chosen.source, arguments.skip_missing)
 
 
+@contextlib.contextmanager
+def _sigterm_exits() -> Iterator[None]:
+    """Meanwhile SIGTERM ends the program by an exception, which also ends the runs."""
+    previous = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a benchmark.
 
@@ -246,7 +257,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"sadgs-bench: {error}", file=sys.stderr)
         return 2
 
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     done = results.read(arguments.output)
     todo = unfinished(jobs, done)
     if arguments.images is not None:
@@ -256,7 +266,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"{without} finished runs have no images; delete their lines to run them again.", flush=True)
     log = arguments.output.with_suffix(".log")
     progress, task = progress_bar(len(jobs), len(jobs) - len(todo), disable=not sys.stdout.isatty())
-    with progress:
+    with _sigterm_exits(), progress:
 
         def finished(result: Result) -> None:
             results.append(arguments.output, result)

@@ -17,18 +17,19 @@ import statistics
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from pytorch_msssim import ssim as ssim_without_border
 from torch import Tensor
-from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
-from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+if TYPE_CHECKING:  # torchmetrics takes a second to import, which is no part of the training that is timed
+    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
 View = tuple[Any, dict[str, Any]]
 """A nerfstudio Cameras of one camera, and its batch with "image" [H, W, 3 or 4], uint8 or float."""
 
-Networks = Mapping[str, LearnedPerceptualImagePatchSimilarity | None]
+Networks = Mapping[str, "LearnedPerceptualImagePatchSimilarity | None"]
 """LPIPS networks by the names of their results; None where there are no weights."""
 
 _WINDOW = 11
@@ -62,6 +63,8 @@ def load_lpips_vgg() -> LearnedPerceptualImagePatchSimilarity | None:
 
 
 def _load(net: Literal["alex", "vgg"], name: str) -> LearnedPerceptualImagePatchSimilarity | None:
+    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
     try:
         return LearnedPerceptualImagePatchSimilarity(net_type=net, normalize=net == "alex")
     except (OSError, RuntimeError) as error:
@@ -88,6 +91,8 @@ def quality(model: Any, views: Iterable[View], networks: Networks) -> dict[str, 
 
     The networks are on the model's device during the call only, so that they take no memory from training.
     """
+    from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+
     values: dict[str, list[float]] = {name: [] for name in ("psnr", "ssim", "ssim_padded", *networks)}
     for network in networks.values():
         if network is not None:

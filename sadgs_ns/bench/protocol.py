@@ -8,7 +8,7 @@
 
 A row may name its own `scenes` and `seeds`, and `sweep: {dotted.path: [a, b]}` makes one row of each combination.
 Rows of different scenes may share a label. `source` says where the scenes come from, for whoever lacks them;
-`curve_every: 500` also measures the held-out views every 500 iterations of each run.
+`curve_every: 500`, for all rows or for one, also measures the held-out views every 500 iterations of each run.
 """
 
 from __future__ import annotations
@@ -52,6 +52,8 @@ class Row:
     """Which scenes; None means all."""
     seeds: tuple[int, ...] | None = None
     """Which seeds; None means the protocol's."""
+    curve_every: int | None = None
+    """Iterations between measurements of the held-out views within a run; None makes none."""
 
 
 @dataclass(frozen=True)
@@ -61,15 +63,13 @@ class Job:
     scene: Scene
     row: Row
     seed: int
-    curve_every: int | None = None
-    """Iterations between measurements of the held-out views within the run; None makes none."""
 
     @property
     def key(self) -> str:
         """Identifies the run in a results file: scene, label, seed and a hash of everything that sets it up."""
         settings: list[Any] = [self.row.method, self.row.overrides, dataclasses.asdict(self.scene)]
-        if self.curve_every is not None:  # a finished run without the curve is not what is asked for
-            settings.append(self.curve_every)
+        if self.row.curve_every is not None:  # a finished run without the curve is not what is asked for
+            settings.append(self.row.curve_every)
         digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()[:12]
         return f"{self.scene.name}/{self.row.label}/{self.seed}/{digest}"
 
@@ -83,13 +83,11 @@ class Protocol:
     seeds: tuple[int, ...] = (0, 1)
     source: str | None = None
     """What the scenes are called and where they come from."""
-    curve_every: int | None = None
-    """As in `Job`."""
 
     def jobs(self) -> list[Job]:
         """All runs: rows in their order, then scenes, then seeds."""
         return [
-            Job(self.scenes[name], row, seed, self.curve_every)
+            Job(self.scenes[name], row, seed)
             for row in self.rows
             for name in (self.scenes if row.scenes is None else row.scenes)
             for seed in (self.seeds if row.seeds is None else row.seeds)
@@ -124,7 +122,9 @@ def parse(content: object) -> Protocol:
     if not scenes:
         raise ValueError("scenes is empty; name at least one scene.")
     rows = tuple(
-        row for i, value in enumerate(_list(top["rows"], "rows")) for row in _rows(value, f"rows[{i}]", scenes)
+        row
+        for i, value in enumerate(_list(top["rows"], "rows"))
+        for row in _rows({"curve_every": top.get("curve_every"), **_mapping(value, f"rows[{i}]")}, f"rows[{i}]", scenes)
     )
     seen = set()
     for label, scene in [(row.label, scene) for row in rows for scene in row.scenes or scenes]:
@@ -132,10 +132,7 @@ def parse(content: object) -> Protocol:
             raise ValueError(f"two rows have the label {label!r} for {scene}; give each its own.")
         seen.add((label, scene))
     source = None if top.get("source") is None else _text(top["source"], "source")
-    curve_every = top.get("curve_every")
-    if curve_every is not None and (type(curve_every) is not int or curve_every < 1):
-        raise ValueError(f"curve_every must be a whole number of iterations from 1, not {curve_every!r}.")
-    return Protocol(scenes, rows, _seeds(top.get("seeds", [0, 1]), "seeds"), source, curve_every)
+    return Protocol(scenes, rows, _seeds(top.get("seeds", [0, 1]), "seeds"), source)
 
 
 def set_dotted(config: Any, path: str, value: Any) -> None:
@@ -201,7 +198,8 @@ def _as_type_of(old: Any, value: Any, path: str) -> Any:
 
 
 def _rows(value: object, where: str, scenes: Mapping[str, Scene]) -> list[Row]:
-    row = _mapping(value, where, required={"label", "method"}, optional={"scenes", "seeds", "overrides", "sweep"})
+    optional = {"scenes", "seeds", "overrides", "sweep", "curve_every"}
+    row = _mapping(value, where, required={"label", "method"}, optional=optional)
     label, method = _text(row["label"], f"{where}.label"), _text(row["method"], f"{where}.method")
     names = None
     if row.get("scenes") is not None:
@@ -211,14 +209,16 @@ def _rows(value: object, where: str, scenes: Mapping[str, Scene]) -> list[Row]:
                 raise ValueError(f"{where}.scenes names {name!r}, which is not under scenes; add it there.")
     seeds = None if row.get("seeds") is None else _seeds(row["seeds"], f"{where}.seeds")
     overrides = _mapping(row.get("overrides") or {}, f"{where}.overrides")
+    curve_every = row.get("curve_every")
+    if curve_every is not None and (type(curve_every) is not int or curve_every < 1):
+        raise ValueError(f"curve_every must be a whole number of iterations from 1, not {curve_every!r}.")
     sweep = _mapping(row.get("sweep") or {}, f"{where}.sweep")
     choices = [[(path, v) for v in _list(values, f"{where}.sweep.{path}")] for path, values in sweep.items()]
     rows = []
     for combination in itertools.product(*choices):
         suffix = ",".join(f"{path.rsplit('.', 1)[-1]}={v}" for path, v in combination)
-        rows.append(
-            Row(f"{label}[{suffix}]" if suffix else label, method, {**overrides, **dict(combination)}, names, seeds)
-        )
+        name = f"{label}[{suffix}]" if suffix else label
+        rows.append(Row(name, method, {**overrides, **dict(combination)}, names, seeds, curve_every))
     return rows
 
 

@@ -14,6 +14,7 @@ import datetime
 import importlib.metadata
 import json
 import subprocess
+import sys
 import tempfile
 import time
 import traceback
@@ -47,6 +48,8 @@ def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> T
     from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
     from nerfstudio.engine.trainer import TrainerConfig
 
+    from sadgs_ns.trainer import SadgsTrainerConfig
+
     config = copy.deepcopy(all_methods.get(row.method))
     if not isinstance(config, TrainerConfig):
         raise ValueError(f"row {row.label!r}: nerfstudio has no method {row.method!r}; install its package.")
@@ -73,6 +76,8 @@ def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> T
     config.logging.local_writer.enable = False
     config.logging.profiler = "none"
     config.steps_per_save = 0
+    if isinstance(config, SadgsTrainerConfig):
+        config.seconds_per_save = 0
     config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 0
     config.output_dir = work
     config.machine.seed = seed
@@ -171,8 +176,8 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
             _ = pipeline.structure_tensors
 
     timer, curve = LoopTimer(), None
-    if job.curve_every is not None:
-        curve = Curve(job.curve_every, timer)
+    if job.row.curve_every is not None:
+        curve = Curve(job.row.curve_every, timer)
         curve.attach(trainer)
     timer.attach(trainer)
     with timed("train"):
@@ -218,11 +223,12 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
 
 
 def software() -> dict[str, str | None]:
-    """Installed versions, and the git commit if this package runs from a checkout."""
+    """Versions, of what was imported where that tells its own, and the git commit if this package is a checkout."""
     versions: dict[str, str | None] = {}
     for name in ("torch", "gsplat", "nerfstudio", "sadgs_ns"):
         try:
-            versions[name] = importlib.metadata.version(name)
+            # Two installations in one folder have two metadata, of which the first need not be what runs.
+            versions[name] = getattr(sys.modules.get(name), "__version__", None) or importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             versions[name] = None
     return {**versions, "commit": _commit(Path(__file__).resolve().parents[2])}
@@ -261,13 +267,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     arguments = parser.parse_args()
     spec = json.loads(arguments.spec)
-    job = Job(Scene(**spec["scene"]), Row(**spec["row"]), spec["seed"], spec["curve_every"])
+    job = Job(Scene(**spec["scene"]), Row(**spec["row"]), spec["seed"])
     images = None if spec["images"] is None else Path(spec["images"])
     record = {
         "status": "ok",
         "error": None,
         "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
-        "versions": software(),
     }
     with tempfile.TemporaryDirectory(dir=arguments.out.parent) as work:
         try:
@@ -275,6 +280,7 @@ def main() -> None:
         except Exception as error:
             traceback.print_exc()
             record |= {"status": "failed", "error": describe(error)}
+    record["versions"] = software()
     arguments.out.write_text(json.dumps(record))
 
 

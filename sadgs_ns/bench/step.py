@@ -21,6 +21,7 @@ from sadgs_ns.optimizers import FusedAdam
 from sadgs_ns.rasterization import rasterize, visible
 from sadgs_ns.split import grid_split
 from sadgs_ns.statistics import empty_statistics, observe
+from sadgs_ns.storage import encode
 from sadgs_ns.structure_tensor import multiscale_structure_tensor
 
 REPEATS = 20
@@ -79,7 +80,7 @@ class Step:
         self.viewmats[0, 2, 3] = 1.6
         self.Ks = torch.tensor([[[width * 0.8, 0, width / 2], [0, width * 0.8, height / 2], [0, 0, 1]]], device=device)
         self.target = uniform(0.0, 1.0, 1, height, width, 3)
-        self.structure_tensors = uniform(0.0, 1.0, 1, height, width, 3).half()
+        self.structure_tensors = torch.randint(0, 256, (1, height, width, 3), dtype=torch.uint8, device=device)
         self.rendered = self.target.clone().requires_grad_()
         self.gradients: list[Tensor | None] = []
         self.render()
@@ -199,7 +200,7 @@ def time_structure_tensors(images: int, width: int, height: int) -> None:
 
     def run(count: int) -> None:
         for start in range(0, count, batch):
-            multiscale_structure_tensor(pictures[start : start + batch].float() / 255).half()
+            encode(multiscale_structure_tensor(pictures[start : start + batch].float() / 255))
 
     run(batch)
     torch.cuda.synchronize()
@@ -215,7 +216,7 @@ def time_structure_tensors(images: int, width: int, height: int) -> None:
         f"\nS̄ of {images} images of {width}×{height} px: {start.elapsed_time(end) / 1e3:.2f} s, {working:.2f} GB of ",
         end="",
     )
-    print(f"working memory; the images take {pictures.numel() / 1e9:.2f} GB, the tensors in float16 twice that.")
+    print(f"working memory; the images take {pictures.numel() / 1e9:.2f} GB, and so do the tensors.")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -18,15 +18,14 @@ from torch.overrides import TorchFunctionMode
 
 from sadgs_ns.eta import wavelength
 from sadgs_ns.statistics import HIGH_ETA
-from sadgs_ns.structure_tensor import FREQUENCY_CONSTANT, TRUNCATION, multiscale_structure_tensor
+from sadgs_ns.storage import decode, encode
+from sadgs_ns.structure_tensor import TRUNCATION, multiscale_structure_tensor
 
 REFERENCE_TRUNCATION = 8.0
 """Kernels of the reference end at this many standard deviations, where float64 cannot tell them from whole ones."""
 TRUNCATIONS = (2.0, 2.5, 3.0, 4.0, 5.0, REFERENCE_TRUNCATION)
 AXIS_LENGTHS = (3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)
 """Axes ‖v‖ in px whose η > 1 decision is compared at every pixel; c = 0.4 has no wavelength under 2.5 px."""
-OCTAVES_OF_8_BITS = 10.0
-"""Frequencies from the largest possible one down to 2⁻¹⁰ of it have a code of their own: Λ from 2.5 to 2,560 px."""
 PAPER = {"exposure ×0.5": 0.05, "exposure ×1.5": 0.08, "noise": 0.07, "sharpened ×1.5": 0.12, "sharpened ×3": 0.40,
          "JPEG": 0.12}  # fmt: skip
 """Average relative change of S̄ in the paper's supplement."""
@@ -122,38 +121,6 @@ class ConvolutionPrecision(TorchFunctionMode):
         return result.to(self.dtype).to(image.dtype)
 
 
-def to_8_bits(tensor: Tensor) -> Tensor:
-    """S̄ in three bytes: √xx and √yy on a logarithmic scale, and the correlation xy / √(xx yy).
-
-    A logarithm keeps the relative error of every wavelength the same, and a correlation within ±1 keeps S̄ positive
-    semidefinite. No scale is stored: S̄'s trace is at most (c / σ_0)² by construction.
-
-    Args:
-        tensor: S̄ as (xx, xy, yy) in 1/px². [..., 3]
-
-    Returns:
-        uint8 [..., 3]
-    """
-    xx, xy, yy = tensor.unbind(-1)
-    frequencies = torch.stack([xx, yy]).clamp_min(0).sqrt()  # [2, ...] in 1/px
-    logarithms = 1 + (frequencies / FREQUENCY_CONSTANT).log2() / OCTAVES_OF_8_BITS  # (−∞, 1]
-    codes = (1 + 254 * logarithms).round().clamp(0, 255)
-    product = frequencies.prod(0)
-    correlation = torch.where(product > 0, xy / product.clamp_min(torch.finfo(product.dtype).tiny), 0.0)
-    return torch.stack([codes[0], (127 + 127 * correlation.clamp(-1, 1)).round(), codes[1]], -1).to(torch.uint8)
-
-
-def from_8_bits(codes: Tensor) -> Tensor:
-    """S̄ in float32 from `to_8_bits`. uint8 [..., 3] → [..., 3]"""
-    x, correlation, y = codes.float().unbind(-1)
-
-    def frequency(code: Tensor) -> Tensor:
-        return torch.where(code > 0, FREQUENCY_CONSTANT * torch.exp2(OCTAVES_OF_8_BITS * ((code - 1) / 254 - 1)), 0.0)
-
-    x, y = frequency(x), frequency(y)
-    return torch.stack([x * x, x * y * (correlation - 127) / 127, y * y], -1)
-
-
 def structure_tensor_rows(images: Tensor, repeats: int) -> Iterator[Row]:
     """How S̄ is computed and stored.
 
@@ -182,8 +149,8 @@ def structure_tensor_rows(images: Tensor, repeats: int) -> Iterator[Row]:
     for truncation in (TRUNCATION, REFERENCE_TRUNCATION):
         tensor, ms = measure(partial(compute, truncation=truncation, incremental=True))
         yield row(f"incremental blur, float32, to {truncation:g}σ", tensor, reference, ms, 12)
-    tensor, ms = measure(lambda: compute().half())
-    yield row(f"as shipped: float32, to {TRUNCATION:g}σ, stored as float16", tensor, reference, ms, 6)
+    code, ms = measure(lambda: encode(compute()))
+    yield row(f"as shipped: float32, to {TRUNCATION:g}σ, stored in 8 bits", decode(code), reference, ms, 3)
 
     shipped = multiscale_structure_tensor(double)
     precisions: tuple[tuple[str, AbstractContextManager[Any], bool, bool], ...] = (
@@ -206,13 +173,13 @@ def structure_tensor_rows(images: Tensor, repeats: int) -> Iterator[Row]:
         yield row(f"precision alone: {variant}", tensor, shipped, ms, 12)
 
     single = shipped.float()
-    for variant, encode, decode, size in (
+    for variant, to_code, from_code, size in (
         ("float32", lambda: single, lambda code: code, 12),
         ("float16", single.half, lambda code: code, 6),
-        ("8 bits", lambda: to_8_bits(single), from_8_bits, 3),
+        ("8 bits", lambda: encode(single), decode, 3),
     ):
-        code, ms = measure(encode)
-        yield row(f"storage alone: {variant}", decode(code), shipped, ms, size)
+        code, ms = measure(to_code)
+        yield row(f"storage alone: {variant}", from_code(code), shipped, ms, size)
 
 
 def _sharpened(image: Image, factor: float) -> Image:

@@ -18,13 +18,13 @@ class LoopTimer:
     """
 
     def __init__(self) -> None:
-        self.seconds = 0.0
+        self.seconds: float = 0.0
         """Time in the loop, until it was last stopped."""
-        self.stopped_seconds = 0.0
+        self.stopped_seconds: float = 0.0
         """Time between the loop's start and end in which the timer was stopped."""
         self.peak_gb: float | None = None
         """Largest memory that tensors took in the loop, in 10⁹ bytes; None without a GPU."""
-        self.finished = False
+        self.finished: bool = False
         """Whether the last iteration has ended."""
         self._start = 0.0
 

@@ -9,6 +9,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from sadgs_ns.storage import HIGHEST_FREQUENCY, OCTAVES
+
 _LANES = 128
 
 
@@ -47,6 +49,12 @@ def _eta(u, v, xx, xy, yy, EPSILON: tl.constexpr, DIRECTIONAL: tl.constexpr):
 
 
 @triton.jit
+def _frequency(code, HIGHEST: tl.constexpr, OCTAVES: tl.constexpr):
+    """As in `storage.decode`."""
+    return tl.where(code > 0, HIGHEST * tl.exp2(OCTAVES * ((code - 1) / 254 - 1)), 0.0)
+
+
+@triton.jit
 def _add_axis(n_high, n_low, eta_max, at, high, low, most, changed):
     tl.store(n_high + at, tl.load(n_high + at, changed, 0.0) + high, changed)
     tl.store(n_low + at, tl.load(n_low + at, changed, 0.0) + low, changed)
@@ -58,7 +66,7 @@ def _observe(
     means, quats, scales, opacities, drawn, means2d, conics, jitter, structure_tensors, viewmats, Ks,
     n_high, n_low, eta_max, n_total, n, num_views, width, height, min_logit,
     HIGH: tl.constexpr, LOW: tl.constexpr, BLUR: tl.constexpr, MARGIN: tl.constexpr, EPSILON: tl.constexpr,
-    DIRECTIONAL: tl.constexpr, LANES: tl.constexpr,
+    HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, DIRECTIONAL: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
     g = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
     candidate = (g < n) & (tl.load(opacities + g, g < n, float("-inf")) >= min_logit)
@@ -83,7 +91,7 @@ def _observe(
         b = tl.load(conics + 3 * at + 1, seen, 0.0).to(tl.float64)
         c = tl.load(conics + 3 * at + 2, seen, 1.0).to(tl.float64)
         determinant = a * c - b * b
-        # Triton's maximum drops NaN, so what is not finite is told by comparison, here and of η.
+        # Triton's maximum drops NaN on a GPU, so what is not finite is told by comparison, here, of S̄ and of η.
         seen = seen & (tl.abs(determinant) < float("inf"))
         inverse = 1 / tl.maximum(tl.maximum(determinant, 1.1920928955078125e-07 * a * c), 2.2250738585072014e-308)
         xx = tl.maximum(c * inverse - BLUR, 0.0)
@@ -101,9 +109,14 @@ def _observe(
         column = tl.where(observed, point_x, 0.0).to(tl.int32)
         row = tl.where(observed, point_y, 0.0).to(tl.int32)
         pixel = structure_tensors + 3 * ((view * height + row).to(tl.int64) * width + column)
-        s_xx = tl.load(pixel, observed, 0.0).to(tl.float32)
-        s_xy = tl.load(pixel + 1, observed, 0.0).to(tl.float32)
-        s_yy = tl.load(pixel + 2, observed, 0.0).to(tl.float32)
+        s_xx = tl.load(pixel, observed, 0).to(tl.float32)
+        s_xy = tl.load(pixel + 1, observed, 0).to(tl.float32)
+        s_yy = tl.load(pixel + 2, observed, 0).to(tl.float32)
+        if structure_tensors.dtype.element_ty == tl.uint8:
+            frequency_x, frequency_y = _frequency(s_xx, HIGHEST, OCTAVES), _frequency(s_yy, HIGHEST, OCTAVES)
+            s_xy = frequency_x * frequency_y * (s_xy - 127) / 127
+            s_xx, s_yy = frequency_x * frequency_x, frequency_y * frequency_y
+        observed = observed & (tl.abs(s_xx) + tl.abs(s_xy) + tl.abs(s_yy) < float("inf"))
         # The Jacobian of gsplat's forward pass, with its clamp near the frustum's border.
         viewmat, K = viewmats + 16 * view, Ks + 9 * view
         depth = _matrix_row(viewmat, 2, x, y, z) + tl.load(viewmat + 11)
@@ -171,7 +184,7 @@ def observe_views(
         means2d: px. [C, N, 2]
         conics: 1/px². [C, N, 3]
         jitter: In [0, 1). [C, N, 2]
-        structure_tensors: S̄. [C, H, W, 3]
+        structure_tensors: S̄, or its codes of `storage.encode`. [C, H, W, 3]
         viewmats: [C, 4, 4]
         Ks: px. [C, 3, 3]
         min_logit: Logit of the opacity from which a Gaussian is observed.
@@ -184,5 +197,5 @@ def observe_views(
     height, width = structure_tensors.shape[1:3]
     _observe[triton.cdiv(n, _LANES),](
         *(value.contiguous() for value in inputs), *statistics, n, num_views, width, height, min_logit,
-        *thresholds, *constants, directional, _LANES,
+        *thresholds, *constants, HIGHEST_FREQUENCY, OCTAVES, directional, _LANES,
     )  # fmt: skip

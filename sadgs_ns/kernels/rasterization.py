@@ -9,10 +9,13 @@ import torch
 from gsplat.cuda._wrapper import fully_fused_projection, rasterize_to_pixels, spherical_harmonics
 from torch import Tensor
 
+from sadgs_ns.kernels import compositing
 from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
 from sadgs_ns.kernels.tiles import intersect_tiles
 
-TILE_SIZE = 8
+BACKWARD: Literal["moments", "gsplat"] = "moments"
+"""Who differentiates the compositing of three channels: our kernel (compositing.py) or gsplat's, its reference."""
+TILE_SIZE = compositing.TILE_SIZE
 """px. gsplat's default of 16 saves list entries; with exact lists, pixels saved weigh more (docs/measurements.md)."""
 
 
@@ -65,6 +68,8 @@ def rasterization(
     opacities = opacities.expand(num_views, -1)
     if compensations is not None:
         opacities = opacities * compensations
+    # The host waits for the lists' length: the colours are computed meanwhile.
+    pending_tiles = intersect_tiles(means2d, radii, depths, conics, opacities, width, height, TILE_SIZE)
     drawn = radii > 0 if radii.dim() == 2 else (radii > 0).all(dim=-1)  # [C, N]
     # gsplat inverts the matrices, which makes the host wait for the device.
     positions = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:]).mT  # [C, 1, 3]
@@ -86,22 +91,14 @@ def rasterization(
     elif render_mode in ("D", "ED"):
         colors = depths[..., None]
         backgrounds = None if backgrounds is None else backgrounds.new_zeros((num_views, 1))
-    isect_offsets, flatten_ids = intersect_tiles(
-        means2d, radii, depths, conics, opacities, width, height, TILE_SIZE
-    )  # fmt: skip
-    renders, alphas = rasterize_to_pixels(
-        means2d,
-        conics,
-        colors,
-        opacities,
-        width,
-        height,
-        TILE_SIZE,
-        isect_offsets,
-        flatten_ids,
-        backgrounds=backgrounds,
-        absgrad=absgrad,
-    )
+    isect_offsets, flatten_ids = pending_tiles.lists()
+    splats = (means2d, conics, colors, opacities, width, height)
+    if BACKWARD == "moments" and colors.shape[-1] == 3:
+        renders, alphas = compositing.rasterize_to_pixels(*splats, isect_offsets, flatten_ids, backgrounds, absgrad)
+    else:
+        renders, alphas = rasterize_to_pixels(
+            *splats, TILE_SIZE, isect_offsets, flatten_ids, backgrounds=backgrounds, absgrad=absgrad
+        )
     if render_mode in ("ED", "RGB+ED"):
         renders = torch.cat([renders[..., :-1], renders[..., -1:] / alphas.clamp_min(1e-10)], dim=-1)
     info = {

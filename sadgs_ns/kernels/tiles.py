@@ -11,6 +11,9 @@ is drawn stays the same, bit for bit.
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
 import torch
 import triton
 import triton.language as tl
@@ -115,6 +118,44 @@ def _list(
             at += listed.to(at.dtype)
 
 
+@dataclass(frozen=True)
+class PendingTiles:
+    """Tile lists whose length is on its way to the host, which may have something else done meanwhile."""
+
+    ellipses: list[Tensor]
+    order: Tensor
+    """Gaussians of all views from front to back. int64 [C * N]"""
+    ends: Tensor
+    """Where each one's pairs end, in this order. int64 [C * N]"""
+    num_pairs: Tensor
+    """The last of them, in the host's memory once `arrived`. int64 [1]"""
+    arrived: torch.cuda.Event | None
+    tile_size: int
+    tile_counts: tuple[int, int, int]
+    """Views, and rows and columns of tiles."""
+
+    @torch.no_grad()
+    def lists(self) -> tuple[Tensor, Tensor]:
+        """Where each tile's list starts, int32 [C, tile rows, tile columns], and the indices in C·N that the lists
+        hold from front to back, int32 [number of pairs]."""
+        if self.arrived is not None:
+            self.arrived.synchronize()
+        num_pairs = int(self.num_pairs)
+        num_tiles, device = math.prod(self.tile_counts), self.ends.device
+        # Tiles are numbered from -2^15, so that 16 bits tell 65,536 of them apart.
+        tiles = torch.empty(num_pairs, dtype=torch.int16 if num_tiles <= 2**16 else torch.int32, device=device)
+        ids = torch.empty(num_pairs, dtype=torch.int32, device=device)
+        n = len(self.order)
+        _list[triton.cdiv(n, _LANES),](
+            *self.ellipses, self.order, self.ends, tiles, ids, n, n // self.tile_counts[0],
+            self.tile_counts[2], self.tile_counts[1], self.tile_size, _LANES, num_warps=1,
+        )  # fmt: skip
+        tiles, by_tile = tiles.sort(stable=True)
+        numbers = torch.arange(-(2**15), num_tiles - 2**15, dtype=tiles.dtype, device=device)
+        starts = torch.searchsorted(tiles, numbers, out_int32=True)
+        return starts.reshape(self.tile_counts), ids[by_tile]
+
+
 @torch.no_grad()
 def intersect_tiles(
     means2d: Tensor,
@@ -125,8 +166,8 @@ def intersect_tiles(
     width: int,
     height: int,
     tile_size: int,
-) -> tuple[Tensor, Tensor]:
-    """List the Gaussians of each tile from front to back; in place of gsplat's `isect_tiles` and `isect_offset_encode`.
+) -> PendingTiles:
+    """Begin to list the Gaussians of each tile; in place of gsplat's `isect_tiles` and `isect_offset_encode`.
 
     Args:
         means2d: px. [C, N, 2]
@@ -139,8 +180,7 @@ def intersect_tiles(
         tile_size: px, a power of two.
 
     Returns:
-        Where each tile's list starts, int32 [C, tile rows, tile columns], and the indices in C·N that the lists hold,
-        int32 [number of pairs].
+        What has the lists, when they are asked for: by then the host should have given the device other work.
     """
     num_views, num_gaussians = means2d.shape[:2]
     tile_width, tile_height = triton.cdiv(width, tile_size), triton.cdiv(height, tile_size)
@@ -148,22 +188,15 @@ def intersect_tiles(
         radii = radii[..., None].expand(-1, -1, 2)
     ellipses = [value.contiguous() for value in (means2d, radii, conics, opacities)]
     n, device = num_views * num_gaussians, means2d.device
-    programs = (triton.cdiv(n, _LANES),)
     counts = torch.empty(n, dtype=torch.int32, device=device)
-    _count[programs](*ellipses, counts, n, tile_width, tile_height, tile_size, _LANES, num_warps=1)
+    _count[triton.cdiv(n, _LANES),](*ellipses, counts, n, tile_width, tile_height, tile_size, _LANES, num_warps=1)
     # Sorting the Gaussians by depth and then their pairs by tile, 16 bits in most cases, moves a fraction of the bytes
     # that sorting pairs by both in 64 bits does. Both sorts are stable, as gsplat's is.
     order = depths.flatten().argsort(stable=True)
     ends = counts[order].cumsum(0)
-    num_pairs = int(ends[-1])  # waits for the device, as gsplat does
-    num_tiles = num_views * tile_height * tile_width
-    # Tiles are numbered from -2^15, so that 16 bits tell 65,536 of them apart.
-    tiles = torch.empty(num_pairs, dtype=torch.int16 if num_tiles <= 2**16 else torch.int32, device=device)
-    ids = torch.empty(num_pairs, dtype=torch.int32, device=device)
-    _list[programs](
-        *ellipses, order, ends, tiles, ids, n, num_gaussians, tile_width, tile_height, tile_size, _LANES, num_warps=1
-    )
-    tiles, by_tile = tiles.sort(stable=True)
-    numbers = torch.arange(-(2**15), num_tiles - 2**15, dtype=tiles.dtype, device=device)
-    starts = torch.searchsorted(tiles, numbers, out_int32=True)
-    return starts.reshape(num_views, tile_height, tile_width), ids[by_tile]
+    num_pairs, arrived = ends[-1:], None
+    if device.type == "cuda":
+        num_pairs = torch.empty(1, dtype=ends.dtype, pin_memory=True).copy_(ends[-1:], non_blocking=True)
+        arrived = torch.cuda.Event()
+        arrived.record()
+    return PendingTiles(ellipses, order, ends, num_pairs, arrived, tile_size, (num_views, tile_height, tile_width))

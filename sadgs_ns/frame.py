@@ -1,0 +1,156 @@
+"""Gaussians in another world frame: what a similarity does to positions, shapes and spherical harmonics."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from sadgs_ns.errors import InputError, reason
+
+Array = NDArray[np.float64]
+
+TRANSFORMS_NAME = "dataparser_transforms.json"
+"""Where nerfstudio's trainer writes, beside `config.yml`, how it moved the data's cameras and points."""
+_TOLERANCE = 1e-4
+"""How far a transform, written in float32, may be from a similarity, relative to its scale."""
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x ↦ scale · orthogonal · x + translation, from one world frame to another."""
+
+    scale: float
+    """> 0."""
+    orthogonal: Array
+    """A rotation, or a rotation times −1, which is a reflection. [3, 3]"""
+    translation: Array
+    """In units of the frame that results. [3]"""
+
+    @staticmethod
+    def of(transform: Array) -> Similarity:
+        """The similarity that a matrix is, up to rounding.
+
+        Args:
+            transform: Linear part and translation. [3, 4]
+
+        Raises:
+            ValueError: If the linear part is not finite, or stretches directions differently.
+        """
+        linear = np.asarray(transform[:, :3], dtype=np.float64)
+        if np.isfinite(transform).all() and (scale := abs(np.linalg.det(linear)) ** (1 / 3)) > 0:
+            left, _, right = np.linalg.svd(linear)
+            orthogonal = np.asarray(left @ right, dtype=np.float64)  # the nearest one; keeps the determinant's sign
+            if np.abs(linear - scale * orthogonal).max() < _TOLERANCE * scale:
+                return Similarity(scale, orthogonal, np.asarray(transform[:, 3], dtype=np.float64))
+        raise ValueError("it is no rotation, scale and translation")
+
+    def inverse(self) -> Similarity:
+        """The way back."""
+        back = self.orthogonal.T
+        return Similarity(1 / self.scale, back, -back @ self.translation / self.scale)
+
+    def positions(self, means: Array) -> Array:
+        """Positions in the new frame. [N, 3] → [N, 3]"""
+        return self.scale * (means @ self.orthogonal.T) + self.translation
+
+    def log_scales(self, scales: Array) -> Array:
+        """Logarithms of standard deviations in the new frame. [N, 3] → [N, 3]"""
+        return scales + math.log(self.scale)
+
+    def rotations(self, quats: Array) -> Array:
+        """Rotations of Gaussians in the new frame; a Gaussian is its own point reflection. wxyz [N, 4] → [N, 4]"""
+        rotation = self.orthogonal * np.sign(np.linalg.det(self.orthogonal))
+        x, y, z, w = pycolmap.Rotation3d(rotation).quat
+        product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+        return quats @ product.T
+
+    def harmonics(self, degree: int) -> Array:
+        """D with c' = D c: coefficients, as seen in the new frame, of colours c that depend on the direction.
+
+        By definition D = ∫ Y(d)ᵀ Y(Qᵀ d) over the unit sphere, Q being the orthogonal part; the quadrature, 4
+        Gauss–Legendre nodes in z times 8 in azimuth, is exact for the polynomials of degree 2 · 3 in it.
+
+        Args:
+            degree: 0 … 3.
+
+        Returns:
+            [(degree + 1)², (degree + 1)²]
+        """
+        z, weights = np.polynomial.legendre.leggauss(4)
+        azimuth = np.arange(8) * (2 * np.pi / 8)
+        radius = np.sqrt(1 - z**2)[:, None]
+        directions = np.stack(
+            np.broadcast_arrays(radius * np.cos(azimuth), radius * np.sin(azimuth), z[:, None]), -1
+        ).reshape(-1, 3)
+        weights = np.repeat(weights * (2 * np.pi / 8), 8)
+        before = spherical_harmonics(directions @ self.orthogonal, degree)
+        return (spherical_harmonics(directions, degree) * weights[:, None]).T @ before
+
+
+def spherical_harmonics(directions: Array, degree: int) -> Array:
+    """The real spherical harmonics, in the order and with the signs of 3D Gaussian splatting.
+
+    Args:
+        directions: Unit vectors. [..., 3]
+        degree: 0 … 3.
+
+    Returns:
+        Orthonormal on the unit sphere. [..., (degree + 1)²]
+
+    Raises:
+        ValueError: If the degree is another.
+    """
+    if not 0 <= degree <= 3:
+        raise ValueError(f"spherical harmonics of degree {degree}: only 0 to 3 are known")
+    x, y, z = np.moveaxis(np.asarray(directions, dtype=np.float64), -1, 0)
+
+    def root(numerator: float, denominator: float) -> float:
+        return math.sqrt(numerator / (denominator * math.pi))
+
+    basis = [
+        np.full_like(x, root(1, 4)),
+        -root(3, 4) * y,
+        root(3, 4) * z,
+        -root(3, 4) * x,
+        root(15, 4) * x * y,
+        -root(15, 4) * y * z,
+        root(5, 16) * (3 * z * z - 1),
+        -root(15, 4) * x * z,
+        root(15, 16) * (x * x - y * y),
+        -root(35, 32) * y * (3 * x * x - y * y),
+        root(105, 4) * x * y * z,
+        -root(21, 32) * y * (5 * z * z - 1),
+        root(7, 16) * z * (5 * z * z - 3),
+        -root(21, 32) * x * (5 * z * z - 1),
+        root(105, 16) * z * (x * x - y * y),
+        -root(35, 32) * x * (x * x - 3 * y * y),
+    ]
+    return np.stack(basis[: (degree + 1) ** 2], -1)
+
+
+def from_data(path: Path) -> Similarity:
+    """How nerfstudio moved the data's world (COLMAP's, or that of `transforms.json`) into its own.
+
+    Args:
+        path: A run's `dataparser_transforms.json`.
+
+    Raises:
+        InputError: If the file cannot be read, or holds anything but a similarity.
+    """
+    try:
+        content = json.loads(path.read_bytes())
+        transform, scale = np.array(content["transform"], dtype=np.float64), float(content["scale"])
+        if transform.shape != (3, 4) or not scale > 0:
+            raise ValueError("it has no transform of 3 rows and 4 columns and a scale above 0")
+        return Similarity.of(scale * transform)
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path} does not tell how to return to the data's frame ({reason(error)}): copy it from the run again, or "
+            "export in nerfstudio's frame."
+        ) from error

@@ -1,0 +1,139 @@
+"""Looks at image files, mostly at their headers alone, and says in half a sentence each what is wrong with them."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image, UnidentifiedImageError
+
+from sadgs_ns.errors import reason
+
+IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"}
+Size = tuple[int, int]
+"""Width and height in px."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """An image with what its camera says."""
+
+    image: Path
+    size: Size | None
+    """None where the image itself decides."""
+    mask: Path | None = None
+
+
+@dataclass(frozen=True)
+class _Image:
+    """What a look at an image file told."""
+
+    size: Size = (0, 0)
+    """Zeros where it is unknown."""
+    mode: str = ""
+    """Pillow's name for the kind of pixels."""
+    problem: str = ""
+    """The rest of a sentence that starts with the file; empty for a good image."""
+
+
+def image_size(path: Path) -> Size:
+    """Width and height in px, zeros where they cannot be read."""
+    return _inspect(path).size
+
+
+def image_problems(frames: Sequence[Frame], source: Path) -> Iterator[str]:
+    """A sentence for each kind of problem with images and masks, naming the first that has it.
+
+    Args:
+        source: The file that the frames' sizes are from.
+    """
+
+    def problem(frame: Frame) -> tuple[str, Path, str] | None:
+        """Kind, file and the rest of the sentence."""
+        image = _inspect(frame.image)
+        if image.problem:
+            return image.problem.split(" (")[0], frame.image, image.problem
+        if image.mode not in ("RGB", "RGBA", "L"):
+            return "mode", frame.image, f"has pixels of Pillow's mode {image.mode}: convert it to 8-bit RGB"
+        if frame.size not in (None, image.size):
+            sizes = "{} × {} px, but its camera in {} {} × {}".format(*image.size, source, *frame.size)
+            return "size", frame.image, f"has {sizes}: use the images that the poses were computed from"
+        if frame.mask is not None:
+            mask = _inspect(frame.mask)
+            if mask.problem:
+                return mask.problem.split(" (")[0], frame.mask, mask.problem
+            if mask.size != image.size:
+                return "mask", frame.mask, f"is a mask of another size than {frame.image}: resize it"
+        return None
+
+    problems: dict[str, list[tuple[Path, str]]] = defaultdict(list)
+    with ThreadPoolExecutor() as pool:
+        for found in pool.map(problem, frames):
+            if found is not None:
+                problems[found[0]].append(found[1:])
+    for same in problems.values():
+        path, text = same[0]
+        yield f"{_and_more(path, len(same))} {text}."
+
+
+def unused_images(frames: Sequence[Frame], source: Path) -> str | None:
+    """A sentence on images beside the frames' that have no pose in the source; None if there are none."""
+    used = {path.resolve() for frame in frames for path in (frame.image, frame.mask) if path is not None}
+    folders = sorted({frame.image.parent for frame in frames})
+    unused = [path for folder in folders for path in images_in(folder) if path.resolve() not in used]
+    if not unused:
+        return None
+    return (
+        f"{_and_more(unused[0], len(unused))} has no pose in {source} and is not used: reconstruct again if it matters."
+    )
+
+
+def images_in(folder: Path) -> list[Path]:
+    """The images right in a folder, sorted; none where there is no folder."""
+    if not folder.is_dir():
+        return []
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+
+
+def _and_more(path: Path, count: int) -> str:
+    """The first of some paths, and how many others there are."""
+    return f"{path} (and {count - 1} more)" if count > 1 else f"{path}"
+
+
+def _inspect(path: Path) -> _Image:
+    """Read an image's header, and decode it only where the file's end does not tell that it is whole."""
+    again = "copy it again, or leave it out of the reconstruction"
+    try:
+        if path.stat().st_size == 0:
+            return _Image(problem=f"has 0 bytes: {again}")
+        with Image.open(path) as image:
+            size, mode = image.size, image.mode
+            whole = _ends_well(path, image)
+        if not whole:
+            with Image.open(path) as image:
+                image.load()
+    except FileNotFoundError:
+        return _Image(problem="does not exist: put it there, or leave it out of the reconstruction")
+    except UnidentifiedImageError:
+        return _Image(problem=f"is no image that Pillow knows: {again}")
+    except Exception as error:  # decoders raise whatever they stumble over: OSError, SyntaxError, struct.error, …
+        return _Image(problem=f"cannot be read as an image ({reason(error)}): {again}")
+    return _Image(size, mode)
+
+
+def _ends_well(path: Path, image: Image.Image) -> bool:
+    """Whether an image that opened is surely whole, found without decoding it; if not, decoding it tells."""
+    if image.format == "JPEG":
+        with path.open("rb") as file:
+            file.seek(-2, 2)
+            return file.read() == b"\xff\xd9"
+    if image.format == "PNG":
+        try:
+            image.verify()  # its checksums
+        except Exception:  # as above; a file without its last bytes fails here and decodes well
+            return False
+        return True
+    return False

@@ -1,0 +1,45 @@
+"""`storage.encode` in one kernel."""
+
+# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
+# (Triton's launch syntax, kernel[grid](...), is not in its types.)
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+_PIXELS = 1024  # a program handles
+_TINY = 1.1754943508222875e-38  # the smallest normal float32, whose logarithm is finite
+
+
+@triton.jit
+def _to_code(value, HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, TINY: tl.constexpr):
+    """Of a squared frequency. Codes are not negative: adding a half rounds them."""
+    octaves = 0.5 * tl.log2(tl.maximum(value, TINY) / (HIGHEST * HIGHEST))
+    return tl.minimum(tl.maximum(255 + 254 * octaves / OCTAVES, 0.0), 255.0) + 0.5
+
+
+@triton.jit(do_not_specialize=["n"])
+def _encode(tensor, codes, n, HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, TINY: tl.constexpr, PIXELS: tl.constexpr):
+    pixel = tl.program_id(0).to(tl.int64) * PIXELS + tl.arange(0, PIXELS)
+    exists = pixel < n
+    xx = tl.load(tensor + 3 * pixel, exists, 0.0)
+    xy = tl.load(tensor + 3 * pixel + 1, exists, 0.0)
+    yy = tl.load(tensor + 3 * pixel + 2, exists, 0.0)
+    product = tl.sqrt(tl.maximum(xx, 0.0)) * tl.sqrt(tl.maximum(yy, 0.0))
+    correlation = tl.where(product > 0, xy / tl.maximum(product, TINY), 0.0)
+    correlation = 127.5 + 127 * tl.minimum(tl.maximum(correlation, -1.0), 1.0)
+    tl.store(codes + 3 * pixel, _to_code(xx, HIGHEST, OCTAVES, TINY).to(tl.uint8), exists)
+    tl.store(codes + 3 * pixel + 1, correlation.to(tl.uint8), exists)
+    tl.store(codes + 3 * pixel + 2, _to_code(yy, HIGHEST, OCTAVES, TINY).to(tl.uint8), exists)
+
+
+def encode(tensor: Tensor, highest_frequency: float, octaves: float) -> Tensor:
+    """As `storage.encode`; where rounding decides, a code may be its neighbour. float32 [..., 3] → uint8 [..., 3]"""
+    tensor = tensor.contiguous()
+    codes = torch.empty_like(tensor, dtype=torch.uint8)
+    n = tensor.numel() // 3
+    _encode[triton.cdiv(n, _PIXELS),](tensor, codes, n, highest_frequency, octaves, _TINY, _PIXELS)
+    return codes

@@ -1,0 +1,336 @@
+"""gsplat's alpha compositing with a backward pass of our own, in which tensor cores sum over the pixels.
+
+gsplat's backward pass sums nine quantities per Gaussian over the lanes of a warp, which takes most of its instructions.
+All nine are linear in two numbers per Gaussian and pixel: the weight of the Gaussian's colour, and the gradient of its
+exponent σ. A colour's gradient is the weights times the pixels' gradients; those of centre, conic and opacity follow
+from the moments of σ's gradient over the tile. Both are products of [Gaussians, pixels] matrices.
+"""
+
+# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false
+# (Triton's launch syntax, kernel[grid](...), and its functions are not in its types.)
+
+from __future__ import annotations
+
+from typing import Any
+
+import triton
+import triton.language as tl
+from gsplat.cuda import _wrapper
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+TILE_SIZE = 8
+"""px. Two pixels for each lane of the one warp that a tile gets."""
+PRECISION = "tf32x3"
+"""How Triton multiplies float32 on tensor cores: of each factor's two parts of 11 bits, three products. "tf32", of
+which one product is made, takes a fifth less time and errs by 4e-4 instead of 2e-5; "ieee" takes twice the time."""
+_GAUSSIANS, _WARPS = 16, 1
+_STRIDE = 12  # gradients of centre 2, conic 3, opacity 1, colour 3; absolute gradient of the centre 2; 1 unused
+
+
+@triton.jit
+def _add(one, other):
+    return one + other
+
+
+@triton.jit
+def _multiply(one, other):
+    return one * other
+
+
+if isinstance(_add, triton.JITFunction):
+
+    @triton.jit
+    def _reciprocal(value):
+        """One instruction; Triton's division spends four more on denormals."""
+        return tl.inline_asm_elementwise(
+            "rcp.approx.ftz.f32 $0, $1;", "=r,r", [value], tl.float32, is_pure=True, pack=1
+        )  # fmt: skip
+else:  # Triton's interpreter, which knows no PTX
+
+    @triton.jit
+    def _reciprocal(value):
+        return 1 / value
+
+
+@triton.jit
+def _row(values, ROW: tl.constexpr):
+    """One row of a block. Adding -0.0 changes nothing, so the compiler leaves no sum."""
+    rows = tl.arange(0, values.shape[0])[:, None]
+    return tl.sum(tl.where(rows == ROW, values, -0.0), axis=0)
+
+
+@triton.jit
+def _rounded(values):
+    """To the nearest that tensor cores read, so that errors average out."""
+    return ((values.to(tl.int32, bitcast=True) + 4096) & -8192).to(tl.float32, bitcast=True)
+
+
+@triton.jit
+def _split4(values):
+    """Columns of [N, 4]."""
+    even, odd = tl.split(tl.reshape(values, [values.shape[0], 2, 2]))
+    c0, c2 = tl.split(even)
+    c1, c3 = tl.split(odd)
+    return c0, c1, c2, c3
+
+
+@triton.jit
+def _split8(values):
+    """Columns of [N, 8]."""
+    even, odd = tl.split(tl.reshape(values, [values.shape[0], 4, 2]))
+    c0, c2, c4, c6 = _split4(even)
+    c1, c3, c5, c7 = _split4(odd)
+    return c0, c1, c2, c3, c4, c5, c6, c7
+
+
+@triton.jit
+def _join4(c0, c1, c2, c3):
+    """[N, 4] of its columns."""
+    return tl.reshape(tl.join(tl.join(c0, c2), tl.join(c1, c3)), [c0.shape[0], 4])
+
+
+@triton.jit
+def _load_gaussians(means2d, conics, colors, opacities, g):
+    """Centre and opacity, conic, and colour of Gaussians [N, 1]: 3 x [N, 4].
+
+    A block of at least as many values as threads is spread over the threads; of a smaller one Triton would have every
+    thread load everything.
+    """
+    k = tl.arange(0, 4)[None, :]
+    centres = tl.load(tl.where(k < 2, means2d + 2 * g + k, opacities + g))
+    k = tl.minimum(k, 2)
+    rgb = tl.load(colors + 3 * g + k)
+    # A colour that is no number makes its pixels NaN; what lies in front elsewhere must not become NaN from 0 * NaN.
+    return centres, tl.load(conics + 3 * g + k), tl.where(tl.abs(rgb) < float("inf"), rgb, 0.0)
+
+
+@triton.jit(do_not_specialize=["num_pairs", "height", "width", "tile_width", "tile_height"])
+def _composite_backward(
+    means2d, conics, colors, opacities, starts, ids, alphas, last_ids, backgrounds, v_renders, v_alphas, gradients,
+    num_pairs, height, width, tile_width, tile_height,
+    TILE: tl.constexpr, GAUSSIANS: tl.constexpr, STRIDE: tl.constexpr, BACKGROUND: tl.constexpr,
+    ABSGRAD: tl.constexpr, PRECISION: tl.constexpr,
+):  # fmt: skip
+    """Add one tile's share to the gradients [C * N, STRIDE].
+
+    Blocks are [Gaussians, pixels], from the back. With one warp, a thread holds all Gaussians of its two pixels, and
+    what accumulates from Gaussian to Gaussian stays in its registers.
+    """
+    PIXELS: tl.constexpr = TILE * TILE
+    FAINTEST = tl.constexpr(0x3B808081)  # bits of 1/255
+    SCALE = tl.constexpr(0.8493218002880191)  # √(log2(e) / 2), of offsets: exp(-σ) is then exp2 of a plain polynomial
+    tile = tl.program_id(0)
+    view = tile // (tile_height * tile_width)
+    row, column = tile // tile_width % tile_height, tile % tile_width
+    pixel = tl.arange(0, PIXELS)
+    x, y = pixel % TILE, pixel // TILE
+    inside = (row * TILE + y < height) & (column * TILE + x < width)
+    at = (view * height + row * TILE + y) * width + column * TILE + x
+    last = tl.load(last_ids + at, inside, -1)
+    start = tl.load(starts + tile)
+    end = num_pairs
+    if tile + 1 < tl.num_programs(0):
+        end = tl.load(starts + tile + 1)
+    end = tl.minimum(end, tl.max(last) + 1)
+    # Offsets from the tile's centre: small, and exact in 11 bits.
+    x, y = x.to(tl.float32) - (TILE - 1) / 2, y.to(tl.float32) - (TILE - 1) / 2
+    scaled_x, scaled_y = SCALE * x, SCALE * y
+    centre_x, centre_y = column.to(tl.float32) * TILE + TILE / 2, row.to(tl.float32) * TILE + TILE / 2
+
+    red = tl.load(v_renders + 3 * at, inside, 0.0)
+    green = tl.load(v_renders + 3 * at + 1, inside, 0.0)
+    blue = tl.load(v_renders + 3 * at + 2, inside, 0.0)
+    v_alpha = tl.load(v_alphas + at, inside, 0.0)
+    # In a matrix product 0 * NaN would reach all Gaussians of the batch. A pixel whose gradient is not finite counts as
+    # 2^100 in the colours' sums and as 0 elsewhere; sums that large become NaN below, in the Gaussians that it sees.
+    finite = tl.maximum(tl.maximum(tl.abs(red), tl.abs(green)), tl.maximum(tl.abs(blue), tl.abs(v_alpha))) < 1e18
+    finite = finite & (red == red) & (green == green) & (blue == blue) & (v_alpha == v_alpha)
+    red, green, blue = tl.where(finite, red, 0.0), tl.where(finite, green, 0.0), tl.where(finite, blue, 0.0)
+    transmittance = 1 - tl.load(alphas + at, inside, 0.0)
+    # Colour behind the present Gaussian times its gradient; alpha is minus a background of one.
+    behind = tl.where(finite, -v_alpha, 0.0)
+    if BACKGROUND:
+        behind += red * tl.load(backgrounds + 3 * view)
+        behind += green * tl.load(backgrounds + 3 * view + 1)
+        behind += blue * tl.load(backgrounds + 3 * view + 2)
+    behind *= transmittance
+
+    k = tl.arange(0, 8)[None, :]
+    powers_x = tl.where((k == 1) | (k == 4), x[:, None], tl.where(k == 3, (x * x)[:, None], 1.0))
+    powers_y = tl.where((k == 2) | (k == 4), y[:, None], tl.where(k == 5, (y * y)[:, None], 1.0))
+    moments = tl.where(k < 6, powers_x * powers_y, 0.0)  # 1, x, y, x², xy, y²
+    v_rgb = tl.load(v_renders + 3 * at[:, None] + k, inside[:, None] & (k < 3), 0.0)
+    v_rgb = tl.where(finite[:, None] | (k >= 3), v_rgb, 1.2676506002282294e30)
+    ones = tl.zeros([PIXELS // 2, 1], tl.float32) + 1
+    to_x, to_y = tl.where(k == 6, ones, 0.0), tl.where(k == 7, ones, 0.0)
+
+    rows = tl.arange(0, GAUSSIANS)
+    first_row = rows[:, None] == 0
+    next_g = tl.load(ids + tl.minimum(tl.maximum(end - 1 - rows, start), num_pairs - 1))
+    next_centre, next_conic, next_rgb = _load_gaussians(means2d, conics, colors, opacities, next_g[:, None])
+    for done in range(0, end - start, GAUSSIANS):
+        position = end - 1 - done - rows
+        g = next_g
+        mean_x, mean_y, opacity, _ = _split4(next_centre)
+        a, b, c, _ = _split4(next_conic)
+        r, g_, b_, _ = _split4(next_rgb)
+        # The next batch is on its way while this one is computed.
+        next_g = tl.load(ids + tl.maximum(position - GAUSSIANS, start))
+        next_centre, next_conic, next_rgb = _load_gaussians(means2d, conics, colors, opacities, next_g[:, None])
+        mean_x -= centre_x
+        mean_y -= centre_y
+
+        # Bits of positive floats are ordered as these: one unsigned comparison finds 1/255 <= alpha <= opacity, the
+        # latter being σ >= 0, with some units in the last place for rounding.
+        reach = tl.where(position >= start, opacity, 0.0).to(tl.int32, bitcast=True) - FAINTEST + 4
+        limit = tl.where(position[:, None] <= last[None, :], tl.maximum(reach, 0)[:, None], 0)
+        dx = SCALE * mean_x[:, None] - scaled_x[None, :]
+        dy = SCALE * mean_y[:, None] - scaled_y[None, :]
+        exponent = dx * (a[:, None] * dx) + dy * (b[:, None] * (dx + dx) + c[:, None] * dy)
+        alpha = opacity[:, None] * tl.exp2(-exponent)
+        above = alpha.to(tl.int32, bitcast=True) - FAINTEST
+        seen = above.to(tl.uint32, bitcast=True) < limit.to(tl.uint32, bitcast=True)
+        alpha = tl.where(seen, tl.minimum(alpha, 0.999), 0.0)
+
+        ratio = _reciprocal(1 - alpha)
+        front = tl.associative_scan(tl.where(first_row, ratio * transmittance[None, :], ratio), 0, _multiply)
+        transmittance = _row(front, GAUSSIANS - 1)
+        weight = alpha * front
+        color = r[:, None] * red[None, :] + g_[:, None] * green[None, :] + b_[:, None] * blue[None, :]
+        share = weight * color
+        share = tl.associative_scan(tl.where(first_row, share + behind[None, :], share), 0, _add)
+        behind = _row(share, GAUSSIANS - 1)
+        by_color = tl.dot(weight, v_rgb, input_precision=PRECISION)
+        # front * color - what is behind / (1 - alpha), with the Gaussian's own share in what is behind
+        v_sigma = tl.where(alpha < 0.999, alpha * ratio * (share - color * front), 0.0)
+        if ABSGRAD:
+            # A thread's two pixels first.
+            slope_x = tl.abs(v_sigma * (a[:, None] * dx + b[:, None] * dy))
+            slope_x = tl.sum(tl.reshape(slope_x, [GAUSSIANS, 2, PIXELS // 2]), axis=1)
+            slope_y = tl.abs(v_sigma * (b[:, None] * dx + c[:, None] * dy))
+            slope_y = tl.sum(tl.reshape(slope_y, [GAUSSIANS, 2, PIXELS // 2]), axis=1)
+            by_color = tl.dot(_rounded(slope_x), to_x, by_color, input_precision="tf32")
+            by_color = tl.dot(_rounded(slope_y), to_y, by_color, input_precision="tf32")
+        by_moment = tl.dot(v_sigma, moments, input_precision=PRECISION)
+
+        r, g_, b_, _, _, _, abs_x, abs_y = _split8(by_color)
+        s, sx, sy, sxx, sxy, syy, _, _ = _split8(by_moment)
+        nan = tl.where(tl.maximum(tl.abs(r), tl.maximum(tl.abs(g_), tl.abs(b_))) < 1e18, 0.0, float("nan"))
+        # Moments of the offset from pixel to centre, mean - (x, y). The conic is applied to mean and (x, y) apart: far
+        # from the centre of a long, thin Gaussian the sums would cancel.
+        v_x = (a * mean_x + b * mean_y) * s - (a * sx + b * sy)
+        v_y = (b * mean_x + c * mean_y) * s - (b * sx + c * sy)
+        v_a = 0.5 * (mean_x * (mean_x * s - 2 * sx) + sxx)
+        v_b = mean_x * (mean_y * s - sy) - mean_y * sx + sxy
+        v_c = 0.5 * (mean_y * (mean_y * s - 2 * sy) + syy)
+        v_opacity = -s / tl.maximum(opacity, 1 / 255)
+        at_row = gradients + (g * STRIDE)[:, None] + tl.arange(0, 4)[None, :]
+        exists = (position >= start)[:, None]
+        tl.atomic_add(at_row, _join4(v_x + nan, v_y + nan, v_a + nan, v_b + nan), exists, sem="relaxed")
+        tl.atomic_add(at_row + 4, _join4(v_c + nan, v_opacity + nan, r + nan, g_ + nan), exists, sem="relaxed")
+        tl.atomic_add(at_row + 8, _join4(b_ + nan, abs_x / SCALE, abs_y / SCALE, 0 * s), exists, sem="relaxed")
+
+
+def composite_backward(
+    means2d: Tensor,
+    conics: Tensor,
+    colors: Tensor,
+    opacities: Tensor,
+    backgrounds: Tensor | None,
+    isect_offsets: Tensor,
+    flatten_ids: Tensor,
+    alphas: Tensor,
+    last_ids: Tensor,
+    v_renders: Tensor,
+    v_alphas: Tensor,
+    absgrad: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]:
+    """Gradients of gsplat's compositing of three channels in tiles of TILE_SIZE. Tensors are contiguous, in float32.
+
+    A pixel whose gradient is not finite, or at least 1e18, makes the gradients of the Gaussians that it sees NaN, and
+    of no others.
+
+    Args:
+        means2d: px. [C, N, 2]
+        conics: In 1/px². [C, N, 3]
+        colors: [C, N, 3]
+        opacities: In [0, 1]. [C, N]
+        backgrounds: [C, 3]
+        isect_offsets: Where each tile's list starts, int32 [C, tile rows, tile columns].
+        flatten_ids: Indices in C·N, int32 [number of pairs].
+        alphas: As rendered. [C, height, width, 1]
+        last_ids: Place in the lists of the last Gaussian that a pixel drew, int32 [C, height, width].
+        v_renders: Gradient of the rendered colours. [C, height, width, 3]
+        v_alphas: Gradient of `alphas`. [C, height, width, 1]
+        absgrad: Whether to sum the absolute gradients of the centres, too.
+
+    Returns:
+        Gradients of means2d, conics, colors and opacities, in their shapes, and the absolute gradient [C, N, 2]: parts
+        of the rows of one tensor.
+    """
+    gradients = means2d.new_zeros((*opacities.shape, _STRIDE))
+    if len(flatten_ids):
+        height, width = last_ids.shape[1:]
+        _composite_backward[(isect_offsets.numel(),)](
+            means2d, conics, colors, opacities, isect_offsets, flatten_ids, alphas, last_ids,
+            means2d if backgrounds is None else backgrounds, v_renders, v_alphas, gradients,
+            len(flatten_ids), height, width, isect_offsets.shape[2], isect_offsets.shape[1],
+            TILE_SIZE, _GAUSSIANS, _STRIDE, backgrounds is not None, absgrad, PRECISION,
+            num_warps=_WARPS, num_stages=1,
+        )  # fmt: skip
+    v_means2d, v_conics, v_opacities, v_colors, v_absolute, _ = gradients.split([2, 3, 1, 3, 2, 1], dim=-1)
+    return v_means2d, v_conics, v_colors, v_opacities[..., 0], v_absolute if absgrad else None
+
+
+class _RasterizeToPixels(_wrapper._RasterizeToPixels):
+    """gsplat's function, whose forward pass saves the same tensors in 1.4 and 1.5, with another backward pass."""
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_renders: Tensor, v_alphas: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        means2d, conics, colors, opacities, backgrounds, _, starts, ids, alphas, last_ids = ctx.saved_tensors
+        v_means2d, v_conics, v_colors, v_opacities, v_absolute = composite_backward(
+            means2d, conics, colors, opacities, backgrounds, starts, ids, alphas, last_ids,
+            v_renders.contiguous(), v_alphas.contiguous(), ctx.absgrad,
+        )  # fmt: skip
+        if ctx.absgrad:
+            means2d.absgrad = v_absolute
+        v_backgrounds = (v_renders * (1.0 - alphas)).sum(dim=(1, 2)) if ctx.needs_input_grad[4] else None
+        return v_means2d, v_conics, v_colors, v_opacities, v_backgrounds, *[None] * 7
+
+
+def rasterize_to_pixels(
+    means2d: Tensor,
+    conics: Tensor,
+    colors: Tensor,
+    opacities: Tensor,
+    width: int,
+    height: int,
+    isect_offsets: Tensor,
+    flatten_ids: Tensor,
+    backgrounds: Tensor | None,
+    absgrad: bool,
+) -> tuple[Tensor, Tensor]:
+    """gsplat's `rasterize_to_pixels` of three channels in tiles of TILE_SIZE, with `composite_backward`.
+
+    Args:
+        means2d: px; with `absgrad`, `backward` sets its attribute of that name. [C, N, 2]
+        conics: In 1/px². [C, N, 3]
+        colors: [C, N, 3]
+        opacities: In [0, 1]. [C, N]
+        width: px.
+        height: px.
+        isect_offsets: Where each tile's list starts, int32 [C, tile rows, tile columns].
+        flatten_ids: Indices in C·N, int32 [number of pairs].
+        backgrounds: [C, 3]
+        absgrad: Whether to sum the absolute gradients of the centres, too.
+
+    Returns:
+        Colours [C, height, width, 3] and alphas [C, height, width, 1].
+    """
+    return _RasterizeToPixels.apply(  # type: ignore[return-value]
+        means2d.contiguous(), conics.contiguous(), colors.contiguous(), opacities.contiguous(),
+        None if backgrounds is None else backgrounds.contiguous(), None, width, height, TILE_SIZE, isect_offsets,
+        flatten_ids, absgrad,
+    )  # fmt: skip

@@ -1,0 +1,50 @@
+"""S̄ in three bytes a pixel: as much as the image that it was computed from."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from sadgs_ns import kernels
+
+HIGHEST_FREQUENCY = 4.0
+"""1/px. S̄'s trace is at most c²/px² by construction, so this is the largest c that can be stored."""
+OCTAVES = 12.0
+"""Frequencies down to 2⁻¹² of the highest one have a code of their own: wavelengths of 0.25 to 1,024 px."""
+
+
+def encode(tensor: Tensor, fused: bool = True) -> Tensor:
+    """√xx and √yy on a logarithmic scale, and the correlation xy / √(xx yy).
+
+    A logarithm keeps the relative error of every wavelength the same (at most 1.7 %), and a correlation within ±1 keeps
+    S̄ positive semidefinite.
+
+    Args:
+        tensor: S̄ as (xx, xy, yy) in 1/px², finite. [..., 3]
+        fused: Use our Triton kernel where it runs: CUDA, float32.
+
+    Returns:
+        uint8 [..., 3]
+    """
+    if fused and tensor.dtype == torch.float32 and kernels.available(tensor.device):
+        from sadgs_ns.kernels import codes as kernel
+
+        return kernel.encode(tensor, HIGHEST_FREQUENCY, OCTAVES)
+    xx, xy, yy = tensor.unbind(-1)
+    frequencies = torch.stack([xx, yy], -1).clamp_min(0).sqrt()  # [..., 2] in 1/px
+    logarithms = 1 + (frequencies / HIGHEST_FREQUENCY).log2() / OCTAVES  # (−∞, 1]
+    codes = (1 + 254 * logarithms).round().clamp(0, 255)
+    product = frequencies.prod(-1)
+    correlation = torch.where(product > 0, xy / product.clamp_min(torch.finfo(product.dtype).tiny), 0.0)
+    return torch.stack([codes[..., 0], (127 + 127 * correlation.clamp(-1, 1)).round(), codes[..., 1]], -1).byte()
+
+
+def decode(codes: Tensor) -> Tensor:
+    """S̄ in float32 from `encode`. uint8 [..., 3] → [..., 3]"""
+    x, correlation, y = codes.float().unbind(-1)
+
+    def frequency(code: Tensor) -> Tensor:
+        return torch.where(code > 0, HIGHEST_FREQUENCY * torch.exp2(OCTAVES * ((code - 1) / 254 - 1)), 0.0)
+
+    x, y = frequency(x), frequency(y)
+    return torch.stack([x * x, x * y * (correlation - 127) / 127, y * y], -1)
