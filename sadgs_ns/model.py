@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, Literal, get_type_hints
 
@@ -132,6 +132,7 @@ class SadgsModel(SplatfactoModel):
         self.step = 0
         self.infos: list[dict[str, Any]] = []
         self.crop_box: OrientedBox | None = None
+        self.viewer_outputs: Callable[[Cameras, dict[str, Tensor]], dict[str, Tensor]] | None = None
         # "random" concerns training; viewers show it as viser's own background.
         self.background_color = (
             torch.tensor([0.1490, 0.1647, 0.2157])
@@ -224,14 +225,24 @@ class SadgsModel(SplatfactoModel):
         """Whether η will be observed at this step."""
         return self.config.densify and self.strategy.observes(step)
 
-    def _render(
-        self, viewmats: Tensor, Ks: Tensor, width: int, height: int, render_mode: Literal["RGB", "RGB+ED"]
+    def cropped(self, values: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+        """Rows of tensors [N, …] of the Gaussians inside the crop box, which the viewer may set; all in training."""
+        if self.crop_box is None or self.training:
+            return values
+        inside = self.crop_box.within(self.means)
+        return {name: value[inside] for name, value in values.items()}
+
+    def render(
+        self,
+        viewmats: Tensor,
+        Ks: Tensor,
+        width: int,
+        height: int,
+        render_mode: Literal["RGB", "RGB+ED"],
+        absgrad: bool = False,
     ) -> tuple[Tensor, Tensor, dict[str, Any]]:
         """Rasterize the Gaussians inside the crop box, if there is one. viewmats [C, 4, 4], Ks [C, 3, 3]"""
-        params: Mapping[str, Tensor] = dict(self.gauss_params.items())
-        if self.crop_box is not None and not self.training:
-            inside = self.crop_box.within(self.means)
-            params = {name: value[inside] for name, value in params.items()}
+        params = self.cropped(dict(self.gauss_params.items()))
         if self.config.sh_degree > 0:
             colors: Tensor | tuple[Tensor, Tensor] = (params["features_dc"], params["features_rest"])
             sh_degree = min(self.step // self.config.sh_degree_interval, self.config.sh_degree)
@@ -249,7 +260,7 @@ class SadgsModel(SplatfactoModel):
             height,
             sh_degree=sh_degree,
             render_mode=render_mode,
-            absgrad=self.training and self.config.densify and self.strategy.needs_absgrad(self.step),
+            absgrad=absgrad,
             rasterize_mode=self.config.rasterize_mode,
             fused=self.config.fused,
         )
@@ -276,7 +287,8 @@ class SadgsModel(SplatfactoModel):
         Returns:
             `rgb` [C, H, W, 3], not clamped, and `background` [3].
         """
-        render, alpha, info = self._render(viewmats, Ks, width, height, "RGB")
+        absgrad = self.training and self.config.densify and self.strategy.needs_absgrad(self.step)
+        render, alpha, info = self.render(viewmats, Ks, width, height, "RGB", absgrad)
         if self.config.densify:
             info |= {"viewmats": viewmats.detach(), "Ks": Ks, "structure_tensors": structure_tensors}
             self.strategy.step_pre_backward(self.gauss_params, self.optimizers, self.strategy_state, self.step, info)
@@ -311,7 +323,7 @@ class SadgsModel(SplatfactoModel):
             return self.get_empty_outputs(width, height, background)
         viewmats = viewmats_from_camera_to_world(camera.camera_to_worlds)
         Ks = camera.get_intrinsics_matrices().to(self.device)
-        render, alpha, _ = self._render(viewmats, Ks, width, height, "RGB+ED")
+        render, alpha, _ = self.render(viewmats, Ks, width, height, "RGB+ED")
         depth = render[..., 3:4]
         return {
             "rgb": (render[..., :3] + (1 - alpha) * background).clamp(0.0, 1.0)[0],
@@ -319,6 +331,11 @@ class SadgsModel(SplatfactoModel):
             "accumulation": alpha[0],
             "background": background.expand(height, width, 3),
         }
+
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+        """What `get_outputs` returns inside a crop box, and what the viewer's panel adds."""
+        outputs = super().get_outputs_for_camera(camera, obb_box)
+        return outputs if self.viewer_outputs is None else outputs | self.viewer_outputs(camera, outputs)
 
     def composite_with_background(self, image: Tensor, background: Tensor) -> Tensor:
         """Put images with an alpha channel before the background.

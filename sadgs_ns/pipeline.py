@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -24,8 +25,10 @@ from sadgs_ns.finite import NonFiniteLog
 from sadgs_ns.memory import STEP_BYTES
 from sadgs_ns.model import SadgsModel, SadgsModelConfig
 from sadgs_ns.optimizers import FusedAdam
+from sadgs_ns.panel import StructurePanel
 from sadgs_ns.preflight import findings_of
 from sadgs_ns.rasterization import viewmats_from_camera_to_world
+from sadgs_ns.statistics import empty_statistics, observe
 from sadgs_ns.storage import HIGHEST_FREQUENCY, encode
 from sadgs_ns.structure_tensor import (
     ENERGY_BLUR,
@@ -102,6 +105,8 @@ class SadgsPipeline(VanillaPipeline):
         positions = self.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]  # [C, 3]
         self.model.set_cameras(positions)
         self.log = NonFiniteLog(self.device)
+        self.structure = StructurePanel(self)
+        self.model.viewer_outputs = self.structure.outputs
 
     def _image_bytes(self) -> float:
         """Memory of the training device that images, structure tensors and a step's pictures will take, in bytes."""
@@ -151,30 +156,77 @@ class SadgsPipeline(VanillaPipeline):
             batch_size = max(_PIXELS_PER_BATCH // (height * width), 1)
             for start in range(0, len(indices), batch_size):
                 batch = indices[start : start + batch_size]
-                for index, tensor in zip(batch, self._structure_tensors_of(batch), strict=True):
+                data = [self.datamanager.cached_train[index] for index in batch]
+                for index, tensor in zip(batch, self.structure_tensors_of(data), strict=True):
                     tensors[index] = tensor.to(self.datamanager.cached_train[index]["image"].device)
         return tensors
 
-    def _structure_tensors_of(self, indices: list[int]) -> Tensor:
-        """Codes of S̄ of training images of one size, computed on the training device. uint8 [B, H, W, 3]"""
-        data = [self.datamanager.cached_train[index] for index in indices]
+    def photo(self, data: dict[str, Any]) -> Tensor:
+        """An image of the datamanager as the loss sees it: on the training device and on the background. [H, W, 3]"""
         background = self.model.background_color.to(self.device)
-        images = [self.model.composite_with_background(self.model.get_gt_img(d["image"]), background) for d in data]
+        return self.model.composite_with_background(self.model.get_gt_img(data["image"]), background).to(self.device)
+
+    def structure_tensors_of(self, data: list[dict[str, Any]]) -> Tensor:
+        """Codes of S̄ of the datamanager's images of one size, on the training device. uint8 [B, H, W, 3]"""
+        images = torch.stack([self.photo(d) for d in data])
         masks = None
         if any("mask" in d for d in data):
             masks = torch.stack(
                 [d["mask"][..., 0].to(self.device) if "mask" in d else torch.ones_like(image[..., 0], dtype=torch.bool)
                  for d, image in zip(data, images, strict=True)]
             )  # fmt: skip
-        tensors = multiscale_structure_tensor(
-            torch.stack(images).to(self.device),
+        return encode(self.structure_tensors_of_images(images, masks), self.config.model.fused)
+
+    def structure_tensors_of_images(self, images: Tensor, masks: Tensor | None = None) -> Tensor:
+        """S̄ with this run's settings. [B, H, W, 3] in [0, 1], bool [B, H, W] or None → [B, H, W, 3]"""
+        return multiscale_structure_tensor(
+            images,
             masks,
             frequency_constant=self.config.frequency_constant,
             noise_floor=self.config.noise_floor,
             energy_blur=self.config.energy_blur,
             fused=self.config.model.fused,
         )
-        return encode(tensors, self.config.model.fused)
+
+    def train_viewmat(self, index: int) -> Tensor:
+        """World to camera of a training view, with the camera optimizer's correction where it is on. [4, 4]"""
+        viewmats, _ = self.train_cameras
+        if self.model.camera_optimizer.config.mode == "off":
+            return viewmats[index]
+        camera = self.datamanager.train_cameras[index : index + 1].to(self.device)
+        camera.metadata = {"cam_idx": index}
+        return viewmats_from_camera_to_world(self.model.camera_optimizer.apply_to_camera(camera))[0]
+
+    @torch.no_grad()
+    def observe_training_views(self, progress: Callable[[range], Iterable[int]] = iter) -> dict[str, Tensor]:
+        """η's statistics of the Gaussians as they are, in one look at each training view.
+
+        Draws from a generator of its own: a run that is watched goes on as if it were not.
+
+        Args:
+            progress: Wraps the numbers of the views, to show how far it is.
+
+        Returns:
+            As `statistics.empty_statistics`.
+        """
+        self.model.set_crop(None)  # the viewer's, which sets it anew whenever it renders
+        strategy, params = self.model.strategy, self.model.gauss_params
+        generator = torch.Generator(self.device).manual_seed(0)
+        statistics = empty_statistics(self.model.num_points, self.device)
+        _, Ks = self.train_cameras
+        for index in progress(range(len(self.structure_tensors))):
+            tensor, viewmat = self.structure_tensors[index].to(self.device)[None], self.train_viewmat(index)[None]
+            _, _, info = self.model.render(viewmat, Ks[index][None], tensor.shape[2], tensor.shape[1], "RGB")
+            observe(
+                statistics,
+                params,
+                info | {"viewmats": viewmat, "Ks": Ks[index][None], "structure_tensors": tensor},
+                directional=strategy.directional_eta,
+                min_opacity=strategy.eta_min_opacity,
+                generator=generator,
+                fused=strategy.fused,
+            )
+        return statistics
 
     def _next_view(self) -> tuple[int, dict[str, Any]]:
         """Index and data of the next training view, in nerfstudio's order, without slicing its cameras for it."""
@@ -200,12 +252,15 @@ class SadgsPipeline(VanillaPipeline):
                 raise InputError(f"pipeline.model.{error}") from error
             if line is not None:
                 CONSOLE.print(line, highlight=False, soft_wrap=True)
+            self.structure.set_max_gaussians.value = self.model.strategy.max_gaussians
         optimizers = training_callback_attributes.optimizers
         for optimizer in optimizers.optimizers.values() if optimizers is not None else ():
             if isinstance(optimizer, FusedAdam):
                 optimizer.log = self.log
+        after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN]
+        counts = TrainingCallback(after, lambda step: self.structure.refresh())
         last = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self._report_nonfinite())
-        return [*super().get_training_callbacks(training_callback_attributes), last]
+        return [*super().get_training_callbacks(training_callback_attributes), counts, last]
 
     def _report_nonfinite(self) -> None:
         """Say in which of the last iterations, and with which images, a loss or gradient was not finite."""
@@ -222,15 +277,10 @@ class SadgsPipeline(VanillaPipeline):
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
         """Render the iteration's views and return the outputs of the last size, mean losses and mean metrics."""
         groups: dict[torch.Size, list[tuple[int, dict[str, Any]]]] = defaultdict(list)
-        viewmats, Ks = self.train_cameras
-        corrected: dict[int, Tensor] = {}
+        _, Ks = self.train_cameras
         for _ in range(self.config.views_per_iteration):
             index, data = self._next_view()
             groups[data["image"].shape].append((index, data))
-            if self.model.camera_optimizer.config.mode != "off":
-                camera = self.datamanager.train_cameras[index : index + 1].to(self.device)
-                camera.metadata = {"cam_idx": index}
-                corrected[index] = viewmats_from_camera_to_world(self.model.camera_optimizer.apply_to_camera(camera))[0]
         losses: dict[str, Tensor] = {}
         metrics: dict[str, Any] = {}
         outputs: dict[str, Any] = {}
@@ -244,7 +294,7 @@ class SadgsPipeline(VanillaPipeline):
             tensors = None
             if observes:
                 tensors = torch.stack([self.structure_tensors[index].to(self.device) for index in indices])
-            group_viewmats = torch.stack([corrected.get(index, viewmats[index]) for index in indices])
+            group_viewmats = torch.stack([self.train_viewmat(index) for index in indices])
             group_Ks = torch.stack([Ks[index] for index in indices])
             outputs = self.model.get_training_outputs(group_viewmats, group_Ks, width, height, indices, tensors)
             group_losses = self.model.get_loss_dict(outputs, batch)

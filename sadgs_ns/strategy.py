@@ -100,6 +100,8 @@ class StructureAwareStrategy(Strategy):
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
         """State to pass to the other methods; its tensors are made at the first step.
 
+        Each structure step appends its numbers of Gaussians to the list `structure_steps`.
+
         Args:
             scene_scale: Extent of the cameras in world units, as 3DGS defines it.
 
@@ -237,27 +239,54 @@ class StructureAwareStrategy(Strategy):
                 # A reset just before the final prune would leave nothing that had time to recover.
                 self._map_opacities(params, optimizers, lambda opacities: opacities * self.reset_factor)
 
+    def consistently_low(self, statistics: Mapping[str, Tensor]) -> Tensor:
+        """Gaussians that answered low on all three axes in more than τ_prune of their observations. bool [N]"""
+        return consistent(statistics["n_low"], statistics["n_total"], self.tau_prune).all(dim=1)
+
+    def split_plan(self, statistics: Mapping[str, Tensor], budget: float) -> tuple[Tensor, Tensor]:
+        """What a structure step makes of the statistics.
+
+        Args:
+            statistics: As made by `empty_statistics`.
+            budget: Gaussians that may be added.
+
+        Returns:
+            n per axis that η asks for, int64 [N, 3]; and the Gaussians whose children fit the budget, bool [N].
+        """
+        violates = consistent(statistics["n_high"], statistics["n_total"], self.tau_split)
+        counts = children_per_axis(statistics["eta_max"], violates, self.split_exponent)  # [N, 3]
+        worst = torch.where(violates, statistics["eta_max"], 0.0).amax(dim=1)  # [N]
+        return counts, limit_growth(counts.prod(dim=1) - 1, worst, budget)
+
     def _structure_step(self, params: Any, optimizers: Any, state: Any, iteration: int) -> None:
         opacities = self._opacities(params)
-        is_low = consistent(state["n_low"], state["n_total"], self.tau_prune).all(dim=1)
+        is_low = self.consistently_low(state)
+        n_before, n_low = len(is_low), int(is_low.sum())
         n_pruned = self._prune(
             params, optimizers, state, (opacities < self.min_opacity) | (is_low & (opacities < self.prune_opacity))
         )
         if self.clamp_opacity < 1:
             self._map_opacities(params, optimizers, lambda alpha: alpha.clamp_max(self.clamp_opacity))
-        violates = consistent(state["n_high"], state["n_total"], self.tau_split)
-        counts = children_per_axis(state["eta_max"], violates, self.split_exponent)  # [N, 3]
-        worst = torch.where(violates, state["eta_max"], 0.0).amax(dim=1)  # [N]
-        growth = counts.prod(dim=1) - 1  # [N]
         under_cap, in_memory = self._room(params, state)
-        allowed = limit_growth(growth, worst, min(under_cap, in_memory))
+        counts, allowed = self.split_plan(state, min(under_cap, in_memory))
         n_parents, n_wanted = int(allowed.sum()), int((counts > 1).any(dim=1).sum())
-        if in_memory < min(int(growth.sum()), under_cap):
+        if in_memory < min(int((counts.prod(dim=1) - 1).sum()), under_cap):
             _warn_of_memory(iteration, in_memory)
         if n_parents > 0:
             grid_split(params, optimizers, state, torch.where(allowed[:, None], counts, 1), self.split_extent)
         # What was learned about parents says nothing about their children.
         self._clear_statistics(params, state)
+        state.setdefault("structure_steps", []).append(
+            {
+                "iteration": iteration,
+                "before": n_before,
+                "violating": n_wanted,
+                "low": n_low,
+                "split": n_parents,
+                "pruned": n_pruned,
+                "after": len(params["means"]),
+            }
+        )
         if self.verbose:
             print(
                 f"Iteration {iteration}: {n_parents} of {n_wanted} violating Gaussians split, {n_pruned} pruned. "

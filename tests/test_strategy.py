@@ -119,7 +119,7 @@ def test_no_reset_so_late_that_the_final_prune_takes_everything():
 
 def test_statistics_end_with_densification():
     _, state, _ = train(short(max_gaussians=3000), 26)
-    assert set(state) == {"scene_scale"}
+    assert set(state) == {"scene_scale", "structure_steps"}
 
 
 def test_final_prune_removes_the_faint_once():

@@ -17,11 +17,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 from pytorch_msssim import ssim
 from rich.console import Console
@@ -29,14 +27,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from torch import Tensor
 
+from sadgs_ns import pictures
 from sadgs_ns.demo.scene import EVAL_INTERVAL, SPARSE_FOLDER, SceneDescription, expected_wavelength_map, write_scene
-from sadgs_ns.eta import wavelength
 from sadgs_ns.export import atomic_path, write_ply
+from sadgs_ns.inspection import get_view
 from sadgs_ns.model import SadgsModel
+from sadgs_ns.pictures import ETA, PERIOD, Panel
 from sadgs_ns.pipeline import SadgsPipeline
 from sadgs_ns.presets import load_preset
-from sadgs_ns.rasterization import rasterize
-from sadgs_ns.storage import decode
 from sadgs_ns.strategy import StructureAwareStrategy
 from sadgs_ns.trainer import SadgsTrainer, SadgsTrainerConfig
 
@@ -59,8 +57,8 @@ class Snapshot:
 
     params: dict[str, Tensor] = field(default_factory=dict)
     """Raw parameters by name, leading dimension N."""
-    eta_max: Tensor = field(default_factory=lambda: torch.empty(0, 3))
-    """Largest η seen per axis. [N, 3]"""
+    statistics: dict[str, Tensor] = field(default_factory=dict)
+    """`eta_max`, the largest η seen per axis [N, 3], and `n_total`, the number of observations [N]."""
 
 
 @dataclass
@@ -175,7 +173,8 @@ def train(config: SadgsTrainerConfig, label: str, on_step: Callable[[int, int], 
             counts.append(-pipeline.model.num_points)
         if step + 1 == strategy.structure_every and "eta_max" in pipeline.model.strategy_state:
             snapshot.params = {name: value.detach().clone() for name, value in pipeline.model.gauss_params.items()}
-            snapshot.eta_max = pipeline.model.strategy_state["eta_max"].clone()
+            state = pipeline.model.strategy_state
+            snapshot.statistics = {name: state[name].clone() for name in ("eta_max", "n_total")}
 
     def after_step(step: int) -> None:
         if at_structure_step(step):
@@ -198,30 +197,6 @@ def train(config: SadgsTrainerConfig, label: str, on_step: Callable[[int, int], 
     return Run(label, pipeline, seconds, renders, targets, snapshot, sum(counts))
 
 
-@torch.no_grad()
-def eta_map(pipeline: SadgsPipeline, snapshot: Snapshot, index: int) -> NDArray[np.float32]:
-    """Largest η of the Gaussians that make up each pixel of a training view, blended like their colours.
-
-    Returns:
-        NaN where nothing is drawn. [H, W]
-    """
-    viewmats, Ks = pipeline.train_cameras
-    camera = pipeline.datamanager.train_dataset.cameras[index]
-    params = snapshot.params
-    values, alphas, _ = rasterize(
-        params["means"],
-        params["quats"],
-        params["scales"].exp(),
-        torch.sigmoid(params["opacities"]).squeeze(-1),
-        snapshot.eta_max.amax(1, keepdim=True),
-        viewmats[index : index + 1],
-        Ks[index : index + 1],
-        int(camera.width),
-        int(camera.height),
-    )
-    return torch.where(alphas > 0.05, values / alphas, torch.nan)[0, ..., 0].cpu().numpy()
-
-
 def draw_side_by_side(path: Path, runs: Sequence[Run]) -> None:
     """One row a held-out view: ground truth, then each run."""
     labels = ["ground truth", *(run.label for run in runs)]
@@ -241,35 +216,20 @@ def draw_side_by_side(path: Path, runs: Sequence[Run]) -> None:
 
 
 def draw_wavelength_and_eta(path: Path, scene: SceneDescription, run: Run, index: int = 0) -> None:
-    """Four panels of a training view: image, estimated and true wavelength, and η before the first split.
-
-    The structure tensor measures ω = c / σ; a sine of period P has 1 / Λ_min = 2π c / P, so the panel shows the period
-    2π c Λ_min that belongs to the estimate.
-    """
-    pipeline = run.pipeline
-    dataset = pipeline.datamanager.train_dataset
-    name = dataset.image_filenames[index].name
-    truth = expected_wavelength_map(scene.surfaces, next(view for view in scene.views if view.name == name))
-    constant = pipeline.config.frequency_constant
-    estimate = 2 * torch.pi * constant * wavelength(decode(pipeline.structure_tensors[index])).cpu().numpy()
-    figure = Figure(figsize=(15, 3.2), layout="constrained")
-    image_axes, estimate_axes, truth_axes, eta_axes = figure.subplots(1, 4)
-    image_axes.imshow(dataset.get_image_float32(index).cpu().numpy())
-    image_axes.set_title(f"training view {name}")
-    maps = [(estimate_axes, estimate, "wavelength, estimated (px)"), (truth_axes, truth, "wavelength, true (px)")]
-    for axes, values, title in maps:
-        shown = axes.imshow(values, norm="log", vmin=3, vmax=60, cmap="viridis")
-        axes.set_title(title)
-        figure.colorbar(shown, ax=axes, ticks=[3, 5, 10, 20, 40], format="%d px").minorticks_off()
-    eta_axes.set_title("largest η before the first split (no unit)")
-    if run.before_split.params:
-        values = eta_map(pipeline, run.before_split, index)
-        shown = eta_axes.imshow(values, norm="log", vmin=1, vmax=30, cmap="magma")  # black: nothing to split
-        figure.colorbar(shown, ax=eta_axes, ticks=[1, 3, 10, 30], format="%g").minorticks_off()
-    for axes in (image_axes, estimate_axes, truth_axes, eta_axes):
-        axes.set_axis_off()
-    with atomic_path(path) as partial:
-        figure.savefig(partial, dpi=110)
+    """Four panels of a training view: image, estimated and true period of its texture, and η before the first split."""
+    pipeline, before = run.pipeline, run.before_split
+    view = get_view(pipeline, index)
+    truth = expected_wavelength_map(scene.surfaces, next(v for v in scene.views if v.name == view.name))
+    estimate = pictures.texture_period(view.structure_tensor, pipeline.config.frequency_constant)
+    panels = [
+        Panel(f"training view {view.name}", pictures.to_picture(view.photo)),
+        Panel("wavelength, estimated", PERIOD(estimate), PERIOD),
+        Panel("wavelength, true", PERIOD(torch.from_numpy(truth)), PERIOD),
+    ]
+    if before.params:
+        eta = pictures.eta_map(before.params, before.statistics, *view.camera)
+        panels.append(Panel("η before the first split", ETA(eta), ETA))
+    pictures.draw(path, panels)
 
 
 def verdict(absgs: Run, sadgs: Run, max_gaussians: int) -> str:
