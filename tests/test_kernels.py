@@ -77,6 +77,12 @@ def test_a_triton_that_compiles_is_found_and_one_that_does_not_is_told_once(monk
         assert not kernels._compiles.__wrapped__(DEVICE)
 
 
+def test_an_old_triton_is_left_alone_and_named(monkeypatch):
+    monkeypatch.setattr("triton.__version__", "3.4.0")
+    with pytest.warns(UserWarning, match=r"do not run here: 3\.4\.0 is older than 3\.5 \(torch 2\.9\);"):
+        assert not kernels._compiles.__wrapped__(DEVICE)
+
+
 @pytest.mark.parametrize("shape", [(2, 3, 21, 34), (1, 1, 1, 40), (1, 2, 5, 3)], ids=str)
 @pytest.mark.parametrize("axis", [2, 3])
 def test_convolution_equals_torchs_in_float64(shape, axis):

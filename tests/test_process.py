@@ -61,8 +61,9 @@ def test_photos_are_registered_where_they_were_taken(processed, scene: Path):
     u, s, vt = np.linalg.svd(expected.T @ found)
     sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
     aligned = (found @ (u @ sign @ vt).T) * (s * np.diag(sign)).sum() / (found**2).sum()
-    error = np.linalg.norm(aligned - expected, axis=1).max()
-    assert error < 0.05 * np.linalg.norm(expected, axis=1).max()  # small photos of gratings: it is about 2 %
+    errors = np.linalg.norm(aligned - expected, axis=1) / np.linalg.norm(expected, axis=1).max()
+    # Small photos of gratings: 1.5 and 4.0 % with our seed; without one the largest error was up to 6.3 %.
+    assert np.median(errors) < 0.03 and errors.max() < 0.05
 
 
 # nerfstudio opens the first photo to learn its size and does not close it.

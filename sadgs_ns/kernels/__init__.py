@@ -8,6 +8,9 @@ from importlib.util import find_spec
 
 import torch
 
+OLDEST_TRITON = (3, 5)
+"""Older ones do not compile all of the kernels: 3.4 knows no matrix products with 8 columns."""
+
 
 def available(device: torch.device) -> bool:
     """Whether the kernels run on this device: it is CUDA, and Triton, which comes with torch, compiles for it."""
@@ -18,6 +21,16 @@ def available(device: torch.device) -> bool:
 def _compiles(device: torch.device) -> bool:
     """Try a small kernel once: Triton also needs a C compiler, Python's headers and a GPU that it knows."""
     if find_spec("triton") is None:
+        return False
+    import triton
+
+    if tuple(map(int, triton.__version__.split(".")[:2])) < OLDEST_TRITON:
+        oldest = ".".join(map(str, OLDEST_TRITON))
+        warnings.warn(
+            f"Triton's kernels do not run here: {triton.__version__} is older than {oldest} (torch 2.9); "
+            "training takes about twice as long.",
+            stacklevel=3,
+        )
         return False
     try:
         from sadgs_ns.kernels.probe import probe
