@@ -74,4 +74,4 @@ def test_the_loop_of_the_readme_runs_and_splits(monkeypatch: pytest.MonkeyPatch)
     assert len({len(parameter) for parameter in params.values()}) == 1
     assert len(params["means"]) > 2 * START, "a fine checker under coarse Gaussians must be split"
     assert all(parameter.isfinite().all() for parameter in params.values())
-    assert set(names["state"]) == {"scene_scale"}, "the statistics end with densification"
+    assert set(names["state"]) == {"scene_scale", "structure_steps"}, "the statistics end with densification"
