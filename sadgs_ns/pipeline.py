@@ -117,7 +117,7 @@ class SadgsPipeline(VanillaPipeline):
             held_out = self.datamanager.eval_dataset.cameras
             cached = float(pixels.sum() + (held_out.height * held_out.width).sum())
             needed += 3 * (1 if config.cache_images_type == "uint8" else 4) * cached
-            needed += 3 * torch.finfo(torch.float16).bits / 8 * float(pixels.sum())  # S̄
+            needed += 3 * float(pixels.sum())  # codes of S̄
         return needed
 
     @property
