@@ -38,7 +38,7 @@ from sadgs_ns.structure_tensor import (
 )
 
 _PIXELS_PER_BATCH = 4_000_000
-"""Structure tensors are computed for as many images at once as fit this; each pixel takes about 300 bytes."""
+"""Structure tensors are computed for as many images at once as fit this; each pixel takes at most about 300 bytes."""
 _NAMED_STEPS = 5
 """Iterations of which a report of what was not finite names the images."""
 
