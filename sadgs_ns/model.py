@@ -82,7 +82,7 @@ class SadgsModelConfig(SplatfactoModelConfig):
     l2_lambda: float = 2.0
     """Weight of the squared error that is added to the loss for faster convergence."""
     fused: bool = True
-    """Train with Triton kernels where they run (CUDA): tile lists, harmonics, loss, η and Adam.
+    """Train with Triton kernels where they run (CUDA): tile lists, compositing, harmonics, loss, S̄, η and Adam.
     Without, torch and gsplat compute the same, more slowly."""
     bounding_box_points: bool = True
     """Also start from points on the faces of the SfM points' bounding box."""
@@ -282,7 +282,7 @@ class SadgsModel(SplatfactoModel):
             width: px.
             height: px.
             cam_indices: The views' indices among the training cameras, C of them.
-            structure_tensors: S̄ of the views [C, H, W, 3], or None where η is not observed.
+            structure_tensors: S̄ of the views, or codes of it, [C, H, W, 3]; None where η is not observed.
 
         Returns:
             `rgb` [C, H, W, 3], not clamped, and `background` [3].

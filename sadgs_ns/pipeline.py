@@ -38,7 +38,7 @@ from sadgs_ns.structure_tensor import (
 )
 
 _PIXELS_PER_BATCH = 4_000_000
-"""Structure tensors are computed for as many images at once as fit this; each pixel takes about 300 bytes."""
+"""Structure tensors are computed for as many images at once as fit this; each pixel takes at most about 300 bytes."""
 _NAMED_STEPS = 5
 """Iterations of which a report of what was not finite names the images."""
 
@@ -117,7 +117,7 @@ class SadgsPipeline(VanillaPipeline):
             held_out = self.datamanager.eval_dataset.cameras
             cached = float(pixels.sum() + (held_out.height * held_out.width).sum())
             needed += 3 * (1 if config.cache_images_type == "uint8" else 4) * cached
-            needed += 3 * torch.finfo(torch.float16).bits / 8 * float(pixels.sum())  # S̄
+            needed += 3 * float(pixels.sum())  # codes of S̄
         return needed
 
     @property

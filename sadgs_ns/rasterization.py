@@ -51,8 +51,8 @@ def rasterize(
         rasterize_mode: "antialiased" compensates opacities for the screen-space blur.
         near_plane: Gaussians whose centre is nearer are culled, in world units.
         far_plane: Gaussians whose centre is farther are culled, in world units.
-        fused: On CUDA, list in each tile only the Gaussians that reach it, with Triton kernels; what is drawn is the
-            same. Assumes rigid viewmats.
+        fused: On CUDA, list in each tile only the Gaussians that reach it, and differentiate the compositing of three
+            channels, with Triton kernels; what is drawn is the same. Assumes rigid viewmats.
 
     Returns:
         Colours [C, height, width, X] with X = D, 1 or D + 1 by `render_mode`, alphas [C, height, width, 1] in [0, 1],

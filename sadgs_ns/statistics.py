@@ -61,8 +61,8 @@ def observe(
     Args:
         statistics: As made by `empty_statistics`.
         params: `means` [N, 3], `quats` [N, 4], log `scales` [N, 3], logit `opacities` [N] or [N, 1].
-        info: gsplat's meta, unpacked, of C views of one size, plus `structure_tensors` [C, H, W, 3], `viewmats`
-            [C, 4, 4] and `Ks` [C, 3, 3].
+        info: gsplat's meta, unpacked, of C views of one size, plus `structure_tensors` (S̄, or its codes of
+            `storage.encode`) [C, H, W, 3], `viewmats` [C, 4, 4] and `Ks` [C, 3, 3].
         directional: Use η^(proj) (paper, eq. 7).
         min_opacity: Only Gaussians at least this opaque are observed.
         generator: Source of the jitter.

@@ -201,7 +201,8 @@ def multiscale_structure_tensor(
         raise ValueError(f"masks must be [B, H, W] = {tuple(images.shape[:3])}, got {tuple(masks.shape)}")
     image = images.permute(0, 3, 1, 2).contiguous()  # [B, C, H, W]; with channels-last strides cuDNN is slower
     image = image.to(torch.promote_types(image.dtype, torch.float32))
-    valid = torch.ones_like(image[:, :1]) if masks is None else masks[:, None].to(image)  # [B, 1, H, W]
+    # [B, 1, H, W]; a transposed mask would stay so, and hand its strides on to whatever it is combined with.
+    valid = torch.ones_like(image[:, :1]) if masks is None else masks[:, None].to(image).contiguous()
     # Without a mask the weights of all images are the same: keep one.
     weight = valid[:1] if masks is None else valid
     image = torch.where(valid > 0, image, 0.0)  # a product would let NaN through

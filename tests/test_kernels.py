@@ -95,13 +95,15 @@ def test_convolution_equals_torchs_in_float64(shape, axis):
     torch.testing.assert_close(actual.cpu().double(), expected, atol=1e-5, rtol=1e-5)
 
 
-@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("masked", [False, True, "transposed"])
 @pytest.mark.parametrize("energy_blur", [0.0, 2.0])
 def test_structure_tensors_are_the_same_with_the_kernels(monkeypatch, masked, energy_blur):
     images = torch.rand((2, 9, 14, 3), generator=torch.Generator().manual_seed(0)).to(DEVICE)
     masks = torch.ones((2, 9, 14), dtype=torch.bool, device=DEVICE) if masked else None
     if masks is not None:
         masks[0, 3:6, 5:7] = False
+        if masked == "transposed":  # the same in memory of another order
+            masks = masks.mT.contiguous().mT
     options = {"num_levels": 2, "energy_blur": energy_blur, "gamma": 2.5}
     expected = multiscale_structure_tensor(images.double(), masks, **options)
     monkeypatch.setattr(kernels, "available", lambda device: True)

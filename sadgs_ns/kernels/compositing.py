@@ -225,7 +225,7 @@ def _composite_backward(
         v_b = mean_x * (mean_y * s - sy) - mean_y * sx + sxy
         v_c = 0.5 * (mean_y * (mean_y * s - 2 * sy) + syy)
         v_opacity = -s / tl.maximum(opacity, 1 / 255)
-        at_row = gradients + (g * STRIDE)[:, None] + tl.arange(0, 4)[None, :]
+        at_row = gradients + (g.to(tl.int64) * STRIDE)[:, None] + tl.arange(0, 4)[None, :]
         exists = (position >= start)[:, None]
         tl.atomic_add(at_row, _join4(v_x + nan, v_y + nan, v_a + nan, v_b + nan), exists, sem="relaxed")
         tl.atomic_add(at_row + 4, _join4(v_c + nan, v_opacity + nan, r + nan, g_ + nan), exists, sem="relaxed")

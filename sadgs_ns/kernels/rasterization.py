@@ -1,4 +1,4 @@
-"""gsplat's `rasterization`, assembled from its own parts with exact tile lists in between."""
+"""gsplat's `rasterization`, assembled from its own parts with exact tile lists and our backward pass in between."""
 
 from __future__ import annotations
 
