@@ -59,7 +59,7 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     views_per_iteration: int = 1
     """Training views rendered for one optimizer step; the loss is their mean. The paper uses 1 outdoors, 2 indoors."""
     frequency_constant: float = FREQUENCY_CONSTANT
-    """c of ω_l = c / σ_l in 1/px: the larger, the shorter every wavelength and the more is split."""
+    """c of ω_l = c / σ_l in 1/px, at most 4: the larger, the shorter every wavelength and the more is split."""
     noise_floor: float = NOISE_FLOOR
     """Amplitude, relative to an image's contrast, under which its structure counts as noise."""
     energy_blur: float = ENERGY_BLUR
