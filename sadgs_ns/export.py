@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -13,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sadgs_ns.atomic import atomic_path
 from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.frame import TRANSFORMS_NAME, Similarity, from_data
 
@@ -23,33 +22,6 @@ _ROWS = 1 << 16
 _PREFIX = "_model.gauss_params."
 _DEGREE_0 = 0.5 / np.sqrt(np.pi)
 """The spherical harmonic of degree 0."""
-
-
-@contextmanager
-def atomic_path(path: Path, beside: Path | None = None) -> Iterator[Path]:
-    """A temporary path that becomes `path` when the block ends well, and vanishes when it raises.
-
-    It is named after `beside` and the same each time, so that the next write replaces what a killed one left.
-
-    Args:
-        path: Made with its folder, or replaced.
-        beside: A neighbour of the temporary path: `path` itself, unless its folder takes no other files.
-
-    Raises:
-        WriteError: If the disk is full or the folder cannot be written.
-    """
-    path = Path(path)
-    neighbour = path if beside is None else beside
-    partial = neighbour.with_name(f".{neighbour.stem}.partial{neighbour.suffix}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield partial
-        os.replace(partial, path)
-    except OSError as error:
-        raise WriteError(path, error) from error
-    finally:
-        with suppress(OSError):  # where even the folder could not be made
-            partial.unlink(missing_ok=True)
 
 
 def write_ply(

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from sadgs_ns.atomic import atomic_path
 from sadgs_ns.eta import WAVELENGTH_EPSILON, wavelength
-from sadgs_ns.export import atomic_path
 from sadgs_ns.rasterization import rasterize
 from sadgs_ns.structure_tensor import FREQUENCY_CONSTANT, NUM_LEVELS, SCALE_STEP
 
