@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -117,6 +118,47 @@ def test_what_is_no_run_of_sadgs_is_refused(run: Path, tmp_path: Path, capsys: p
     missing.write_bytes(run.read_bytes())
     assert "holds no checkpoint yet" in wrong([str(missing)], capsys)
     assert "no checkpoint of step 7: give --load-step one of 8, 16" in wrong([str(run), "--load-step", "7"], capsys)
+
+
+def test_a_run_and_its_capture_may_have_moved(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    config = yaml.load(run.read_text(), Loader=yaml.Loader)
+    scene = Path(config.pipeline.datamanager.dataparser.data)
+    shutil.copytree(run.parent, tmp_path / "moved")
+    config.pipeline.datamanager.data = config.pipeline.datamanager.dataparser.data = Path(
+        "scene"
+    )  # as trained elsewhere
+    (tmp_path / "moved" / "config.yml").write_text(yaml.dump(config))
+    monkeypatch.chdir(tmp_path)
+    assert "scene does not exist: give --data" in wrong(["moved"], capsys)
+    assert inspection.main(["moved", "--data", str(scene)]) == 0
+    assert len(list(Path("moved/inspect").iterdir())) == 6
+
+
+def test_checkpoints_that_cannot_be_used_are_named_with_options_that_there_are(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    shutil.copytree(run.parent, tmp_path / "run")
+    folder = tmp_path / "run" / "nerfstudio_models"
+    latest = max(folder.iterdir())
+    state = torch.load(latest, weights_only=True)
+    means = state["pipeline"].pop("_model.gauss_params.means")
+    torch.save(state, latest)
+    remedy = "give another with --load-step, or another run of sadgs."
+    line = wrong([str(tmp_path / "run")], capsys)
+    assert f"{latest} does not fit its run: The checkpoint has no means" in line and line.endswith(remedy)
+    state["pipeline"] |= {"_model.gauss_params.means": means[:-1]}
+    state["pipeline"] |= {"_model.camera_optimizer.pose_adjustment": torch.zeros(1, 6)}
+    torch.save(state, latest)
+    config = yaml.load(run.read_text(), Loader=yaml.Loader)
+    config.pipeline.model.camera_optimizer.mode = "SO3xR3"
+    (tmp_path / "run" / "config.yml").write_text(yaml.dump(config))
+    line = wrong([str(tmp_path / "run")], capsys)
+    assert f"{latest} is not of this version of sadgs (" in line and line.endswith(remedy)
+    (folder / "step-000000008.ckpt").write_bytes(b"half")
+    line = wrong([str(tmp_path / "run"), "--load-step", "8"], capsys)
+    assert "step-000000008.ckpt is cut off, damaged" in line and line.endswith(remedy)
 
 
 # --- what is drawn ---
