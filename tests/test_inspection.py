@@ -323,7 +323,7 @@ def test_where_no_gaussian_is_opaque_enough_the_panel_says_that_none_was_observe
     statistics = panel.statistics()
     assert statistics is not None and not (statistics["n_total"] > 0).any()
     picture = panel.picture("η", a_camera(pipeline), torch.zeros(HEIGHT, WIDTH, 3))
-    assert (picture == 128).all(), "grey"
+    assert (picture == 0).all(), "black"
 
 
 def test_sliders_reach_the_strategy_and_the_plan(panel: StructurePanel):
