@@ -285,6 +285,19 @@ def test_every_choice_is_a_picture_for_the_viewer_and_nothing_for_evaluation(pan
     assert not [pair for pair in pairs if torch.equal(shown[pair[0]], shown[pair[1]])]
 
 
+@pytest.mark.parametrize("choice", ["wavelength of the nearest photo", "ellipses of the nearest photo", "η"])
+def test_drawing_which_the_viewer_may_break_off_loads_no_photo(choice: str, panel: StructurePanel):
+    pipeline = pipeline_of(panel)
+    panel.choice.value = choice  # as the viewer sets it, before it calls the panel
+    outputs = in_the_viewer(lambda: pipeline.model.get_outputs_for_camera(a_camera(pipeline)))
+    assert torch.equal(outputs[OUTPUT], outputs["rgb"])
+    assert "cached_train" not in vars(pipeline.datamanager)
+    panel.choose()
+    assert "cached_train" in vars(pipeline.datamanager) and "structure_tensors" in vars(pipeline)
+    outputs = in_the_viewer(lambda: pipeline.model.get_outputs_for_camera(a_camera(pipeline)))
+    assert not torch.equal(outputs[OUTPUT], outputs["rgb"])
+
+
 @torch.no_grad()
 def test_the_pictures_survive_tiny_windows_and_crop_boxes(panel: StructurePanel):
     pipeline = pipeline_of(panel)
