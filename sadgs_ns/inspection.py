@@ -190,10 +190,8 @@ def _try(
 
 def structure_step(model: SadgsModel, statistics: dict[str, Tensor]) -> Step:
     """What a structure-aware step would split, without its pruning."""
-    strategy = model.strategy
-    counts, fits = strategy.split_plan(statistics, strategy.max_gaussians - model.num_points)
-    counts = torch.where(fits[:, None], counts, 1)
-    return _try(model, {}, lambda p, o, s: grid_split(p, o, s, counts, strategy.split_extent))
+    counts, extent = model.strategy.children_now(statistics), model.strategy.split_extent
+    return _try(model, {}, lambda p, o, s: grid_split(p, o, s, counts, extent))
 
 
 def conventional_step(model: SadgsModel, gradients: dict[str, Tensor]) -> Step:
@@ -220,8 +218,7 @@ def view_panels(pipeline: SadgsPipeline, view: View, statistics: dict[str, Tenso
     """The pictures of one view, by name."""
     model, constant = pipeline.model, pipeline.config.frequency_constant
     params, options = dict(model.gauss_params.items()), {"rasterize_mode": model.config.rasterize_mode}
-    counts, fits = model.strategy.split_plan(statistics, model.strategy.max_gaussians - model.num_points)
-    counts = torch.where(fits[:, None], counts, 1)
+    counts = model.strategy.children_now(statistics)
     is_low = model.strategy.consistently_low(statistics)
     height, width = view.photo.shape[:2]
     enlarge = max(MIN_SIDE / max(height, width), 1.0)

@@ -284,9 +284,8 @@ class StructurePanel(torch.nn.Module):
             text = "No observations yet: press “Observe all training views”, or wait for some iterations."
             return pictures.annotate(np.zeros((height, width, 3), np.uint8), text)
         strategy = model.strategy
-        counts, fits = strategy.split_plan(statistics, strategy.max_gaussians - model.num_points)
         kept = {name: statistics[name] for name in ("eta_max", "n_total")}
-        kept |= {"children": torch.where(fits[:, None], counts, 1), "low": strategy.consistently_low(statistics)}
+        kept |= {"children": strategy.children_now(statistics), "low": strategy.consistently_low(statistics)}
         rows = model.cropped({**model.gauss_params, **kept})
         viewmat = viewmats_from_camera_to_world(camera.camera_to_worlds)[0].to(model.device)
         view = viewmat, camera.get_intrinsics_matrices()[0].to(model.device), width, height
@@ -297,7 +296,7 @@ class StructurePanel(torch.nn.Module):
             text = f"largest η: over 1 violates, under 0.1 is low ({seen})"
         elif choice == CHILDREN_OF:
             drawn, scale = pictures.children_map(rows, rows["children"], *view, **options), CHILDREN
-            split = int((counts[fits] > 1).any(dim=1).sum())
+            split = int((kept["children"] > 1).any(dim=1).sum())
             text = f"children at a structure step now: {split:,} Gaussians would split ({seen})"
         else:
             drawn, scale = pictures.share_map(rows, rows["low"], *view, **options), LOW
