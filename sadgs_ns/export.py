@@ -22,6 +22,8 @@ _ROWS = 1 << 16
 _PREFIX = "_model.gauss_params."
 _DEGREE_0 = 0.5 / np.sqrt(np.pi)
 """The spherical harmonic of degree 0."""
+_REMEDY = "give another checkpoint step-*.ckpt of a run of sadgs or splatfacto"
+"""For a checkpoint that cannot be used."""
 
 
 def write_ply(
@@ -156,7 +158,7 @@ def export(run: Path, output: Path, frame: Frame = "nerfstudio") -> int:
     try:
         return write_ply(output, **params, similarity=similarity)
     except ValueError as error:
-        raise InputError(f"{checkpoint} holds no Gaussians that can be exported: {error}.") from error
+        raise InputError(f"{checkpoint} holds no Gaussians that can be exported ({error}): {_REMEDY}.") from error
 
 
 def _checkpoint_of(run: Path) -> Path:
@@ -173,23 +175,22 @@ def _checkpoint_of(run: Path) -> Path:
 
 
 def _read(checkpoint: Path, latest: bool) -> dict[str, Tensor]:
-    """The Gaussians' parameters, mapped from the file: what is not written is not read either."""
+    """The Gaussians' parameters, mapped from the file: what is not written takes no memory."""
     from sadgs_ns import checkpoints  # here, since they import nerfstudio
 
-    remedy = "give another checkpoint step-*.ckpt of a run of sadgs or splatfacto"
     if latest:
         checkpoints.checkpoint_path(
             checkpoint.parent, load_step=None, load_checkpoint=None
         )  # refuses what lies among them
-        checkpoint, state = checkpoints.read_or_earlier(checkpoint, remedy, mmap=True)
+        checkpoint, state = checkpoints.read_or_earlier(checkpoint, _REMEDY, mmap=True)
     else:
-        state = checkpoints.read(checkpoint, remedy, mmap=True)
+        state = checkpoints.read(checkpoint, _REMEDY, mmap=True)
     loaded = state["pipeline"] if isinstance(state["pipeline"], dict) else {}
     params = {}
     for name in ("means", "scales", "quats", "opacities", "features_dc", "features_rest"):
         value = loaded.get(_PREFIX + name)
         if not isinstance(value, Tensor) or value.dim() < 2:
-            raise InputError(f"{checkpoint} holds no {name} of Gaussians, so another method made it: {remedy}.")
+            raise InputError(f"{checkpoint} holds no {name} of Gaussians, so another method made it: {_REMEDY}.")
         params[name] = value
     return params
 
