@@ -85,9 +85,11 @@ def _check_cuda() -> Iterator[Finding]:
         yield Finding("note", "Triton compiles its kernels here.")
     else:
         why = "; ".join(str(warning.message) for warning in caught) or "Triton is not installed or failed before"
+        needed = ".".join(map(str, kernels.OLDEST_TRITON))
         yield Finding(
             "warning",
-            f"Training will take twice as long ({why}): Triton needs a C compiler and Python's headers.",
+            f"Training will take twice as long ({why}): install a torch whose Triton is {needed} or newer, a C "
+            "compiler and Python's headers.",
         )
     try:
         backend = importlib.import_module("gsplat.cuda._backend")

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -13,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sadgs_ns.atomic import atomic_path
 from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.frame import TRANSFORMS_NAME, Similarity, from_data
 
@@ -23,33 +22,8 @@ _ROWS = 1 << 16
 _PREFIX = "_model.gauss_params."
 _DEGREE_0 = 0.5 / np.sqrt(np.pi)
 """The spherical harmonic of degree 0."""
-
-
-@contextmanager
-def atomic_path(path: Path, beside: Path | None = None) -> Iterator[Path]:
-    """A temporary path that becomes `path` when the block ends well, and vanishes when it raises.
-
-    It is named after `beside` and the same each time, so that the next write replaces what a killed one left.
-
-    Args:
-        path: Made with its folder, or replaced.
-        beside: A neighbour of the temporary path: `path` itself, unless its folder takes no other files.
-
-    Raises:
-        WriteError: If the disk is full or the folder cannot be written.
-    """
-    path = Path(path)
-    neighbour = path if beside is None else beside
-    partial = neighbour.with_name(f".{neighbour.stem}.partial{neighbour.suffix}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield partial
-        os.replace(partial, path)
-    except OSError as error:
-        raise WriteError(path, error) from error
-    finally:
-        with suppress(OSError):  # where even the folder could not be made
-            partial.unlink(missing_ok=True)
+_REMEDY = "give another checkpoint step-*.ckpt of a run of sadgs or splatfacto"
+"""For a checkpoint that cannot be used."""
 
 
 def write_ply(
@@ -184,7 +158,7 @@ def export(run: Path, output: Path, frame: Frame = "nerfstudio") -> int:
     try:
         return write_ply(output, **params, similarity=similarity)
     except ValueError as error:
-        raise InputError(f"{checkpoint} holds no Gaussians that can be exported: {error}.") from error
+        raise InputError(f"{checkpoint} holds no Gaussians that can be exported ({error}): {_REMEDY}.") from error
 
 
 def _checkpoint_of(run: Path) -> Path:
@@ -201,23 +175,22 @@ def _checkpoint_of(run: Path) -> Path:
 
 
 def _read(checkpoint: Path, latest: bool) -> dict[str, Tensor]:
-    """The Gaussians' parameters, mapped from the file: what is not written is not read either."""
+    """The Gaussians' parameters, mapped from the file: what is not written takes no memory."""
     from sadgs_ns import checkpoints  # here, since they import nerfstudio
 
-    remedy = "give another checkpoint step-*.ckpt of a run of sadgs or splatfacto"
     if latest:
         checkpoints.checkpoint_path(
             checkpoint.parent, load_step=None, load_checkpoint=None
         )  # refuses what lies among them
-        checkpoint, state = checkpoints.read_or_earlier(checkpoint, remedy, mmap=True)
+        checkpoint, state = checkpoints.read_or_earlier(checkpoint, _REMEDY, mmap=True)
     else:
-        state = checkpoints.read(checkpoint, remedy, mmap=True)
+        state = checkpoints.read(checkpoint, _REMEDY, mmap=True)
     loaded = state["pipeline"] if isinstance(state["pipeline"], dict) else {}
     params = {}
     for name in ("means", "scales", "quats", "opacities", "features_dc", "features_rest"):
         value = loaded.get(_PREFIX + name)
         if not isinstance(value, Tensor) or value.dim() < 2:
-            raise InputError(f"{checkpoint} holds no {name} of Gaussians, so another method made it: {remedy}.")
+            raise InputError(f"{checkpoint} holds no {name} of Gaussians, so another method made it: {_REMEDY}.")
         params[name] = value
     return params
 

@@ -39,6 +39,8 @@ MIN_SIDE = 900
 """Least longer side of a picture with ellipses, px."""
 MIN_RENDER_SIDE = 640
 """Least longer side of a rendering in random colours, px: on smaller ones Gaussians could not be told apart."""
+_REMEDY = "give another with --load-step, or another run of sadgs"
+"""For a checkpoint that cannot be used."""
 
 
 @dataclass(frozen=True)
@@ -62,14 +64,15 @@ class View:
         return self.viewmat, self.K, width, height
 
 
-def load_run(path: Path, load_step: int | None = None) -> tuple[SadgsPipeline, int]:
+def load_run(path: Path, load_step: int | None = None, data: Path | None = None) -> tuple[SadgsPipeline, int]:
     """Load a finished or running run from its `config.yml`, as nerfstudio's `eval_setup` does.
 
     The file is read with PyYAML's full loader, which calls what it names. Checkpoints are looked for beside it.
 
     Args:
-        path: The run's config.yml.
+        path: The run's config.yml, or its folder.
         load_step: Of the checkpoint; None takes the latest that can be read.
+        data: The capture; None is where it was in training.
 
     Returns:
         The pipeline in evaluation mode, and the iterations that it was trained.
@@ -96,14 +99,21 @@ def load_run(path: Path, load_step: int | None = None) -> tuple[SadgsPipeline, i
         )
     checkpoint = checkpoints.checkpoint_path(folder, load_step, None)
     assert checkpoint is not None
-    _, state = checkpoints.read_or_earlier(checkpoint) if load_step is None else (None, checkpoints.read(checkpoint))
+    if load_step is None:
+        checkpoint, state = checkpoints.read_or_earlier(checkpoint, _REMEDY)
+    else:
+        state = checkpoints.read(checkpoint, _REMEDY)
+    if data is not None:
+        config.pipeline.datamanager.data = data
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     pipeline: SadgsPipeline = config.pipeline.setup(device=device, test_mode="test")
     pipeline.eval()
     try:
         pipeline.load_pipeline(state["pipeline"], state["step"])
-    except KeyError as error:
-        raise InputError(f"{checkpoint} is not of this version of sadgs ({reason(error)}): train again.") from error
+    except InputError as error:
+        raise InputError(f"{checkpoint} does not fit its run: {str(error).rstrip('.')}; {_REMEDY}.") from error
+    except (KeyError, RuntimeError) as error:  # what lacks, or has another size
+        raise InputError(f"{checkpoint} is not of this version of sadgs ({reason(error)}): {_REMEDY}.") from error
     pipeline.model.strategy.fit_to_run(config.max_num_iterations)
     return pipeline, state["step"] + 1
 
@@ -180,10 +190,8 @@ def _try(
 
 def structure_step(model: SadgsModel, statistics: dict[str, Tensor]) -> Step:
     """What a structure-aware step would split, without its pruning."""
-    strategy = model.strategy
-    counts, fits = strategy.split_plan(statistics, strategy.max_gaussians - model.num_points)
-    counts = torch.where(fits[:, None], counts, 1)
-    return _try(model, {}, lambda p, o, s: grid_split(p, o, s, counts, strategy.split_extent))
+    counts, extent = model.strategy.children_now(statistics), model.strategy.split_extent
+    return _try(model, {}, lambda p, o, s: grid_split(p, o, s, counts, extent))
 
 
 def conventional_step(model: SadgsModel, gradients: dict[str, Tensor]) -> Step:
@@ -210,8 +218,7 @@ def view_panels(pipeline: SadgsPipeline, view: View, statistics: dict[str, Tenso
     """The pictures of one view, by name."""
     model, constant = pipeline.model, pipeline.config.frequency_constant
     params, options = dict(model.gauss_params.items()), {"rasterize_mode": model.config.rasterize_mode}
-    counts, fits = model.strategy.split_plan(statistics, model.strategy.max_gaussians - model.num_points)
-    counts = torch.where(fits[:, None], counts, 1)
+    counts = model.strategy.children_now(statistics)
     is_low = model.strategy.consistently_low(statistics)
     height, width = view.photo.shape[:2]
     enlarge = max(MIN_SIDE / max(height, width), 1.0)
@@ -274,16 +281,18 @@ def inspect_run(
     split: Literal["train", "eval"] = "train",
     output: Path | None = None,
     load_step: int | None = None,
+    data: Path | None = None,
     console: Console | None = None,
 ) -> list[Path]:
     """Write all pictures of one view of a run.
 
     Args:
-        path: The run's config.yml.
+        path: The run's config.yml, or its folder.
         index: The view's number in its split.
         split: "train" or "eval".
         output: Folder, made if need be; None is `inspect` beside the config.
         load_step: Step of the checkpoint; None takes the latest.
+        data: The capture; None is where it was in training.
         console: For progress and numbers.
 
     Returns:
@@ -298,7 +307,7 @@ def inspect_run(
     def progress(what: str) -> Callable[[range], Any]:
         return lambda views: track(views, what, console=console, transient=True)
 
-    pipeline, iterations = load_run(path, load_step)
+    pipeline, iterations = load_run(path, load_step, data)
     view = get_view(pipeline, index, split)
     statistics = pipeline.observe_training_views(progress("η in all training views"))
     gradients = screen_gradients(pipeline, progress("gradients of all training views"))
@@ -329,18 +338,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prog="sadgs-inspect",
         description="Pictures of a view of a run: the photo's structure tensor as ellipses and local wavelength, η of "
         "the Gaussians, how many children they would get, which are low, and one densification step, conventional "
-        "against structure-aware, in random colours.",
+        "against structure-aware, in random colours. A config.yml is a program, which this runs: give only those "
+        "you trust.",
     )
-    parser.add_argument("config", type=Path, help="config.yml of a finished or running run of sadgs")
+    parser.add_argument("config", type=Path, help="config.yml of a finished or running run of sadgs, or its folder")
     parser.add_argument("--view", type=int, default=0, help="number of the view, from 0 (default %(default)s)")
     parser.add_argument("--split", choices=["train", "eval"], default="train", help="(default %(default)s)")
     parser.add_argument("--output", type=Path, help="folder for the PNGs (default: inspect beside the config)")
     parser.add_argument("--load-step", type=int, help="step of the checkpoint (default: the latest)")
+    parser.add_argument("--data", type=Path, help="folder of the capture (default: where it was in training)")
     given = parser.parse_args(arguments)
     # nerfstudio and torch warn about their own internals.
     warnings.filterwarnings("ignore", module=r"(torch|nerfstudio|torchmetrics)\b")
     try:
-        written = inspect_run(given.config, given.view, given.split, given.output, given.load_step)
+        written = inspect_run(given.config, given.view, given.split, given.output, given.load_step, given.data)
     except (ValueError, OSError) as error:
         print(f"sadgs-inspect: {error}", file=sys.stderr)
         return 2

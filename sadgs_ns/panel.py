@@ -46,6 +46,8 @@ OFF, ETA_OF, CHILDREN_OF, LOW_OF = "off", "η", "children", "low"
 PERIOD_HERE, ELLIPSES_HERE = "wavelength of this rendering", "ellipses of this rendering"
 PERIOD_NEAR, ELLIPSES_NEAR = "wavelength of the nearest photo", "ellipses of the nearest photo"
 CHOICES = [OFF, ETA_OF, CHILDREN_OF, LOW_OF, PERIOD_HERE, ELLIPSES_HERE, PERIOD_NEAR, ELLIPSES_NEAR]
+OF_PHOTOS = (PERIOD_NEAR, ELLIPSES_NEAR)
+"""Choices that need the training photos."""
 OF_STATISTICS = (ETA_OF, CHILDREN_OF, LOW_OF)
 """Choices that need observations of the training views."""
 RANGES = {"tau_split": (0.0, 1.0), "split_exponent": (0.1, 1.0), "max_gaussians": (1, 100_000_000)}
@@ -133,6 +135,7 @@ class StructurePanel(torch.nn.Module):
         self._reference = weakref.ref(pipeline)  # as a submodule the pipeline would contain itself
         self._observed: dict[str, Tensor] = {}
         self._refreshed = 0.0
+        self._shown = OFF
         strategy = pipeline.model.strategy
         self.choice = ViewerDropdown(
             "Show", OFF, CHOICES, cb_hook=lambda _: self.choose(), hint="What the output type “structure” shows"
@@ -204,10 +207,17 @@ class StructurePanel(torch.nn.Module):
         self._observed = self._pipeline.observe_training_views()
 
     def choose(self) -> None:
-        """After a choice: make the observations that it needs, and have the viewer show it."""
+        """After a choice: make what it needs, and have the viewer show it.
+
+        Here and not when it is drawn, since the viewer breaks off drawing at any line when its camera moves: photos
+        that are undistorted a second time would be wrong.
+        """
         chosen = self.choice.value
         if chosen in OF_STATISTICS and self.statistics() is None:
             self.observe_now()
+        elif chosen in OF_PHOTOS:
+            _ = self._pipeline.structure_tensors
+        self._shown = chosen
         viewer = getattr(self.viewer, "viewer", None)  # set when the viewer was made
         if viewer is not None:
             output = viewer.control_panel._output_render  # nerfstudio 1.1 has no public way
@@ -229,9 +239,9 @@ class StructurePanel(torch.nn.Module):
         """
         if not isinstance(threading.current_thread(), RenderStateMachine):
             return {}
-        if self.choice.value == OFF:
+        if self._shown == OFF:
             return {OUTPUT: rendered["rgb"]}
-        picture = self.picture(self.choice.value, camera, rendered["rgb"])
+        picture = self.picture(self._shown, camera, rendered["rgb"])
         return {OUTPUT: torch.from_numpy(picture).to(rendered["rgb"]) / 255}
 
     @torch.no_grad()
@@ -274,9 +284,8 @@ class StructurePanel(torch.nn.Module):
             text = "No observations yet: press “Observe all training views”, or wait for some iterations."
             return pictures.annotate(np.zeros((height, width, 3), np.uint8), text)
         strategy = model.strategy
-        counts, fits = strategy.split_plan(statistics, strategy.max_gaussians - model.num_points)
         kept = {name: statistics[name] for name in ("eta_max", "n_total")}
-        kept |= {"children": torch.where(fits[:, None], counts, 1), "low": strategy.consistently_low(statistics)}
+        kept |= {"children": strategy.children_now(statistics), "low": strategy.consistently_low(statistics)}
         rows = model.cropped({**model.gauss_params, **kept})
         viewmat = viewmats_from_camera_to_world(camera.camera_to_worlds)[0].to(model.device)
         view = viewmat, camera.get_intrinsics_matrices()[0].to(model.device), width, height
@@ -287,7 +296,7 @@ class StructurePanel(torch.nn.Module):
             text = f"largest η: over 1 violates, under 0.1 is low ({seen})"
         elif choice == CHILDREN_OF:
             drawn, scale = pictures.children_map(rows, rows["children"], *view, **options), CHILDREN
-            split = int((counts[fits] > 1).any(dim=1).sum())
+            split = int((kept["children"] > 1).any(dim=1).sum())
             text = f"children at a structure step now: {split:,} Gaussians would split ({seen})"
         else:
             drawn, scale = pictures.share_map(rows, rows["low"], *view, **options), LOW

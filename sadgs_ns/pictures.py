@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from sadgs_ns.atomic import atomic_path
 from sadgs_ns.eta import WAVELENGTH_EPSILON, wavelength
-from sadgs_ns.export import atomic_path
 from sadgs_ns.rasterization import rasterize
 from sadgs_ns.structure_tensor import FREQUENCY_CONSTANT, NUM_LEVELS, SCALE_STEP
 
@@ -36,8 +36,9 @@ MIN_COVER = 0.05
 """Share of a pixel that Gaussians with a value must make up, lest it count as empty."""
 ELLIPSES_ACROSS = 28
 """Ellipses along an image's shorter side."""
-NOTHING = "#808080"
-"""Colour of pixels without a value."""
+NOTHING = "black"
+"""Colour of pixels without a value: no scale has it. Grey is in the middle of cividis, and, to the colour-blind, of
+viridis."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class Scale:
         return matplotlib.colormaps[self.colors].with_extremes(bad=NOTHING)
 
     def __call__(self, values: Tensor) -> Picture:
-        """Colour a map; NaN is grey. [H, W] → [H, W, 3]"""
+        """Colour a map; NaN is black. [H, W] → [H, W, 3]"""
         shown = self.norm(np.ma.masked_invalid(values.detach().float().cpu().numpy()))
         return self.colormap(shown, bytes=True)[..., :3]  # type: ignore[return-value]
 

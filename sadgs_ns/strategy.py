@@ -258,6 +258,11 @@ class StructureAwareStrategy(Strategy):
         worst = torch.where(violates, statistics["eta_max"], 0.0).amax(dim=1)  # [N]
         return counts, limit_growth(counts.prod(dim=1) - 1, worst, budget)
 
+    def children_now(self, statistics: Mapping[str, Tensor]) -> Tensor:
+        """n per axis that a structure step would split by now, 1 where whole or over the cap. int64 [N, 3]"""
+        counts, fits = self.split_plan(statistics, self.max_gaussians - len(statistics["n_total"]))
+        return torch.where(fits[:, None], counts, 1)
+
     def _structure_step(self, params: Any, optimizers: Any, state: Any, iteration: int) -> None:
         opacities = self._opacities(params)
         is_low = self.consistently_low(state)

@@ -20,8 +20,8 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from sadgs_ns import checkpoints
+from sadgs_ns.atomic import atomic_path
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
-from sadgs_ns.export import atomic_path
 from sadgs_ns.interrupts import Interrupted, Interrupts, resume_command
 from sadgs_ns.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
 from sadgs_ns.pipeline import SadgsPipeline, SadgsPipelineConfig

@@ -16,6 +16,7 @@ import torch
 from PIL import Image
 from plyfile import PlyData
 
+from sadgs_ns.atomic import atomic_path
 from sadgs_ns.demo import scene as demo_scene
 from sadgs_ns.demo.scene import (
     EVAL_INTERVAL,
@@ -31,7 +32,7 @@ from sadgs_ns.demo.scene import (
     room_surfaces,
     write_scene,
 )
-from sadgs_ns.export import atomic_path, write_ply
+from sadgs_ns.export import write_ply
 
 WIDTH, HEIGHT, VIEWS = 48, 36, 9
 

@@ -114,6 +114,7 @@ def test_kernels_that_do_not_compile_say_why(cuda: SimpleNamespace):
     cuda.compiles, cuda.backend = False, SimpleNamespace(_C=None)
     severity, sentence = about("Triton")
     assert severity == "warning" and "(Triton's kernels do not run here: no C compiler): " in sentence
+    assert sentence.endswith("install a torch whose Triton is 3.5 or newer, a C compiler and Python's headers.")
     severity, sentence = about("gsplat")
     assert severity == "error" and "(neither prebuilt nor compiled): install its wheel" in sentence
 

@@ -60,7 +60,7 @@ def test_without_texture_there_is_no_wavelength_and_no_ellipse():
     flat = torch.full((HEIGHT, WIDTH, 3), 0.5)
     period = pictures.texture_period(structure_tensor(flat))
     assert period.isnan().all()
-    assert (PERIOD(period) == PERIOD(period)[0, 0]).all() and PERIOD(period)[0, 0].tolist() == [128, 128, 128]
+    assert (PERIOD(period) == PERIOD(period)[0, 0]).all() and PERIOD(period)[0, 0].tolist() == [0, 0, 0]
     assert len(pictures.structure_ellipses(structure_tensor(flat)).centers) == 0
     drawn = pictures.draw_ellipses(pictures.to_picture(flat), structure_tensor(flat))
     assert len(np.unique(drawn)) == 1
@@ -105,6 +105,14 @@ def test_eta_is_colored_around_one():
     assert violet[2] > violet[1] and orange[0] > orange[2]
     assert white.min() > 240
     assert ETA(torch.tensor([[1e-9, 1e9]])).tolist() == ETA(torch.tensor([[ETA.low, ETA.high]])).tolist()
+
+
+@pytest.mark.parametrize("scale", [PERIOD, ETA, CHILDREN, LOW], ids=lambda scale: scale.colors)
+def test_nothing_has_another_color_than_every_value(scale: pictures.Scale):
+    values = scale.norm.inverse(np.linspace(0, 1, 200))
+    colors = scale(torch.from_numpy(values)[None])[0].astype(int)
+    nothing = scale(torch.full((1, 1), torch.nan))[0, 0].astype(int)
+    assert np.abs(colors - nothing).max(axis=1).min() > 64
 
 
 def test_each_gaussian_has_its_own_eta_and_unobserved_ones_none():

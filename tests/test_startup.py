@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
-LATER = ("pycolmap", "torchmetrics", "matplotlib.pyplot", "open3d", "jinja2.sandbox")
+LATER = ("sadgs_ns.export", "pycolmap", "torchmetrics", "matplotlib.pyplot", "open3d", "jinja2.sandbox")
 
 
 def test_the_methods_import_nothing_that_training_does_not_need():

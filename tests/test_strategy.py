@@ -205,3 +205,16 @@ def test_wrong_use_is_named():
     del params["quats"]
     with pytest.raises(ValueError, match="lack \\['quats'\\]"):
         strategy.check_sanity(params, adam(params))
+
+
+def test_what_would_be_split_now_keeps_to_the_cap():
+    statistics = empty_statistics(3, torch.device("cpu"))
+    statistics["n_total"][:] = 1
+    statistics["eta_max"][0, 0], statistics["eta_max"][1, 1] = 4.0, 9.0
+    statistics["n_high"][:] = (statistics["eta_max"] > 1).to(statistics["n_high"])
+    strategy = StructureAwareStrategy(max_gaussians=6)
+    assert strategy.children_now(statistics).tolist() == [[2, 1, 1], [1, 3, 1], [1, 1, 1]]
+    strategy.max_gaussians = 5  # room for two more: the larger η comes first
+    assert strategy.children_now(statistics).tolist() == [[1, 1, 1], [1, 3, 1], [1, 1, 1]]
+    strategy.max_gaussians = 2
+    assert (strategy.children_now(statistics) == 1).all()

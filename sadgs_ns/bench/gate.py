@@ -82,7 +82,7 @@ def _metrics(metrics: Any, where: str) -> dict[str, Metric]:
 
 def write(path: Path, baseline: Baseline) -> None:
     """Write a baseline; the file appears complete or not at all."""
-    from sadgs_ns.export import atomic_path
+    from sadgs_ns.atomic import atomic_path
 
     content = {
         row: {name: dataclasses.asdict(metric) for name, metric in metrics.items()} for row, metrics in baseline.items()

@@ -12,8 +12,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from sadgs_ns.atomic import atomic_path
 from sadgs_ns.bench.evaluate import View, render
-from sadgs_ns.export import atomic_path
 
 MAX_VIEWS = 4
 """Views of a scene that are kept."""

@@ -28,8 +28,9 @@ from rich.table import Table
 from torch import Tensor
 
 from sadgs_ns import pictures
+from sadgs_ns.atomic import atomic_path
 from sadgs_ns.demo.scene import EVAL_INTERVAL, SPARSE_FOLDER, SceneDescription, expected_wavelength_map, write_scene
-from sadgs_ns.export import atomic_path, write_ply
+from sadgs_ns.export import write_ply
 from sadgs_ns.inspection import get_view
 from sadgs_ns.model import SadgsModel
 from sadgs_ns.pictures import ETA, PERIOD, Panel
