@@ -355,6 +355,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"sadgs-inspect: {error}", file=sys.stderr)
         return 2
+    except torch.cuda.OutOfMemoryError:
+        remedy = "end other programs on it, or draw on the CPU: CUDA_VISIBLE_DEVICES= sadgs-inspect …"
+        print(f"sadgs-inspect: the GPU's memory does not hold {given.config}: {remedy}", file=sys.stderr)
+        return 2
     for path in written:
         print(path)
     return 0

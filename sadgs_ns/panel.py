@@ -27,9 +27,11 @@ from nerfstudio.viewer.viewer_elements import (
     ViewerParameter,
     ViewerSlider,
 )
+from rich.markup import escape
 from torch import Tensor
 
 from sadgs_ns import pictures
+from sadgs_ns.errors import reason
 from sadgs_ns.pictures import CHILDREN, ETA, LOW, PERIOD, Picture, to_picture
 from sadgs_ns.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.storage import decode
@@ -138,9 +140,13 @@ class StructurePanel(torch.nn.Module):
         self._shown = OFF
         strategy = pipeline.model.strategy
         self.choice = ViewerDropdown(
-            "Show", OFF, CHOICES, cb_hook=lambda _: self.choose(), hint="What the output type “structure” shows"
+            "Show",
+            OFF,
+            CHOICES,
+            cb_hook=lambda _: self._told(self.choose),
+            hint="What the output type “structure” shows",
         )
-        self.observe = ViewerButton("Observe all training views", cb_hook=lambda _: self.observe_now())
+        self.observe = ViewerButton("Observe all training views", cb_hook=lambda _: self._told(self.observe_now))
         self.set_max_gaussians = ViewerNumber(
             "max_gaussians",
             strategy.max_gaussians,
@@ -186,6 +192,14 @@ class StructurePanel(torch.nn.Module):
             CONSOLE.print(f"[yellow]{error}[/]")
             element.value = getattr(strategy, name)
         self.table.refresh()
+
+    @staticmethod
+    def _told(act: Callable[[], None]) -> None:
+        """Do it, and say on the console what went wrong: the viewer's threads keep their errors to themselves."""
+        try:
+            act()
+        except (RuntimeError, ValueError) as error:  # memory that is full, or data that went away
+            CONSOLE.print(f"[yellow]The viewer's panel stays as it was: {escape(reason(error))}[/]")
 
     def refresh(self) -> None:
         """Show the present numbers, at most once a second; without a viewer this costs nothing."""

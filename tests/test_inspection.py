@@ -161,6 +161,16 @@ def test_checkpoints_that_cannot_be_used_are_named_with_options_that_there_are(
     assert "step-000000008.ckpt is cut off, damaged" in line and line.endswith(remedy)
 
 
+def test_a_gpu_that_is_full_is_one_sentence(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def full(*_: Any) -> None:
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 22.00 MiB.")
+
+    monkeypatch.setattr(inspection, "inspect_run", full)
+    assert f"memory does not hold {run}: end other programs on it" in wrong([str(run)], capsys)
+
+
 # --- what is drawn ---
 
 
@@ -337,6 +347,18 @@ def test_where_no_gaussian_is_opaque_enough_the_panel_says_that_none_was_observe
     assert statistics is not None and not (statistics["n_total"] > 0).any()
     picture = panel.picture("η", a_camera(pipeline), torch.zeros(HEIGHT, WIDTH, 3))
     assert (picture == 0).all(), "black"
+
+
+def test_what_fails_in_a_viewer_s_thread_is_told(
+    panel: StructurePanel, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def full() -> None:
+        raise RuntimeError("CUDA out of memory.\nOf no interest.")
+
+    monkeypatch.setattr(pipeline_of(panel), "observe_training_views", full)
+    panel.observe.cb_hook(panel.observe)
+    told = " ".join(capsys.readouterr().out.split())
+    assert told == "The viewer's panel stays as it was: CUDA out of memory"
 
 
 def test_sliders_reach_the_strategy_and_the_plan(panel: StructurePanel):

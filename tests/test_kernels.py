@@ -62,8 +62,11 @@ def test_mean_squared_error_carries_no_gradient():
     assert not mse.requires_grad
 
 
-def test_kernels_are_for_cuda_only():
-    assert not kernels.available(torch.device("cpu"))
+def test_kernels_are_for_the_current_cuda_device_only(monkeypatch):
+    monkeypatch.setattr(kernels, "_compiles", lambda device: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
+    names = ("cpu", "cuda", "cuda:0", "cuda:1")
+    assert [kernels.available(torch.device(name)) for name in names] == [False, True, False, True]
 
 
 def test_a_triton_that_compiles_is_found_and_one_that_does_not_is_told_once(monkeypatch):

@@ -13,8 +13,9 @@ OLDEST_TRITON = (3, 5)
 
 
 def available(device: torch.device) -> bool:
-    """Whether the kernels run on this device: it is CUDA, and Triton, which comes with torch, compiles for it."""
-    return device.type == "cuda" and _compiles(device)
+    """Whether the kernels run on this device: it is CUDA's current one, on which Triton launches whatever tensors it is
+    given, and Triton, which comes with torch, compiles for it."""
+    return device.type == "cuda" and device.index in (None, torch.cuda.current_device()) and _compiles(device)
 
 
 @cache
