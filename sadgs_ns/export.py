@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
@@ -195,12 +196,8 @@ def _read(checkpoint: Path, latest: bool) -> dict[str, Tensor]:
     return params
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    """Command line.
-
-    Raises:
-        SystemExit: With one sentence, if the run or the output cannot be used or the file could not be written.
-    """
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code, 2 if the run or the output cannot be used."""
     parser = argparse.ArgumentParser(
         prog="sadgs-export",
         description="Write a trained run's Gaussians as the PLY that viewers of 3D Gaussian splatting read. It needs "
@@ -218,11 +215,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     given = parser.parse_args(argv)
     try:
         count = export(given.run, given.output, given.frame)
-    except WriteError as error:
-        raise RunError(str(error)) from error
+    except (InputError, RunError, WriteError) as error:
+        print(f"sadgs-export: {error}", file=sys.stderr)
+        return 2
     size = given.output.stat().st_size
     print(f"{given.output}: {count:,} Gaussians, {size / 1e6:,.1f} MB, in the frame of {given.frame}")
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())
