@@ -95,3 +95,30 @@ def checkpoint_path(load_dir: Path | None, load_step: int | None, load_checkpoin
         there = ", ".join(map(str, sorted(steps)))
         raise InputError(f"{load_dir} holds no checkpoint of step {load_step}: give --load-step one of {there}.")
     return steps[max(steps) if load_step is None else load_step]
+
+
+def read_chosen(
+    load_dir: Path | None,
+    load_step: int | None,
+    load_checkpoint: Path | None,
+    remedy: str = REMEDY,
+    mmap: bool = False,
+) -> tuple[Path, dict[str, Any]] | None:
+    """Read the checkpoint that these options name; where they leave the step open, an earlier one if it is damaged.
+
+    Args:
+        load_dir, load_step, load_checkpoint: As for `checkpoint_path`.
+        remedy, mmap: As for `read`.
+
+    Returns:
+        Its path and content; None where the options name none.
+
+    Raises:
+        InputError: As `checkpoint_path` and `read`.
+    """
+    path = checkpoint_path(load_dir, load_step, load_checkpoint)
+    if path is None:
+        return None
+    if load_dir is not None and load_step is None:
+        return read_or_earlier(path, remedy, mmap)
+    return path, read(path, remedy, mmap)

@@ -179,13 +179,10 @@ def _read(checkpoint: Path, latest: bool) -> dict[str, Tensor]:
     """The Gaussians' parameters, mapped from the file: what is not written takes no memory."""
     from sadgs_ns import checkpoints  # here, since they import nerfstudio
 
-    if latest:
-        checkpoints.checkpoint_path(
-            checkpoint.parent, load_step=None, load_checkpoint=None
-        )  # refuses what lies among them
-        checkpoint, state = checkpoints.read_or_earlier(checkpoint, _REMEDY, mmap=True)
-    else:
-        state = checkpoints.read(checkpoint, _REMEDY, mmap=True)
+    folder, single = (checkpoint.parent, None) if latest else (None, checkpoint)
+    chosen = checkpoints.read_chosen(folder, None, single, _REMEDY, mmap=True)
+    assert chosen is not None
+    checkpoint, state = chosen
     loaded = state["pipeline"] if isinstance(state["pipeline"], dict) else {}
     params = {}
     for name in ("means", "scales", "quats", "opacities", "features_dc", "features_rest"):

@@ -97,12 +97,9 @@ def load_run(path: Path, load_step: int | None = None, data: Path | None = None)
         raise InputError(
             f"{folder} holds no checkpoint yet: train to the end, or with --steps-per-save 500 to look on the way."
         )
-    checkpoint = checkpoints.checkpoint_path(folder, load_step, None)
-    assert checkpoint is not None
-    if load_step is None:
-        checkpoint, state = checkpoints.read_or_earlier(checkpoint, _REMEDY)
-    else:
-        state = checkpoints.read(checkpoint, _REMEDY)
+    chosen = checkpoints.read_chosen(folder, load_step, None, _REMEDY)
+    assert chosen is not None
+    checkpoint, state = chosen
     if data is not None:
         config.pipeline.datamanager.data = data
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")

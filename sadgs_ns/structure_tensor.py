@@ -220,6 +220,8 @@ def multiscale_structure_tensor(
     noise = (noise_floor * contrast).clamp_min(_ROUNDING_FLOOR)  # [B, 1, 1, 1]
 
     fused = fused and image.dtype == torch.float32 and kernels.available(image.device)
+    if fused:
+        from sadgs_ns.kernels import scale_space
     filters = _Filters(truncation, fused)
     reach = _Reach(filters, weight, masks is not None)
     numerator = torch.zeros_like(image[:, :1]).repeat(1, 3, 1, 1)  # [B, 3, H, W]
@@ -232,9 +234,7 @@ def multiscale_structure_tensor(
             source, step = previous * valid, math.sqrt(sigma**2 - SCALE_STEP ** (2 * level - 2))
         blurs, reaches = filters.blur_and_gradient(source, step), reach.blur_and_gradient(step)
         if fused:
-            from sadgs_ns.kernels.scale_space import differentiate
-
-            smoothed, products, energy = differentiate(blurs, reaches, weight, previous)
+            smoothed, products, energy = scale_space.differentiate(blurs, reaches, weight, previous)
         else:
             smoothed = blurs[0] / reaches[0]
             # The derivative of the quotient.
@@ -251,10 +251,8 @@ def multiscale_structure_tensor(
         if energy_blur > 0:
             energy, total = filters.blur(energy, window), reach.blur(window)
         if fused:
-            from sadgs_ns.kernels.scale_space import accumulate
-
             sums = numerator, denominator
-            accumulate(
+            scale_space.accumulate(
                 (products, integrated), (energy, total), noise, sums, gamma / 2, frequency_constant / sigma, sigma
             )
         else:

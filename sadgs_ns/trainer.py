@@ -31,8 +31,6 @@ _LESS_MEMORY = (
     "lower --pipeline.model.strategy.max-gaussians, or take smaller images (`--downscale-factor 2` after "
     "`nerfstudio-data` or `colmap`)"
 )
-
-
 _SAVING_SHARE = 0.01
 """The most of the time from one of the clock's checkpoints to the next that the saving may take."""
 
@@ -132,11 +130,10 @@ class SadgsTrainer(Trainer):
             InputError: If there is none, none can be read, or it is not of this method.
         """
         config = self.config
-        path = checkpoints.checkpoint_path(config.load_dir, config.load_step, config.load_checkpoint)
-        if path is None:
+        chosen = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
+        if chosen is None:
             return super()._load_checkpoint()
-        latest = config.load_dir is not None and config.load_step is None
-        path, state = checkpoints.read_or_earlier(path) if latest else (path, checkpoints.read(path))
+        path, state = chosen
         try:
             self._start_step = state["step"] + 1
             self.pipeline.load_pipeline(state["pipeline"], state["step"])

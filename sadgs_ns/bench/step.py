@@ -83,6 +83,7 @@ class Step:
         self.structure_tensors = torch.randint(0, 256, (1, height, width, 3), dtype=torch.uint8, device=device)
         self.rendered = self.target.clone().requires_grad_()
         self.gradients: list[Tensor | None] = []
+        self.calls = 0  # of `whole`
         self.render()
         self.keep_gradients()
 
@@ -139,9 +140,9 @@ class Step:
         """A step; η is observed in the calls that `ETA_EVERY` divides."""
         self.forget_gradients()
         colors, _ = self.forward()
-        self.calls = getattr(self, "calls", -1) + 1
         if self.calls % ETA_EVERY == 0:
             self.observe()
+        self.calls += 1
         photometric_loss(colors, self.target, fused=self.fused)[0].backward()
         for optimizer in self.optimizers.values():
             optimizer.step()

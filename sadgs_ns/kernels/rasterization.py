@@ -17,6 +17,8 @@ BACKWARD: Literal["moments", "gsplat"] = "moments"
 """Who differentiates the compositing of three channels: our kernel (compositing.py) or gsplat's, its reference."""
 TILE_SIZE = compositing.TILE_SIZE
 """px. gsplat's default of 16 saves list entries; with exact lists, pixels saved weigh more (docs/measurements.md)."""
+_BOUNDS_RADII = "opacities" in inspect.signature(fully_fused_projection).parameters
+"""gsplat 1.5 takes opacities to bound the radii."""
 
 
 def rasterization(
@@ -47,10 +49,7 @@ def rasterization(
     if packed:
         raise ValueError("exact tile lists are made of unpacked projections: packed=False")
     num_views = len(viewmats)
-    # gsplat 1.5 takes opacities to bound the radii.
-    bound: dict[str, Any] = (
-        {"opacities": opacities} if "opacities" in inspect.signature(fully_fused_projection).parameters else {}
-    )
+    bound: dict[str, Any] = {"opacities": opacities} if _BOUNDS_RADII else {}
     radii, means2d, depths, conics, compensations = fully_fused_projection(
         means,
         None,
