@@ -19,6 +19,7 @@ from torch import Tensor
 
 from sadgs_ns import kernels
 from sadgs_ns.cameras import refuse_failed_undistortion, refuse_unsupported_cameras
+from sadgs_ns.contribution import most_pixels
 from sadgs_ns.datamanager import SadgsDatamanagerConfig
 from sadgs_ns.errors import InputError
 from sadgs_ns.finite import NonFiniteLog
@@ -260,7 +261,19 @@ class SadgsPipeline(VanillaPipeline):
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN]
         counts = TrainingCallback(after, lambda step: self.structure.refresh())
         last = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self._report_nonfinite())
-        return [*super().get_training_callbacks(training_callback_attributes), counts, last]
+        needless = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._prune_needless)
+        return [*super().get_training_callbacks(training_callback_attributes), needless, counts, last]
+
+    def _prune_needless(self, step: int) -> None:
+        """Remove what training showed to be needless, where the schedule says so."""
+        model = self.model
+        if not model.config.densify or step + 1 not in model.strategy.contribution_prune_iters:
+            return
+        viewmats, Ks = self.train_cameras
+        sizes = [data["image"].shape for data in self.datamanager.cached_train]
+        views = ((viewmats[i], Ks[i], width, height) for i, (height, width, _) in enumerate(sizes))
+        pixels = most_pixels(model.gauss_params, views, model.config.fused)
+        model.strategy.prune_needless(model.gauss_params, model.optimizers, model.strategy_state, pixels)
 
     def _report_nonfinite(self) -> None:
         """Say in which of the last iterations, and with which images, a loss or gradient was not finite."""

@@ -87,6 +87,10 @@ class StructureAwareStrategy(Strategy):
     """An opacity reset multiplies every opacity by this."""
     final_prune_opacity: float = 0.1
     """Opacity under which Gaussians are pruned when densification ends."""
+    contribution_prune_iters: tuple[int, ...] = ()
+    """Iterations after which Gaussians that contribute less than `min_contribution` to every training view are removed."""
+    min_contribution: float = 1.0
+    """Pixels of a training view that a Gaussian must account for, in the view in which it does most."""
     fused: bool = True
     """Measure η in one Triton kernel where that runs (CUDA)."""
     verbose: bool = False
@@ -238,6 +242,10 @@ class StructureAwareStrategy(Strategy):
             elif _due(iteration, self.reset_every) and iteration <= self.refine_stop_iter - self.reset_every // 4:
                 # A reset just before the final prune would leave nothing that had time to recover.
                 self._map_opacities(params, optimizers, lambda opacities: opacities * self.reset_factor)
+
+    def prune_needless(self, params: Params, optimizers: Any, state: Any, pixels: Tensor) -> int:
+        """Remove Gaussians that account for less than `min_contribution` px (`contribution.most_pixels`, [N])."""
+        return self._prune(params, optimizers, state, pixels < self.min_contribution)
 
     def consistently_low(self, statistics: Mapping[str, Tensor]) -> Tensor:
         """Gaussians that answered low on all three axes in more than τ_prune of their observations. bool [N]"""
