@@ -23,6 +23,7 @@ class NonFiniteLog:
         self._losses = torch.zeros(capacity, device=device)
         # NaN where one was left out. Rows of 16 bytes: Triton would compile Adam anew for a less aligned one.
         self._gradients = torch.zeros((capacity, 4), device=device)
+        self._slots = self._gradients[:, :1].unbind()  # views made once: slicing takes the host long
         self._steps: list[tuple[int, list[int]]] = []
 
     @property
@@ -44,8 +45,7 @@ class NonFiniteLog:
     @property
     def gradients(self) -> Tensor:
         """Where the present step notes, with NaN, that a gradient was not finite. float32 [1]"""
-        slot = max(len(self._steps) - 1, 0)
-        return self._gradients[slot, :1]
+        return self._slots[max(len(self._steps) - 1, 0)]
 
     def read(self) -> list[tuple[int, list[int], str]]:
         """Steps in which something was not finite, and forget all; waits for the device.

@@ -15,7 +15,6 @@ import torch
 import tyro
 import yaml
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
-from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
@@ -23,7 +22,7 @@ from sadgs_ns import checkpoints
 from sadgs_ns.atomic import atomic_path
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
 from sadgs_ns.interrupts import Interrupted, Interrupts, resume_command
-from sadgs_ns.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
+from sadgs_ns.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig, SadgsOptimizers
 from sadgs_ns.pipeline import SadgsPipeline, SadgsPipelineConfig
 from sadgs_ns.preflight import check_ahead
 
@@ -152,7 +151,7 @@ class SadgsTrainer(Trainer):
             ) from error
         CONSOLE.print(f"Resuming after step {state['step']} of {path}", markup=False, soft_wrap=True)
 
-    def setup_optimizers(self) -> Optimizers:
+    def setup_optimizers(self) -> SadgsOptimizers:
         """Build the optimizers with schedules as long as the run, fused where the model is."""
         optimizers: dict[str, Any] = copy.deepcopy(dict(self.config.optimizers))
         for group in optimizers.values():
@@ -163,7 +162,7 @@ class SadgsTrainer(Trainer):
                 scheduler.max_steps = self.config.max_num_iterations
         if self.config.scale_position_lr:
             optimizers["means"]["optimizer"].lr *= self.pipeline.model.strategy_state["scene_scale"]
-        return Optimizers(optimizers, self.pipeline.get_param_groups())
+        return SadgsOptimizers(optimizers, self.pipeline.get_param_groups())
 
     def train(self) -> None:
         """Train up to `max_num_iterations` in all; nerfstudio 1.1.5 trains that many more after resuming.

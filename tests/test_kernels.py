@@ -196,21 +196,77 @@ def test_observation_equals_the_reference(monkeypatch, directional, min_opacity,
     torch.testing.assert_close(fast["eta_max"], reference["eta_max"], atol=1e-6, rtol=2e-5)
 
 
-def test_adam_equals_torchs():
+ADAM = {"betas": (0.9, 0.999), "eps": 1e-15}
+WIDTHS = [(3,), (15, 3), (), (4,), (1,)]  # a row of each parameter
+LRS = (0.1, 0.01, 0.3, 0.003, 0.02)
+
+
+def with_moments(start: list[Tensor]) -> tuple[tuple[Tensor, ...], ...]:
+    """Copies of parameters, and their moments."""
+    zeros = [tuple(torch.zeros_like(p, device=DEVICE) for p in start) for _ in range(2)]
+    return tuple(p.to(DEVICE).clone() for p in start), *zeros
+
+
+@pytest.mark.parametrize("rows", [0, 1, 37, 1024], ids="{} Gaussians".format)
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-5), (torch.float32, 2e-5)], ids=str)
+def test_adam_in_one_launch_equals_torchs_and_one_launch_for_each_parameter(rows, dtype, tolerance):
     generator = torch.Generator().manual_seed(0)
-    start = torch.randn((37, 45), generator=generator)
-    expected = torch.nn.Parameter(start.double())
-    optimizer = torch.optim.Adam([expected], lr=0.1, eps=1e-15)
-    actual = start.to(DEVICE).clone()
-    moments = torch.zeros_like(actual), torch.zeros_like(actual)
+    start = [torch.randn((rows, *width), generator=generator) for width in WIDTHS]
+    expected = [torch.nn.Parameter(p.to(dtype, copy=True)) for p in start]
+    groups = [{"params": [p], "lr": lr} for p, lr in zip(expected, LRS, strict=True)]
+    optimizer = torch.optim.Adam(groups, **ADAM)
+    together, separate = with_moments(start), with_moments(start)
     noted = torch.zeros(1, device=DEVICE)
     for step in range(1, 6):
-        gradient = torch.randn(start.shape, generator=generator)
-        expected.grad = gradient.double()
+        gradients = tuple(torch.randn(p.shape, generator=generator) for p in start)
+        for parameter, gradient in zip(expected, gradients, strict=True):
+            parameter.grad = gradient.to(dtype)
         optimizer.step()
-        adam.adam_step(actual, gradient.to(DEVICE), *moments, noted, step=step, lr=0.1, betas=(0.9, 0.999), eps=1e-15)
-    torch.testing.assert_close(actual.double().cpu(), expected.detach(), atol=1e-5, rtol=1e-5)
+        gradients = tuple(gradient.to(DEVICE) for gradient in gradients)
+        adam.adam_step(together[0], gradients, *together[1:], noted, steps=[step] * 5, lrs=LRS, **ADAM)
+        for gradient, lr, (p, m, v) in zip(gradients, LRS, zip(*separate, strict=True), strict=True):
+            adam.adam_step((p,), (gradient,), (m,), (v,), noted, steps=[step], lrs=[lr], **ADAM)
     assert float(noted) == 0
+    for one, other in zip(together, separate, strict=True):
+        assert all(map(torch.equal, one, other))
+    for actual, parameter in zip(together[0], expected, strict=True):
+        torch.testing.assert_close(actual.to("cpu", dtype), parameter.detach(), atol=tolerance, rtol=tolerance)
+
+
+def test_adam_counts_each_parameters_own_updates():
+    start = [torch.linspace(-1, 1, 50), torch.linspace(1, 2, 50)]
+    expected = [torch.nn.Parameter(p.double()) for p in start]
+    optimizers = [torch.optim.Adam([p], lr=0.1, eps=1e-15) for p in expected]
+    actual = with_moments(start)
+    noted = torch.zeros(1, device=DEVICE)
+    for step in range(1, 5):
+        for k in (0, 1) if step > 2 else (0,):  # the other one's gradients come late
+            expected[k].grad = torch.full_like(expected[k], step)
+            optimizers[k].step()
+        gradients = tuple(torch.full_like(p, step) for p in actual[0])
+        if step > 2:
+            adam.adam_step(actual[0], gradients, *actual[1:], noted, steps=[step, step - 2], lrs=[0.1, 0.1], **ADAM)
+        else:
+            first = [values[:1] for values in (actual[0], gradients, *actual[1:])]
+            adam.adam_step(*first, noted, steps=[step], lrs=[0.1], **ADAM)
+    for p, q in zip(actual[0], expected, strict=True):
+        torch.testing.assert_close(p.double().cpu(), q.detach(), atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -1e30])
+@pytest.mark.parametrize("k", range(len(WIDTHS)))
+def test_a_gradient_that_is_not_finite_is_noted_and_left_out_of_its_parameter_alone(k, wrong):
+    start = [torch.ones((37, *width)) for width in WIDTHS]
+    results = []
+    for value in (0.0, wrong):
+        parameters = with_moments(start)
+        noted = torch.zeros(1, device=DEVICE)
+        gradients = tuple(torch.full_like(p, 0.5) for p in parameters[0])
+        gradients[k].flatten()[-1:] = value  # within the block that is not full
+        adam.adam_step(parameters[0], gradients, *parameters[1:], noted, steps=[1] * 5, lrs=LRS, **ADAM)
+        assert bool(noted.isnan()) == (value != 0.0)
+        results.append([tensor for tensors in parameters for tensor in tensors])
+    assert all(map(torch.equal, *results))
 
 
 def test_optimizer_keeps_torchs_state_while_it_runs_the_kernel(monkeypatch):

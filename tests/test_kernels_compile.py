@@ -21,14 +21,18 @@ CONSTANTS = {
     "GAUSSIAN": (0.25, 0.5, 0.25), "STRIP": 1024, "ROWS": 16, "COLUMNS": 64, "TILE": 8, "LANES": 32, "VIEWS": 2,
     "BLOCK": 1024, "HIGH": 1.0, "LOW": 0.1, "BLUR": 0.3, "MARGIN": 0.3, "EPSILON": 1e-5, "DIRECTIONAL": False,
     "VERTICAL": False, "MAX": 1e18, "PIXELS": 1024, "TINY": 1e-38, "HIGHEST": 4.0, "OCTAVES": 12.0,
-    "GAUSSIANS": 16, "STRIDE": 12, "BACKGROUND": True, "ABSGRAD": True, "PRECISION": "tf32x3",
+    "WIDTHS": (3, 45, 1), "GAUSSIANS": 16, "STRIDE": 12, "BACKGROUND": True, "ABSGRAD": True, "PRECISION": "tf32x3",
 }
 INTEGERS = "n row height width taps num_gaussians num_views tile_width tile_height used stride start".split()
-INTEGERS += "channels weight_stride num_pairs".split()
-FLOATS = "exponent frequency sigma rate scale beta1 beta2 eps min_logit l1_weight ssim_weight l2_weight".split()
+INTEGERS += "channels weight_stride num_pairs rows".split()
+FLOATS = "exponent frequency sigma beta1 beta2 eps min_logit l1_weight ssim_weight l2_weight".split()
 POINTERS = {
     "radii": "*i32", "counts": "*i32", "order": "*i64", "ends": "*i64", "tiles": "*i16", "ids": "*i32", "drawn": "*i1",
     "structure_tensors": "*u8", "starts": "*i32", "last_ids": "*i32",
+}
+TUPLES = {  # of Adam's kernel; the names mean single tensors elsewhere
+    **dict.fromkeys(["parameters", "gradients", "means", "squares"], ("*fp32",) * 3),
+    **dict.fromkeys(["rates", "scales"], ("fp32",) * 3),
 }
 
 compiled = []
@@ -42,6 +46,8 @@ for module in pkgutil.iter_modules(package.__path__):
         for i, parameter in enumerate(kernel.params):
             if parameter.is_constexpr:
                 signature[parameter.name], constants[(i,)] = "constexpr", CONSTANTS[parameter.name]
+            elif name == "_update" and parameter.name in TUPLES:
+                signature[parameter.name] = TUPLES[parameter.name]
             elif parameter.name in INTEGERS:
                 signature[parameter.name] = "i32"
             elif parameter.name in FLOATS:
@@ -66,3 +72,35 @@ def test_every_kernel_compiles(capability, tmp_path):
     expected |= {"_forward", "_backward", "_update", "_correlate", "_differentiate", "_accumulate", "_write_one"}
     expected |= {"_composite_backward", "_encode"}
     assert set(run.stdout.split()) == expected
+
+
+WIDE = """
+import re
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+from sadgs_ns.kernels.adam import _update
+
+tensors, rates = ["parameters", "gradients", "means", "squares"], ["rates", "scales", "beta1", "beta2", "eps"]
+signature, aligned = {}, {}
+for i, parameter in enumerate(_update.params):
+    name = parameter.name
+    if name in tensors:
+        signature[name] = ("*fp32",) * 3
+        aligned |= {(i, k): [["tt.divisibility", 16]] for k in range(3)}
+    elif name in rates:
+        signature[name] = ("fp32",) * 3 if name in rates[:2] else "fp32"
+    else:
+        signature[name] = {"noted": "*fp32", "rows": "i32"}.get(name, "constexpr")
+constants = {"WIDTHS": (3, 45, 1), "MAX": 1e18, "BLOCK": 1024}
+ptx = triton.compile(ASTSource(_update, signature, constants, aligned), target=GPUTarget("cuda", 90, 32)).asm["ptx"]
+print(len(re.findall(r"ld\\.global\\.v4", ptx)), len(re.findall(r"st\\.global\\.v4", ptx)))
+"""
+
+
+def test_adam_reads_and_writes_memory_in_wide_words_whichever_parameter_it_is(tmp_path):
+    """Each of 128 threads has 8 numbers of a block: two words for each of four tensors, of which three are written."""
+    environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
+    environment["TRITON_CACHE_DIR"] = str(tmp_path)
+    run = subprocess.run([sys.executable, "-c", WIDE], env=environment, capture_output=True, text=True)
+    assert run.stdout.split() == ["8", "6"], run.stderr[-3000:]

@@ -328,6 +328,27 @@ def test_one_switch_takes_all_kernels_out(colmap: ColmapDataParserConfig, tmp_pa
     assert not any(optimizer.defaults["fused"] for optimizer in trainer.optimizers.optimizers.values())
 
 
+def test_a_training_step_updates_the_gaussians_in_one_launch(
+    colmap: ColmapDataParserConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
+    launch, launched = adam.adam_step, []
+
+    def counted(parameters: tuple[torch.Tensor, ...], *args: Any, **kwargs: Any) -> None:
+        launched.append(len(parameters))
+        launch(parameters, *args, **kwargs)
+
+    monkeypatch.setattr(adam, "adam_step", counted)
+    trainer = set_up(configure(tmp_path, colmap, 3))
+    before = {name: parameter.detach().clone() for name, parameter in trainer.pipeline.model.gauss_params.items()}
+    for name in before:
+        trainer.optimizers.optimizers[name].triton = True  # type: ignore[attr-defined] # in its interpreter, without CUDA
+    trainer.train()
+    assert launched == [6] * 3
+    for name, parameter in trainer.pipeline.model.gauss_params.items():
+        assert parameter.isfinite().all() and (name == "features_rest" or not torch.equal(parameter, before[name]))
+
+
 def test_the_position_rate_grows_with_the_cameras_extent(colmap: ColmapDataParserConfig, tmp_path: Path):
     trainer = set_up(configure(tmp_path, colmap))
     extent = trainer.pipeline.model.strategy_state["scene_scale"]

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from sadgs_ns.losses import photometric_loss
-from sadgs_ns.optimizers import FusedAdam
+from sadgs_ns.optimizers import FusedAdam, step_together
 from sadgs_ns.rasterization import rasterize, visible
 from sadgs_ns.split import grid_split
 from sadgs_ns.statistics import empty_statistics, observe
@@ -133,8 +133,15 @@ class Step:
         """Adam on all parameters."""
         for parameter, gradient in zip(self.params.values(), self.gradients, strict=True):
             parameter.grad = gradient
+        self.step_optimizers()
+
+    def step_optimizers(self) -> None:
+        """Adam on all parameters that have gradients: our kernel in one launch, as in training."""
+        together = [o for o in self.optimizers.values() if isinstance(o, FusedAdam) and o.triton]
+        step_together(together)
         for optimizer in self.optimizers.values():
-            optimizer.step()
+            if optimizer not in together:
+                optimizer.step()
 
     def whole(self) -> None:
         """A step; η is observed in the calls that `ETA_EVERY` divides."""
@@ -144,8 +151,7 @@ class Step:
             self.observe()
         self.calls += 1
         photometric_loss(colors, self.target, fused=self.fused)[0].backward()
-        for optimizer in self.optimizers.values():
-            optimizer.step()
+        self.step_optimizers()
 
 
 def compare_parts(gaussians: int, width: int, height: int) -> None:

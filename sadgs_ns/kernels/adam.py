@@ -1,9 +1,11 @@
-"""Adam, one kernel per parameter; torch's fused one reaches a third of the memory's bandwidth on Gaussians."""
+"""Adam, one launch for all parameters; torch's fused one reaches a third of the memory's bandwidth on Gaussians."""
 
 # pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false
 # (Triton's launch syntax, kernel[grid](...), and its functions are not in its types.)
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import triton
 import triton.language as tl
@@ -24,12 +26,27 @@ def _moments_and_step(g, m, v, rate, scale, beta1, beta2, eps, noted, i, exists,
     return m, v, rate * m / (tl.sqrt(v) * scale + eps)
 
 
-@triton.jit(do_not_specialize=["n"])
+@triton.jit(do_not_specialize=["rows"])
 def _update(
-    parameter, gradient, mean, square, noted, n, rate, scale, beta1, beta2, eps, MAX: tl.constexpr, BLOCK: tl.constexpr
+    parameters, gradients, means, squares, rates, scales, noted, rows, beta1, beta2, eps,
+    WIDTHS: tl.constexpr, MAX: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    if (tl.program_id(0) + 1).to(tl.int64) * BLOCK <= n:  # without a mask, memory is read in wide words
+    # Each program updates a block of one parameter. Sizes are made here of `rows`: as a tuple, Triton would look at
+    # which of them 16 divides, and compile anew when densification changes that.
+    block = tl.program_id(0).to(tl.int64)
+    n = rows.to(tl.int64) * WIDTHS[0]
+    parameter, gradient, mean, square, rate, scale = (
+        parameters[0], gradients[0], means[0], squares[0], rates[0], scales[0]
+    )  # fmt: skip
+    for k in tl.static_range(1, len(WIDTHS)):
+        if block * BLOCK >= n:  # it is of a later one
+            block -= tl.cdiv(n, BLOCK)
+            n = rows.to(tl.int64) * WIDTHS[k]
+            parameter, gradient, mean, square, rate, scale = (
+                parameters[k], gradients[k], means[k], squares[k], rates[k], scales[k]
+            )  # fmt: skip
+    i = block * BLOCK + tl.arange(0, BLOCK)
+    if (block + 1) * BLOCK <= n:  # without a mask, memory is read in wide words
         g, m, v = tl.load(gradient + i), tl.load(mean + i), tl.load(square + i)
         m, v, change = _moments_and_step(g, m, v, rate, scale, beta1, beta2, eps, noted, i, i < n, MAX)
         tl.store(mean + i, m)
@@ -45,35 +62,39 @@ def _update(
 
 
 def adam_step(
-    parameter: Tensor,
-    gradient: Tensor,
-    exp_avg: Tensor,
-    exp_avg_sq: Tensor,
+    parameters: tuple[Tensor, ...],
+    gradients: tuple[Tensor, ...],
+    exp_avgs: tuple[Tensor, ...],
+    exp_avg_sqs: tuple[Tensor, ...],
     noted: Tensor,
     *,
-    step: int,
-    lr: float,
+    steps: Sequence[int],
+    lrs: Sequence[float],
     betas: tuple[float, float],
     eps: float,
 ) -> None:
-    """Update a parameter and its moments in place, as torch's Adam without weight decay.
+    """Update parameters and their moments in place, in one launch, as torch's Adam without weight decay.
 
     A gradient that is NaN, or at least `finite.MAX_GRADIENT`, counts as 0.
 
     Args:
-        parameter: Contiguous float32, any shape.
-        gradient: Contiguous, of the same shape; so are the moments.
-        exp_avg: Running mean of the gradient.
-        exp_avg_sq: Running mean of its square.
+        parameters: One or more, contiguous float32, all of the same length. [N, ...] each
+        gradients: Contiguous, each of its parameter's shape; so are the moments.
+        exp_avgs: Running means of the gradients.
+        exp_avg_sqs: Running means of their squares.
         noted: Becomes NaN if there was such a gradient. float32 [1]
-        step: Which update this is, from 1.
-        lr: Learning rate.
+        steps: Which update this is of each parameter, from 1.
+        lrs: Learning rate of each.
         betas: Decay of the two running means, in [0, 1).
         eps: Added to the denominator.
     """
-    rate, scale = lr / (1 - betas[0] ** step), (1 - betas[1] ** step) ** -0.5
-    grid = (triton.cdiv(parameter.numel(), _BLOCK),)
-    moments = (exp_avg, exp_avg_sq)
+    beta1, beta2 = betas
+    rates = tuple(lr / (1 - beta1**step) for lr, step in zip(lrs, steps, strict=True))
+    scales = tuple((1 - beta2**step) ** -0.5 for step in steps)
+    rows = parameters[0].shape[:1].numel()  # 1 without dimensions
+    widths = tuple(parameter.shape[1:].numel() for parameter in parameters)
+    grid = (sum(-(-rows * width // _BLOCK) for width in widths),)
     _update[grid](
-        parameter, gradient, *moments, noted, parameter.numel(), rate, scale, *betas, eps, MAX_GRADIENT, _BLOCK
+        parameters, gradients, exp_avgs, exp_avg_sqs, rates, scales, noted, rows, beta1, beta2, eps,
+        widths, MAX_GRADIENT, _BLOCK,
     )  # fmt: skip
