@@ -91,7 +91,7 @@ def load_run(path: Path, load_step: int | None = None, data: Path | None = None)
         raise InputError(f"{path} cannot be read as a run's config.yml ({what}): give one of sadgs.") from error
     if not isinstance(config, SadgsTrainerConfig):
         method = f"of the method {config.method_name}" if isinstance(config, TrainerConfig) else "no run's config.yml"
-        raise InputError(f"{path} is {method}: give one of sadgs, sadgs-indoor or sadgs-large.")
+        raise InputError(f"{path} is {method}: give one of sadgs, sadgs-indoor, sadgs-large or sadgs-paper.")
     folder = path.parent / config.relative_model_dir
     if not folder.is_dir() or not any(folder.iterdir()):
         raise InputError(

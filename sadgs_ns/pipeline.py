@@ -40,6 +40,8 @@ from sadgs_ns.structure_tensor import (
 
 _PIXELS_PER_BATCH = 4_000_000
 """Structure tensors are computed for as many images at once as fit this; each pixel takes at most about 300 bytes."""
+_VIEWS_PER_BATCH = 4
+"""Views that are rendered at once where all of them are looked at."""
 _NAMED_STEPS = 5
 """Iterations of which a report of what was not finite names the images."""
 
@@ -261,19 +263,27 @@ class SadgsPipeline(VanillaPipeline):
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN]
         counts = TrainingCallback(after, lambda step: self.structure.refresh())
         last = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self._report_nonfinite())
-        needless = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._prune_needless)
+        needless = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._remove_needless)
         return [*super().get_training_callbacks(training_callback_attributes), needless, counts, last]
 
-    def _prune_needless(self, step: int) -> None:
-        """Remove what training showed to be needless, where the schedule says so."""
+    def _remove_needless(self, step: int) -> None:
+        """Remove the Gaussians that no training view needs, where the strategy says that it is time."""
         model = self.model
-        if not model.config.densify or step + 1 not in model.strategy.contribution_prune_iters:
+        if not model.config.densify or not model.strategy.removes_needless(step):
             return
-        viewmats, Ks = self.train_cameras
-        sizes = [data["image"].shape for data in self.datamanager.cached_train]
-        views = ((viewmats[i], Ks[i], width, height) for i, (height, width, _) in enumerate(sizes))
-        pixels = most_pixels(model.gauss_params, views, model.config.fused)
-        model.strategy.prune_needless(model.gauss_params, model.optimizers, model.strategy_state, pixels)
+        by_size = defaultdict(list)
+        for index, data in enumerate(self.datamanager.cached_train):
+            by_size[data["image"].shape[:2]].append(index)
+        _, Ks = self.train_cameras
+        views = (
+            (torch.stack([self.train_viewmat(index) for index in batch]).detach(), Ks[batch], width, height)
+            for (height, width), indices in by_size.items()
+            for batch in (indices[i : i + _VIEWS_PER_BATCH] for i in range(0, len(indices), _VIEWS_PER_BATCH))
+        )
+        pixels = most_pixels(
+            model.gauss_params, views, rasterize_mode=model.config.rasterize_mode, fused=model.config.fused
+        )
+        model.strategy.remove_needless(model.gauss_params, model.optimizers, model.strategy_state, pixels)
 
     def _report_nonfinite(self) -> None:
         """Say in which of the last iterations, and with which images, a loss or gradient was not finite."""

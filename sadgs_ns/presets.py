@@ -36,7 +36,7 @@ OPTIMIZER_GROUPS = (
 def load_preset(name: str) -> MethodSpecification:
     """Read `configs/NAME.yaml` into a method.
 
-    Besides `description`, the keys are those of the method's configuration, nested as on its command line. An entry
+    A preset with a `base` begins with that preset's values. Besides `description`, the keys are those of the method's configuration, nested as on its command line. An entry
     of `optimizers` holds fields of `FusedAdamOptimizerConfig` and, under `schedule`, of
     `RunLengthDecaySchedulerConfig`.
 
@@ -49,7 +49,7 @@ def load_preset(name: str) -> MethodSpecification:
             names the file and the key.
     """
     where = f"{name}.yaml"
-    values = _mapping(_parse((_configs() / where).read_bytes(), where), where)
+    values = _read(where)
     for key in ("description", "optimizers"):
         if key not in values:
             raise ValueError(f"{where} lacks {key!r}; add it.")
@@ -69,6 +69,26 @@ def load_preset(name: str) -> MethodSpecification:
         if group not in groups:
             raise ValueError(f"{where}: optimizers lacks {group!r}; add it.")
     return MethodSpecification(config=config, description=description)
+
+
+def _read(where: str) -> dict[Any, Any]:
+    """Values of a file of presets, on top of its base's."""
+    values = _mapping(_parse((_configs() / where).read_bytes(), where), where)
+    if "base" not in values:
+        return values
+    base = values.pop("base")
+    if not isinstance(base, str) or not (_configs() / f"{base}.yaml").is_file():
+        raise ValueError(f"{where}: base must be the name of another preset, got {_show(base)}.")
+    below = _mapping(_parse((_configs() / f"{base}.yaml").read_bytes(), f"{base}.yaml"), f"{base}.yaml")
+    if "base" in below:
+        raise ValueError(f"{where}: base {base} has a base itself; name that one.")
+    return _merged(below, values)
+
+
+def _merged(below: dict[Any, Any], above: dict[Any, Any]) -> dict[Any, Any]:
+    """Nested mappings, the second's values before the first's."""
+    both = [key for key in above if isinstance(above[key], dict) and isinstance(below.get(key), dict)]
+    return {**below, **above, **{key: _merged(below[key], above[key]) for key in both}}
 
 
 def _parse(content: bytes, where: str) -> Any:
@@ -171,3 +191,5 @@ def _registered(name: str) -> MethodSpecification:
 sadgs: MethodSpecification = _registered("sadgs")
 sadgs_indoor: MethodSpecification = _registered("sadgs-indoor")
 sadgs_large: MethodSpecification = _registered("sadgs-large")
+sadgs_paper: MethodSpecification = _registered("sadgs-paper")
+sadgs_paper_indoor: MethodSpecification = _registered("sadgs-paper-indoor")

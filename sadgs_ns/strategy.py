@@ -87,10 +87,11 @@ class StructureAwareStrategy(Strategy):
     """An opacity reset multiplies every opacity by this."""
     final_prune_opacity: float = 0.1
     """Opacity under which Gaussians are pruned when densification ends."""
-    contribution_prune_iters: tuple[int, ...] = ()
-    """Iterations after which Gaussians that contribute less than `min_contribution` to every training view are removed."""
-    min_contribution: float = 1.0
-    """Pixels of a training view that a Gaussian must account for, in the view in which it does most."""
+    needless_every: int = 1000
+    """Iterations between removals of Gaussians that no training view needs, up to the last such iteration of
+    densification and once more at its end; 0 keeps them, as the paper does."""
+    needless_pixels: float = 1.0
+    """Pixels that a Gaussian must account for in the training view in which it does most, or it is needless."""
     fused: bool = True
     """Measure η in one Triton kernel where that runs (CUDA)."""
     verbose: bool = False
@@ -243,9 +244,35 @@ class StructureAwareStrategy(Strategy):
                 # A reset just before the final prune would leave nothing that had time to recover.
                 self._map_opacities(params, optimizers, lambda opacities: opacities * self.reset_factor)
 
-    def prune_needless(self, params: Params, optimizers: Any, state: Any, pixels: Tensor) -> int:
-        """Remove Gaussians that account for less than `min_contribution` px (`contribution.most_pixels`, [N])."""
-        return self._prune(params, optimizers, state, pixels < self.min_contribution)
+    def removes_needless(self, step: int) -> bool:
+        """Whether `remove_needless` is due after this step's `step_post_backward`."""
+        iteration = step + 1
+        if self.needless_every == 0 or not self.refine_start_iter <= iteration <= self.refine_stop_iter:
+            return False
+        return iteration == self.refine_stop_iter or _due(iteration, self.needless_every)
+
+    def remove_needless(
+        self,
+        params: Params,
+        optimizers: Mapping[str, torch.optim.Optimizer],
+        state: MutableMapping[str, Any],
+        pixels: Tensor,
+    ) -> int:
+        """Remove the Gaussians that account for less than `needless_pixels`, unless none would be left.
+
+        Args:
+            params: gsplat's parameters.
+            optimizers: One per parameter.
+            state: The strategy's state.
+            pixels: As `contribution.most_pixels` measures it over the training views. [N]
+
+        Returns:
+            How many were removed.
+        """
+        n_removed = self._prune(params, optimizers, state, pixels < self.needless_pixels)
+        if self.verbose:
+            print(f"{n_removed} needless Gaussians removed. Now having {len(params['means'])}.")
+        return n_removed
 
     def consistently_low(self, statistics: Mapping[str, Tensor]) -> Tensor:
         """Gaussians that answered low on all three axes in more than τ_prune of their observations. bool [N]"""

@@ -36,7 +36,7 @@ else:
     import tomli as tomllib
 
 CHECKOUT = Path(__file__).parents[1]
-METHODS = ("sadgs", "sadgs-indoor", "sadgs-large")
+METHODS = ("sadgs", "sadgs-indoor", "sadgs-large", "sadgs-paper", "sadgs-paper-indoor")
 CONFIG_CLASSES = (
     SadgsTrainerConfig,
     SadgsPipelineConfig,
@@ -124,8 +124,8 @@ def test_presets_load_under_their_own_names_with_every_optimizer(name: str):
 
 def test_presets_differ_where_their_comments_say():
     views = [load_preset(name).config.pipeline.views_per_iteration for name in METHODS]  # type: ignore[attr-defined]
-    assert views == [1, 2, 1]
-    assert [load_preset(name).config.max_num_iterations for name in METHODS] == [3000, 3000, 7000]
+    assert views == [1, 2, 1, 1, 2]
+    assert [load_preset(name).config.max_num_iterations for name in METHODS] == [3000, 3000, 7000, 3000, 3000]
 
 
 @pytest.mark.parametrize(
@@ -301,3 +301,22 @@ def test_pre_commit_checks_what_make_lint_does():
         ".venv/bin/ruff check", ".venv/bin/ruff format", ".venv/bin/pyright --pythonpath"
     ]  # fmt: skip
     assert re.findall(r"\$\(BIN\)/(\w+ \S+)", lint) == ["ruff check", "ruff format", "pyright --pythonpath"]
+
+
+def test_the_papers_presets_are_ours_without_what_we_added():
+    for name in ("sadgs", "sadgs-indoor"):
+        config, paper = load_preset(name).config, load_preset(name.replace("sadgs", "sadgs-paper")).config
+        assert config.pipeline.model.strategy.needless_every > 0
+        config.pipeline.model.strategy.needless_every = 0
+        config.method_name = paper.method_name
+        assert yaml.dump(config) == yaml.dump(paper)
+
+
+@pytest.mark.parametrize("base", ["nothing", "../pyproject", "sadgs-paper", 3])
+def test_a_base_that_is_no_plain_preset_is_named(base: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for path in (CHECKOUT / "configs").glob("*.yaml"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    (tmp_path / "mine.yaml").write_text(yaml.dump({"base": base, "description": "mine"}))
+    monkeypatch.setattr(presets, "_configs", lambda: tmp_path)
+    with pytest.raises(ValueError, match="^mine.yaml: base "):
+        load_preset("mine")

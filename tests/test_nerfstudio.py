@@ -287,6 +287,14 @@ def test_max_gaussians_is_never_exceeded(colmap: ColmapDataParserConfig, tmp_pat
     assert max(numbers) == cap
 
 
+def test_needless_gaussians_leave_when_the_strategy_says_so(colmap: ColmapDataParserConfig, tmp_path: Path):
+    counts: list[int] = []
+    off = {"absgs_every": 0, "structure_every": 0, "refine_start_iter": 1, "refine_stop_iter": 4}
+    config = configure(tmp_path, colmap, needless_every=2, needless_pixels=4.0, final_prune_opacity=0.0, **off)
+    train(config, lambda trainer: counts.append(trainer.pipeline.model.num_points))
+    assert counts[0] > counts[1] == counts[2] >= counts[3] == counts[4] == counts[5] > 0
+
+
 def test_more_initial_points_than_max_gaussians_are_thinned_out(
     colmap: ColmapDataParserConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

@@ -195,7 +195,7 @@ def test_an_image_apart_from_the_others_by_dots_is_refused(tmp_path: Path):
 
 
 def test_saved_configs_make_the_datamanager_with_the_checks():
-    for name in ("sadgs", "sadgs-indoor", "sadgs-large"):
+    for name in ("sadgs", "sadgs-indoor", "sadgs-large", "sadgs-paper", "sadgs-paper-indoor"):
         datamanager: FullImageDatamanagerConfig = load_preset(name).config.pipeline.datamanager  # type: ignore
         assert datamanager._target is SadgsDatamanagerConfig()._target  # what nerfstudio puts into a loaded config
 
@@ -234,7 +234,7 @@ def test_the_viewer_answers_only_on_loopback_unless_told_otherwise(
         trainer.shutdown()
 
 
-@pytest.mark.parametrize("method", ["sadgs", "sadgs-indoor", "sadgs-large"])
+@pytest.mark.parametrize("method", ["sadgs", "sadgs-indoor", "sadgs-large", "sadgs-paper"])
 def test_the_help_shows_that_the_viewer_listens_on_loopback(method: str, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit):
         cli(AnnotatedBaseConfigUnion, args=[method, "--help"])
