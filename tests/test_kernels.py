@@ -11,6 +11,7 @@ from gsplat.cuda._torch_impl import _spherical_harmonics
 from torch import Tensor
 
 from sadgs_ns import kernels, losses
+from sadgs_ns.absgs import accumulate_gradients, empty_gradients
 from sadgs_ns.bench.rasterizers import random_scene
 from sadgs_ns.optimizers import FusedAdam
 from sadgs_ns.statistics import empty_statistics, observe
@@ -194,6 +195,40 @@ def test_observation_equals_the_reference(monkeypatch, directional, min_opacity,
     for name in ("n_total", "n_high", "n_low"):
         assert torch.equal(fast[name], reference[name]), name
     torch.testing.assert_close(fast["eta_max"], reference["eta_max"], atol=1e-6, rtol=2e-5)
+
+
+@pytest.mark.parametrize("layout", ["parts of rows", "apart", "transposed"])
+@pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
+def test_screen_gradients_add_up_as_in_the_reference(monkeypatch, per_axis_radii, layout):
+    views, n = 3, 300
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.randn((views, n, 12), generator=generator)
+    rows[0, 1, :2], rows[1, 2, 10], rows[2, 3, 9] = math.nan, math.nan, math.inf
+    radii = torch.randint(-1, 4, (views, n, 2), generator=generator, dtype=torch.int32)
+    radii[:, 1:4], radii[:, 5] = 1, 0
+    radii = radii if per_axis_radii else radii[..., 1].contiguous()
+    rows = rows.to(DEVICE)  # before it is cut: a copy of a part would lie apart
+    parts = [rows[..., :2], rows[..., 9:11]]
+    if layout == "apart":
+        parts = [part.contiguous() for part in parts]
+    elif layout == "transposed":
+        parts = [part.mT.contiguous().mT for part in parts]
+    results = []
+    for fused in (False, True):
+        monkeypatch.setattr(kernels, "available", lambda device: True)
+        means2d = torch.zeros((views, n, 2), device=DEVICE)
+        means2d.grad, means2d.absgrad = parts  # type: ignore[attr-defined]
+        info = {"means2d": means2d, "radii": radii.to(DEVICE), "width": 64, "height": 48}
+        sums = empty_gradients(n, DEVICE)
+        for _ in range(2):
+            accumulate_gradients(sums, info, num_views=views, fused=fused)
+        results.append(sums)
+    reference, fast = results
+    assert set(reference["grad_count"].unique().tolist()) == {0, 2, 4, 6} and reference["grad2d"][5] == 0
+    assert reference["absgrad2d"].isinf().nonzero().tolist() == [[3]] and not reference["grad2d"].isnan().any()
+    assert torch.equal(fast.pop("grad_count"), reference["grad_count"])
+    for name, value in fast.items():
+        torch.testing.assert_close(value, reference[name], atol=1e-5, rtol=1e-6)
 
 
 def test_adam_equals_torchs():
