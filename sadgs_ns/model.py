@@ -351,9 +351,9 @@ class SadgsModel(SplatfactoModel):
 
     def get_metrics_dict(self, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Any]:
         """PSNR of the batch and the number of Gaussians; in training PSNR costs nothing beyond the loss."""
-        if "mse" not in outputs:
+        if "psnr" not in outputs:
             return super().get_metrics_dict(outputs, batch)  # type: ignore[arg-type]
-        metrics: dict[str, Any] = {"psnr": -10 * outputs["mse"].log10(), "gaussian_count": self.num_points}
+        metrics: dict[str, Any] = {"psnr": outputs["psnr"], "gaussian_count": self.num_points}
         self.camera_optimizer.get_metrics_dict(metrics)
         return metrics
 
@@ -363,7 +363,7 @@ class SadgsModel(SplatfactoModel):
         """Photometric loss of views of one size, and splatfacto's regularizers where they are on.
 
         Args:
-            outputs: `rgb` [C, H, W, 3] or [H, W, 3], and `background`. The mean squared error is added as `mse`.
+            outputs: `rgb` [C, H, W, 3] or [H, W, 3], and `background`. In training, PSNR is added as `psnr`.
             batch: `image` of the same leading shape and, optionally, a boolean `mask` [..., H, W, 1].
         """
         target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
@@ -372,7 +372,7 @@ class SadgsModel(SplatfactoModel):
             mask = batch["mask"].to(self.device)
             target, predicted = target * mask, predicted * mask
         height, width = target.shape[-3:-1]
-        loss, mse = photometric_loss(
+        loss, psnr = photometric_loss(
             predicted.reshape(-1, height, width, 3),
             target.reshape(-1, height, width, 3),
             ssim_lambda=self.config.ssim_lambda,
@@ -381,7 +381,7 @@ class SadgsModel(SplatfactoModel):
         )
         losses = {"main_loss": loss}
         if self.training:
-            outputs["mse"] = mse.detach()
+            outputs["psnr"] = psnr
             if self.config.use_scale_regularization and self.step % 10 == 0:
                 scales = self.scales.exp()
                 ratio = scales.amax(dim=-1) / scales.amin(dim=-1)
