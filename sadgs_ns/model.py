@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
+from functools import lru_cache
 from typing import Annotated, Any, Literal, get_type_hints
 
 import torch
@@ -337,6 +338,16 @@ class SadgsModel(SplatfactoModel):
         outputs = super().get_outputs_for_camera(camera, obb_box)
         return outputs if self.viewer_outputs is None else outputs | self.viewer_outputs(camera, outputs)
 
+    def get_gt_img(self, image: Tensor) -> Tensor:
+        """An image as the loss compares it: on the model's device and in [0, 1], from uint8 in one launch, not two."""
+        image = image.to(self.device)
+        return image / 255.0 if image.dtype == torch.uint8 else image
+
+    def _get_background_color(self) -> Tensor:
+        """Splatfacto's, but black and white are not made anew in each step. [3]"""
+        grey = {"black": 0.0, "white": 1.0}.get(self.config.background_color)
+        return super()._get_background_color() if grey is None else _constant_color(grey, self.device)
+
     def composite_with_background(self, image: Tensor, background: Tensor) -> Tensor:
         """Put images with an alpha channel before the background.
 
@@ -435,6 +446,11 @@ class SadgsModel(SplatfactoModel):
         for name, parameter in self.gauss_params.items():
             parameter.data = torch.empty_like(dict[f"gauss_params.{name}"], device=self.device)
         return super(SplatfactoModel, self).load_state_dict(dict, **kwargs)
+
+
+@lru_cache(maxsize=8)
+def _constant_color(grey: float, device: torch.device) -> Tensor:
+    return torch.full((3,), grey, device=device)
 
 
 def _refuse_fields_without_effect(config: SadgsModelConfig) -> None:
