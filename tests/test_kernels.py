@@ -157,15 +157,23 @@ def test_codes_are_the_references_or_their_neighbours(monkeypatch):
     assert torch.equal(actual[0, :4], expected[0, :4])
 
 
+@pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
 @pytest.mark.parametrize("degree", range(4))
-def test_colours_and_gradients_equal_gsplats_float64_harmonics(degree):
+def test_colours_and_gradients_equal_gsplats_float64_harmonics(degree, per_axis_radii):
     generator = torch.Generator().manual_seed(degree)
-    shapes = (90, 3), (90, 3), (90, 15, 3), (3, 1, 3), (3, 90, 3)
-    *values, positions, weights = (torch.randn(shape, generator=generator) for shape in shapes)
-    drawn = torch.rand((3, 90), generator=generator) > 0.2
+    shapes = (90, 3), (90, 3), (90, 15, 3), (3, 3), (3, 90, 3)
+    *values, centres, weights = (torch.randn(shape, generator=generator) for shape in shapes)
+    viewmats, radii = scenes.cameras_at(centres), torch.randint(-1, 9, (3, 90, 2), generator=generator)
+    radii = radii if per_axis_radii else radii[..., 0].contiguous()
+    drawn = (radii > 0).all(dim=-1) if per_axis_radii else radii > 0
     fast = [value.to(DEVICE, copy=True).requires_grad_() for value in values]
-    colors = harmonics.colors_from_harmonics(degree, *fast, positions.to(DEVICE), drawn.to(DEVICE))
-    (colors * (weights * drawn[..., None]).to(DEVICE)).sum().backward()
+    colors = harmonics.colors_from_harmonics(degree, *fast, viewmats.to(DEVICE), radii.to(DEVICE))
+    v_colors = (weights * drawn[..., None]).to(DEVICE)
+    if per_axis_radii:  # as compositing returns them
+        v_colors = torch.nn.functional.pad(v_colors, (6, 3))[..., 6:9]
+    colors.backward(v_colors)
+    positions = scenes.centres_of(viewmats)
+    torch.testing.assert_close(positions[:, 0].float(), centres, atol=1e-5, rtol=1e-5)
     slow = means, first, rest = [value.double().requires_grad_() for value in values]
     coefficients = torch.cat([first[:, None], rest], dim=1).expand(3, -1, -1, -1)
     expected = (_spherical_harmonics(degree, means - positions, coefficients) + 0.5).clamp_min(0)

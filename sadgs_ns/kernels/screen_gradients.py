@@ -9,16 +9,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from sadgs_ns.kernels.visibility import drawn
+
 _LANES = 256  # Gaussians a program handles
-
-
-@triton.jit
-def drawn(radii, at, exists, PER_GAUSSIAN: tl.constexpr):
-    """Whether the rasterizer drew Gaussian `at` of all views: as `rasterization.visible`, of contiguous radii."""
-    radius = tl.load(radii + PER_GAUSSIAN * at, exists, 0)
-    if PER_GAUSSIAN == 2:
-        radius = tl.minimum(radius, tl.load(radii + 2 * at + 1, exists, 0))
-    return exists & (radius > 0)
 
 
 @triton.jit
