@@ -9,6 +9,7 @@ import torch
 from gsplat.strategy.ops import duplicate, split
 from torch import Tensor
 
+from sadgs_ns import kernels
 from sadgs_ns.rasterization import visible
 from sadgs_ns.split import Params, limit_growth
 
@@ -20,7 +21,9 @@ def empty_gradients(num_gaussians: int, device: torch.device) -> dict[str, Tenso
 
 
 @torch.no_grad()
-def accumulate_gradients(gradients: MutableMapping[str, Tensor], info: Mapping[str, Any], num_views: int) -> None:
+def accumulate_gradients(
+    gradients: MutableMapping[str, Tensor], info: Mapping[str, Any], num_views: int, *, fused: bool = True
+) -> None:
     """Add the screen-space gradients of one backward pass, in place.
 
     Gradients are normalised as in 3DGS: by half the image size, so that 1 is the gradient per half image, and by the
@@ -30,11 +33,18 @@ def accumulate_gradients(gradients: MutableMapping[str, Tensor], info: Mapping[s
         gradients: As made by `empty_gradients`.
         info: gsplat's meta, unpacked, whose `means2d` [C, N, 2] kept its `.grad` and `.absgrad`.
         num_views: Views that the loss is a mean of.
+        fused: Use the Triton kernel where it runs: CUDA, float32.
     """
     means2d = info["means2d"]
-    seen = visible(info)  # [C, N]
     # Python numbers: a tensor made of them here would make the host wait for its copy to the device.
     scale_x, scale_y = info["width"] / 2.0 * num_views, info["height"] / 2.0 * num_views
+    if fused and means2d.dtype == torch.float32 and kernels.available(means2d.device):
+        from sadgs_ns.kernels import screen_gradients
+
+        sums = gradients["grad2d"], gradients["absgrad2d"], gradients["grad_count"]
+        screen_gradients.accumulate_gradients(sums, info["radii"], means2d.grad, means2d.absgrad, (scale_x, scale_y))
+        return
+    seen = visible(info)  # [C, N]
     for key, gradient in (("grad2d", means2d.grad), ("absgrad2d", means2d.absgrad)):
         norm = torch.hypot(gradient[..., 0] * scale_x, gradient[..., 1] * scale_y)  # [C, N]
         gradients[key] += torch.where(seen, norm, 0.0).nansum(0)

@@ -29,7 +29,7 @@ from sadgs_ns.model import SadgsModel
 from sadgs_ns.pictures import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
 from sadgs_ns.pipeline import SadgsPipeline
 from sadgs_ns.rasterization import viewmats_from_camera_to_world
-from sadgs_ns.split import grid_split
+from sadgs_ns.split import grid_split, num_children
 from sadgs_ns.storage import decode
 from sadgs_ns.trainer import SadgsTrainerConfig
 
@@ -160,7 +160,7 @@ def screen_gradients(pipeline: SadgsPipeline, progress: Callable[[range], Any]) 
             outputs = {"rgb": render[..., :3] + (1 - alpha) * background, "background": background}
             batch = {name: data[name][None].to(pipeline.device) for name in ("image", "mask") if name in data}
             model.get_loss_dict(outputs, batch)["main_loss"].backward()
-        accumulate_gradients(gradients, info, num_views=1)
+        accumulate_gradients(gradients, info, num_views=1, fused=model.strategy.fused)
         model.zero_grad(set_to_none=True)
     return gradients
 
@@ -220,7 +220,7 @@ def view_panels(pipeline: SadgsPipeline, view: View, statistics: dict[str, Tenso
     height, width = view.photo.shape[:2]
     enlarge = max(MIN_SIDE / max(height, width), 1.0)
     size = (round(enlarge * height), round(enlarge * width))
-    split, added = int((counts > 1).any(dim=1).sum()), int((counts.prod(dim=1) - 1).sum())
+    split, added = int((counts > 1).any(dim=1).sum()), int((num_children(counts) - 1).sum())
     photo = to_picture(view.photo)
     return {
         "ellipses": Panel(

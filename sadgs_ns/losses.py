@@ -36,7 +36,7 @@ def photometric_loss(
         fused: Take the Triton kernels where they run and hold: CUDA, float32, views of at least 11×11 px.
 
     Returns:
-        The loss and the mean squared error, both scalars.
+        The loss, and PSNR in dB for values in [0, 1], without gradient; both scalars.
     """
     suits = predicted.dtype == target.dtype == torch.float32 and min(predicted.shape[1:3]) >= WINDOW
     if fused and suits and kernels.available(predicted.device):
@@ -52,4 +52,4 @@ def photometric_loss(
         data_range=1.0,
         win=_window(predicted.device, predicted.dtype),
     )
-    return (1 - ssim_lambda) * l1 + ssim_lambda * (1 - similarity) + l2_lambda * l2, l2
+    return (1 - ssim_lambda) * l1 + ssim_lambda * (1 - similarity) + l2_lambda * l2, -10 * l2.detach().log10()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
+from functools import lru_cache
 from typing import Annotated, Any, Literal, get_type_hints
 
 import torch
@@ -337,6 +338,16 @@ class SadgsModel(SplatfactoModel):
         outputs = super().get_outputs_for_camera(camera, obb_box)
         return outputs if self.viewer_outputs is None else outputs | self.viewer_outputs(camera, outputs)
 
+    def get_gt_img(self, image: Tensor) -> Tensor:
+        """An image as the loss compares it: on the model's device and in [0, 1], from uint8 in one launch, not two."""
+        image = image.to(self.device)
+        return image / 255.0 if image.dtype == torch.uint8 else image
+
+    def _get_background_color(self) -> Tensor:
+        """Splatfacto's, but black and white are not made anew in each step. [3]"""
+        grey = {"black": 0.0, "white": 1.0}.get(self.config.background_color)
+        return super()._get_background_color() if grey is None else _constant_color(grey, self.device)
+
     def composite_with_background(self, image: Tensor, background: Tensor) -> Tensor:
         """Put images with an alpha channel before the background.
 
@@ -351,9 +362,9 @@ class SadgsModel(SplatfactoModel):
 
     def get_metrics_dict(self, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Any]:
         """PSNR of the batch and the number of Gaussians; in training PSNR costs nothing beyond the loss."""
-        if "mse" not in outputs:
+        if "psnr" not in outputs:
             return super().get_metrics_dict(outputs, batch)  # type: ignore[arg-type]
-        metrics: dict[str, Any] = {"psnr": -10 * outputs["mse"].log10(), "gaussian_count": self.num_points}
+        metrics: dict[str, Any] = {"psnr": outputs["psnr"], "gaussian_count": self.num_points}
         self.camera_optimizer.get_metrics_dict(metrics)
         return metrics
 
@@ -363,7 +374,7 @@ class SadgsModel(SplatfactoModel):
         """Photometric loss of views of one size, and splatfacto's regularizers where they are on.
 
         Args:
-            outputs: `rgb` [C, H, W, 3] or [H, W, 3], and `background`. The mean squared error is added as `mse`.
+            outputs: `rgb` [C, H, W, 3] or [H, W, 3], and `background`. In training, PSNR is added as `psnr`.
             batch: `image` of the same leading shape and, optionally, a boolean `mask` [..., H, W, 1].
         """
         target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
@@ -372,7 +383,7 @@ class SadgsModel(SplatfactoModel):
             mask = batch["mask"].to(self.device)
             target, predicted = target * mask, predicted * mask
         height, width = target.shape[-3:-1]
-        loss, mse = photometric_loss(
+        loss, psnr = photometric_loss(
             predicted.reshape(-1, height, width, 3),
             target.reshape(-1, height, width, 3),
             ssim_lambda=self.config.ssim_lambda,
@@ -381,7 +392,7 @@ class SadgsModel(SplatfactoModel):
         )
         losses = {"main_loss": loss}
         if self.training:
-            outputs["mse"] = mse.detach()
+            outputs["psnr"] = psnr
             if self.config.use_scale_regularization and self.step % 10 == 0:
                 scales = self.scales.exp()
                 ratio = scales.amax(dim=-1) / scales.amin(dim=-1)
@@ -435,6 +446,11 @@ class SadgsModel(SplatfactoModel):
         for name, parameter in self.gauss_params.items():
             parameter.data = torch.empty_like(dict[f"gauss_params.{name}"], device=self.device)
         return super(SplatfactoModel, self).load_state_dict(dict, **kwargs)
+
+
+@lru_cache(maxsize=8)
+def _constant_color(grey: float, device: torch.device) -> Tensor:
+    return torch.full((3,), grey, device=device)
 
 
 def _refuse_fields_without_effect(config: SadgsModelConfig) -> None:

@@ -27,6 +27,7 @@ from torch import Tensor
 from sadgs_ns.atomic import atomic_path
 from sadgs_ns.eta import WAVELENGTH_EPSILON, wavelength
 from sadgs_ns.rasterization import rasterize
+from sadgs_ns.split import num_children
 from sadgs_ns.structure_tensor import FREQUENCY_CONSTANT, NUM_LEVELS, SCALE_STEP
 
 Picture = NDArray[np.uint8]
@@ -248,7 +249,7 @@ def children_map(params: Mapping[str, Tensor], counts: Tensor, *view, **options)
     Returns:
         ≥ 1; NaN where hardly anything is drawn. [H, W]
     """
-    total, cover = blend(params, counts.prod(dim=1, keepdim=True).float().log(), *view, **options)
+    total, cover = blend(params, num_children(counts)[:, None].float().log(), *view, **options)
     return torch.where(cover > MIN_COVER, (total / cover).exp(), torch.nan)[..., 0]
 
 

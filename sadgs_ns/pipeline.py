@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -129,8 +129,8 @@ class SadgsPipeline(VanillaPipeline):
         return self._model  # type: ignore[return-value]
 
     @cached_property
-    def train_cameras(self) -> tuple[Tensor, Tensor]:
-        """World-to-camera matrices [C, 4, 4] and intrinsics in px [C, 3, 3] of all training views.
+    def train_cameras(self) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+        """World-to-camera matrices [4, 4] and intrinsics in px [3, 3] of all training views, each a tensor of its own.
 
         Made once: asking nerfstudio's cameras for them in each step makes the host wait for the device.
 
@@ -146,7 +146,7 @@ class SadgsPipeline(VanillaPipeline):
         cameras = dataset.cameras
         refuse_failed_undistortion(cameras, dataset.image_filenames)
         viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
-        return viewmats.to(self.device), cameras.get_intrinsics_matrices().to(self.device)
+        return viewmats.to(self.device).unbind(), cameras.get_intrinsics_matrices().to(self.device).unbind()
 
     @cached_property
     def structure_tensors(self) -> list[Tensor]:
@@ -199,6 +199,16 @@ class SadgsPipeline(VanillaPipeline):
         camera = self.datamanager.train_cameras[index : index + 1].to(self.device)
         camera.metadata = {"cam_idx": index}
         return viewmats_from_camera_to_world(self.model.camera_optimizer.apply_to_camera(camera))[0]
+
+    def _stacked_cameras(self, indices: list[int]) -> tuple[Tensor, Tensor]:
+        """World-to-camera matrices [V, 4, 4] and intrinsics in px [V, 3, 3] of V training views."""
+        viewmats, Ks = [self.train_viewmat(index) for index in indices], [self.train_cameras[1][i] for i in indices]
+        n = len(indices)
+        if n == 1:
+            return viewmats[0][None], Ks[0][None]
+        # One copy on the device instead of two; both results are contiguous, as gsplat wants them.
+        flat_viewmats, flat_Ks = torch.cat([matrix.flatten() for matrix in viewmats + Ks]).split([16 * n, 9 * n])
+        return flat_viewmats.view(n, 4, 4), flat_Ks.view(n, 3, 3).detach()
 
     @torch.no_grad()
     def observe_training_views(self, progress: Callable[[range], Iterable[int]] = iter) -> dict[str, Tensor]:
@@ -300,7 +310,6 @@ class SadgsPipeline(VanillaPipeline):
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
         """Render the iteration's views and return the outputs of the last size, mean losses and mean metrics."""
         groups: dict[torch.Size, list[tuple[int, dict[str, Any]]]] = defaultdict(list)
-        _, Ks = self.train_cameras
         for _ in range(self.config.views_per_iteration):
             index, data = self._next_view()
             groups[data["image"].shape].append((index, data))
@@ -310,21 +319,21 @@ class SadgsPipeline(VanillaPipeline):
         observes = self.model.wants_structure_tensors(step)
         for (height, width, _), views in groups.items():
             indices = [index for index, _ in views]
-            batch = {"image": torch.stack([data["image"] for _, data in views])}
+            batch = {"image": _stack([data["image"] for _, data in views])}
             if any("mask" in data for _, data in views):
                 everything = torch.ones((height, width, 1), dtype=torch.bool, device=self.device)
-                batch["mask"] = torch.stack([data.get("mask", everything).to(self.device) for _, data in views])
+                batch["mask"] = _stack([data.get("mask", everything).to(self.device) for _, data in views])
             tensors = None
             if observes:
-                tensors = torch.stack([self.structure_tensors[index].to(self.device) for index in indices])
-            group_viewmats = torch.stack([self.train_viewmat(index) for index in indices])
-            group_Ks = torch.stack([Ks[index] for index in indices])
-            outputs = self.model.get_training_outputs(group_viewmats, group_Ks, width, height, indices, tensors)
+                tensors = _stack([self.structure_tensors[index].to(self.device) for index in indices])
+            viewmats, Ks = self._stacked_cameras(indices)
+            outputs = self.model.get_training_outputs(viewmats, Ks, width, height, indices, tensors)
             group_losses = self.model.get_loss_dict(outputs, batch)
             weight = len(views) / self.config.views_per_iteration
             for total, part in ((losses, group_losses), (metrics, self.model.get_metrics_dict(outputs, batch))):
                 for name, value in part.items():
-                    total[name] = total.get(name, 0) + weight * value
+                    # The mean over one size, the usual case, is no work for the device, here or in the backward pass.
+                    total[name] = value if len(groups) == 1 else total.get(name, 0) + weight * value
         if self.log.full:
             self._report_nonfinite()
         self.log.begin_step(step, [index for views in groups.values() for index, _ in views], losses["main_loss"])
@@ -376,3 +385,8 @@ class SadgsPipeline(VanillaPipeline):
                 self.datamanager.random_generator.setstate(state["view_shuffle"])
         if "cuda" in state and self.device.type == "cuda":
             torch.cuda.set_rng_state(state["cuda"].cpu(), self.device)
+
+
+def _stack(tensors: list[Tensor]) -> Tensor:
+    """`torch.stack`, but a single tensor is not copied."""
+    return tensors[0][None] if len(tensors) == 1 else torch.stack(tensors)

@@ -36,9 +36,9 @@ OPTIMIZER_GROUPS = (
 def load_preset(name: str) -> MethodSpecification:
     """Read `configs/NAME.yaml` into a method.
 
-    A preset with a `base` begins with that preset's values. Besides `description`, the keys are those of the method's configuration, nested as on its command line. An entry
-    of `optimizers` holds fields of `FusedAdamOptimizerConfig` and, under `schedule`, of
-    `RunLengthDecaySchedulerConfig`.
+    A preset with a `base` begins with that one's values. Besides `description`, the keys are those of the method's
+    configuration, nested as on its command line. An entry of `optimizers` holds fields of `FusedAdamOptimizerConfig`
+    and, under `schedule`, of `RunLengthDecaySchedulerConfig`.
 
     Args:
         name: The preset and the method, such as `sadgs-indoor`.

@@ -40,6 +40,13 @@ def children_per_axis(eta_max: Tensor, violates: Tensor, exponent: float = 0.5) 
     return torch.where(violates & (counts >= 1), counts, 1.0).long()
 
 
+def num_children(counts: Tensor) -> Tensor:
+    """Children of each parent: the product n_x · n_y · n_z. int64 [N, 3] → [N]"""
+    # For `prod` of integers on CUDA torch compiles a kernel at its first use, which takes half a second.
+    n_x, n_y, n_z = counts.unbind(1)
+    return n_x * n_y * n_z
+
+
 def limit_growth(growth: Tensor, priority: Tensor, budget: float) -> Tensor:
     """Choose which Gaussians may grow so that the hard cap holds, the largest violations first.
 
@@ -83,7 +90,7 @@ def grid_offsets(
         Index of each child's parent, int64 [Q], and the grid coordinate g in parent standard deviations [Q, 3],
         children of one parent in a row, the first axis running fastest.
     """
-    totals = counts.prod(dim=1)  # [P]
+    totals = num_children(counts)  # [P]
     parents = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), totals)  # [Q]
     local = torch.arange(len(parents), device=counts.device) - (torch.cumsum(totals, 0) - totals)[parents]  # [Q]
     n_x, n_y, n_z = counts[parents].unbind(1)

@@ -34,7 +34,7 @@ def encode(tensor: Tensor, fused: bool = True) -> Tensor:
     frequencies = torch.stack([xx, yy], -1).clamp_min(0).sqrt()  # [..., 2] in 1/px
     logarithms = 1 + (frequencies / HIGHEST_FREQUENCY).log2() / OCTAVES  # (−∞, 1]
     codes = (1 + 254 * logarithms).round().clamp(0, 255)
-    product = frequencies.prod(-1)
+    product = frequencies[..., 0] * frequencies[..., 1]
     correlation = torch.where(product > 0, xy / product.clamp_min(torch.finfo(product.dtype).tiny), 0.0)
     return torch.stack([codes[..., 0], (127 + 127 * correlation.clamp(-1, 1)).round(), codes[..., 1]], -1).byte()
 

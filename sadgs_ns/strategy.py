@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sadgs_ns.absgs import accumulate_gradients, empty_gradients, grow
 from sadgs_ns.memory import PLANNED_SHARE, affordable_growth, available_bytes, free_bytes, gaussian_bytes
-from sadgs_ns.split import VARIANCE_EXTENT, Params, children_per_axis, grid_split, limit_growth
+from sadgs_ns.split import VARIANCE_EXTENT, Params, children_per_axis, grid_split, limit_growth, num_children
 from sadgs_ns.statistics import consistent, empty_statistics, observe
 
 Info = Mapping[str, Any]
@@ -93,7 +93,7 @@ class StructureAwareStrategy(Strategy):
     needless_pixels: float = 1.0
     """Pixels that a Gaussian must account for in the training view in which it does most, or it is needless."""
     fused: bool = True
-    """Measure η in one Triton kernel where that runs (CUDA)."""
+    """Measure η, and add up AbsGS's gradients, in one Triton kernel each where these run (CUDA)."""
     verbose: bool = False
     """Print a line at each densification step."""
 
@@ -229,8 +229,9 @@ class StructureAwareStrategy(Strategy):
             return
         views = _views(info)
         if self.absgrad:
+            num_views = sum(view["n_cameras"] for view in views)
             for view in views:
-                accumulate_gradients(state, view, num_views=sum(v["n_cameras"] for v in views))
+                accumulate_gradients(state, view, num_views, fused=self.fused)
         if iteration >= self.refine_start_iter:
             if _due(iteration, self.structure_every):
                 self._structure_step(params, optimizers, state, iteration)
@@ -291,7 +292,7 @@ class StructureAwareStrategy(Strategy):
         violates = consistent(statistics["n_high"], statistics["n_total"], self.tau_split)
         counts = children_per_axis(statistics["eta_max"], violates, self.split_exponent)  # [N, 3]
         worst = torch.where(violates, statistics["eta_max"], 0.0).amax(dim=1)  # [N]
-        return counts, limit_growth(counts.prod(dim=1) - 1, worst, budget)
+        return counts, limit_growth(num_children(counts) - 1, worst, budget)
 
     def children_now(self, statistics: Mapping[str, Tensor]) -> Tensor:
         """n per axis that a structure step would split by now, 1 where whole or over the cap. int64 [N, 3]"""
@@ -310,7 +311,7 @@ class StructureAwareStrategy(Strategy):
         under_cap, in_memory = self._room(params, state)
         counts, allowed = self.split_plan(state, min(under_cap, in_memory))
         n_parents, n_wanted = int(allowed.sum()), int((counts > 1).any(dim=1).sum())
-        if in_memory < min(int((counts.prod(dim=1) - 1).sum()), under_cap):
+        if in_memory < min(int((num_children(counts) - 1).sum()), under_cap):
             _warn_of_memory(iteration, in_memory)
         if n_parents > 0:
             grid_split(params, optimizers, state, torch.where(allowed[:, None], counts, 1), self.split_extent)

@@ -50,6 +50,21 @@ def camera(width: int = 64, height: int = 48, focal: float = 60.0, dtype: torch.
     return torch.eye(4, dtype=dtype)[None], K[None]
 
 
+def cameras_at(centres: Tensor, seed: int = 0) -> Tensor:
+    """viewmats of cameras at centres [C, 3], turned at random. [C, 4, 4]"""
+    generator = torch.Generator().manual_seed(seed)
+    viewmats = torch.eye(4).repeat(len(centres), 1, 1)
+    viewmats[:, :3, :3] = torch.linalg.qr(torch.randn((len(centres), 3, 3), generator=generator))[0]
+    viewmats[:, :3, 3:] = -viewmats[:, :3, :3] @ centres[..., None].float()
+    return viewmats
+
+
+def centres_of(viewmats: Tensor) -> Tensor:
+    """Where cameras are, in float64. [C, 4, 4] → [C, 1, 3]"""
+    viewmats = viewmats.double().cpu()
+    return -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:]).mT
+
+
 def splat(params: dict[str, torch.nn.Parameter], viewmats: Tensor, Ks: Tensor, width: int, height: int, **options: Any):
     """The splatter's colours [C, H, W, 3], alphas [C, H, W, 1] and info of `random_params`' parameters."""
     return rasterization(

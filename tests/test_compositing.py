@@ -146,6 +146,16 @@ def test_without_absgrad_the_rest_is_the_same():
         torch.testing.assert_close(both[1][name], value, atol=1e-6, rtol=1e-5)
 
 
+def test_without_a_gradient_of_alphas_it_counts_as_zero():
+    scene = make_scene("usual", n=30, width=9, height=9)
+    _, alphas, last_ids = reference(scene, background=True)
+    scene["v_alphas"] = torch.zeros_like(scene["v_alphas"])
+    expected = gradients_of(scene, alphas, last_ids, True)
+    scene["v_alphas"] = None
+    for name, value in gradients_of(scene, alphas, last_ids, True).items():
+        torch.testing.assert_close(value, expected[name], atol=1e-6, rtol=1e-5)
+
+
 @pytest.mark.parametrize("broken", [float("nan"), float("inf"), -1e30])
 def test_a_broken_pixel_reaches_the_gaussians_that_it_sees_and_no_others(broken):
     scene = make_scene("usual", width=8, height=8)
@@ -188,8 +198,12 @@ def test_tiles_without_gaussians_stay_out_of_the_others_lists():
         torch.testing.assert_close(gradients[name], expected[name], atol=1e-5, rtol=1e-5)
 
 
-def test_autograd_gets_what_the_kernel_returns(monkeypatch):
+@pytest.mark.parametrize("through", ["colours and alphas", "colours", "alphas"])
+def test_autograd_gets_what_the_kernel_returns(monkeypatch, through):
     scene = make_scene("usual", n=30, width=9, height=9)
+    for name, what in (("v_renders", "colours"), ("v_alphas", "alphas")):
+        if what not in through:
+            scene[name] = torch.zeros_like(scene[name])
     expected, alphas, last_ids = reference(scene, background=True)
     if DEVICE.type == "cpu":  # gsplat's forward pass needs CUDA
         renders = torch.zeros(1, 9, 9, 3)
@@ -201,7 +215,9 @@ def test_autograd_gets_what_the_kernel_returns(monkeypatch):
     renders, alphas = compositing.rasterize_to_pixels(
         *(inputs[name] for name in NAMES[:4]), 9, 9, scene["starts"], scene["ids"], inputs["backgrounds"], True
     )
-    torch.autograd.backward([renders, alphas], [scene["v_renders"], scene["v_alphas"]])
+    outputs = {"v_renders": renders, "v_alphas": alphas}
+    used = [name for name in outputs if scene[name].any()]
+    torch.autograd.backward([outputs[name] for name in used], [scene[name] for name in used])
     for name, value in expected.items():
         found = inputs["means2d"].absgrad if name == "absgrad" else inputs[name].grad
         if name in ("conics", "opacities"):

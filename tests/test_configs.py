@@ -318,5 +318,5 @@ def test_a_base_that_is_no_plain_preset_is_named(base: Any, tmp_path: Path, monk
         (tmp_path / path.name).write_bytes(path.read_bytes())
     (tmp_path / "mine.yaml").write_text(yaml.dump({"base": base, "description": "mine"}))
     monkeypatch.setattr(presets, "_configs", lambda: tmp_path)
-    with pytest.raises(ValueError, match="^mine.yaml: base "):
+    with pytest.raises(ValueError, match=r"^mine\.yaml: base "):
         load_preset("mine")

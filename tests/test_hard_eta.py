@@ -419,8 +419,8 @@ def test_broken_harmonics_show_in_the_colour_and_distant_ones_are_finite():
             means,
             first,
             rest,
-            torch.zeros((1, 1, 3), device=DEVICE),
-            torch.ones((1, 4), dtype=torch.bool, device=DEVICE),
+            torch.eye(4, device=DEVICE)[None],
+            torch.ones((1, 4), dtype=torch.int32, device=DEVICE),
         )
     assert colors[0, :3].isfinite().all(), "too far to be squared, and in the camera: no direction, degree 0 only"
     assert colors[0, 3].isnan().tolist() == [False, True, False]

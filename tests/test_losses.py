@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from pytorch_msssim import ssim
 
@@ -16,17 +18,17 @@ def images(*shape: int) -> tuple[torch.Tensor, torch.Tensor]:
 
 def test_loss_is_the_stated_sum():
     predicted, target = images(2, 20, 30, 3)
-    loss, mse = photometric_loss(predicted, target, ssim_lambda=0.3, l2_lambda=1.5)
+    loss, psnr = photometric_loss(predicted, target, ssim_lambda=0.3, l2_lambda=1.5)
     similarity = ssim(predicted.permute(0, 3, 1, 2), target.permute(0, 3, 1, 2), data_range=1.0)
     l1, l2 = (predicted - target).abs().mean(), (predicted - target).square().mean()
     torch.testing.assert_close(loss, 0.7 * l1 + 0.3 * (1 - similarity) + 1.5 * l2)
-    torch.testing.assert_close(mse, l2)
+    torch.testing.assert_close(psnr, 10 * torch.log10(1 / l2))
 
 
 def test_equal_images_cost_nothing():
     _, target = images(1, 16, 16, 3)
-    loss, mse = photometric_loss(target, target)
-    assert abs(float(loss)) < 1e-6 and float(mse) == 0
+    loss, psnr = photometric_loss(target, target)
+    assert abs(float(loss)) < 1e-6 and psnr == math.inf
 
 
 def test_gradient_by_finite_differences():

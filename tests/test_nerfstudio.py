@@ -469,6 +469,33 @@ def test_views_of_two_sizes_train_together(tmp_path: Path):
     assert is_finite(pipeline.model)
 
 
+@pytest.mark.parametrize("camera_optimizer", ["off", "SO3xR3"])
+def test_the_loss_of_views_is_the_mean_of_their_own(tmp_path: Path, camera_optimizer: Any):
+    """Each with its own camera, whether they are rendered together or, being of two sizes, one by one."""
+    config = configure(tmp_path / "out", nerfstudio_data(tmp_path / "data", [(WIDTH, HEIGHT), (40, 30)]), iterations=3)
+    config.pipeline.model.camera_optimizer.mode, config.pipeline.model.densify = camera_optimizer, False
+    pipeline = set_up(config).pipeline
+
+    def loss(*indices: int) -> torch.Tensor:
+        pipeline.config.views_per_iteration = len(indices)
+        pipeline.datamanager.train_unseen_cameras[:0] = indices
+        _, losses, metrics = pipeline.get_train_loss_dict(0)
+        assert metrics["gaussian_count"] == pytest.approx(pipeline.model.num_points)
+        return losses["main_loss"].detach()
+
+    alone = [loss(index) for index in range(5)]
+    assert len({round(float(value), 4) for value in alone}) == 5
+    for indices in [(0, 2), (3, 1), (0, 1), (4, 1, 2)]:
+        torch.testing.assert_close(loss(*indices), torch.stack([alone[i] for i in indices]).mean(), rtol=1e-5, atol=0)
+
+
+def test_images_in_bytes_become_what_two_operations_made_of_them(tmp_path: Path, colmap: ColmapDataParserConfig):
+    model = set_up(configure(tmp_path, colmap)).pipeline.model
+    image = torch.arange(256, dtype=torch.uint8).view(-1, 2, 1).expand(-1, -1, 3)
+    assert torch.equal(model.get_gt_img(image), image.float() / 255.0)
+    assert torch.equal(model.get_gt_img(image.double()), image.double())
+
+
 def test_masked_pixels_have_no_structure_and_no_part_in_the_loss(tmp_path: Path):
     config = configure(tmp_path / "out", nerfstudio_data(tmp_path / "data", masks=True), iterations=7)
     config.pipeline.views_per_iteration = 2

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 import triton
 import triton.language as tl
 from gsplat.cuda import _wrapper
@@ -110,7 +111,7 @@ def _composite_backward(
     means2d, conics, colors, opacities, starts, ids, alphas, last_ids, backgrounds, v_renders, v_alphas, gradients,
     num_pairs, height, width, tile_width, tile_height,
     TILE: tl.constexpr, GAUSSIANS: tl.constexpr, STRIDE: tl.constexpr, BACKGROUND: tl.constexpr,
-    ABSGRAD: tl.constexpr, PRECISION: tl.constexpr,
+    ALPHAS: tl.constexpr, ABSGRAD: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
     """Add one tile's share to the gradients [C * N, STRIDE].
 
@@ -141,7 +142,9 @@ def _composite_backward(
     red = tl.load(v_renders + 3 * at, inside, 0.0)
     green = tl.load(v_renders + 3 * at + 1, inside, 0.0)
     blue = tl.load(v_renders + 3 * at + 2, inside, 0.0)
-    v_alpha = tl.load(v_alphas + at, inside, 0.0)
+    v_alpha = red * 0
+    if ALPHAS:
+        v_alpha = tl.load(v_alphas + at, inside, 0.0)
     # In a matrix product 0 * NaN would reach all Gaussians of the batch. A pixel whose gradient is not finite counts as
     # 2^100 in the colours' sums and as 0 elsewhere; sums that large become NaN below, in the Gaussians that it sees.
     finite = tl.maximum(tl.maximum(tl.abs(red), tl.abs(green)), tl.maximum(tl.abs(blue), tl.abs(v_alpha))) < 1e18
@@ -243,7 +246,7 @@ def composite_backward(
     alphas: Tensor,
     last_ids: Tensor,
     v_renders: Tensor,
-    v_alphas: Tensor,
+    v_alphas: Tensor | None,
     absgrad: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]:
     """Gradients of gsplat's compositing of three channels in tiles of TILE_SIZE. Tensors are contiguous, in float32.
@@ -262,7 +265,7 @@ def composite_backward(
         alphas: As rendered. [C, height, width, 1]
         last_ids: Place in the lists of the last Gaussian that a pixel drew, int32 [C, height, width].
         v_renders: Gradient of the rendered colours. [C, height, width, 3]
-        v_alphas: Gradient of `alphas`. [C, height, width, 1]
+        v_alphas: Gradient of `alphas`, None where nothing depends on them. [C, height, width, 1]
         absgrad: Whether to sum the absolute gradients of the centres, too.
 
     Returns:
@@ -274,9 +277,9 @@ def composite_backward(
         height, width = last_ids.shape[1:]
         _composite_backward[(isect_offsets.numel(),)](
             means2d, conics, colors, opacities, isect_offsets, flatten_ids, alphas, last_ids,
-            means2d if backgrounds is None else backgrounds, v_renders, v_alphas, gradients,
-            len(flatten_ids), height, width, isect_offsets.shape[2], isect_offsets.shape[1],
-            TILE_SIZE, _GAUSSIANS, _STRIDE, backgrounds is not None, absgrad, PRECISION,
+            means2d if backgrounds is None else backgrounds, v_renders, alphas if v_alphas is None else v_alphas,
+            gradients, len(flatten_ids), height, width, isect_offsets.shape[2], isect_offsets.shape[1],
+            TILE_SIZE, _GAUSSIANS, _STRIDE, backgrounds is not None, v_alphas is not None, absgrad, PRECISION,
             num_warps=_WARPS, num_stages=1,
         )  # fmt: skip
     v_means2d, v_conics, v_opacities, v_colors, v_absolute, _ = gradients.split([2, 3, 1, 3, 2, 1], dim=-1)
@@ -287,12 +290,21 @@ class _RasterizeToPixels(_wrapper._RasterizeToPixels):
     """gsplat's function, whose forward pass saves the same tensors in 1.4 and 1.5, with another backward pass."""
 
     @staticmethod
+    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor]:
+        ctx.set_materialize_grads(False)  # where nothing depends on alphas, their gradient would be an image of zeros
+        return _wrapper._RasterizeToPixels.forward(ctx, *inputs)
+
+    @staticmethod
     @once_differentiable
-    def backward(ctx: Any, v_renders: Tensor, v_alphas: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(  # type: ignore[override]
+        ctx: Any, v_renders: Tensor | None, v_alphas: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
         means2d, conics, colors, opacities, backgrounds, _, starts, ids, alphas, last_ids = ctx.saved_tensors
+        if v_renders is None:
+            v_renders = torch.zeros((*last_ids.shape, 3), device=colors.device)
         v_means2d, v_conics, v_colors, v_opacities, v_absolute = composite_backward(
             means2d, conics, colors, opacities, backgrounds, starts, ids, alphas, last_ids,
-            v_renders.contiguous(), v_alphas.contiguous(), ctx.absgrad,
+            v_renders.contiguous(), None if v_alphas is None else v_alphas.contiguous(), ctx.absgrad,
         )  # fmt: skip
         if ctx.absgrad:
             means2d.absgrad = v_absolute

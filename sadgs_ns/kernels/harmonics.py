@@ -16,6 +16,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from sadgs_ns.kernels.visibility import drawn
+
 MAX_DEGREE = 3
 """Highest degree that the kernels know."""
 _LANES, _BACKWARD_LANES = 128, 32  # Gaussians a program handles; with four threads for each backwards
@@ -23,11 +25,20 @@ _VIEWS = 2  # how many views' gradients are summed in registers
 
 
 @triton.jit
-def _direction(means, positions, view, g, exists):
+def _minus_centre(viewmat, column):
+    """A coordinate of the camera's centre, −Rᵀ t, with the sign changed."""
+    x = tl.load(viewmat + column) * tl.load(viewmat + 3)
+    y = tl.load(viewmat + 4 + column) * tl.load(viewmat + 7)
+    return x + y + tl.load(viewmat + 8 + column) * tl.load(viewmat + 11)
+
+
+@triton.jit
+def _direction(means, viewmats, view, g, exists):
     """Unit vector from the camera to the Gaussian, and the inverse of its length."""
-    x = tl.load(means + 3 * g, exists, 1.0) - tl.load(positions + 3 * view)
-    y = tl.load(means + 3 * g + 1, exists, 0.0) - tl.load(positions + 3 * view + 1)
-    z = tl.load(means + 3 * g + 2, exists, 0.0) - tl.load(positions + 3 * view + 2)
+    viewmat = viewmats + 16 * view
+    x = tl.load(means + 3 * g, exists, 1.0) + _minus_centre(viewmat, 0)
+    y = tl.load(means + 3 * g + 1, exists, 0.0) + _minus_centre(viewmat, 1)
+    z = tl.load(means + 3 * g + 2, exists, 0.0) + _minus_centre(viewmat, 2)
     inverse = 1 / tl.maximum(tl.sqrt(x * x + y * y + z * z), 1e-30)
     return x * inverse, y * inverse, z * inverse, inverse
 
@@ -117,12 +128,14 @@ def _slopes(x, y, z):
 
 
 @triton.jit(do_not_specialize=["n", "used", "stride"])
-def _forward(means, positions, first, rest, drawn, colors, n, used, stride, LANES: tl.constexpr):
+def _forward(
+    means, viewmats, first, rest, radii, colors, n, used, stride, PER_GAUSSIAN: tl.constexpr, LANES: tl.constexpr
+):  # fmt: skip
     g = tl.program_id(0) * LANES + tl.arange(0, LANES)
     view = tl.program_id(1)
     at = view * n + g
-    exists = tl.load(drawn + at, g < n, 0) != 0
-    x, y, z, _ = _direction(means, positions, view, g, exists)
+    exists = drawn(radii, at, g < n, PER_GAUSSIAN)
+    x, y, z, _ = _direction(means, viewmats, view, g, exists)
     basis = _basis(x, y, z)
     red = 0.2820947917738781 * tl.load(first + 3 * g, exists, 0.0) + 0.5
     green = 0.2820947917738781 * tl.load(first + 3 * g + 1, exists, 0.0) + 0.5
@@ -159,14 +172,15 @@ def _add(sums, basis, v):
     )
 
 
-@triton.jit(do_not_specialize=["n", "start", "num_views", "used", "stride"])
+@triton.jit(do_not_specialize=["n", "start", "num_views", "used", "stride", "row"])
 def _backward(
-    means, positions, rest, drawn, colors, v_colors, v_means, v_first, v_rest, n, start, num_views, used, stride,
-    LANES: tl.constexpr, VIEWS: tl.constexpr,
+    means, viewmats, rest, radii, colors, v_colors, v_means, v_first, v_rest, n, start, num_views, used, stride, row,
+    PER_GAUSSIAN: tl.constexpr, LANES: tl.constexpr, VIEWS: tl.constexpr,
 ):  # fmt: skip
     """Gradients from VIEWS views, added to those from the views before `start`.
 
-    A Gaussian's three channels lie in neighbouring threads, as in memory; the fourth does nothing.
+    A Gaussian's three channels lie in neighbouring threads, as in memory; the fourth does nothing. Rows of the colours'
+    gradients are `row` numbers apart.
     """
     g = tl.program_id(0) * LANES + tl.arange(0, LANES)
     channel = tl.arange(0, 4)[None, :]
@@ -180,12 +194,12 @@ def _backward(
     for i in tl.static_range(VIEWS):
         view = tl.minimum(start + i, num_views - 1)
         at = view * n + g
-        exists = tl.load(drawn + at, (g < n) & (start + i < num_views), 0) != 0
-        x, y, z, inverse = _direction(means, positions, view, g, exists)
+        exists = drawn(radii, at, (g < n) & (start + i < num_views), PER_GAUSSIAN)
+        x, y, z, inverse = _direction(means, viewmats, view, g, exists)
         seen = exists[:, None] & mine
-        of = 3 * at[:, None] + channel
+        v = tl.load(v_colors + at.to(tl.int64)[:, None] * row + channel, seen, 0.0)
         # A colour that was clamped to 0 passes no gradient on.
-        v = tl.where(tl.load(colors + of, seen, 0.0) > 0, tl.load(v_colors + of, seen, 0.0), 0.0)
+        v = tl.where(tl.load(colors + 3 * at[:, None] + channel, seen, 0.0) > 0, v, 0.0)
         v_sum += v
         sums = _add(sums, _basis(x, y, z), v)
         by_x, by_y, by_z = _slopes(x, y, z)
@@ -213,33 +227,37 @@ def _backward(
 class _Colors(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, first: Tensor, rest: Tensor, positions: Tensor, drawn: Tensor, used: int
+        ctx: Any, means: Tensor, first: Tensor, rest: Tensor, viewmats: Tensor, radii: Tensor, used: int
     ) -> Tensor:
-        num_views, n = drawn.shape
+        num_views, n = radii.shape[:2]
         colors = means.new_empty((num_views, n, 3))
         grid = (triton.cdiv(n, _LANES), num_views)
-        _forward[grid](means, positions, first, rest, drawn, colors, n, used, rest.shape[1] * 3, _LANES)
-        ctx.save_for_backward(means, rest, positions, drawn, colors)
+        _forward[grid](
+            means, viewmats, first, rest, radii, colors, n, used, rest.shape[1] * 3, radii.dim() - 1, _LANES
+        )  # fmt: skip
+        ctx.save_for_backward(means, rest, viewmats, radii, colors)
         ctx.used = used
         return colors
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, v_colors: Tensor) -> tuple[Tensor | None, ...]:
-        means, rest, positions, drawn, colors = ctx.saved_tensors
-        num_views, n = drawn.shape
+        means, rest, viewmats, radii, colors = ctx.saved_tensors
+        num_views, n = radii.shape[:2]
         v_means, v_first, v_rest = torch.empty_like(means), torch.empty_like(means), torch.empty_like(rest)
-        v_colors, stride = v_colors.contiguous(), rest.shape[1] * 3
+        row, stride = v_colors.stride(1), rest.shape[1] * 3
+        if v_colors.stride() != (n * row, row, 1):  # parts of rows, as compositing makes them, are read where they are
+            v_colors, row = v_colors.contiguous(), 3
         for start in range(0, num_views, _VIEWS):
             _backward[triton.cdiv(n, _BACKWARD_LANES),](
-                means, positions, rest, drawn, colors, v_colors, v_means, v_first, v_rest,
-                n, start, num_views, ctx.used, stride, _BACKWARD_LANES, _VIEWS,
+                means, viewmats, rest, radii, colors, v_colors, v_means, v_first, v_rest,
+                n, start, num_views, ctx.used, stride, row, radii.dim() - 1, _BACKWARD_LANES, _VIEWS,
             )  # fmt: skip
         return v_means, v_first, v_rest, None, None, None
 
 
 def colors_from_harmonics(
-    degree: int, means: Tensor, first: Tensor, rest: Tensor, positions: Tensor, drawn: Tensor
+    degree: int, means: Tensor, first: Tensor, rest: Tensor, viewmats: Tensor, radii: Tensor
 ) -> Tensor:
     """max(Σ_k Y_k(direction) · coefficient_k + 0.5, 0), the colours that 3DGS gives Gaussians seen from cameras.
 
@@ -248,11 +266,11 @@ def colors_from_harmonics(
         means: Centres in world space, float32. [N, 3]
         first: Coefficient of degree 0. [N, 3]
         rest: The others, at least those that `degree` needs. [N, K − 1, 3]
-        positions: Camera centres, which get no gradient. [C, 3]
-        drawn: Which Gaussians are seen; the colours of others mean nothing. bool [C, N]
+        viewmats: World-to-camera transforms, rigid, which get no gradient. [C, 4, 4]
+        radii: px, of gsplat 1.4 [C, N] or 1.5 [C, N, 2]; where one is not positive, the colour means nothing.
 
     Returns:
         [C, N, 3]
     """
-    tensors = (value.contiguous() for value in (means, first, rest, positions, drawn))
+    tensors = (value.contiguous() for value in (means, first, rest, viewmats, radii))
     return _Colors.apply(*tensors, (degree + 1) ** 2 - 1)  # type: ignore[return-value]

@@ -1,4 +1,4 @@
-"""`losses.photometric_loss` in four kernels: two separable blurs forward, their adjoints backward.
+"""`losses.photometric_loss` in five kernels: two separable blurs and the sums forward, the blurs' adjoints backward.
 
 Images stay [C, H, W, 3]: a row is 3W numbers, a horizontal neighbour 3 numbers away. The window is symmetric, so the
 adjoint of a blur is the same blur of the zero-padded map. Sizes are not specialised: other images would compile anew.
@@ -22,6 +22,7 @@ from sadgs_ns.losses import WINDOW
 _WEIGHTS = [math.exp(-((k - WINDOW // 2) ** 2) / (2 * 1.5**2)) for k in range(WINDOW)]
 _GAUSSIAN = tuple(weight / sum(_WEIGHTS) for weight in _WEIGHTS)
 _STRIP, _ROWS, _COLUMNS = 1024, 16, 64  # numbers a program handles: along a row, or in a tile for vertical neighbours
+_LANES = 4096  # partial sums that are added at once
 
 
 @triton.jit(do_not_specialize=["n", "row"])
@@ -79,6 +80,30 @@ def _similarity(
     tl.store(slopes + 2 * size + i, by_xy, valid)
     program = (tl.program_id(2) * tl.num_programs(1) + tl.program_id(1)) * tl.num_programs(0) + tl.program_id(0)
     tl.store(sums + program, tl.sum(tl.where(valid, luminance * structure, 0.0)))
+
+
+@triton.jit
+def _total(values, count, LANES: tl.constexpr):
+    """Sum of all, in an order that is always the same. Each lane adds few, so that rounding stays that of a tree."""
+    sums = tl.zeros([LANES], tl.float32)
+    for start in range(0, count, LANES):
+        i = start + tl.arange(0, LANES)
+        sums += tl.load(values + i, i < count, 0.0)
+    return tl.sum(sums)
+
+
+@triton.jit(do_not_specialize=["n", "num_strips", "num_tiles"])
+def _finish(
+    differences, similarities, loss, psnr, n, num_strips, num_tiles, ssim_lambda, l1_weight, ssim_weight, l2_weight,
+    LANES: tl.constexpr,
+):  # fmt: skip
+    """The loss and PSNR of the partial sums, in a program that runs once."""
+    absolute, square = _total(differences, num_strips, LANES), _total(differences + num_strips, num_strips, LANES)
+    of_ssim = ssim_lambda - ssim_weight * _total(similarities, num_tiles, LANES)
+    tl.store(loss + tl.program_id(0), l1_weight * absolute + of_ssim + l2_weight * square)
+    mse = square / n
+    decibels = -3.010299956639812 * tl.log2(tl.where(mse > 0, mse, 1.0))
+    tl.store(psnr + tl.program_id(0), tl.where(mse > 0, decibels, tl.where(mse == 0, float("inf"), mse)))
 
 
 @triton.jit(do_not_specialize=["n", "height", "row"])
@@ -141,10 +166,14 @@ class _PhotometricLoss(torch.autograd.Function):
         ctx.save_for_backward(x, y, slopes)
         n_valid = 3 * views * (height - WINDOW + 1) * (width - WINDOW + 1)
         ctx.weights = (1 - ssim_lambda) / n, ssim_lambda / n_valid, l2_lambda / n
-        l1, l2 = differences.sum(dim=1) / n
-        loss = (1 - ssim_lambda) * l1 + ssim_lambda * (1 - similarities.sum() / n_valid) + l2_lambda * l2
-        ctx.mark_non_differentiable(l2)
-        return loss, l2
+        loss, psnr = x.new_empty(()), x.new_empty(())
+        _finish[1,](
+            differences, similarities, loss, psnr, n, strips, similarities.numel(), ssim_lambda, *ctx.weights, _LANES,
+            num_warps=8,
+        )  # fmt: skip
+        ctx.mark_non_differentiable(psnr)
+        ctx.set_materialize_grads(False)  # PSNR's would be filled with zeros on the device
+        return loss, psnr
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -164,7 +193,7 @@ class _PhotometricLoss(torch.autograd.Function):
 def photometric_loss(
     predicted: Tensor, target: Tensor, *, ssim_lambda: float, l2_lambda: float
 ) -> tuple[Tensor, Tensor]:
-    """As `losses.photometric_loss`, for views of at least 11×11 px; the mean squared error carries no gradient.
+    """As `losses.photometric_loss`, for views of at least 11×11 px; PSNR carries no gradient.
 
     Args:
         predicted: float32 [C, H, W, 3]
@@ -173,6 +202,6 @@ def photometric_loss(
         l2_lambda: λ_2 ≥ 0.
 
     Returns:
-        The loss and the mean squared error, both scalars.
+        The loss and PSNR in dB, both scalars.
     """
     return _PhotometricLoss.apply(predicted.contiguous(), target.contiguous(), ssim_lambda, l2_lambda)  # type: ignore[return-value]

@@ -64,16 +64,12 @@ def rasterization(
         calc_compensations=rasterize_mode == "antialiased",
         **bound,
     )
-    opacities = opacities.expand(num_views, -1)
-    if compensations is not None:
-        opacities = opacities * compensations
+    # Copied once, for the tiles and for compositing.
+    opacities = opacities.expand(num_views, -1).contiguous() if compensations is None else opacities * compensations
     # The host waits for the lists' length: the colours are computed meanwhile.
     pending_tiles = intersect_tiles(means2d, radii, depths, conics, opacities, width, height, TILE_SIZE)
-    drawn = radii > 0 if radii.dim() == 2 else (radii > 0).all(dim=-1)  # [C, N]
-    # gsplat inverts the matrices, which makes the host wait for the device.
-    positions = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:]).mT  # [C, 1, 3]
     if isinstance(colors, tuple) and sh_degree is not None and sh_degree <= MAX_DEGREE and not viewmats.requires_grad:
-        colors = colors_from_harmonics(sh_degree, means, *colors, positions, drawn)
+        colors = colors_from_harmonics(sh_degree, means, *colors, viewmats, radii)
     else:
         if isinstance(colors, tuple):
             colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
@@ -81,6 +77,9 @@ def rasterization(
             colors = colors.expand(num_views, -1, -1)
         else:
             coefficients = colors.expand(num_views, -1, -1, -1)
+            drawn = radii > 0 if radii.dim() == 2 else (radii > 0).all(dim=-1)  # [C, N]
+            # gsplat inverts the matrices, which makes the host wait for the device.
+            positions = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:]).mT  # [C, 1, 3]
             colors = spherical_harmonics(sh_degree, means - positions, coefficients, masks=drawn)
             colors = torch.clamp_min(colors + 0.5, 0.0)
     if render_mode in ("RGB+D", "RGB+ED"):

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 import triton
@@ -23,10 +24,15 @@ _LANES = 32  # Gaussians a program handles: one warp, so that a large one holds 
 
 
 @triton.jit
-def _load_ellipse(means2d, radii, conics, opacities, g, exists, tile_width, tile_height, TILE: tl.constexpr):
+def _load_ellipse(
+    means2d, radii, conics, opacities, g, exists, tile_width, tile_height,
+    PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr,
+):  # fmt: skip
     """Centre, conic, level 2 ln(255 α), reach in y, and the tile rows and columns that gsplat would list."""
-    rx = tl.load(radii + 2 * g, exists, 0).to(tl.float32)
-    ry = tl.load(radii + 2 * g + 1, exists, 0).to(tl.float32)
+    rx = tl.load(radii + PER_GAUSSIAN * g, exists, 0).to(tl.float32)
+    ry = rx
+    if PER_GAUSSIAN == 2:
+        ry = tl.load(radii + 2 * g + 1, exists, 0).to(tl.float32)
     opacity = 255.0 * tl.load(opacities + g, exists, 0.0)
     drawn = exists & (rx > 0) & (ry > 0) & (opacity >= 1)  # gsplat leaves the rest of what it culls unwritten
     x, y = tl.load(means2d + 2 * g, drawn, 0.0), tl.load(means2d + 2 * g + 1, drawn, 0.0)
@@ -73,12 +79,13 @@ def _columns_of_row(row, x, y, a, b, c, level, determinant, proper, first_column
 
 @triton.jit(do_not_specialize=["n", "tile_width", "tile_height"])
 def _count(
-    means2d, radii, conics, opacities, counts, n, tile_width, tile_height, TILE: tl.constexpr, LANES: tl.constexpr
-):
+    means2d, radii, conics, opacities, counts, n, tile_width, tile_height,
+    PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr, LANES: tl.constexpr,
+):  # fmt: skip
     """Number of tiles per Gaussian and view."""
     g = tl.program_id(0) * LANES + tl.arange(0, LANES)
     x, y, a, b, c, level, determinant, proper, first_column, last_column, first_row, last_row = _load_ellipse(
-        means2d, radii, conics, opacities, g, g < n, tile_width, tile_height, TILE
+        means2d, radii, conics, opacities, g, g < n, tile_width, tile_height, PER_GAUSSIAN, TILE
     )
     count = tl.zeros([LANES], tl.int32)
     for i in range(tl.max(last_row - first_row)):
@@ -93,7 +100,7 @@ def _count(
 @triton.jit(do_not_specialize=["n", "num_gaussians", "tile_width", "tile_height"])
 def _list(
     means2d, radii, conics, opacities, order, ends, tiles, ids, n, num_gaussians, tile_width, tile_height,
-    TILE: tl.constexpr, LANES: tl.constexpr,
+    PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
     """Tile and Gaussian of each pair, nearest Gaussians first."""
     lane = tl.program_id(0) * LANES + tl.arange(0, LANES)
@@ -101,7 +108,7 @@ def _list(
     g = tl.load(order + lane, exists, 0).to(tl.int32)
     at = tl.load(ends + lane - 1, exists & (lane > 0), 0)
     x, y, a, b, c, level, determinant, proper, first_column, last_column, first_row, last_row = _load_ellipse(
-        means2d, radii, conics, opacities, g, exists, tile_width, tile_height, TILE
+        means2d, radii, conics, opacities, g, exists, tile_width, tile_height, PER_GAUSSIAN, TILE
     )
     view = g // num_gaussians * tile_height
     for i in range(tl.max(last_row - first_row)):
@@ -116,6 +123,12 @@ def _list(
             tl.store(tiles + at, (tile - 32768).to(tiles.dtype.element_ty), listed)
             tl.store(ids + at, g, listed)
             at += listed.to(at.dtype)
+
+
+@lru_cache(maxsize=8)
+def _tile_numbers(num_tiles: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Of all tiles, in their order."""
+    return torch.arange(-(2**15), num_tiles - 2**15, dtype=dtype, device=device)
 
 
 @dataclass(frozen=True)
@@ -148,11 +161,10 @@ class PendingTiles:
         n = len(self.order)
         _list[triton.cdiv(n, _LANES),](
             *self.ellipses, self.order, self.ends, tiles, ids, n, n // self.tile_counts[0],
-            self.tile_counts[2], self.tile_counts[1], self.tile_size, _LANES, num_warps=1,
+            self.tile_counts[2], self.tile_counts[1], self.ellipses[1].dim() - 1, self.tile_size, _LANES, num_warps=1,
         )  # fmt: skip
         tiles, by_tile = tiles.sort(stable=True)
-        numbers = torch.arange(-(2**15), num_tiles - 2**15, dtype=tiles.dtype, device=device)
-        starts = torch.searchsorted(tiles, numbers, out_int32=True)
+        starts = torch.searchsorted(tiles, _tile_numbers(num_tiles, tiles.dtype, device), out_int32=True)
         return starts.reshape(self.tile_counts), ids[by_tile]
 
 
@@ -184,12 +196,12 @@ def intersect_tiles(
     """
     num_views, num_gaussians = means2d.shape[:2]
     tile_width, tile_height = triton.cdiv(width, tile_size), triton.cdiv(height, tile_size)
-    if radii.dim() == 2:
-        radii = radii[..., None].expand(-1, -1, 2)
     ellipses = [value.contiguous() for value in (means2d, radii, conics, opacities)]
     n, device = num_views * num_gaussians, means2d.device
-    counts = torch.empty(n, dtype=torch.int32, device=device)
-    _count[triton.cdiv(n, _LANES),](*ellipses, counts, n, tile_width, tile_height, tile_size, _LANES, num_warps=1)
+    counts = torch.empty(n, dtype=torch.int64, device=device)  # as cumsum would convert them
+    _count[triton.cdiv(n, _LANES),](
+        *ellipses, counts, n, tile_width, tile_height, radii.dim() - 1, tile_size, _LANES, num_warps=1
+    )  # fmt: skip
     # Sorting the Gaussians by depth and then their pairs by tile, 16 bits in most cases, moves a fraction of the bytes
     # that sorting pairs by both in 64 bits does. Both sorts are stable, as gsplat's is.
     order = depths.flatten().argsort(stable=True)

@@ -1,0 +1,69 @@
+"""`absgs.accumulate_gradients` in one kernel."""
+
+# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
+# (Triton's launch syntax, kernel[grid](...), is not in its types.)
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from sadgs_ns.kernels.visibility import drawn
+
+_LANES = 256  # Gaussians a program handles
+
+
+@triton.jit
+def _norm(gradient, at, seen, scale_x, scale_y):
+    """Length of a gradient, 0 where it is NaN."""
+    x, y = scale_x * tl.load(gradient + at, seen, 0.0), scale_y * tl.load(gradient + at + 1, seen, 0.0)
+    length = tl.sqrt(x * x + y * y)
+    return tl.where(length == length, length, 0.0)
+
+
+# Row lengths are not specialised: a kernel for those that 16 divides would compile anew as Gaussians are added.
+@triton.jit(do_not_specialize=["n", "num_views", "view", "row", "absolute_view", "absolute_row"])
+def _accumulate_gradients(
+    radii, gradient, absolute, grad2d, absgrad2d, grad_count, n, num_views, view, row, absolute_view, absolute_row,
+    scale_x, scale_y, PER_GAUSSIAN: tl.constexpr, LANES: tl.constexpr,
+):  # fmt: skip
+    """Rows of the gradients are `row` numbers apart, and views `view`."""
+    g = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
+    total = tl.zeros([LANES], tl.float32)
+    absolute_total, count = total, total
+    for i in range(num_views):
+        seen = drawn(radii, i * tl.cast(n, tl.int64) + g, g < n, PER_GAUSSIAN)
+        total += _norm(gradient, i * tl.cast(view, tl.int64) + g * row, seen, scale_x, scale_y)
+        absolute_at = i * tl.cast(absolute_view, tl.int64) + g * absolute_row
+        absolute_total += _norm(absolute, absolute_at, seen, scale_x, scale_y)
+        count += seen
+    changed = count > 0
+    tl.store(grad2d + g, tl.load(grad2d + g, changed, 0.0) + total, changed)
+    tl.store(absgrad2d + g, tl.load(absgrad2d + g, changed, 0.0) + absolute_total, changed)
+    tl.store(grad_count + g, tl.load(grad_count + g, changed, 0.0) + count, changed)
+
+
+def accumulate_gradients(
+    sums: tuple[Tensor, Tensor, Tensor],
+    radii: Tensor,
+    gradient: Tensor,
+    absolute: Tensor,
+    scales: tuple[float, float],
+) -> None:
+    """As `absgs.accumulate_gradients`; a gradient longer than 1e19 counts as infinite.
+
+    Args:
+        sums: grad2d, absgrad2d and grad_count, contiguous float32 [N], updated in place.
+        radii: px, of gsplat 1.4 [C, N] or 1.5 [C, N, 2]; not positive where culled.
+        gradient: By the centres in px, float32; may be part of the rows of a larger tensor. [C, N, 2]
+        absolute: The absolute one, likewise. [C, N, 2]
+        scales: What x and y of the gradients are multiplied by.
+    """
+    num_views, n = radii.shape[:2]
+    # Parts of rows are read where they are; only a copy would give other layouts neighbouring x and y.
+    gradient, absolute = (value if value.stride(2) == 1 else value.contiguous() for value in (gradient, absolute))
+    _accumulate_gradients[triton.cdiv(n, _LANES),](
+        radii.contiguous(), gradient, absolute, *sums, n, num_views, gradient.stride(0), gradient.stride(1),
+        absolute.stride(0), absolute.stride(1), *scales, radii.dim() - 1, _LANES,
+    )  # fmt: skip
