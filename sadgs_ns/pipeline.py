@@ -284,9 +284,8 @@ class SadgsPipeline(VanillaPipeline):
         by_size = defaultdict(list)
         for index, data in enumerate(self.datamanager.cached_train):
             by_size[data["image"].shape[:2]].append(index)
-        _, Ks = self.train_cameras
         views = (
-            (torch.stack([self.train_viewmat(index) for index in batch]).detach(), Ks[batch], width, height)
+            (*(camera.detach() for camera in self._stacked_cameras(batch)), width, height)
             for (height, width), indices in by_size.items()
             for batch in (indices[i : i + _VIEWS_PER_BATCH] for i in range(0, len(indices), _VIEWS_PER_BATCH))
         )
