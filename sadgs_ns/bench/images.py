@@ -54,14 +54,16 @@ def save(
         image, _ = render(model, views[index])  # [1, 3, H, W]
         path = Path(file_name(scene), f"{file_name(label)}-{seed}", picture)
         _write(folder / path, image[0].movedim(0, -1))
-        _write(folder / file_name(scene) / "truth" / picture, views[index][1]["image"])
+        truth = folder / file_name(scene) / "truth" / picture
+        # Runs side by side write the same photograph: each by way of a file of its own.
+        _write(truth, views[index][1]["image"], beside=truth.with_name(f"{path.parent.name}-{picture}"))
         paths.append(path.as_posix())
     return paths
 
 
-def _write(path: Path, image: Tensor) -> None:
-    """image: [H, W, 3 or 4], uint8 or float in [0, 1]"""
+def _write(path: Path, image: Tensor, beside: Path | None = None) -> None:
+    """image: [H, W, 3 or 4], uint8 or float in [0, 1]; `beside` as in `atomic_path`"""
     if image.dtype != torch.uint8:
         image = (255 * image).round().byte()
-    with atomic_path(path) as partial:
+    with atomic_path(path, beside) as partial:
         Image.fromarray(image.cpu().numpy()).save(partial)
