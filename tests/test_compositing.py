@@ -5,17 +5,28 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+import scenes
 import torch
+from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
 from torch import Tensor
 
+from sadgs_ns import splatter
+
 compositing = pytest.importorskip("sadgs_ns.kernels.compositing", reason="Triton is not installed")
+rasterization = pytest.importorskip("sadgs_ns.kernels.rasterization", reason="Triton is not installed")
 tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not installed")
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 NAMES = ("means2d", "conics", "colors", "opacities", "absgrad")
 
 
-def make_scene(kind: str, num_views: int = 1, n: int = 60, width: int = 21, height: int = 18) -> dict[str, Any]:
+TINY = 0.05
+"""Standard deviation of the "tiny" kind in px; gsplat's own blur leaves none under 0.55."""
+
+
+def make_scene(
+    kind: str, num_views: int = 1, n: int = 60, width: int = 21, height: int = 18, tiny: float = TINY
+) -> dict[str, Any]:
     """Projected Gaussians with their tile lists, and gradients of what they render."""
     generator = torch.Generator().manual_seed(1)
 
@@ -35,8 +46,8 @@ def make_scene(kind: str, num_views: int = 1, n: int = 60, width: int = 21, heig
         sigmas = torch.stack([20 + 80 * random(), torch.full((num_views, n), 0.56)], dim=-1)
         means2d = size / 2 + 60 * (random() - 0.5)[..., None] * torch.stack([angles.cos(), angles.sin()], dim=-1)
     elif kind == "tiny":
-        sigmas = torch.full((num_views, n, 2), 0.05)
-        means2d = means2d.floor() + 0.5 + 0.2 * random(2)
+        sigmas = torch.full((num_views, n, 2), tiny)
+        means2d = means2d.floor() + 0.5 + min(4 * tiny, 1.0) * random(2)
     elif kind == "huge":
         sigmas = 500 + 1000 * random(2)
         means2d = means2d + 2000 * (random(2) - 0.5)
@@ -137,6 +148,17 @@ def test_gradients_equal_float64_autograd(kind):
         assert error < (5e-4 if name == "absgrad" else TOLERANCES[kind]), (name, float(error))
 
 
+@pytest.mark.parametrize("sigma", [0.05, 0.1, 0.2, 0.55])
+def test_small_gaussians_err_as_the_module_says(sigma):
+    scene = make_scene("tiny", n=200, width=61, height=46, tiny=sigma)
+    expected, alphas, last_ids = reference(scene, background=True)
+    gradients = gradients_of(scene, alphas, last_ids, True)
+    errors = {name: float((gradients[name] - value).norm() / value.norm()) for name, value in expected.items()}
+    assert errors.pop("conics") < 2e-6 / sigma**2  # "about 1e-6"
+    assert errors.pop("absgrad") < (3e-4 if sigma < 0.5 else 1.5e-4)
+    assert max(errors.values()) < 1e-5, errors
+
+
 def test_without_absgrad_the_rest_is_the_same():
     scene = make_scene("usual", n=30, width=9, height=9)
     _, alphas, last_ids = reference(scene, background=True)
@@ -228,10 +250,66 @@ def test_autograd_gets_what_the_kernel_returns(monkeypatch, through):
     torch.testing.assert_close(inputs["backgrounds"].grad, v_backgrounds, atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.skipif(
+    torch.cuda.is_available(), reason="with CUDA, tests/test_rasterization.py takes gsplat's own kernels"
+)
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatch, mode):
+    """All that surrounds gsplat's two kernels, for two views; torch code stands in for these."""
+    width, height, depths = 32, 24, []
+
+    def project(means, _, quats, scales, viewmats, Ks, width, height, calc_compensations, **planes):
+        covariances = _quat_scale_to_covar_preci(quats, scales, True, False)[0]
+        assert covariances is not None
+        projected = _fully_fused_projection(
+            means, covariances, viewmats, Ks, width, height, calc_compensations=calc_compensations, **planes
+        )
+        depths[:] = [projected[2].detach()]
+        return projected
+
+    def draw(means2d, conics, colors, opacities, backgrounds, masks, width, height, tile_size, starts, ids):
+        values = (value.detach().clone() for value in (means2d, conics, colors, opacities))
+        scene = dict(zip(NAMES, values, strict=False)) | {"starts": starts, "ids": ids, "depths": depths[0]}
+        scene["v_renders"], scene["v_alphas"] = torch.ones(2, height, width, 3), torch.ones(2, height, width, 1)
+        with torch.enable_grad():
+            _, alphas, last_ids = reference(scene, background=False)
+        return torch.zeros(2, height, width, 3), alphas.float(), last_ids  # nobody looks at the colours
+
+    monkeypatch.setattr(rasterization, "fully_fused_projection", project)
+    monkeypatch.setattr(compositing._wrapper, "_make_lazy_cuda_func", lambda name: draw)
+    generator = torch.Generator().manual_seed(0)
+    viewmats = torch.eye(4).repeat(2, 1, 1)
+    viewmats[1, :3, :3] = torch.linalg.qr(torch.eye(3) + 0.05 * torch.randn(3, 3, generator=generator))[0]
+    viewmats[1, :3, :3] *= viewmats[1, :3, :3].diagonal().sign()
+    viewmats[1, :3, 3] = torch.tensor([0.2, 0.1, 0.3])
+    Ks = scenes.camera(width, height, 30.0)[1].repeat(2, 1, 1)
+    rest, v_renders = (0.1 * torch.randn(shape, generator=generator) for shape in ((60, 15, 3), (2, height, width, 3)))
+    results = []
+    for function, dtype in ((rasterization.rasterization, torch.float32), (splatter.rasterization, torch.float64)):
+        values = {name: p.detach() for name, p in scenes.random_params(60).items()} | {"rest": rest}
+        values = {name: value.to(dtype, copy=True).requires_grad_() for name, value in values.items()}
+        colors: Any = values["features_dc"], values["rest"]
+        if dtype == torch.float64:
+            colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
+        geometry = values["means"], values["quats"], values["scales"].exp(), torch.sigmoid(values["opacities"])
+        renders, _, info = function(
+            *geometry, colors, viewmats.to(dtype), Ks.to(dtype), width, height, near_plane=0.01, far_plane=1e10,
+            sh_degree=3, packed=False, backgrounds=None, render_mode="RGB", absgrad=True, rasterize_mode=mode,
+        )  # fmt: skip
+        renders.backward(v_renders.to(dtype))
+        results.append({name: value.grad for name, value in values.items()} | {"absgrad": info["means2d"].absgrad})
+    for name, expected in results[1].items():
+        error = (results[0][name].double() - expected).norm() / expected.norm()
+        assert error < (1e-4 if name == "absgrad" else 5e-6), (name, float(error))
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat's kernels need CUDA")
 @pytest.mark.parametrize("kind", TOLERANCES)
 def test_gradients_are_as_close_to_float64_as_gsplats(kind):
-    """As norms: rounding moves a few pairs over a cut-off, in either's passes, and single values with them."""
+    """As norms: rounding moves a few pairs over a cut-off, in either's passes, and single values with them.
+
+    Where ours may err more than gsplat's, it is by what the module states.
+    """
     from gsplat.cuda._wrapper import rasterize_to_pixels
 
     scene = make_scene(kind, num_views=2, n=300, width=93, height=70)
@@ -254,5 +332,8 @@ def test_gradients_are_as_close_to_float64_as_gsplats(kind):
         )  # fmt: skip
         errors.append({k: float((gradients[k].double().cpu() - v).norm() / v.norm()) for k, v in expected.items()})
     print(kind, *errors)
+    stated = {"absgrad": 1e-4}
+    if kind == "tiny":
+        stated = {"absgrad": 3e-4, "conics": 1e-6 / TINY**2}
     for name, error in errors[0].items():
-        assert error < max(2 * errors[1][name], 1e-4 if name == "absgrad" else 1e-5), (name, error, errors[1][name])
+        assert error < max(2 * errors[1][name], stated.get(name, 1e-5)), (name, error, errors[1][name])
