@@ -88,8 +88,8 @@ class StructureAwareStrategy(Strategy):
     final_prune_opacity: float = 0.1
     """Opacity under which Gaussians are pruned when densification ends."""
     needless_every: int = 1000
-    """Iterations between removals of Gaussians that no training view needs, up to the last such iteration of
-    densification and once more at its end; 0 keeps them, as the paper does."""
+    """Iterations between removals of Gaussians that no training view needs, in the densification window and at its end.
+    0 keeps them, as the paper does."""
     needless_pixels: float = 1.0
     """Pixels that a Gaussian must account for in the training view in which it does most, or it is needless."""
     fused: bool = True

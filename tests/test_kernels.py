@@ -298,7 +298,10 @@ def test_adam_in_one_launch_equals_torchs_and_one_launch_for_each_parameter(rows
             adam.adam_step((p,), (gradient,), (m,), (v,), noted, steps=[step], lrs=[lr], **ADAM)
     assert float(noted) == 0
     for one, other in zip(together, separate, strict=True):
-        assert all(map(torch.equal, one, other))
+        if torch.device("cpu") == DEVICE:
+            assert all(map(torch.equal, one, other))
+        else:  # compiled, a product and a sum may round once in one kernel and twice in another
+            torch.testing.assert_close(one, other, atol=1e-7, rtol=2e-6)
     for actual, parameter in zip(together[0], expected, strict=True):
         torch.testing.assert_close(actual.to("cpu", dtype), parameter.detach(), atol=tolerance, rtol=tolerance)
 
