@@ -285,9 +285,10 @@ class SadgsPipeline(VanillaPipeline):
         for index, data in enumerate(self.datamanager.cached_train):
             by_size[data["image"].shape[:2]].append(index)
         views = (
-            (*(camera.detach() for camera in self._stacked_cameras(batch)), width, height)
+            (viewmats.detach(), Ks, width, height)
             for (height, width), indices in by_size.items()
-            for batch in (indices[i : i + _VIEWS_PER_BATCH] for i in range(0, len(indices), _VIEWS_PER_BATCH))
+            for i in range(0, len(indices), _VIEWS_PER_BATCH)
+            for viewmats, Ks in [self._stacked_cameras(indices[i : i + _VIEWS_PER_BATCH])]
         )
         pixels = most_pixels(
             model.gauss_params, views, rasterize_mode=model.config.rasterize_mode, fused=model.config.fused
