@@ -24,6 +24,14 @@ def test_scales_are_the_mean_distance_to_three_neighbours():
     assert float(neighbour_scales(points)[0]) == pytest.approx(2.0)
 
 
+def test_scales_of_a_cloud_are_those_of_all_distances():
+    points = torch.rand((500, 3), generator=torch.Generator().manual_seed(0))
+    points[100:110] = points[200]  # duplicates are at distance 0
+    distances = torch.cdist(points.double(), points.double(), compute_mode="donot_use_mm_for_euclid_dist")
+    expected = distances.sort(dim=1).values[:, 1:4].mean(dim=1).float().clamp_min(1e-6)
+    torch.testing.assert_close(neighbour_scales(points), expected, rtol=1e-5, atol=2e-6)
+
+
 @pytest.mark.parametrize("points", [[[0.0, 0, 0]], [[0.0, 0, 0]] * 5, [[0.0, 0, 0], [1.0, 0, 0]]])
 def test_few_or_equal_points_have_finite_log_scales(points: list[list[float]]):
     scales = neighbour_scales(torch.tensor(points))
