@@ -368,21 +368,18 @@ def _check_camera(camera: colmap.Camera, where: str) -> None:
 
 
 def _check_points(model_folder: Path) -> Iterator[Finding]:
-    """Findings for the SfM points; nerfstudio prefers the binary file."""
-    path = next((p for kind in ("bin", "txt") if (p := model_folder / f"points3D.{kind}").is_file()), None)
+    """Findings for the SfM points."""
+    path = colmap.points_file(model_folder)
     random = "add `--load-3D-points False` after `colmap` to start from random points"
     if path is None:
         yield Finding(
             "error", f"{model_folder} has no points3D.bin or .txt: copy the whole reconstruction, or {random}."
         )
         return
-    count = 0
-    for position in colmap.read_points(path):
-        count += 1
-        if not all(map(math.isfinite, position)):
-            yield Finding("error", f"{path} has NaN or infinity in a point: run COLMAP's mapper again, or {random}.")
-            return
-    if count == 0:
+    positions, _ = colmap.read_points(path)
+    if not np.isfinite(positions).all():
+        yield Finding("error", f"{path} has NaN or infinity in a point: run COLMAP's mapper again, or {random}.")
+    if len(positions) == 0:
         yield Finding("error", f"{path} holds no SfM point: run COLMAP's mapper again, or {random}.")
 
 

@@ -33,6 +33,10 @@ CAMERA_PARAMETERS = {
 """COLMAP's camera models in the order of their numbers, and how many parameters each has."""
 
 
+Points = tuple[NDArray[np.float64], NDArray[np.uint8]]
+"""Positions [P, 3] and colours [P, 3]."""
+
+
 @dataclass(frozen=True)
 class Camera:
     """Intrinsics, as COLMAP stores them."""
@@ -98,7 +102,7 @@ class _Binary:
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<iiQQ")
 _POSE = struct.Struct("<i7di")
-_POINT = struct.Struct("<Q3d3BdQ")
+_POINT = np.dtype([("id", "<u8"), ("position", "<f8", 3), ("color", "u1", 3), ("error", "<f8"), ("track", "<u8")])
 
 
 def _read_binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
@@ -122,12 +126,19 @@ def _read_binary_poses(path: Path) -> Iterator[tuple[str, int, NDArray[np.float6
         yield name, camera_id, np.array(pose)
 
 
-def _read_binary_points(path: Path) -> Iterator[tuple[float, float, float]]:
+def _read_binary_points(path: Path) -> Points:
     file = _Binary(path)
-    for _ in range(file.take(_COUNT)[0]):
-        _, x, y, z, _, _, _, _, track = file.take(_POINT)
-        file.skip(8 * track)
-        yield x, y, z
+    records = []
+    (count,), content, start = file.take(_COUNT), file.content, file.offset
+    for _ in range(count):  # of up to millions: no calls in here
+        record = content[start : start + _POINT.itemsize]
+        records.append(record)
+        start += _POINT.itemsize + 8 * int.from_bytes(record[-8:], "little")  # its track follows it
+        if start > len(content):
+            break
+    file.skip(start - file.offset)
+    points = np.frombuffer(b"".join(records), _POINT)
+    return points["position"], points["color"].copy()
 
 
 def _read_text(path: Path, minimum: int) -> Iterator[tuple[list[str], Iterator[str]]]:
@@ -170,12 +181,16 @@ def _read_text_poses(path: Path) -> Iterator[tuple[str, int, NDArray[np.float64]
             raise _not_colmap(path, error) from error
 
 
-def _read_text_points(path: Path) -> Iterator[tuple[float, float, float]]:
-    for fields, _ in _read_text(path, 8):
-        try:
-            yield float(fields[1]), float(fields[2]), float(fields[3])
-        except ValueError as error:
-            raise _not_colmap(path, error) from error
+def _read_text_points(path: Path) -> Points:
+    lines = [fields[1:7] for fields, _ in _read_text(path, 8)]
+    try:
+        values = np.array(lines, np.float64).reshape(-1, 6)
+        colors = values[:, 3:]
+        if not ((colors >= 0) & (colors <= 255)).all():
+            raise ValueError("a colour is not in 0 … 255")
+    except ValueError as error:
+        raise _not_colmap(path, error) from error
+    return values[:, :3], colors.astype(np.uint8)
 
 
 def read_cameras(path: Path) -> dict[int, Camera]:
@@ -192,6 +207,11 @@ def read_poses(path: Path) -> list[tuple[str, int, NDArray[np.float64]]]:
     return list((_read_binary_poses if path.suffix == ".bin" else _read_text_poses)(path))
 
 
-def read_points(path: Path) -> Iterator[tuple[float, float, float]]:
-    """Positions of the points of `points3D.*`, one by one."""
+def points_file(model: Path) -> Path | None:
+    """The points of a folder with a reconstruction; the binary file, as nerfstudio prefers it; None if it has none."""
+    return next((path for kind in ("bin", "txt") if (path := model / f"points3D.{kind}").is_file()), None)
+
+
+def read_points(path: Path) -> Points:
+    """Positions [P, 3] in the reconstruction's world, and colours in 0 … 255 [P, 3], of the points of `points3D.*`."""
     return (_read_binary_points if path.suffix == ".bin" else _read_text_points)(path)

@@ -232,6 +232,13 @@ COLMAP = {
         model(lambda cameras, images, points: points.update({1: points[1]._replace(xyz=np.full(3, np.nan))})),
         r"\S+/points3D\.bin has NaN or infinity in a point: .*\.",
     ),
+    "text-colour": (
+        lambda data: (
+            model(lambda *parts: None, ".txt")(data),
+            overwrite(f"{SPARSE}/points3D.txt", "1 0 0 0 256 0 0 1 1 0\n")(data),
+        ),
+        r"\S+/points3D\.txt is not COLMAP's text \(a colour is not in 0 … 255\): copy it again, .*",
+    ),
     "text-corrupt": (
         lambda data: (
             model(lambda *parts: None, ".txt")(data),
@@ -476,8 +483,9 @@ def test_colmap_s_text_and_binary_models_read_alike_and_as_nerfstudio_reads_them
             assert pose == pytest.approx(np.concatenate([image.qvec, image.tvec]), abs=1e-12)
             rotation = colmap_parsing_utils.qvec2rotmat(image.qvec)
             assert colmap.camera_centre(pose) == pytest.approx(-rotation.T @ image.tvec)
-        points = np.array(list(colmap.read_points(folder / f"points3D.{ext}")))
-        assert points == pytest.approx(np.array([point.xyz for point in theirs[2].values()]), abs=1e-12)
+        positions, colors = colmap.read_points(folder / f"points3D.{ext}")
+        assert positions == pytest.approx(np.array([point.xyz for point in theirs[2].values()]), abs=1e-12)
+        assert (colors == np.array([point.rgb for point in theirs[2].values()])).all()
 
 
 @pytest.mark.parametrize("factor", [2, 3])
