@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sadgs_ns import kernels
 from sadgs_ns.rasterization import visible
-from sadgs_ns.split import Params, limit_growth
+from sadgs_ns.split import Params, grid_split, limit_growth
 
 
 def empty_gradients(num_gaussians: int, device: torch.device) -> dict[str, Tensor]:
@@ -61,6 +61,8 @@ def grow(
     split_threshold: float,
     size_threshold: float,
     budget: float,
+    random: bool = False,
+    child: float = 0.0,
 ) -> tuple[int, int]:
     """Clone small Gaussians by their mean gradient, split large ones in two by their absolute gradient.
 
@@ -82,12 +84,16 @@ def grow(
     split_ratio = state["absgrad2d"] / count / split_threshold
     steepness = torch.where(is_small, clone_ratio, split_ratio)  # ≥ 1 grows
     grows = (steepness >= 1) & steepness.isfinite()  # a sum that overflowed says nothing
-    chosen = limit_growth(grows.long(), steepness, budget)
+    chosen = limit_growth(grows.long(), torch.rand_like(steepness) if random else steepness, budget)
     is_clone, is_split = chosen & is_small, chosen & ~is_small
     n_clone, n_split = int(is_clone.sum()), int(is_split.sum())
     if n_clone > 0:
         duplicate(params, optimizers, state, is_clone)  # type: ignore[arg-type]
     if n_split > 0:
         is_split = torch.cat([is_split, is_split.new_zeros(n_clone)])  # clones are not split
+        if child > 0:
+            longest = torch.nn.functional.one_hot(params["scales"].argmax(dim=1), 3)
+            grid_split(params, optimizers, state, 1 + longest * is_split[:, None], child=child, child_opacity="mass")
+            return n_clone, n_split
         split(params, optimizers, state, is_split)  # type: ignore[arg-type]
     return n_clone, n_split

@@ -291,6 +291,8 @@ class SadgsModel(SplatfactoModel):
         absgrad = self.training and self.config.densify and self.strategy.needs_absgrad(self.step)
         render, alpha, info = self.render(viewmats, Ks, width, height, "RGB", absgrad)
         if self.config.densify:
+            if structure_tensors is not None:
+                structure_tensors = self._lab_mask(structure_tensors, render, info, viewmats, Ks)
             info |= {"viewmats": viewmats.detach(), "Ks": Ks, "structure_tensors": structure_tensors}
             self.strategy.step_pre_backward(self.gauss_params, self.optimizers, self.strategy_state, self.step, info)
             self.infos.append(info)
@@ -304,6 +306,42 @@ class SadgsModel(SplatfactoModel):
                 ]
             )
         return {"rgb": rgb, "background": background}
+
+    @torch.no_grad()
+    def _lab_mask(self, codes: Tensor, render: Tensor, info: Any, viewmats: Tensor, Ks: Tensor) -> Tensor:
+        from sadgs_ns.storage import decode
+
+        strategy = self.strategy
+        if strategy.lab_gate == 0 and strategy.lab_supply == 0:
+            return codes
+        tensors = decode(codes)
+        keep = torch.ones_like(codes[..., :1], dtype=torch.bool)
+        if strategy.lab_gate > 0:
+            residual = (render[..., :3] - self.lab_target).abs().mean(-1)[:, None]  # [C, 1, H, W]
+            residual = torch.nn.functional.avg_pool2d(residual, 7, 1, 3, count_include_pad=False)
+            keep &= residual.permute(0, 2, 3, 1) > strategy.lab_gate
+        if strategy.lab_supply > 0:
+            a, b, c = info["conics"].unbind(-1)
+            extent = (a * c - b * b).clamp_min(1e-20) ** -0.25  # [C, N] px
+            colors = torch.where(torch.isfinite(extent), extent, 0.0).clamp(1e-2, 1e3).log()[..., None].repeat(1, 1, 3)
+            params = self.gauss_params
+            image, alpha, _ = rasterize(
+                params["means"],
+                params["quats"],
+                params["scales"].exp(),
+                params["opacities"].sigmoid().squeeze(-1),
+                colors.contiguous(),
+                viewmats,
+                Ks,
+                codes.shape[2],
+                codes.shape[1],
+                fused=self.config.fused,
+            )
+            extents = (image[..., :1] / alpha.clamp_min(1e-3)).exp()
+            xx, xy, yy = tensors.unbind(-1)
+            frequency = (0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)).clamp_min(0).sqrt()[..., None]
+            keep &= extents * frequency > strategy.lab_supply
+        return torch.where(keep, tensors, float("nan") if strategy.lab_gate_mode == "nan" else 0.0).contiguous()
 
     def get_outputs(self, camera: Cameras) -> dict[str, Any]:
         """Render one camera for the viewer, evaluation and rendering.
@@ -393,6 +431,12 @@ class SadgsModel(SplatfactoModel):
         losses = {"main_loss": loss}
         if self.training:
             outputs["psnr"] = psnr
+            if self.strategy.lab_opacity_reg > 0 and self.step < self.strategy.lab_reg_until:
+                losses["opacity_reg"] = (
+                    self.strategy.lab_opacity_reg * torch.sigmoid(self.gauss_params["opacities"]).mean()
+                )
+            if self.strategy.lab_mcmc:
+                losses["scale_reg"] = 0.01 * torch.exp(self.gauss_params["scales"]).mean()
             if self.config.use_scale_regularization and self.step % 10 == 0:
                 scales = self.scales.exp()
                 ratio = scales.amax(dim=-1) / scales.amin(dim=-1)

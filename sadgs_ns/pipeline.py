@@ -327,6 +327,8 @@ class SadgsPipeline(VanillaPipeline):
             if observes:
                 tensors = _stack([self.structure_tensors[index].to(self.device) for index in indices])
             viewmats, Ks = self._stacked_cameras(indices)
+            if tensors is not None and self.model.strategy.lab_gate > 0:
+                self.model.lab_target = torch.stack([self.photo(data) for _, data in views])
             outputs = self.model.get_training_outputs(viewmats, Ks, width, height, indices, tensors)
             group_losses = self.model.get_loss_dict(outputs, batch)
             weight = len(views) / self.config.views_per_iteration

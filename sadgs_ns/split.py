@@ -106,6 +106,9 @@ def grid_split(
     state: MutableMapping[str, Any],
     counts: Tensor,
     extent: float = VARIANCE_EXTENT,
+    flat: bool = False,
+    child: float = 1.0,
+    child_opacity: str = "copy",
 ) -> None:
     """Replace every Gaussian with more than one child by its grid of children, in place, as gsplat's `split` does.
 
@@ -128,7 +131,18 @@ def grid_split(
     rotmats = normalized_quat_to_rotmat(F.normalize(params["quats"][parents], dim=-1))  # [Q, 3, 3]
     # Not a batched matrix product: cuBLAS takes 3×3 matrices 65,535 at a time.
     offsets = (rotmats * (params["scales"][parents].exp() * grid)[:, None]).sum(dim=-1)  # [Q, 3]
-    shrink = counts[parents].to(params["scales"].dtype).log()  # [Q, 3]
+    n = counts[parents].to(params["scales"].dtype)  # [Q, 3]
+    shrink = n.log()  # [Q, 3]
+    if flat:
+        shrink = torch.where(n == 1, shrink.amax(dim=1, keepdim=True), shrink)
+    split_axes = n > 1
+    if child != 1:
+        # Children of k s / n, on a grid that keeps the covariance.
+        grid_now = grid * torch.where(
+            split_axes, torch.sqrt((1 - child**2 / n**2) / (1 - 1 / n**2).clamp_min(0.1)), 1.0
+        )
+        offsets = (rotmats * (params["scales"][parents].exp() * grid_now)[:, None]).sum(dim=-1)
+        shrink = shrink - split_axes * math.log(child)
 
     def param_fn(name: str, p: Tensor) -> Tensor:
         children = p[parents]
@@ -136,6 +150,9 @@ def grid_split(
             children = children + offsets
         elif name == "scales":
             children = children - shrink
+        elif name == "opacities" and child_opacity == "mass":
+            share = child ** -split_axes.sum(dim=1).to(children.dtype)
+            children = torch.logit((torch.sigmoid(children.flatten()) * share).clamp(1e-6, 1 - 1e-6)).view_as(children)
         return torch.nn.Parameter(torch.cat([p[rest], children]), requires_grad=p.requires_grad)
 
     def optimizer_fn(key: str, v: Tensor) -> Tensor:

@@ -52,6 +52,7 @@ def observe(
     min_opacity: float = 0.0,
     generator: torch.Generator | None = None,
     fused: bool = True,
+    mean: bool = False,
 ) -> None:
     """Add one forward pass: one jittered sample per visible Gaussian and view, counted in place.
 
@@ -85,6 +86,7 @@ def observe(
             info["Ks"],
             min_logit=float(torch.logit(torch.tensor(min_opacity, dtype=torch.float64).clamp(0, 1))),
             directional=directional,
+            mean=mean,
             thresholds=(HIGH_ETA, LOW_ETA),
             constants=(SCREEN_BLUR, FRUSTUM_MARGIN, WAVELENGTH_EPSILON),
         )
@@ -119,7 +121,10 @@ def observe(
         statistics["n_high"] += violation > HIGH_ETA
         statistics["n_low"] += observed & (violation < LOW_ETA)
         statistics["n_total"] += observed[:, 0]
-        torch.maximum(statistics["eta_max"], violation, out=statistics["eta_max"])
+        if mean:
+            statistics["eta_max"] += violation
+        else:
+            torch.maximum(statistics["eta_max"], violation, out=statistics["eta_max"])
 
 
 def consistent(counts: Tensor, n_total: Tensor, threshold: float) -> Tensor:

@@ -92,6 +92,30 @@ class StructureAwareStrategy(Strategy):
     0 keeps them, as the paper does."""
     needless_pixels: float = 1.0
     """Pixels that a Gaussian must account for in the training view in which it does most, or it is needless."""
+    lab_axes: str = "all"
+    """Experiment. "two": split at most two axes, "flat": and make the third as small as theirs."""
+    lab_gate: float = 0.0
+    """Experiment. Mask S̄ where the mean absolute error of 7×7 px is lower."""
+    lab_gate_mode: str = "zero"
+    """Experiment. "zero": masked S̄ is a low response; "nan": no observation."""
+    lab_supply: float = 0.0
+    """Experiment. Mask S̄ where the blended extent of the Gaussians drawn, over the wavelength, is lower."""
+    lab_mean: bool = False
+    """Experiment. n from the mean instead of the largest η."""
+    lab_child: float = 1.0
+    """Experiment. Children this many times s / n large."""
+    lab_child_opacity: str = "copy"
+    """Experiment. "mass": less opaque by as much."""
+    lab_opacity_reg: float = 0.0
+    """Experiment. Weight of the mean opacity in the loss."""
+    lab_reg_until: int = 3000
+    """Experiment. Iterations until which it is added."""
+    lab_absgs_child: float = 0.0
+    """Experiment. AbsGS splits the longest axis in two so; 0 as gsplat."""
+    lab_random: bool = False
+    """Experiment. Grow at random under the cap."""
+    lab_mcmc: bool = False
+    """Experiment. gsplat's MCMC instead."""
     fused: bool = True
     """Measure η, and add up AbsGS's gradients, in one Triton kernel each where these run (CUDA)."""
     verbose: bool = False
@@ -193,7 +217,7 @@ class StructureAwareStrategy(Strategy):
         info: Info | Sequence[Info],
     ) -> None:
         """Keep the screen gradients and observe η, before `loss.backward()`."""
-        if step >= self.refine_stop_iter:
+        if step >= self.refine_stop_iter or self.lab_mcmc:
             return
         self._ensure_statistics(params, state)
         for view in _views(info):
@@ -206,6 +230,7 @@ class StructureAwareStrategy(Strategy):
                     directional=self.directional_eta,
                     min_opacity=self.eta_min_opacity,
                     fused=self.fused,
+                    mean=self.lab_mean,
                 )
 
     def step_post_backward(
@@ -225,6 +250,17 @@ class StructureAwareStrategy(Strategy):
         if packed:
             raise ValueError("StructureAwareStrategy reads gsplat's unpacked meta: call rasterization(packed=False)")
         iteration = step + 1
+        if self.lab_mcmc:
+            from gsplat.strategy import MCMCStrategy
+
+            if not hasattr(self, "_mcmc"):
+                self._mcmc = MCMCStrategy(
+                    cap_max=self.max_gaussians, refine_start_iter=100, refine_stop_iter=2500, refine_every=50
+                )
+                self._mcmc_state = self._mcmc.initialize_state()
+            lr = optimizers["means"].param_groups[0]["lr"]
+            self._mcmc.step_post_backward(params, optimizers, self._mcmc_state, step, {}, lr)
+            return
         if iteration > self.refine_stop_iter:
             return
         views = _views(info)
@@ -290,8 +326,16 @@ class StructureAwareStrategy(Strategy):
             n per axis that η asks for, int64 [N, 3]; and the Gaussians whose children fit the budget, bool [N].
         """
         violates = consistent(statistics["n_high"], statistics["n_total"], self.tau_split)
-        counts = children_per_axis(statistics["eta_max"], violates, self.split_exponent)  # [N, 3]
-        worst = torch.where(violates, statistics["eta_max"], 0.0).amax(dim=1)  # [N]
+        eta_max = statistics["eta_max"]
+        if self.lab_mean:
+            eta_max = eta_max / statistics["n_total"].clamp_min(1)[:, None]
+        if self.lab_axes != "all":
+            least = torch.nn.functional.one_hot(eta_max.argmin(dim=1), 3).bool()
+            violates = violates & ~(least & violates.all(dim=1, keepdim=True))
+        counts = children_per_axis(eta_max, violates, self.split_exponent)  # [N, 3]
+        worst = torch.where(violates, eta_max, 0.0).amax(dim=1)  # [N]
+        if self.lab_random:
+            worst = torch.rand_like(worst)
         return counts, limit_growth(num_children(counts) - 1, worst, budget)
 
     def children_now(self, statistics: Mapping[str, Tensor]) -> Tensor:
@@ -314,7 +358,16 @@ class StructureAwareStrategy(Strategy):
         if in_memory < min(int((num_children(counts) - 1).sum()), under_cap):
             _warn_of_memory(iteration, in_memory)
         if n_parents > 0:
-            grid_split(params, optimizers, state, torch.where(allowed[:, None], counts, 1), self.split_extent)
+            grid_split(
+                params,
+                optimizers,
+                state,
+                torch.where(allowed[:, None], counts, 1),
+                self.split_extent,
+                self.lab_axes == "flat",
+                self.lab_child,
+                self.lab_child_opacity,
+            )
         # What was learned about parents says nothing about their children.
         self._clear_statistics(params, state)
         state.setdefault("structure_steps", []).append(
@@ -344,6 +397,8 @@ class StructureAwareStrategy(Strategy):
             split_threshold=self.split_absgrad2d,
             size_threshold=self.small_scale * state["scene_scale"],
             budget=min(under_cap, in_memory),
+            random=self.lab_random,
+            child=self.lab_absgs_child,
         )
         if in_memory <= n_clone + n_split < under_cap:
             _warn_of_memory(iteration, in_memory)

@@ -55,10 +55,14 @@ def _frequency(code, HIGHEST: tl.constexpr, OCTAVES: tl.constexpr):
 
 
 @triton.jit
-def _add_axis(n_high, n_low, eta_max, at, high, low, most, changed):
+def _add_axis(n_high, n_low, eta_max, at, high, low, most, changed, MEAN: tl.constexpr):
     tl.store(n_high + at, tl.load(n_high + at, changed, 0.0) + high, changed)
     tl.store(n_low + at, tl.load(n_low + at, changed, 0.0) + low, changed)
-    tl.store(eta_max + at, tl.maximum(tl.load(eta_max + at, changed, 0.0), most), changed)
+    before = tl.load(eta_max + at, changed, 0.0)
+    if MEAN:
+        tl.store(eta_max + at, before + most, changed)
+    else:
+        tl.store(eta_max + at, tl.maximum(before, most), changed)
 
 
 @triton.jit(do_not_specialize=["n", "num_views", "width", "height"])
@@ -66,7 +70,7 @@ def _observe(
     means, quats, scales, opacities, drawn, means2d, conics, jitter, structure_tensors, viewmats, Ks,
     n_high, n_low, eta_max, n_total, n, num_views, width, height, min_logit,
     HIGH: tl.constexpr, LOW: tl.constexpr, BLUR: tl.constexpr, MARGIN: tl.constexpr, EPSILON: tl.constexpr,
-    HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, DIRECTIONAL: tl.constexpr, LANES: tl.constexpr,
+    HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, DIRECTIONAL: tl.constexpr, MEAN: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
     g = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
     candidate = (g < n) & (tl.load(opacities + g, g < n, float("-inf")) >= min_logit)
@@ -150,13 +154,16 @@ def _observe(
         low0 += observed & (eta0 < LOW)
         low1 += observed & (eta1 < LOW)
         low2 += observed & (eta2 < LOW)
-        most0, most1, most2 = tl.maximum(most0, eta0), tl.maximum(most1, eta1), tl.maximum(most2, eta2)
+        if MEAN:
+            most0, most1, most2 = most0 + eta0, most1 + eta1, most2 + eta2
+        else:
+            most0, most1, most2 = tl.maximum(most0, eta0), tl.maximum(most1, eta1), tl.maximum(most2, eta2)
         total += observed
     changed = total > 0
     tl.store(n_total + g, tl.load(n_total + g, changed, 0.0) + total, changed)
-    _add_axis(n_high, n_low, eta_max, 3 * g, high0, low0, most0, changed)
-    _add_axis(n_high, n_low, eta_max, 3 * g + 1, high1, low1, most1, changed)
-    _add_axis(n_high, n_low, eta_max, 3 * g + 2, high2, low2, most2, changed)
+    _add_axis(n_high, n_low, eta_max, 3 * g, high0, low0, most0, changed, MEAN)
+    _add_axis(n_high, n_low, eta_max, 3 * g + 1, high1, low1, most1, changed, MEAN)
+    _add_axis(n_high, n_low, eta_max, 3 * g + 2, high2, low2, most2, changed, MEAN)
 
 
 def observe_views(
@@ -172,6 +179,7 @@ def observe_views(
     *,
     min_logit: float,
     directional: bool,
+    mean: bool,
     thresholds: tuple[float, float],
     constants: tuple[float, float, float],
 ) -> None:
@@ -197,5 +205,5 @@ def observe_views(
     height, width = structure_tensors.shape[1:3]
     _observe[triton.cdiv(n, _LANES),](
         *(value.contiguous() for value in inputs), *statistics, n, num_views, width, height, min_logit,
-        *thresholds, *constants, HIGHEST_FREQUENCY, OCTAVES, directional, _LANES,
+        *thresholds, *constants, HIGHEST_FREQUENCY, OCTAVES, directional, mean, _LANES,
     )  # fmt: skip
