@@ -91,7 +91,7 @@ def load_run(path: Path, load_step: int | None = None, data: Path | None = None)
         raise InputError(f"{path} cannot be read as a run's config.yml ({what}): give one of sadgs.") from error
     if not isinstance(config, SadgsTrainerConfig):
         method = f"of the method {config.method_name}" if isinstance(config, TrainerConfig) else "no run's config.yml"
-        raise InputError(f"{path} is {method}: give one of sadgs, sadgs-indoor, sadgs-large or sadgs-paper.")
+        raise InputError(f"{path} is {method}: give one of a method whose name begins with sadgs.")
     folder = path.parent / config.relative_model_dir
     if not folder.is_dir() or not any(folder.iterdir()):
         raise InputError(
@@ -187,8 +187,8 @@ def _try(
 
 def structure_step(model: SadgsModel, statistics: dict[str, Tensor]) -> Step:
     """What a structure-aware step would split, without its pruning."""
-    counts, extent = model.strategy.children_now(statistics), model.strategy.split_extent
-    return _try(model, {}, lambda p, o, s: grid_split(p, o, s, counts, extent))
+    counts, grid = model.strategy.children_now(statistics), model.strategy.child_grid
+    return _try(model, {}, lambda p, o, s: grid_split(p, o, s, counts, *grid))
 
 
 def conventional_step(model: SadgsModel, gradients: dict[str, Tensor]) -> Step:

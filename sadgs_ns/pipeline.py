@@ -19,7 +19,6 @@ from torch import Tensor
 
 from sadgs_ns import kernels
 from sadgs_ns.cameras import refuse_failed_undistortion, refuse_unsupported_cameras
-from sadgs_ns.contribution import most_pixels
 from sadgs_ns.datamanager import SadgsDatamanagerConfig
 from sadgs_ns.errors import InputError
 from sadgs_ns.finite import NonFiniteLog
@@ -40,8 +39,6 @@ from sadgs_ns.structure_tensor import (
 
 _PIXELS_PER_BATCH = 4_000_000
 """Structure tensors are computed for as many images at once as fit this; each pixel takes at most about 300 bytes."""
-_VIEWS_PER_BATCH = 4
-"""Views that are rendered at once where all of them are looked at."""
 _NAMED_STEPS = 5
 """Iterations of which a report of what was not finite names the images."""
 
@@ -273,27 +270,7 @@ class SadgsPipeline(VanillaPipeline):
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN]
         counts = TrainingCallback(after, lambda step: self.structure.refresh())
         last = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self._report_nonfinite())
-        needless = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._remove_needless)
-        return [*super().get_training_callbacks(training_callback_attributes), needless, counts, last]
-
-    def _remove_needless(self, step: int) -> None:
-        """Remove the Gaussians that no training view needs, where the strategy says that it is time."""
-        model = self.model
-        if not model.config.densify or not model.strategy.removes_needless(step):
-            return
-        by_size = defaultdict(list)
-        for index, data in enumerate(self.datamanager.cached_train):
-            by_size[data["image"].shape[:2]].append(index)
-        views = (
-            (viewmats.detach(), Ks, width, height)
-            for (height, width), indices in by_size.items()
-            for i in range(0, len(indices), _VIEWS_PER_BATCH)
-            for viewmats, Ks in [self._stacked_cameras(indices[i : i + _VIEWS_PER_BATCH])]
-        )
-        pixels = most_pixels(
-            model.gauss_params, views, rasterize_mode=model.config.rasterize_mode, fused=model.config.fused
-        )
-        model.strategy.remove_needless(model.gauss_params, model.optimizers, model.strategy_state, pixels)
+        return [*super().get_training_callbacks(training_callback_attributes), counts, last]
 
     def _report_nonfinite(self) -> None:
         """Say in which of the last iterations, and with which images, a loss or gradient was not finite."""

@@ -77,11 +77,13 @@ def _read(where: str) -> dict[Any, Any]:
     if "base" not in values:
         return values
     base = values.pop("base")
-    if not isinstance(base, str) or not (_configs() / f"{base}.yaml").is_file():
-        raise ValueError(f"{where}: base must be the name of another preset, got {_show(base)}.")
+    known = sorted(p.name[:-5] for p in _configs().iterdir() if p.name.endswith(".yaml") and p.name != where)
+    if base not in known:
+        others = ", ".join(known)
+        raise ValueError(f"{where}: base must be the name of another preset, got {_show(base)}; known are {others}.")
     below = _mapping(_parse((_configs() / f"{base}.yaml").read_bytes(), f"{base}.yaml"), f"{base}.yaml")
     if "base" in below:
-        raise ValueError(f"{where}: base {base} has a base itself; name that one.")
+        raise ValueError(f"{where}: base {base} has a base itself; name a preset that has none.")
     return _merged(below, values)
 
 

@@ -106,6 +106,7 @@ def grid_split(
     state: MutableMapping[str, Any],
     counts: Tensor,
     extent: float = VARIANCE_EXTENT,
+    child_scale: float = 1.0,
 ) -> None:
     """Replace every Gaussian with more than one child by its grid of children, in place, as gsplat's `split` does.
 
@@ -113,22 +114,32 @@ def grid_split(
     afterwards is [unsplit, children grouped by parent]. Children start with zero optimizer moments and inherit the
     parent's rows of every tensor in `state`.
 
+    Such children stand √12 of their own standard deviations apart. Children k times as large (not in the paper) fill
+    these gaps: their grid is narrower, so that the covariance stays, and their opacity 1/k for each axis that is split,
+    so that the integral of opacity stays.
+
     Args:
         params: gsplat's parameters: `means`, log `scales`, `quats` and any others with leading dimension N.
         optimizers: One per parameter.
         state: The strategy's state; its tensors have leading dimension N.
         counts: n per axis. int64 [N, 3]
-        extent: Half-width of the child grid in parent standard deviations.
+        extent: Half-width of the child grid in parent standard deviations, for children of s ⊘ n.
+        child_scale: k in [1, 2).
     """
     is_split = (counts > 1).any(dim=1)
     rest = torch.where(~is_split)[0]
     selected = torch.where(is_split)[0]
     local_parents, grid = grid_offsets(counts[selected], extent, params["scales"].dtype)
     parents = selected[local_parents]  # [Q]
+    n = counts[parents].to(params["scales"].dtype)  # [Q, 3]
+    is_axis_split = n > 1
+    # An axis that is not split has one cell, in the middle: any factor does.
+    grid = grid * ((1 - (child_scale / n) ** 2) / (1 - (1 / n) ** 2).clamp_min(0.75)).clamp_min(0).sqrt()
     rotmats = normalized_quat_to_rotmat(F.normalize(params["quats"][parents], dim=-1))  # [Q, 3, 3]
     # Not a batched matrix product: cuBLAS takes 3×3 matrices 65,535 at a time.
     offsets = (rotmats * (params["scales"][parents].exp() * grid)[:, None]).sum(dim=-1)  # [Q, 3]
-    shrink = counts[parents].to(params["scales"].dtype).log()  # [Q, 3]
+    shrink = torch.where(is_axis_split, (n / child_scale).log(), 0.0)  # [Q, 3]
+    log_share = -math.log(child_scale) * is_axis_split.sum(dim=1).to(n.dtype)  # [Q]
 
     def param_fn(name: str, p: Tensor) -> Tensor:
         children = p[parents]
@@ -136,6 +147,10 @@ def grid_split(
             children = children + offsets
         elif name == "scales":
             children = children - shrink
+        elif name == "opacities":
+            log_q = log_share.view(-1, *[1] * (children.dim() - 1))
+            # logit(q σ(x)) without overflow or cancellation; x itself where q is 1.
+            children = log_q - torch.logaddexp(torch.log(-torch.expm1(log_q)), -children)
         return torch.nn.Parameter(torch.cat([p[rest], children]), requires_grad=p.requires_grad)
 
     def optimizer_fn(key: str, v: Tensor) -> Tensor:

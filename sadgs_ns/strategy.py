@@ -67,14 +67,17 @@ class StructureAwareStrategy(Strategy):
     """p of the split factor n = ⌈η^p⌉."""
     split_extent: float = VARIANCE_EXTENT
     """Half-width of the child grid in parent standard deviations; √3 keeps the parent's covariance."""
+    child_scale: float = 1.5
+    """k in [1, 2): children are k times the paper's s/n long on the axes that are split, which closes their gaps.
+    They stand closer and are 1/k as opaque an axis, which keeps the covariance and the mass; 1 is the paper's."""
     tau_prune: float = 0.8
     """Fraction of observations that must be low (η < 0.1) on every axis before a faint Gaussian is pruned."""
     prune_opacity: float = 0.1
     """Opacity under which a Gaussian with consistently low η is pruned."""
-    clone_grad2d: float = 2e-4
-    """AbsGS: normalised mean screen gradient at which a small Gaussian is cloned."""
-    split_absgrad2d: float = 4e-4
-    """AbsGS: normalised mean absolute screen gradient at which a large Gaussian is split in two."""
+    clone_grad2d: float = 3e-4
+    """AbsGS: normalised mean screen gradient at which a small Gaussian is cloned; AbsGS's own is 2e-4."""
+    split_absgrad2d: float = 6e-4
+    """AbsGS: normalised mean absolute screen gradient at which a large Gaussian is split; AbsGS's own is 4e-4."""
     small_scale: float = 0.001
     """AbsGS: largest scale, relative to the scene's extent, at which a Gaussian counts as small."""
     min_opacity: float = 0.005
@@ -87,15 +90,15 @@ class StructureAwareStrategy(Strategy):
     """An opacity reset multiplies every opacity by this."""
     final_prune_opacity: float = 0.1
     """Opacity under which Gaussians are pruned when densification ends."""
-    needless_every: int = 1000
-    """Iterations between removals of Gaussians that no training view needs, in the densification window and at its end.
-    0 keeps them, as the paper does."""
-    needless_pixels: float = 1.0
-    """Pixels that a Gaussian must account for in the training view in which it does most, or it is needless."""
     fused: bool = True
     """Measure η, and add up AbsGS's gradients, in one Triton kernel each where these run (CUDA)."""
     verbose: bool = False
     """Print a line at each densification step."""
+
+    @property
+    def child_grid(self) -> tuple[float, float]:
+        """The last arguments of `grid_split`."""
+        return self.split_extent, self.child_scale
 
     @property
     def absgrad(self) -> bool:
@@ -111,10 +114,12 @@ class StructureAwareStrategy(Strategy):
             scene_scale: Extent of the cameras in world units, as 3DGS defines it.
 
         Raises:
-            ValueError: If `max_gaussians` allows none.
+            ValueError: If `max_gaussians` allows none, or `child_scale` is not in [1, 2).
         """
         if self.max_gaussians < 1:
             raise ValueError(f"strategy.max_gaussians must be at least 1, got {self.max_gaussians}.")
+        if not 1 <= self.child_scale < 2:
+            raise ValueError(f"strategy.child_scale must be at least 1 and less than 2, got {self.child_scale:g}.")
         return {"scene_scale": scene_scale}
 
     def fit_to_run(self, num_iterations: int) -> None:
@@ -245,36 +250,6 @@ class StructureAwareStrategy(Strategy):
                 # A reset just before the final prune would leave nothing that had time to recover.
                 self._map_opacities(params, optimizers, lambda opacities: opacities * self.reset_factor)
 
-    def removes_needless(self, step: int) -> bool:
-        """Whether `remove_needless` is due after this step's `step_post_backward`."""
-        iteration = step + 1
-        if self.needless_every == 0 or not self.refine_start_iter <= iteration <= self.refine_stop_iter:
-            return False
-        return iteration == self.refine_stop_iter or _due(iteration, self.needless_every)
-
-    def remove_needless(
-        self,
-        params: Params,
-        optimizers: Mapping[str, torch.optim.Optimizer],
-        state: MutableMapping[str, Any],
-        pixels: Tensor,
-    ) -> int:
-        """Remove the Gaussians that account for less than `needless_pixels`, unless none would be left.
-
-        Args:
-            params: gsplat's parameters.
-            optimizers: One per parameter.
-            state: The strategy's state.
-            pixels: As `contribution.most_pixels` measures it over the training views. [N]
-
-        Returns:
-            How many were removed.
-        """
-        n_removed = self._prune(params, optimizers, state, pixels < self.needless_pixels)
-        if self.verbose:
-            print(f"{n_removed} needless Gaussians removed. Now having {len(params['means'])}.")
-        return n_removed
-
     def consistently_low(self, statistics: Mapping[str, Tensor]) -> Tensor:
         """Gaussians that answered low on all three axes in more than τ_prune of their observations. bool [N]"""
         return consistent(statistics["n_low"], statistics["n_total"], self.tau_prune).all(dim=1)
@@ -314,7 +289,7 @@ class StructureAwareStrategy(Strategy):
         if in_memory < min(int((num_children(counts) - 1).sum()), under_cap):
             _warn_of_memory(iteration, in_memory)
         if n_parents > 0:
-            grid_split(params, optimizers, state, torch.where(allowed[:, None], counts, 1), self.split_extent)
+            grid_split(params, optimizers, state, torch.where(allowed[:, None], counts, 1), *self.child_grid)
         # What was learned about parents says nothing about their children.
         self._clear_statistics(params, state)
         state.setdefault("structure_steps", []).append(
@@ -348,8 +323,7 @@ class StructureAwareStrategy(Strategy):
         if in_memory <= n_clone + n_split < under_cap:
             _warn_of_memory(iteration, in_memory)
         n_pruned = self._prune(params, optimizers, state, self._opacities(params) < self.min_opacity)
-        for key, value in empty_gradients(len(params["means"]), params["means"].device).items():
-            state[key] = value
+        state.update(empty_gradients(len(params["means"]), params["means"].device))
         if self.verbose:
             print(
                 f"Iteration {iteration}: {n_clone} Gaussians cloned, {n_split} split in two, {n_pruned} pruned. "

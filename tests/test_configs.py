@@ -307,13 +307,15 @@ def test_the_papers_presets_are_ours_without_what_we_added():
     for name in ("sadgs", "sadgs-indoor"):
         config: Any = load_preset(name).config
         paper = load_preset(name.replace("sadgs", "sadgs-paper")).config
-        assert config.pipeline.model.strategy.needless_every > 0
-        config.pipeline.model.strategy.needless_every = 0
+        model = config.pipeline.model
+        assert model.ssim_lambda > 0.2 and model.opacity_reg > 0 and model.strategy.child_scale > 1
+        model.ssim_lambda, model.opacity_reg, model.strategy.child_scale = 0.2, 0.0, 1.0
+        model.strategy.clone_grad2d, model.strategy.split_absgrad2d = 2e-4, 4e-4
         config.method_name = paper.method_name
         assert yaml.dump(config) == yaml.dump(paper)
 
 
-@pytest.mark.parametrize("base", ["nothing", "../pyproject", "sadgs-paper", 3])
+@pytest.mark.parametrize("base", ["nothing", "../pyproject", "sadgs-paper", "mine", "x" * 300, 3])
 def test_a_base_that_is_no_plain_preset_is_named(base: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     for path in (CHECKOUT / "configs").glob("*.yaml"):
         (tmp_path / path.name).write_bytes(path.read_bytes())

@@ -81,7 +81,7 @@ def test_all_violate_beyond_measure_and_fill_the_cap(eta_max: float):
     short(max_gaussians=50 + 3 * 511 + 100)._structure_step(params, adam(params, lr=0.0), state, 10)
     assert len(params["means"]) == 50 + 3 * 511, "three parents of 8³ children fit, a fourth does not"
     assert all(p.isfinite().all() for p in params.values())
-    torch.testing.assert_close(params["scales"][47:].amin(), before["scales"][:3].amin() - math.log(8))
+    torch.testing.assert_close(params["scales"][47:].amin(), before["scales"][:3].amin() - math.log(8 / 1.5))
     assert not any(value.any() for value in state.values() if isinstance(value, Tensor))
 
 
@@ -130,6 +130,12 @@ def test_a_cap_under_the_initial_number_stops_growth_only():
 def test_a_cap_that_allows_no_gaussian_is_refused():
     with pytest.raises(ValueError, match=r"strategy\.max_gaussians must be at least 1, got 0\."):
         StructureAwareStrategy(max_gaussians=0).initialize_state()
+
+
+@pytest.mark.parametrize("child_scale", [0.5, 2.0, math.nan])
+def test_children_smaller_than_the_papers_or_as_large_as_a_parent_are_refused(child_scale: float):
+    with pytest.raises(ValueError, match=r"child_scale must be at least 1 and less than 2, got (0\.5|2|nan)\."):
+        StructureAwareStrategy(child_scale=child_scale).initialize_state()
 
 
 # --- memory ---

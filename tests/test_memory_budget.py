@@ -126,7 +126,6 @@ def test_ns_train_says_the_cap_at_the_start_and_keeps_it(
     strategy = config.pipeline.model.strategy
     strategy.max_gaussians, strategy.clone_grad2d, strategy.refine_start_iter = DEFAULT, 0.0, 1
     strategy.final_prune_opacity = strategy.min_opacity = strategy.prune_opacity = 0.0
-    strategy.needless_every = 0
     images = VIEWS * WIDTH * HEIGHT * 3 + 8 * WIDTH * HEIGHT * 3 + WIDTH * HEIGHT * 300
     unbounded = copy.deepcopy(config)
     card((images + 120.5 * BYTES) / 0.8e9, 8)

@@ -287,12 +287,33 @@ def test_max_gaussians_is_never_exceeded(colmap: ColmapDataParserConfig, tmp_pat
     assert max(numbers) == cap
 
 
-def test_needless_gaussians_leave_when_the_strategy_says_so(colmap: ColmapDataParserConfig, tmp_path: Path):
-    counts: list[int] = []
-    off = {"absgs_every": 0, "structure_every": 0, "refine_start_iter": 1, "refine_stop_iter": 4}
-    config = configure(tmp_path, colmap, needless_every=2, needless_pixels=4.0, final_prune_opacity=0.0, **off)
-    train(config, lambda trainer: counts.append(trainer.pipeline.model.num_points))
-    assert counts[0] > counts[1] == counts[2] >= counts[3] == counts[4] == counts[5] > 0
+def test_the_mean_opacity_weighs_in_the_loss_while_densification_runs(colmap: ColmapDataParserConfig, tmp_path: Path):
+    config = configure(
+        tmp_path,
+        colmap,
+        8,
+        absgs_every=0,
+        structure_every=0,
+        refine_stop_iter=4,
+        final_prune_opacity=0.0,
+        reset_every=0,
+    )
+    config.pipeline.model.opacity_reg = 100.0  # against which the images weigh nothing
+    black = {"rgb": torch.zeros((16, 16, 3)), "background": torch.zeros(3)}
+    opacities: list[float] = []
+    regularized: list[bool] = []
+
+    def look(trainer: SadgsTrainer) -> None:
+        model = trainer.pipeline.model
+        losses = model.get_loss_dict(dict(black), {"image": torch.zeros((16, 16, 3))})
+        regularized.append("opacity_reg" in losses)
+        opacities.append(float(torch.sigmoid(model.opacities.detach()).mean()))
+        if regularized[-1]:
+            assert float(losses["opacity_reg"]) == pytest.approx(100 * opacities[-1], rel=1e-5)
+
+    train(config, look)
+    assert regularized == [True] * 4 + [False] * 4
+    assert opacities[0] > opacities[1] > opacities[2] > opacities[3]
 
 
 def test_more_initial_points_than_max_gaussians_are_thinned_out(

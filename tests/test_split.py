@@ -65,13 +65,14 @@ def test_grid_is_centred_and_its_variance_completes_the_child_s():
     assert float(spacing) == pytest.approx(math.sqrt(12) / 4)
 
 
+@pytest.mark.parametrize("child_scale", [1.0, 1.5, 1.99])
 @pytest.mark.parametrize("counts", [[2, 1, 1], [2, 3, 1], [3, 3, 3], [8, 1, 5]])
-def test_split_keeps_the_parent_s_mean_and_covariance(counts: list[int]):
+def test_split_keeps_the_parent_s_mean_and_covariance(counts: list[int], child_scale: float):
     params = random_params(3, dtype=torch.float64)
     parent = {name: value.detach()[1].clone() for name, value in params.items()}
     n = torch.ones((3, 3), dtype=torch.long)
     n[1] = torch.tensor(counts)
-    grid_split(params, adam(params, lr=0.0), {}, n)
+    grid_split(params, adam(params, lr=0.0), {}, n, child_scale=child_scale)
     children = {name: value.detach()[2:] for name, value in params.items()}
     assert len(children["means"]) == math.prod(counts)
     rotation = normalized_quat_to_rotmat(torch.nn.functional.normalize(parent["quats"], dim=-1))
@@ -82,8 +83,40 @@ def test_split_keeps_the_parent_s_mean_and_covariance(counts: list[int]):
     mixture = own.mean(0) + (offset.T @ offset) / len(offset)
     torch.testing.assert_close(children["means"].mean(0), parent["means"], rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(mixture, covariance, rtol=1e-10, atol=1e-14)
-    for name in ("opacities", "features_dc", "quats"):
+    for name in ("features_dc", "quats"):
         torch.testing.assert_close(children[name], parent[name].expand_as(children[name]))
+    # And the integral of opacity: opacity times the product of scales.
+    mass = [torch.sigmoid(p["opacities"].flatten()) * p["scales"].exp().prod(dim=-1) for p in (parent, children)]
+    torch.testing.assert_close(mass[1].sum(), mass[0].sum(), rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("logit", [-200.0, -30.0, 0.0, 30.0, 200.0])
+def test_children_of_extreme_opacity_have_finite_logits(logit: float):
+    params = random_params(1)
+    params["opacities"].data = torch.tensor([logit])
+    grid_split(params, adam(params, lr=0.0), {}, torch.tensor([[2, 3, 1]]), child_scale=1.5)
+    share = 1 / 1.5**2
+    expected = math.log(share) + logit if logit < 0 else math.log(share / (1 - share))
+    if abs(logit) >= 30:
+        assert params["opacities"].tolist() == pytest.approx([expected] * 6, rel=1e-6)
+    assert torch.sigmoid(params["opacities"]).tolist() == pytest.approx([share / (1 + math.exp(-logit))] * 6, rel=1e-5)
+
+
+def test_larger_children_fill_the_gaps_between_them():
+    """A flat, faint Gaussian across the view, 2 × 2 in its plane: the picture changes less than half as much."""
+    viewmats, Ks = camera(64, 64, focal=64.0)
+    errors = []
+    for child_scale in (1.0, 1.5):
+        params = random_params(1)
+        params["means"].data = torch.tensor([[0.0, 0.0, 4.0]])
+        params["scales"].data = torch.log(torch.tensor([[1.2, 1.2, 0.01]]))
+        params["quats"].data = torch.tensor([[1.0, 0.0, 0.0, 0.0]])
+        params["opacities"].data = torch.logit(torch.tensor([0.1]))
+        before = splat(params, viewmats, Ks, 64, 64)[1].detach()
+        grid_split(params, adam(params, lr=0.0), {}, torch.tensor([[2, 2, 1]]), child_scale=child_scale)
+        after = splat(params, viewmats, Ks, 64, 64)[1].detach()
+        errors.append(float((after - before).abs().mean() / before.mean()))
+    assert errors[1] < 0.5 * errors[0], errors
 
 
 def test_split_nearly_keeps_the_render():

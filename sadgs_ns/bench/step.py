@@ -16,6 +16,7 @@ import gsplat
 import torch
 from torch import Tensor
 
+from sadgs_ns.finite import NonFiniteLog
 from sadgs_ns.losses import photometric_loss
 from sadgs_ns.optimizers import FusedAdam, step_together
 from sadgs_ns.rasterization import rasterize, visible
@@ -75,6 +76,10 @@ class Step:
             name: FusedAdam([p], lr=1e-6, eps=1e-15) if fused else torch.optim.Adam([p], lr=1e-6, eps=1e-15, fused=True)
             for name, p in self.params.items()
         }
+        log = NonFiniteLog(device, capacity=1)
+        for optimizer in self.optimizers.values():
+            if isinstance(optimizer, FusedAdam):
+                optimizer.log = log  # one for all, as in training: what shares it is updated in one launch
         self.state: dict[str, Any] = empty_statistics(gaussians, device)
         self.viewmats = torch.eye(4, device=device)[None]
         self.viewmats[0, 2, 3] = 1.6
@@ -137,11 +142,10 @@ class Step:
 
     def step_optimizers(self) -> None:
         """Adam on all parameters that have gradients: our kernel in one launch, as in training."""
-        together = [o for o in self.optimizers.values() if isinstance(o, FusedAdam) and o.triton]
+        together = [o for o in self.optimizers.values() if isinstance(o, FusedAdam)]
         step_together(together)
-        for optimizer in self.optimizers.values():
-            if optimizer not in together:
-                optimizer.step()
+        for optimizer in self.optimizers.values() if not together else ():
+            optimizer.step()
 
     def whole(self) -> None:
         """A step; η is observed in the calls that `ETA_EVERY` divides."""

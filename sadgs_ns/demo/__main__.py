@@ -111,7 +111,6 @@ def fit_schedule(strategy: StructureAwareStrategy, iterations: int, max_gaussian
     strategy.clone_grad2d *= ABSGS_THRESHOLD_FACTOR
     strategy.split_absgrad2d *= ABSGS_THRESHOLD_FACTOR
     strategy.max_gaussians = max_gaussians
-    strategy.needless_every = 0  # hardly a Gaussian accounts for a whole pixel of so small an image
 
 
 def run_config(

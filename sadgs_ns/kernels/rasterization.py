@@ -12,6 +12,7 @@ from torch import Tensor
 from sadgs_ns.kernels import compositing
 from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
 from sadgs_ns.kernels.tiles import intersect_tiles
+from sadgs_ns.rasterization import visible
 
 BACKWARD: Literal["moments", "gsplat"] = "moments"
 """Who differentiates the compositing of three channels: our kernel (compositing.py) or gsplat's, its reference."""
@@ -77,10 +78,11 @@ def rasterization(
             colors = colors.expand(num_views, -1, -1)
         else:
             coefficients = colors.expand(num_views, -1, -1, -1)
-            drawn = radii > 0 if radii.dim() == 2 else (radii > 0).all(dim=-1)  # [C, N]
             # gsplat inverts the matrices, which makes the host wait for the device.
             positions = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:]).mT  # [C, 1, 3]
-            colors = spherical_harmonics(sh_degree, means - positions, coefficients, masks=drawn)
+            colors = spherical_harmonics(
+                sh_degree, means - positions, coefficients, masks=visible({"radii": radii, "means2d": means2d})
+            )
             colors = torch.clamp_min(colors + 0.5, 0.0)
     if render_mode in ("RGB+D", "RGB+ED"):
         colors = torch.cat([colors, depths[..., None]], dim=-1)
