@@ -65,8 +65,9 @@ def rasterization(
         calc_compensations=rasterize_mode == "antialiased",
         **bound,
     )
-    # Copied once, for the tiles and for compositing.
-    opacities = opacities.expand(num_views, -1).contiguous() if compensations is None else opacities * compensations
+    # Copied once, for the tiles and for compositing. Not by `expand`: torch reduces its gradient over the views, even
+    # over one, ten times as slowly as it adds.
+    opacities = torch.stack([opacities] * num_views) if compensations is None else opacities * compensations
     # The host waits for the lists' length: the colours are computed meanwhile.
     pending_tiles = intersect_tiles(means2d, radii, depths, conics, opacities, width, height, TILE_SIZE)
     if isinstance(colors, tuple) and sh_degree is not None and sh_degree <= MAX_DEGREE and not viewmats.requires_grad:
