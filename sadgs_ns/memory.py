@@ -15,7 +15,7 @@ COPIES = 4
 """Tensors of a parameter's size that live between steps: itself, its gradient and Adam's two moments."""
 WORKING_BYTES = 4000
 """Bytes a Gaussian takes during a step besides those: projections, tile lists, colours and their gradients. With them a
-Gaussian of degree 3 takes 5 kB; the peaks in the README's tables differ by 3.5 to 5.4 kB for each Gaussian more."""
+Gaussian of degree 3 takes 5 kB; the README's runs took 3.0 to 4.3 kB, images included, when they had the most."""
 STEP_BYTES = 300
 """Bytes a pixel of the views that are rendered together takes during a step, whoever computes the loss."""
 PLANNED_SHARE = 0.8

@@ -86,7 +86,7 @@ class SadgsModelConfig(SplatfactoModelConfig):
     """Weight of the mean opacity in the loss while densification runs: what no image needs fades until it is pruned.
     Larger leaves fewer Gaussians; 0 is off, as in the paper."""
     fused: bool = True
-    """Train with Triton kernels where they run (CUDA): tile lists, compositing, harmonics, loss, S̄, η and Adam.
+    """Train with Triton kernels where they run (CUDA): tile lists, compositing, harmonics, loss, S̄, η, AbsGS and Adam.
     Without, torch and gsplat compute the same, more slowly."""
     bounding_box_points: bool = True
     """Also start from points on the faces of the SfM points' bounding box."""
