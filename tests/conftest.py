@@ -5,6 +5,7 @@ so that ours still fail a test.
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,10 @@ settings.register_profile("long", max_examples=5000)  # pytest --hypothesis-prof
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel is defined: they then run on the CPU, slowly
+
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    # Under nohup or in the background a shell ignores Ctrl-C for its children, and so would the runs that tests interrupt.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 if TYPE_CHECKING:  # imported by the fixtures alone: nerfstudio takes seconds
     from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
