@@ -19,7 +19,7 @@ if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel is defined: they then run on the CPU, slowly
 
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
-    # Under nohup or in the background a shell ignores Ctrl-C for its children, and so would the runs that tests interrupt.
+    # Where a shell lets its children ignore Ctrl-C (nohup, in the background), so would the runs that tests interrupt.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 if TYPE_CHECKING:  # imported by the fixtures alone: nerfstudio takes seconds
