@@ -153,9 +153,9 @@ def screen_gradients(pipeline: SadgsPipeline, progress: Callable[[range], Any]) 
     for index in progress(range(len(pipeline.datamanager.train_dataset))):
         data = pipeline.datamanager.cached_train[index]
         height, width = data["image"].shape[:2]
-        viewmat, K = pipeline.train_viewmat(index).detach()[None], pipeline.train_cameras[1][index][None]
+        viewmats, Ks = pipeline.stacked_cameras([index])
         with torch.enable_grad():
-            render, alpha, info = model.render(viewmat, K, width, height, "RGB", absgrad=True)
+            render, alpha, info = model.render(viewmats.detach(), Ks, width, height, "RGB", absgrad=True)
             info["means2d"].retain_grad()
             outputs = {"rgb": render[..., :3] + (1 - alpha) * background, "background": background}
             batch = {name: data[name][None].to(pipeline.device) for name in ("image", "mask") if name in data}

@@ -197,7 +197,7 @@ class SadgsPipeline(VanillaPipeline):
         camera.metadata = {"cam_idx": index}
         return viewmats_from_camera_to_world(self.model.camera_optimizer.apply_to_camera(camera))[0]
 
-    def _stacked_cameras(self, indices: list[int]) -> tuple[Tensor, Tensor]:
+    def stacked_cameras(self, indices: list[int]) -> tuple[Tensor, Tensor]:
         """World-to-camera matrices [V, 4, 4] and intrinsics in px [V, 3, 3] of V training views."""
         viewmats, Ks = [self.train_viewmat(index) for index in indices], [self.train_cameras[1][i] for i in indices]
         n = len(indices)
@@ -223,14 +223,13 @@ class SadgsPipeline(VanillaPipeline):
         strategy, params = self.model.strategy, self.model.gauss_params
         generator = torch.Generator(self.device).manual_seed(0)
         statistics = empty_statistics(self.model.num_points, self.device)
-        _, Ks = self.train_cameras
         for index in progress(range(len(self.structure_tensors))):
-            tensor, viewmat = self.structure_tensors[index].to(self.device)[None], self.train_viewmat(index)[None]
-            _, _, info = self.model.render(viewmat, Ks[index][None], tensor.shape[2], tensor.shape[1], "RGB")
+            tensor, (viewmats, Ks) = self.structure_tensors[index].to(self.device)[None], self.stacked_cameras([index])
+            _, _, info = self.model.render(viewmats, Ks, tensor.shape[2], tensor.shape[1], "RGB")
             observe(
                 statistics,
                 params,
-                info | {"viewmats": viewmat, "Ks": Ks[index][None], "structure_tensors": tensor},
+                info | {"viewmats": viewmats, "Ks": Ks, "structure_tensors": tensor},
                 directional=strategy.directional_eta,
                 min_opacity=strategy.eta_min_opacity,
                 generator=generator,
@@ -303,7 +302,7 @@ class SadgsPipeline(VanillaPipeline):
             tensors = None
             if observes:
                 tensors = _stack([self.structure_tensors[index].to(self.device) for index in indices])
-            viewmats, Ks = self._stacked_cameras(indices)
+            viewmats, Ks = self.stacked_cameras(indices)
             outputs = self.model.get_training_outputs(viewmats, Ks, width, height, indices, tensors)
             group_losses = self.model.get_loss_dict(outputs, batch)
             weight = len(views) / self.config.views_per_iteration

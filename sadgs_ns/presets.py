@@ -73,7 +73,7 @@ def load_preset(name: str) -> MethodSpecification:
 
 def _read(where: str) -> dict[Any, Any]:
     """Values of a file of presets, on top of its base's."""
-    values = _mapping(_parse((_configs() / where).read_bytes(), where), where)
+    values = _read_alone(where)
     if "base" not in values:
         return values
     base = values.pop("base")
@@ -81,10 +81,14 @@ def _read(where: str) -> dict[Any, Any]:
     if base not in known:
         others = ", ".join(known)
         raise ValueError(f"{where}: base must be the name of another preset, got {_show(base)}; known are {others}.")
-    below = _mapping(_parse((_configs() / f"{base}.yaml").read_bytes(), f"{base}.yaml"), f"{base}.yaml")
+    below = _read_alone(f"{base}.yaml")
     if "base" in below:
         raise ValueError(f"{where}: base {base} has a base itself; name a preset that has none.")
     return _merged(below, values)
+
+
+def _read_alone(where: str) -> dict[Any, Any]:
+    return _mapping(_parse((_configs() / where).read_bytes(), where), where)
 
 
 def _merged(below: dict[Any, Any], above: dict[Any, Any]) -> dict[Any, Any]:

@@ -85,6 +85,8 @@ def test_split_keeps_the_parent_s_mean_and_covariance(counts: list[int], child_s
     torch.testing.assert_close(mixture, covariance, rtol=1e-10, atol=1e-14)
     for name in ("features_dc", "quats"):
         torch.testing.assert_close(children[name], parent[name].expand_as(children[name]))
+    if child_scale == 1:  # the paper's are as opaque as the parent
+        torch.testing.assert_close(children["opacities"], parent["opacities"].expand_as(children["opacities"]))
     # And the integral of opacity: opacity times the product of scales.
     mass = [torch.sigmoid(p["opacities"].flatten()) * p["scales"].exp().prod(dim=-1) for p in (parent, children)]
     torch.testing.assert_close(mass[1].sum(), mass[0].sum(), rtol=1e-12, atol=0)

@@ -142,9 +142,9 @@ class Step:
 
     def step_optimizers(self) -> None:
         """Adam on all parameters that have gradients: our kernel in one launch, as in training."""
-        together = [o for o in self.optimizers.values() if isinstance(o, FusedAdam)]
+        together = [o for o in self.optimizers.values() if isinstance(o, FusedAdam) and o.triton]
         step_together(together)
-        for optimizer in self.optimizers.values() if not together else ():
+        for optimizer in () if together else self.optimizers.values():
             optimizer.step()
 
     def whole(self) -> None:
