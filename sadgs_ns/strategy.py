@@ -29,7 +29,7 @@ class StructureAwareStrategy(Strategy):
 
         strategy = StructureAwareStrategy()
         state = strategy.initialize_state(scene_scale)
-        renders, alphas, info = rasterization(..., packed=False, absgrad=strategy.absgrad)
+        renders, alphas, info = rasterization(..., packed=False, absgrad=strategy.needs_absgrad(step))
         info |= {"structure_tensors": ..., "viewmats": ..., "Ks": ...}   # [C, H, W, 3], [C, 4, 4], [C, 3, 3]
         strategy.step_pre_backward(params, optimizers, state, step, info)
         loss.backward()                                                  # the mean over the C views
@@ -52,7 +52,7 @@ class StructureAwareStrategy(Strategy):
     """Iterations between AbsGS steps, skipped where a structure step falls; 0 turns them off."""
     refine_start_iter: int = 100
     """First iteration at which densification may run."""
-    refine_stop_iter: int = 1900
+    refine_stop_iter: int = 1600
     """Last iteration at which densification may run; opacities under `final_prune_opacity` are pruned there."""
     eta_every: int = 10
     """Iterations between η observations; the paper observes at every one, which costs time and changes nothing."""
@@ -80,8 +80,8 @@ class StructureAwareStrategy(Strategy):
     """AbsGS: normalised mean absolute screen gradient at which a large Gaussian is split; AbsGS's own is 4e-4."""
     small_scale: float = 0.001
     """AbsGS: largest scale, relative to the scene's extent, at which a Gaussian counts as small."""
-    min_opacity: float = 0.005
-    """Opacity under which every densification step prunes."""
+    min_opacity: float = 0.02
+    """Opacity under which every densification step prunes; AbsGS's own is 0.005."""
     clamp_opacity: float = 0.8
     """Structure steps lower opacities to at most this, so that what lies behind gets gradients again; 1 is off."""
     reset_every: int = 1200
@@ -99,11 +99,6 @@ class StructureAwareStrategy(Strategy):
     def child_grid(self) -> tuple[float, float]:
         """The last arguments of `grid_split`."""
         return self.split_extent, self.child_scale
-
-    @property
-    def absgrad(self) -> bool:
-        """Whether the rasterizer must provide absolute screen gradients."""
-        return self.absgs_every > 0
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
         """State to pass to the other methods; its tensors are made at the first step.
@@ -186,8 +181,13 @@ class StructureAwareStrategy(Strategy):
         return next_structure_step <= self.refine_stop_iter  # afterwards nobody would read it
 
     def needs_absgrad(self, step: int) -> bool:
-        """Whether AbsGS still reads absolute screen gradients at this step."""
-        return self.absgrad and step < self.refine_stop_iter
+        """Whether the rasterizer must provide absolute screen gradients: an AbsGS step will read this step's.
+
+        Those just before a structure step are not read: it forgets them.
+        """
+        first = max(step + 1, self.refine_start_iter)
+        read = _next_due(first, self.absgs_every)
+        return read <= self.refine_stop_iter and read < _next_due(first, self.structure_every)
 
     def step_pre_backward(
         self,
@@ -202,7 +202,8 @@ class StructureAwareStrategy(Strategy):
             return
         self._ensure_statistics(params, state)
         for view in _views(info):
-            view["means2d"].retain_grad()
+            if self.needs_absgrad(step):
+                view["means2d"].retain_grad()
             if self.observes(step):
                 observe(
                     state,
@@ -233,7 +234,7 @@ class StructureAwareStrategy(Strategy):
         if iteration > self.refine_stop_iter:
             return
         views = _views(info)
-        if self.absgrad:
+        if self.needs_absgrad(step):
             num_views = sum(view["n_cameras"] for view in views)
             for view in views:
                 accumulate_gradients(state, view, num_views, fused=self.fused)
@@ -389,3 +390,8 @@ def _warn_of_memory(iteration: int, in_memory: float) -> None:
 
 def _due(iteration: int, every: int) -> bool:
     return every > 0 and iteration % every == 0
+
+
+def _next_due(iteration: int, every: int) -> float:
+    """The first iteration from this one on at which `_due`."""
+    return -(-iteration // every) * every if every > 0 else math.inf

@@ -96,7 +96,7 @@ def training_step(
 ) -> None:
     """An iteration of a plain gsplat loop with the strategy, on images [C, H, W, 3]."""
     height, width = images.shape[1:3]
-    renders, _, info = splat(params, viewmats, Ks, width, height, absgrad=strategy.absgrad, **options)
+    renders, _, info = splat(params, viewmats, Ks, width, height, absgrad=strategy.needs_absgrad(step), **options)
     info |= {"structure_tensors": structure_tensors, "viewmats": viewmats, "Ks": Ks}
     strategy.step_pre_backward(params, optimizers, state, step, info)
     (renders - images).abs().mean().backward()

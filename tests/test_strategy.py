@@ -86,7 +86,7 @@ def test_nothing_happens_outside_the_window():
 
 
 def test_window_fits_short_runs_and_keeps_long_ones():
-    for length, expected in ((3000, 1900), (300, 190), (30_000, 1900)):
+    for length, expected in ((3000, 1600), (300, 190), (30_000, 1600)):
         strategy = StructureAwareStrategy()
         strategy.fit_to_run(length)
         assert strategy.refine_stop_iter == expected
@@ -96,6 +96,30 @@ def test_eta_is_observed_only_where_a_structure_step_will_read_it():
     strategy = StructureAwareStrategy(structure_every=500, refine_stop_iter=1900, eta_every=10)
     assert strategy.observes(0) and strategy.observes(1490)
     assert not strategy.observes(5) and not strategy.observes(1500) and not strategy.observes(2500)
+
+
+def test_gradients_are_kept_only_where_an_absgs_step_will_read_them():
+    strategy = StructureAwareStrategy(refine_start_iter=100, absgs_every=100, structure_every=500)
+    strategy.refine_stop_iter = 1600
+    needed = {step + 1 for step in range(3000) if strategy.needs_absgrad(step)}  # iterations
+    assert needed == set(range(1, 401)) | set(range(501, 901)) | set(range(1001, 1401)) | set(range(1501, 1601))
+    strategy.structure_every = 0
+    assert all(strategy.needs_absgrad(step) == (step < 1600) for step in range(3000))
+    strategy.absgs_every = 0
+    assert not any(strategy.needs_absgrad(step) for step in range(3000))
+
+
+def test_keeping_all_gradients_changes_nothing():
+    class Hoarder(StructureAwareStrategy):
+        def needs_absgrad(self, step: int) -> bool:
+            return step < self.refine_stop_iter
+
+    thrifty = short(clone_grad2d=2e-5, split_absgrad2d=4e-5)
+    plain, _, counts = train(thrifty, 26)
+    hoarded, _, same = train(Hoarder(**vars(thrifty)), 26)
+    assert counts == same and counts[3] > 60 and counts[9] > counts[8]
+    for name, parameter in plain.items():
+        assert torch.equal(parameter, hoarded[name])
 
 
 def test_opacity_schedule():

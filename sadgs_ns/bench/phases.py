@@ -155,7 +155,8 @@ def within_densification(strategy: Any) -> Iterator[None]:
     schedule = {name: getattr(strategy, name) for name in _SCHEDULE if getattr(strategy, name, 0) > 0}
     try:
         for name in schedule:
-            setattr(strategy, name, sys.maxsize)
+            # Before the next structure step, which would forget AbsGS's gradients, so that they are not even computed.
+            setattr(strategy, name, sys.maxsize // 2 if name == "absgs_every" else sys.maxsize)
         yield
     finally:
         for name, value in schedule.items():
