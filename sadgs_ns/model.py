@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import lru_cache
@@ -24,6 +25,7 @@ from nerfstudio.models.splatfacto import (
 from nerfstudio.utils.colors import get_color
 from nerfstudio.utils.rich_utils import CONSOLE
 from pytorch_msssim import SSIM
+from rich.markup import escape
 from torch import Tensor
 
 from sadgs_ns.cameras import refuse_unsupported_cameras
@@ -143,6 +145,7 @@ class SadgsModel(SplatfactoModel):
             if config.background_color == "random"
             else get_color(config.background_color)
         )
+        self.photo_background = self.background_color  # for the run; the viewer exchanges the other while it draws
         if config.use_bilateral_grid:
             x, y, w = config.grid_shape
             self.bil_grids = BilateralGrid(num=self.num_train_data, grid_X=x, grid_Y=y, grid_W=w)
@@ -291,7 +294,7 @@ class SadgsModel(SplatfactoModel):
         Returns:
             `rgb` [C, H, W, 3], not clamped, and `background` [3].
         """
-        absgrad = self.training and self.config.densify and self.strategy.needs_absgrad(self.step)
+        absgrad = self.config.densify and self.strategy.needs_absgrad(self.step)
         render, alpha, info = self.render(viewmats, Ks, width, height, "RGB", absgrad)
         if self.config.densify:
             info |= {"viewmats": viewmats.detach(), "Ks": Ks, "structure_tensors": structure_tensors}
@@ -337,8 +340,19 @@ class SadgsModel(SplatfactoModel):
         }
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """What `get_outputs` returns inside a crop box, and what the viewer's panel adds."""
-        outputs = super().get_outputs_for_camera(camera, obb_box)
+        """What `get_outputs` returns inside a crop box, and what the viewer's panel adds.
+
+        Raises:
+            InputError: If the camera is no pinhole; the viewer, whose thread would end, is shown nothing instead.
+        """
+        try:
+            outputs = super().get_outputs_for_camera(camera, obb_box)
+        except InputError as error:
+            if not in_viewer():
+                raise
+            _say_once(str(error))
+            width, height = int(camera.width.item()), int(camera.height.item())
+            outputs: dict[str, Any] = self.get_empty_outputs(width, height, self._get_background_color())
         return outputs if self.viewer_outputs is None else outputs | self.viewer_outputs(camera, outputs)
 
     def get_gt_img(self, image: Tensor) -> Tensor:
@@ -451,6 +465,18 @@ class SadgsModel(SplatfactoModel):
         for name, parameter in self.gauss_params.items():
             parameter.data = torch.empty_like(dict[f"gauss_params.{name}"], device=self.device)
         return super(SplatfactoModel, self).load_state_dict(dict, **kwargs)
+
+
+def in_viewer() -> bool:
+    """Whether this is a thread in which nerfstudio's viewer draws."""
+    from nerfstudio.viewer.render_state_machine import RenderStateMachine
+
+    return isinstance(threading.current_thread(), RenderStateMachine)
+
+
+@lru_cache(maxsize=8)
+def _say_once(text: str) -> None:
+    CONSOLE.print(f"[yellow]{escape(text)}[/]")
 
 
 @lru_cache(maxsize=8)

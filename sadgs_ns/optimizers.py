@@ -114,9 +114,12 @@ class SadgsOptimizers(Optimizers):
     def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
         """Update the named parameters."""
         together: dict[str, FusedAdam] = {}
-        for name in () if grad_scaler.is_enabled() else param_groups:
-            optimizer, clipped = self.optimizers[name], self.config[name]["optimizer"].max_norm is not None
-            if isinstance(optimizer, FusedAdam) and optimizer.triton and not clipped:
+        for name in param_groups:
+            optimizer = self.optimizers[name]
+            if self.config[name]["optimizer"].max_norm is not None:
+                # nerfstudio would clip the gradients of parameters that densification has replaced.
+                self.parameters[name] = optimizer.param_groups[0]["params"]
+            elif isinstance(optimizer, FusedAdam) and optimizer.triton and not grad_scaler.is_enabled():
                 together[name] = optimizer
                 optimizer._opt_called = True  # type: ignore[attr-defined] # as `step` notes for torch's schedulers
         step_together(together.values())

@@ -6,7 +6,6 @@ The viewer finds the elements by walking the pipeline, and shows them in alphabe
 from __future__ import annotations
 
 import math
-import threading
 import time
 import weakref
 from collections.abc import Callable
@@ -17,7 +16,6 @@ import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.rich_utils import CONSOLE
-from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.viewer_elements import (
     ViewerButton,
     ViewerControl,
@@ -32,6 +30,7 @@ from torch import Tensor
 
 from sadgs_ns import pictures
 from sadgs_ns.errors import reason
+from sadgs_ns.model import in_viewer
 from sadgs_ns.pictures import CHILDREN, ETA, LOW, PERIOD, Picture, to_picture
 from sadgs_ns.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.storage import decode
@@ -251,7 +250,7 @@ class StructurePanel(torch.nn.Module):
         Returns:
             `structure`, [H, W, 3] in [0, 1]; or nothing.
         """
-        if not isinstance(threading.current_thread(), RenderStateMachine):
+        if not in_viewer():
             return {}
         if self._shown == OFF:
             return {OUTPUT: rendered["rgb"]}
@@ -301,6 +300,8 @@ class StructurePanel(torch.nn.Module):
         kept = {name: statistics[name] for name in ("eta_max", "n_total")}
         kept |= {"children": strategy.children_now(statistics), "low": strategy.consistently_low(statistics)}
         rows = model.cropped({**model.gauss_params, **kept})
+        if len(rows["means"]) == 0:
+            return pictures.annotate(np.zeros((height, width, 3), np.uint8), "No Gaussians in the crop box.")
         viewmat = viewmats_from_camera_to_world(camera.camera_to_worlds)[0].to(model.device)
         view = viewmat, camera.get_intrinsics_matrices()[0].to(model.device), width, height
         options = {"rasterize_mode": model.config.rasterize_mode}

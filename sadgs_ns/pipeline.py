@@ -158,12 +158,15 @@ class SadgsPipeline(VanillaPipeline):
                 batch = indices[start : start + batch_size]
                 data = [self.datamanager.cached_train[index] for index in batch]
                 for index, tensor in zip(batch, self.structure_tensors_of(data), strict=True):
-                    tensors[index] = tensor.to(self.datamanager.cached_train[index]["image"].device)
+                    tensor = tensor.to(self.datamanager.cached_train[index]["image"].device)
+                    # As nerfstudio pins images that it leaves on the host: a step's copy then stops nobody.
+                    on_host = self.device.type == "cuda" and tensor.device.type == "cpu"
+                    tensors[index] = tensor.pin_memory() if on_host else tensor
         return tensors
 
     def photo(self, data: dict[str, Any]) -> Tensor:
         """An image of the datamanager as the loss sees it: on the training device and on the background. [H, W, 3]"""
-        background = self.model.background_color.to(self.device)
+        background = self.model.photo_background.to(self.device)
         return self.model.composite_with_background(self.model.get_gt_img(data["image"]), background).to(self.device)
 
     def structure_tensors_of(self, data: list[dict[str, Any]]) -> Tensor:
@@ -244,7 +247,7 @@ class SadgsPipeline(VanillaPipeline):
         if not datamanager.train_unseen_cameras:
             datamanager.train_unseen_cameras = datamanager.sample_train_cameras()
         data = datamanager.cached_train[index]
-        return index, {**data, "image": data["image"].to(self.device)}
+        return index, {**data, "image": data["image"].to(self.device, non_blocking=True)}
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
@@ -298,10 +301,14 @@ class SadgsPipeline(VanillaPipeline):
             batch = {"image": _stack([data["image"] for _, data in views])}
             if any("mask" in data for _, data in views):
                 everything = torch.ones((height, width, 1), dtype=torch.bool, device=self.device)
-                batch["mask"] = _stack([data.get("mask", everything).to(self.device) for _, data in views])
+                batch["mask"] = _stack(
+                    [data.get("mask", everything).to(self.device, non_blocking=True) for _, data in views]
+                )
             tensors = None
             if observes:
-                tensors = _stack([self.structure_tensors[index].to(self.device) for index in indices])
+                tensors = _stack(
+                    [self.structure_tensors[index].to(self.device, non_blocking=True) for index in indices]
+                )
             viewmats, Ks = self.stacked_cameras(indices)
             outputs = self.model.get_training_outputs(viewmats, Ks, width, height, indices, tensors)
             group_losses = self.model.get_loss_dict(outputs, batch)

@@ -109,17 +109,27 @@ class StructureAwareStrategy(Strategy):
             scene_scale: Extent of the cameras in world units, as 3DGS defines it.
 
         Raises:
-            ValueError: If `max_gaussians` allows none, or `child_scale` is not in [1, 2).
+            ValueError: If `max_gaussians`, `eta_every` or `split_exponent` is not positive, or `child_scale` not in
+                [1, 2).
         """
         if self.max_gaussians < 1:
             raise ValueError(f"strategy.max_gaussians must be at least 1, got {self.max_gaussians}.")
+        if self.eta_every < 1:
+            raise ValueError(f"strategy.eta_every must be at least 1, got {self.eta_every}.")
+        if not self.split_exponent > 0:
+            raise ValueError(f"strategy.split_exponent must be positive, got {self.split_exponent:g}.")
         if not 1 <= self.child_scale < 2:
             raise ValueError(f"strategy.child_scale must be at least 1 and less than 2, got {self.child_scale:g}.")
         return {"scene_scale": scene_scale}
 
     def fit_to_run(self, num_iterations: int) -> None:
-        """Let densification end early enough in a short run: after at most 19/30 of it, as in the released code."""
+        """Let densification end early enough in a short run: after at most 19/30 of it, as in the released code.
+
+        Where it would end before `refine_start_iter`, there is none, and nothing that prepares it.
+        """
         self.refine_stop_iter = min(self.refine_stop_iter, num_iterations * 19 // 30)
+        if self.refine_stop_iter < self.refine_start_iter:
+            self.refine_stop_iter = 0
 
     def fit_to_memory(self, params: Params, other_bytes: float) -> str | None:
         """Lower `max_gaussians` to what the budget, or the device's free memory, holds; call before the first step.

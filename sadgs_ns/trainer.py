@@ -198,12 +198,18 @@ class SadgsTrainer(Trainer):
             raise RunError(self._rescue(out_of_memory))
 
     def _rescue(self, out_of_memory: str) -> str:
-        """Save the state before the present step, if it is whole; returns what to tell the user."""
+        """Save the state of before the present step, if it is whole; returns what to tell the user.
+
+        Memory that ran out while Gaussians were split leaves the step's update in it, which is then made twice.
+        """
         torch.cuda.empty_cache()
         model = self.pipeline.model
         lengths = {len(parameter) for parameter in model.gauss_params.values()}
-        for name in model.gauss_params:
-            for state in self.optimizers.optimizers[name].state.values():
+        for name, parameter in model.gauss_params.items():
+            states = self.optimizers.optimizers[name].state
+            if not states and parameter.numel() > 0:
+                lengths.add(-1)  # gsplat takes a state out while it rewrites it
+            for state in states.values():
                 lengths |= {len(value) for value in state.values() if isinstance(value, torch.Tensor) and value.dim()}
         lengths |= {len(v) for v in model.strategy_state.values() if isinstance(v, torch.Tensor) and v.dim()}
         if len(lengths) > 1 or self.step <= self._start_step:

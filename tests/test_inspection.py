@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import shutil
 import threading
@@ -14,7 +15,7 @@ import pytest
 import torch
 import yaml
 from kill_and_resume import configure, set_up
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.configs.method_configs import method_configs
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
@@ -22,8 +23,10 @@ from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
 from PIL import Image
 
-from sadgs_ns import inspection, pictures
+from sadgs_ns import inspection, pictures, rasterization
 from sadgs_ns.demo.scene import write_scene
+from sadgs_ns.errors import InputError
+from sadgs_ns.model import _say_once
 from sadgs_ns.panel import CHOICES, OFF, OUTPUT, StructurePanel, change, describe, nearest_view
 from sadgs_ns.pipeline import SadgsPipeline
 from sadgs_ns.strategy import StructureAwareStrategy
@@ -309,7 +312,14 @@ def test_drawing_which_the_viewer_may_break_off_loads_no_photo(choice: str, pane
 
 
 @torch.no_grad()
-def test_the_pictures_survive_tiny_windows_and_crop_boxes(panel: StructurePanel):
+def test_the_pictures_survive_tiny_windows_and_crop_boxes(panel: StructurePanel, monkeypatch: pytest.MonkeyPatch):
+    rendered: list[int] = []
+
+    def rasterize(means: torch.Tensor, *args: Any, **options: Any) -> Any:
+        rendered.append(len(means))
+        return rasterization.rasterize(means, *args, **options)
+
+    monkeypatch.setattr(pictures, "rasterize", rasterize)
     pipeline = pipeline_of(panel)
     camera = a_camera(pipeline)
     camera.rescale_output_resolution(0.2)
@@ -321,6 +331,24 @@ def test_the_pictures_survive_tiny_windows_and_crop_boxes(panel: StructurePanel)
         for box in (None, nowhere, middle):
             outputs = in_the_viewer(lambda box=box: pipeline.model.get_outputs_for_camera(camera, obb_box=box))
             assert outputs[OUTPUT].shape == outputs["rgb"].shape
+    assert rendered and 0 not in rendered, "the kernels cannot render nothing"
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("choice", CHOICES)
+def test_the_viewer_is_told_of_a_camera_that_is_no_pinhole_and_goes_on(choice: str, panel: StructurePanel, capsys: Any):
+    pipeline = pipeline_of(panel)
+    panel.choice.value = choice
+    panel.choose()
+    camera = copy.deepcopy(a_camera(pipeline))
+    camera.camera_type = torch.full_like(camera.camera_type, CameraType.EQUIRECTANGULAR.value)
+    _say_once.cache_clear()
+    for _ in range(2):
+        outputs = in_the_viewer(lambda: pipeline.model.get_outputs_for_camera(camera))
+        assert outputs[OUTPUT].shape == outputs["rgb"].shape == (HEIGHT, WIDTH, 3)
+    assert capsys.readouterr().out.count("EQUIRECTANGULAR") == 1
+    with pytest.raises(InputError, match="EQUIRECTANGULAR"):  # ns-render
+        pipeline.model.get_outputs_for_camera(camera)
 
 
 def test_a_finished_run_is_observed_when_eta_is_asked_for(panel: StructurePanel):

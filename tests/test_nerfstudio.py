@@ -548,6 +548,8 @@ def test_transparent_images_train_in_front_of_the_background(tmp_path: Path):
     assert data["image"].shape[-1] == 4
     target = trainer.pipeline.model.composite_with_background(data["image"] / 255, torch.ones(3))
     assert (target[:, : WIDTH // 2] == 1).all() and target[:, WIDTH // 2 :].amin() < 1
+    trainer.pipeline.model.set_background(torch.zeros(3))  # as the viewer does whenever it draws
+    torch.testing.assert_close(trainer.pipeline.photo(data), target)
     trainer.train()
     assert is_finite(trainer.pipeline.model)
 

@@ -196,6 +196,16 @@ def test_what_the_launch_cannot_do_goes_nerfstudios_way(options, scaled, expecte
     assert launches == expected * 3
 
 
+def test_gradients_are_also_clipped_when_densification_has_replaced_their_parameter():
+    training = Training(SadgsOptimizers, means=config(FusedAdamOptimizerConfig(lr=0.1, max_norm=0.1)))
+    group = training.optimizers.optimizers["means"].param_groups[0]
+    replaced = torch.nn.Parameter(group["params"][0].detach().repeat(2, 1))
+    replaced.grad = torch.ones_like(replaced)
+    group["params"] = [replaced]
+    training.optimizers.optimizer_scaler_step_some(OFF, ["means"])  # type: ignore[arg-type]
+    assert float(replaced.grad.norm()) == pytest.approx(0.1, rel=1e-3)
+
+
 @pytest.mark.parametrize("source", [Optimizers, SadgsOptimizers, "torch"])
 @pytest.mark.parametrize("target", [Optimizers, SadgsOptimizers, "torch"])
 def test_a_checkpoint_goes_on_in_the_other(source, target):

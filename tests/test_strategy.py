@@ -92,6 +92,13 @@ def test_window_fits_short_runs_and_keeps_long_ones():
         assert strategy.refine_stop_iter == expected
 
 
+def test_a_run_too_short_to_densify_prepares_nothing_for_it():
+    strategy = StructureAwareStrategy(structure_every=50, absgs_every=10, refine_start_iter=500)
+    strategy.fit_to_run(700)  # 443 would be before 500
+    assert not any(strategy.observes(step) or strategy.needs_absgrad(step) for step in range(700))
+    assert strategy.refine_stop_iter == 0
+
+
 def test_eta_is_observed_only_where_a_structure_step_will_read_it():
     strategy = StructureAwareStrategy(structure_every=500, refine_stop_iter=1900, eta_every=10)
     assert strategy.observes(0) and strategy.observes(1490)

@@ -167,8 +167,8 @@ def measure(trainer: Any, steps: int = STEPS) -> dict[str, float]:
     """Train some steps beyond the end of a run and take their time apart.
 
     What is measured is a step with the trained model's Gaussians as within the densification window: the strategy
-    observes η and gathers gradients as it did then, but densifies nothing. It therefore takes longer than the run's
-    mean step: most of those had fewer Gaussians or no statistics to keep.
+    observes η and gathers gradients as in a step that AbsGS reads, but densifies nothing. It therefore takes longer
+    than the run's mean step: most of those had fewer Gaussians or no statistics to keep.
 
     Phases:
         rasterize_forward: From the parameters to the image, activations and background included, η excluded.
