@@ -28,6 +28,8 @@ import pycolmap
 from PIL import ExifTags, Image
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from sadgs_ns.atomic import atomic_path
+from sadgs_ns.errors import free_space, reason
 from sadgs_ns.image_checks import IMAGE_SUFFIXES
 
 VIDEO_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"}
@@ -97,31 +99,46 @@ def sharpest_frames(video: Path, count: int) -> Iterator[tuple[int, np.ndarray]]
             best = (sharpness, frame)
 
 
-def find_photos(source: Path, work: Path, frames: int) -> tuple[Path, list[str]]:
-    """The folder of photos and their names; a video's sharpest frames are written first.
+def find_photos(source: Path, out: Path) -> list[str]:
+    """The names of a folder's photos, relative to it; a scene that is made in the same folder is none of them.
 
     Raises:
         ValueError: If there are fewer than three photos.
     """
-    folder = source
-    if source.is_file():
-        if source.suffix.lower() not in VIDEO_SUFFIXES:
-            raise ValueError(
-                f"{source} is neither a folder of photos nor a video ({', '.join(sorted(VIDEO_SUFFIXES))})."
-            )
-        folder = work / "frames"
-        done = work / "frames.json"
-        if not done.exists():
-            _empty_folder(folder)
-            for number, frame in sharpest_frames(source, frames):
-                cv2.imwrite(str(folder / f"{number:05d}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, 97])
-            done.write_text(json.dumps({"video": source.name, "frames": frames}))
-    elif not source.is_dir():
+    if not source.is_dir():
         raise ValueError(f"{source} does not exist; give a folder of photos or a video.")
-    names = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES)
-    if len(names) < 3:
-        raise ValueError(f"{source} holds {len(names)} photos; a reconstruction needs at least 3, better 30 or more.")
-    return folder, names
+    folder, scene = source.resolve(), out.resolve()
+    found = [path for path in folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES]
+    if folder in scene.parents:
+        found = [path for path in found if scene not in path.parents]
+    if len(found) < 3:
+        raise ValueError(f"{source} holds {len(found)} photos; a reconstruction needs at least 3, better 30 or more.")
+    return sorted(path.relative_to(folder).as_posix() for path in found)
+
+
+def film_frames(video: Path, count: int) -> Iterator[tuple[int, np.ndarray]]:
+    """The `sharpest_frames` of a video that has enough of them, which is known when this returns.
+
+    Raises:
+        ValueError: If it is no video or gives fewer than three frames.
+    """
+    if video.suffix.lower() not in VIDEO_SUFFIXES:
+        raise ValueError(f"{video} is neither a folder of photos nor a video ({', '.join(sorted(VIDEO_SUFFIXES))}).")
+    frames = sharpest_frames(video, count)
+    first = list(itertools.islice(frames, 3))
+    if len(first) < 3:
+        raise ValueError(f"{video} gives {len(first)} frames; a reconstruction needs at least 3, better 30 or more.")
+    return itertools.chain(first, frames)
+
+
+def write_frames(frames: Iterator[tuple[int, np.ndarray]], folder: Path) -> None:
+    """Write numbered photos to a folder that is there only when all of them are."""
+    partial = _empty_folder(folder.with_suffix(".partial"))
+    for number, frame in frames:
+        photo = partial / f"{number:05d}.jpg"
+        if not cv2.imwrite(str(photo), frame, [cv2.IMWRITE_JPEG_QUALITY, 97]):
+            raise OSError(f"{photo} could not be written")
+    partial.rename(folder)
 
 
 def _empty_folder(folder: Path) -> Path:
@@ -313,6 +330,32 @@ def summarize(names: Sequence[str], model: Path, database: Path) -> Summary:
     )
 
 
+def _note(settings: dict, noted: Path) -> None:
+    """Write the settings that a scene is begun with; a scene that goes on keeps its own."""
+    if not noted.exists():
+        with atomic_path(noted) as partial:
+            partial.write_text(json.dumps(settings))
+
+
+def _changes(begun: dict, asked: dict) -> str:
+    """What differs between the settings that a scene was begun with and those asked for now; empty if nothing does."""
+    changed = [name for name in asked if begun.get(name) != asked[name]]
+    if "source" in changed:  # the rest follows from it
+        changed = ["source"]
+    told = []
+    for name in changed:
+        if name not in begun:
+            told.append(f"an earlier version began it and did not compare its {name}")
+        elif name == "photos":
+            before, now = set(begun[name]), set(asked[name])
+            for verb, names in (("added", now - before), ("removed", before - now)):
+                told += [f"photos {verb}: {len(names)}, such as {min(names)}"] if names else []
+        else:
+            option = name if name == "source" else "--" + name.replace("_", "-")
+            told.append(f"{option} was {begun[name]}, is {asked[name]}")
+    return "; ".join(told)
+
+
 def process(
     source: Path,
     out: Path,
@@ -341,17 +384,27 @@ def process(
         ValueError: One sentence that names the input and the remedy.
     """
     work = out / "work"
-    settings = {"source": str(source.resolve()), "camera_per_photo": camera_per_photo}
     noted = work / "settings.json"
-    if out.exists() and any(out.iterdir()) and not noted.exists():
+    if out.is_file() or (out.exists() and any(out.iterdir()) and not noted.exists()):
         raise ValueError(f"{out} exists and is not a scene that sadgs-process began; give another folder.")
-    if noted.exists() and json.loads(noted.read_text()) != settings:
-        raise ValueError(f"{out} was begun with other photos or settings; give another folder or delete it.")
     is_video = source.is_file()
-    photos, names = find_photos(source, work, frames)
-    work.mkdir(parents=True, exist_ok=True)
-    noted.write_text(json.dumps(settings))
+    settings = {"source": str(source.resolve()), "camera_per_photo": camera_per_photo}
+    settings |= {"frames": frames} if is_video else {"photos": find_photos(source, out)}
+    if noted.exists() and (changes := _changes(json.loads(noted.read_text()), settings)):
+        raise ValueError(
+            f"{out} was begun with other photos or settings ({changes}); give another folder or delete it."
+        )
+    if is_video:
+        photos = work / "frames"
+        if not photos.exists():
+            chosen = film_frames(source, frames)
+            _note(settings, noted)  # before anything else lies in the folder, so that an interrupted run can go on
+            write_frames(chosen, photos)
+        names = sorted(photo.name for photo in photos.glob("*.jpg"))
+    else:
+        photos, names = source, settings["photos"]
     groups = [[name] for name in names] if camera_per_photo else photos_by_camera(photos, names)
+    _note(settings, noted)  # of a folder only now, when its photos are known to be readable
     database = work / "database.db"
     columns = (TextColumn("{task.description:>24}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, int(pycolmap.logging.ERROR)
@@ -371,7 +424,7 @@ def _first_line(error: Exception) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Make a scene; returns the exit code, 2 if the input is wrong, 130 after an interrupt."""
+    """Make a scene; returns the exit code: 1 on a full disk, 2 if the input is wrong, 130 after an interrupt."""
     parser = argparse.ArgumentParser(prog="sadgs-process", description="From photos or a video to a scene for sadgs.")
     parser.add_argument("source", type=Path, help="folder of photos, or a video")
     parser.add_argument("out", type=Path, help="folder for the scene; an interrupted run goes on in it")
@@ -396,6 +449,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ValueError as error:
         print(f"sadgs-process: {error}", file=sys.stderr)
         return 2
+    except OSError as error:
+        why, free = reason(error), free_space(options.out)
+        print(f"sadgs-process: {why} ({free} free there); the same command goes on.", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print("sadgs-process: stopped; the same command goes on.", file=sys.stderr)
         return 130

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import shutil
 from pathlib import Path
 
@@ -142,6 +143,7 @@ def test_bad_photos_are_told_in_a_sentence(tmp_path: Path, prepare, sentence: st
     assert main([str(tmp_path / "photos"), str(tmp_path / "out")]) == 2
     printed = capsys.readouterr().err
     assert sentence in printed and printed.count("\n") == 1
+    assert not (tmp_path / "out").exists()
 
 
 def broken(folder: Path) -> None:
@@ -173,3 +175,114 @@ def test_a_film_that_is_none_is_told_in_a_sentence(tmp_path: Path, capsys):
     (tmp_path / "film.mp4").write_bytes(b"no film")
     assert main([str(tmp_path / "film.mp4"), str(tmp_path / "out")]) == 2
     assert "film.mp4 cannot be read as a video" in capsys.readouterr().err
+    film(tmp_path / "short.avi", 2)
+    assert main([str(tmp_path / "short.avi"), str(tmp_path / "out")]) == 2
+    assert "short.avi gives 2 frames; a reconstruction needs at least 3" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def film(path: Path, frames: int) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (32, 24))
+    for i in range(frames):
+        writer.write(np.full((24, 32, 3), 20 * i, np.uint8))
+    writer.release()
+    return path
+
+
+def black(folder: Path, *names: str) -> Path:
+    """A folder with these photos in it."""
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (8, 8)).save(folder / name)
+    return folder
+
+
+@pytest.fixture
+def taken(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """The photos of every run, each of which is interrupted before it looks for features in them."""
+    runs: list[list[str]] = []
+
+    def stop(photos: Path, groups: list[list[str]], *others: object) -> None:
+        assert all((photos / name).is_file() for name in itertools.chain(*groups))
+        runs.append(sorted(itertools.chain(*groups)))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "extract", stop)
+    return runs
+
+
+def test_a_film_whose_frames_were_being_written_goes_on(tmp_path: Path, monkeypatch, taken: list[list[str]]):
+    command = [str(film(tmp_path / "film.avi", 6)), str(tmp_path / "out"), "--frames", "6"]
+
+    def interrupted(video: Path, count: int):
+        yield from itertools.islice(sharpest_frames(video, count), 4)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(module, "sharpest_frames", interrupted)
+        assert main(command) == 130 and len(list((tmp_path / "out").rglob("*.jpg"))) == 4
+    assert main(command) == 130 and taken == [[f"{i:05d}.jpg" for i in range(6)]]
+    monkeypatch.setattr(module, "film_frames", None)  # a third run reads none again
+    assert main(command) == 130 and taken[0] == taken[1]
+
+
+def test_a_frame_that_could_not_be_written_is_told_and_made_again(tmp_path: Path, monkeypatch, taken: list, capsys):
+    command = [str(film(tmp_path / "film.avi", 6)), str(tmp_path / "out"), "--frames", "6"]
+    with monkeypatch.context() as patched:
+        patched.setattr(cv2, "imwrite", lambda *args: False)  # as on a full disk
+        assert main(command) == 1
+    told = capsys.readouterr().err
+    assert "00000.jpg could not be written (" in told and told.count("\n") == 1
+    assert main(command) == 130 and len(taken[0]) == 6
+
+
+def test_another_number_of_frames_is_another_scene(tmp_path: Path, taken: list[list[str]], capsys):
+    command = [str(film(tmp_path / "film.avi", 8)), str(tmp_path / "out"), "--frames"]
+    assert main([*command, "4"]) == 130 and len(taken[0]) == 4
+    assert main([*command, "8"]) == 2 and len(taken) == 1
+    printed = capsys.readouterr().err
+    assert "with other photos or settings (--frames was 4, is 8); give another folder or delete it." in printed
+    assert main([*command, "4"]) == 130 and taken[0] == taken[1]
+
+
+def test_added_and_removed_photos_make_another_scene(tmp_path: Path, taken: list[list[str]], capsys):
+    photos = black(tmp_path / "photos", "a.png", "b.png", "c.png", "day/a.png")
+    command = [str(photos), str(tmp_path / "out")]
+    assert main(command) == main(command) == 130
+    assert taken == [["a.png", "b.png", "c.png", "day/a.png"]] * 2
+    (photos / "b.png").unlink()
+    black(photos, "day/c.png", "day/b.png")
+    capsys.readouterr()
+    assert main(command) == 2 and len(taken) == 2
+    changes = "photos added: 2, such as day/b.png; photos removed: 1, such as b.png"
+    assert f"settings ({changes}); give another folder or delete it." in capsys.readouterr().err
+    other = black(tmp_path / "other", "a.png", "b.png", "c.png")
+    assert main([str(other), str(tmp_path / "out")]) == 2
+    assert f"(source was {photos.resolve()}, is {other.resolve()})" in capsys.readouterr().err
+
+
+def test_an_unreadable_photo_can_be_removed(tmp_path: Path, taken: list[list[str]]):
+    photos = black(tmp_path / "photos", "a.png", "b.png", "c.png")
+    (photos / "d.png").write_bytes(b"no image")
+    command = [str(photos), str(tmp_path / "out")]
+    assert main(command) == 2
+    (photos / "d.png").unlink()
+    assert main(command) == 130 and taken == [["a.png", "b.png", "c.png"]]
+
+
+@pytest.mark.parametrize("kind", ["photos", "frames"])
+def test_a_scene_of_an_earlier_version_is_told_in_a_sentence(tmp_path: Path, kind: str, taken: list, capsys):
+    source = black(tmp_path / "a", "a.png", "b.png", "c.png") if kind == "photos" else film(tmp_path / "a.avi", 4)
+    work = tmp_path / "out" / "work"
+    work.mkdir(parents=True)
+    (work / "settings.json").write_text(json.dumps({"source": str(source.resolve()), "camera_per_photo": False}))
+    assert main([str(source), str(tmp_path / "out")]) == 2 and not taken
+    assert f"(an earlier version began it and did not compare its {kind}); give" in capsys.readouterr().err
+
+
+def test_a_scene_among_its_photos_is_none_of_them(tmp_path: Path, monkeypatch, taken: list[list[str]]):
+    black(tmp_path, "a.png", "b.png", "scenery/c.png")
+    monkeypatch.chdir(tmp_path)
+    assert main([".", "scene"]) == 130
+    black(tmp_path / "scene", "images/a.png", "work/undistorted/images/a.png")
+    assert main([".", "scene"]) == 130 and taken == [["a.png", "b.png", "scenery/c.png"]] * 2
