@@ -78,6 +78,8 @@ class StructureAwareStrategy(Strategy):
     """AbsGS: normalised mean screen gradient at which a small Gaussian is cloned; AbsGS's own is 2e-4."""
     split_absgrad2d: float = 6e-4
     """AbsGS: normalised mean absolute screen gradient at which a large Gaussian is split; AbsGS's own is 4e-4."""
+    absgs_long_axis: bool = False
+    """AbsGS halves a large Gaussian's longest axis as structure steps do, instead of drawing two places at random."""
     small_scale: float = 0.001
     """AbsGS: largest scale, relative to the scene's extent, at which a Gaussian counts as small."""
     min_opacity: float = 0.02
@@ -330,6 +332,7 @@ class StructureAwareStrategy(Strategy):
             split_threshold=self.split_absgrad2d,
             size_threshold=self.small_scale * state["scene_scale"],
             budget=min(under_cap, in_memory),
+            long_axis=self.absgs_long_axis,
         )
         if in_memory <= n_clone + n_split < under_cap:
             _warn_of_memory(iteration, in_memory)

@@ -183,7 +183,7 @@ def gradient_state(grad: list[float], absgrad: list[float]) -> dict[str, torch.T
     return {"grad2d": torch.tensor(grad), "absgrad2d": torch.tensor(absgrad), "grad_count": torch.ones(len(grad))}
 
 
-def grow_with(params, state, budget: int = 1000) -> tuple[int, int]:
+def grow_with(params, state, budget: int = 1000, **options: bool) -> tuple[int, int]:
     return grow(
         params,
         adam(params, lr=0.0),
@@ -192,6 +192,7 @@ def grow_with(params, state, budget: int = 1000) -> tuple[int, int]:
         split_threshold=4e-4,
         size_threshold=0.1,
         budget=budget,
+        **options,
     )
 
 
@@ -205,6 +206,28 @@ def test_absgs_clones_on_the_mean_and_splits_on_the_absolute_gradient():
     assert len(params["means"]) == 6
     scales = params["scales"].exp()[:, 0]
     torch.testing.assert_close(scales.sort().values, torch.tensor([0.05, 0.05, 0.05, 0.3125, 0.3125, 0.5]))
+
+
+def test_absgs_halves_the_longest_axis_in_its_place():
+    params = random_params(4)
+    params["scales"].data = torch.log(torch.tensor([[0.05, 0.05, 0.05], [0.2, 0.4, 0.8], [0.5, 0.3, 0.1], [1, 1, 1]]))
+    params["quats"].data = torch.tensor([[1.0, 0, 0, 0]]).repeat(4, 1)
+    before = {name: parameter.detach().clone() for name, parameter in params.items()}
+    state = gradient_state([3e-4, 0.0, 0.0, 0.0], [0.0, 9e-4, 5e-4, 1e-4])
+    state["n_total"] = torch.arange(4.0)
+    assert grow_with(params, state, long_axis=True) == (1, 2)  # the first is small, the last has too small a gradient
+    assert state["n_total"].tolist() == [0, 3, 0, 1, 1, 2, 2]  # whole, clone, children in pairs
+    children = {name: parameter.detach()[3:].unflatten(0, (2, 2)) for name, parameter in params.items()}
+    parents = {name: value[[1, 2]] for name, value in before.items()}
+    axes = torch.tensor([[0.0, 0, 1], [1, 0, 0]])
+    torch.testing.assert_close(
+        children["scales"].exp(), (parents["scales"].exp() * (1 - axes / 2))[:, None].repeat(1, 2, 1)
+    )
+    torch.testing.assert_close(children["means"].mean(dim=1), parents["means"])
+    offset = (children["means"][:, 1] - children["means"][:, 0]) / 2
+    torch.testing.assert_close(offset.abs(), axes * parents["scales"].exp() * 0.75**0.5)  # which keeps the covariance
+    for name in ("quats", "opacities", "features_dc"):
+        torch.testing.assert_close(children[name], parents[name][:, None].expand_as(children[name]))
 
 
 def test_absgs_spends_a_budget_on_the_steepest():
