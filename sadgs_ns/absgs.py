@@ -15,6 +15,10 @@ from sadgs_ns.rasterization import visible
 from sadgs_ns.split import Params, grid_split, limit_growth
 
 
+_OTHER_AXES = 0.8
+"""Of a Gaussian whose longest axis is halved: how long the others stay (docs/measurements.md)."""
+
+
 def empty_gradients(num_gaussians: int, device: torch.device) -> dict[str, Tensor]:
     """Sums `grad2d`, `absgrad2d` and the number of views `grad_count` that they run over, each float32 [N]."""
     zeros = torch.zeros(num_gaussians, device=device)
@@ -74,8 +78,8 @@ def grow(
         split_threshold: Normalised mean absolute gradient at which a large one is split; AbsGS uses 4e-4.
         size_threshold: Largest scale in world units at which a Gaussian counts as small.
         budget: Gaussians that may be added in all, the steepest gradients first.
-        long_axis: Halve the longest axis of a large one as `grid_split` does, instead of drawing the places of two that
-            are 1.6 times as small on all axes, as 3DGS does.
+        long_axis: Halve the longest axis of a large one as `grid_split` does, and take a fifth off the others, instead
+            of drawing the places of two that are 1.6 times as small on all axes, as 3DGS does.
 
     Returns:
         Numbers of clones and of splits.
@@ -95,7 +99,7 @@ def grow(
         is_split = torch.cat([is_split, is_split.new_zeros(n_clone)])  # clones are not split
         if long_axis:
             longest = F.one_hot(params["scales"].argmax(dim=-1), 3)  # [N, 3]
-            grid_split(params, optimizers, state, 1 + longest * is_split[:, None])
+            grid_split(params, optimizers, state, 1 + longest * is_split[:, None], others=_OTHER_AXES)
         else:
             split(params, optimizers, state, is_split)  # type: ignore[arg-type]
     return n_clone, n_split

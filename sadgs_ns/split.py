@@ -107,6 +107,7 @@ def grid_split(
     counts: Tensor,
     extent: float = VARIANCE_EXTENT,
     child_scale: float = 1.0,
+    others: float = 1.0,
 ) -> None:
     """Replace every Gaussian with more than one child by its grid of children, in place, as gsplat's `split` does.
 
@@ -125,6 +126,7 @@ def grid_split(
         counts: n per axis. int64 [N, 3]
         extent: Half-width of the child grid in parent standard deviations, for children of s ⊘ n.
         child_scale: k in [1, 2).
+        others: Factor on the scales of those axes of a parent that are not split.
     """
     is_split = (counts > 1).any(dim=1)
     rest = torch.where(~is_split)[0]
@@ -138,7 +140,7 @@ def grid_split(
     rotmats = normalized_quat_to_rotmat(F.normalize(params["quats"][parents], dim=-1))  # [Q, 3, 3]
     # Not a batched matrix product: cuBLAS takes 3×3 matrices 65,535 at a time.
     offsets = (rotmats * (params["scales"][parents].exp() * grid)[:, None]).sum(dim=-1)  # [Q, 3]
-    shrink = torch.where(is_axis_split, (n / child_scale).log(), 0.0)  # [Q, 3]
+    shrink = torch.where(is_axis_split, (n / child_scale).log(), -math.log(others))  # [Q, 3]
     log_share = -math.log(child_scale) * is_axis_split.sum(dim=1).to(n.dtype)  # [Q]
 
     def param_fn(name: str, p: Tensor) -> Tensor:

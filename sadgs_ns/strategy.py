@@ -79,7 +79,7 @@ class StructureAwareStrategy(Strategy):
     split_absgrad2d: float = 6e-4
     """AbsGS: normalised mean absolute screen gradient at which a large Gaussian is split; AbsGS's own is 4e-4."""
     absgs_long_axis: bool = False
-    """AbsGS halves a large Gaussian's longest axis as structure steps do, instead of drawing two places at random."""
+    """AbsGS halves a large Gaussian's longest axis in its place, instead of drawing the places of two at random."""
     small_scale: float = 0.001
     """AbsGS: largest scale, relative to the scene's extent, at which a Gaussian counts as small."""
     min_opacity: float = 0.02

@@ -221,7 +221,7 @@ def test_absgs_halves_the_longest_axis_in_its_place():
     parents = {name: value[[1, 2]] for name, value in before.items()}
     axes = torch.tensor([[0.0, 0, 1], [1, 0, 0]])
     torch.testing.assert_close(
-        children["scales"].exp(), (parents["scales"].exp() * (1 - axes / 2))[:, None].repeat(1, 2, 1)
+        children["scales"].exp(), (parents["scales"].exp() * (0.8 - 0.3 * axes))[:, None].repeat(1, 2, 1)
     )
     torch.testing.assert_close(children["means"].mean(dim=1), parents["means"])
     offset = (children["means"][:, 1] - children["means"][:, 0]) / 2
