@@ -14,7 +14,6 @@ from sadgs_ns import kernels
 from sadgs_ns.rasterization import visible
 from sadgs_ns.split import Params, grid_split, limit_growth
 
-
 _OTHER_AXES = 0.8
 """Of a Gaussian whose longest axis is halved: how long the others stay (docs/measurements.md)."""
 
