@@ -149,7 +149,7 @@ def screen_gradients(pipeline: SadgsPipeline, progress: Callable[[range], Any]) 
     """
     model = pipeline.model
     gradients = empty_gradients(model.num_points, pipeline.device)
-    background = model.background_color.to(pipeline.device)
+    background = model.photo_background.to(pipeline.device)
     for index in progress(range(len(pipeline.datamanager.train_dataset))):
         data = pipeline.datamanager.cached_train[index]
         height, width = data["image"].shape[:2]

@@ -346,13 +346,13 @@ class SadgsModel(SplatfactoModel):
             InputError: If the camera is no pinhole; the viewer, whose thread would end, is shown nothing instead.
         """
         try:
-            outputs = super().get_outputs_for_camera(camera, obb_box)
+            outputs: dict[str, Any] = super().get_outputs_for_camera(camera, obb_box)
         except InputError as error:
             if not in_viewer():
                 raise
             _say_once(str(error))
             width, height = int(camera.width.item()), int(camera.height.item())
-            outputs: dict[str, Any] = self.get_empty_outputs(width, height, self._get_background_color())
+            outputs = self.get_empty_outputs(width, height, self._get_background_color())
         return outputs if self.viewer_outputs is None else outputs | self.viewer_outputs(camera, outputs)
 
     def get_gt_img(self, image: Tensor) -> Tensor:

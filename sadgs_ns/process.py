@@ -17,22 +17,20 @@ import shutil
 import sqlite3
 import sys
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Literal
 
-import cv2
-import numpy as np
 import pycolmap
 from PIL import ExifTags, Image
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sadgs_ns.atomic import atomic_path
 from sadgs_ns.errors import free_space, reason
+from sadgs_ns.film import film_frames, write_frames
 from sadgs_ns.image_checks import IMAGE_SUFFIXES
 
-VIDEO_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"}
 _SEED = 0
 """Of COLMAP's random samples, which otherwise draws from the clock: equal photos give nearly equal cameras."""
 EXHAUSTIVE_LIMIT = 200
@@ -73,32 +71,6 @@ def sequential_pairs(names: Sequence[str], overlap: int = 10) -> list[tuple[str,
     return [(names[i], names[i + step]) for i in range(len(names)) for step in steps if i + step < len(names)]
 
 
-def sharpest_frames(video: Path, count: int) -> Iterator[tuple[int, np.ndarray]]:
-    """The sharpest frame of each of `count` stretches of a video, by the variance of its Laplacian.
-
-    Raises:
-        ValueError: If OpenCV cannot read the video.
-    """
-    capture = cv2.VideoCapture(str(video))
-    total = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-    if not capture.isOpened() or total < 1:
-        raise ValueError(f"{video} cannot be read as a video; convert it to MP4 with H.264.")
-    stretch = max(total / count, 1.0)
-    best: tuple[float, np.ndarray] | None = None
-    for i in itertools.count():
-        read, frame = capture.read()
-        number = int(i / stretch)
-        if best is not None and (not read or int((i - 1) / stretch) != number):
-            yield int((i - 1) / stretch), best[1]
-            best = None
-        if not read:
-            return
-        grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-        sharpness = float(cv2.Laplacian(grey, cv2.CV_64F).var())
-        if best is None or sharpness > best[0]:
-            best = (sharpness, frame)
-
-
 def find_photos(source: Path, out: Path) -> list[str]:
     """The names of a folder's photos, relative to it; a scene that is made in the same folder is none of them.
 
@@ -114,31 +86,6 @@ def find_photos(source: Path, out: Path) -> list[str]:
     if len(found) < 3:
         raise ValueError(f"{source} holds {len(found)} photos; a reconstruction needs at least 3, better 30 or more.")
     return sorted(path.relative_to(folder).as_posix() for path in found)
-
-
-def film_frames(video: Path, count: int) -> Iterator[tuple[int, np.ndarray]]:
-    """The `sharpest_frames` of a video that has enough of them, which is known when this returns.
-
-    Raises:
-        ValueError: If it is no video or gives fewer than three frames.
-    """
-    if video.suffix.lower() not in VIDEO_SUFFIXES:
-        raise ValueError(f"{video} is neither a folder of photos nor a video ({', '.join(sorted(VIDEO_SUFFIXES))}).")
-    frames = sharpest_frames(video, count)
-    first = list(itertools.islice(frames, 3))
-    if len(first) < 3:
-        raise ValueError(f"{video} gives {len(first)} frames; a reconstruction needs at least 3, better 30 or more.")
-    return itertools.chain(first, frames)
-
-
-def write_frames(frames: Iterator[tuple[int, np.ndarray]], folder: Path) -> None:
-    """Write numbered photos to a folder that is there only when all of them are."""
-    partial = _empty_folder(folder.with_suffix(".partial"))
-    for number, frame in frames:
-        photo = partial / f"{number:05d}.jpg"
-        if not cv2.imwrite(str(photo), frame, [cv2.IMWRITE_JPEG_QUALITY, 97]):
-            raise OSError(f"{photo} could not be written")
-    partial.rename(folder)
 
 
 def _empty_folder(folder: Path) -> Path:
@@ -399,7 +346,9 @@ def process(
         if not photos.exists():
             chosen = film_frames(source, frames)
             _note(settings, noted)  # before anything else lies in the folder, so that an interrupted run can go on
-            write_frames(chosen, photos)
+            partial = _empty_folder(work / "frames.partial")
+            write_frames(chosen, partial)
+            partial.rename(photos)
         names = sorted(photo.name for photo in photos.glob("*.jpg"))
     else:
         photos, names = source, settings["photos"]

@@ -187,10 +187,8 @@ class StructureAwareStrategy(Strategy):
 
     def observes(self, step: int) -> bool:
         """Whether `step_pre_backward` will measure η at this step, and so needs structure tensors."""
-        if self.structure_every == 0 or step % self.eta_every != 0:
-            return False
-        next_structure_step = (step // self.structure_every + 1) * self.structure_every
-        return next_structure_step <= self.refine_stop_iter  # afterwards nobody would read it
+        # Beyond the last structure step nobody would read it.
+        return step % self.eta_every == 0 and _next_due(step + 1, self.structure_every) <= self.refine_stop_iter
 
     def needs_absgrad(self, step: int) -> bool:
         """Whether the rasterizer must provide absolute screen gradients: an AbsGS step will read this step's.

@@ -132,12 +132,15 @@ def test_a_cap_that_allows_no_gaussian_is_refused():
         StructureAwareStrategy(max_gaussians=0).initialize_state()
 
 
-@pytest.mark.parametrize("child_scale", [0.5, 2.0, math.nan])
-def test_children_smaller_than_the_papers_or_as_large_as_a_parent_are_refused(child_scale: float):
+def test_an_interval_or_exponent_of_zero_is_refused_at_the_start():
     with pytest.raises(ValueError, match=r"strategy\.eta_every must be at least 1, got 0\."):
         StructureAwareStrategy(eta_every=0).initialize_state()
     with pytest.raises(ValueError, match=r"strategy\.split_exponent must be positive, got 0\."):
         StructureAwareStrategy(split_exponent=0.0).initialize_state()
+
+
+@pytest.mark.parametrize("child_scale", [0.5, 2.0, math.nan])
+def test_children_smaller_than_the_papers_or_as_large_as_a_parent_are_refused(child_scale: float):
     with pytest.raises(ValueError, match=r"child_scale must be at least 1 and less than 2, got (0\.5|2|nan)\."):
         StructureAwareStrategy(child_scale=child_scale).initialize_state()
 

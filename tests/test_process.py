@@ -16,7 +16,8 @@ from PIL import Image
 
 from sadgs_ns import process as module
 from sadgs_ns.demo.scene import write_scene
-from sadgs_ns.process import main, photos_by_camera, process, sequential_pairs, sharpest_frames
+from sadgs_ns.film import sharpest_frames
+from sadgs_ns.process import main, photos_by_camera, process, sequential_pairs
 
 
 @pytest.fixture(scope="module")
@@ -219,7 +220,7 @@ def test_a_film_whose_frames_were_being_written_goes_on(tmp_path: Path, monkeypa
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(module, "sharpest_frames", interrupted)
+        patched.setattr("sadgs_ns.film.sharpest_frames", interrupted)
         assert main(command) == 130 and len(list((tmp_path / "out").rglob("*.jpg"))) == 4
     assert main(command) == 130 and taken == [[f"{i:05d}.jpg" for i in range(6)]]
     monkeypatch.setattr(module, "film_frames", None)  # a third run reads none again

@@ -1,0 +1,65 @@
+"""Photos from a film: the sharpest frames of its stretches."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+VIDEO_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"}
+
+
+def sharpest_frames(video: Path, count: int) -> Iterator[tuple[int, np.ndarray]]:
+    """The sharpest frame of each of `count` stretches of a video, by the variance of its Laplacian.
+
+    Raises:
+        ValueError: If OpenCV cannot read the video.
+    """
+    capture = cv2.VideoCapture(str(video))
+    total = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    if not capture.isOpened() or total < 1:
+        raise ValueError(f"{video} cannot be read as a video; convert it to MP4 with H.264.")
+    stretch = max(total / count, 1.0)
+    best: tuple[float, np.ndarray] | None = None
+    for i in itertools.count():
+        read, frame = capture.read()
+        number = int(i / stretch)
+        if best is not None and (not read or int((i - 1) / stretch) != number):
+            yield int((i - 1) / stretch), best[1]
+            best = None
+        if not read:
+            return
+        grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+        sharpness = float(cv2.Laplacian(grey, cv2.CV_64F).var())
+        if best is None or sharpness > best[0]:
+            best = (sharpness, frame)
+
+
+def film_frames(video: Path, count: int) -> Iterator[tuple[int, np.ndarray]]:
+    """The `sharpest_frames` of a video that has enough of them, which is known when this returns.
+
+    Raises:
+        ValueError: If it is no video or gives fewer than three frames.
+    """
+    if video.suffix.lower() not in VIDEO_SUFFIXES:
+        raise ValueError(f"{video} is neither a folder of photos nor a video ({', '.join(sorted(VIDEO_SUFFIXES))}).")
+    frames = sharpest_frames(video, count)
+    first = list(itertools.islice(frames, 3))
+    if len(first) < 3:
+        raise ValueError(f"{video} gives {len(first)} frames; a reconstruction needs at least 3, better 30 or more.")
+    return itertools.chain(first, frames)
+
+
+def write_frames(frames: Iterable[tuple[int, np.ndarray]], folder: Path) -> None:
+    """Write them to a folder as numbered photos.
+
+    Raises:
+        OSError: If one cannot be written.
+    """
+    for number, frame in frames:
+        photo = folder / f"{number:05d}.jpg"
+        if not cv2.imwrite(str(photo), frame, [cv2.IMWRITE_JPEG_QUALITY, 97]):
+            raise OSError(f"{photo} could not be written")
