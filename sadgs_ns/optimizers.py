@@ -28,16 +28,11 @@ class FusedAdam(torch.optim.Adam):
     Args:
         params: Parameters, all on one device.
         fused: Use the Triton kernel on CUDA, torch's fused implementation elsewhere.
-        sparse: Leave values whose gradient is 0, and their moments, as they are.
         **options: As torch's.
     """
 
-    def __init__(
-        self, params: Iterable[torch.Tensor], *, fused: bool = True, sparse: bool = False, **options: Any
-    ) -> None:
+    def __init__(self, params: Iterable[torch.Tensor], *, fused: bool = True, **options: Any) -> None:
         parameters = list(params)
-        self.sparse = sparse
-        """Whether values whose gradient is 0 stay as they are."""
         self.triton = fused and kernels.available(parameters[0].device) and not options.get("weight_decay")
         """Whether the Triton kernel is used."""
         # torch's own keeps the step count on the device, which would make the host wait for it.
@@ -54,30 +49,18 @@ class FusedAdam(torch.optim.Adam):
                 loss = closure()
         if not self.triton:
             noted = self.log.gradients
-            kept: list[tuple[Any, torch.Tensor, list[torch.Tensor]]] = []
             for group in self.param_groups:
                 for parameter in group["params"]:
                     if parameter.grad is not None:
                         leave_out_nonfinite(parameter.grad, noted)
-                        if self.sparse:
-                            stays = parameter.grad == 0
-                            kept.append((parameter, stays, [value[stays] for value in self._values(parameter)]))
             super().step()
-            for parameter, stays, values in kept:
-                for value, before in zip(self._values(parameter), values, strict=False):
-                    value[stays] = before  # of moments that there were none of before, what stays is 0
             return loss
         step_together([self])
         return loss
 
-    def _values(self, parameter: torch.Tensor) -> list[torch.Tensor]:
-        """A parameter and, after its first update, its moments."""
-        state = self.state[parameter]
-        return [parameter, *(state[name] for name in ("exp_avg", "exp_avg_sq") if name in state)]
-
 
 def step_together(optimizers: Iterable[FusedAdam]) -> None:
-    """Step several optimizers; parameters of one length whose betas, eps, sparsity and log agree are updated in one launch.
+    """Step several optimizers; parameters of one length whose betas, eps and log agree are updated in one launch.
 
     Results are, to the bit, those of one optimizer after the other.
 
@@ -98,16 +81,15 @@ def step_together(optimizers: Iterable[FusedAdam]) -> None:
                     state["step"] = torch.tensor(0.0)
                     state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
                 state["step"] = step = state["step"].cpu() + _ONE
-                key = optimizer.log, optimizer.sparse, group["betas"], group["eps"], parameter.shape[:1]
+                key = optimizer.log, group["betas"], group["eps"], parameter.shape[:1]
                 launches.setdefault(key, []).append(
                     (parameter, gradient.contiguous(), state["exp_avg"], state["exp_avg_sq"], int(step), group["lr"])
                 )
-    for (log, sparse, betas, eps, _), updates in launches.items():
+    for (log, betas, eps, _), updates in launches.items():
         parameters, gradients, exp_avgs, exp_avg_sqs, steps, lrs = zip(*updates, strict=True)
         adam_step(
-            parameters, gradients, exp_avgs, exp_avg_sqs, log.gradients,
-            steps=steps, lrs=lrs, betas=betas, eps=eps, sparse=sparse,
-        )  # fmt: skip
+            parameters, gradients, exp_avgs, exp_avg_sqs, log.gradients, steps=steps, lrs=lrs, betas=betas, eps=eps
+        )
 
 
 class SadgsOptimizers(Optimizers):
@@ -151,8 +133,6 @@ class FusedAdamOptimizerConfig(AdamOptimizerConfig):
     _target: type = FusedAdam
     fused: bool = True
     """Update in a single kernel: ours for all parameters on CUDA, torch's for each elsewhere."""
-    sparse: bool = False
-    """Leave values whose gradient is exactly 0, as those of Gaussians out of view, and their moments as they are."""
 
 
 @dataclass

@@ -306,40 +306,6 @@ def test_adam_in_one_launch_equals_torchs_and_one_launch_for_each_parameter(rows
         torch.testing.assert_close(actual.to("cpu", dtype), parameter.detach(), atol=tolerance, rtol=tolerance)
 
 
-@pytest.mark.parametrize("rows", [37, 1024], ids="{} Gaussians".format)
-@pytest.mark.parametrize("triton", [False, True], ids=["torch", "kernel"])
-def test_sparse_adam_moves_only_what_has_a_gradient(rows, triton, monkeypatch):
-    monkeypatch.setattr(kernels, "available", lambda device: triton)
-    generator = torch.Generator().manual_seed(0)
-    start = [torch.randn((rows, *width), generator=generator) for width in WIDTHS]
-    expected = [p.double() for p in start]
-    moments = [[torch.zeros_like(p) for p in expected] for _ in range(2)]
-    parameters = [torch.nn.Parameter(p.to(DEVICE)) for p in start]
-    optimizers = [FusedAdam([p], lr=lr, eps=1e-15, sparse=True) for p, lr in zip(parameters, LRS, strict=True)]
-    for step in range(1, 6):
-        visible = torch.rand(rows, generator=generator) < 0.5
-        for k, (parameter, lr) in enumerate(zip(parameters, LRS, strict=True)):
-            gradient = torch.randn(parameter.shape, generator=generator)
-            gradient[~visible] = 0
-            if step == 3:
-                gradient.flatten()[-1] = math.nan  # counts as 0
-            parameter.grad = gradient.to(DEVICE)
-            # Adam, value by value where there is a gradient.
-            g = gradient.double().nan_to_num(0.0)
-            p, m, v = expected[k], moments[0][k], moments[1][k]
-            m = torch.where(g != 0, 0.9 * m + 0.1 * g, m)
-            v = torch.where(g != 0, 0.999 * v + 0.001 * g * g, v)
-            change = lr / (1 - 0.9**step) * m / ((v / (1 - 0.999**step)).sqrt() + 1e-15)
-            expected[k], moments[0][k], moments[1][k] = torch.where(g != 0, p - change, p), m, v
-            optimizers[k].step()
-            assert optimizers[k].log.gradients.isnan().item() == (step >= 3)
-    for k, (parameter, optimizer) in enumerate(zip(parameters, optimizers, strict=True)):
-        torch.testing.assert_close(parameter.detach().cpu().double(), expected[k], atol=2e-5, rtol=2e-5)
-        state = optimizer.state[parameter]
-        torch.testing.assert_close(state["exp_avg"].cpu().double(), moments[0][k], atol=1e-6, rtol=1e-5)
-        torch.testing.assert_close(state["exp_avg_sq"].cpu().double(), moments[1][k], atol=1e-6, rtol=1e-5)
-
-
 def test_adam_counts_each_parameters_own_updates():
     start = [torch.linspace(-1, 1, 50), torch.linspace(1, 2, 50)]
     expected = [torch.nn.Parameter(p.double()) for p in start]

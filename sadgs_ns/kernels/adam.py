@@ -17,24 +17,19 @@ _BLOCK = 1024
 
 
 @triton.jit
-def _moments_and_step(
-    p, g, m, v, rate, scale, beta1, beta2, eps, noted, i, exists, MAX: tl.constexpr, SPARSE: tl.constexpr
-):  # fmt: skip
+def _moments_and_step(g, m, v, rate, scale, beta1, beta2, eps, noted, i, exists, MAX: tl.constexpr):
     usable = tl.abs(g) < MAX  # NaN compares as false
     tl.store(noted + i * 0, float("nan"), exists & ~usable)
     g = tl.where(usable, g, 0.0)
-    next_m = beta1 * m + (1 - beta1) * g
-    next_v = beta2 * v + (1 - beta2) * g * g
-    next_p = p - rate * next_m / (tl.sqrt(next_v) * scale + eps)
-    if SPARSE:
-        next_p, next_m, next_v = tl.where(g == 0, p, next_p), tl.where(g == 0, m, next_m), tl.where(g == 0, v, next_v)
-    return next_p, next_m, next_v
+    m = beta1 * m + (1 - beta1) * g
+    v = beta2 * v + (1 - beta2) * g * g
+    return m, v, rate * m / (tl.sqrt(v) * scale + eps)
 
 
 @triton.jit(do_not_specialize=["rows"])
 def _update(
     parameters, gradients, means, squares, rates, scales, noted, rows, beta1, beta2, eps,
-    WIDTHS: tl.constexpr, MAX: tl.constexpr, SPARSE: tl.constexpr, BLOCK: tl.constexpr,
+    WIDTHS: tl.constexpr, MAX: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     # Each program updates a block of one parameter. Sizes are made here of `rows`: as a tuple, Triton would look at
     # which of them 16 divides, and compile anew when densification changes that.
@@ -50,31 +45,20 @@ def _update(
             parameter, gradient, mean, square, rate, scale = (
                 parameters[k], gradients[k], means[k], squares[k], rates[k], scales[k]
             )  # fmt: skip
-    # Rows of four: a mask that is the same for all four, or none, lets memory be read in words of 16 bytes.
-    i = block * BLOCK + 4 * tl.arange(0, BLOCK // 4)[:, None] + tl.arange(0, 4)[None, :]
-    if (block + 1) * BLOCK <= n:
-        g = tl.load(gradient + i)
-        if SPARSE:
-            changes = tl.max((g != 0).to(tl.int32), axis=1, keep_dims=True) > 0
-            p, m, v = tl.load(parameter + i, changes), tl.load(mean + i, changes), tl.load(square + i, changes)
-            p, m, v = _moments_and_step(p, g, m, v, rate, scale, beta1, beta2, eps, noted, i, i < n, MAX, SPARSE)
-            tl.store(parameter + i, p, changes)
-            tl.store(mean + i, m, changes)
-            tl.store(square + i, v, changes)
-        else:
-            p, m, v = tl.load(parameter + i), tl.load(mean + i), tl.load(square + i)
-            p, m, v = _moments_and_step(p, g, m, v, rate, scale, beta1, beta2, eps, noted, i, i < n, MAX, SPARSE)
-            tl.store(parameter + i, p)
-            tl.store(mean + i, m)
-            tl.store(square + i, v)
+    i = block * BLOCK + tl.arange(0, BLOCK)
+    if (block + 1) * BLOCK <= n:  # without a mask, memory is read in wide words
+        g, m, v = tl.load(gradient + i), tl.load(mean + i), tl.load(square + i)
+        m, v, change = _moments_and_step(g, m, v, rate, scale, beta1, beta2, eps, noted, i, i < n, MAX)
+        tl.store(mean + i, m)
+        tl.store(square + i, v)
+        tl.store(parameter + i, tl.load(parameter + i) - change)
     else:
         exists = i < n
-        g, p = tl.load(gradient + i, exists), tl.load(parameter + i, exists)
-        m, v = tl.load(mean + i, exists), tl.load(square + i, exists)
-        p, m, v = _moments_and_step(p, g, m, v, rate, scale, beta1, beta2, eps, noted, i, exists, MAX, SPARSE)
-        tl.store(parameter + i, p, exists)
+        g, m, v = tl.load(gradient + i, exists), tl.load(mean + i, exists), tl.load(square + i, exists)
+        m, v, change = _moments_and_step(g, m, v, rate, scale, beta1, beta2, eps, noted, i, exists, MAX)
         tl.store(mean + i, m, exists)
         tl.store(square + i, v, exists)
+        tl.store(parameter + i, tl.load(parameter + i, exists) - change, exists)
 
 
 def adam_step(
@@ -88,7 +72,6 @@ def adam_step(
     lrs: Sequence[float],
     betas: tuple[float, float],
     eps: float,
-    sparse: bool = False,
 ) -> None:
     """Update parameters and their moments in place, in one launch, as torch's Adam without weight decay.
 
@@ -104,7 +87,6 @@ def adam_step(
         lrs: Learning rate of each.
         betas: Decay of the two running means, in [0, 1).
         eps: Added to the denominator.
-        sparse: Leave values whose gradient is 0, and their moments, as they are.
     """
     beta1, beta2 = betas
     rates = tuple(lr / (1 - beta1**step) for lr, step in zip(lrs, steps, strict=True))
@@ -114,5 +96,5 @@ def adam_step(
     grid = (sum(-(-rows * width // _BLOCK) for width in widths),)
     _update[grid](
         parameters, gradients, exp_avgs, exp_avg_sqs, rates, scales, noted, rows, beta1, beta2, eps,
-        widths, MAX_GRADIENT, sparse, _BLOCK,
+        widths, MAX_GRADIENT, _BLOCK,
     )  # fmt: skip
