@@ -312,6 +312,8 @@ def test_the_papers_presets_are_ours_without_what_we_added():
         model.ssim_lambda, model.opacity_reg, model.strategy.child_scale = 0.2, 0.0, 1.0
         model.strategy.clone_grad2d, model.strategy.split_absgrad2d = 2e-4, 4e-4
         model.strategy.min_opacity, model.strategy.refine_stop_iter = 0.005, 1900
+        model.strategy.absgs_long_axis = False
+        config.optimizers["means"]["optimizer"].lr = 1.6e-4
         config.method_name = paper.method_name
         assert yaml.dump(config) == yaml.dump(paper)
 
