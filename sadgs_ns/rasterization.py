@@ -23,12 +23,9 @@ def rasterize(
     height: int,
     *,
     sh_degree: int | None = None,
-    render_mode: Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"] = "RGB",
-    backgrounds: Tensor | None = None,  # [C, D]
+    render_mode: Literal["RGB", "RGB+ED"] = "RGB",
     absgrad: bool = False,
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
-    near_plane: float = 0.01,
-    far_plane: float = 1e10,
     fused: bool = True,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians into C pinhole cameras on the device of `means`, unpacked.
@@ -45,17 +42,14 @@ def rasterize(
         width: Image width in pixels.
         height: Image height in pixels.
         sh_degree: Degree to evaluate, (sh_degree + 1)^2 <= K; None takes `colors` as they are.
-        render_mode: "RGB" renders colours, "D" accumulated depth, "ED" expected depth; the sums append depth.
-        backgrounds: Colours behind the Gaussians. [C, D]
+        render_mode: "RGB" renders colours, "RGB+ED" appends the expected depth.
         absgrad: Whether `backward` sets `info["means2d"].absgrad`. [C, N, 2]
         rasterize_mode: "antialiased" compensates opacities for the screen-space blur.
-        near_plane: Gaussians whose centre is nearer are culled, in world units.
-        far_plane: Gaussians whose centre is farther are culled, in world units.
         fused: On CUDA, list in each tile only the Gaussians that reach it, and differentiate the compositing of three
             channels, with Triton kernels; what is drawn is the same. Assumes rigid viewmats.
 
     Returns:
-        Colours [C, height, width, X] with X = D, 1 or D + 1 by `render_mode`, alphas [C, height, width, 1] in [0, 1],
+        Colours [C, height, width, X] with X = D or D + 1 by `render_mode`, alphas [C, height, width, 1] in [0, 1],
         and gsplat's `info`, in which `radii` depends on the gsplat version: read it through `visible`.
 
     Raises:
@@ -80,11 +74,8 @@ def rasterize(
         Ks,
         width,
         height,
-        near_plane=near_plane,
-        far_plane=far_plane,
         sh_degree=sh_degree,
         packed=False,
-        backgrounds=backgrounds,
         render_mode=render_mode,
         absgrad=absgrad,
         rasterize_mode=rasterize_mode,

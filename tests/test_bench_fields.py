@@ -23,13 +23,14 @@ import yaml
 from PIL import Image
 from torch import Tensor
 
+from sadgs_ns import splatter
 from sadgs_ns.bench import __main__ as bench
 from sadgs_ns.bench import evaluate, images, phases, protocol, results, run, timer
 from sadgs_ns.bench.curve import undisturbed
 from sadgs_ns.bench.phases import PHASES, Stopwatch
 from sadgs_ns.bench.protocol import Job, Row, Scene
 from sadgs_ns.demo.scene import SPARSE_FOLDER, write_scene
-from sadgs_ns.rasterization import rasterize, viewmats_from_camera_to_world
+from sadgs_ns.rasterization import viewmats_from_camera_to_world
 
 WIDTH, HEIGHT, VIEWS = 48, 36, 10
 ITERATIONS = 12
@@ -109,7 +110,7 @@ def replace_gsplat(patch: pytest.MonkeyPatch) -> None:
         return
 
     def rasterization(packed: bool, sparse_grad: bool, **options: Any) -> Any:
-        return rasterize(**options)
+        return splatter.rasterization(**options)
 
     patch.setattr(splatfacto, "rasterization", rasterization)
     patch.setattr(splatfacto, "get_viewmat", viewmats_from_camera_to_world)  # else torch.compile takes a minute

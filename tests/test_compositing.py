@@ -60,7 +60,6 @@ def make_scene(
         "colors": random(3),
         "opacities": opacities,
         "depths": random(),
-        "backgrounds": torch.rand((num_views, 3), generator=generator),
         "v_renders": torch.randn((num_views, height, width, 3), generator=generator),
         "v_alphas": torch.randn((num_views, height, width, 1), generator=generator),
     }
@@ -72,7 +71,7 @@ def make_scene(
     return scene
 
 
-def reference(scene: dict[str, Any], background: bool) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+def reference(scene: dict[str, Any]) -> tuple[dict[str, Tensor], Tensor, Tensor]:
     """Gradients by autograd in float64, alphas [C, height, width, 1] and last_ids [C, height, width]."""
     num_views, height, width = scene["v_renders"].shape[:3]
     n = scene["means2d"].shape[1]
@@ -100,8 +99,6 @@ def reference(scene: dict[str, Any], background: bool) -> tuple[dict[str, Tensor
     behind = (1 - alpha).cumprod(dim=1)
     weights = alpha * torch.cat([torch.ones_like(behind[:, :1]), behind[:, :-1]], dim=1)
     renders = weights.mT @ colors.gather(1, order[..., :3])  # [C, P, 3]
-    if background:
-        renders = renders + behind[:, -1, :, None] * scene["backgrounds"].double().cpu()[:, None]
     alphas = 1 - behind[:, -1]
     loss = (renders * scene["v_renders"].double().cpu().flatten(1, 2)).sum()
     (loss + (alphas * scene["v_alphas"].double().cpu().flatten(1)).sum()).backward()
@@ -111,13 +108,10 @@ def reference(scene: dict[str, Any], background: bool) -> tuple[dict[str, Tensor
     return gradients, alphas.detach().reshape(num_views, height, width, 1), last_ids.int()
 
 
-def gradients_of(
-    scene: dict[str, Any], alphas: Tensor, last_ids: Tensor, background: bool, absgrad: bool = True
-) -> dict[str, Any]:
+def gradients_of(scene: dict[str, Any], alphas: Tensor, last_ids: Tensor, absgrad: bool = True) -> dict[str, Any]:
     """Those of the kernel, in float64 on the CPU."""
     results = compositing.composite_backward(
         *(scene[name] for name in NAMES[:4]),
-        scene["backgrounds"] if background else None,
         scene["starts"],
         scene["ids"],
         alphas.float().to(DEVICE),
@@ -137,11 +131,10 @@ TOLERANCES = {"usual": 2e-6, "opaque": 3e-4, "faint": 2e-6, "long and thin": 3e-
 @pytest.mark.parametrize("kind", TOLERANCES)
 def test_gradients_equal_float64_autograd(kind):
     scene = make_scene(kind, num_views=2 if kind == "usual" else 1)
-    background = kind != "tiny"
-    expected, alphas, last_ids = reference(scene, background)
+    expected, alphas, last_ids = reference(scene)
     if kind == "opaque":  # most lists end behind what is drawn
         assert (alphas > 0.999).float().mean() > 0.3 and last_ids.max() < len(scene["ids"]) - 5
-    gradients = gradients_of(scene, alphas, last_ids, background)
+    gradients = gradients_of(scene, alphas, last_ids)
     for name, value in expected.items():
         assert value.abs().max() > 0
         error = (gradients[name] - value).abs().max() / value.abs().max()
@@ -151,8 +144,8 @@ def test_gradients_equal_float64_autograd(kind):
 @pytest.mark.parametrize("sigma", [0.05, 0.1, 0.2, 0.55])
 def test_small_gaussians_err_as_the_module_says(sigma):
     scene = make_scene("tiny", n=200, width=61, height=46, tiny=sigma)
-    expected, alphas, last_ids = reference(scene, background=True)
-    gradients = gradients_of(scene, alphas, last_ids, True)
+    expected, alphas, last_ids = reference(scene)
+    gradients = gradients_of(scene, alphas, last_ids)
     errors = {name: float((gradients[name] - value).norm() / value.norm()) for name, value in expected.items()}
     assert errors.pop("conics") < 2e-6 / sigma**2  # "about 1e-6"
     assert errors.pop("absgrad") < (3e-4 if sigma < 0.5 else 1.5e-4)
@@ -161,8 +154,8 @@ def test_small_gaussians_err_as_the_module_says(sigma):
 
 def test_without_absgrad_the_rest_is_the_same():
     scene = make_scene("usual", n=30, width=9, height=9)
-    _, alphas, last_ids = reference(scene, background=True)
-    both = [gradients_of(scene, alphas, last_ids, True, absgrad) for absgrad in (True, False)]
+    _, alphas, last_ids = reference(scene)
+    both = [gradients_of(scene, alphas, last_ids, absgrad) for absgrad in (True, False)]
     assert both[0].pop("absgrad") is not None and both[1].pop("absgrad") is None
     for name, value in both[0].items():
         torch.testing.assert_close(both[1][name], value, atol=1e-6, rtol=1e-5)
@@ -170,22 +163,22 @@ def test_without_absgrad_the_rest_is_the_same():
 
 def test_without_a_gradient_of_alphas_it_counts_as_zero():
     scene = make_scene("usual", n=30, width=9, height=9)
-    _, alphas, last_ids = reference(scene, background=True)
+    _, alphas, last_ids = reference(scene)
     scene["v_alphas"] = torch.zeros_like(scene["v_alphas"])
-    expected = gradients_of(scene, alphas, last_ids, True)
+    expected = gradients_of(scene, alphas, last_ids)
     scene["v_alphas"] = None
-    for name, value in gradients_of(scene, alphas, last_ids, True).items():
+    for name, value in gradients_of(scene, alphas, last_ids).items():
         torch.testing.assert_close(value, expected[name], atol=1e-6, rtol=1e-5)
 
 
 @pytest.mark.parametrize("broken", [float("nan"), float("inf"), -1e30])
 def test_a_broken_pixel_reaches_the_gaussians_that_it_sees_and_no_others(broken):
     scene = make_scene("usual", width=8, height=8)
-    _, alphas, last_ids = reference(scene, background=True)
+    _, alphas, last_ids = reference(scene)
     scene["v_renders"][0, 2, 3, 1] = 0
-    expected = gradients_of(scene, alphas, last_ids, True)
+    expected = gradients_of(scene, alphas, last_ids)
     scene["v_renders"][0, 2, 3, 1] = broken
-    gradients = gradients_of(scene, alphas, last_ids, True)
+    gradients = gradients_of(scene, alphas, last_ids)
     delta = scene["means2d"][0].cpu() - torch.tensor([3.5, 2.5])
     a, b, c = scene["conics"][0].cpu().unbind(-1)
     sigma = 0.5 * (a * delta[:, 0] ** 2 + c * delta[:, 1] ** 2) + b * delta[:, 0] * delta[:, 1]
@@ -203,7 +196,7 @@ def test_nothing_in_sight_has_gradients_of_zero():
     scene = make_scene("usual", n=3)
     scene["starts"], scene["ids"] = torch.zeros_like(scene["starts"]), scene["ids"][:0]
     alphas, last_ids = torch.zeros(1, 18, 21, 1), torch.zeros(1, 18, 21, dtype=torch.int32)
-    assert all((value == 0).all() for value in gradients_of(scene, alphas, last_ids, True).values())
+    assert all((value == 0).all() for value in gradients_of(scene, alphas, last_ids).values())
 
 
 def test_tiles_without_gaussians_stay_out_of_the_others_lists():
@@ -214,8 +207,8 @@ def test_tiles_without_gaussians_stay_out_of_the_others_lists():
         scene["conics"], scene["opacities"].fill_(0.9), 40, 40, 8,
     ).lists()  # fmt: skip
     assert 0 < len(scene["ids"]) < 10
-    expected, alphas, last_ids = reference(scene, background=False)
-    gradients = gradients_of(scene, alphas, last_ids, False)
+    expected, alphas, last_ids = reference(scene)
+    gradients = gradients_of(scene, alphas, last_ids)
     for name in NAMES[:4]:
         torch.testing.assert_close(gradients[name], expected[name], atol=1e-5, rtol=1e-5)
 
@@ -226,16 +219,16 @@ def test_autograd_gets_what_the_kernel_returns(monkeypatch, through):
     for name, what in (("v_renders", "colours"), ("v_alphas", "alphas")):
         if what not in through:
             scene[name] = torch.zeros_like(scene[name])
-    expected, alphas, last_ids = reference(scene, background=True)
+    expected, alphas, last_ids = reference(scene)
     if DEVICE.type == "cpu":  # gsplat's forward pass needs CUDA
         renders = torch.zeros(1, 9, 9, 3)
         forward = lambda *_: (renders, alphas.float(), last_ids)  # noqa: E731
         monkeypatch.setattr(compositing._wrapper, "_make_lazy_cuda_func", lambda name: forward)
-    inputs = {name: scene[name].clone() for name in (*NAMES[:4], "backgrounds")}
-    for name in ("means2d", "colors", "backgrounds"):
+    inputs = {name: scene[name].clone() for name in NAMES[:4]}
+    for name in ("means2d", "colors"):
         inputs[name].requires_grad_()
     renders, alphas = compositing.rasterize_to_pixels(
-        *(inputs[name] for name in NAMES[:4]), 9, 9, scene["starts"], scene["ids"], inputs["backgrounds"], True
+        *(inputs[name] for name in NAMES[:4]), 9, 9, scene["starts"], scene["ids"], True
     )
     outputs = {"v_renders": renders, "v_alphas": alphas}
     used = [name for name in outputs if scene[name].any()]
@@ -246,8 +239,6 @@ def test_autograd_gets_what_the_kernel_returns(monkeypatch, through):
             assert found is None
         else:
             torch.testing.assert_close(found.double().cpu(), value, atol=5e-4 * float(value.abs().max()), rtol=0)
-    v_backgrounds = (scene["v_renders"] * (1 - alphas)).sum(dim=(1, 2))
-    torch.testing.assert_close(inputs["backgrounds"].grad, v_backgrounds, atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.skipif(
@@ -258,11 +249,11 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
     """All that surrounds gsplat's two kernels, for two views; torch code stands in for these."""
     width, height, depths = 32, 24, []
 
-    def project(means, _, quats, scales, viewmats, Ks, width, height, calc_compensations, **planes):
+    def project(means, _, quats, scales, viewmats, Ks, width, height, calc_compensations):
         covariances = _quat_scale_to_covar_preci(quats, scales, True, False)[0]
         assert covariances is not None
         projected = _fully_fused_projection(
-            means, covariances, viewmats, Ks, width, height, calc_compensations=calc_compensations, **planes
+            means, covariances, viewmats, Ks, width, height, calc_compensations=calc_compensations
         )
         depths[:] = [projected[2].detach()]
         return projected
@@ -272,7 +263,7 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
         scene = dict(zip(NAMES, values, strict=False)) | {"starts": starts, "ids": ids, "depths": depths[0]}
         scene["v_renders"], scene["v_alphas"] = torch.ones(2, height, width, 3), torch.ones(2, height, width, 1)
         with torch.enable_grad():
-            _, alphas, last_ids = reference(scene, background=False)
+            _, alphas, last_ids = reference(scene)
         return torch.zeros(2, height, width, 3), alphas.float(), last_ids  # nobody looks at the colours
 
     monkeypatch.setattr(rasterization, "fully_fused_projection", project)
@@ -293,8 +284,8 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
             colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
         geometry = values["means"], values["quats"], values["scales"].exp(), torch.sigmoid(values["opacities"])
         renders, _, info = function(
-            *geometry, colors, viewmats.to(dtype), Ks.to(dtype), width, height, near_plane=0.01, far_plane=1e10,
-            sh_degree=3, packed=False, backgrounds=None, render_mode="RGB", absgrad=True, rasterize_mode=mode,
+            *geometry, colors, viewmats.to(dtype), Ks.to(dtype), width, height,
+            sh_degree=3, packed=False, render_mode="RGB", absgrad=True, rasterize_mode=mode,
         )  # fmt: skip
         renders.backward(v_renders.to(dtype))
         results.append({name: value.grad for name, value in values.items()} | {"absgrad": info["means2d"].absgrad})
@@ -313,18 +304,16 @@ def test_gradients_are_as_close_to_float64_as_gsplats(kind):
     from gsplat.cuda._wrapper import rasterize_to_pixels
 
     scene = make_scene(kind, num_views=2, n=300, width=93, height=70)
-    expected, _, _ = reference(scene, background=True)
+    expected, _, _ = reference(scene)
     errors = []
     for ours in (True, False):
         means2d, conics, colors, opacities = inputs = [scene[name].clone().requires_grad_() for name in NAMES[:4]]
         lists = scene["starts"], scene["ids"]
         if ours:
-            outputs = compositing.rasterize_to_pixels(
-                means2d, conics, colors, opacities, 93, 70, *lists, scene["backgrounds"], True
-            )
+            outputs = compositing.rasterize_to_pixels(means2d, conics, colors, opacities, 93, 70, *lists, True)
         else:
             outputs = rasterize_to_pixels(
-                means2d, conics, colors, opacities, 93, 70, 8, *lists, backgrounds=scene["backgrounds"], absgrad=True
+                means2d, conics, colors, opacities, 93, 70, 8, *lists, absgrad=True
             )  # fmt: skip
         torch.autograd.backward(outputs, [scene["v_renders"], scene["v_alphas"]])
         gradients: dict[str, Any] = dict(

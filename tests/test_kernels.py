@@ -444,8 +444,8 @@ def test_rasterization_equals_gsplats_own(render_mode):
     scene = {name: value.float().cuda() for name, value in random_scene(3000, 128, seed=0).items()}
     del scene["weights"]
     shared = {"width": 128, "height": 128, "sh_degree": 3, "render_mode": render_mode, "packed": False}
-    shared |= {"near_plane": 0.01, "far_plane": 1e10, "rasterize_mode": "antialiased", "absgrad": False}
+    shared |= {"rasterize_mode": "antialiased", "absgrad": False}
     expected, expected_alphas, _ = gsplats(**scene, **shared, tile_size=ours.TILE_SIZE)
-    renders, alphas, _ = ours.rasterization(**scene, **shared, backgrounds=None)
+    renders, alphas, _ = ours.rasterization(**scene, **shared)
     assert torch.equal(alphas, expected_alphas)
     torch.testing.assert_close(renders, expected, atol=1e-5, rtol=1e-5)

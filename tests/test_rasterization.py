@@ -19,9 +19,8 @@ def test_the_cpu_gets_the_splatter(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsplat.rendering.rasterization", Mock(side_effect=AssertionError("gsplat on a CPU")))
     scene: dict[str, Any] = random_scene(50, 32, seed=0)
     del scene["weights"]
-    background = torch.rand(1, 3, dtype=torch.float64)
-    options: dict[str, Any] = {"sh_degree": 3, "backgrounds": background, "rasterize_mode": "antialiased"}
-    options |= {"render_mode": "RGB+ED", "near_plane": 2.5, "far_plane": 3.5}
+    scene["means"][:5, 2] = -4.0  # behind the camera
+    options: dict[str, Any] = {"sh_degree": 3, "rasterize_mode": "antialiased", "render_mode": "RGB+ED"}
     colors, alphas, info = rasterize(**scene, width=32, height=32, **options)
     expected_colors, expected_alphas, expected_info = splatter.rasterization(**scene, width=32, height=32, **options)
     assert torch.equal(colors, expected_colors) and torch.equal(alphas, expected_alphas)
@@ -33,14 +32,11 @@ def test_cuda_gets_gsplat_unpacked(monkeypatch: pytest.MonkeyPatch) -> None:
     gsplat = Mock(return_value=("colors", "alphas", {}))
     monkeypatch.setattr("gsplat.rendering.rasterization", gsplat)
     arguments: list[Any] = [Mock(is_cuda=True), *(Mock() for _ in range(6)), 32, 24]
-    assert rasterize(*arguments, absgrad=True, near_plane=0.2)[:2] == ("colors", "alphas")
+    assert rasterize(*arguments, absgrad=True)[:2] == ("colors", "alphas")
     gsplat.assert_called_once_with(
         *arguments,
-        near_plane=0.2,
-        far_plane=1e10,
         sh_degree=None,
         packed=False,
-        backgrounds=None,
         render_mode="RGB",
         absgrad=True,
         rasterize_mode="classic",

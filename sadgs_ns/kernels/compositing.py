@@ -114,10 +114,10 @@ def _load_gaussians(means2d, conics, colors, opacities, g):
 
 @triton.jit(do_not_specialize=["num_pairs", "height", "width", "tile_width", "tile_height"])
 def _composite_backward(
-    means2d, conics, colors, opacities, starts, ids, alphas, last_ids, backgrounds, v_renders, v_alphas, gradients,
+    means2d, conics, colors, opacities, starts, ids, alphas, last_ids, v_renders, v_alphas, gradients,
     num_pairs, height, width, tile_width, tile_height,
-    TILE: tl.constexpr, GAUSSIANS: tl.constexpr, STRIDE: tl.constexpr, BACKGROUND: tl.constexpr,
-    ALPHAS: tl.constexpr, ABSGRAD: tl.constexpr, PRECISION: tl.constexpr,
+    TILE: tl.constexpr, GAUSSIANS: tl.constexpr, STRIDE: tl.constexpr, ALPHAS: tl.constexpr,
+    ABSGRAD: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
     """Add one tile's share to the gradients [C * N, STRIDE].
 
@@ -158,12 +158,7 @@ def _composite_backward(
     red, green, blue = tl.where(finite, red, 0.0), tl.where(finite, green, 0.0), tl.where(finite, blue, 0.0)
     transmittance = 1 - tl.load(alphas + at, inside, 0.0)
     # Colour behind the present Gaussian times its gradient; alpha is minus a background of one.
-    behind = tl.where(finite, -v_alpha, 0.0)
-    if BACKGROUND:
-        behind += red * tl.load(backgrounds + 3 * view)
-        behind += green * tl.load(backgrounds + 3 * view + 1)
-        behind += blue * tl.load(backgrounds + 3 * view + 2)
-    behind *= transmittance
+    behind = tl.where(finite, -v_alpha, 0.0) * transmittance
 
     k = tl.arange(0, 8)[None, :]
     powers_x = tl.where((k == 1) | (k == 4), x[:, None], tl.where(k == 3, (x * x)[:, None], 1.0))
@@ -246,7 +241,6 @@ def composite_backward(
     conics: Tensor,
     colors: Tensor,
     opacities: Tensor,
-    backgrounds: Tensor | None,
     isect_offsets: Tensor,
     flatten_ids: Tensor,
     alphas: Tensor,
@@ -265,7 +259,6 @@ def composite_backward(
         conics: In 1/px². [C, N, 3]
         colors: [C, N, 3]
         opacities: In [0, 1]. [C, N]
-        backgrounds: [C, 3]
         isect_offsets: Where each tile's list starts, int32 [C, tile rows, tile columns].
         flatten_ids: Indices in C·N, int32 [number of pairs].
         alphas: As rendered. [C, height, width, 1]
@@ -283,9 +276,9 @@ def composite_backward(
         height, width = last_ids.shape[1:]
         _composite_backward[(isect_offsets.numel(),)](
             means2d, conics, colors, opacities, isect_offsets, flatten_ids, alphas, last_ids,
-            means2d if backgrounds is None else backgrounds, v_renders, alphas if v_alphas is None else v_alphas,
-            gradients, len(flatten_ids), height, width, isect_offsets.shape[2], isect_offsets.shape[1],
-            TILE_SIZE, _GAUSSIANS, _STRIDE, backgrounds is not None, v_alphas is not None, absgrad, PRECISION,
+            v_renders, alphas if v_alphas is None else v_alphas, gradients,
+            len(flatten_ids), height, width, isect_offsets.shape[2], isect_offsets.shape[1],
+            TILE_SIZE, _GAUSSIANS, _STRIDE, v_alphas is not None, absgrad, PRECISION,
             num_warps=_WARPS, num_stages=1,
         )  # fmt: skip
     v_means2d, v_conics, v_opacities, v_colors, v_absolute, _ = gradients.split([2, 3, 1, 3, 2, 1], dim=-1)
@@ -305,17 +298,16 @@ class _RasterizeToPixels(_wrapper._RasterizeToPixels):
     def backward(  # type: ignore[override]
         ctx: Any, v_renders: Tensor | None, v_alphas: Tensor | None
     ) -> tuple[Tensor | None, ...]:
-        means2d, conics, colors, opacities, backgrounds, _, starts, ids, alphas, last_ids = ctx.saved_tensors
+        means2d, conics, colors, opacities, _, _, starts, ids, alphas, last_ids = ctx.saved_tensors
         if v_renders is None:
             v_renders = torch.zeros((*last_ids.shape, 3), device=colors.device)
         v_means2d, v_conics, v_colors, v_opacities, v_absolute = composite_backward(
-            means2d, conics, colors, opacities, backgrounds, starts, ids, alphas, last_ids,
+            means2d, conics, colors, opacities, starts, ids, alphas, last_ids,
             v_renders.contiguous(), None if v_alphas is None else v_alphas.contiguous(), ctx.absgrad,
         )  # fmt: skip
         if ctx.absgrad:
             means2d.absgrad = v_absolute
-        v_backgrounds = (v_renders * (1.0 - alphas)).sum(dim=(1, 2)) if ctx.needs_input_grad[4] else None
-        return v_means2d, v_conics, v_colors, v_opacities, v_backgrounds, *[None] * 7
+        return v_means2d, v_conics, v_colors, v_opacities, *[None] * 8
 
 
 def rasterize_to_pixels(
@@ -327,7 +319,6 @@ def rasterize_to_pixels(
     height: int,
     isect_offsets: Tensor,
     flatten_ids: Tensor,
-    backgrounds: Tensor | None,
     absgrad: bool,
 ) -> tuple[Tensor, Tensor]:
     """gsplat's `rasterize_to_pixels` of three channels in tiles of TILE_SIZE, with `composite_backward`.
@@ -341,7 +332,6 @@ def rasterize_to_pixels(
         height: px.
         isect_offsets: Where each tile's list starts, int32 [C, tile rows, tile columns].
         flatten_ids: Indices in C·N, int32 [number of pairs].
-        backgrounds: [C, 3]
         absgrad: Whether to sum the absolute gradients of the centres, too.
 
     Returns:
@@ -349,6 +339,5 @@ def rasterize_to_pixels(
     """
     return _RasterizeToPixels.apply(  # type: ignore[return-value]
         means2d.contiguous(), conics.contiguous(), colors.contiguous(), opacities.contiguous(),
-        None if backgrounds is None else backgrounds.contiguous(), None, width, height, TILE_SIZE, isect_offsets,
-        flatten_ids, absgrad,
+        None, None, width, height, TILE_SIZE, isect_offsets, flatten_ids, absgrad,
     )  # fmt: skip

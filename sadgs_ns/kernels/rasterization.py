@@ -33,12 +33,9 @@ def rasterization(
     width: int,
     height: int,
     *,
-    near_plane: float,
-    far_plane: float,
     sh_degree: int | None,
     packed: bool,
-    backgrounds: Tensor | None,  # [C, D]
-    render_mode: Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"],
+    render_mode: Literal["RGB", "RGB+ED"],
     absgrad: bool,
     rasterize_mode: Literal["classic", "antialiased"],
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
@@ -60,8 +57,6 @@ def rasterization(
         Ks,
         width,
         height,
-        near_plane=near_plane,
-        far_plane=far_plane,
         calc_compensations=rasterize_mode == "antialiased",
         **bound,
     )
@@ -85,22 +80,15 @@ def rasterization(
                 sh_degree, means - positions, coefficients, masks=visible({"radii": radii, "means2d": means2d})
             )
             colors = torch.clamp_min(colors + 0.5, 0.0)
-    if render_mode in ("RGB+D", "RGB+ED"):
+    if render_mode == "RGB+ED":
         colors = torch.cat([colors, depths[..., None]], dim=-1)
-        if backgrounds is not None:
-            backgrounds = torch.cat([backgrounds, backgrounds.new_zeros((num_views, 1))], dim=-1)
-    elif render_mode in ("D", "ED"):
-        colors = depths[..., None]
-        backgrounds = None if backgrounds is None else backgrounds.new_zeros((num_views, 1))
     isect_offsets, flatten_ids = pending_tiles.lists()
     splats = (means2d, conics, colors, opacities, width, height)
     if BACKWARD == "moments" and colors.shape[-1] == 3:
-        renders, alphas = compositing.rasterize_to_pixels(*splats, isect_offsets, flatten_ids, backgrounds, absgrad)
+        renders, alphas = compositing.rasterize_to_pixels(*splats, isect_offsets, flatten_ids, absgrad)
     else:
-        renders, alphas = rasterize_to_pixels(
-            *splats, TILE_SIZE, isect_offsets, flatten_ids, backgrounds=backgrounds, absgrad=absgrad
-        )
-    if render_mode in ("ED", "RGB+ED"):
+        renders, alphas = rasterize_to_pixels(*splats, TILE_SIZE, isect_offsets, flatten_ids, absgrad=absgrad)
+    if render_mode == "RGB+ED":
         renders = torch.cat([renders[..., :-1], renders[..., -1:] / alphas.clamp_min(1e-10)], dim=-1)
     info = {
         "camera_ids": None,
