@@ -162,7 +162,7 @@ def _gradient(
     exists = c < row
     i = (tl.program_id(2) * height + first) * row + c
     size = tl.cast(n, tl.int64)
-    above: tl.constexpr = len(GAUSSIAN) - 1
+    above = tl.constexpr(len(GAUSSIAN) - 1)
     begin, end = above - first, height - first
     by_x = _blur_along_columns(spread, i - above * row, row, begin, end, exists, GAUSSIAN, RUN)
     by_xx = _blur_along_columns(spread + size, i - above * row, row, begin, end, exists, GAUSSIAN, RUN)
