@@ -34,7 +34,8 @@ class Scene:
     data: str
     """Folder, relative to the root that holds all scenes."""
     dataparser: str
-    """A registered nerfstudio dataparser; `blender` stands for `blender-data`."""
+    """A registered nerfstudio dataparser, as the method sets it where it is the method's own; `blender` stands for
+    `blender-data`."""
     options: dict[str, Any] = field(default_factory=dict)
     """Dotted paths into the dataparser's config."""
 

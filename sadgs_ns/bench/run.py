@@ -62,7 +62,9 @@ def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> T
         raise ValueError(f"scene {scene.name!r}: nerfstudio has no dataparser {name!r}; give one of {known}.")
     if not (root / scene.data).exists():
         raise ValueError(f"scene {scene.name!r}: {root / scene.data} does not exist; check --scenes.")
-    dataparser = copy.deepcopy(all_dataparsers[name])
+    # As `ns-train METHOD PARSER` does: the method's own settings of its default parser, which may read SfM points.
+    own, registered = datamanager.dataparser, all_dataparsers[name]
+    dataparser = copy.deepcopy(own if type(own) is type(registered) else registered)
     for path, value in scene.options.items():
         set_dotted(dataparser, path, value)
     datamanager.dataparser = dataparser
