@@ -97,17 +97,21 @@ def quality(model: Any, views: Iterable[View], networks: Networks) -> dict[str, 
     for network in networks.values():
         if network is not None:
             network.to(model.device)
-    for view in views:
-        image, truth = render(model, view)
-        values["psnr"].append(float(peak_signal_noise_ratio(image, truth, data_range=1.0)))
-        similarity = structural_similarity_index_measure(
-            image, truth, gaussian_kernel=True, sigma=1.5, kernel_size=_WINDOW, data_range=1.0
-        )
-        values["ssim"].append(float(similarity))  # type: ignore[arg-type]
-        values["ssim_padded"].append(float(ssim_padded(image, truth)))
-        for name, network in networks.items():
-            if network is not None:
-                values[name].append(float(network(image, truth)))
+    # nerfstudio has cuDNN search for algorithms, with whatever memory is free as their workspace: a process that
+    # evaluated beside others on a GPU was seen to hold 133 GiB, and another one failed.
+    cudnn = torch.backends.cudnn
+    with cudnn.flags(enabled=True, benchmark=False, deterministic=False, allow_tf32=cudnn.allow_tf32):
+        for view in views:
+            image, truth = render(model, view)
+            values["psnr"].append(float(peak_signal_noise_ratio(image, truth, data_range=1.0)))
+            similarity = structural_similarity_index_measure(
+                image, truth, gaussian_kernel=True, sigma=1.5, kernel_size=_WINDOW, data_range=1.0
+            )
+            values["ssim"].append(float(similarity))  # type: ignore[arg-type]
+            values["ssim_padded"].append(float(ssim_padded(image, truth)))
+            for name, network in networks.items():
+                if network is not None:
+                    values[name].append(float(network(image, truth)))
     for network in networks.values():
         if network is not None:
             network.cpu()
