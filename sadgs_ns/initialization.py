@@ -70,6 +70,47 @@ def neighbour_scales(points: Tensor, neighbours: int = 3) -> Tensor:
     return torch.from_numpy(distances[:, 1:].mean(1)).to(points).clamp_min(1e-6 * extent)
 
 
+def starting_points(points: Tensor, colors: Tensor, *, faces: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The points that training starts from, with the size and opacity of each.
+
+    Args:
+        points: World units. [P, 3]
+        colors: In [0, 1]. [P, 3]
+        faces: Whether to add `bounding_box_points`.
+
+    Returns:
+        Points in world units [N, 3], colours in [0, 1] [N, 3], scales in world units, > 0 [N], opacities in [0, 1] [N].
+
+    Raises:
+        ValueError: If there is no point.
+    """
+    scales, opacities = neighbour_scales(points), torch.full((len(points),), POINT_OPACITY)
+    if not faces:
+        return points, colors, scales, opacities
+    added, spacing = bounding_box_points(points)
+    return (
+        torch.cat([points, added]),
+        torch.cat([colors, torch.full_like(added, FACE_GREY)]),
+        torch.cat([scales, torch.full((len(added),), spacing)]),
+        torch.cat([opacities, torch.full((len(added),), FACE_OPACITY)]),
+    )
+
+
+def clear_of_cameras(means: Tensor, radii: Tensor, positions: Tensor) -> Tensor:
+    """Which points have no camera nearer than their radius.
+
+    Args:
+        means: World units. [N, 3]
+        radii: World units. [N]
+        positions: Camera centres in world units. [C, 3]
+
+    Returns:
+        bool [N]
+    """
+    chunks = means.split(65_536)  # all distances at once would take gigabytes on a large capture
+    return torch.cat([torch.cdist(chunk, positions).amin(dim=1) for chunk in chunks]) >= radii
+
+
 def camera_extent(positions: Tensor) -> float:
     """Extent of the cameras as 3DGS defines it: 1.1 times the largest distance from their centre.
 

@@ -30,14 +30,7 @@ from torch import Tensor
 
 from sadgs_ns.cameras import refuse_unsupported_cameras
 from sadgs_ns.errors import InputError
-from sadgs_ns.initialization import (
-    FACE_GREY,
-    FACE_OPACITY,
-    POINT_OPACITY,
-    bounding_box_points,
-    camera_extent,
-    neighbour_scales,
-)
+from sadgs_ns.initialization import camera_extent, clear_of_cameras, starting_points
 from sadgs_ns.losses import photometric_loss
 from sadgs_ns.rasterization import rasterize, viewmats_from_camera_to_world
 from sadgs_ns.strategy import StructureAwareStrategy
@@ -159,18 +152,11 @@ class SadgsModel(SplatfactoModel):
                     f"[yellow]The data has no SfM points: starting from {config.num_random} random ones in a cube of "
                     f"side {config.random_scale}. A sparse reconstruction (ns-process-data) gives a better splat.[/]"
                 )
-            means = (torch.rand((config.num_random, 3)) - 0.5) * config.random_scale  # [N, 3]
-            colors = torch.rand((len(means), 3))
-            scales, opacities = neighbour_scales(means), torch.full((len(means),), POINT_OPACITY)
+            points = (torch.rand((config.num_random, 3)) - 0.5) * config.random_scale  # [P, 3]
+            means, colors, scales, opacities = starting_points(points, torch.rand((len(points), 3)), faces=False)
         else:
-            means, colors = self.seed_points[0].float(), self.seed_points[1].float() / 255.0
-            scales, opacities = neighbour_scales(means), torch.full((len(means),), POINT_OPACITY)
-            if config.bounding_box_points:
-                faces, spacing = bounding_box_points(means)
-                means = torch.cat([means, faces])
-                colors = torch.cat([colors, torch.full_like(faces, FACE_GREY)])
-                scales = torch.cat([scales, torch.full((len(faces),), spacing)])
-                opacities = torch.cat([opacities, torch.full((len(faces),), FACE_OPACITY)])
+            points, colors = self.seed_points[0].float(), self.seed_points[1].float() / 255.0
+            means, colors, scales, opacities = starting_points(points, colors, faces=config.bounding_box_points)
         cap = self.strategy.max_gaussians
         if len(means) > cap:
             CONSOLE.print(f"[yellow]Keeping a random {cap} of {len(means)} initial points: max_gaussians is {cap}.[/]")
@@ -197,10 +183,8 @@ class SadgsModel(SplatfactoModel):
         self.strategy_state["scene_scale"] = camera_extent(positions)
         if self.config.camera_clearance == 0:
             return
-        radius = self.config.camera_clearance * self.scales.detach().exp().amax(dim=1)  # [N]
-        positions = positions.to(self.means)
-        chunks = self.means.detach().split(65_536)  # all distances at once would take gigabytes on a large capture
-        keep = torch.cat([torch.cdist(means, positions).amin(dim=1) for means in chunks]) >= radius  # [N]
+        radii = self.config.camera_clearance * self.scales.detach().exp().amax(dim=1)  # [N]
+        keep = clear_of_cameras(self.means.detach(), radii, positions.to(self.means))  # [N]
         if keep.any():
             for parameter in self.gauss_params.values():
                 parameter.data = parameter.data[keep]

@@ -5,7 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 
-from sadgs_ns.initialization import bounding_box_points, camera_extent, neighbour_scales
+from sadgs_ns.initialization import (
+    bounding_box_points,
+    camera_extent,
+    clear_of_cameras,
+    neighbour_scales,
+    starting_points,
+)
 
 
 def test_points_lie_on_the_six_faces():
@@ -42,3 +48,22 @@ def test_camera_extent_is_that_of_3dgs():
     positions = torch.tensor([[0.0, 0, 0], [2.0, 0, 0], [1.0, 0, 0]])
     assert camera_extent(positions) == pytest.approx(1.1)
     assert camera_extent(positions[:1]) == 1.0
+
+
+def test_points_come_first_and_the_faces_faint_grey_and_a_cell_large_after_them():
+    points, colors = torch.rand(20, 3), torch.rand(20, 3)
+    alone = starting_points(points, colors, faces=False)
+    assert alone[0] is points and alone[1] is colors and (alone[3] == 0.1).all()
+    torch.testing.assert_close(alone[2], neighbour_scales(points))
+    faces, spacing = bounding_box_points(points)
+    for value, before, added in zip(
+        starting_points(points, colors, faces=True), alone, (faces, 0.5, spacing, 0.05), strict=True
+    ):
+        assert torch.equal(value[:20], before) and len(value) == 20 + len(faces)
+        torch.testing.assert_close(value[20:], torch.as_tensor(added).expand_as(value[20:]))
+
+
+def test_points_are_clear_of_cameras_from_their_radius_on():
+    means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]])
+    positions = torch.tensor([[0.0, 0, 2], [9, 0, 0]])
+    assert clear_of_cameras(means, torch.tensor([2.0, 2.5, 3.0]), positions).tolist() == [True, False, True]
