@@ -97,8 +97,8 @@ def quality(model: Any, views: Iterable[View], networks: Networks) -> dict[str, 
     for network in networks.values():
         if network is not None:
             network.to(model.device)
-    # nerfstudio has cuDNN search for algorithms, with whatever memory is free as their workspace: a process that
-    # evaluated beside others on a GPU was seen to hold 133 GiB, and another one failed.
+    # nerfstudio has cuDNN search for algorithms, with whatever memory is free as their workspace. Probably so a process
+    # came to hold 133 GiB, for want of which another one on the same GPU failed here.
     cudnn = torch.backends.cudnn
     with cudnn.flags(enabled=True, benchmark=False, deterministic=False, allow_tf32=cudnn.allow_tf32):
         for view in views:
