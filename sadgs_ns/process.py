@@ -27,7 +27,7 @@ from PIL import ExifTags, Image
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sadgs_ns.atomic import atomic_path
-from sadgs_ns.errors import free_space, reason
+from sadgs_ns.errors import WriteError, free_space, reason
 from sadgs_ns.film import film_frames, write_frames
 from sadgs_ns.image_checks import IMAGE_SUFFIXES
 
@@ -35,6 +35,8 @@ _SEED = 0
 """Of COLMAP's random samples, which otherwise draws from the clock: equal photos give nearly equal cameras."""
 EXHAUSTIVE_LIMIT = 200
 """Photos up to which every pair is matched; twice the photos take four times as long."""
+_UNREAD_SUFFIXES = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"}
+"""Of photos in formats that phones and cameras write and COLMAP does not read."""
 FEW_FEATURES = 500
 """Keypoints under which a photo counts as blurred or empty."""
 Matching = Literal["auto", "exhaustive", "sequential", "spatial", "vocabulary"]
@@ -84,7 +86,12 @@ def find_photos(source: Path, out: Path) -> list[str]:
     if folder in scene.parents:
         found = [path for path in found if scene not in path.parents]
     if len(found) < 3:
-        raise ValueError(f"{source} holds {len(found)} photos; a reconstruction needs at least 3, better 30 or more.")
+        kinds = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
+        others = sorted({path.suffix for path in folder.rglob("*") if path.suffix.lower() in _UNREAD_SUFFIXES})
+        remedy = f" Its {' and '.join(others)} files are not read: convert them to one of {kinds}." if others else ""
+        raise ValueError(
+            f"{source} holds {len(found)} photos; a reconstruction needs at least 3, better 30 or more.{remedy}"
+        )
     return sorted(path.relative_to(folder).as_posix() for path in found)
 
 
@@ -169,6 +176,13 @@ def match(
                 pycolmap.match_vocabtree(database, verification_options=verification)
             except Exception as error:  # it downloads a vocabulary at its first use
                 raise ValueError(f"--matching vocabulary failed ({_first_line(error)}); use exhaustive.") from error
+        progress.advance(task)
+        return
+    if any(character.isspace() for name in names for character in name):
+        # COLMAP separates the names in a list of pairs by spaces. Its own ways tell nothing of their progress.
+        task = progress.add_task(f"matches ({matching})", total=1)
+        run = pycolmap.match_sequential if matching == "sequential" else pycolmap.match_exhaustive
+        run(database, verification_options=verification)
         progress.advance(task)
         return
     pairs = sequential_pairs(names) if matching == "sequential" else list(itertools.combinations(names, 2))
@@ -393,11 +407,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parser.parse_args(argv)
     if options.frames < 3:
         parser.error("--frames must be at least 3")
+    if options.max_size < 0:
+        parser.error("--max-size must not be negative")
     try:
         summary = process(**vars(options))
     except ValueError as error:
         print(f"sadgs-process: {error}", file=sys.stderr)
         return 2
+    except WriteError as error:
+        print(f"sadgs-process: {error}", file=sys.stderr)
+        return 1
     except OSError as error:
         why, free = reason(error), free_space(options.out)
         print(f"sadgs-process: {why} ({free} free there); the same command goes on.", file=sys.stderr)

@@ -13,6 +13,7 @@ import pycolmap
 import pytest
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
+from rich.progress import Progress
 
 from sadgs_ns import process as module
 from sadgs_ns.demo.scene import write_scene
@@ -135,6 +136,7 @@ def test_photos_of_one_size_and_lens_share_a_camera(tmp_path: Path):
     [
         (lambda folder: None, "photos does not exist; give a folder of photos or a video."),
         (lambda folder: folder.mkdir(), "photos holds 0 photos; a reconstruction needs at least 3"),
+        (lambda folder: heic(folder), "Its .HEIC files are not read: convert them to one of bmp, jpeg, jpg, png"),
         (lambda folder: folder.write_text("x"), "photos is neither a folder of photos nor a video"),
         (lambda folder: broken(folder), "2.png cannot be read as an image"),
     ],
@@ -147,11 +149,37 @@ def test_bad_photos_are_told_in_a_sentence(tmp_path: Path, prepare, sentence: st
     assert not (tmp_path / "out").exists()
 
 
+def heic(folder: Path) -> None:
+    folder.mkdir()
+    for i in range(4):
+        (folder / f"IMG_{i}.HEIC").write_bytes(b"ftypheic")
+
+
 def broken(folder: Path) -> None:
     folder.mkdir()
     for i in range(2):
         Image.new("RGB", (8, 8)).save(folder / f"{i}.png")
     (folder / "2.png").write_bytes(b"no image")
+
+
+def test_names_may_hold_spaces(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for i, photo in enumerate(sorted((scene / "images").iterdir())):
+        (tmp_path / "photos").mkdir(exist_ok=True)
+        shutil.copy(photo, tmp_path / "photos" / f"my photo {i:02d}{photo.suffix}")
+    summary = process(tmp_path / "photos", tmp_path / "out")
+    assert summary.registered == 20 and not summary.left_out
+    frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
+    assert all((tmp_path / "out" / frame["file_path"]).is_file() for frame in frames) and len(frames) == 20
+    neighbours: list[Path] = []  # of a film: these photos' neighbours stand apart
+    monkeypatch.setattr(pycolmap, "match_sequential", lambda database, **options: neighbours.append(database))
+    module.match(["a 1.png", "a 2.png"], tmp_path / "db", tmp_path, "sequential", False, Progress())
+    assert neighbours == [tmp_path / "db"]
+
+
+def test_a_size_below_nothing_is_refused(tmp_path: Path, capsys):
+    with pytest.raises(SystemExit):
+        main([str(tmp_path), str(tmp_path / "out"), "--max-size", "-5"])
+    assert "--max-size must not be negative" in capsys.readouterr().err
 
 
 def test_photos_without_texture_are_told_in_a_sentence(tmp_path: Path, capsys):
