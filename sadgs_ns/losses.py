@@ -37,6 +37,9 @@ def photometric_loss(
 
     Returns:
         The loss, and PSNR in dB for values in [0, 1], without gradient; both scalars.
+
+    Raises:
+        ValueError: From pytorch_msssim, if views are one pixel high or wide.
     """
     suits = predicted.dtype == target.dtype == torch.float32 and min(predicted.shape[1:3]) >= WINDOW
     if fused and suits and kernels.available(predicted.device):

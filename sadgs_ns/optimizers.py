@@ -33,7 +33,8 @@ class FusedAdam(torch.optim.Adam):
 
     def __init__(self, params: Iterable[torch.Tensor], *, fused: bool = True, **options: Any) -> None:
         parameters = list(params)
-        self.triton = fused and kernels.available(parameters[0].device) and not options.get("weight_decay")
+        plain = not any(options.get(name) for name in ("weight_decay", "amsgrad", "maximize"))
+        self.triton = fused and plain and kernels.available(parameters[0].device)
         """Whether the Triton kernel is used."""
         # torch's own keeps the step count on the device, which would make the host wait for it.
         super().__init__(parameters, fused=fused and not self.triton, **options)
@@ -96,14 +97,16 @@ class SadgsOptimizers(Optimizers):
     """nerfstudio's, but all parameters that `FusedAdam` updates in Triton are updated in one launch.
 
     At 300k Gaussians the GPU waits for the host, which spent a quarter of a step on six optimizers. Gradients that are
-    scaled (mixed precision) or clipped (max_norm), and other optimizers, go nerfstudio's way. Hooks on the `step` of
-    those that are updated together are not called.
+    scaled or clipped (max_norm), and other optimizers, go nerfstudio's way. Hooks on the `step` of those that are
+    updated together are not called.
     """
 
     def zero_grad_some(self, param_groups: list[str]) -> None:
         """Forget the gradients of the named parameters; torch's own way takes the host 60 times as long."""
         for name in param_groups:
             optimizer = self.optimizers[name]
+            # nerfstudio keeps those of the start, which densification replaces: their memory, and what it would clip.
+            self.parameters[name] = optimizer.param_groups[0]["params"]
             if not isinstance(optimizer, FusedAdam):
                 optimizer.zero_grad()
                 continue
@@ -116,10 +119,8 @@ class SadgsOptimizers(Optimizers):
         together: dict[str, FusedAdam] = {}
         for name in param_groups:
             optimizer = self.optimizers[name]
-            if self.config[name]["optimizer"].max_norm is not None:
-                # nerfstudio would clip the gradients of parameters that densification has replaced.
-                self.parameters[name] = optimizer.param_groups[0]["params"]
-            elif isinstance(optimizer, FusedAdam) and optimizer.triton and not grad_scaler.is_enabled():
+            plain = self.config[name]["optimizer"].max_norm is None and not grad_scaler.is_enabled()
+            if plain and isinstance(optimizer, FusedAdam) and optimizer.triton:
                 together[name] = optimizer
                 optimizer._opt_called = True  # type: ignore[attr-defined] # as `step` notes for torch's schedulers
         step_together(together.values())

@@ -50,10 +50,12 @@ def rasterize(
 
     Returns:
         Colours [C, height, width, X] with X = D or D + 1 by `render_mode`, alphas [C, height, width, 1] in [0, 1],
-        and gsplat's `info`, in which `radii` depends on the gsplat version: read it through `visible`.
+        and what strategies read of gsplat's `info`, in which `radii` depends on the gsplat version: read it through
+        `visible`.
 
     Raises:
-        ValueError: From the splatter, if a mode is unknown or a shape does not match. gsplat raises AssertionError.
+        ValueError: From the splatter, if a mode is unknown or a shape does not match. gsplat raises AssertionError; the
+            Triton kernels, for their speed, check nothing.
     """
     rasterization: Any = splatter.rasterization
     fused = fused and kernels.available(means.device)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import gc
 import warnings
+import weakref
 from collections.abc import Iterator
 from typing import Any
 
@@ -200,8 +202,13 @@ def test_gradients_are_also_clipped_when_densification_has_replaced_their_parame
     training = Training(SadgsOptimizers, means=config(FusedAdamOptimizerConfig(lr=0.1, max_norm=0.1)))
     group = training.optimizers.optimizers["means"].param_groups[0]
     replaced = torch.nn.Parameter(group["params"][0].detach().repeat(2, 1))
-    replaced.grad = torch.ones_like(replaced)
+    first = weakref.ref(group["params"][0])
     group["params"] = [replaced]
+    training.params.clear()  # as densification exchanges them
+    training.optimizers.zero_grad_some(["means"])
+    gc.collect()
+    assert first() is None, "the Gaussians of the start stay in memory"
+    replaced.grad = torch.ones_like(replaced)
     training.optimizers.optimizer_scaler_step_some(OFF, ["means"])  # type: ignore[arg-type]
     assert float(replaced.grad.norm()) == pytest.approx(0.1, rel=1e-3)
 

@@ -244,7 +244,10 @@ class _Colors(torch.autograd.Function):
     def backward(ctx: Any, v_colors: Tensor) -> tuple[Tensor | None, ...]:
         means, rest, viewmats, radii, colors = ctx.saved_tensors
         num_views, n = radii.shape[:2]
-        v_means, v_first, v_rest = torch.empty_like(means), torch.empty_like(means), torch.empty_like(rest)
+        v_means, v_first = torch.empty_like(means), torch.empty_like(means)
+        # The kernel writes up to degree MAX_DEGREE; beyond that nothing depends on coefficients.
+        written = rest.shape[1] < (MAX_DEGREE + 1) ** 2
+        v_rest = torch.empty_like(rest) if written else torch.zeros_like(rest)
         row, stride = v_colors.stride(1), rest.shape[1] * 3
         if v_colors.stride() != (n * row, row, 1):  # parts of rows, as compositing makes them, are read where they are
             v_colors, row = v_colors.contiguous(), 3
