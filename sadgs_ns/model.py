@@ -88,6 +88,23 @@ class SadgsModelConfig(SplatfactoModelConfig):
     camera_clearance: float = 2.0
     """Initial Gaussians nearer to a camera than this many of their standard deviations are dropped; 0 keeps all."""
 
+    def check(self) -> None:
+        """See whether training can work with these options.
+
+        Raises:
+            InputError: If one is out of its range, or was set and has no effect on this method.
+        """
+        _refuse_fields_without_effect(self)
+        if not 0 <= self.ssim_lambda <= 1:
+            raise InputError(f"pipeline.model.ssim_lambda must be in [0, 1], got {self.ssim_lambda:g}.")
+        for name in ("l2_lambda", "opacity_reg", "camera_clearance"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"pipeline.model.{name} must not be negative, got {getattr(self, name):g}.")
+        try:
+            self.strategy.initialize_state()
+        except ValueError as error:
+            raise InputError(f"pipeline.model.{error}") from error
+
 
 # tyro reads these for `ns-train sadgs --help`, which would repeat splatfacto's texts.
 for _name, _hint in get_type_hints(SplatfactoModelConfig).items():
@@ -115,10 +132,10 @@ class SadgsModel(SplatfactoModel):
         Overrides splatfacto's, which needs CUDA and LPIPS weights. LPIPS is loaded when it is first asked for.
 
         Raises:
-            InputError: If a field that has no effect on this method was set.
+            InputError: As `SadgsModelConfig.check`.
         """
         config = self.config
-        _refuse_fields_without_effect(config)
+        config.check()
         self.strategy = copy.deepcopy(config.strategy)
         self.strategy.fused &= config.fused
         self.strategy_state = self.strategy.initialize_state()
@@ -483,7 +500,8 @@ def _load_lpips(device: torch.device) -> torch.nn.Module | None:
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
     try:
-        return LearnedPerceptualImagePatchSimilarity(normalize=True).to(device)
+        with torch.random.fork_rng(devices=[]):  # weights are drawn before they are loaded: training must not notice
+            return LearnedPerceptualImagePatchSimilarity(normalize=True).to(device)
     except Exception as error:
         CONSOLE.print(f"[yellow]LPIPS is not reported: its AlexNet weights could not be loaded ({error}).[/]")
         return None

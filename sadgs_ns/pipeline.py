@@ -65,24 +65,33 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     energy_blur: float = ENERGY_BLUR
     """Window, in multiples of σ_l, over which the energy of a scale is averaged; 0 measures it per pixel (eq. 4)."""
 
+    def check(self) -> None:
+        """See whether training can work with these options.
+
+        Raises:
+            InputError: If views_per_iteration or frequency_constant is out of range; as `SadgsModelConfig.check`.
+        """
+        if self.views_per_iteration < 1:
+            raise InputError(f"pipeline.views_per_iteration must be at least 1, got {self.views_per_iteration}.")
+        if not 0 < self.frequency_constant <= HIGHEST_FREQUENCY:
+            raise InputError(
+                f"pipeline.frequency_constant must be in (0, {HIGHEST_FREQUENCY:g}], got {self.frequency_constant}."
+            )
+        self.model.check()
+
 
 class SadgsPipeline(VanillaPipeline):
     """Draws views, renders those of one size together, and feeds the model their structure tensors.
 
     Raises:
-        InputError: If views_per_iteration or frequency_constant is out of range, or the data cannot be trained on.
+        InputError: As `SadgsPipelineConfig.check`, or if the data cannot be trained on.
     """
 
     config: SadgsPipelineConfig
     datamanager: FullImageDatamanager
 
     def __init__(self, config: SadgsPipelineConfig, *args: Any, **kwargs: Any) -> None:
-        if config.views_per_iteration < 1:
-            raise InputError(f"pipeline.views_per_iteration must be at least 1, got {config.views_per_iteration}.")
-        if not 0 < config.frequency_constant <= HIGHEST_FREQUENCY:
-            raise InputError(
-                f"pipeline.frequency_constant must be in (0, {HIGHEST_FREQUENCY:g}], got {config.frequency_constant}."
-            )
+        config.check()
         # Rendering new views ("inference") opens no image.
         for finding in findings_of(config.datamanager, open_images=kwargs.get("test_mode") != "inference"):
             if finding.severity == "warning":

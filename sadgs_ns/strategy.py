@@ -20,6 +20,10 @@ from sadgs_ns.statistics import consistent, empty_statistics, observe
 
 Info = Mapping[str, Any]
 
+_SHARES = ("eta_min_opacity", "tau_split", "tau_prune", "prune_opacity", "min_opacity", "clamp_opacity", "reset_factor",
+           "final_prune_opacity")  # fmt: skip
+"""Options that are fractions or opacities."""
+
 
 @dataclass
 class StructureAwareStrategy(Strategy):
@@ -55,7 +59,7 @@ class StructureAwareStrategy(Strategy):
     refine_stop_iter: int = 1600
     """Last iteration at which densification may run; opacities under `final_prune_opacity` are pruned there."""
     eta_every: int = 10
-    """Iterations between η observations; the paper observes at every one, which costs time and changes nothing."""
+    """Iterations between η observations; the paper observes at every one, which costs time and brings nothing."""
     directional_eta: bool = False
     """Measure η along each axis's own direction (paper, eq. 7) instead of against the shortest wavelength (eq. 6)."""
     eta_min_opacity: float = 0.3
@@ -111,8 +115,8 @@ class StructureAwareStrategy(Strategy):
             scene_scale: Extent of the cameras in world units, as 3DGS defines it.
 
         Raises:
-            ValueError: If `max_gaussians`, `eta_every` or `split_exponent` is not positive, or `child_scale` not in
-                [1, 2).
+            ValueError: If `max_gaussians`, `eta_every`, `split_exponent` or `memory_budget_gb` is not positive, a
+                fraction or an opacity not in [0, 1], or `child_scale` not in [1, 2).
         """
         if self.max_gaussians < 1:
             raise ValueError(f"strategy.max_gaussians must be at least 1, got {self.max_gaussians}.")
@@ -122,6 +126,11 @@ class StructureAwareStrategy(Strategy):
             raise ValueError(f"strategy.split_exponent must be positive, got {self.split_exponent:g}.")
         if not 1 <= self.child_scale < 2:
             raise ValueError(f"strategy.child_scale must be at least 1 and less than 2, got {self.child_scale:g}.")
+        for name in _SHARES:
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"strategy.{name} must be in [0, 1], got {getattr(self, name):g}.")
+        if self.memory_budget_gb is not None and not self.memory_budget_gb > 0:
+            raise ValueError(f"strategy.memory_budget_gb must be positive, got {self.memory_budget_gb:g}.")
         return {"scene_scale": scene_scale}
 
     def fit_to_run(self, num_iterations: int) -> None:
@@ -254,7 +263,8 @@ class StructureAwareStrategy(Strategy):
             elif _due(iteration, self.absgs_every):
                 self._absgs_step(params, optimizers, state, iteration)
             if iteration == self.refine_stop_iter:
-                self._prune(params, optimizers, state, self._opacities(params) < self.final_prune_opacity)
+                if not _due(iteration, self.structure_every):  # whose step has done so
+                    self._prune(params, optimizers, state, self._opacities(params) < self.final_prune_opacity)
                 for key in self._empty_state(0, torch.device("cpu")):
                     state.pop(key, None)  # nobody reads them any more: neither memory nor checkpoints should hold them
             elif _due(iteration, self.reset_every) and iteration <= self.refine_stop_iter - self.reset_every // 4:
@@ -289,8 +299,10 @@ class StructureAwareStrategy(Strategy):
         opacities = self._opacities(params)
         is_low = self.consistently_low(state)
         n_before, n_low = len(is_low), int(is_low.sum())
+        # The final prune, before children are made: those are fainter, and would go with what they replace.
+        faint = max(self.min_opacity, self.final_prune_opacity if iteration == self.refine_stop_iter else 0.0)
         n_pruned = self._prune(
-            params, optimizers, state, (opacities < self.min_opacity) | (is_low & (opacities < self.prune_opacity))
+            params, optimizers, state, (opacities < faint) | (is_low & (opacities < self.prune_opacity))
         )
         if self.clamp_opacity < 1:
             self._map_opacities(params, optimizers, lambda alpha: alpha.clamp_max(self.clamp_opacity))

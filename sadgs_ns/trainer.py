@@ -71,12 +71,29 @@ class SadgsTrainerConfig(TrainerConfig):
     scale_position_lr: bool = True
     """Multiply the position learning rate with the cameras' extent, as 3DGS does; splatfacto does not."""
 
+    def check(self) -> None:
+        """See whether training can work with these options.
+
+        Raises:
+            InputError: If there is no iteration to do, or gradients would be scaled; as `SadgsPipelineConfig.check`.
+        """
+        if self.max_num_iterations < 1:
+            raise InputError(f"max_num_iterations must be at least 1, got {self.max_num_iterations}.")
+        if self.mixed_precision or self.use_grad_scaler:
+            raise InputError(
+                "sadgs trains in float32, and its densification reads gradients as they are: leave mixed_precision and "
+                "use_grad_scaler off."
+            )
+        self.pipeline.check()
+
     def save_config(self) -> None:
-        """Write `config.yml`, the first file of a run: not before the data and the output folder are found to be good.
+        """Write `config.yml`, the first file of a run: not before options, data and output folder are found to be good.
 
         Raises:
             InputError: If they are not; nothing is written then.
         """
+        self.check()
+        checkpoints.checkpoint_path(self.load_dir, self.load_step, self.load_checkpoint)
         check_ahead(self.pipeline.datamanager)
         path = self.get_base_dir() / "config.yml"
         CONSOLE.log(f"Saving config to: {path}")
@@ -94,7 +111,7 @@ class SadgsTrainer(Trainer):
     """Trains one model on one device.
 
     Raises:
-        InputError: If several devices are asked for.
+        InputError: If several devices are asked for; as `SadgsTrainerConfig.check`.
     """
 
     config: SadgsTrainerConfig
@@ -103,6 +120,7 @@ class SadgsTrainer(Trainer):
     def __init__(self, config: SadgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         if world_size > 1:
             raise InputError(f"sadgs trains on one device; set machine.num_devices to 1, not {world_size}.")
+        config.check()
         super().__init__(config, local_rank, world_size)
         self._stepping = False
         self._completed_step = self._saved_step = -1
@@ -216,7 +234,7 @@ class SadgsTrainer(Trainer):
             kept = "nothing newer than the last checkpoint could be saved"
         else:
             try:
-                self.save_checkpoint(self.step - 1)
+                self.save_checkpoint(max(self.step - 1, self._completed_step))
                 kept = f"what was trained is saved and goes on with --load-dir {self.checkpoint_dir}"
             except WriteError as error:
                 kept = f"what was trained is lost, since {error}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import re
@@ -544,6 +545,41 @@ def test_uncaught_errors_print_one_sentence_and_exit_with_1(tmp_path: Path):
         assert (result.returncode, result.stderr) == (1, "error: Nothing: do something.\n")
     for kind, ordinary in ((InputError, ValueError), (RunError, RuntimeError)):
         assert issubclass(kind, ordinary) and str(kind("Nothing.")) == "Nothing."
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "sentence"),
+    [
+        ("max_num_iterations", 0, "max_num_iterations must be at least 1, got 0."),
+        ("use_grad_scaler", True, "sadgs trains in float32,"),
+        ("mixed_precision", True, "sadgs trains in float32,"),
+        ("load_dir", Path("nowhere"), "nowhere holds no checkpoint: give --load-dir the folder"),
+        ("load_checkpoint", Path("no.ckpt"), "no.ckpt does not exist: give --load-checkpoint a file"),
+        ("pipeline.views_per_iteration", 0, "pipeline.views_per_iteration must be at least 1, got 0."),
+        ("pipeline.frequency_constant", -1.0, "pipeline.frequency_constant must be in (0, 4], got -1.0."),
+        ("pipeline.model.refine_every", 50, "pipeline.model.refine_every has no effect on this method;"),
+        ("pipeline.model.ssim_lambda", 7.0, "pipeline.model.ssim_lambda must be in [0, 1], got 7."),
+        ("pipeline.model.opacity_reg", -1.0, "pipeline.model.opacity_reg must not be negative, got -1."),
+        ("pipeline.model.strategy.tau_split", 1.5, "pipeline.model.strategy.tau_split must be in [0, 1], got 1.5."),
+        (
+            "pipeline.model.strategy.max_gaussians",
+            0,
+            "pipeline.model.strategy.max_gaussians must be at least 1, got 0.",
+        ),
+    ],
+)
+def test_options_that_cannot_work_are_refused_in_one_sentence_before_anything_is_written(
+    option: str, value: Any, sentence: str, copied: Callable[[str], Path], tmp_path: Path
+):
+    config = configure(tmp_path / "out", parser_of(copied("colmap")))
+    *owners, name = option.split(".")
+    setattr(functools.reduce(getattr, owners, config), name, value)
+    with pytest.raises(InputError) as refused:
+        config.save_config()
+    assert str(refused.value).startswith(sentence) and "\n" not in str(refused.value)
+    with pytest.raises(InputError, match=re.escape(sentence)):
+        set_up(config)
+    assert not (tmp_path / "out").exists()
 
 
 def test_ns_train_on_bad_data_ends_with_the_sentence_alone(copied: Callable[[str], Path], tmp_path: Path):

@@ -243,6 +243,20 @@ def test_full_memory_saves_what_was_trained_and_says_what_helps(config: SadgsTra
     assert checkpoint(resumed, 5)["step"] == 5 and is_finite(resumed.pipeline.model)
 
 
+def test_full_memory_after_a_step_saves_that_step(config: SadgsTrainerConfig):
+    trainer = set_up(config)
+
+    def full(step: int) -> None:
+        if step == 3:
+            raise FULL
+
+    trainer.eval_iteration = full  # type: ignore[method-assign] # after densification
+    with pytest.raises(RunError, match=r"full at iteration 3 .*saved and goes on"):
+        trainer.train()
+    state = checkpoint(trainer, 3)
+    assert state["step"] == 3 and state["schedulers"]["means"]["last_epoch"] == 4
+
+
 def _shorten(trainer: SadgsTrainer) -> None:
     means = trainer.pipeline.model.gauss_params["means"]
     means.data = means.data[:-1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import Any
@@ -137,6 +138,18 @@ def test_an_interval_or_exponent_of_zero_is_refused_at_the_start():
         StructureAwareStrategy(eta_every=0).initialize_state()
     with pytest.raises(ValueError, match=r"strategy\.split_exponent must be positive, got 0\."):
         StructureAwareStrategy(split_exponent=0.0).initialize_state()
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "allowed"),
+    [
+        ("tau_split", 1.5, r"in \[0, 1\], got 1\.5"), ("tau_prune", math.nan, r"in \[0, 1\], got nan"),
+        ("min_opacity", -0.1, r"in \[0, 1\], got -0\.1"), ("memory_budget_gb", -3.0, "positive, got -3"),
+    ],
+)  # fmt: skip
+def test_an_option_out_of_its_range_is_refused_at_the_start(option: str, value: float, allowed: str):
+    with pytest.raises(ValueError, match=rf"strategy\.{option} must be {allowed}\."):
+        dataclasses.replace(StructureAwareStrategy(), **{option: value}).initialize_state()
 
 
 @pytest.mark.parametrize("child_scale", [0.5, 2.0, math.nan])

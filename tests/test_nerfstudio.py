@@ -29,7 +29,7 @@ from plyfile import PlyData
 from scenes import HEIGHT, POINTS, VIEWS, WIDTH
 
 from sadgs_ns.demo.scene import SPARSE_FOLDER, arc_views, render, room_surfaces
-from sadgs_ns.model import SadgsModel
+from sadgs_ns.model import SadgsModel, _load_lpips
 from sadgs_ns.presets import load_preset
 from sadgs_ns.storage import decode
 from sadgs_ns.trainer import SadgsTrainer, SadgsTrainerConfig
@@ -174,6 +174,16 @@ def test_ns_train_leaves_one_checkpoint_of_the_last_iteration_that_loads_safely(
     assert state["step"] == ITERATIONS - 1
     means = state["pipeline"]["_model.gauss_params.means"]
     assert len(means) > POINTS and means.isfinite().all()
+
+
+def test_making_lpips_draws_no_number_that_training_would(monkeypatch: pytest.MonkeyPatch):
+    def weights(*args: object, **kwargs: object) -> torch.nn.Module:
+        return torch.nn.Linear(3, 3)  # draws its weights, as AlexNet does before it loads its own
+
+    monkeypatch.setattr("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", weights)
+    before = torch.random.get_rng_state()
+    assert _load_lpips(torch.device("cpu")) is not None
+    assert torch.equal(torch.random.get_rng_state(), before)
 
 
 def test_ns_eval_reports_psnr_and_ssim_and_says_once_why_lpips_is_missing(

@@ -160,6 +160,30 @@ def test_final_prune_removes_the_faint_once():
     assert len(params["means"]) == counts[-1]
 
 
+@pytest.mark.parametrize("end", ["with a structure step", "without"])
+def test_the_final_prune_spares_children_of_what_it_would_have_kept(end: str):
+    params = random_params(4)
+    params["opacities"].data = torch.logit(torch.tensor([0.05, 0.12, 0.5, 0.12]))
+    state = {"scene_scale": 1.0, **empty_statistics(4, torch.device("cpu")), **empty_gradients(4, torch.device("cpu"))}
+    state["n_total"] += 10
+    state["n_high"][:3, 0], state["eta_max"][:3, 0] = 10.0, 4.0  # all but the last are split in two
+    stop = 20 if end == "with a structure step" else 21
+    strategy = short(
+        refine_stop_iter=stop, structure_every=20, absgs_every=0, child_scale=1.5, final_prune_opacity=0.1,
+        reset_every=0, prune_opacity=0.0,
+    )  # fmt: skip
+    optimizers = adam(params, lr=0.0)
+    strategy.step_post_backward(params, optimizers, state, 19, [])
+    # 0.12 / 1.5 is under the final prune's 0.1: at the very end such children are new, later they had their chance.
+    faint, parents = params["opacities"].sigmoid() < 0.1, state["structure_steps"][0]["split"]
+    if end == "with a structure step":
+        assert parents == 2 and len(faint) == 5 and faint.sum() == 2
+    else:
+        assert parents == 3 and len(faint) == 7
+        strategy.step_post_backward(params, optimizers, state, 20, [])
+        assert len(params["means"]) == 3 and (params["opacities"].sigmoid() >= 0.1).all()
+
+
 def test_low_eta_and_low_opacity_together_prune():
     params = random_params(4)
     params["opacities"].data = torch.logit(torch.tensor([0.05, 0.05, 0.5, 0.05]))

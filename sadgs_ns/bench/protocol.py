@@ -67,7 +67,10 @@ class Job:
 
     @property
     def key(self) -> str:
-        """Identifies the run in a results file: scene, label, seed and a hash of everything that sets it up."""
+        """Identifies the run in a results file: scene, label, seed and a hash of what the protocol says.
+
+        It knows nothing of the code and its defaults: rows say their commit.
+        """
         settings: list[Any] = [self.row.method, self.row.overrides, dataclasses.asdict(self.scene)]
         if self.row.curve_every is not None:  # a finished run without the curve is not what is asked for
             settings.append(self.row.curve_every)
