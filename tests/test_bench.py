@@ -399,6 +399,13 @@ def test_table_takes_the_last_result_and_tells_of_shared_gpus():
     assert text.endswith("- Some runs shared a GPU: their times are not comparable.")
 
 
+def test_table_tells_of_our_runs_of_several_commits():
+    commits = ["a" * 40, "b" * 40]
+    rows = [result(seed=i, method="sadgs-indoor", versions={"commit": commits[i]}) for i in range(2)]
+    told = "- The rows of sadgs are of several commits (aaaaaaa, bbbbbbb);"
+    assert told in markdown(rows) and told not in markdown([{**row, "method": "splatfacto"} for row in rows])
+
+
 def test_a_finished_run_is_one_line():
     assert bench.line(result()) == (
         "fox ours seed 0: loop 10.0 s, PSNR 30.00, SSIM 0.9000, LPIPS 0.1000, 1,000 Gaussians, 2.00 GB"

@@ -69,11 +69,18 @@ def cells(rows: Iterable[Result], reference: str | None = None) -> list[tuple[st
 
 
 def notes(rows: Iterable[Result]) -> list[str]:
-    """What is wrong with the table, a sentence each: runs that failed, times that do not compare."""
+    """What is wrong with the table, a sentence each: runs that failed, what does not compare."""
     last = latest(rows)
     sentences = [f"{r['scene']}, {r['label']}, seed {r['seed']} failed: {r['error']}" for r in last if r.get("error")]
     if any(row.get("jobs_per_gpu", 1) > 1 for row in last):
         sentences.append("Some runs shared a GPU: their times are not comparable.")
+    ours = [row for row in last if str(row.get("method")).startswith("sadgs") and not row.get("error")]
+    commits = {commit[:7] for row in ours if (commit := row.get("versions", {}).get("commit"))}
+    if len(commits) > 1:
+        sentences.append(
+            f"The rows of sadgs are of several commits ({', '.join(sorted(commits))}); a run is made again when its "
+            "line is deleted."
+        )
     return sentences
 
 
