@@ -55,7 +55,7 @@ def rasterize(
 
     Raises:
         ValueError: From the splatter, if a mode is unknown or a shape does not match. gsplat raises AssertionError; the
-            Triton kernels, for their speed, check nothing.
+            Triton kernels check nothing.
     """
     rasterization: Any = splatter.rasterization
     fused = fused and kernels.available(means.device)
