@@ -101,7 +101,7 @@ class SadgsModelConfig(SplatfactoModelConfig):
             if not getattr(self, name) >= 0:
                 raise InputError(f"pipeline.model.{name} must not be negative, got {getattr(self, name):g}.")
         try:
-            self.strategy.initialize_state()
+            self.strategy.check()
         except ValueError as error:
             raise InputError(f"pipeline.model.{error}") from error
 

@@ -163,7 +163,9 @@ def match(
             matching = "spatial" if _all_have_positions(database, len(names)) else "vocabulary"
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = _SEED
-    if matching in ("spatial", "vocabulary"):
+    # COLMAP separates the names in a list of pairs by spaces.
+    listable = not any(character.isspace() for name in names for character in name)
+    if matching in ("spatial", "vocabulary") or not listable:  # COLMAP's own ways, which tell nothing of their progress
         task = progress.add_task(f"matches ({matching})", total=1)
         if matching == "spatial":
             if not _all_have_positions(database, len(names)):
@@ -171,18 +173,15 @@ def match(
                     "--matching spatial needs a GPS position in every photo; use vocabulary or exhaustive."
                 )
             pycolmap.match_spatial(database, verification_options=verification)
+        elif matching == "sequential":
+            pycolmap.match_sequential(database, verification_options=verification)
+        elif matching == "exhaustive":
+            pycolmap.match_exhaustive(database, verification_options=verification)
         else:
             try:
                 pycolmap.match_vocabtree(database, verification_options=verification)
             except Exception as error:  # it downloads a vocabulary at its first use
                 raise ValueError(f"--matching vocabulary failed ({_first_line(error)}); use exhaustive.") from error
-        progress.advance(task)
-        return
-    if any(character.isspace() for name in names for character in name):
-        # COLMAP separates the names in a list of pairs by spaces. Its own ways tell nothing of their progress.
-        task = progress.add_task(f"matches ({matching})", total=1)
-        run = pycolmap.match_sequential if matching == "sequential" else pycolmap.match_exhaustive
-        run(database, verification_options=verification)
         progress.advance(task)
         return
     pairs = sequential_pairs(names) if matching == "sequential" else list(itertools.combinations(names, 2))
@@ -414,12 +413,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ValueError as error:
         print(f"sadgs-process: {error}", file=sys.stderr)
         return 2
-    except WriteError as error:
-        print(f"sadgs-process: {error}", file=sys.stderr)
-        return 1
     except OSError as error:
-        why, free = reason(error), free_space(options.out)
-        print(f"sadgs-process: {why} ({free} free there); the same command goes on.", file=sys.stderr)
+        told = f"{reason(error)} ({free_space(options.out)} free there); the same command goes on."
+        print(f"sadgs-process: {error if isinstance(error, WriteError) else told}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("sadgs-process: stopped; the same command goes on.", file=sys.stderr)

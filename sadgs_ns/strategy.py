@@ -106,13 +106,8 @@ class StructureAwareStrategy(Strategy):
         """The last arguments of `grid_split`."""
         return self.split_extent, self.child_scale
 
-    def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
-        """State to pass to the other methods; its tensors are made at the first step.
-
-        Each structure step appends its numbers of Gaussians to the list `structure_steps`.
-
-        Args:
-            scene_scale: Extent of the cameras in world units, as 3DGS defines it.
+    def check(self) -> None:
+        """See whether densification can work with these options.
 
         Raises:
             ValueError: If `max_gaussians`, `eta_every`, `split_exponent` or `memory_budget_gb` is not positive, a
@@ -131,6 +126,19 @@ class StructureAwareStrategy(Strategy):
                 raise ValueError(f"strategy.{name} must be in [0, 1], got {getattr(self, name):g}.")
         if self.memory_budget_gb is not None and not self.memory_budget_gb > 0:
             raise ValueError(f"strategy.memory_budget_gb must be positive, got {self.memory_budget_gb:g}.")
+
+    def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
+        """State to pass to the other methods; its tensors are made at the first step.
+
+        Each structure step appends its numbers of Gaussians to the list `structure_steps`.
+
+        Args:
+            scene_scale: Extent of the cameras in world units, as 3DGS defines it.
+
+        Raises:
+            ValueError: As `check`.
+        """
+        self.check()
         return {"scene_scale": scene_scale}
 
     def fit_to_run(self, num_iterations: int) -> None:

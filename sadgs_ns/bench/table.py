@@ -75,7 +75,7 @@ def notes(rows: Iterable[Result]) -> list[str]:
     if any(row.get("jobs_per_gpu", 1) > 1 for row in last):
         sentences.append("Some runs shared a GPU: their times are not comparable.")
     ours = [row for row in last if str(row.get("method")).startswith("sadgs") and not row.get("error")]
-    commits = {commit[:7] for row in ours if (commit := row.get("versions", {}).get("commit"))}
+    commits = {commit[:7] for row in ours if (commit := (row.get("versions") or {}).get("commit"))}
     if len(commits) > 1:
         sentences.append(
             f"The rows of sadgs are of several commits ({', '.join(sorted(commits))}); a run is made again when its "
