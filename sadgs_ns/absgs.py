@@ -26,12 +26,7 @@ def empty_gradients(num_gaussians: int, device: torch.device) -> dict[str, Tenso
 
 @torch.no_grad()
 def accumulate_gradients(
-    gradients: MutableMapping[str, Tensor],
-    info: Mapping[str, Any],
-    num_views: int,
-    *,
-    fused: bool = True,
-    lab=(0, 0, 0, 0),
+    gradients: MutableMapping[str, Tensor], info: Mapping[str, Any], num_views: int, *, fused: bool = True
 ) -> None:
     """Add the screen-space gradients of one backward pass, in place.
 
@@ -47,8 +42,7 @@ def accumulate_gradients(
     means2d = info["means2d"]
     # Python numbers: a tensor made of them here would make the host wait for its copy to the device.
     scale_x, scale_y = info["width"] / 2.0 * num_views, info["height"] / 2.0 * num_views
-    vote, cap, clone_t, split_t = lab
-    if not (vote or cap) and fused and means2d.dtype == torch.float32 and kernels.available(means2d.device):
+    if fused and means2d.dtype == torch.float32 and kernels.available(means2d.device):
         from sadgs_ns.kernels import screen_gradients
 
         sums = gradients["grad2d"], gradients["absgrad2d"], gradients["grad_count"]
@@ -57,11 +51,6 @@ def accumulate_gradients(
     seen = visible(info)  # [C, N]
     for key, gradient in (("grad2d", means2d.grad), ("absgrad2d", means2d.absgrad)):
         norm = torch.hypot(gradient[..., 0] * scale_x, gradient[..., 1] * scale_y)  # [C, N]
-        t = clone_t if key == "grad2d" else split_t
-        if vote:
-            norm = (norm > t).float()
-        elif cap:
-            norm = norm.clamp_max(cap * t)
         gradients[key] += torch.where(seen, norm, 0.0).nansum(0)
     gradients["grad_count"] += seen.sum(0)
 
@@ -77,8 +66,6 @@ def grow(
     size_threshold: float,
     budget: float,
     long_axis: bool = False,
-    eta_gate: float = 0.0,
-    eta_axis: bool = False,
 ) -> tuple[int, int]:
     """Clone small Gaussians by their mean gradient, split large ones in two by their absolute gradient.
 
@@ -102,9 +89,6 @@ def grow(
     split_ratio = state["absgrad2d"] / count / split_threshold
     steepness = torch.where(is_small, clone_ratio, split_ratio)  # ≥ 1 grows
     grows = (steepness >= 1) & steepness.isfinite()  # a sum that overflowed says nothing
-    if eta_gate > 0:
-        known = state["n_total"] >= 3
-        grows = grows & ~(known & (state["eta_max"].amax(dim=1) < eta_gate))
     chosen = limit_growth(grows.long(), steepness, budget)
     is_clone, is_split = chosen & is_small, chosen & ~is_small
     n_clone, n_split = int(is_clone.sum()), int(is_split.sum())
@@ -113,16 +97,7 @@ def grow(
     if n_split > 0:
         is_split = torch.cat([is_split, is_split.new_zeros(n_clone)])  # clones are not split
         if long_axis:
-            axis = params["scales"].argmax(dim=-1)
-            if eta_axis:
-                axis = torch.where(state["n_total"] >= 3, state["eta_max"].argmax(dim=-1), axis)
-            longest = F.one_hot(axis, 3)  # [N, 3]
-            if eta_gate > 0 or eta_axis:
-                state["eta_max"] = torch.where(
-                    (longest * is_split[:, None]) > 0,
-                    state["eta_max"] / 2,
-                    torch.where(is_split[:, None], state["eta_max"] * 0.8, state["eta_max"]),
-                )
+            longest = F.one_hot(params["scales"].argmax(dim=-1), 3)  # [N, 3]
             grid_split(params, optimizers, state, 1 + longest * is_split[:, None], others=_OTHER_AXES)
         else:
             split(params, optimizers, state, is_split)  # type: ignore[arg-type]

@@ -33,7 +33,6 @@ class FusedAdam(torch.optim.Adam):
 
     def __init__(self, params: Iterable[torch.Tensor], *, fused: bool = True, **options: Any) -> None:
         parameters = list(params)
-        options["betas"] = (options.pop("beta1", 0.9), options.pop("beta2", 0.999))
         plain = not any(options.get(name) for name in ("weight_decay", "amsgrad", "maximize"))
         self.triton = fused and plain and kernels.available(parameters[0].device)
         """Whether the Triton kernel is used."""
@@ -135,10 +134,6 @@ class FusedAdamOptimizerConfig(AdamOptimizerConfig):
     _target: type = FusedAdam
     fused: bool = True
     """Update in a single kernel: ours for all parameters on CUDA, torch's for each elsewhere."""
-    beta1: float = 0.9
-    """Experiment: share that the running mean of the gradients keeps, an iteration."""
-    beta2: float = 0.999
-    """Experiment: the same of their squares."""
 
 
 @dataclass
@@ -150,8 +145,6 @@ class RunLengthDecaySchedulerConfig(SchedulerConfig):
     """Learning rate at the first iteration, relative to the optimizer's."""
     final_factor: float = 1.0
     """Learning rate at the last iteration, relative to the optimizer's."""
-    cooldown: float = 0.0
-    """Experiment: last part of the run, as a fraction of it, in which the learning rate falls to 0 besides."""
     max_steps: int | None = None
     """Iterations until `final_factor`; None is the length of the run."""
 
@@ -169,11 +162,10 @@ class RunLengthDecayScheduler(Scheduler):
         max_steps = self.config.max_steps
         if max_steps is None:
             raise ValueError("max_steps is unset: SadgsTrainer sets it to the length of the run.")
-        initial, final, cooldown = self.config.initial_factor, self.config.final_factor, self.config.cooldown
+        initial, final = self.config.initial_factor, self.config.final_factor
 
         def factor(step: int) -> float:
             t = min(step / max(max_steps, 1), 1.0)
-            rest = min((1 - t) / cooldown, 1.0) if cooldown > 0 else 1.0
-            return float(initial ** (1 - t) * final**t * rest)
+            return float(initial ** (1 - t) * final**t)
 
         return LambdaLR(optimizer, factor)

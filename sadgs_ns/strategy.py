@@ -82,14 +82,6 @@ class StructureAwareStrategy(Strategy):
     """AbsGS: normalised mean screen gradient at which a small Gaussian is cloned; AbsGS's own is 2e-4."""
     split_absgrad2d: float = 6e-4
     """AbsGS: normalised mean absolute screen gradient at which a large Gaussian is split; AbsGS's own is 4e-4."""
-    absgs_vote: float = 0.0
-    """Experiment: fraction of views whose gradient must exceed the threshold; 0 is the mean."""
-    absgs_cap: float = 0.0
-    """Experiment: a view's gradient counts at most this many thresholds; 0 is no cap."""
-    absgs_eta_gate: float = 0.0
-    """Experiment: AbsGS leaves Gaussians whose largest eta is below this."""
-    absgs_eta_axis: bool = False
-    """Experiment: AbsGS halves the axis of the largest eta."""
     absgs_long_axis: bool = True
     """AbsGS halves a large Gaussian's longest axis in its place, instead of drawing the places of two at random."""
     small_scale: float = 0.001
@@ -272,13 +264,7 @@ class StructureAwareStrategy(Strategy):
         if self.needs_absgrad(step):
             num_views = sum(view["n_cameras"] for view in views)
             for view in views:
-                accumulate_gradients(
-                    state,
-                    view,
-                    num_views,
-                    fused=self.fused,
-                    lab=(self.absgs_vote, self.absgs_cap, self.clone_grad2d, self.split_absgrad2d),
-                )
+                accumulate_gradients(state, view, num_views, fused=self.fused)
         if iteration >= self.refine_start_iter:
             if _due(iteration, self.structure_every):
                 self._structure_step(params, optimizers, state, iteration)
@@ -360,13 +346,11 @@ class StructureAwareStrategy(Strategy):
             params,
             optimizers,
             state,
-            clone_threshold=self.absgs_vote or self.clone_grad2d,
-            split_threshold=self.absgs_vote or self.split_absgrad2d,
+            clone_threshold=self.clone_grad2d,
+            split_threshold=self.split_absgrad2d,
             size_threshold=self.small_scale * state["scene_scale"],
             budget=min(under_cap, in_memory),
             long_axis=self.absgs_long_axis,
-            eta_gate=self.absgs_eta_gate,
-            eta_axis=self.absgs_eta_axis,
         )
         if in_memory <= n_clone + n_split < under_cap:
             _warn_of_memory(iteration, in_memory)

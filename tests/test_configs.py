@@ -314,6 +314,7 @@ def test_the_papers_presets_are_ours_without_what_we_added():
         model.strategy.min_opacity, model.strategy.refine_stop_iter = 0.005, 1900
         model.strategy.absgs_long_axis = False
         config.optimizers["means"]["optimizer"].lr = 1.6e-4
+        config.optimizers["scales"]["optimizer"].lr = {"sadgs": 0.01, "sadgs-indoor": 0.005}[name]
         config.method_name = paper.method_name
         assert yaml.dump(config) == yaml.dump(paper)
 
