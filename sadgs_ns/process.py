@@ -73,6 +73,15 @@ def sequential_pairs(names: Sequence[str], overlap: int = 10) -> list[tuple[str,
     return [(names[i], names[i + step]) for i in range(len(names)) for step in steps if i + step < len(names)]
 
 
+def _photos_not_read(folder: Path) -> str:
+    """A sentence on the photos in formats that are not read; empty if there are none."""
+    others = [path.suffix for path in folder.rglob("*") if path.suffix.lower() in _UNREAD_SUFFIXES]
+    if not others:
+        return ""
+    kinds = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
+    return f"Its {len(others)} {' and '.join(sorted(set(others)))} files are not read: convert them to one of {kinds}."
+
+
 def find_photos(source: Path, out: Path) -> list[str]:
     """The names of a folder's photos, relative to it; a scene that is made in the same folder is none of them.
 
@@ -86,12 +95,8 @@ def find_photos(source: Path, out: Path) -> list[str]:
     if folder in scene.parents:
         found = [path for path in found if scene not in path.parents]
     if len(found) < 3:
-        kinds = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
-        others = sorted({path.suffix for path in folder.rglob("*") if path.suffix.lower() in _UNREAD_SUFFIXES})
-        remedy = f" Its {' and '.join(others)} files are not read: convert them to one of {kinds}." if others else ""
-        raise ValueError(
-            f"{source} holds {len(found)} photos; a reconstruction needs at least 3, better 30 or more.{remedy}"
-        )
+        told = f"{source} holds {len(found)} photos; a reconstruction needs at least 3, better 30 or more."
+        raise ValueError(f"{told} {_photos_not_read(folder)}".rstrip())
     return sorted(path.relative_to(folder).as_posix() for path in found)
 
 
@@ -421,6 +426,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("sadgs-process: stopped; the same command goes on.", file=sys.stderr)
         return 130
     print(summary)
+    if options.source.is_dir() and (not_read := _photos_not_read(options.source)):
+        print(not_read)
     if summary.registered < 0.5 * summary.photos:
         print("Fewer than half of the photos registered: more overlap between them would help.")
     print(f"\nns-train sadgs --data {options.out}")

@@ -136,7 +136,7 @@ def test_photos_of_one_size_and_lens_share_a_camera(tmp_path: Path):
     [
         (lambda folder: None, "photos does not exist; give a folder of photos or a video."),
         (lambda folder: folder.mkdir(), "photos holds 0 photos; a reconstruction needs at least 3"),
-        (lambda folder: heic(folder), "Its .HEIC files are not read: convert them to one of bmp, jpeg, jpg, png"),
+        (lambda folder: heic(folder), "Its 4 .HEIC files are not read: convert them to one of bmp, jpeg, jpg, png"),
         (lambda folder: folder.write_text("x"), "photos is neither a folder of photos nor a video"),
         (lambda folder: broken(folder), "2.png cannot be read as an image"),
     ],
@@ -153,6 +153,14 @@ def heic(folder: Path) -> None:
     folder.mkdir()
     for i in range(4):
         (folder / f"IMG_{i}.HEIC").write_bytes(b"ftypheic")
+
+
+def test_photos_that_are_not_read_are_told_beside_those_that_are(tmp_path: Path, monkeypatch, capsys):
+    heic(tmp_path / "photos")
+    monkeypatch.setattr(module, "process", lambda **options: module.Summary(9, 9, 100, 0.5, {}))
+    assert main([str(tmp_path / "photos"), str(tmp_path / "out")]) == 0
+    assert "9 of 9 photos registered" in (printed := capsys.readouterr().out)
+    assert "Its 4 .HEIC files are not read: convert them to one of bmp, jpeg, jpg, png" in printed
 
 
 def broken(folder: Path) -> None:
