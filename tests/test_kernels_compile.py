@@ -106,3 +106,40 @@ def test_adam_reads_and_writes_memory_in_wide_words_whichever_parameter_it_is(tm
     environment["TRITON_CACHE_DIR"] = str(tmp_path)
     run = subprocess.run([sys.executable, "-c", WIDE], env=environment, capture_output=True, text=True)
     assert run.stdout.split() == ["8", "6"], run.stderr[-3000:]
+
+
+TIMED = """
+import time
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+from sadgs_ns.bench.timer import CompileTimer
+from sadgs_ns.kernels.probe import _write_one
+
+def compile():
+    triton.compile(ASTSource(_write_one, {"target": "*fp32"}, {}), target=GPUTarget("cuda", 90, 32))
+
+begin = time.perf_counter()
+with (timer := CompileTimer()):
+    compile()
+assert 0 < timer.seconds <= time.perf_counter() - begin
+seconds = timer.seconds
+with timer:
+    compile()
+assert timer.seconds == seconds, "the cache held it"
+triton.knobs.cache.dir += "-of-another-machine"
+compile()
+assert timer.seconds == seconds, "nobody listens"
+triton.knobs.cache.dir += "-and-another"
+with timer:
+    compile()
+assert timer.seconds > seconds
+print("done")
+"""
+
+
+def test_a_benchmark_knows_how_long_triton_compiled(tmp_path):
+    environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
+    environment["TRITON_CACHE_DIR"] = str(tmp_path / "cache")
+    run = subprocess.run([sys.executable, "-c", TIMED], env=environment, capture_output=True, text=True)
+    assert run.stdout.split() == ["done"], run.stderr[-3000:]

@@ -113,6 +113,8 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
             loop_seconds: The training loop, nothing else.
             train_seconds: The loop and the checkpoint after it.
             wall_seconds: Everything from the first import to the saved checkpoint.
+            compile_seconds: What Triton took of these to compile kernels, in a machine's first run; of them
+                loop_compile_seconds in the loop.
             evaluation_seconds: After it.
         Over the held-out views: `psnr` in dB, `ssim`, `ssim_padded`, `lpips`, `lpips_vgg` (None without weights; see
         `evaluate`); and `train_psnr` over some training views, `fps`, `gaussians`, `peak_gb`, how many views there
@@ -136,7 +138,7 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
     from sadgs_ns.bench import evaluate, phases
     from sadgs_ns.bench import images as pictures
     from sadgs_ns.bench.curve import Curve, point
-    from sadgs_ns.bench.timer import LoopTimer
+    from sadgs_ns.bench.timer import CompileTimer, LoopTimer
 
     seconds["import_seconds"] = time.perf_counter() - start
 
@@ -153,7 +155,8 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
 
         return populate
 
-    with timed("setup"):
+    compiling = CompileTimer()
+    with timed("setup"), compiling:
         config = build_config(job.scene, job.row, job.seed, root, work)
         _set_random_seed(job.seed)
         trainer: Any = config.setup(local_rank=0, world_size=1)
@@ -163,7 +166,8 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
     pipeline, datamanager, model = trainer.pipeline, trainer.pipeline.datamanager, trainer.pipeline.model
     with timed("load"):  # else the first iteration decodes all images
         train_images, _ = datamanager.cached_train, datamanager.cached_eval
-    with timed("warmup"):  # gsplat's, Triton's and torch.compile's kernels build at the first call, once per machine
+    # gsplat's, Triton's and torch.compile's kernels build at the first call, once per machine.
+    with timed("warmup"), compiling:
         camera = datamanager.train_dataset.cameras[:1].to(trainer.device)
         pipeline.eval()
         outputs = model.get_outputs(camera)
@@ -174,7 +178,7 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
         pipeline.train()
     # Looked up on the class: on the instance hasattr would already compute it.
     if hasattr(type(pipeline), "structure_tensors"):
-        with timed("structure_tensor"):
+        with timed("structure_tensor"), compiling:
             _ = pipeline.structure_tensors
 
     timer, curve = LoopTimer(), None
@@ -182,7 +186,8 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
         curve = Curve(job.row.curve_every, timer)
         curve.attach(trainer)
     timer.attach(trainer)
-    with timed("train"):
+    before_loop = compiling.seconds
+    with timed("train"), compiling:
         trainer.train()
     seconds["train_seconds"] -= timer.stopped_seconds
     wall = time.perf_counter() - start - timer.stopped_seconds
@@ -204,6 +209,8 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
         "loop_seconds": timer.seconds,
         **seconds,
         "wall_seconds": wall,
+        "compile_seconds": compiling.seconds,
+        "loop_compile_seconds": compiling.seconds - before_loop,
         **held_out,
         "train_psnr": train_psnr,
         "fps": fps,

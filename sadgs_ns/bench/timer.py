@@ -1,4 +1,4 @@
-"""The clock of the training loop."""
+"""The clocks of the training loop and of what Triton compiles in it."""
 
 from __future__ import annotations
 
@@ -59,3 +59,32 @@ class LoopTimer:
     def _end(self, step: int) -> None:
         self._stop()
         self.finished = True
+
+
+class CompileTimer(contextlib.AbstractContextManager):
+    """Times what Triton compiles while the context is open, however often it is opened.
+
+    Kernels that an earlier run on the machine has left in Triton's cache count as nothing.
+    """
+
+    def __init__(self) -> None:
+        self.seconds: float = 0.0
+        """Sum over the kernels."""
+
+    def __enter__(self) -> CompileTimer:
+        self._listen(self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._listen(None)
+
+    def _listen(self, listener: Any) -> None:
+        try:
+            from triton import knobs
+        except ImportError:  # no Triton, or one too old for our kernels
+            return
+        knobs.compilation.listener = listener
+
+    def _note(self, *, times: Any, cache_hit: bool, **_: Any) -> None:
+        if not cache_hit:
+            self.seconds += times.total / 1e6  # µs
