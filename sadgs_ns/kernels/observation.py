@@ -61,7 +61,11 @@ def _add_axis(n_high, n_low, eta_max, at, high, low, most, changed):
     tl.store(eta_max + at, tl.maximum(tl.load(eta_max + at, changed, 0.0), most), changed)
 
 
-@triton.jit(do_not_specialize=["n", "num_views", "width", "height"])
+# One view's intrinsics and codes may be part of a tensor of several: whether they lie at 16 bytes would compile anew.
+@triton.jit(
+    do_not_specialize=["n", "num_views", "width", "height"],
+    do_not_specialize_on_alignment=["structure_tensors", "Ks"],
+)
 def _observe(
     means, quats, scales, opacities, drawn, means2d, conics, jitter, structure_tensors, viewmats, Ks,
     n_high, n_low, eta_max, n_total, n, num_views, width, height, min_logit,
