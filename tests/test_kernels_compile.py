@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -62,13 +63,16 @@ print(" ".join(compiled))
 """
 
 
+def run_with_the_compiler(cache: Path, *code: str) -> subprocess.CompletedProcess[str]:
+    """Run code and its arguments outside the interpreter of these tests, with a cache of Triton's own."""
+    environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
+    environment["TRITON_CACHE_DIR"] = str(cache)
+    return subprocess.run([sys.executable, "-c", *code], env=environment, capture_output=True, text=True)
+
+
 @pytest.mark.parametrize("capability", [80, 90], ids=["A100", "H200"])
 def test_every_kernel_compiles(capability, tmp_path):
-    environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
-    environment["TRITON_CACHE_DIR"] = str(tmp_path)
-    run = subprocess.run(
-        [sys.executable, "-c", COMPILE, str(capability)], env=environment, capture_output=True, text=True
-    )
+    run = run_with_the_compiler(tmp_path, COMPILE, str(capability))
     assert run.returncode == 0, run.stderr[-3000:]
     expected = {"_blur_along_rows", "_similarity", "_spread_along_rows", "_gradient", "_count", "_list", "_observe"}
     expected |= {"_forward", "_backward", "_update", "_correlate", "_differentiate", "_accumulate", "_write_one"}
@@ -102,9 +106,7 @@ print(len(re.findall(r"ld\\.global\\.v4", ptx)), len(re.findall(r"st\\.global\\.
 
 def test_adam_reads_and_writes_memory_in_wide_words_whichever_parameter_it_is(tmp_path):
     """Each of 128 threads has 8 numbers of a block: two words for each of four tensors, of which three are written."""
-    environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
-    environment["TRITON_CACHE_DIR"] = str(tmp_path)
-    run = subprocess.run([sys.executable, "-c", WIDE], env=environment, capture_output=True, text=True)
+    run = run_with_the_compiler(tmp_path, WIDE)
     assert run.stdout.split() == ["8", "6"], run.stderr[-3000:]
 
 
@@ -139,7 +141,5 @@ print("done")
 
 
 def test_a_benchmark_knows_how_long_triton_compiled(tmp_path):
-    environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
-    environment["TRITON_CACHE_DIR"] = str(tmp_path / "cache")
-    run = subprocess.run([sys.executable, "-c", TIMED], env=environment, capture_output=True, text=True)
+    run = run_with_the_compiler(tmp_path / "cache", TIMED)
     assert run.stdout.split() == ["done"], run.stderr[-3000:]

@@ -1,4 +1,4 @@
-"""The clocks of the training loop and of what Triton compiles in it."""
+"""The clocks of the training loop and of Triton's compiler."""
 
 from __future__ import annotations
 
