@@ -16,27 +16,23 @@ import json
 import shutil
 import sqlite3
 import sys
-from collections import defaultdict
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Literal
 
 import pycolmap
-from PIL import ExifTags, Image
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sadgs_ns.atomic import atomic_path
 from sadgs_ns.errors import WriteError, free_space, reason
 from sadgs_ns.film import film_frames, write_frames
-from sadgs_ns.image_checks import IMAGE_SUFFIXES
+from sadgs_ns.photos import find_photos, photos_by_camera, photos_not_read
 
 _SEED = 0
 """Of COLMAP's random samples, which otherwise draws from the clock: equal photos give nearly equal cameras."""
 EXHAUSTIVE_LIMIT = 200
 """Photos up to which every pair is matched; twice the photos take four times as long."""
-_UNREAD_SUFFIXES = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"}
-"""Of photos in formats that phones and cameras write and COLMAP does not read."""
 FEW_FEATURES = 500
 """Keypoints under which a photo counts as blurred or empty."""
 Matching = Literal["auto", "exhaustive", "sequential", "spatial", "vocabulary"]
@@ -73,56 +69,11 @@ def sequential_pairs(names: Sequence[str], overlap: int = 10) -> list[tuple[str,
     return [(names[i], names[i + step]) for i in range(len(names)) for step in steps if i + step < len(names)]
 
 
-def _photos_not_read(folder: Path) -> str:
-    """A sentence on the photos in formats that are not read; empty if there are none."""
-    others = [path.suffix for path in folder.rglob("*") if path.suffix.lower() in _UNREAD_SUFFIXES]
-    if not others:
-        return ""
-    kinds = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
-    return f"Its {len(others)} {' and '.join(sorted(set(others)))} files are not read: convert them to one of {kinds}."
-
-
-def find_photos(source: Path, out: Path) -> list[str]:
-    """The names of a folder's photos, relative to it; a scene that is made in the same folder is none of them.
-
-    Raises:
-        ValueError: If there are fewer than three photos.
-    """
-    if not source.is_dir():
-        raise ValueError(f"{source} does not exist; give a folder of photos or a video.")
-    folder, scene = source.resolve(), out.resolve()
-    found = [path for path in folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES]
-    if folder in scene.parents:
-        found = [path for path in found if scene not in path.parents]
-    if len(found) < 3:
-        told = f"{source} holds {len(found)} photos; a reconstruction needs at least 3, better 30 or more."
-        raise ValueError(f"{told} {_photos_not_read(folder)}".rstrip())
-    return sorted(path.relative_to(folder).as_posix() for path in found)
-
-
 def _empty_folder(folder: Path) -> Path:
     """Make a folder, without what an interrupted run left in it."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     return folder
-
-
-def photos_by_camera(photos: Path, names: Sequence[str]) -> list[list[str]]:
-    """Photos that one camera at one focal length took, as far as their size and EXIF tell.
-
-    Raises:
-        ValueError: If a photo cannot be read.
-    """
-    groups: dict[tuple, list[str]] = defaultdict(list)
-    for name in names:
-        try:
-            with Image.open(photos / name) as image:
-                exif = image.getexif()
-                lens = exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLength)
-                groups[image.size, exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model), lens].append(name)
-        except OSError as error:
-            raise ValueError(f"{photos / name} cannot be read as an image ({error}); remove or replace it.") from error
-    return list(groups.values())
 
 
 def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, progress: Progress) -> None:
@@ -426,7 +377,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("sadgs-process: stopped; the same command goes on.", file=sys.stderr)
         return 130
     print(summary)
-    if options.source.is_dir() and (not_read := _photos_not_read(options.source)):
+    if options.source.is_dir() and (not_read := photos_not_read(options.source)):
         print(not_read)
     if summary.registered < 0.5 * summary.photos:
         print("Fewer than half of the photos registered: more overlap between them would help.")

@@ -18,7 +18,8 @@ from rich.progress import Progress
 from sadgs_ns import process as module
 from sadgs_ns.demo.scene import write_scene
 from sadgs_ns.film import sharpest_frames
-from sadgs_ns.process import main, photos_by_camera, process, sequential_pairs
+from sadgs_ns.photos import photos_by_camera
+from sadgs_ns.process import main, process, sequential_pairs
 
 
 @pytest.fixture(scope="module")
