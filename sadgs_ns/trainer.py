@@ -19,6 +19,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from sadgs_ns import checkpoints
+from sadgs_ns.ahead import compile_kernels
 from sadgs_ns.atomic import atomic_path
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
 from sadgs_ns.interrupts import Interrupted, Interrupts, resume_command
@@ -129,7 +130,7 @@ class SadgsTrainer(Trainer):
         self._interrupts = Interrupts(waiting=lambda: self.training_state != "training" and not self._stepping)
 
     def setup(self, *args: Any, **kwargs: Any) -> None:
-        """Load data, model and checkpoint.
+        """Load data, model and checkpoint, and compile what the machine has not compiled yet.
 
         Raises:
             InputError: If one of them cannot be used.
@@ -137,6 +138,7 @@ class SadgsTrainer(Trainer):
         """
         try:
             super().setup(*args, **kwargs)
+            compile_kernels(self.pipeline, self.optimizers.optimizers)
         except torch.cuda.OutOfMemoryError as error:
             raise RunError(f"The GPU's memory is too small to start ({_memory(error)}): {_LESS_MEMORY}.") from error
 

@@ -113,8 +113,8 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
             loop_seconds: The training loop, nothing else.
             train_seconds: The loop and the checkpoint after it.
             wall_seconds: Everything from the first import to the saved checkpoint.
-            compile_seconds: What Triton took of these to compile kernels, in a machine's first run; of them
-                loop_compile_seconds in the loop.
+            compile_seconds: What Triton took to compile kernels, in a machine's first run, added up over those that are
+                compiled side by side in the setup; of them loop_compile_seconds in the loop.
             evaluation_seconds: After it.
         Over the held-out views: `psnr` in dB, `ssim`, `ssim_padded`, `lpips`, `lpips_vgg` (None without weights; see
         `evaluate`); and `train_psnr` over some training views, `fps`, `gaussians`, `peak_gb`, how many views there

@@ -172,7 +172,11 @@ def _add(sums, basis, v):
     )
 
 
-@triton.jit(do_not_specialize=["n", "start", "num_views", "used", "stride", "row"])
+# The colours' gradients may be parts of rows: whether these lie at 16 bytes would compile anew.
+@triton.jit(
+    do_not_specialize=["n", "start", "num_views", "used", "stride", "row"],
+    do_not_specialize_on_alignment=["v_colors"],
+)
 def _backward(
     means, viewmats, rest, radii, colors, v_colors, v_means, v_first, v_rest, n, start, num_views, used, stride, row,
     PER_GAUSSIAN: tl.constexpr, LANES: tl.constexpr, VIEWS: tl.constexpr,
