@@ -21,12 +21,12 @@ _OTHER_AXES = 0.8
 def empty_gradients(num_gaussians: int, device: torch.device) -> dict[str, Tensor]:
     """Sums `grad2d`, `absgrad2d` and the number of views `grad_count` that they run over, each float32 [N]."""
     zeros = torch.zeros(num_gaussians, device=device)
-    return {"grad2d": zeros, "absgrad2d": zeros.clone(), "grad_count": zeros.clone(), "err_sum": zeros.clone(), "err_max": zeros.clone(), "err_w": zeros.clone()}
+    return {"grad2d": zeros, "absgrad2d": zeros.clone(), "grad_count": zeros.clone()}
 
 
 @torch.no_grad()
 def accumulate_gradients(
-    gradients: MutableMapping[str, Tensor], info: Mapping[str, Any], num_views: int, *, fused: bool = True, weight: str = "views"
+    gradients: MutableMapping[str, Tensor], info: Mapping[str, Any], num_views: int, *, fused: bool = True
 ) -> None:
     """Add the screen-space gradients of one backward pass, in place.
 
@@ -49,21 +49,10 @@ def accumulate_gradients(
         screen_gradients.accumulate_gradients(sums, info["radii"], means2d.grad, means2d.absgrad, (scale_x, scale_y))
         return
     seen = visible(info)  # [C, N]
-    w = seen.float()
-    if weight == "pixels":
-        r = info["radii"].float()
-        r = r if r.dim() == 2 else r.amax(-1)
-        w = torch.where(seen, r.clamp(1, 64) ** 2, 0.0)
-    elif weight == "radius":
-        r = info["radii"].float()
-        r = r if r.dim() == 2 else r.amax(-1)
-        w = torch.where(seen, r.clamp(1, 64), 0.0)
     for key, gradient in (("grad2d", means2d.grad), ("absgrad2d", means2d.absgrad)):
         norm = torch.hypot(gradient[..., 0] * scale_x, gradient[..., 1] * scale_y)  # [C, N]
-        if weight == "square":
-            norm = norm.square()
-        gradients[key] += (torch.where(seen, norm, 0.0) * w).nansum(0)
-    gradients["grad_count"] += w.sum(0)
+        gradients[key] += torch.where(seen, norm, 0.0).nansum(0)
+    gradients["grad_count"] += seen.sum(0)
 
 
 @torch.no_grad()
@@ -77,9 +66,6 @@ def grow(
     size_threshold: float,
     budget: float,
     long_axis: bool = False,
-    rank: str = "gradient",
-    weight: str = "views",
-    others: float = _OTHER_AXES,
 ) -> tuple[int, int]:
     """Clone small Gaussians by their mean gradient, split large ones in two by their absolute gradient.
 
@@ -99,30 +85,10 @@ def grow(
     """
     count = state["grad_count"].clamp_min(1)
     is_small = params["scales"].exp().amax(dim=-1) <= size_threshold
-    mean, absolute = state["grad2d"] / count, state["absgrad2d"] / count
-    if weight == "square":
-        mean, absolute = mean.sqrt(), absolute.sqrt()
-    clone_ratio = mean / clone_threshold
-    split_ratio = absolute / split_threshold
+    clone_ratio = state["grad2d"] / count / clone_threshold
+    split_ratio = state["absgrad2d"] / count / split_threshold
     steepness = torch.where(is_small, clone_ratio, split_ratio)  # ≥ 1 grows
     grows = (steepness >= 1) & steepness.isfinite()  # a sum that overflowed says nothing
-    if rank != "gradient":
-        k = int(grows.sum())
-        if rank == "max":
-            score = state["err_max"]
-        elif rank == "sum":
-            score = state["err_sum"]
-        elif rank == "mean*gradient":
-            score = steepness * state["err_sum"] / state["err_w"].clamp_min(1e-6)
-        elif rank == "max*gradient":
-            score = steepness * state["err_max"]
-        elif rank == "sqrt max*gradient":
-            score = steepness * state["err_max"].sqrt()
-        score = torch.where(score.isfinite() & steepness.isfinite(), score, 0.0)
-        top = score.topk(k).indices
-        steepness = score
-        grows = torch.zeros_like(grows)
-        grows[top] = True
     chosen = limit_growth(grows.long(), steepness, budget)
     is_clone, is_split = chosen & is_small, chosen & ~is_small
     n_clone, n_split = int(is_clone.sum()), int(is_split.sum())
@@ -132,7 +98,7 @@ def grow(
         is_split = torch.cat([is_split, is_split.new_zeros(n_clone)])  # clones are not split
         if long_axis:
             longest = F.one_hot(params["scales"].argmax(dim=-1), 3)  # [N, 3]
-            grid_split(params, optimizers, state, 1 + longest * is_split[:, None], others=others)
+            grid_split(params, optimizers, state, 1 + longest * is_split[:, None], others=_OTHER_AXES)
         else:
             split(params, optimizers, state, is_split)  # type: ignore[arg-type]
     return n_clone, n_split

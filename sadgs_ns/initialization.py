@@ -70,7 +70,7 @@ def neighbour_scales(points: Tensor, neighbours: int = 3) -> Tensor:
     return torch.from_numpy(distances[:, 1:].mean(1)).to(points).clamp_min(1e-6 * extent)
 
 
-def starting_points(points: Tensor, colors: Tensor, *, faces: bool, opacity: float = POINT_OPACITY, size: float = 1.0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def starting_points(points: Tensor, colors: Tensor, *, faces: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The points that training starts from, with the size and opacity of each.
 
     Args:
@@ -84,7 +84,7 @@ def starting_points(points: Tensor, colors: Tensor, *, faces: bool, opacity: flo
     Raises:
         ValueError: If there is no point.
     """
-    scales, opacities = size * neighbour_scales(points), torch.full((len(points),), opacity)
+    scales, opacities = neighbour_scales(points), torch.full((len(points),), POINT_OPACITY)
     if not faces:
         return points, colors, scales, opacities
     added, spacing = bounding_box_points(points)

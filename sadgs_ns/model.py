@@ -83,26 +83,6 @@ class SadgsModelConfig(SplatfactoModelConfig):
     fused: bool = True
     """Train with Triton kernels where they run (CUDA): tile lists, compositing, harmonics, loss, S̄, η, AbsGS and Adam.
     Without, torch and gsplat compute the same, more slowly."""
-    initial_opacity: float = 0.1
-    """lab"""
-    initial_size: float = 1.0
-    """lab"""
-    ssim_sigma: float = 1.5
-    """lab"""
-    opacity_reg_start: int = 0
-    """lab"""
-    reinit_iter: int = 0
-    """lab"""
-    reinit_points: int = 100000
-    """lab"""
-    reinit_keep: bool = False
-    """lab"""
-    reinit_power: float = 2.0
-    """lab"""
-    reinit_opacity: float = 0.3
-    """lab"""
-    reinit_size: float = 1.0
-    """lab"""
     bounding_box_points: bool = True
     """Also start from points on the faces of the SfM points' bounding box."""
     camera_clearance: float = 2.0
@@ -156,11 +136,6 @@ class SadgsModel(SplatfactoModel):
         """
         config = self.config
         config.check()
-        if config.ssim_sigma != 1.5:
-            import math
-            from sadgs_ns.kernels import photometric
-            w = [math.exp(-((k - 5) ** 2) / (2 * config.ssim_sigma**2)) for k in range(11)]
-            photometric._GAUSSIAN = tuple(x / sum(w) for x in w)
         self.strategy = copy.deepcopy(config.strategy)
         self.strategy.fused &= config.fused
         self.strategy_state = self.strategy.initialize_state()
@@ -195,10 +170,10 @@ class SadgsModel(SplatfactoModel):
                     f"side {config.random_scale}. A sparse reconstruction (ns-process-data) gives a better splat.[/]"
                 )
             points = (torch.rand((config.num_random, 3)) - 0.5) * config.random_scale  # [P, 3]
-            means, colors, scales, opacities = starting_points(points, torch.rand((len(points), 3)), faces=False, opacity=config.initial_opacity, size=config.initial_size)
+            means, colors, scales, opacities = starting_points(points, torch.rand((len(points), 3)), faces=False)
         else:
             points, colors = self.seed_points[0].float(), self.seed_points[1].float() / 255.0
-            means, colors, scales, opacities = starting_points(points, colors, faces=config.bounding_box_points, opacity=config.initial_opacity, size=config.initial_size)
+            means, colors, scales, opacities = starting_points(points, colors, faces=config.bounding_box_points)
         cap = self.strategy.max_gaussians
         if len(means) > cap:
             CONSOLE.print(f"[yellow]Keeping a random {cap} of {len(means)} initial points: max_gaussians is {cap}.[/]")
@@ -440,7 +415,7 @@ class SadgsModel(SplatfactoModel):
                 scales = self.scales.exp()
                 ratio = scales.amax(dim=-1) / scales.amin(dim=-1)
                 losses["scale_reg"] = 0.1 * (ratio - self.config.max_gauss_ratio).clamp_min(0).mean()
-            if self.config.opacity_reg > 0 and self.config.densify and self.step >= self.config.opacity_reg_start and self.step < self.strategy.refine_stop_iter:
+            if self.config.opacity_reg > 0 and self.config.densify and self.step < self.strategy.refine_stop_iter:
                 losses["opacity_reg"] = self.config.opacity_reg * torch.sigmoid(self.opacities).mean()
             self.camera_optimizer.get_loss_dict(losses)
             if self.config.use_bilateral_grid:

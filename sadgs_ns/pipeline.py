@@ -297,8 +297,6 @@ class SadgsPipeline(VanillaPipeline):
 
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
         """Render the iteration's views and return the outputs of the last size, mean losses and mean metrics."""
-        if step > 0 and step == self.config.model.reinit_iter:
-            self.reinitialize()
         groups: dict[torch.Size, list[tuple[int, dict[str, Any]]]] = defaultdict(list)
         for _ in range(self.config.views_per_iteration):
             index, data = self._next_view()
@@ -322,8 +320,6 @@ class SadgsPipeline(VanillaPipeline):
                 )
             viewmats, Ks = self.stacked_cameras(indices)
             outputs = self.model.get_training_outputs(viewmats, Ks, width, height, indices, tensors)
-            if self.model.strategy.rank != "gradient" and step % 10 == 0 and step < self.model.strategy.refine_stop_iter:
-                self._note_errors(outputs["rgb"], batch["image"])
             group_losses = self.model.get_loss_dict(outputs, batch)
             weight = len(views) / self.config.views_per_iteration
             for total, part in ((losses, group_losses), (metrics, self.model.get_metrics_dict(outputs, batch))):
@@ -334,90 +330,6 @@ class SadgsPipeline(VanillaPipeline):
             self._report_nonfinite()
         self.log.begin_step(step, [index for views in groups.values() for index, _ in views], losses["main_loss"])
         return outputs, losses, metrics
-
-    def _note_errors(self, rgb: Tensor, image: Tensor) -> None:
-        state, dc = self.model.strategy_state, self.model.gauss_params["features_dc"]
-        with torch.no_grad():
-            x = rgb.clamp(0, 1).permute(0, 3, 1, 2)
-            y = self.model.get_gt_img(image)[..., :3].permute(0, 3, 1, 2)
-            C = x.shape[1]
-            from sadgs_ns.losses import _window
-            g = _window(x.device, x.dtype)  # [3, 1, 1, 11]
-
-            def blur(v: Tensor) -> Tensor:
-                v = torch.nn.functional.conv2d(v, g, padding=(0, 5), groups=C)
-                return torch.nn.functional.conv2d(v, g.transpose(2, 3), padding=(5, 0), groups=C)
-
-            mx, my = blur(x), blur(y)
-            vx, vy, cxy = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
-            c1, c2 = 0.01**2, 0.03**2
-            ssim = (2 * mx * my + c1) * (2 * cxy + c2) / ((mx * mx + my * my + c1) * (vx + vy + c2))
-            err = (1 - ssim).mean(1).clamp(0, 1)  # [C, H, W]
-        for v in range(len(err)):
-            maps = torch.zeros_like(rgb)
-            maps[v, ..., 0], maps[v, ..., 1] = err[v], 1.0
-            (sums,) = torch.autograd.grad(rgb, dc, maps, retain_graph=True)
-            sums = sums.reshape(len(dc), -1) / 0.28209479
-            state["err_sum"] += sums[:, 0]
-            state["err_w"] += sums[:, 1]
-            state["err_max"] = torch.maximum(state["err_max"], sums[:, 0])
-
-    @torch.no_grad()
-    def reinitialize(self) -> None:
-        """Sample pixels by the local wavelength, and start anew where the rendered depth puts them."""
-        from gsplat.strategy.ops import _update_param_with_optimizer
-        from nerfstudio.models.splatfacto import RGB2SH, random_quat_tensor
-
-        from sadgs_ns.eta import wavelength
-        from sadgs_ns.initialization import clear_of_cameras, neighbour_scales
-        from sadgs_ns.storage import decode
-
-        config, model = self.config.model, self.model
-        params, state = model.gauss_params, model.strategy_state
-        n_views = len(self.structure_tensors)
-        each = max(config.reinit_points // n_views, 1)
-        points, colors = [], []
-        for index in range(n_views):
-            tensor, (viewmats, Ks) = self.structure_tensors[index].to(self.device), self.stacked_cameras([index])
-            height, width = tensor.shape[:2]
-            render, alpha, _ = model.render(viewmats, Ks, width, height, "RGB+ED")
-            weight = wavelength(decode(tensor)).clamp(2, 64) ** -config.reinit_power * (alpha[0, ..., 0] > 0.5)
-            if not (weight > 0).any():
-                continue
-            flat = torch.multinomial(weight.flatten(), each, replacement=False)
-            y, x = torch.div(flat, width, rounding_mode="floor"), flat % width
-            depth = render[0, ..., 3].flatten()[flat]
-            pixels = torch.stack([x + 0.5, y + 0.5, torch.ones_like(depth)], -1) * depth[:, None]
-            local = pixels @ Ks[0].inverse().mT
-            viewmat = viewmats[0]
-            points.append((local - viewmat[:3, 3]) @ viewmat[:3, :3])
-            photo = self.photo(self.datamanager.cached_train[index])
-            colors.append(photo.reshape(-1, 3)[flat])
-        means, rgb = torch.cat(points), torch.cat(colors)
-        scales = (config.reinit_size * neighbour_scales(means)).to(means)
-        positions = self.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3].to(means)
-        keep = clear_of_cameras(means, 2 * scales, positions) & means.isfinite().all(1)
-        means, rgb, scales = means[keep], rgb[keep], scales[keep]
-        n = len(means)
-        new = {
-            "means": means,
-            "scales": scales.log()[:, None].repeat(1, 3),
-            "quats": random_quat_tensor(n).to(means),
-            "features_dc": RGB2SH(rgb),
-            "features_rest": means.new_zeros((n, *params["features_rest"].shape[1:])),
-            "opacities": torch.full((n, 1), config.reinit_opacity).to(means).logit(),
-        }
-        before = model.num_points if config.reinit_keep else 0
-
-        def param_fn(name: str, p: Tensor) -> Tensor:
-            return torch.nn.Parameter(torch.cat([p[:before].detach(), new[name]]))
-
-        def optimizer_fn(key: str, v: Tensor) -> Tensor:
-            return torch.cat([v[:before], v.new_zeros((n, *v.shape[1:]))])
-
-        _update_param_with_optimizer(param_fn, optimizer_fn, params, model.optimizers)
-        model.strategy._clear_statistics(params, state)
-        print(f"reinitialized: {before} kept, {n} new")
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint's parameters and states.

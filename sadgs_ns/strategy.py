@@ -84,18 +84,6 @@ class StructureAwareStrategy(Strategy):
     """AbsGS: normalised mean absolute screen gradient at which a large Gaussian is split; AbsGS's own is 4e-4."""
     absgs_long_axis: bool = True
     """AbsGS halves a large Gaussian's longest axis in its place, instead of drawing the places of two at random."""
-    gradient_weight: str = "views"
-    """lab"""
-    rank: str = "gradient"
-    """lab"""
-    late_prune_iter: int = 0
-    """lab"""
-    late_prune_opacity: float = 0.05
-    """lab"""
-    others_axes: float = 0.8
-    """lab"""
-    threshold_final: float = 1.0
-    """lab"""
     small_scale: float = 0.001
     """AbsGS: largest scale, relative to the scene's extent, at which a Gaussian counts as small."""
     min_opacity: float = 0.02
@@ -270,15 +258,13 @@ class StructureAwareStrategy(Strategy):
         if packed:
             raise ValueError("StructureAwareStrategy reads gsplat's unpacked meta: call rasterization(packed=False)")
         iteration = step + 1
-        if iteration == self.late_prune_iter:
-            self._prune(params, optimizers, state, self._opacities(params) < self.late_prune_opacity)
         if iteration > self.refine_stop_iter:
             return
         views = _views(info)
         if self.needs_absgrad(step):
             num_views = sum(view["n_cameras"] for view in views)
             for view in views:
-                accumulate_gradients(state, view, num_views, fused=self.fused and self.gradient_weight == "views", weight=self.gradient_weight)
+                accumulate_gradients(state, view, num_views, fused=self.fused)
         if iteration >= self.refine_start_iter:
             if _due(iteration, self.structure_every):
                 self._structure_step(params, optimizers, state, iteration)
@@ -360,11 +346,8 @@ class StructureAwareStrategy(Strategy):
             params,
             optimizers,
             state,
-            clone_threshold=self.clone_grad2d * self.threshold_final ** (iteration / self.refine_stop_iter),
-            split_threshold=self.split_absgrad2d * self.threshold_final ** (iteration / self.refine_stop_iter),
-            rank=self.rank,
-            weight=self.gradient_weight,
-            others=self.others_axes,
+            clone_threshold=self.clone_grad2d,
+            split_threshold=self.split_absgrad2d,
             size_threshold=self.small_scale * state["scene_scale"],
             budget=min(under_cap, in_memory),
             long_axis=self.absgs_long_axis,
