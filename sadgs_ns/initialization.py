@@ -70,13 +70,16 @@ def neighbour_scales(points: Tensor, neighbours: int = 3) -> Tensor:
     return torch.from_numpy(distances[:, 1:].mean(1)).to(points).clamp_min(1e-6 * extent)
 
 
-def starting_points(points: Tensor, colors: Tensor, *, faces: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def starting_points(
+    points: Tensor, colors: Tensor, *, faces: bool, opacity: float = POINT_OPACITY
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The points that training starts from, with the size and opacity of each.
 
     Args:
         points: World units. [P, 3]
         colors: In [0, 1]. [P, 3]
         faces: Whether to add `bounding_box_points`.
+        opacity: Of the points that are given, in [0, 1].
 
     Returns:
         Points in world units [N, 3], colours in [0, 1] [N, 3], scales in world units, > 0 [N], opacities in [0, 1] [N].
@@ -84,7 +87,7 @@ def starting_points(points: Tensor, colors: Tensor, *, faces: bool) -> tuple[Ten
     Raises:
         ValueError: If there is no point.
     """
-    scales, opacities = neighbour_scales(points), torch.full((len(points),), POINT_OPACITY)
+    scales, opacities = neighbour_scales(points), torch.full((len(points),), opacity)
     if not faces:
         return points, colors, scales, opacities
     added, spacing = bounding_box_points(points)

@@ -30,9 +30,10 @@ from torch import Tensor
 
 from sadgs_ns.cameras import refuse_unsupported_cameras
 from sadgs_ns.errors import InputError
-from sadgs_ns.initialization import camera_extent, clear_of_cameras, starting_points
+from sadgs_ns.initialization import POINT_OPACITY, camera_extent, clear_of_cameras, starting_points
 from sadgs_ns.losses import photometric_loss
 from sadgs_ns.rasterization import rasterize, viewmats_from_camera_to_world
+from sadgs_ns.residuals import dissimilarity, error_shares
 from sadgs_ns.strategy import StructureAwareStrategy
 
 WITHOUT_EFFECT = {
@@ -85,6 +86,9 @@ class SadgsModelConfig(SplatfactoModelConfig):
     Without, torch and gsplat compute the same, more slowly."""
     bounding_box_points: bool = True
     """Also start from points on the faces of the SfM points' bounding box."""
+    initial_opacity: float = POINT_OPACITY
+    """Opacity at which SfM points start, in (0, 1); random ones start at 0.1.
+    0.5 needs fewer Gaussians on one indoor scene of two, and is worse outdoors (docs/measurements.md)."""
     camera_clearance: float = 2.0
     """Initial Gaussians nearer to a camera than this many of their standard deviations are dropped; 0 keeps all."""
 
@@ -97,6 +101,8 @@ class SadgsModelConfig(SplatfactoModelConfig):
         _refuse_fields_without_effect(self)
         if not 0 <= self.ssim_lambda <= 1:
             raise InputError(f"pipeline.model.ssim_lambda must be in [0, 1], got {self.ssim_lambda:g}.")
+        if not 0 < self.initial_opacity < 1:
+            raise InputError(f"pipeline.model.initial_opacity must be in (0, 1), got {self.initial_opacity:g}.")
         for name in ("l2_lambda", "opacity_reg", "camera_clearance"):
             if not getattr(self, name) >= 0:
                 raise InputError(f"pipeline.model.{name} must not be negative, got {getattr(self, name):g}.")
@@ -173,7 +179,9 @@ class SadgsModel(SplatfactoModel):
             means, colors, scales, opacities = starting_points(points, torch.rand((len(points), 3)), faces=False)
         else:
             points, colors = self.seed_points[0].float(), self.seed_points[1].float() / 255.0
-            means, colors, scales, opacities = starting_points(points, colors, faces=config.bounding_box_points)
+            means, colors, scales, opacities = starting_points(
+                points, colors, faces=config.bounding_box_points, opacity=config.initial_opacity
+            )
         cap = self.strategy.max_gaussians
         if len(means) > cap:
             CONSOLE.print(f"[yellow]Keeping a random {cap} of {len(means)} initial points: max_gaussians is {cap}.[/]")
@@ -411,6 +419,14 @@ class SadgsModel(SplatfactoModel):
         losses = {"main_loss": loss}
         if self.training:
             outputs["psnr"] = psnr
+            if self.infos and self.strategy.needs_errors(self.step):
+                self.infos[-1]["errors"] = error_shares(
+                    self.gauss_params,
+                    dissimilarity(predicted.detach(), target),
+                    self.infos[-1],
+                    rasterize_mode=self.config.rasterize_mode,
+                    fused=self.config.fused,
+                )
             if self.config.use_scale_regularization and self.step % 10 == 0:
                 scales = self.scales.exp()
                 ratio = scales.amax(dim=-1) / scales.amin(dim=-1)
