@@ -12,9 +12,12 @@ import numpy as np
 import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 from nerfstudio.data.datasets.base_dataset import InputDataset
+from numpy.typing import NDArray
+from torch import Tensor
 
-from sadgs_ns import colmap, paths
+from sadgs_ns import colmap, paths, ply
 
 
 @dataclass
@@ -25,12 +28,12 @@ class SadgsDatamanagerConfig(FullImageDatamanagerConfig):
 
 
 class SadgsDatamanager(FullImageDatamanager[InputDataset]):
-    """Checks what the data's images are called, and where they lie, and reads SfM points once, and faster.
+    """Checks what the data's images are called, and where they lie, and reads SfM points once, faster, without open3d.
 
     The checks are here rather than in the pipeline, because `ns-render dataset` makes a datamanager of its own.
 
     Raises:
-        InputError: As `colmap.read_poses`, `paths.check_names` and `paths.check_paths`.
+        InputError: As `colmap.read_poses`, `ply.read_points`, `paths.check_names` and `paths.check_paths`.
     """
 
     def __init__(self, config: FullImageDatamanagerConfig, *args: Any, **kwargs: Any) -> None:
@@ -45,7 +48,10 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
             plain = parser._target is ColmapDataParser and parser.max_2D_matches_per_3D_point == 0
             if plain and parser.load_3D_points:
                 self._points = colmap.points_file(model)
-        with _without_points(parser) if self._points is not None else nullcontext():
+        with (
+            _without_points(parser) if self._points is not None else nullcontext(),
+            _target(parser, _Nerfstudio) if parser._target is Nerfstudio else nullcontext(),
+        ):
             super().__init__(config, *args, **kwargs)  # type: ignore[arg-type]
         for dataset in (self.train_dataset, self.eval_dataset):
             paths.check_paths(dataset.image_filenames)
@@ -54,16 +60,43 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         """nerfstudio's, with COLMAP's points as nerfstudio would give them: it takes ten times as long to read them."""
         if self._points is not None:
             outputs = self.train_dataparser_outputs
-            positions, colors = colmap.read_points(self._points)
-            homogeneous = torch.from_numpy(np.pad(positions.astype(np.float32), ((0, 0), (0, 1)), constant_values=1))
-            outputs.metadata["points3D_xyz"] = homogeneous @ outputs.dataparser_transform.T * outputs.dataparser_scale
-            outputs.metadata["points3D_rgb"] = torch.from_numpy(colors)
+            points = colmap.read_points(self._points)
+            outputs.metadata |= _points_in_the_run(*points, outputs.dataparser_transform, outputs.dataparser_scale)
         return super().create_train_dataset()
 
     def create_eval_dataset(self) -> InputDataset:
         """nerfstudio's, without reading the points a second time: nothing looks for them here."""
         with _without_points(self.config.dataparser):
             return super().create_eval_dataset()
+
+
+class _Nerfstudio(Nerfstudio):
+    """nerfstudio's parser, which would read points with open3d."""
+
+    def _load_3D_points(
+        self, ply_file_path: Path, transform_matrix: Tensor, scale_factor: float
+    ) -> dict[str, Tensor] | None:
+        positions, colors = ply.read_points(ply_file_path)
+        return _points_in_the_run(positions, colors, transform_matrix, scale_factor) if len(positions) else None
+
+
+def _points_in_the_run(
+    positions: NDArray[np.floating], colors: NDArray[np.uint8], transform: Tensor, scale: float
+) -> dict[str, Tensor]:
+    """Points as nerfstudio's metadata hold them. [P, 3] in the data's frame, [P, 3], [3, 4] into the run's"""
+    homogeneous = torch.from_numpy(np.pad(positions.astype(np.float32), ((0, 0), (0, 1)), constant_values=1))
+    return {"points3D_xyz": homogeneous @ transform.T * scale, "points3D_rgb": torch.from_numpy(colors)}
+
+
+@contextmanager
+def _target(parser: Any, target: type) -> Iterator[None]:
+    """For the duration, a parser's configuration makes one of another class; the run's `config.yml` names its own."""
+    before = parser._target
+    parser._target = target
+    try:
+        yield
+    finally:
+        parser._target = before
 
 
 @contextmanager

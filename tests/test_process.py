@@ -16,6 +16,7 @@ from PIL import Image
 from rich.progress import Progress
 
 from sadgs_ns import process as module
+from sadgs_ns.datamanager import SadgsDatamanagerConfig
 from sadgs_ns.demo.scene import write_scene
 from sadgs_ns.film import sharpest_frames
 from sadgs_ns.photos import photos_by_camera
@@ -71,14 +72,28 @@ def test_photos_are_registered_where_they_were_taken(processed, scene: Path):
 
 
 # nerfstudio opens the first photo to learn its size and does not close it.
-@pytest.mark.filterwarnings("ignore:Exception ignored in. <_io.FileIO:pytest.PytestUnraisableExceptionWarning")
+OPEN = pytest.mark.filterwarnings("ignore:Exception ignored in. <_io.FileIO:pytest.PytestUnraisableExceptionWarning")
+
+
+@OPEN
 def test_nerfstudio_reads_the_scene_without_options(processed):
+    try:
+        import open3d  # noqa: F401 (nerfstudio's parser reads points with it)
+    except (ImportError, OSError) as error:
+        pytest.skip(f"open3d cannot be imported here: {error}")
     out, _ = processed
     parsed = NerfstudioDataParserConfig(data=out, load_3D_points=True).setup().get_dataparser_outputs("train")
     assert 10 < len(parsed.image_filenames) < 20 and all(path.exists() for path in parsed.image_filenames)
     assert len({(int(w), int(h)) for w, h in zip(parsed.cameras.width, parsed.cameras.height, strict=True)}) == 1
     assert parsed.cameras.distortion_params is None or not parsed.cameras.distortion_params.any()
     assert len(parsed.metadata["points3D_xyz"]) > 200
+
+
+@OPEN
+def test_training_reads_the_scene_without_options(processed):
+    parser = NerfstudioDataParserConfig(data=processed[0], load_3D_points=True)
+    dataset = SadgsDatamanagerConfig(dataparser=parser).setup(device="cpu").train_dataset
+    assert 10 < len(dataset) < 20 and len(dataset.metadata["points3D_xyz"]) > 200
 
 
 def test_an_interrupted_run_goes_on(photos: Path, tmp_path: Path, monkeypatch, capsys):
