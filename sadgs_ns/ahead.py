@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
 
 from sadgs_ns import kernels
 from sadgs_ns.absgs import accumulate_gradients, empty_gradients
@@ -52,6 +53,9 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
     image = torch.linspace(0.0, 1.0, 3 * _SIZE * _SIZE, device=device).view(1, _SIZE, _SIZE, 3)
     camera = viewmats, Ks, _SIZE, _SIZE
 
+    def blank(name: str) -> Tensor:
+        return means.new_zeros((n, *model.gauss_params[name].shape[1:]))
+
     def structure() -> None:
         encode(pipeline.structure_tensors_of_images(image))
 
@@ -63,7 +67,7 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
         log, twins = NonFiniteLog(device, capacity=1), []
         for name, optimizer in optimizers.items():
             if name in model.gauss_params and isinstance(optimizer, FusedAdam) and optimizer.triton:
-                parameter = torch.nn.Parameter(means.new_zeros((n, *model.gauss_params[name].shape[1:])))
+                parameter = torch.nn.Parameter(blank(name))
                 parameter.grad = torch.zeros_like(parameter)
                 twins.append(FusedAdam([parameter], **{key: optimizer.defaults[key] for key in ("betas", "eps")}))
                 twins[-1].log = log  # together, like the run's
@@ -72,8 +76,7 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
     def composite(absgrad: bool) -> None:
         centres = means.clone().requires_grad_()
         renders, alphas, info = rasterize(
-            centres, quats, scales, opacities, means, *camera, sh_degree=None, absgrad=absgrad,
-            rasterize_mode=config.rasterize_mode,
+            centres, quats, scales, opacities, means, *camera, absgrad=absgrad, rasterize_mode=config.rasterize_mode
         )  # fmt: skip
         info["means2d"].retain_grad()
         (renders.sum() if config.background_color == "black" else renders.sum() + alphas.sum()).backward()
@@ -84,12 +87,9 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
         from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
 
         if 0 < config.sh_degree <= MAX_DEGREE:
-            first, rest = (torch.zeros_like(model.gauss_params[f"features_{part}"][:n]) for part in ("dc", "rest"))
-            some = len(first)  # of a run that starts from fewer
-            colors = colors_from_harmonics(
-                config.sh_degree, means[:some].requires_grad_(), first, rest, viewmats, info["radii"][:, :some]
-            )
-            colors.sum().backward()
+            coefficients = blank("features_dc"), blank("features_rest")
+            centres = means.clone().requires_grad_()
+            colors_from_harmonics(config.sh_degree, centres, *coefficients, viewmats, info["radii"]).sum().backward()
 
     def observation() -> None:
         params = {"means": means, "quats": quats, "scales": scales.log(), "opacities": opacities[:, None].logit()}
@@ -106,7 +106,7 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
     with ThreadPoolExecutor() as pool:
         pending = [pool.submit(stage) for stage in (loss, structure, update)]
         try:  # the tile lists, which all the others read
-            _, _, info = rasterize(means, quats, scales, opacities, means, *camera, sh_degree=None)
+            _, _, info = rasterize(means, quats, scales, opacities, means, *camera)
         except Exception:
             return
         pending += [pool.submit(stage) for stage in (harmonics, observation)]

@@ -49,8 +49,8 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
             if plain and parser.load_3D_points:
                 self._points = colmap.points_file(model)
         with (
-            _without_points(parser) if self._points is not None else nullcontext(),
-            _target(parser, _Nerfstudio) if parser._target is Nerfstudio else nullcontext(),
+            _set(parser, "load_3D_points", False) if self._points is not None else nullcontext(),
+            _set(parser, "_target", _Nerfstudio) if parser._target is Nerfstudio else nullcontext(),
         ):
             super().__init__(config, *args, **kwargs)  # type: ignore[arg-type]
         for dataset in (self.train_dataset, self.eval_dataset):
@@ -66,7 +66,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
 
     def create_eval_dataset(self) -> InputDataset:
         """nerfstudio's, without reading the points a second time: nothing looks for them here."""
-        with _without_points(self.config.dataparser):
+        with _set(self.config.dataparser, "load_3D_points", False):
             return super().create_eval_dataset()
 
 
@@ -89,24 +89,14 @@ def _points_in_the_run(
 
 
 @contextmanager
-def _target(parser: Any, target: type) -> Iterator[None]:
-    """For the duration, a parser's configuration makes one of another class; the run's `config.yml` names its own."""
-    before = parser._target
-    parser._target = target
+def _set(parser: Any, option: str, value: Any) -> Iterator[None]:
+    """For the duration, a parser's configuration, if it has the option, has this value; `config.yml` keeps its own."""
+    if not hasattr(parser, option):
+        yield
+        return
+    before = getattr(parser, option)
+    setattr(parser, option, value)
     try:
         yield
     finally:
-        parser._target = before
-
-
-@contextmanager
-def _without_points(parser: Any) -> Iterator[None]:
-    """For the duration, a parser of nerfstudio's reads no SfM points, if it can."""
-    loads = getattr(parser, "load_3D_points", None)
-    if loads:
-        parser.load_3D_points = False
-    try:
-        yield
-    finally:
-        if loads:
-            parser.load_3D_points = loads
+        setattr(parser, option, before)

@@ -64,6 +64,7 @@ def error_shares(
     """
     means, quats, scales, opacities = (params[name].detach() for name in ("means", "quats", "scales", "opacities"))
     with torch.enable_grad():
+        # Three channels, since our kernels differentiate no other number; two of them have no error.
         colors = means.new_zeros((len(errors), len(means), 3)).requires_grad_()
         renders, _, _ = rasterize(
             means,

@@ -115,11 +115,7 @@ def test_points_of_a_ply_file_are_read_once_and_without_open3d(
     assert outputs.metadata["points3D_rgb"].tolist() == COLORS.tolist()
 
 
-def test_points_of_a_ply_file_are_nerfstudio_s(tmp_path: Path):
-    try:
-        import open3d  # noqa: F401
-    except (ImportError, OSError) as error:
-        pytest.skip(f"open3d cannot be imported here: {error}")
+def test_points_of_a_ply_file_are_nerfstudio_s(tmp_path: Path, open3d: None):
     parser = ply_scene(tmp_path, colors=COLORS.astype(np.uint8))
     expected = parser.setup().get_dataparser_outputs("train").metadata
     metadata = load(parser).train_dataset.metadata

@@ -76,11 +76,7 @@ OPEN = pytest.mark.filterwarnings("ignore:Exception ignored in. <_io.FileIO:pyte
 
 
 @OPEN
-def test_nerfstudio_reads_the_scene_without_options(processed):
-    try:
-        import open3d  # noqa: F401 (nerfstudio's parser reads points with it)
-    except (ImportError, OSError) as error:
-        pytest.skip(f"open3d cannot be imported here: {error}")
+def test_nerfstudio_reads_the_scene_without_options(processed, open3d: None):
     out, _ = processed
     parsed = NerfstudioDataParserConfig(data=out, load_3D_points=True).setup().get_dataparser_outputs("train")
     assert 10 < len(parsed.image_filenames) < 20 and all(path.exists() for path in parsed.image_filenames)
