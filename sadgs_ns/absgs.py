@@ -55,22 +55,6 @@ def accumulate_gradients(
     gradients["grad_count"] += seen.sum(0)
 
 
-def accumulate_errors(state: MutableMapping[str, Any], info: Mapping[str, Any]) -> None:
-    """Keep the largest error in a view that each Gaussian had a share in. One that is not finite counts as 0.
-
-    Args:
-        state: The strategy's, where it is kept as `error` [N].
-        info: With `errors` [C, N], as of `residuals.error_shares`.
-
-    Raises:
-        ValueError: If they are missing.
-    """
-    if "errors" not in info:
-        raise ValueError("rank_by_error needs info['errors']: residuals.error_shares makes them where needs_errors.")
-    largest = info["errors"].nan_to_num(0.0, 0.0, 0.0).amax(dim=0)
-    state["error"] = torch.maximum(state["error"], largest) if "error" in state else largest
-
-
 @torch.no_grad()
 def grow(
     params: Params,
@@ -82,7 +66,6 @@ def grow(
     size_threshold: float,
     budget: float,
     long_axis: bool = False,
-    error: Tensor | None = None,
 ) -> tuple[int, int]:
     """Clone small Gaussians by their mean gradient, split large ones in two by their absolute gradient.
 
@@ -96,7 +79,6 @@ def grow(
         budget: Gaussians that may be added in all, the steepest gradients first.
         long_axis: Halve the longest axis of a large one as `grid_split` does, and take a fifth off the others, instead
             of drawing the places of two that are 1.6 times as small on all axes, as 3DGS does.
-        error: Where given, as many grow as exceed the thresholds, but those whose error is largest. ≥ 0. [N]
 
     Returns:
         Numbers of clones and of splits.
@@ -107,10 +89,6 @@ def grow(
     split_ratio = state["absgrad2d"] / count / split_threshold
     steepness = torch.where(is_small, clone_ratio, split_ratio)  # ≥ 1 grows
     grows = (steepness >= 1) & steepness.isfinite()  # a sum that overflowed says nothing
-    if error is not None:
-        steepness = torch.where(steepness.isfinite(), error, 0.0)
-        first = steepness.topk(int(grows.sum())).indices
-        grows = torch.zeros_like(grows).index_fill(0, first, True) & (steepness > 0)
     chosen = limit_growth(grows.long(), steepness, budget)
     is_clone, is_split = chosen & is_small, chosen & ~is_small
     n_clone, n_split = int(is_clone.sum()), int(is_split.sum())

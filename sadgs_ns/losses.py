@@ -16,7 +16,7 @@ WINDOW = 11
 
 
 @lru_cache(maxsize=8)
-def similarity_window(device: torch.device, dtype: torch.dtype) -> Tensor:
+def _window(device: torch.device, dtype: torch.dtype) -> Tensor:
     """SSIM's window, σ 1.5 px, where the images are: made anew in each step, its copy would stop the host."""
     return _fspecial_gauss_1d(WINDOW, 1.5).repeat(3, 1, 1, 1).to(device, dtype)
 
@@ -53,6 +53,6 @@ def photometric_loss(
         predicted.permute(0, 3, 1, 2).contiguous(),
         target.permute(0, 3, 1, 2).contiguous(),
         data_range=1.0,
-        win=similarity_window(predicted.device, predicted.dtype),
+        win=_window(predicted.device, predicted.dtype),
     )
     return (1 - ssim_lambda) * l1 + ssim_lambda * (1 - similarity) + l2_lambda * l2, -10 * l2.detach().log10()

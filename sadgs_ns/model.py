@@ -33,7 +33,6 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.initialization import POINT_OPACITY, camera_extent, clear_of_cameras, starting_points
 from sadgs_ns.losses import photometric_loss
 from sadgs_ns.rasterization import rasterize, viewmats_from_camera_to_world
-from sadgs_ns.residuals import dissimilarity, error_shares
 from sadgs_ns.strategy import StructureAwareStrategy
 
 WITHOUT_EFFECT = {
@@ -88,7 +87,7 @@ class SadgsModelConfig(SplatfactoModelConfig):
     """Also start from points on the faces of the SfM points' bounding box."""
     initial_opacity: float = POINT_OPACITY
     """Opacity at which SfM points start, in (0, 1); random ones start at 0.1.
-    0.5 needs fewer Gaussians on one indoor scene of two, and is worse outdoors (docs/measurements.md)."""
+    Half opaque ones gave a better LPIPS indoors, and a worse one outdoors (docs/measurements.md)."""
     camera_clearance: float = 2.0
     """Initial Gaussians nearer to a camera than this many of their standard deviations are dropped; 0 keeps all."""
 
@@ -419,14 +418,6 @@ class SadgsModel(SplatfactoModel):
         losses = {"main_loss": loss}
         if self.training:
             outputs["psnr"] = psnr
-            if self.infos and self.strategy.needs_errors(self.step):
-                self.infos[-1]["errors"] = error_shares(
-                    self.gauss_params,
-                    dissimilarity(predicted.detach(), target),
-                    self.infos[-1],
-                    rasterize_mode=self.config.rasterize_mode,
-                    fused=self.config.fused,
-                )
             if self.config.use_scale_regularization and self.step % 10 == 0:
                 scales = self.scales.exp()
                 ratio = scales.amax(dim=-1) / scales.amin(dim=-1)

@@ -58,28 +58,12 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     """The Gaussians and their densification."""
     views_per_iteration: int = 1
     """Training views rendered for one optimizer step; the loss is their mean. The paper uses 1 outdoors, 2 indoors."""
-    early_views: int = 0
-    """Trial: views per iteration before `early_until`; 0 is `views_per_iteration`."""
-    early_until: int = 1000
-    """Trial: the iteration from which `views_per_iteration` holds."""
-    late_views: int = 0
-    """Trial: views per iteration from `late_from` on; 0 is `views_per_iteration`."""
-    late_from: int = 2000
-    """Trial: the first iteration of `late_views`."""
     frequency_constant: float = FREQUENCY_CONSTANT
     """c of ω_l = c / σ_l in 1/px, at most 4: the larger, the shorter every wavelength and the more is split."""
     noise_floor: float = NOISE_FLOOR
     """Amplitude, relative to an image's contrast, under which its structure counts as noise."""
     energy_blur: float = ENERGY_BLUR
     """Window, in multiples of σ_l, over which the energy of a scale is averaged; 0 measures it per pixel (eq. 4)."""
-
-    def views_at(self, step: int) -> int:
-        """Views of an iteration."""
-        if self.early_views and step < self.early_until:
-            return self.early_views
-        if self.late_views and step >= self.late_from:
-            return self.late_views
-        return self.views_per_iteration
 
     def check(self) -> None:
         """See whether training can work with these options.
@@ -314,7 +298,7 @@ class SadgsPipeline(VanillaPipeline):
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
         """Render the iteration's views and return the outputs of the last size, mean losses and mean metrics."""
         groups: dict[torch.Size, list[tuple[int, dict[str, Any]]]] = defaultdict(list)
-        for _ in range(self.config.views_at(step)):
+        for _ in range(self.config.views_per_iteration):
             index, data = self._next_view()
             groups[data["image"].shape].append((index, data))
         losses: dict[str, Tensor] = {}
@@ -337,7 +321,7 @@ class SadgsPipeline(VanillaPipeline):
             viewmats, Ks = self.stacked_cameras(indices)
             outputs = self.model.get_training_outputs(viewmats, Ks, width, height, indices, tensors)
             group_losses = self.model.get_loss_dict(outputs, batch)
-            weight = len(views) / self.config.views_at(step)
+            weight = len(views) / self.config.views_per_iteration
             for total, part in ((losses, group_losses), (metrics, self.model.get_metrics_dict(outputs, batch))):
                 for name, value in part.items():
                     # The mean over one size, the usual case, is no work for the device, here or in the backward pass.

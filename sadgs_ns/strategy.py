@@ -13,7 +13,7 @@ from gsplat.strategy.base import Strategy
 from gsplat.strategy.ops import _update_param_with_optimizer, remove
 from torch import Tensor
 
-from sadgs_ns.absgs import accumulate_errors, accumulate_gradients, empty_gradients, grow
+from sadgs_ns.absgs import accumulate_gradients, empty_gradients, grow
 from sadgs_ns.memory import PLANNED_SHARE, affordable_growth, available_bytes, free_bytes, gaussian_bytes
 from sadgs_ns.split import VARIANCE_EXTENT, Params, children_per_axis, grid_split, limit_growth, num_children
 from sadgs_ns.statistics import consistent, empty_statistics, observe
@@ -40,9 +40,8 @@ class StructureAwareStrategy(Strategy):
         ...                                                              # the optimizers step
         strategy.step_post_backward(params, optimizers, state, step, info)
 
-    With `rank_by_error`, `info` also holds `errors` [C, N], from `residuals.error_shares`, where `needs_errors(step)`
-    says so, by the time of `step_post_backward`. The README holds the whole loop. Views of different sizes are rendered
-    one by one; `info` is then the list of their infos.
+    The README holds the whole loop. Views of different sizes are rendered one by one; `info` is then the list of their
+    infos.
     """
 
     max_gaussians: int = 4_000_000
@@ -85,9 +84,6 @@ class StructureAwareStrategy(Strategy):
     """AbsGS: normalised mean absolute screen gradient at which a large Gaussian is split; AbsGS's own is 4e-4."""
     absgs_long_axis: bool = True
     """AbsGS halves a large Gaussian's longest axis in its place, instead of drawing the places of two at random."""
-    rank_by_error: bool = False
-    """AbsGS grows as many Gaussians as exceed its thresholds, but those with the largest share in a view's error.
-    Indoors that gave a better LPIPS at the same count, outdoors a worse one (docs/measurements.md)."""
     small_scale: float = 0.001
     """AbsGS: largest scale, relative to the scene's extent, at which a Gaussian counts as small."""
     min_opacity: float = 0.02
@@ -220,10 +216,6 @@ class StructureAwareStrategy(Strategy):
         read = _next_due(first, self.absgs_every)
         return read <= self.refine_stop_iter and read < _next_due(first, self.structure_every)
 
-    def needs_errors(self, step: int) -> bool:
-        """Whether `step_post_backward` will read each Gaussian's share in the views' errors at this step."""
-        return self.rank_by_error and step % self.eta_every == 0 and self.needs_absgrad(step)
-
     def step_pre_backward(
         self,
         params: Params,
@@ -273,8 +265,6 @@ class StructureAwareStrategy(Strategy):
             num_views = sum(view["n_cameras"] for view in views)
             for view in views:
                 accumulate_gradients(state, view, num_views, fused=self.fused)
-                if self.needs_errors(step):
-                    accumulate_errors(state, view)
         if iteration >= self.refine_start_iter:
             if _due(iteration, self.structure_every):
                 self._structure_step(params, optimizers, state, iteration)
@@ -283,7 +273,7 @@ class StructureAwareStrategy(Strategy):
             if iteration == self.refine_stop_iter:
                 if not _due(iteration, self.structure_every):  # whose step has done so
                     self._prune(params, optimizers, state, self._opacities(params) < self.final_prune_opacity)
-                for key in (*self._empty_state(0, torch.device("cpu")), "error"):
+                for key in self._empty_state(0, torch.device("cpu")):
                     state.pop(key, None)  # nobody reads them any more: neither memory nor checkpoints should hold them
             elif _due(iteration, self.reset_every) and iteration <= self.refine_stop_iter - self.reset_every // 4:
                 # A reset just before the final prune would leave nothing that had time to recover.
@@ -361,13 +351,11 @@ class StructureAwareStrategy(Strategy):
             size_threshold=self.small_scale * state["scene_scale"],
             budget=min(under_cap, in_memory),
             long_axis=self.absgs_long_axis,
-            error=state.get("error"),
         )
         if in_memory <= n_clone + n_split < under_cap:
             _warn_of_memory(iteration, in_memory)
         n_pruned = self._prune(params, optimizers, state, self._opacities(params) < self.min_opacity)
         state.update(empty_gradients(len(params["means"]), params["means"].device))
-        state.pop("error", None)
         if self.verbose:
             print(
                 f"Iteration {iteration}: {n_clone} Gaussians cloned, {n_split} split in two, {n_pruned} pruned. "
@@ -413,7 +401,6 @@ class StructureAwareStrategy(Strategy):
     @staticmethod
     def _clear_statistics(params: Any, state: MutableMapping[str, Any]) -> None:
         state.update(StructureAwareStrategy._empty_state(len(params["means"]), params["means"].device))
-        state.pop("error", None)
 
     @staticmethod
     def _empty_state(n: int, device: torch.device) -> dict[str, Tensor]:

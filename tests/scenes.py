@@ -7,7 +7,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sadgs_ns.residuals import dissimilarity, error_shares
 from sadgs_ns.splatter import rasterization
 from sadgs_ns.strategy import StructureAwareStrategy
 
@@ -100,8 +99,6 @@ def training_step(
     renders, _, info = splat(params, viewmats, Ks, width, height, absgrad=strategy.needs_absgrad(step), **options)
     info |= {"structure_tensors": structure_tensors, "viewmats": viewmats, "Ks": Ks}
     strategy.step_pre_backward(params, optimizers, state, step, info)
-    if strategy.needs_errors(step):
-        info["errors"] = error_shares(params, dissimilarity(renders, images), info)
     (renders - images).abs().mean().backward()
     for optimizer in optimizers.values():
         optimizer.step()

@@ -124,8 +124,18 @@ def test_presets_load_under_their_own_names_with_every_optimizer(name: str):
 
 def test_presets_differ_where_their_comments_say():
     views = [load_preset(name).config.pipeline.views_per_iteration for name in METHODS]  # type: ignore[attr-defined]
-    assert views == [1, 2, 1, 1, 2]
-    assert [load_preset(name).config.max_num_iterations for name in METHODS] == [3000, 3000, 7000, 3000, 3000]
+    assert views == [1, 4, 1, 1, 2]
+    assert [load_preset(name).config.max_num_iterations for name in METHODS] == [3000, 2000, 7000, 3000, 3000]
+
+
+def test_the_indoor_preset_does_in_2000_iterations_as_many_densification_steps_as_the_default_in_3000():
+    indoor: Any = load_preset("sadgs-indoor").config
+    for schedule in (StructureAwareStrategy(), indoor.pipeline.model.strategy):
+        assert schedule.structure_every == 5 * schedule.absgs_every
+        assert schedule.refine_stop_iter == 16 * schedule.absgs_every
+        assert schedule.reset_every == 12 * schedule.absgs_every and schedule.refine_start_iter == schedule.absgs_every
+        assert schedule.absgs_every == 10 * schedule.eta_every
+    assert schedule.refine_stop_iter <= indoor.max_num_iterations * 19 // 30, "fit_to_run shortens nothing"
 
 
 @pytest.mark.parametrize(
@@ -303,20 +313,24 @@ def test_pre_commit_checks_what_make_lint_does():
     assert re.findall(r"\$\(BIN\)/(\w+ \S+)", lint) == ["ruff check", "ruff format", "pyright --pythonpath"]
 
 
-def test_the_papers_presets_are_ours_without_what_we_added():
-    for name in ("sadgs", "sadgs-indoor"):
-        config: Any = load_preset(name).config
-        paper = load_preset(name.replace("sadgs", "sadgs-paper")).config
-        model = config.pipeline.model
-        assert model.ssim_lambda > 0.2 and model.opacity_reg > 0 and model.strategy.child_scale > 1
-        model.ssim_lambda, model.opacity_reg, model.strategy.child_scale = 0.2, 0.0, 1.0
-        model.strategy.clone_grad2d, model.strategy.split_absgrad2d = 2e-4, 4e-4
-        model.strategy.min_opacity, model.strategy.refine_stop_iter = 0.005, 1900
-        model.strategy.absgs_long_axis = False
-        config.optimizers["means"]["optimizer"].lr = 1.6e-4
-        config.optimizers["scales"]["optimizer"].lr = {"sadgs": 0.01, "sadgs-indoor": 0.005}[name]
-        config.method_name = paper.method_name
-        assert yaml.dump(config) == yaml.dump(paper)
+def test_the_papers_presets_are_sadgs_without_what_we_added():
+    config: Any = load_preset("sadgs").config
+    paper, indoor = (load_preset(name).config for name in ("sadgs-paper", "sadgs-paper-indoor"))
+    model = config.pipeline.model
+    assert model.ssim_lambda > 0.2 and model.opacity_reg > 0 and model.strategy.child_scale > 1
+    model.ssim_lambda, model.opacity_reg, model.strategy.child_scale = 0.2, 0.0, 1.0
+    model.strategy.clone_grad2d, model.strategy.split_absgrad2d = 2e-4, 4e-4
+    model.strategy.min_opacity, model.strategy.refine_stop_iter = 0.005, 1900
+    model.strategy.absgs_long_axis = False
+    config.optimizers["scales"]["optimizer"].lr = 0.01
+    config.method_name = "sadgs-paper"
+    assert yaml.dump(config) == yaml.dump(paper)
+    config.pipeline.views_per_iteration = 2
+    for group, rate in (("scales", 0.005), ("quats", 0.001)):
+        config.optimizers[group]["optimizer"].lr = rate
+        config.optimizers[group]["scheduler"] = RunLengthDecaySchedulerConfig(initial_factor=3.0, final_factor=0.5)
+    config.method_name = "sadgs-paper-indoor"
+    assert yaml.dump(config) == yaml.dump(indoor)
 
 
 @pytest.mark.parametrize("base", ["nothing", "../pyproject", "sadgs-paper", "mine", "x" * 300, 3])

@@ -255,12 +255,9 @@ def test_training_makes_the_training_views_more_alike(colmap: ColmapDataParserCo
     assert psnr[1] > psnr[0] + 0.5
 
 
-@pytest.mark.parametrize("rank_by_error", [False, True], ids=["by gradient", "by error"])
-def test_a_resumed_run_equals_one_that_was_never_stopped(
-    colmap: ColmapDataParserConfig, tmp_path: Path, rank_by_error: bool
-):
+def test_a_resumed_run_equals_one_that_was_never_stopped(colmap: ColmapDataParserConfig, tmp_path: Path):
     middle, last = 7, 15  # after the structure step of iteration 6, before AbsGS at 9, and beyond the last of them
-    config = configure(tmp_path / "whole", colmap, iterations=last + 1, rank_by_error=rank_by_error)
+    config = configure(tmp_path / "whole", colmap, iterations=last + 1)
     config.pipeline.views_per_iteration = 2
     config.steps_per_save, config.save_only_latest_checkpoint = middle, False
     whole = train(config)
@@ -268,9 +265,7 @@ def test_a_resumed_run_equals_one_that_was_never_stopped(
     numbers = [len(state["pipeline"]["_model.gauss_params.means"]) for state in (stopped, expected)]
     assert POINTS < numbers[0] != numbers[1]
 
-    resumed_config = configure(
-        tmp_path / "resumed", copy.deepcopy(colmap), iterations=last + 1, rank_by_error=rank_by_error
-    )
+    resumed_config = configure(tmp_path / "resumed", copy.deepcopy(colmap), iterations=last + 1)
     resumed_config.pipeline.views_per_iteration = 2
     resumed_config.load_dir, resumed_config.load_step = whole.checkpoint_dir, middle
     steps: list[int] = []
@@ -327,14 +322,6 @@ def test_the_mean_opacity_weighs_in_the_loss_while_densification_runs(colmap: Co
     train(config, look)
     assert regularized == [True] * 4 + [False] * 4
     assert opacities[0] > opacities[1] > opacities[2] > opacities[3]
-
-
-def test_growth_by_error_chooses_other_gaussians(colmap: ColmapDataParserConfig, tmp_path: Path):
-    by_gradient = train(configure(tmp_path / "gradient", colmap, iterations=ITERATIONS)).pipeline.model
-    by_error = train(configure(tmp_path / "error", colmap, iterations=ITERATIONS, rank_by_error=True)).pipeline.model
-    assert POINTS < by_error.num_points < 2 * by_gradient.num_points
-    assert is_finite(by_error) and "error" not in by_error.strategy_state
-    assert not torch.equal(by_error.means[:POINTS], by_gradient.means[:POINTS])
 
 
 def test_sfm_points_start_as_opaque_as_asked_and_no_others(colmap: ColmapDataParserConfig, tmp_path: Path):
