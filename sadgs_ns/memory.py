@@ -15,8 +15,8 @@ COPIES = 4
 """Tensors of a parameter's size that live between steps: itself, its gradient and Adam's two moments."""
 WORKING_BYTES = 4000
 """Bytes a Gaussian takes during a step besides those: projections, tile lists, colours and their gradients. With them a
-Gaussian of degree 3 takes 5 kB; the README's runs took 3.0 to 4.5 kB with images and the views of a step when they had
-the most, fox with its four views about 7."""
+Gaussian of degree 3 takes 5 kB; with images and the views of a step the README's runs took 3.1 to 4.6 kB (bonsai,
+south) and 7 kB (fox, four views of fewer Gaussians) when they had the most."""
 STEP_BYTES = 300
 """Bytes a pixel of the views that are rendered together takes during a step, whoever computes the loss."""
 PLANNED_SHARE = 0.8
