@@ -42,7 +42,7 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
     config, strategy = model.config, model.strategy
     if not (config.fused and kernels.available(device)):
         return
-    views, n = pipeline.config.views_per_iteration, _GAUSSIANS
+    views, n = pipeline.views_per_iteration, _GAUSSIANS
     ramp = torch.linspace(-0.5, 0.5, n, device=device)
     means = torch.stack([ramp, ramp.flip(0), torch.full_like(ramp, 2.0)], dim=-1)
     quats = means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
@@ -52,6 +52,13 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
     Ks = means.new_tensor([[_SIZE, 0.0, half], [0.0, _SIZE, half], [0.0, 0.0, 1.0]]).repeat(views, 1, 1)
     image = torch.linspace(0.0, 1.0, 3 * _SIZE * _SIZE, device=device).view(1, _SIZE, _SIZE, 3)
     camera = viewmats, Ks, _SIZE, _SIZE
+    cameras = pipeline.datamanager.train_dataset.cameras
+
+    def tile_lists() -> None:
+        # Of the run's size: whether tiles are numbered in 16 or in 32 bits depends on how many there are.
+        rasterize(
+            means, quats, scales, opacities, means, viewmats, Ks, int(cameras.width.max()), int(cameras.height.max())
+        )
 
     def blank(name: str) -> Tensor:
         return means.new_zeros((n, *model.gauss_params[name].shape[1:]))
@@ -105,11 +112,11 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
 
     with ThreadPoolExecutor() as pool:
         pending = [pool.submit(stage) for stage in (loss, structure, update)]
-        try:  # the tile lists, which all the others read
+        try:  # the projection, which all the others read
             _, _, info = rasterize(means, quats, scales, opacities, means, *camera)
         except Exception:
             return
-        pending += [pool.submit(stage) for stage in (harmonics, observation)]
+        pending += [pool.submit(stage) for stage in (harmonics, observation, tile_lists)]
         pending += [pool.submit(composite, absgrad) for absgrad in (True, False)]
         if wait(pending, timeout=_PATIENCE).not_done:
             CONSOLE.print("Compiling kernels for this GPU, once …")

@@ -35,7 +35,7 @@ print("compiled", before.seconds > 0, after.seconds)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="the kernels are compiled for the GPU that is there")
-@pytest.mark.parametrize("views", [1, 2])
+@pytest.mark.parametrize("views", [1, 2, 4])
 def test_training_compiles_nothing_that_was_not_compiled_ahead(scene: Path, tmp_path: Path, views: int):
     arguments = str(Path(__file__).parent), str(scene), str(tmp_path / "out"), str(views)
     run = run_with_the_compiler(tmp_path / "cache", FIRST_RUN, *arguments)
@@ -47,6 +47,26 @@ def test_without_a_gpu_there_is_nothing_to_compile(config: SadgsTrainerConfig, m
     trainer = SadgsTrainer(config)
     monkeypatch.setattr(ahead, "ThreadPoolExecutor", None)  # which would fail if it were called
     trainer.setup()
+    trainer.shutdown()
+
+
+def test_tile_lists_are_tried_in_the_size_of_the_run(config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch):
+    """More tiles than 16 bits number have a kernel of their own."""
+    trainer = SadgsTrainer(config)
+    trainer.setup()
+    sizes = []
+
+    def rasterize(*args, **options):
+        sizes.append(args[7:9])
+        return None, None, {}
+
+    monkeypatch.setattr(ahead, "rasterize", rasterize)
+    monkeypatch.setattr(kernels, "available", lambda device: True)
+    for name in ("encode", "photometric_loss", "step_together", "observe"):
+        monkeypatch.setattr(ahead, name, None)  # the stages that need a GPU end at once
+    ahead.compile_kernels(trainer.pipeline, trainer.optimizers.optimizers)
+    cameras = trainer.pipeline.datamanager.train_dataset.cameras
+    assert (int(cameras.width.max()), int(cameras.height.max())) in sizes and (64, 64) in sizes
     trainer.shutdown()
 
 

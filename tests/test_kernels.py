@@ -444,6 +444,20 @@ def test_tiles_list_the_gaussians_that_reach_them_and_hardly_more(tile_size, rad
     assert n_listed < 1.02 * n_needed < 0.7 * n_square
 
 
+def test_more_tiles_than_16_bits_number_are_listed_as_view_by_view():
+    n, width, height = 40, 1480, 1000  # 23,125 tiles a view, 69,375 in three
+    gaussians = {name: value.to(DEVICE) for name, value in projected_gaussians(3, n, width, height).items()}
+    starts, ids = tiles.intersect_tiles(**gaussians, width=width, height=height, tile_size=8).lists()
+    assert starts.shape == (3, 125, 185) and starts.numel() > 2**16
+    parts = []
+    for view in range(3):
+        alone = {name: value[view : view + 1] for name, value in gaussians.items()}
+        start, listed = tiles.intersect_tiles(**alone, width=width, height=height, tile_size=8).lists()
+        parts.append((start[0] + sum(len(ids) for _, ids in parts), listed + view * n))
+    assert torch.equal(starts, torch.stack([start for start, _ in parts]))
+    assert torch.equal(ids, torch.cat([listed for _, listed in parts])) and len(ids) > 500
+
+
 def test_no_gaussian_in_sight_makes_empty_lists():
     gaussians = projected_gaussians(1, 5, 32, 32)
     gaussians["radii"] = torch.zeros_like(gaussians["radii"])

@@ -57,7 +57,9 @@ for module in pkgutil.iter_modules(package.__path__):
                 signature[parameter.name] = "fp32"
             else:
                 signature[parameter.name] = POINTERS.get(parameter.name, "*fp32")
-        triton.compile(ASTSource(kernel, signature, constants), target=GPUTarget("cuda", int(sys.argv[1]), 32))
+        signatures = [signature] if name != "_list" else [signature, signature | {"tiles": "*i32"}]
+        for signature in signatures:
+            triton.compile(ASTSource(kernel, signature, constants), target=GPUTarget("cuda", int(sys.argv[1]), 32))
         compiled.append(name)
 print(" ".join(compiled))
 """

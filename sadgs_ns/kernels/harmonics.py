@@ -21,7 +21,7 @@ from sadgs_ns.kernels.visibility import drawn
 MAX_DEGREE = 3
 """Highest degree that the kernels know."""
 _LANES, _BACKWARD_LANES = 128, 32  # Gaussians a program handles; with four threads for each backwards
-_VIEWS = 2  # how many views' gradients are summed in registers
+_VIEWS = 2  # how many views' gradients are summed in registers; more views take more launches
 
 
 @triton.jit
