@@ -14,7 +14,7 @@ from gsplat.strategy.ops import _update_param_with_optimizer, remove
 from torch import Tensor
 
 from sadgs_ns.absgs import accumulate_gradients, empty_gradients, grow
-from sadgs_ns.memory import PLANNED_SHARE, affordable_growth, available_bytes, free_bytes, gaussian_bytes
+from sadgs_ns.memory import PLANNED_SHARE, STEP_BYTES, affordable_growth, available_bytes, free_bytes, gaussian_bytes
 from sadgs_ns.split import VARIANCE_EXTENT, Params, children_per_axis, grid_split, limit_growth, num_children
 from sadgs_ns.statistics import consistent, empty_statistics, observe
 
@@ -179,8 +179,8 @@ class StructureAwareStrategy(Strategy):
             if given is not None and affordable < 1:
                 raise ValueError(
                     f"strategy.memory_budget_gb is {given:g} and leaves no room for Gaussians: images and rendering "
-                    f"take {other_bytes / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; raise it, or take fewer or "
-                    "smaller images."
+                    f"take {other_bytes / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; raise it, take fewer or "
+                    "smaller images, or lower pipeline.views-per-iteration."
                 )
             if affordable < self.max_gaussians:
                 self.max_gaussians = max(affordable, 1)
@@ -266,10 +266,11 @@ class StructureAwareStrategy(Strategy):
             for view in views:
                 accumulate_gradients(state, view, num_views, fused=self.fused)
         if iteration >= self.refine_start_iter:
+            view_bytes = STEP_BYTES * sum(view["n_cameras"] * view["width"] * view["height"] for view in views)
             if _due(iteration, self.structure_every):
-                self._structure_step(params, optimizers, state, iteration)
+                self._structure_step(params, optimizers, state, iteration, view_bytes)
             elif _due(iteration, self.absgs_every):
-                self._absgs_step(params, optimizers, state, iteration)
+                self._absgs_step(params, optimizers, state, iteration, view_bytes)
             if iteration == self.refine_stop_iter:
                 if not _due(iteration, self.structure_every):  # whose step has done so
                     self._prune(params, optimizers, state, self._opacities(params) < self.final_prune_opacity)
@@ -303,7 +304,9 @@ class StructureAwareStrategy(Strategy):
         counts, fits = self.split_plan(statistics, self.max_gaussians - len(statistics["n_total"]))
         return torch.where(fits[:, None], counts, 1)
 
-    def _structure_step(self, params: Any, optimizers: Any, state: Any, iteration: int) -> None:
+    def _structure_step(
+        self, params: Any, optimizers: Any, state: Any, iteration: int, view_bytes: float = 0.0
+    ) -> None:
         opacities = self._opacities(params)
         is_low = self.consistently_low(state)
         n_before, n_low = len(is_low), int(is_low.sum())
@@ -314,7 +317,7 @@ class StructureAwareStrategy(Strategy):
         )
         if self.clamp_opacity < 1:
             self._map_opacities(params, optimizers, lambda alpha: alpha.clamp_max(self.clamp_opacity))
-        under_cap, in_memory = self._room(params, state)
+        under_cap, in_memory = self._room(params, state, view_bytes)
         counts, allowed = self.split_plan(state, min(under_cap, in_memory))
         n_parents, n_wanted = int(allowed.sum()), int((counts > 1).any(dim=1).sum())
         if in_memory < min(int((num_children(counts) - 1).sum()), under_cap):
@@ -340,8 +343,8 @@ class StructureAwareStrategy(Strategy):
                 f"Now having {len(params['means'])}."
             )
 
-    def _absgs_step(self, params: Any, optimizers: Any, state: Any, iteration: int) -> None:
-        under_cap, in_memory = self._room(params, state)
+    def _absgs_step(self, params: Any, optimizers: Any, state: Any, iteration: int, view_bytes: float = 0.0) -> None:
+        under_cap, in_memory = self._room(params, state, view_bytes)
         n_clone, n_split = grow(
             params,
             optimizers,
@@ -362,9 +365,10 @@ class StructureAwareStrategy(Strategy):
                 f"Now having {len(params['means'])}."
             )
 
-    def _room(self, params: Params, state: Mapping[str, Any]) -> tuple[int, float]:
-        """How many Gaussians may be added under the cap, and how many fit in the device's memory."""
-        free = free_bytes(params["means"].device)
+    def _room(self, params: Params, state: Mapping[str, Any], view_bytes: float) -> tuple[int, float]:
+        """How many Gaussians may be added under the cap, and how many fit in the device's memory beside the views that
+        the next step renders."""
+        free = free_bytes(params["means"].device) - view_bytes
         return self.max_gaussians - len(params["means"]), affordable_growth(params, state, free)
 
     @staticmethod

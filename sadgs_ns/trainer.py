@@ -28,8 +28,8 @@ from sadgs_ns.pipeline import SadgsPipeline, SadgsPipelineConfig
 from sadgs_ns.preflight import check_ahead
 
 _LESS_MEMORY = (
-    "lower --pipeline.model.strategy.max-gaussians, or take smaller images (`--downscale-factor 2` after "
-    "`nerfstudio-data` or `colmap`)"
+    "lower --pipeline.model.strategy.max-gaussians or --pipeline.views-per-iteration, or take smaller images "
+    "(`--downscale-factor 2` after `nerfstudio-data` or `colmap`)"
 )
 _SAVING_SHARE = 0.01
 """The most of the time from one of the clock's checkpoints to the next that the saving may take."""

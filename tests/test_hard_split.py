@@ -200,8 +200,13 @@ def test_a_split_that_would_not_fit_in_memory_is_reduced_with_a_warning_and_trai
 
     def scarce(device: torch.device) -> float:
         asked.append(device)
-        # As if `room` more Gaussians fitted: params of 14 numbers in 4 copies, 13 of state, the widest row of 4.
-        return (len(params["means"]) + room) * (memory.WORKING_BYTES + 16) + room * 4 * (4 * 14 + 13)
+        # As if `room` more Gaussians fitted beside the next step's view: params of 14 numbers in 4 copies, 13 of state,
+        # the widest row of 4.
+        return (
+            memory.STEP_BYTES * WIDTH * HEIGHT
+            + (len(params["means"]) + room) * (memory.WORKING_BYTES + 16)
+            + room * 4 * (4 * 14 + 13)
+        )
 
     monkeypatch.setattr(strategy_module, "free_bytes", scarce)
     params = random_params(30)

@@ -99,7 +99,7 @@ def test_a_full_card_still_starts_and_a_budget_for_nothing_is_refused(card: Any)
         fit(other=1e9, memory_budget_gb=0.5)
     assert str(error.value) == (
         "strategy.memory_budget_gb is 0.5 and leaves no room for Gaussians: images and rendering take 1.0 GB, and 0.5 "
-        "GB are free; raise it, or take fewer or smaller images."
+        "GB are free; raise it, take fewer or smaller images, or lower pipeline.views-per-iteration."
     )
 
 
