@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -57,7 +57,8 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     model: SadgsModelConfig = field(default_factory=SadgsModelConfig)
     """The Gaussians and their densification."""
     views_per_iteration: int = 1
-    """Training views rendered for one optimizer step; the loss is their mean. The paper uses 1 outdoors, 2 indoors."""
+    """Training views rendered for one optimizer step, at most as many as there are; the loss is their mean.
+    The paper uses 1 outdoors, 2 indoors. A preset's learning rates and AbsGS thresholds fit its own number."""
     frequency_constant: float = FREQUENCY_CONSTANT
     """c of ω_l = c / σ_l in 1/px, at most 4: the larger, the shorter every wavelength and the more is split."""
     noise_floor: float = NOISE_FLOOR
@@ -121,7 +122,7 @@ class SadgsPipeline(VanillaPipeline):
         """Memory of the training device that images, structure tensors and a step's pictures will take, in bytes."""
         config, train = self.datamanager.config, self.datamanager.train_dataset.cameras
         pixels = train.height * train.width  # [C, 1]
-        needed = STEP_BYTES * self.config.views_per_iteration * float(pixels.max())
+        needed = STEP_BYTES * self.views_per_iteration * float(pixels.max())
         if config.cache_images == "gpu":
             held_out = self.datamanager.eval_dataset.cameras
             cached = float(pixels.sum() + (held_out.height * held_out.width).sum())
@@ -133,6 +134,11 @@ class SadgsPipeline(VanillaPipeline):
     def model(self) -> SadgsModel:
         """The unwrapped model."""
         return self._model  # type: ignore[return-value]
+
+    @property
+    def views_per_iteration(self) -> int:
+        """As configured, but no more than there are: a view that is rendered twice in a step would count twice."""
+        return min(self.config.views_per_iteration, len(self.datamanager.train_dataset))
 
     @cached_property
     def train_cameras(self) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
@@ -298,7 +304,7 @@ class SadgsPipeline(VanillaPipeline):
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
         """Render the iteration's views and return the outputs of the last size, mean losses and mean metrics."""
         groups: dict[torch.Size, list[tuple[int, dict[str, Any]]]] = defaultdict(list)
-        for _ in range(self.config.views_per_iteration):
+        for _ in range(self.views_per_iteration):
             index, data = self._next_view()
             groups[data["image"].shape].append((index, data))
         losses: dict[str, Tensor] = {}
@@ -321,7 +327,7 @@ class SadgsPipeline(VanillaPipeline):
             viewmats, Ks = self.stacked_cameras(indices)
             outputs = self.model.get_training_outputs(viewmats, Ks, width, height, indices, tensors)
             group_losses = self.model.get_loss_dict(outputs, batch)
-            weight = len(views) / self.config.views_per_iteration
+            weight = len(views) / self.views_per_iteration
             for total, part in ((losses, group_losses), (metrics, self.model.get_metrics_dict(outputs, batch))):
                 for name, value in part.items():
                     # The mean over one size, the usual case, is no work for the device, here or in the backward pass.
@@ -353,6 +359,12 @@ class SadgsPipeline(VanillaPipeline):
             raise InputError("The checkpoint lacks the state of structure-aware densification, so splatfacto made it.")
         super().load_pipeline(loaded_state, step)
 
+    def _settings(self) -> dict[str, Any]:
+        """What decides how training goes on from a checkpoint, by the names of the options."""
+        strategy = asdict(self.config.model.strategy)
+        settings = {f"model.strategy.{name}": strategy[name] for name in strategy if name not in ("fused", "verbose")}
+        return {"views_per_iteration": self.config.views_per_iteration, **settings}
+
     def get_extra_state(self) -> dict[str, Any]:
         """Random states and the order of the views, so that a resumed run goes on as if never stopped.
 
@@ -361,6 +373,7 @@ class SadgsPipeline(VanillaPipeline):
         state: dict[str, Any] = {
             "torch": torch.get_rng_state(),
             "view_order": list(self.datamanager.train_unseen_cameras),
+            "settings": self._settings(),
         }
         if hasattr(self.datamanager, "random_generator"):
             state["view_shuffle"] = self.datamanager.random_generator.getstate()
@@ -369,7 +382,20 @@ class SadgsPipeline(VanillaPipeline):
         return state
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what `get_extra_state` saved; the view order only where the data still has that many views."""
+        """Restore what `get_extra_state` saved; the view order only where the data still has that many views.
+
+        Says where densification goes on with other settings than the checkpoint's run had.
+        """
+        now, changed = self._settings(), []
+        for name, before in state.get("settings", {}).items():
+            if name in now and now[name] != before:
+                changed.append(f"pipeline.{name} was {before} and is {now[name]}")
+        if changed:
+            CONSOLE.print(
+                "[yellow]The checkpoint's run had other settings; this one goes on with its own: "
+                f"{escape(', '.join(changed))}.[/]",
+                soft_wrap=True,
+            )
         torch.set_rng_state(state["torch"].cpu())
         if max(state["view_order"], default=0) < len(self.datamanager.train_dataset):
             self.datamanager.train_unseen_cameras = list(state["view_order"])

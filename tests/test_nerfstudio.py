@@ -229,6 +229,19 @@ def test_each_iteration_takes_its_number_of_views_in_nerfstudio_s_order(
     assert trainer.pipeline.datamanager.train_unseen_cameras == order[3 * views :]
 
 
+def test_an_iteration_takes_no_more_views_than_there_are(colmap: ColmapDataParserConfig, tmp_path: Path):
+    config = configure(tmp_path, colmap, iterations=3)
+    config.pipeline.views_per_iteration = TRAIN_VIEWS + 3
+    seen: list[list[int]] = []
+
+    def note(trainer: SadgsTrainer) -> None:
+        seen.append(list(trainer.pipeline.datamanager.train_unseen_cameras))
+
+    trainer = train(config, note)
+    assert trainer.pipeline.views_per_iteration == TRAIN_VIEWS
+    assert len(seen) >= 3 and all(sorted(left) == list(range(TRAIN_VIEWS)) for left in seen), "a round each"
+
+
 def test_no_view_at_all_per_iteration_is_refused(colmap: ColmapDataParserConfig, tmp_path: Path):
     config = configure(tmp_path, colmap)
     config.pipeline.views_per_iteration = 0
@@ -276,8 +289,25 @@ def test_a_resumed_run_equals_one_that_was_never_stopped(colmap: ColmapDataParse
     assert differences(stopped, expected) != []
 
 
+def test_resuming_with_other_settings_says_which(
+    finished: Path, colmap: ColmapDataParserConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    for views, tau_split in ((2, 0.8), (4, 0.7)):
+        config = configure(tmp_path / str(views), copy.deepcopy(colmap), iterations=ITERATIONS, tau_split=tau_split)
+        config.pipeline.views_per_iteration = views
+        config.load_dir = finished / "nerfstudio_models"
+        set_up(config)
+        printed = " ".join(capsys.readouterr().out.split())
+        assert ("other settings" in printed) == (views == 4)
+    assert (
+        "other settings; this one goes on with its own: pipeline.views_per_iteration was 2 and is 4, "
+        "pipeline.model.strategy.tau_split was 0.8 and is 0.7."
+    ) in printed
+
+
 def test_resuming_a_finished_run_trains_no_further(finished: Path, colmap: ColmapDataParserConfig, tmp_path: Path):
     config = configure(tmp_path, colmap, iterations=ITERATIONS)
+    config.pipeline.views_per_iteration = 2
     config.load_dir = finished / "nerfstudio_models"
     steps: list[int] = []
     trainer = train(config, lambda trainer: steps.append(trainer.step))
