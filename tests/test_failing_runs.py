@@ -231,8 +231,8 @@ def test_full_memory_saves_what_was_trained_and_says_what_helps(config: SadgsTra
         trainer.train()
     assert re.fullmatch(
         r"The GPU's memory was full at iteration 4 with \d+ Gaussians \(CUDA out of memory\. Tried to allocate 2\.00 "
-        r"GiB\): lower --pipeline\.model\.strategy\.max-gaussians, or take smaller images .*; what was trained is "
-        r"saved and goes on with --load-dir \S+/nerfstudio_models\.",
+        r"GiB\): lower --pipeline\.model\.strategy\.max-gaussians or --pipeline\.views-per-iteration, or take smaller "
+        r"images .*; what was trained is saved and goes on with --load-dir \S+/nerfstudio_models\.",
         str(stopped.value),
     )
     state = checkpoint(trainer, 3)
