@@ -97,6 +97,19 @@ def checkpoint_path(load_dir: Path | None, load_step: int | None, load_checkpoin
     return steps[max(steps) if load_step is None else load_step]
 
 
+def check_chosen(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> None:
+    """See at a glance whether these options name a checkpoint; what it holds is seen when it is read.
+
+    Raises:
+        InputError: As `checkpoint_path`, or if no file among those that `read_chosen` would try is whole.
+    """
+    path = checkpoint_path(load_dir, load_step, load_checkpoint)
+    if path is not None:
+        tried = path.parent.glob("step-*.ckpt") if load_dir is not None and load_step is None else [path]
+        if not any(map(zipfile.is_zipfile, tried)):  # a zip file's table of contents is at its end
+            read(path)  # which says why it cannot be
+
+
 def read_chosen(
     load_dir: Path | None,
     load_step: int | None,

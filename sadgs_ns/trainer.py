@@ -88,13 +88,13 @@ class SadgsTrainerConfig(TrainerConfig):
         self.pipeline.check()
 
     def save_config(self) -> None:
-        """Write `config.yml`, the first file of a run: not before options, data and output folder are found to be good.
+        """Write `config.yml`, the first file of a run: not before options, checkpoint, data and folder are found good.
 
         Raises:
             InputError: If they are not; nothing is written then.
         """
         self.check()
-        checkpoints.checkpoint_path(self.load_dir, self.load_step, self.load_checkpoint)
+        checkpoints.check_chosen(self.load_dir, self.load_step, self.load_checkpoint)
         check_ahead(self.pipeline.datamanager)
         path = self.get_base_dir() / "config.yml"
         CONSOLE.log(f"Saving config to: {path}")

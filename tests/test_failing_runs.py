@@ -194,6 +194,29 @@ def test_a_checkpoint_that_cannot_be_continued_is_refused_in_one_sentence(
     assert re.fullmatch(sentence, str(refused.value)), str(refused.value)
 
 
+@pytest.mark.parametrize("case", ["not-one", "truncated", "other-file", "empty-folder"])
+def test_a_checkpoint_that_is_none_is_refused_before_anything_is_written(
+    case: str, saved: Path, config: SadgsTrainerConfig, tmp_path: Path
+):
+    spoil, sentence = CHECKPOINTS[case]
+    (tmp_path / "models").mkdir()
+    spoil(Path(shutil.copy(saved, tmp_path / "models")))
+    config.load_dir, config.output_dir = tmp_path / "models", tmp_path / "out"
+    with pytest.raises(InputError) as refused:
+        config.save_config()
+    assert re.fullmatch(sentence, str(refused.value)), str(refused.value)
+    assert not config.output_dir.exists()
+
+
+def test_one_whole_checkpoint_among_damaged_ones_is_enough(saved: Path, tmp_path: Path):
+    shutil.copy(saved, tmp_path)
+    latest = tmp_path / "step-000000009.ckpt"
+    latest.write_bytes(b"cut off")
+    checkpoints.check_chosen(tmp_path, None, None)
+    with pytest.raises(InputError, match=r"9\.ckpt is cut off"):
+        checkpoints.check_chosen(tmp_path, 9, None)
+
+
 def test_a_step_or_file_without_a_checkpoint_is_named(saved: Path, tmp_path: Path):
     with pytest.raises(InputError, match=r"no checkpoint of step 3: give --load-step one of 5\."):
         checkpoints.checkpoint_path(saved.parent, 3, None)
