@@ -46,33 +46,6 @@ def read(path: Path, remedy: str = REMEDY, mmap: bool = False) -> dict[str, Any]
     return state
 
 
-def read_or_earlier(path: Path, remedy: str = REMEDY, mmap: bool = False) -> tuple[Path, dict[str, Any]]:
-    """Read the latest checkpoint of a folder; while one cannot be read, say so and take the one before it.
-
-    Args:
-        path: The latest.
-        remedy, mmap: As for `read`.
-
-    Returns:
-        Its path, or that of an earlier one in its folder, and the content.
-
-    Raises:
-        InputError: As `read`, of the latest, if none can be read.
-    """
-    errors = []
-    for candidate in sorted(path.parent.glob("step-*.ckpt"), key=lambda p: int(p.stem[5:]), reverse=True):
-        try:
-            state = read(candidate, remedy, mmap)
-        except InputError as error:
-            errors.append(error)
-            continue
-        for error in errors:
-            text = f"{error} Going on from {candidate} instead."
-            CONSOLE.print(text, style="yellow", markup=False, soft_wrap=True)
-        return candidate, state
-    raise errors[0]
-
-
 def checkpoint_path(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> Path | None:
     """The checkpoint that nerfstudio's trainer will load for these options, or None.
 
@@ -98,16 +71,14 @@ def checkpoint_path(load_dir: Path | None, load_step: int | None, load_checkpoin
 
 
 def check_chosen(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> None:
-    """See at a glance whether these options name a checkpoint; what it holds is seen when it is read.
+    """See at a glance whether `read_chosen` will find a whole file; what it holds is seen when it is read.
 
     Raises:
-        InputError: As `checkpoint_path`, or if no file among those that `read_chosen` would try is whole.
+        InputError: As `checkpoint_path`, or if none of the files is whole.
     """
-    path = checkpoint_path(load_dir, load_step, load_checkpoint)
-    if path is not None:
-        tried = path.parent.glob("step-*.ckpt") if load_dir is not None and load_step is None else [path]
-        if not any(map(zipfile.is_zipfile, tried)):  # a zip file's table of contents is at its end
-            read(path)  # which says why it cannot be
+    tried = _tried(load_dir, load_step, load_checkpoint)
+    if tried and not any(map(zipfile.is_zipfile, tried)):  # a zip file's table of contents is at its end
+        read(tried[0])  # which says why it cannot be
 
 
 def read_chosen(
@@ -127,11 +98,29 @@ def read_chosen(
         Its path and content; None where the options name none.
 
     Raises:
-        InputError: As `checkpoint_path` and `read`.
+        InputError: As `checkpoint_path`, and as `read`, of the first, if none can be read.
     """
+    errors = []
+    for path in _tried(load_dir, load_step, load_checkpoint):
+        try:
+            state = read(path, remedy, mmap)
+        except InputError as error:
+            errors.append(error)
+            continue
+        for error in errors:
+            text = f"{error} Going on from {path} instead."
+            CONSOLE.print(text, style="yellow", markup=False, soft_wrap=True)
+        return path, state
+    if errors:
+        raise errors[0]
+    return None
+
+
+def _tried(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> list[Path]:
+    """The checkpoints that are tried one after the other until one can be read."""
     path = checkpoint_path(load_dir, load_step, load_checkpoint)
     if path is None:
-        return None
-    if load_dir is not None and load_step is None:
-        return read_or_earlier(path, remedy, mmap)
-    return path, read(path, remedy, mmap)
+        return []
+    if load_dir is None or load_step is not None:
+        return [path]
+    return sorted(load_dir.glob("step-*.ckpt"), key=lambda p: int(p.stem[5:]), reverse=True)

@@ -266,11 +266,10 @@ class StructureAwareStrategy(Strategy):
             for view in views:
                 accumulate_gradients(state, view, num_views, fused=self.fused)
         if iteration >= self.refine_start_iter:
-            view_bytes = STEP_BYTES * sum(view["n_cameras"] * view["width"] * view["height"] for view in views)
             if _due(iteration, self.structure_every):
-                self._structure_step(params, optimizers, state, iteration, view_bytes)
+                self._structure_step(params, optimizers, state, iteration, views)
             elif _due(iteration, self.absgs_every):
-                self._absgs_step(params, optimizers, state, iteration, view_bytes)
+                self._absgs_step(params, optimizers, state, iteration, views)
             if iteration == self.refine_stop_iter:
                 if not _due(iteration, self.structure_every):  # whose step has done so
                     self._prune(params, optimizers, state, self._opacities(params) < self.final_prune_opacity)
@@ -305,7 +304,7 @@ class StructureAwareStrategy(Strategy):
         return torch.where(fits[:, None], counts, 1)
 
     def _structure_step(
-        self, params: Any, optimizers: Any, state: Any, iteration: int, view_bytes: float = 0.0
+        self, params: Any, optimizers: Any, state: Any, iteration: int, views: Sequence[Info] = ()
     ) -> None:
         opacities = self._opacities(params)
         is_low = self.consistently_low(state)
@@ -317,7 +316,7 @@ class StructureAwareStrategy(Strategy):
         )
         if self.clamp_opacity < 1:
             self._map_opacities(params, optimizers, lambda alpha: alpha.clamp_max(self.clamp_opacity))
-        under_cap, in_memory = self._room(params, state, view_bytes)
+        under_cap, in_memory = self._room(params, state, views)
         counts, allowed = self.split_plan(state, min(under_cap, in_memory))
         n_parents, n_wanted = int(allowed.sum()), int((counts > 1).any(dim=1).sum())
         if in_memory < min(int((num_children(counts) - 1).sum()), under_cap):
@@ -343,8 +342,8 @@ class StructureAwareStrategy(Strategy):
                 f"Now having {len(params['means'])}."
             )
 
-    def _absgs_step(self, params: Any, optimizers: Any, state: Any, iteration: int, view_bytes: float = 0.0) -> None:
-        under_cap, in_memory = self._room(params, state, view_bytes)
+    def _absgs_step(self, params: Any, optimizers: Any, state: Any, iteration: int, views: Sequence[Info] = ()) -> None:
+        under_cap, in_memory = self._room(params, state, views)
         n_clone, n_split = grow(
             params,
             optimizers,
@@ -365,10 +364,10 @@ class StructureAwareStrategy(Strategy):
                 f"Now having {len(params['means'])}."
             )
 
-    def _room(self, params: Params, state: Mapping[str, Any], view_bytes: float) -> tuple[int, float]:
-        """How many Gaussians may be added under the cap, and how many fit in the device's memory beside the views that
-        the next step renders."""
-        free = free_bytes(params["means"].device) - view_bytes
+    def _room(self, params: Params, state: Mapping[str, Any], views: Sequence[Info]) -> tuple[int, float]:
+        """How many Gaussians may be added under the cap, and how many fit in the device's memory beside such views."""
+        pixels = sum(view["n_cameras"] * view["width"] * view["height"] for view in views)
+        free = free_bytes(params["means"].device) - STEP_BYTES * pixels
         return self.max_gaussians - len(params["means"]), affordable_growth(params, state, free)
 
     @staticmethod
