@@ -33,8 +33,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from sadgs_ns.demo.__main__ import fit_schedule
 from sadgs_ns.demo.scene import EVAL_INTERVAL, SPARSE_FOLDER, write_scene
-from sadgs_ns.presets import load_preset
-from sadgs_ns.trainer import SadgsTrainer, SadgsTrainerConfig
+from sadgs_ns.plugin.presets import load_preset
+from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 PLACES = ("within a step", "after a split", "saving", "after renaming", "after a step", "from outside")
 

@@ -13,9 +13,9 @@ import pytest
 import torch
 from scenes import adam, camera, random_params
 
-from sadgs_ns import strategy as strategy_module
-from sadgs_ns.rasterization import rasterize
-from sadgs_ns.strategy import StructureAwareStrategy
+from sadgs_ns.method import strategy as strategy_module
+from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.render.rasterization import rasterize
 
 README = Path(__file__).parents[1] / "README.md"
 WIDTH, HEIGHT, VIEWS, START = 64, 48, 3, 60

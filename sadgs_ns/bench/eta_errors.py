@@ -13,13 +13,13 @@ from torch import Tensor
 
 from sadgs_ns.bench.tensor_errors import Row, spread, timed
 from sadgs_ns.demo.scene import SceneDescription
-from sadgs_ns.eta import SCREEN_BLUR, eta, sample_footprint, sample_map
-from sadgs_ns.initialization import neighbour_scales
-from sadgs_ns.rasterization import rasterize
-from sadgs_ns.split import children_per_axis
-from sadgs_ns.statistics import HIGH_ETA, consistent, empty_statistics, observe
-from sadgs_ns.strategy import StructureAwareStrategy
-from sadgs_ns.structure_tensor import multiscale_structure_tensor
+from sadgs_ns.method.eta import SCREEN_BLUR, eta, sample_footprint, sample_map
+from sadgs_ns.method.initialization import neighbour_scales
+from sadgs_ns.method.split import children_per_axis
+from sadgs_ns.method.statistics import HIGH_ETA, consistent, empty_statistics, observe
+from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
+from sadgs_ns.render.rasterization import rasterize
 
 SAMPLES = (1, 4, 16)
 INTERVALS = (1, 2, 5, 10, 20)

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-import sadgs_ns.strategy
+import sadgs_ns.method.strategy
 
 PHASES: tuple[str, ...] = ("rasterize_forward", "rasterize_backward", "loss", "eta", "optimizer", "rest")
 STEPS = 30
@@ -140,7 +140,7 @@ def booked(trainer: Any, watch: Stopwatch) -> Iterator[None]:
         stack.enter_context(replaced(model, render, rendering))
         stack.enter_context(replaced(model, "get_loss_dict", losing))
         stack.enter_context(replaced(torch.Tensor, "backward", watch.during("loss")))
-        stack.enter_context(replaced(sadgs_ns.strategy, "observe", watch.during("eta")))
+        stack.enter_context(replaced(sadgs_ns.method.strategy, "observe", watch.during("eta")))
         for name in ("zero_grad_some", "optimizer_scaler_step_some", "scheduler_step_all"):
             stack.enter_context(replaced(optimizers, name, watch.during("optimizer")))
         yield

@@ -15,7 +15,7 @@ import gsplat
 import torch
 from torch import Tensor
 
-from sadgs_ns.rasterization import rasterize, visible
+from sadgs_ns.render.rasterization import rasterize, visible
 
 _PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
 

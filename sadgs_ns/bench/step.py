@@ -16,14 +16,14 @@ import gsplat
 import torch
 from torch import Tensor
 
-from sadgs_ns.finite import NonFiniteLog
-from sadgs_ns.losses import photometric_loss
-from sadgs_ns.optimizers import FusedAdam, step_together
-from sadgs_ns.rasterization import rasterize, visible
-from sadgs_ns.split import grid_split
-from sadgs_ns.statistics import empty_statistics, observe
-from sadgs_ns.storage import encode
-from sadgs_ns.structure_tensor import multiscale_structure_tensor
+from sadgs_ns.method.codes import encode
+from sadgs_ns.method.losses import photometric_loss
+from sadgs_ns.method.split import grid_split
+from sadgs_ns.method.statistics import empty_statistics, observe
+from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
+from sadgs_ns.plugin.nonfinite import NonFiniteLog
+from sadgs_ns.plugin.optimizers import FusedAdam, step_together
+from sadgs_ns.render.rasterization import rasterize, visible
 
 REPEATS = 20
 ETA_EVERY = 10

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from sadgs_ns.eta import wavelength
-from sadgs_ns.statistics import HIGH_ETA
-from sadgs_ns.storage import decode, encode
-from sadgs_ns.structure_tensor import TRUNCATION, multiscale_structure_tensor
+from sadgs_ns.method.codes import decode, encode
+from sadgs_ns.method.eta import wavelength
+from sadgs_ns.method.statistics import HIGH_ETA
+from sadgs_ns.method.structure_tensor import TRUNCATION, multiscale_structure_tensor
 
 REFERENCE_TRUNCATION = 8.0
 """Kernels of the reference end at this many standard deviations, where float64 cannot tell them from whole ones."""

@@ -34,7 +34,7 @@ def _compiles(device: torch.device) -> bool:
         )
         return False
     try:
-        from sadgs_ns.kernels.probe import probe
+        from sadgs_ns.kernels.trial_kernel import probe
 
         probe(device)
     except Exception as error:

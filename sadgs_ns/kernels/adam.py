@@ -11,7 +11,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from sadgs_ns.finite import MAX_GRADIENT
+from sadgs_ns.plugin.nonfinite import MAX_GRADIENT
 
 _BLOCK = 1024
 

@@ -1,4 +1,4 @@
-"""`storage.encode` in one kernel."""
+"""`codes.encode` in one kernel."""
 
 # pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
 # (Triton's launch syntax, kernel[grid](...), is not in its types.)
@@ -37,7 +37,7 @@ def _encode(tensor, codes, n, HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, TINY
 
 
 def encode(tensor: Tensor, highest_frequency: float, octaves: float) -> Tensor:
-    """As `storage.encode`; where rounding decides, a code may be its neighbour. float32 [..., 3] → uint8 [..., 3]"""
+    """As `codes.encode`; where rounding decides, a code may be its neighbour. float32 [..., 3] → uint8 [..., 3]"""
     tensor = tensor.contiguous()
     codes = torch.empty_like(tensor, dtype=torch.uint8)
     n = tensor.numel() // 3

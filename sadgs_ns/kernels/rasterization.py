@@ -12,7 +12,7 @@ from torch import Tensor
 from sadgs_ns.kernels import compositing
 from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
 from sadgs_ns.kernels.tiles import intersect_tiles
-from sadgs_ns.rasterization import visible
+from sadgs_ns.render.rasterization import visible
 
 BACKWARD: Literal["moments", "gsplat"] = "moments"
 """Who differentiates the compositing of three channels: our kernel (compositing.py) or gsplat's, its reference."""

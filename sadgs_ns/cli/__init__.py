@@ -1,0 +1,1 @@
+"""The commands beside nerfstudio's: sadgs-process, sadgs-doctor, sadgs-inspect and sadgs-export."""

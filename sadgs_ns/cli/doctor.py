@@ -1,0 +1,150 @@
+"""`sadgs-doctor [DATA]`: what this machine offers to training, and what is wrong with a data folder."""
+
+from __future__ import annotations
+
+import argparse
+import ctypes.util
+import importlib
+import os
+import platform
+import shutil
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from sadgs_ns.data.validation import Finding, check_data
+from sadgs_ns.errors import free_space, reason
+
+PACKAGES = ("sadgs_ns", "torch", "torchvision", "gsplat", "nerfstudio", "triton", "pycolmap", "open3d")
+_LPIPS_NETWORKS = {"AlexNet": "AlexNet_Weights", "VGG": "VGG16_Weights"}
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that matter; "missing" for those that are not installed."""
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "missing"
+    return found
+
+
+def check_machine() -> Iterator[Finding]:
+    """Findings for torch, its device, the kernels, LPIPS's weights and what nerfstudio's commands need.
+
+    Notes say what is well. Nothing is downloaded; on CUDA a small kernel is compiled, and gsplat's, if they never were.
+    """
+    try:
+        import torch
+        import torchvision  # noqa: F401
+    except (
+        Exception
+    ) as error:  # whatever a broken installation raises; for torch and torchvision that do not fit, an OSError
+        yield Finding("error", f"torch cannot be used ({reason(error)}): install the versions of constraints.txt.")
+        return
+    if torch.cuda.is_available():
+        yield from _check_cuda()
+    else:
+        built = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "built without CUDA"
+        yield Finding(
+            "warning",
+            f"torch is {built} and sees no GPU: training runs on {os.cpu_count()} CPU cores, which is for small scenes "
+            "and tests; for more, install a GPU's driver and a torch for its CUDA.",
+        )
+    yield from _check_lpips()
+    for program, package, use in (
+        ("ffmpeg", "ffmpeg", "`ns-render` needs it for videos, and nerfstudio to scale images down"),
+        ("libusb-1.0", "libusb-1.0-0", "`ns-export` imports open3d, which needs it"),
+    ):
+        found = shutil.which(program) or ctypes.util.find_library(program.removeprefix("lib"))
+        if found:
+            yield Finding("note", f"{program}: {found}.")
+        else:
+            yield Finding("warning", f"{program} is missing: {use}; install the system's package {package}.")
+
+
+def _check_cuda() -> Iterator[Finding]:
+    import torch
+
+    from sadgs_ns import kernels
+
+    device = torch.device("cuda")
+    free, total = torch.cuda.mem_get_info(device)
+    yield Finding(
+        "note",
+        f"GPU: {torch.cuda.get_device_name(device)}, {free / 1e9:.1f} of {total / 1e9:.1f} GB free, CUDA "
+        f"{torch.version.cuda}.",
+    )
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        compiles = kernels.available(device)
+    if compiles:
+        yield Finding("note", "Triton compiles its kernels here.")
+    else:
+        why = "; ".join(str(warning.message) for warning in caught) or "Triton is not installed or failed before"
+        needed = ".".join(map(str, kernels.OLDEST_TRITON))
+        yield Finding(
+            "warning",
+            f"Training will take twice as long ({why}): install a torch whose Triton is {needed} or newer, a C "
+            "compiler and Python's headers.",
+        )
+    try:
+        backend = importlib.import_module("gsplat.cuda._backend")
+        problem = None if backend._C is not None else "neither prebuilt nor compiled"
+    except Exception as error:  # its compilation fails in many ways
+        problem = reason(error)
+    if problem is None:
+        yield Finding("note", "gsplat has its CUDA kernels.")
+    else:
+        yield Finding(
+            "error",
+            f"gsplat has no CUDA kernels ({problem}): install its wheel for this torch, or the CUDA toolkit.",
+        )
+
+
+def _check_lpips() -> Iterator[Finding]:
+    import torch
+    import torchvision
+
+    for name, weights in _LPIPS_NETWORKS.items():
+        file = Path(getattr(torchvision.models, weights).DEFAULT.url).name
+        path = Path(torch.hub.get_dir(), "checkpoints", file)
+        if path.is_file():
+            yield Finding("note", f"LPIPS with {name} has its weights: {path}.")
+        elif name == "AlexNet":
+            yield Finding(
+                "warning",
+                f"LPIPS with {name} has no weights: the first `ns-eval` downloads them to {path}, or leaves it out.",
+            )
+        else:
+            yield Finding("note", f"LPIPS with {name}, for benchmarks alone, has no weights: put them at {path}.")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns 1 if there is an error, else 0."""
+    parser = argparse.ArgumentParser(
+        prog="sadgs-doctor",
+        description="Print what this machine offers to training, and check a data folder before a long run. The exit "
+        "code is 1 if something would stop training.",
+    )
+    parser.add_argument(
+        "data", type=Path, nargs="?", help="folder with transforms.json, a COLMAP model or Blender data"
+    )
+    given = parser.parse_args(arguments)
+    print(", ".join(f"{package} {number}" for package, number in versions().items()))
+    findings = [Finding("note", f"Free disk space here: {free_space(Path())}."), *check_machine()]
+    if given.data is not None:
+        of_data = check_data(given.data)
+        if not of_data:
+            of_data = [Finding("note", f"{given.data}: nothing to complain about.")]
+        findings += of_data
+    for finding in findings:
+        print(f"{finding.severity}: {finding.sentence}")
+    return int(any(finding.severity == "error" for finding in findings))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

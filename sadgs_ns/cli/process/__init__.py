@@ -1,0 +1,1 @@
+"""`sadgs-process`: photos or a video → a COLMAP scene."""

@@ -1,0 +1,1 @@
+"""Reading and checking captures: COLMAP, PLY, cameras and images."""

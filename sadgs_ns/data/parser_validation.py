@@ -1,0 +1,96 @@
+"""nerfstudio glue: checks data with its parser's settings, once a run, before anything is written."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
+from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.utils import dataparsers_utils as splits
+
+from sadgs_ns.data import validation
+
+_checked: list[tuple[FullImageDatamanagerConfig, list[validation.Finding]]] = []
+"""At most one: settings whose data were just found good, and the findings that do not stop training."""
+
+
+def check_ahead(config: FullImageDatamanagerConfig) -> None:
+    """Check the data of the pipeline that will be made next; with these settings it then does not check them again.
+
+    Raises:
+        InputError: As `refuse_bad_data`.
+    """
+    _checked.clear()
+    _checked.append((copy.deepcopy(config), refuse_bad_data(config)))
+
+
+def findings_of(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[validation.Finding]:
+    """Those of `check_ahead`, once, or of a check now."""
+    while _checked:
+        settings, findings = _checked.pop()
+        if settings == config:
+            return findings
+    return refuse_bad_data(config, open_images)
+
+
+def refuse_bad_data(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[validation.Finding]:
+    """Check the data before nerfstudio parses them; parsers other than its three common ones are not checked.
+
+    Returns:
+        Findings that do not stop training.
+
+    Raises:
+        InputError: With the first finding that does.
+    """
+    parser = config.dataparser
+    data = Path(config.data or parser.data)
+    if isinstance(parser, ColmapDataParserConfig):
+        findings = validation.check_colmap(
+            data,
+            images_path=parser.images_path,
+            colmap_path=parser.colmap_path,
+            masks_path=parser.masks_path,
+            downscale_factor=parser.downscale_factor,
+            rounding=parser.downscale_rounding_mode,
+            load_points=parser.load_3D_points,
+            training_images=_training_images(parser),
+            open_images=open_images,
+        )
+    elif isinstance(parser, NerfstudioDataParserConfig):
+        findings = validation.check_nerfstudio(
+            data,
+            downscale_factor=parser.downscale_factor,
+            load_points=parser.load_3D_points,
+            training_images=_training_images(parser),
+            open_images=open_images,
+        )
+    elif isinstance(parser, BlenderDataParserConfig):
+        findings = validation.check_blender(data, open_images=open_images)
+    else:
+        findings = []
+    validation.refuse(findings, data)
+    return findings
+
+
+def _training_images(parser: ColmapDataParserConfig | NerfstudioDataParserConfig) -> Callable[[int], int] | None:
+    """How many of so many views the parser trains on; None if that depends on their names."""
+    if parser.eval_mode == "filename":
+        return None
+
+    def count(views: int) -> int:
+        names: list[Any] = [None] * views
+        if parser.eval_mode == "fraction":
+            chosen, _ = splits.get_train_eval_split_fraction(names, parser.train_split_fraction)
+        elif parser.eval_mode == "interval":
+            chosen, _ = splits.get_train_eval_split_interval(names, parser.eval_interval)
+        else:
+            chosen = np.arange(views)
+        return len(chosen)
+
+    return count

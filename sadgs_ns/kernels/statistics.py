@@ -1,0 +1,205 @@
+"""`statistics.observe` in one kernel: project the axes, sample S̄ in the footprint, update the counts."""
+
+# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false
+# (Triton's launch syntax, kernel[grid](...), and its functions are not in its types.)
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from sadgs_ns.method.codes import HIGHEST_FREQUENCY, OCTAVES
+
+_LANES = 128
+
+
+@triton.jit
+def _hypot(a, b):
+    a, b = tl.abs(a), tl.abs(b)
+    large = tl.maximum(tl.maximum(a, b), 1e-37)
+    small = tl.minimum(a, b) / large
+    return large * tl.sqrt(1 + small * small)
+
+
+@triton.jit
+def _matrix_row(matrix, row, x, y, z):
+    """Row of a 3×3 matrix, of which rows are 4 apart, times a vector."""
+    at = matrix + 4 * row
+    return tl.load(at) * x + tl.load(at + 1) * y + tl.load(at + 2) * z
+
+
+@triton.jit
+def _screen_axis(viewmat, x, y, z, scale, jxx, jxz, jyy, jyz):
+    """J W times an axis of the Gaussian, x and y, in px."""
+    to_right, down = _matrix_row(viewmat, 0, x, y, z), _matrix_row(viewmat, 1, x, y, z)
+    forward = _matrix_row(viewmat, 2, x, y, z)
+    return (jxx * to_right + jxz * forward) * scale, (jyy * down + jyz * forward) * scale
+
+
+@triton.jit
+def _eta(u, v, xx, xy, yy, EPSILON: tl.constexpr, DIRECTIONAL: tl.constexpr):
+    length = _hypot(u, v)
+    if DIRECTIONAL:
+        u, v = u / length, v / length  # lengths² overflow
+        return length * tl.sqrt(tl.maximum(xx * u * u + 2 * xy * u * v + yy * v * v, 0.0))
+    else:
+        largest = 0.5 * (xx + yy) + _hypot(0.5 * (xx - yy), xy)
+        return length * (tl.sqrt(tl.maximum(largest, 0.0)) + EPSILON)
+
+
+@triton.jit
+def _frequency(code, HIGHEST: tl.constexpr, OCTAVES: tl.constexpr):
+    """As in `codes.decode`."""
+    return tl.where(code > 0, HIGHEST * tl.exp2(OCTAVES * ((code - 1) / 254 - 1)), 0.0)
+
+
+@triton.jit
+def _add_axis(n_high, n_low, eta_max, at, high, low, most, changed):
+    tl.store(n_high + at, tl.load(n_high + at, changed, 0.0) + high, changed)
+    tl.store(n_low + at, tl.load(n_low + at, changed, 0.0) + low, changed)
+    tl.store(eta_max + at, tl.maximum(tl.load(eta_max + at, changed, 0.0), most), changed)
+
+
+# One view's intrinsics and codes may be part of a tensor of several: whether they lie at 16 bytes would compile anew.
+@triton.jit(
+    do_not_specialize=["n", "num_views", "width", "height"],
+    do_not_specialize_on_alignment=["structure_tensors", "Ks"],
+)
+def _observe(
+    means, quats, scales, opacities, drawn, means2d, conics, jitter, structure_tensors, viewmats, Ks,
+    n_high, n_low, eta_max, n_total, n, num_views, width, height, min_logit,
+    HIGH: tl.constexpr, LOW: tl.constexpr, BLUR: tl.constexpr, MARGIN: tl.constexpr, EPSILON: tl.constexpr,
+    HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, DIRECTIONAL: tl.constexpr, LANES: tl.constexpr,
+):  # fmt: skip
+    g = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
+    candidate = (g < n) & (tl.load(opacities + g, g < n, float("-inf")) >= min_logit)
+    x = tl.load(means + 3 * g, candidate, 0.0)
+    y = tl.load(means + 3 * g + 1, candidate, 0.0)
+    z = tl.load(means + 3 * g + 2, candidate, 1.0)
+    scale0 = tl.exp(tl.load(scales + 3 * g, candidate, 0.0))
+    scale1 = tl.exp(tl.load(scales + 3 * g + 1, candidate, 0.0))
+    scale2 = tl.exp(tl.load(scales + 3 * g + 2, candidate, 0.0))
+    qw, qx = tl.load(quats + 4 * g, candidate, 1.0), tl.load(quats + 4 * g + 1, candidate, 0.0)
+    qy, qz = tl.load(quats + 4 * g + 2, candidate, 0.0), tl.load(quats + 4 * g + 3, candidate, 0.0)
+    norm = 1 / tl.maximum(tl.sqrt(qw * qw + qx * qx + qy * qy + qz * qz), 1e-12)
+    qw, qx, qy, qz = qw * norm, qx * norm, qy * norm, qz * norm
+    zero = tl.zeros([LANES], tl.float32)
+    high0, high1, high2, low0, low1, low2 = zero, zero, zero, zero, zero, zero
+    most0, most1, most2, total = zero, zero, zero, zero
+    for view in range(num_views):
+        at = view * n + g
+        seen = candidate & (tl.load(drawn + at, candidate, 0) != 0)
+        # The sample, from the Cholesky factor of Σ2D; in float64, for a long thin Gaussian's determinant cancels.
+        a = tl.load(conics + 3 * at, seen, 1.0).to(tl.float64)
+        b = tl.load(conics + 3 * at + 1, seen, 0.0).to(tl.float64)
+        c = tl.load(conics + 3 * at + 2, seen, 1.0).to(tl.float64)
+        determinant = a * c - b * b
+        # Triton's maximum drops NaN on a GPU, so what is not finite is told by comparison, here, of S̄ and of η.
+        seen = seen & (tl.abs(determinant) < float("inf"))
+        inverse = 1 / tl.maximum(tl.maximum(determinant, 1.1920928955078125e-07 * a * c), 2.2250738585072014e-308)
+        xx = tl.maximum(c * inverse - BLUR, 0.0)
+        yy = tl.sqrt(tl.maximum(a * inverse - BLUR, 0.0))
+        factor_xx = tl.sqrt(xx)
+        factor_xy = tl.where(xx > 0, -b * inverse / tl.where(xx > 0, factor_xx, 1.0), 0.0)
+        factor_xy = tl.maximum(tl.minimum(factor_xy, yy), -yy)
+        factor_yy = tl.sqrt(tl.maximum(yy * yy - factor_xy * factor_xy, 0.0))
+        radius = 2 * tl.sqrt(tl.load(jitter + 2 * at, seen, 0.0))
+        angle = 6.283185307179586 * tl.load(jitter + 2 * at + 1, seen, 0.0)
+        u, v = radius * tl.cos(angle), radius * tl.sin(angle)
+        point_x = tl.load(means2d + 2 * at, seen, -1.0) + (factor_xx * u).to(tl.float32)
+        point_y = tl.load(means2d + 2 * at + 1, seen, -1.0) + (factor_xy * u + factor_yy * v).to(tl.float32)
+        observed = seen & (point_x >= 0) & (point_x < width) & (point_y >= 0) & (point_y < height)
+        column = tl.where(observed, point_x, 0.0).to(tl.int32)
+        row = tl.where(observed, point_y, 0.0).to(tl.int32)
+        pixel = structure_tensors + 3 * ((view * height + row).to(tl.int64) * width + column)
+        s_xx = tl.load(pixel, observed, 0).to(tl.float32)
+        s_xy = tl.load(pixel + 1, observed, 0).to(tl.float32)
+        s_yy = tl.load(pixel + 2, observed, 0).to(tl.float32)
+        if structure_tensors.dtype.element_ty == tl.uint8:
+            frequency_x, frequency_y = _frequency(s_xx, HIGHEST, OCTAVES), _frequency(s_yy, HIGHEST, OCTAVES)
+            s_xy = frequency_x * frequency_y * (s_xy - 127) / 127
+            s_xx, s_yy = frequency_x * frequency_x, frequency_y * frequency_y
+        observed = observed & (tl.abs(s_xx) + tl.abs(s_xy) + tl.abs(s_yy) < float("inf"))
+        # The Jacobian of gsplat's forward pass, with its clamp near the frustum's border.
+        viewmat, K = viewmats + 16 * view, Ks + 9 * view
+        depth = _matrix_row(viewmat, 2, x, y, z) + tl.load(viewmat + 11)
+        depth = tl.where(seen, depth, 1.0)
+        fx, fy, cx, cy = tl.load(K), tl.load(K + 4), tl.load(K + 2), tl.load(K + 5)
+        tangent_x = (_matrix_row(viewmat, 0, x, y, z) + tl.load(viewmat + 3)) / depth
+        tangent_y = (_matrix_row(viewmat, 1, x, y, z) + tl.load(viewmat + 7)) / depth
+        margin_x, margin_y = MARGIN * 0.5 * width / fx, MARGIN * 0.5 * height / fy
+        tangent_x = tl.maximum(tl.minimum(tangent_x, (width - cx) / fx + margin_x), -cx / fx - margin_x)
+        tangent_y = tl.maximum(tl.minimum(tangent_y, (height - cy) / fy + margin_y), -cy / fy - margin_y)
+        jxx, jyy = fx / depth, fy / depth
+        jxz, jyz = -jxx * tangent_x, -jyy * tangent_y
+        u0, v0 = _screen_axis(
+            viewmat, 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + qw * qz), 2 * (qx * qz - qw * qy),
+            scale0, jxx, jxz, jyy, jyz,
+        )  # fmt: skip
+        u1, v1 = _screen_axis(
+            viewmat, 2 * (qx * qy - qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz + qw * qx),
+            scale1, jxx, jxz, jyy, jyz,
+        )  # fmt: skip
+        u2, v2 = _screen_axis(
+            viewmat, 2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy),
+            scale2, jxx, jxz, jyy, jyz,
+        )  # fmt: skip
+        eta0 = _eta(u0, v0, s_xx, s_xy, s_yy, EPSILON, DIRECTIONAL)
+        eta1 = _eta(u1, v1, s_xx, s_xy, s_yy, EPSILON, DIRECTIONAL)
+        eta2 = _eta(u2, v2, s_xx, s_xy, s_yy, EPSILON, DIRECTIONAL)
+        observed = observed & (eta0 < float("inf")) & (eta1 < float("inf")) & (eta2 < float("inf"))
+        eta0, eta1, eta2 = tl.where(observed, eta0, 0.0), tl.where(observed, eta1, 0.0), tl.where(observed, eta2, 0.0)
+        high0, high1, high2 = high0 + (eta0 > HIGH), high1 + (eta1 > HIGH), high2 + (eta2 > HIGH)
+        low0 += observed & (eta0 < LOW)
+        low1 += observed & (eta1 < LOW)
+        low2 += observed & (eta2 < LOW)
+        most0, most1, most2 = tl.maximum(most0, eta0), tl.maximum(most1, eta1), tl.maximum(most2, eta2)
+        total += observed
+    changed = total > 0
+    tl.store(n_total + g, tl.load(n_total + g, changed, 0.0) + total, changed)
+    _add_axis(n_high, n_low, eta_max, 3 * g, high0, low0, most0, changed)
+    _add_axis(n_high, n_low, eta_max, 3 * g + 1, high1, low1, most1, changed)
+    _add_axis(n_high, n_low, eta_max, 3 * g + 2, high2, low2, most2, changed)
+
+
+def observe_views(
+    statistics: tuple[Tensor, Tensor, Tensor, Tensor],
+    params: tuple[Tensor, Tensor, Tensor, Tensor],
+    drawn: Tensor,
+    means2d: Tensor,
+    conics: Tensor,
+    jitter: Tensor,
+    structure_tensors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    *,
+    min_logit: float,
+    directional: bool,
+    thresholds: tuple[float, float],
+    constants: tuple[float, float, float],
+) -> None:
+    """As the loop in `statistics.observe`, all views at once.
+
+    Args:
+        statistics: n_high, n_low, eta_max [N, 3] and n_total [N], float32, updated in place.
+        params: means [N, 3], quats [N, 4], log scales [N, 3] and logit opacities, N of them.
+        drawn: Which Gaussians the forward pass drew. bool [C, N]
+        means2d: px. [C, N, 2]
+        conics: 1/px². [C, N, 3]
+        jitter: In [0, 1). [C, N, 2]
+        structure_tensors: S̄, or its codes of `codes.encode`. [C, H, W, 3]
+        viewmats: [C, 4, 4]
+        Ks: px. [C, 3, 3]
+        min_logit: Logit of the opacity from which a Gaussian is observed.
+        directional: Use η^(proj).
+        thresholds: η above the first is high, below the second low.
+        constants: gsplat's blur in px², its margin of the frustum, and ε of the wavelength in 1/px.
+    """
+    inputs = (*params, drawn, means2d, conics, jitter, structure_tensors, viewmats, Ks)
+    num_views, n = drawn.shape
+    height, width = structure_tensors.shape[1:3]
+    _observe[triton.cdiv(n, _LANES),](
+        *(value.contiguous() for value in inputs), *statistics, n, num_views, width, height, min_logit,
+        *thresholds, *constants, HIGHEST_FREQUENCY, OCTAVES, directional, _LANES,
+    )  # fmt: skip

@@ -1,0 +1,104 @@
+"""AbsGS densification: clone on the mean gradient, split on the absolute one (paper, section 3.6; AbsGS)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, MutableMapping
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from gsplat.strategy.ops import duplicate, split
+from torch import Tensor
+
+from sadgs_ns import kernels
+from sadgs_ns.method.split import Params, grid_split, limit_growth
+from sadgs_ns.render.rasterization import visible
+
+_OTHER_AXES = 0.8
+"""Of a Gaussian whose longest axis is halved: how long the others stay (docs/measurements.md)."""
+
+
+def empty_gradients(num_gaussians: int, device: torch.device) -> dict[str, Tensor]:
+    """Sums `grad2d`, `absgrad2d` and the number of views `grad_count` that they run over, each float32 [N]."""
+    zeros = torch.zeros(num_gaussians, device=device)
+    return {"grad2d": zeros, "absgrad2d": zeros.clone(), "grad_count": zeros.clone()}
+
+
+@torch.no_grad()
+def accumulate_gradients(
+    gradients: MutableMapping[str, Tensor], info: Mapping[str, Any], num_views: int, *, fused: bool = True
+) -> None:
+    """Add the screen-space gradients of one backward pass, in place.
+
+    Gradients are normalised as in 3DGS: by half the image size, so that 1 is the gradient per half image, and by the
+    number of views, since the loss is a mean over views. One that is NaN adds nothing.
+
+    Args:
+        gradients: As made by `empty_gradients`.
+        info: gsplat's meta, unpacked, whose `means2d` [C, N, 2] kept its `.grad` and `.absgrad`.
+        num_views: Views that the loss is a mean of.
+        fused: Use the Triton kernel where it runs: CUDA, float32.
+    """
+    means2d = info["means2d"]
+    # Python numbers: a tensor made of them here would make the host wait for its copy to the device.
+    scale_x, scale_y = info["width"] / 2.0 * num_views, info["height"] / 2.0 * num_views
+    if fused and means2d.dtype == torch.float32 and kernels.available(means2d.device):
+        from sadgs_ns.kernels import absgs as kernel
+
+        sums = gradients["grad2d"], gradients["absgrad2d"], gradients["grad_count"]
+        kernel.accumulate_gradients(sums, info["radii"], means2d.grad, means2d.absgrad, (scale_x, scale_y))
+        return
+    seen = visible(info)  # [C, N]
+    for key, gradient in (("grad2d", means2d.grad), ("absgrad2d", means2d.absgrad)):
+        norm = torch.hypot(gradient[..., 0] * scale_x, gradient[..., 1] * scale_y)  # [C, N]
+        gradients[key] += torch.where(seen, norm, 0.0).nansum(0)
+    gradients["grad_count"] += seen.sum(0)
+
+
+@torch.no_grad()
+def grow(
+    params: Params,
+    optimizers: MutableMapping[str, torch.optim.Optimizer],
+    state: MutableMapping[str, Any],
+    *,
+    clone_threshold: float,
+    split_threshold: float,
+    size_threshold: float,
+    budget: float,
+    long_axis: bool = False,
+) -> tuple[int, int]:
+    """Clone small Gaussians by their mean gradient, split large ones in two by their absolute gradient.
+
+    Args:
+        params: gsplat's parameters.
+        optimizers: One per parameter.
+        state: The strategy's state with the sums of `empty_gradients`.
+        clone_threshold: Normalised mean gradient at which a small Gaussian is cloned; AbsGS uses 2e-4.
+        split_threshold: Normalised mean absolute gradient at which a large one is split; AbsGS uses 4e-4.
+        size_threshold: Largest scale in world units at which a Gaussian counts as small.
+        budget: Gaussians that may be added in all, the steepest gradients first.
+        long_axis: Halve the longest axis of a large one as `grid_split` does, and take a fifth off the others, instead
+            of drawing the places of two that are 1.6 times as small on all axes, as 3DGS does.
+
+    Returns:
+        Numbers of clones and of splits.
+    """
+    count = state["grad_count"].clamp_min(1)
+    is_small = params["scales"].exp().amax(dim=-1) <= size_threshold
+    clone_ratio = state["grad2d"] / count / clone_threshold
+    split_ratio = state["absgrad2d"] / count / split_threshold
+    steepness = torch.where(is_small, clone_ratio, split_ratio)  # ≥ 1 grows
+    grows = (steepness >= 1) & steepness.isfinite()  # a sum that overflowed says nothing
+    chosen = limit_growth(grows.long(), steepness, budget)
+    is_clone, is_split = chosen & is_small, chosen & ~is_small
+    n_clone, n_split = int(is_clone.sum()), int(is_split.sum())
+    if n_clone > 0:
+        duplicate(params, optimizers, state, is_clone)  # type: ignore[arg-type]
+    if n_split > 0:
+        is_split = torch.cat([is_split, is_split.new_zeros(n_clone)])  # clones are not split
+        if long_axis:
+            longest = F.one_hot(params["scales"].argmax(dim=-1), 3)  # [N, 3]
+            grid_split(params, optimizers, state, 1 + longest * is_split[:, None], others=_OTHER_AXES)
+        else:
+            split(params, optimizers, state, is_split)  # type: ignore[arg-type]
+    return n_clone, n_split

@@ -1,0 +1,154 @@
+"""η at the visible Gaussians: projected axes against the local wavelength (paper, section 3.3, eq. 1, 6, 7).
+
+Pure tensor functions over the observations of one training step. An observation is a pair (camera, Gaussian) that the
+forward pass found visible; M is their number.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from gsplat.utils import normalized_quat_to_rotmat
+from torch import Tensor
+
+from sadgs_ns.method.codes import decode
+
+WAVELENGTH_EPSILON = 1e-5
+"""ε of Λ_min = 1 / (√λ_1 + ε) in 1/px: a textureless region has a wavelength of 10⁵ px, not infinity."""
+SCREEN_BLUR = 0.3
+"""px²; gsplat adds this to the diagonal of Σ2D before it inverts it (its `eps2d`)."""
+FRUSTUM_MARGIN = 0.3
+"""gsplat evaluates the projection Jacobian at most this fraction of half the image beyond the image's border."""
+
+
+def principal_eigenvalue(structure_tensor: Tensor) -> Tensor:
+    """Larger eigenvalue λ_1 of symmetric 2×2 tensors, in closed form.
+
+    Both terms are non-negative, so nothing cancels, however close to isotropic the tensor is.
+
+    Args:
+        structure_tensor: (xx, xy, yy). [..., 3]
+
+    Returns:
+        λ_1 in the tensor's units. [...]
+    """
+    xx, xy, yy = structure_tensor.unbind(-1)
+    return 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)
+
+
+def wavelength(structure_tensor: Tensor) -> Tensor:
+    """Smallest local wavelength Λ_min = 1 / (√λ_1 + ε) (paper, section 3.3).
+
+    Args:
+        structure_tensor: S̄ as (xx, xy, yy) in 1/px². [..., 3]
+
+    Returns:
+        Λ_min in px, in (0, 1/ε]. [...]
+    """
+    return 1.0 / (principal_eigenvalue(structure_tensor).clamp_min(0).sqrt() + WAVELENGTH_EPSILON)
+
+
+def projected_axes(
+    means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int
+) -> Tensor:
+    """Screen-space vectors of the three principal axes, v_k = J W R S_k (paper, eq. 1).
+
+    J is the Jacobian that gsplat's forward pass uses for a pinhole camera, with its clamp near the frustum's border.
+
+    Args:
+        means: World positions, in front of the camera. [M, 3]
+        quats: wxyz, not necessarily normalised. [M, 4]
+        scales: Standard deviations along the axes, world units, > 0. [M, 3]
+        viewmats: World to camera, one per observation. [M, 4, 4]
+        Ks: Intrinsics in px, one per observation. [M, 3, 3]
+        width: Image width in px.
+        height: Image height in px.
+
+    Returns:
+        v_k in px, axis k before component. [M, 3, 2]
+    """
+    rotation = viewmats[:, :3, :3]  # W [M, 3, 3]
+    x, y, z = (torch.einsum("mij,mj->mi", rotation, means) + viewmats[:, :3, 3]).unbind(-1)  # [M] each
+    fx, fy, cx, cy = Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2]
+    margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
+    tangent_x = torch.maximum(torch.minimum(x / z, (width - cx) / fx + margin_x), -cx / fx - margin_x)
+    tangent_y = torch.maximum(torch.minimum(y / z, (height - cy) / fy + margin_y), -cy / fy - margin_y)
+    zero, jxx, jyy = torch.zeros_like(z), fx / z, fy / z  # never z², which underflows long before z does
+    jacobian = torch.stack([jxx, zero, -jxx * tangent_x, zero, jyy, -jyy * tangent_y], -1).view(-1, 2, 3)
+    axes = normalized_quat_to_rotmat(F.normalize(quats, dim=-1)) * scales[:, None, :]  # R S [M, 3, 3]
+    return (jacobian @ rotation @ axes).transpose(1, 2)
+
+
+def sample_footprint(means2d: Tensor, conics: Tensor, jitter: Tensor) -> Tensor:
+    """One point in each Gaussian's footprint, uniformly distributed where the jitter is.
+
+    The footprint is the 2σ ellipse of Σ2D: a uniform point in it has mean μ_2D and covariance Σ2D. gsplat's conic
+    contains its screen-space blur, which is taken out again; what rounding makes negative is set to 0. Rounded to
+    float32, a conic tells its determinant from 0 only above ε a c: footprints longer than that (thousands of px) are
+    cut to it.
+
+    Args:
+        means2d: px. [M, 2]
+        conics: (a, b, c) of the inverse of Σ2D + SCREEN_BLUR·I, in 1/px². [M, 3]
+        jitter: In [0, 1). [M, 2]
+
+    Returns:
+        Points in px, pixel centres at half-integers; NaN where the conic is NaN or infinite. [M, 2]
+    """
+    a, b, c = conics.double().unbind(-1)  # the determinant of a long thin Gaussian cancels in float32
+    determinant = a * c - b * b  # of float32 numbers it cannot overflow: it is finite where they are
+    known = torch.maximum(determinant, torch.finfo(conics.dtype).eps * a * c)
+    # The conic of a Gaussian too large for float32 is 0.
+    determinant = torch.where(determinant.isfinite(), known.clamp_min(torch.finfo(known.dtype).tiny), torch.nan)
+    xx = (c / determinant - SCREEN_BLUR).clamp_min(0)
+    yy = (a / determinant - SCREEN_BLUR).clamp_min(0)
+    xy = -b / determinant
+    # Cholesky factor of Σ2D, with xy limited to what a positive semidefinite matrix allows.
+    factor_xx = xx.sqrt()
+    factor_xy = torch.where(xx > 0, xy / factor_xx, 0.0)
+    factor_xy = torch.maximum(torch.minimum(factor_xy, yy.sqrt()), -yy.sqrt())
+    factor_yy = (yy - factor_xy**2).clamp_min(0).sqrt()
+    radius, angle = 2.0 * jitter[:, 0].sqrt(), 2.0 * torch.pi * jitter[:, 1]
+    u, v = radius * angle.cos(), radius * angle.sin()
+    return means2d + torch.stack([factor_xx * u, factor_xy * u + factor_yy * v], -1).to(means2d.dtype)
+
+
+def sample_map(structure_tensors: Tensor, camera_ids: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Read S̄ at the pixel under each point.
+
+    Args:
+        structure_tensors: S̄ of each camera's image, any floating dtype, or its codes of `codes.encode`. [C, H, W, 3]
+        camera_ids: Which image. [M]
+        points: px. [M, 2]
+
+    Returns:
+        S̄ in float32 or wider [M, 3] (0 outside the image), and whether the point lies inside the image. bool [M]
+    """
+    height, width = structure_tensors.shape[1:3]
+    x, y = points.unbind(-1)
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    column = torch.where(inside, x, 0).long()
+    row = torch.where(inside, y, 0).long()
+    values = structure_tensors[camera_ids, row, column]
+    is_code = values.dtype == torch.uint8
+    values = decode(values) if is_code else values.to(torch.promote_types(values.dtype, torch.float32))
+    return values * inside[:, None], inside
+
+
+def eta(axes: Tensor, structure_tensor: Tensor, directional: bool = False) -> Tensor:
+    """Frequency violation of each axis: η_k = ‖v_k‖ / Λ_min (paper, eq. 6), or η^(proj) (eq. 7).
+
+    Args:
+        axes: v_k in px. [M, 3, 2]
+        structure_tensor: S̄ at the footprint's sample, (xx, xy, yy) in 1/px². [M, 3]
+        directional: Measure each axis along its own direction, η_k^(proj) = √(v_kᵀ S̄ v_k).
+
+    Returns:
+        η ≥ 0; above 1 the axis is longer than the local wavelength. [M, 3]
+    """
+    length = torch.hypot(axes[..., 0], axes[..., 1])  # [M, 3]
+    if directional:
+        xx, xy, yy = structure_tensor[:, None].unbind(-1)  # [M, 1] each
+        u, v = (axes / length.clamp_min(torch.finfo(length.dtype).tiny)[..., None]).unbind(-1)  # lengths² overflow
+        return length * (xx * u**2 + 2 * xy * u * v + yy * v**2).clamp_min(0).sqrt()
+    return length / wavelength(structure_tensor)[:, None]

@@ -1,0 +1,136 @@
+"""η observations → per-Gaussian multiview statistics (paper, section 3.4).
+
+The statistics are tensors with leading dimension N in a gsplat strategy state, so every gsplat operation that adds or
+removes Gaussians keeps them in step with the parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, MutableMapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sadgs_ns import kernels
+from sadgs_ns.method.eta import (
+    FRUSTUM_MARGIN,
+    SCREEN_BLUR,
+    WAVELENGTH_EPSILON,
+    eta,
+    projected_axes,
+    sample_footprint,
+    sample_map,
+)
+from sadgs_ns.method.split import Params
+from sadgs_ns.render.rasterization import visible
+
+HIGH_ETA = 1.0
+"""η above this is a violation: the axis is longer than the local wavelength (paper, section 3.4)."""
+LOW_ETA = 0.1
+"""η below this is a low response: the axis covers a smooth region (paper, section 3.4)."""
+
+
+def empty_statistics(num_gaussians: int, device: torch.device) -> dict[str, Tensor]:
+    """Statistics of Gaussians that nobody has seen yet.
+
+    Returns:
+        `n_high`, `n_low` (counts per axis) and `eta_max` (largest η per axis), each float32 [N, 3]; `n_total`, the
+        number of observations, float32 [N].
+    """
+    zeros = torch.zeros((num_gaussians, 3), device=device)
+    return {"n_high": zeros, "n_low": zeros.clone(), "eta_max": zeros.clone(), "n_total": zeros[:, 0].clone()}
+
+
+@torch.no_grad()
+def observe(
+    statistics: MutableMapping[str, Tensor],
+    params: Params,
+    info: Mapping[str, Any],
+    *,
+    directional: bool = False,
+    min_opacity: float = 0.0,
+    generator: torch.Generator | None = None,
+    fused: bool = True,
+) -> None:
+    """Add one forward pass: one jittered sample per visible Gaussian and view, counted in place.
+
+    A Gaussian is observed in a view when the rasterizer drew it there, its sample lies inside the image, and its η is
+    finite on all axes: NaN and infinities of the projection or of S̄ are no observation.
+
+    Args:
+        statistics: As made by `empty_statistics`.
+        params: `means` [N, 3], `quats` [N, 4], log `scales` [N, 3], logit `opacities` [N] or [N, 1].
+        info: gsplat's meta, unpacked, of C views of one size, plus `structure_tensors` (S̄, or its codes of
+            `codes.encode`) [C, H, W, 3], `viewmats` [C, 4, 4] and `Ks` [C, 3, 3].
+        directional: Use η^(proj) (paper, eq. 7).
+        min_opacity: Only Gaussians at least this opaque are observed.
+        generator: Source of the jitter.
+        fused: Use the Triton kernel where it runs: CUDA, float32.
+    """
+    seen = visible(info)  # [C, N]
+    jitter = torch.rand((*seen.shape, 2), generator=generator, device=seen.device)  # [C, N, 2]
+    if fused and kernels.available(seen.device) and params["means"].dtype == torch.float32:
+        from sadgs_ns.kernels.statistics import observe_views
+
+        observe_views(
+            (statistics["n_high"], statistics["n_low"], statistics["eta_max"], statistics["n_total"]),
+            (params["means"], params["quats"], params["scales"], params["opacities"]),
+            seen,
+            info["means2d"],
+            info["conics"],
+            jitter,
+            info["structure_tensors"],
+            info["viewmats"],
+            info["Ks"],
+            min_logit=float(torch.logit(torch.tensor(min_opacity, dtype=torch.float64).clamp(0, 1))),
+            directional=directional,
+            thresholds=(HIGH_ETA, LOW_ETA),
+            constants=(SCREEN_BLUR, FRUSTUM_MARGIN, WAVELENGTH_EPSILON),
+        )
+        return
+    if min_opacity > 0:
+        seen = seen & (torch.sigmoid(params["opacities"].flatten()) >= min_opacity)
+    num_cameras, num_gaussians = seen.shape
+    scales = torch.exp(params["scales"])
+    # Every Gaussian is measured and the unseen are masked out: selecting them first would make the host wait.
+    for camera in range(num_cameras):
+        camera_ids = torch.full((num_gaussians,), camera, device=seen.device)  # [N]
+        axes = projected_axes(
+            params["means"],
+            params["quats"],
+            scales,
+            info["viewmats"][camera].expand(num_gaussians, 4, 4),
+            info["Ks"][camera].expand(num_gaussians, 3, 3),
+            info["width"],
+            info["height"],
+        )  # [N, 3, 2]
+        # An unseen Gaussian's projection is garbage; its sample is moved to a place where nothing can overflow.
+        means2d = torch.where(seen[camera, :, None], info["means2d"][camera], -1.0)
+        a, b, c = info["conics"][camera].unbind(-1)
+        # Python numbers: a tensor made of them here would make the host wait for its copy to the device.
+        a, b, c = (torch.where(seen[camera], *pair) for pair in ((a, 1.0), (b, 0.0), (c, 1.0)))
+        conics = torch.stack([a, b, c], -1)
+        points = sample_footprint(means2d, conics, jitter[camera])
+        sampled, inside = sample_map(info["structure_tensors"], camera_ids, points)
+        violation = eta(axes, sampled, directional)  # [N, 3]
+        observed = (seen[camera] & inside & violation.isfinite().all(dim=1))[:, None]  # [N, 1]
+        violation = torch.where(observed, violation, 0.0)
+        statistics["n_high"] += violation > HIGH_ETA
+        statistics["n_low"] += observed & (violation < LOW_ETA)
+        statistics["n_total"] += observed[:, 0]
+        torch.maximum(statistics["eta_max"], violation, out=statistics["eta_max"])
+
+
+def consistent(counts: Tensor, n_total: Tensor, threshold: float) -> Tensor:
+    """Whether a response was seen in more than a fraction of the observations: N / N_total > τ.
+
+    Args:
+        counts: `n_high` or `n_low`. [N, 3]
+        n_total: [N]
+        threshold: τ_split or τ_prune in [0, 1].
+
+    Returns:
+        Per axis; False for a Gaussian that was never observed. bool [N, 3]
+    """
+    return counts > threshold * n_total[:, None]

@@ -1,0 +1,438 @@
+"""The densification schedule: a gsplat strategy that needs no nerfstudio (paper, sections 3.4–3.6)."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping, MutableMapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from gsplat.strategy.base import Strategy
+from gsplat.strategy.ops import _update_param_with_optimizer, remove
+from torch import Tensor
+
+from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow
+from sadgs_ns.method.memory import (
+    PLANNED_SHARE,
+    STEP_BYTES,
+    affordable_growth,
+    available_bytes,
+    free_bytes,
+    gaussian_bytes,
+)
+from sadgs_ns.method.split import VARIANCE_EXTENT, Params, children_per_axis, grid_split, limit_growth, num_children
+from sadgs_ns.method.statistics import consistent, empty_statistics, observe
+
+Info = Mapping[str, Any]
+
+_SHARES = ("eta_min_opacity", "tau_split", "tau_prune", "prune_opacity", "min_opacity", "clamp_opacity", "reset_factor",
+           "final_prune_opacity")  # fmt: skip
+"""Options that are fractions or opacities."""
+
+
+@dataclass
+class StructureAwareStrategy(Strategy):
+    """Structure-aware densification: split where η says so, in one step, into an anisotropic grid.
+
+    A gsplat `Strategy`. Iterations are counted from 1: `step` s is iteration s + 1. In a training loop:
+
+        strategy = StructureAwareStrategy()
+        state = strategy.initialize_state(scene_scale)
+        renders, alphas, info = rasterization(..., packed=False, absgrad=strategy.needs_absgrad(step))
+        info |= {"structure_tensors": ..., "viewmats": ..., "Ks": ...}   # [C, H, W, 3], [C, 4, 4], [C, 3, 3]
+        strategy.step_pre_backward(params, optimizers, state, step, info)
+        loss.backward()                                                  # the mean over the C views
+        ...                                                              # the optimizers step
+        strategy.step_post_backward(params, optimizers, state, step, info)
+
+    The README holds the whole loop. Views of different sizes are rendered one by one; `info` is then the list of their
+    infos.
+    """
+
+    max_gaussians: int = 4_000_000
+    """Hard cap on the number of Gaussians, never exceeded; the largest violations are split first.
+    On CUDA fewer are added, with a warning, where the device's memory would not hold them."""
+    memory_budget_gb: float | None = None
+    """Memory of the GPU, in 10⁹ bytes, that training may take; `ns-train` lowers `max_gaussians` to it at the start.
+    None is 80 % of what is free, unless `max_gaussians` was changed, which then stays."""
+    structure_every: int = 500
+    """Iterations between structure-aware split and prune steps; 0 turns them off."""
+    absgs_every: int = 100
+    """Iterations between AbsGS steps, skipped where a structure step falls; 0 turns them off."""
+    refine_start_iter: int = 100
+    """First iteration at which densification may run."""
+    refine_stop_iter: int = 1600
+    """Last iteration at which densification may run; opacities under `final_prune_opacity` are pruned there."""
+    eta_every: int = 10
+    """Iterations between η observations; the paper observes at every one, which costs time and brings nothing."""
+    directional_eta: bool = False
+    """Measure η along each axis's own direction (paper, eq. 7) instead of against the shortest wavelength (eq. 6)."""
+    eta_min_opacity: float = 0.3
+    """Opacity in [0, 1] from which a Gaussian's η is observed, high or low; 0, as in the paper, takes all visible ones.
+    Pruning by low η then only concerns Gaussians that were this opaque since the last structure step."""
+    tau_split: float = 0.8
+    """Fraction of observations that must violate (η > 1) before an axis is split."""
+    split_exponent: float = 0.5
+    """p of the split factor n = ⌈η^p⌉."""
+    split_extent: float = VARIANCE_EXTENT
+    """Half-width of the child grid in parent standard deviations; √3 keeps the parent's covariance."""
+    child_scale: float = 1.5
+    """k in [1, 2): children are k times the paper's s/n long on the axes that are split, which closes their gaps.
+    They stand closer and are 1/k as opaque an axis, which keeps the covariance and the mass; 1 is the paper's."""
+    tau_prune: float = 0.8
+    """Fraction of observations that must be low (η < 0.1) on every axis before a faint Gaussian is pruned."""
+    prune_opacity: float = 0.1
+    """Opacity under which a Gaussian with consistently low η is pruned."""
+    clone_grad2d: float = 3e-4
+    """AbsGS: normalised mean screen gradient at which a small Gaussian is cloned; AbsGS's own is 2e-4."""
+    split_absgrad2d: float = 6e-4
+    """AbsGS: normalised mean absolute screen gradient at which a large Gaussian is split; AbsGS's own is 4e-4."""
+    absgs_long_axis: bool = True
+    """AbsGS halves a large Gaussian's longest axis in its place, instead of drawing the places of two at random."""
+    small_scale: float = 0.001
+    """AbsGS: largest scale, relative to the scene's extent, at which a Gaussian counts as small."""
+    min_opacity: float = 0.02
+    """Opacity under which every densification step prunes; AbsGS's own is 0.005."""
+    clamp_opacity: float = 0.8
+    """Structure steps lower opacities to at most this, so that what lies behind gets gradients again; 1 is off."""
+    reset_every: int = 1200
+    """Iterations between opacity resets inside the densification window; 0 turns them off."""
+    reset_factor: float = 0.1
+    """An opacity reset multiplies every opacity by this."""
+    final_prune_opacity: float = 0.1
+    """Opacity under which Gaussians are pruned when densification ends."""
+    fused: bool = True
+    """Measure η, and add up AbsGS's gradients, in one Triton kernel each where these run (CUDA)."""
+    verbose: bool = False
+    """Print a line at each densification step."""
+
+    @property
+    def child_grid(self) -> tuple[float, float]:
+        """The last arguments of `grid_split`."""
+        return self.split_extent, self.child_scale
+
+    def check(self) -> None:
+        """See whether densification can work with these options.
+
+        Raises:
+            ValueError: If `max_gaussians`, `eta_every`, `split_exponent` or `memory_budget_gb` is not positive, a
+                fraction or an opacity not in [0, 1], or `child_scale` not in [1, 2).
+        """
+        if self.max_gaussians < 1:
+            raise ValueError(f"strategy.max_gaussians must be at least 1, got {self.max_gaussians}.")
+        if self.eta_every < 1:
+            raise ValueError(f"strategy.eta_every must be at least 1, got {self.eta_every}.")
+        if not self.split_exponent > 0:
+            raise ValueError(f"strategy.split_exponent must be positive, got {self.split_exponent:g}.")
+        if not 1 <= self.child_scale < 2:
+            raise ValueError(f"strategy.child_scale must be at least 1 and less than 2, got {self.child_scale:g}.")
+        for name in _SHARES:
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"strategy.{name} must be in [0, 1], got {getattr(self, name):g}.")
+        if self.memory_budget_gb is not None and not self.memory_budget_gb > 0:
+            raise ValueError(f"strategy.memory_budget_gb must be positive, got {self.memory_budget_gb:g}.")
+
+    def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
+        """State to pass to the other methods; its tensors are made at the first step.
+
+        Each structure step appends its numbers of Gaussians to the list `structure_steps`.
+
+        Args:
+            scene_scale: Extent of the cameras in world units, as 3DGS defines it.
+
+        Raises:
+            ValueError: As `check`.
+        """
+        self.check()
+        return {"scene_scale": scene_scale}
+
+    def fit_to_run(self, num_iterations: int) -> None:
+        """Let densification end early enough in a short run: after at most 19/30 of it, as in the released code.
+
+        Where it would end before `refine_start_iter`, there is none, and nothing that prepares it.
+        """
+        self.refine_stop_iter = min(self.refine_stop_iter, num_iterations * 19 // 30)
+        if self.refine_stop_iter < self.refine_start_iter:
+            self.refine_stop_iter = 0
+
+    def fit_to_memory(self, params: Params, other_bytes: float) -> str | None:
+        """Lower `max_gaussians` to what the budget, or the device's free memory, holds; call before the first step.
+
+        The estimate errs on the safe side (`memory.WORKING_BYTES`). A cap under the present number of Gaussians adds
+        none and takes none away.
+
+        Args:
+            params: The initial Gaussians, on the device of training.
+            other_bytes: What images and rendering will take besides the Gaussians.
+
+        Returns:
+            A line for the user, None without CUDA, where nothing is changed.
+
+        Raises:
+            ValueError: If `memory_budget_gb` leaves no room for Gaussians.
+        """
+        device = params["means"].device
+        free, total = available_bytes(device)
+        if math.isinf(free):
+            return None
+        each = gaussian_bytes(params, self._empty_state(0, device))
+        why = ""
+        if self.memory_budget_gb is not None or self.max_gaussians == StructureAwareStrategy.max_gaussians:
+            given = self.memory_budget_gb
+            budget = PLANNED_SHARE * free if given is None else min(1e9 * given, free)
+            affordable = math.floor((budget - other_bytes) / each)
+            if given is not None and affordable < 1:
+                raise ValueError(
+                    f"strategy.memory_budget_gb is {given:g} and leaves no room for Gaussians: images and rendering "
+                    f"take {other_bytes / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; raise it, take fewer or "
+                    "smaller images, or lower pipeline.views-per-iteration."
+                )
+            if affordable < self.max_gaussians:
+                self.max_gaussians = max(affordable, 1)
+                why = f"; {free / 1e9:.1f} GB are free" if given is None else f"; memory_budget_gb is {given:g}"
+                if self.max_gaussians < (n := len(params["means"])):
+                    why += f", which holds no more than the {n:,} at the start: none will be added"
+        need = (other_bytes + each * max(self.max_gaussians, len(params["means"]))) / 1e9
+        return f"At most {self.max_gaussians:,} Gaussians: {need:.1f} GB of the card's {total / 1e9:.1f} GB{why}."
+
+    def check_sanity(self, params: Params, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
+        """Check names and optimizers.
+
+        Raises:
+            AssertionError: As gsplat's `Strategy.check_sanity`.
+            ValueError: If a parameter that the method needs is missing.
+        """
+        super().check_sanity(params, optimizers)  # type: ignore[arg-type]
+        missing = {"means", "scales", "quats", "opacities"} - set(params)
+        if missing:
+            raise ValueError(f"params lack {sorted(missing)}: StructureAwareStrategy needs them by these names")
+
+    def observes(self, step: int) -> bool:
+        """Whether `step_pre_backward` will measure η at this step, and so needs structure tensors."""
+        # Beyond the last structure step nobody would read it.
+        return step % self.eta_every == 0 and _next_due(step + 1, self.structure_every) <= self.refine_stop_iter
+
+    def needs_absgrad(self, step: int) -> bool:
+        """Whether the rasterizer must provide absolute screen gradients: an AbsGS step will read this step's.
+
+        Those just before a structure step are not read: it forgets them.
+        """
+        first = max(step + 1, self.refine_start_iter)
+        read = _next_due(first, self.absgs_every)
+        return read <= self.refine_stop_iter and read < _next_due(first, self.structure_every)
+
+    def step_pre_backward(
+        self,
+        params: Params,
+        optimizers: Mapping[str, torch.optim.Optimizer],
+        state: MutableMapping[str, Any],
+        step: int,
+        info: Info | Sequence[Info],
+    ) -> None:
+        """Keep the screen gradients and observe η, before `loss.backward()`."""
+        if step >= self.refine_stop_iter:
+            return
+        self._ensure_statistics(params, state)
+        for view in _views(info):
+            if self.needs_absgrad(step):
+                view["means2d"].retain_grad()
+            if self.observes(step):
+                observe(
+                    state,
+                    params,
+                    view,
+                    directional=self.directional_eta,
+                    min_opacity=self.eta_min_opacity,
+                    fused=self.fused,
+                )
+
+    def step_post_backward(
+        self,
+        params: Params,
+        optimizers: MutableMapping[str, torch.optim.Optimizer],
+        state: MutableMapping[str, Any],
+        step: int,
+        info: Info | Sequence[Info],
+        packed: bool = False,
+    ) -> None:
+        """Accumulate the screen gradients and densify when the schedule says so, after `loss.backward()`.
+
+        Raises:
+            ValueError: If `packed`; η and AbsGS read the unpacked meta.
+        """
+        if packed:
+            raise ValueError("StructureAwareStrategy reads gsplat's unpacked meta: call rasterization(packed=False)")
+        iteration = step + 1
+        if iteration > self.refine_stop_iter:
+            return
+        views = _views(info)
+        if self.needs_absgrad(step):
+            num_views = sum(view["n_cameras"] for view in views)
+            for view in views:
+                accumulate_gradients(state, view, num_views, fused=self.fused)
+        if iteration >= self.refine_start_iter:
+            if _due(iteration, self.structure_every):
+                self._structure_step(params, optimizers, state, iteration, views)
+            elif _due(iteration, self.absgs_every):
+                self._absgs_step(params, optimizers, state, iteration, views)
+            if iteration == self.refine_stop_iter:
+                if not _due(iteration, self.structure_every):  # whose step has done so
+                    self._prune(params, optimizers, state, self._opacities(params) < self.final_prune_opacity)
+                for key in self._empty_state(0, torch.device("cpu")):
+                    state.pop(key, None)  # nobody reads them any more: neither memory nor checkpoints should hold them
+            elif _due(iteration, self.reset_every) and iteration <= self.refine_stop_iter - self.reset_every // 4:
+                # A reset just before the final prune would leave nothing that had time to recover.
+                self._map_opacities(params, optimizers, lambda opacities: opacities * self.reset_factor)
+
+    def consistently_low(self, statistics: Mapping[str, Tensor]) -> Tensor:
+        """Gaussians that answered low on all three axes in more than τ_prune of their observations. bool [N]"""
+        return consistent(statistics["n_low"], statistics["n_total"], self.tau_prune).all(dim=1)
+
+    def split_plan(self, statistics: Mapping[str, Tensor], budget: float) -> tuple[Tensor, Tensor]:
+        """What a structure step makes of the statistics.
+
+        Args:
+            statistics: As made by `empty_statistics`.
+            budget: Gaussians that may be added.
+
+        Returns:
+            n per axis that η asks for, int64 [N, 3]; and the Gaussians whose children fit the budget, bool [N].
+        """
+        violates = consistent(statistics["n_high"], statistics["n_total"], self.tau_split)
+        counts = children_per_axis(statistics["eta_max"], violates, self.split_exponent)  # [N, 3]
+        worst = torch.where(violates, statistics["eta_max"], 0.0).amax(dim=1)  # [N]
+        return counts, limit_growth(num_children(counts) - 1, worst, budget)
+
+    def children_now(self, statistics: Mapping[str, Tensor]) -> Tensor:
+        """n per axis that a structure step would split by now, 1 where whole or over the cap. int64 [N, 3]"""
+        counts, fits = self.split_plan(statistics, self.max_gaussians - len(statistics["n_total"]))
+        return torch.where(fits[:, None], counts, 1)
+
+    def _structure_step(
+        self, params: Any, optimizers: Any, state: Any, iteration: int, views: Sequence[Info] = ()
+    ) -> None:
+        opacities = self._opacities(params)
+        is_low = self.consistently_low(state)
+        n_before, n_low = len(is_low), int(is_low.sum())
+        # The final prune, before children are made: those are fainter, and would go with what they replace.
+        faint = max(self.min_opacity, self.final_prune_opacity if iteration == self.refine_stop_iter else 0.0)
+        n_pruned = self._prune(
+            params, optimizers, state, (opacities < faint) | (is_low & (opacities < self.prune_opacity))
+        )
+        if self.clamp_opacity < 1:
+            self._map_opacities(params, optimizers, lambda alpha: alpha.clamp_max(self.clamp_opacity))
+        under_cap, in_memory = self._room(params, state, views)
+        counts, allowed = self.split_plan(state, min(under_cap, in_memory))
+        n_parents, n_wanted = int(allowed.sum()), int((counts > 1).any(dim=1).sum())
+        if in_memory < min(int((num_children(counts) - 1).sum()), under_cap):
+            _warn_of_memory(iteration, in_memory)
+        if n_parents > 0:
+            grid_split(params, optimizers, state, torch.where(allowed[:, None], counts, 1), *self.child_grid)
+        # What was learned about parents says nothing about their children.
+        self._clear_statistics(params, state)
+        state.setdefault("structure_steps", []).append(
+            {
+                "iteration": iteration,
+                "before": n_before,
+                "violating": n_wanted,
+                "low": n_low,
+                "split": n_parents,
+                "pruned": n_pruned,
+                "after": len(params["means"]),
+            }
+        )
+        if self.verbose:
+            print(
+                f"Iteration {iteration}: {n_parents} of {n_wanted} violating Gaussians split, {n_pruned} pruned. "
+                f"Now having {len(params['means'])}."
+            )
+
+    def _absgs_step(self, params: Any, optimizers: Any, state: Any, iteration: int, views: Sequence[Info] = ()) -> None:
+        under_cap, in_memory = self._room(params, state, views)
+        n_clone, n_split = grow(
+            params,
+            optimizers,
+            state,
+            clone_threshold=self.clone_grad2d,
+            split_threshold=self.split_absgrad2d,
+            size_threshold=self.small_scale * state["scene_scale"],
+            budget=min(under_cap, in_memory),
+            long_axis=self.absgs_long_axis,
+        )
+        if in_memory <= n_clone + n_split < under_cap:
+            _warn_of_memory(iteration, in_memory)
+        n_pruned = self._prune(params, optimizers, state, self._opacities(params) < self.min_opacity)
+        state.update(empty_gradients(len(params["means"]), params["means"].device))
+        if self.verbose:
+            print(
+                f"Iteration {iteration}: {n_clone} Gaussians cloned, {n_split} split in two, {n_pruned} pruned. "
+                f"Now having {len(params['means'])}."
+            )
+
+    def _room(self, params: Params, state: Mapping[str, Any], views: Sequence[Info]) -> tuple[int, float]:
+        """How many Gaussians may be added under the cap, and how many fit in the device's memory beside such views."""
+        pixels = sum(view["n_cameras"] * view["width"] * view["height"] for view in views)
+        free = free_bytes(params["means"].device) - STEP_BYTES * pixels
+        return self.max_gaussians - len(params["means"]), affordable_growth(params, state, free)
+
+    @staticmethod
+    def _opacities(params: Params) -> Tensor:
+        return torch.sigmoid(params["opacities"].detach().flatten())  # [N]
+
+    @staticmethod
+    def _prune(params: Any, optimizers: Any, state: Any, mask: Tensor) -> int:
+        """Remove Gaussians, unless none would be left to train."""
+        n_prune = int(mask.sum())
+        if n_prune == len(mask):
+            return 0
+        if n_prune > 0:
+            remove(params, optimizers, state, mask)
+        return n_prune
+
+    @staticmethod
+    def _map_opacities(params: Any, optimizers: Any, function: Any) -> None:
+        """Change the opacities (not their logits) and forget their optimizer moments, as gsplat's reset does."""
+
+        def param_fn(name: str, p: Tensor) -> Tensor:
+            changed = torch.logit(function(torch.sigmoid(p)).clamp(1e-6, 1 - 1e-6))
+            return torch.nn.Parameter(changed, requires_grad=p.requires_grad)
+
+        _update_param_with_optimizer(
+            param_fn, lambda key, v: torch.zeros_like(v), params, optimizers, names=["opacities"]
+        )
+
+    @staticmethod
+    def _ensure_statistics(params: Any, state: MutableMapping[str, Any]) -> None:
+        if "n_total" not in state:
+            StructureAwareStrategy._clear_statistics(params, state)
+
+    @staticmethod
+    def _clear_statistics(params: Any, state: MutableMapping[str, Any]) -> None:
+        state.update(StructureAwareStrategy._empty_state(len(params["means"]), params["means"].device))
+
+    @staticmethod
+    def _empty_state(n: int, device: torch.device) -> dict[str, Tensor]:
+        return empty_statistics(n, device) | empty_gradients(n, device)
+
+
+def _views(info: Info | Sequence[Info]) -> Sequence[Info]:
+    return [info] if isinstance(info, Mapping) else info
+
+
+def _warn_of_memory(iteration: int, in_memory: float) -> None:
+    warnings.warn(
+        f"Iteration {iteration}: the device's memory holds {in_memory} more Gaussians, so at most these are added. "
+        "Lower max_gaussians, use smaller images, or end other programs on the device.",
+        stacklevel=2,
+    )
+
+
+def _due(iteration: int, every: int) -> bool:
+    return every > 0 and iteration % every == 0
+
+
+def _next_due(iteration: int, every: int) -> float:
+    """The first iteration from this one on at which `_due`."""
+    return -(-iteration // every) * every if every > 0 else math.inf

@@ -1,0 +1,122 @@
+"""nerfstudio glue: a run's Triton kernels, compiled side by side before it starts instead of one by one on its way."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor, wait
+from typing import TYPE_CHECKING
+
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from sadgs_ns import kernels
+from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients
+from sadgs_ns.method.codes import encode
+from sadgs_ns.method.losses import photometric_loss
+from sadgs_ns.method.statistics import empty_statistics, observe
+from sadgs_ns.plugin.nonfinite import NonFiniteLog
+from sadgs_ns.plugin.optimizers import FusedAdam, step_together
+from sadgs_ns.render.rasterization import rasterize
+
+if TYPE_CHECKING:
+    from sadgs_ns.plugin.pipeline import SadgsPipeline
+
+_GAUSSIANS, _SIZE = 64, 64
+"""Of the picture on which the kernels are tried, px wide and high."""
+_PATIENCE = 2.0
+"""Seconds after which the user is told what takes so long."""
+
+
+def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
+    """Launch the kernels of training once, on a few Gaussians and in threads, whose compilations then overlap.
+
+    Triton keeps what it compiled on the disk: a machine's first run takes seconds here, a later one none. The run
+    itself is left as it was, random numbers included. What fails here fails again in training, which says why.
+
+    Args:
+        pipeline: Set up.
+        optimizers: The run's, by the names of their parameters.
+    """
+    model, device = pipeline.model, pipeline.device
+    config, strategy = model.config, model.strategy
+    if not (config.fused and kernels.available(device)):
+        return
+    views, n = pipeline.views_per_iteration, _GAUSSIANS
+    ramp = torch.linspace(-0.5, 0.5, n, device=device)
+    means = torch.stack([ramp, ramp.flip(0), torch.full_like(ramp, 2.0)], dim=-1)
+    quats = means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
+    scales, opacities = torch.full_like(means, 0.05), torch.full_like(ramp, 0.5)
+    viewmats = torch.eye(4, device=device).repeat(views, 1, 1)
+    half = _SIZE / 2
+    Ks = means.new_tensor([[_SIZE, 0.0, half], [0.0, _SIZE, half], [0.0, 0.0, 1.0]]).repeat(views, 1, 1)
+    image = torch.linspace(0.0, 1.0, 3 * _SIZE * _SIZE, device=device).view(1, _SIZE, _SIZE, 3)
+    camera = viewmats, Ks, _SIZE, _SIZE
+    cameras = pipeline.datamanager.train_dataset.cameras
+
+    def tile_lists() -> None:
+        # Of the run's size: whether tiles are numbered in 16 or in 32 bits depends on how many there are.
+        rasterize(
+            means, quats, scales, opacities, means, viewmats, Ks, int(cameras.width.max()), int(cameras.height.max())
+        )
+
+    def blank(name: str) -> Tensor:
+        return means.new_zeros((n, *model.gauss_params[name].shape[1:]))
+
+    def structure() -> None:
+        encode(pipeline.structure_tensors_of_images(image))
+
+    def loss() -> None:
+        predicted = image.repeat(views, 1, 1, 1).requires_grad_()
+        photometric_loss(predicted, torch.zeros_like(predicted))[0].backward()
+
+    def update() -> None:
+        log, twins = NonFiniteLog(device, capacity=1), []
+        for name, optimizer in optimizers.items():
+            if name in model.gauss_params and isinstance(optimizer, FusedAdam) and optimizer.triton:
+                parameter = torch.nn.Parameter(blank(name))
+                parameter.grad = torch.zeros_like(parameter)
+                twins.append(FusedAdam([parameter], **{key: optimizer.defaults[key] for key in ("betas", "eps")}))
+                twins[-1].log = log  # together, like the run's
+        step_together(twins)
+
+    def composite(absgrad: bool) -> None:
+        centres = means.clone().requires_grad_()
+        renders, alphas, info = rasterize(
+            centres, quats, scales, opacities, means, *camera, absgrad=absgrad, rasterize_mode=config.rasterize_mode
+        )  # fmt: skip
+        info["means2d"].retain_grad()
+        (renders.sum() if config.background_color == "black" else renders.sum() + alphas.sum()).backward()
+        if absgrad:
+            accumulate_gradients(empty_gradients(n, device), info, views, fused=strategy.fused)
+
+    def harmonics() -> None:
+        from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
+
+        if 0 < config.sh_degree <= MAX_DEGREE:
+            coefficients = blank("features_dc"), blank("features_rest")
+            centres = means.clone().requires_grad_()
+            colors_from_harmonics(config.sh_degree, centres, *coefficients, viewmats, info["radii"]).sum().backward()
+
+    def observation() -> None:
+        params = {"means": means, "quats": quats, "scales": scales.log(), "opacities": opacities[:, None].logit()}
+        observe(
+            empty_statistics(n, device),
+            params,  # type: ignore[arg-type]
+            info | {"structure_tensors": image.byte().repeat(views, 1, 1, 1), "viewmats": viewmats, "Ks": Ks},
+            directional=strategy.directional_eta,
+            min_opacity=strategy.eta_min_opacity,
+            generator=torch.Generator(device).manual_seed(0),
+            fused=strategy.fused,
+        )
+
+    with ThreadPoolExecutor() as pool:
+        pending = [pool.submit(stage) for stage in (loss, structure, update)]
+        try:  # the projection, which all the others read
+            _, _, info = rasterize(means, quats, scales, opacities, means, *camera)
+        except Exception:
+            return
+        pending += [pool.submit(stage) for stage in (harmonics, observation, tile_lists)]
+        pending += [pool.submit(composite, absgrad) for absgrad in (True, False)]
+        if wait(pending, timeout=_PATIENCE).not_done:
+            CONSOLE.print("Compiling kernels for this GPU, once …")

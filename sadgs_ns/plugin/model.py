@@ -1,0 +1,514 @@
+"""nerfstudio glue: a splatfacto model whose Gaussians follow the structure-aware strategy."""
+
+from __future__ import annotations
+
+import copy
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from functools import lru_cache
+from typing import Annotated, Any, Literal, get_type_hints
+
+import torch
+import tyro
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
+from nerfstudio.model_components.lib_bilagrid import BilateralGrid, total_variation_loss
+from nerfstudio.models.splatfacto import (
+    RGB2SH,
+    SplatfactoModel,
+    SplatfactoModelConfig,
+    num_sh_bases,
+    random_quat_tensor,
+)
+from nerfstudio.utils.colors import get_color
+from nerfstudio.utils.rich_utils import CONSOLE
+from pytorch_msssim import SSIM
+from rich.markup import escape
+from torch import Tensor
+
+from sadgs_ns.data.cameras import refuse_unsupported_cameras
+from sadgs_ns.errors import InputError
+from sadgs_ns.method.initialization import POINT_OPACITY, camera_extent, clear_of_cameras, starting_points
+from sadgs_ns.method.losses import photometric_loss
+from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world
+
+WITHOUT_EFFECT = {
+    "warmup_length": "strategy.refine_start_iter",
+    "refine_every": "strategy.absgs_every and strategy.structure_every",
+    "resolution_schedule": "nothing: sadgs trains at full resolution from the start",
+    "cull_alpha_thresh": "strategy.min_opacity",
+    "cull_scale_thresh": "nothing: sadgs does not prune by size",
+    "reset_alpha_every": "strategy.reset_every",
+    "densify_grad_thresh": "strategy.clone_grad2d and strategy.split_absgrad2d",
+    "use_absgrad": "strategy.absgs_every",
+    "densify_size_thresh": "strategy.small_scale",
+    "n_split_samples": "strategy.split_exponent",
+    "cull_screen_size": "nothing: sadgs does not prune by size",
+    "split_screen_size": "nothing: η compares sizes with the texture instead",
+    "stop_screen_size_at": "nothing: sadgs has no screen-size rule",
+    "stop_split_at": "strategy.refine_stop_iter",
+    "output_depth_during_training": "nothing: no loss of this method reads depth",
+}
+"""Fields inherited from splatfacto that this method does not read, and what replaces each here."""
+
+OF_RAYS = ("enable_collider", "collider_params", "loss_coefficients", "eval_num_rays_per_chunk", "prompt")
+"""Fields that nerfstudio gives every model, and that no model of Gaussians reads."""
+
+
+@dataclass
+class SadgsModelConfig(SplatfactoModelConfig):
+    """Splatfacto's model with structure-aware densification."""
+
+    _target: type = field(default_factory=lambda: SadgsModel)
+    strategy: StructureAwareStrategy = field(default_factory=StructureAwareStrategy)
+    """When and how Gaussians are split, cloned and pruned."""
+    densify: bool = True
+    """Whether Gaussians are added or removed at all; without it only the initial ones are optimized."""
+    background_color: Literal["random", "black", "white"] = "black"
+    """Colour behind the Gaussians."""
+    num_downscales: int = 0
+    """Training starts at full resolution; only 0 is accepted."""
+    sh_degree_interval: int = 1
+    """Iterations between spherical-harmonic degrees: all of them are on from the fourth iteration."""
+    ssim_lambda: float = 0.6
+    """Weight of SSIM against L1 in the loss. The paper's 0.2 resolves less detail for as many Gaussians."""
+    l2_lambda: float = 2.0
+    """Weight of the squared error that is added to the loss for faster convergence."""
+    opacity_reg: float = 0.01
+    """Weight of the mean opacity in the loss while densification runs: what no image needs fades until it is pruned.
+    Larger leaves fewer Gaussians; 0 is off, as in the paper."""
+    fused: bool = True
+    """Train with Triton kernels where they run (CUDA): tile lists, compositing, harmonics, loss, S̄, η, AbsGS and Adam.
+    Without, torch and gsplat compute the same, more slowly."""
+    bounding_box_points: bool = True
+    """Also start from points on the faces of the SfM points' bounding box."""
+    initial_opacity: float = POINT_OPACITY
+    """Opacity at which SfM points start, in (0, 1); random ones start at 0.1.
+    Half opaque ones gave a better LPIPS indoors, and a worse one outdoors (docs/measurements.md)."""
+    camera_clearance: float = 2.0
+    """Initial Gaussians nearer to a camera than this many of their standard deviations are dropped; 0 keeps all."""
+
+    def check(self) -> None:
+        """See whether training can work with these options.
+
+        Raises:
+            InputError: If one is out of its range, or was set and has no effect on this method.
+        """
+        _refuse_fields_without_effect(self)
+        if not 0 <= self.ssim_lambda <= 1:
+            raise InputError(f"pipeline.model.ssim_lambda must be in [0, 1], got {self.ssim_lambda:g}.")
+        if not 0 < self.initial_opacity < 1:
+            raise InputError(f"pipeline.model.initial_opacity must be in (0, 1), got {self.initial_opacity:g}.")
+        for name in ("l2_lambda", "opacity_reg", "camera_clearance"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"pipeline.model.{name} must not be negative, got {getattr(self, name):g}.")
+        try:
+            self.strategy.check()
+        except ValueError as error:
+            raise InputError(f"pipeline.model.{error}") from error
+
+
+# tyro reads these for `ns-train sadgs --help`, which would repeat splatfacto's texts.
+for _name, _hint in get_type_hints(SplatfactoModelConfig).items():
+    if _name in WITHOUT_EFFECT:
+        _text = f"Splatfacto's, refused here: use {WITHOUT_EFFECT[_name]}.".replace("use nothing: ", "")
+        SadgsModelConfig.__annotations__[_name] = Annotated[_hint, tyro.conf.arg(help=_text)]
+    elif _name in OF_RAYS:
+        SadgsModelConfig.__annotations__[_name] = tyro.conf.Suppress[_hint]
+
+
+class SadgsModel(SplatfactoModel):
+    """Gaussians, their renderings and losses; what splatfacto's viewer, evaluation and export expect of a model.
+
+    Args:
+        config: The model's configuration.
+        seed_points: SfM points [P, 3] and their colours in 0 … 255 [P, 3], or None for random points.
+    """
+
+    config: SadgsModelConfig
+    strategy: StructureAwareStrategy
+
+    def populate_modules(self) -> None:
+        """Make parameters, metrics and the strategy.
+
+        Overrides splatfacto's, which needs CUDA and LPIPS weights. LPIPS is loaded when it is first asked for.
+
+        Raises:
+            InputError: As `SadgsModelConfig.check`.
+        """
+        config = self.config
+        config.check()
+        self.strategy = copy.deepcopy(config.strategy)
+        self.strategy.fused &= config.fused
+        self.strategy_state = self.strategy.initialize_state()
+        self.gauss_params = torch.nn.ParameterDict(
+            {name: torch.nn.Parameter(value) for name, value in self._initial_gaussians().items()}
+        )
+        self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
+        self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
+        self._lpips: list[torch.nn.Module | None] = []  # a list, so that its weights stay out of the checkpoint
+        self.step = 0
+        self.infos: list[dict[str, Any]] = []
+        self.crop_box: OrientedBox | None = None
+        self.viewer_outputs: Callable[[Cameras, dict[str, Tensor]], dict[str, Tensor]] | None = None
+        # "random" concerns training; viewers show it as viser's own background.
+        self.background_color = (
+            torch.tensor([0.1490, 0.1647, 0.2157])
+            if config.background_color == "random"
+            else get_color(config.background_color)
+        )
+        self.photo_background = self.background_color  # for the run; the viewer exchanges the other while it draws
+        if config.use_bilateral_grid:
+            x, y, w = config.grid_shape
+            self.bil_grids = BilateralGrid(num=self.num_train_data, grid_X=x, grid_Y=y, grid_W=w)
+
+    def _initial_gaussians(self) -> dict[str, Tensor]:
+        """Initial parameters, each with leading dimension N: log scales, logit opacities [N, 1], SH coefficients."""
+        config = self.config
+        if self.seed_points is None or config.random_init:
+            if not config.random_init:
+                CONSOLE.print(
+                    f"[yellow]The data has no SfM points: starting from {config.num_random} random ones in a cube of "
+                    f"side {config.random_scale}. A sparse reconstruction (ns-process-data) gives a better splat.[/]"
+                )
+            points = (torch.rand((config.num_random, 3)) - 0.5) * config.random_scale  # [P, 3]
+            means, colors, scales, opacities = starting_points(points, torch.rand((len(points), 3)), faces=False)
+        else:
+            points, colors = self.seed_points[0].float(), self.seed_points[1].float() / 255.0
+            means, colors, scales, opacities = starting_points(
+                points, colors, faces=config.bounding_box_points, opacity=config.initial_opacity
+            )
+        cap = self.strategy.max_gaussians
+        if len(means) > cap:
+            CONSOLE.print(f"[yellow]Keeping a random {cap} of {len(means)} initial points: max_gaussians is {cap}.[/]")
+            keep = torch.randperm(len(means))[:cap]
+            means, colors, scales, opacities = means[keep], colors[keep], scales[keep], opacities[keep]
+        sh_degree = config.sh_degree
+        return {
+            "means": means,
+            "scales": scales.log()[:, None].repeat(1, 3),
+            "quats": random_quat_tensor(len(means)),
+            "features_dc": RGB2SH(colors) if sh_degree > 0 else torch.logit(colors, eps=1e-4),
+            "features_rest": torch.zeros((len(means), num_sh_bases(sh_degree) - 1, 3)),
+            "opacities": torch.logit(opacities)[:, None],
+        }
+
+    def set_cameras(self, positions: Tensor) -> None:
+        """Fit the initial Gaussians and the strategy to the training cameras; call before optimizers are made.
+
+        Initial Gaussians that contain a camera are dropped: they could only become haze in front of it.
+
+        Args:
+            positions: Camera centres in world units. [C, 3]
+        """
+        self.strategy_state["scene_scale"] = camera_extent(positions)
+        if self.config.camera_clearance == 0:
+            return
+        radii = self.config.camera_clearance * self.scales.detach().exp().amax(dim=1)  # [N]
+        keep = clear_of_cameras(self.means.detach(), radii, positions.to(self.means))  # [N]
+        if keep.any():
+            for parameter in self.gauss_params.values():
+                parameter.data = parameter.data[keep]
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Splatfacto's two callbacks, after fitting the schedule to the length of the run."""
+        if training_callback_attributes.trainer is not None:
+            iterations = training_callback_attributes.trainer.config.max_num_iterations
+            self.strategy.fit_to_run(iterations)
+            if self.config.densify and self.strategy.refine_stop_iter < self.strategy.structure_every:
+                CONSOLE.print(
+                    f"[yellow]{iterations} iterations are too few for a structure-aware split: densification ends at "
+                    f"{self.strategy.refine_stop_iter}, the first split would come at {self.strategy.structure_every}. "
+                    "Train longer or lower pipeline.model.strategy.structure-every.[/]"
+                )
+        return super().get_training_callbacks(training_callback_attributes)
+
+    def step_post_backward(self, step: int) -> None:
+        """Hand the step's forward passes to the strategy."""
+        if self.config.densify and self.infos:
+            self.strategy.step_post_backward(
+                self.gauss_params, self.optimizers, self.strategy_state, self.step, self.infos
+            )
+        self.infos = []
+
+    def wants_structure_tensors(self, step: int) -> bool:
+        """Whether η will be observed at this step."""
+        return self.config.densify and self.strategy.observes(step)
+
+    def cropped(self, values: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+        """Rows of tensors [N, …] of the Gaussians inside the crop box, which the viewer may set; all in training."""
+        if self.crop_box is None or self.training:
+            return values
+        inside = self.crop_box.within(self.means)
+        return {name: value[inside] for name, value in values.items()}
+
+    def render(
+        self,
+        viewmats: Tensor,
+        Ks: Tensor,
+        width: int,
+        height: int,
+        render_mode: Literal["RGB", "RGB+ED"],
+        absgrad: bool = False,
+    ) -> tuple[Tensor, Tensor, dict[str, Any]]:
+        """Rasterize the Gaussians inside the crop box, if there is one. viewmats [C, 4, 4], Ks [C, 3, 3]"""
+        params = self.cropped(dict(self.gauss_params.items()))
+        if self.config.sh_degree > 0:
+            colors: Tensor | tuple[Tensor, Tensor] = (params["features_dc"], params["features_rest"])
+            sh_degree = min(self.step // self.config.sh_degree_interval, self.config.sh_degree)
+        else:
+            colors, sh_degree = torch.sigmoid(params["features_dc"]), None  # [N, 3]
+        return rasterize(
+            params["means"],
+            params["quats"],
+            torch.exp(params["scales"]),
+            torch.sigmoid(params["opacities"]).squeeze(-1),
+            colors,
+            viewmats,
+            Ks,
+            width,
+            height,
+            sh_degree=sh_degree,
+            render_mode=render_mode,
+            absgrad=absgrad,
+            rasterize_mode=self.config.rasterize_mode,
+            fused=self.config.fused,
+        )
+
+    def get_training_outputs(
+        self,
+        viewmats: Tensor,
+        Ks: Tensor,
+        width: int,
+        height: int,
+        cam_indices: list[int],
+        structure_tensors: Tensor | None,
+    ) -> dict[str, Tensor]:
+        """Render training views of one size and let the strategy see the forward pass.
+
+        Args:
+            viewmats: [C, 4, 4]
+            Ks: px. [C, 3, 3]
+            width: px.
+            height: px.
+            cam_indices: The views' indices among the training cameras, C of them.
+            structure_tensors: S̄ of the views, or codes of it, [C, H, W, 3]; None where η is not observed.
+
+        Returns:
+            `rgb` [C, H, W, 3], not clamped, and `background` [3].
+        """
+        absgrad = self.config.densify and self.strategy.needs_absgrad(self.step)
+        render, alpha, info = self.render(viewmats, Ks, width, height, "RGB", absgrad)
+        if self.config.densify:
+            info |= {"viewmats": viewmats.detach(), "Ks": Ks, "structure_tensors": structure_tensors}
+            self.strategy.step_pre_backward(self.gauss_params, self.optimizers, self.strategy_state, self.step, info)
+            self.infos.append(info)
+        background = self._get_background_color()
+        rgb = render[..., :3] if self.config.background_color == "black" else render[..., :3] + (1 - alpha) * background
+        if self.config.use_bilateral_grid:
+            rgb = torch.stack(
+                [
+                    self._apply_bilateral_grid(view[None], i, height, width)[0]
+                    for view, i in zip(rgb, cam_indices, strict=True)
+                ]
+            )
+        return {"rgb": rgb, "background": background}
+
+    def get_outputs(self, camera: Cameras) -> dict[str, Any]:
+        """Render one camera for the viewer, evaluation and rendering.
+
+        Args:
+            camera: One camera, shape [1].
+
+        Returns:
+            `rgb` [H, W, 3] in [0, 1], `depth` [H, W, 1], `accumulation` [H, W, 1], `background` [H, W, 3].
+
+        Raises:
+            ValueError: If the camera is no pinhole.
+        """
+        refuse_unsupported_cameras(camera)
+        width, height = int(camera.width.item()), int(camera.height.item())
+        background = self._get_background_color()
+        if self.crop_box is not None and not self.crop_box.within(self.means).any():
+            return self.get_empty_outputs(width, height, background)
+        viewmats = viewmats_from_camera_to_world(camera.camera_to_worlds)
+        Ks = camera.get_intrinsics_matrices().to(self.device)
+        render, alpha, _ = self.render(viewmats, Ks, width, height, "RGB+ED")
+        depth = render[..., 3:4]
+        return {
+            "rgb": (render[..., :3] + (1 - alpha) * background).clamp(0.0, 1.0)[0],
+            "depth": torch.where(alpha > 0, depth, depth.detach().max())[0],
+            "accumulation": alpha[0],
+            "background": background.expand(height, width, 3),
+        }
+
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+        """What `get_outputs` returns inside a crop box, and what the viewer's panel adds.
+
+        Raises:
+            InputError: If the camera is no pinhole; the viewer, whose thread would end, is shown nothing instead.
+        """
+        try:
+            outputs: dict[str, Any] = super().get_outputs_for_camera(camera, obb_box)
+        except InputError as error:
+            if not in_viewer():
+                raise
+            _say_once(str(error))
+            width, height = int(camera.width.item()), int(camera.height.item())
+            outputs = self.get_empty_outputs(width, height, self._get_background_color())
+        return outputs if self.viewer_outputs is None else outputs | self.viewer_outputs(camera, outputs)
+
+    def get_gt_img(self, image: Tensor) -> Tensor:
+        """An image as the loss compares it: on the model's device and in [0, 1], from uint8 in one launch, not two."""
+        image = image.to(self.device)
+        return image / 255.0 if image.dtype == torch.uint8 else image
+
+    def _get_background_color(self) -> Tensor:
+        """Splatfacto's, but black and white are not made anew in each step. [3]"""
+        grey = {"black": 0.0, "white": 1.0}.get(self.config.background_color)
+        return super()._get_background_color() if grey is None else _constant_color(grey, self.device)
+
+    def composite_with_background(self, image: Tensor, background: Tensor) -> Tensor:
+        """Put images with an alpha channel before the background.
+
+        Args:
+            image: In [0, 1]. [..., H, W, 3 or 4]
+            background: [3] or [H, W, 3]
+        """
+        if image.shape[-1] == 4:
+            alpha = image[..., 3:]
+            return alpha * image[..., :3] + (1 - alpha) * background
+        return image
+
+    def get_metrics_dict(self, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Any]:
+        """PSNR of the batch and the number of Gaussians; in training PSNR costs nothing beyond the loss."""
+        if "psnr" not in outputs:
+            return super().get_metrics_dict(outputs, batch)  # type: ignore[arg-type]
+        metrics: dict[str, Any] = {"psnr": outputs["psnr"], "gaussian_count": self.num_points}
+        self.camera_optimizer.get_metrics_dict(metrics)
+        return metrics
+
+    def get_loss_dict(
+        self, outputs: dict[str, Any], batch: Mapping[str, Any], metrics_dict: Mapping[str, Any] | None = None
+    ) -> dict[str, Tensor]:
+        """Photometric loss of views of one size, and splatfacto's regularizers where they are on.
+
+        Args:
+            outputs: `rgb` [C, H, W, 3] or [H, W, 3], and `background`. In training, PSNR is added as `psnr`.
+            batch: `image` of the same leading shape and, optionally, a boolean `mask` [..., H, W, 1].
+        """
+        target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        predicted = outputs["rgb"]
+        if "mask" in batch:
+            mask = batch["mask"].to(self.device)
+            target, predicted = target * mask, predicted * mask
+        height, width = target.shape[-3:-1]
+        loss, psnr = photometric_loss(
+            predicted.reshape(-1, height, width, 3),
+            target.reshape(-1, height, width, 3),
+            ssim_lambda=self.config.ssim_lambda,
+            l2_lambda=self.config.l2_lambda,
+            fused=self.config.fused,
+        )
+        losses = {"main_loss": loss}
+        if self.training:
+            outputs["psnr"] = psnr
+            if self.config.use_scale_regularization and self.step % 10 == 0:
+                scales = self.scales.exp()
+                ratio = scales.amax(dim=-1) / scales.amin(dim=-1)
+                losses["scale_reg"] = 0.1 * (ratio - self.config.max_gauss_ratio).clamp_min(0).mean()
+            if self.config.opacity_reg > 0 and self.config.densify and self.step < self.strategy.refine_stop_iter:
+                losses["opacity_reg"] = self.config.opacity_reg * torch.sigmoid(self.opacities).mean()
+            self.camera_optimizer.get_loss_dict(losses)
+            if self.config.use_bilateral_grid:
+                losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
+        return losses
+
+    def psnr(self, predicted: Tensor, target: Tensor) -> Tensor:
+        """PSNR in dB of images in [0, 1]."""
+        # A second of imports that training does not need.
+        from torchmetrics.functional.image import peak_signal_noise_ratio
+
+        return peak_signal_noise_ratio(predicted, target, data_range=1.0)
+
+    def lpips(self, predicted: Tensor, target: Tensor) -> Tensor:
+        """LPIPS (AlexNet) of images [1, 3, H, W] in [0, 1], NaN where its weights cannot be loaded.
+
+        The weights are loaded at the first call, so that neither training nor rendering needs them.
+        """
+        if not self._lpips:
+            self._lpips = [_load_lpips(self.device)]
+        metric = self._lpips[0]
+        return predicted.new_tensor(float("nan")) if metric is None else metric(predicted, target)
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """PSNR, SSIM and, where its weights are at hand, LPIPS of one held-out view."""
+        metrics, images = super().get_image_metrics_and_images(outputs, batch)
+        return {name: value for name, value in metrics.items() if "lpips" not in name or value == value}, images
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """What a checkpoint needs besides parameters: the step and the strategy's state."""
+        return {"step": self.step, "strategy_state": dict(self.strategy_state)}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_extra_state` saved."""
+        self.step = state["step"]
+        self.strategy_state = {
+            key: value.to(self.device) if isinstance(value, Tensor) else value
+            for key, value in state["strategy_state"].items()
+        }
+
+    def load_state_dict(self, dict: dict[str, Any], **kwargs: Any) -> Any:  # type: ignore[override]
+        """Load a checkpoint of any number of Gaussians.
+
+        The parameters are resized in place: the optimizers were built on these very tensors.
+        """
+        for name, parameter in self.gauss_params.items():
+            parameter.data = torch.empty_like(dict[f"gauss_params.{name}"], device=self.device)
+        return super(SplatfactoModel, self).load_state_dict(dict, **kwargs)
+
+
+def in_viewer() -> bool:
+    """Whether this is a thread in which nerfstudio's viewer draws."""
+    from nerfstudio.viewer.render_state_machine import RenderStateMachine
+
+    return isinstance(threading.current_thread(), RenderStateMachine)
+
+
+@lru_cache(maxsize=8)
+def _say_once(text: str) -> None:
+    CONSOLE.print(f"[yellow]{escape(text)}[/]")
+
+
+@lru_cache(maxsize=8)
+def _constant_color(grey: float, device: torch.device) -> Tensor:
+    return torch.full((3,), grey, device=device)
+
+
+def _refuse_fields_without_effect(config: SadgsModelConfig) -> None:
+    defaults = {f.name: f.default for f in fields(SplatfactoModelConfig)}
+    for name, replacement in WITHOUT_EFFECT.items():
+        if getattr(config, name) != defaults[name]:
+            raise InputError(f"pipeline.model.{name} has no effect on this method; use {replacement}.")
+    if config.num_downscales != 0:
+        raise InputError(
+            "pipeline.model.num_downscales must be 0: this method trains at full resolution from the start."
+        )
+
+
+def _load_lpips(device: torch.device) -> torch.nn.Module | None:
+    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+    try:
+        with torch.random.fork_rng(devices=[]):  # weights are drawn before they are loaded: training must not notice
+            return LearnedPerceptualImagePatchSimilarity(normalize=True).to(device)
+    except Exception as error:
+        CONSOLE.print(f"[yellow]LPIPS is not reported: its AlexNet weights could not be loaded ({error}).[/]")
+        return None

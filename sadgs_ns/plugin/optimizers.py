@@ -1,0 +1,171 @@
+"""nerfstudio glue: fused Adam and learning rates that decay over the run's own length."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
+from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
+from torch.cuda.amp.grad_scaler import GradScaler
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+
+from sadgs_ns import kernels
+from sadgs_ns.plugin.nonfinite import NonFiniteLog, leave_out_nonfinite
+
+_ONE = torch.tensor(1.0, device="cpu")
+"""Adding it to the count of steps costs the host a third of adding Python's 1."""
+
+
+class FusedAdam(torch.optim.Adam):
+    """torch's Adam, updated by our Triton kernel where that runs; state and results are torch's.
+
+    Gradients that are NaN, infinite or beyond `finite.MAX_GRADIENT` count as 0: parameters and moments stay finite.
+
+    Args:
+        params: Parameters, all on one device.
+        fused: Use the Triton kernel on CUDA, torch's fused implementation elsewhere.
+        **options: As torch's.
+    """
+
+    def __init__(self, params: Iterable[torch.Tensor], *, fused: bool = True, **options: Any) -> None:
+        parameters = list(params)
+        plain = not any(options.get(name) for name in ("weight_decay", "amsgrad", "maximize"))
+        self.triton = fused and plain and kernels.available(parameters[0].device)
+        """Whether the Triton kernel is used."""
+        # torch's own keeps the step count on the device, which would make the host wait for it.
+        super().__init__(parameters, fused=fused and not self.triton, **options)
+        self.log = NonFiniteLog(parameters[0].device, capacity=1)
+        """Where it is noted that a gradient was left out; the pipeline puts its own here."""
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
+        """Update the parameters that have a gradient."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        if not self.triton:
+            noted = self.log.gradients
+            for group in self.param_groups:
+                for parameter in group["params"]:
+                    if parameter.grad is not None:
+                        leave_out_nonfinite(parameter.grad, noted)
+            super().step()
+            return loss
+        step_together([self])
+        return loss
+
+
+def step_together(optimizers: Iterable[FusedAdam]) -> None:
+    """Step several optimizers; parameters of one length whose betas, eps and log agree are updated in one launch.
+
+    Results are, to the bit, those of one optimizer after the other.
+
+    Args:
+        optimizers: Such as use the Triton kernel.
+    """
+    from sadgs_ns.kernels.adam import adam_step
+
+    launches: dict[Any, list[tuple[Any, ...]]] = {}
+    for optimizer in optimizers:
+        for group in optimizer.param_groups:
+            for parameter in group["params"]:
+                gradient = parameter.grad
+                if gradient is None:
+                    continue
+                state = optimizer.state[parameter]
+                if not state:
+                    state["step"] = torch.tensor(0.0)
+                    state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+                state["step"] = step = state["step"].cpu() + _ONE
+                key = optimizer.log, group["betas"], group["eps"], parameter.shape[:1]
+                launches.setdefault(key, []).append(
+                    (parameter, gradient.contiguous(), state["exp_avg"], state["exp_avg_sq"], int(step), group["lr"])
+                )
+    for (log, betas, eps, _), updates in launches.items():
+        parameters, gradients, exp_avgs, exp_avg_sqs, steps, lrs = zip(*updates, strict=True)
+        adam_step(
+            parameters, gradients, exp_avgs, exp_avg_sqs, log.gradients, steps=steps, lrs=lrs, betas=betas, eps=eps
+        )
+
+
+class SadgsOptimizers(Optimizers):
+    """nerfstudio's, but all parameters that `FusedAdam` updates in Triton are updated in one launch.
+
+    At 300k Gaussians the GPU waits for the host, which spent a quarter of a step on six optimizers. Gradients that are
+    scaled or clipped (max_norm), and other optimizers, go nerfstudio's way. Hooks on the `step` of those that are
+    updated together are not called.
+    """
+
+    def zero_grad_some(self, param_groups: list[str]) -> None:
+        """Forget the gradients of the named parameters; torch's own way takes the host 60 times as long."""
+        for name in param_groups:
+            optimizer = self.optimizers[name]
+            # nerfstudio keeps those of the start, which densification replaces: their memory, and what it would clip.
+            self.parameters[name] = optimizer.param_groups[0]["params"]
+            if not isinstance(optimizer, FusedAdam):
+                optimizer.zero_grad()
+                continue
+            for group in optimizer.param_groups:
+                for parameter in group["params"]:
+                    parameter.grad = None
+
+    def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
+        """Update the named parameters."""
+        together: dict[str, FusedAdam] = {}
+        for name in param_groups:
+            optimizer = self.optimizers[name]
+            plain = self.config[name]["optimizer"].max_norm is None and not grad_scaler.is_enabled()
+            if plain and isinstance(optimizer, FusedAdam) and optimizer.triton:
+                together[name] = optimizer
+                optimizer._opt_called = True  # type: ignore[attr-defined] # as `step` notes for torch's schedulers
+        step_together(together.values())
+        super().optimizer_scaler_step_some(grad_scaler, [name for name in param_groups if name not in together])
+
+
+@dataclass
+class FusedAdamOptimizerConfig(AdamOptimizerConfig):
+    """Adam in one kernel."""
+
+    _target: type = FusedAdam
+    fused: bool = True
+    """Update in a single kernel: ours for all parameters on CUDA, torch's for each elsewhere."""
+
+
+@dataclass
+class RunLengthDecaySchedulerConfig(SchedulerConfig):
+    """Exponential decay over the length of the run, whatever `--max-num-iterations` is."""
+
+    _target: type = field(default_factory=lambda: RunLengthDecayScheduler)
+    initial_factor: float = 1.0
+    """Learning rate at the first iteration, relative to the optimizer's."""
+    final_factor: float = 1.0
+    """Learning rate at the last iteration, relative to the optimizer's."""
+    max_steps: int | None = None
+    """Iterations until `final_factor`; None is the length of the run."""
+
+
+class RunLengthDecayScheduler(Scheduler):
+    """lr(t) = lr · initial^(1−t) · final^t with t the fraction of the run that has passed."""
+
+    config: RunLengthDecaySchedulerConfig
+
+    def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LambdaLR:
+        """Make torch's scheduler.
+
+        Its state holds Python numbers only, so that checkpoints load with torch's safe loader.
+        """
+        max_steps = self.config.max_steps
+        if max_steps is None:
+            raise ValueError("max_steps is unset: SadgsTrainer sets it to the length of the run.")
+        initial, final = self.config.initial_factor, self.config.final_factor
+
+        def factor(step: int) -> float:
+            t = min(step / max(max_steps, 1), 1.0)
+            return float(initial ** (1 - t) * final**t)
+
+        return LambdaLR(optimizer, factor)

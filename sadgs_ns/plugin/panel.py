@@ -1,0 +1,322 @@
+"""nerfstudio glue: what the viewer shows of the method, and the settings that can be changed while it trains.
+
+The viewer finds the elements by walking the pipeline, and shows them in alphabetical order of their attributes.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+import weakref
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.utils.rich_utils import CONSOLE
+from nerfstudio.viewer.viewer_elements import (
+    ViewerButton,
+    ViewerControl,
+    ViewerDropdown,
+    ViewerElement,
+    ViewerNumber,
+    ViewerParameter,
+    ViewerSlider,
+)
+from rich.markup import escape
+from torch import Tensor
+
+from sadgs_ns.errors import reason
+from sadgs_ns.method.codes import decode
+from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.plugin import visualization
+from sadgs_ns.plugin.model import in_viewer
+from sadgs_ns.plugin.visualization import CHILDREN, ETA, LOW, PERIOD, Picture, to_picture
+from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
+
+if TYPE_CHECKING:
+    from viser import ViserServer
+
+    from sadgs_ns.plugin.pipeline import SadgsPipeline
+
+OUTPUT = "structure"
+"""Name of the panel's picture among the viewer's output types."""
+OFF, ETA_OF, CHILDREN_OF, LOW_OF = "off", "η", "children", "low"
+PERIOD_HERE, ELLIPSES_HERE = "wavelength of this rendering", "ellipses of this rendering"
+PERIOD_NEAR, ELLIPSES_NEAR = "wavelength of the nearest photo", "ellipses of the nearest photo"
+CHOICES = [OFF, ETA_OF, CHILDREN_OF, LOW_OF, PERIOD_HERE, ELLIPSES_HERE, PERIOD_NEAR, ELLIPSES_NEAR]
+OF_PHOTOS = (PERIOD_NEAR, ELLIPSES_NEAR)
+"""Choices that need the training photos."""
+OF_STATISTICS = (ETA_OF, CHILDREN_OF, LOW_OF)
+"""Choices that need observations of the training views."""
+RANGES = {"tau_split": (0.0, 1.0), "split_exponent": (0.1, 1.0), "max_gaussians": (1, 100_000_000)}
+"""Fields of the strategy that may be changed while it trains, and between which values."""
+ROWS = 8
+"""Structure steps in the table, the last ones."""
+
+
+def change(strategy: StructureAwareStrategy, name: str, value: float) -> None:
+    """Set one of `RANGES`' fields; the next densification acts on it.
+
+    Raises:
+        ValueError: If the value is no number in the field's range; the field is then as before.
+    """
+    low, high = RANGES[name]
+    if not (isinstance(value, int | float) and math.isfinite(value) and low <= value <= high):
+        raise ValueError(f"{name} must be in {low} … {high}, got {value}; it stays {getattr(strategy, name)}.")
+    setattr(strategy, name, int(value) if isinstance(low, int) else float(value))
+
+
+def describe(strategy: StructureAwareStrategy, num_points: int, state: dict[str, Any]) -> str:
+    """Number of Gaussians, and those of the last structure steps, as Markdown."""
+    lines = [f"**{num_points:,} Gaussians** (cap {strategy.max_gaussians:,})", ""]
+    steps = state.get("structure_steps", [])[-ROWS:]
+    if not steps:
+        return "\n".join([*lines, "No structure step yet."])
+    lines += ["| iteration | violate | low | Gaussians |", "| --- | --- | --- | --- |"]
+    lines += [
+        f"| {step['iteration']} | {step['violating']:,} | {step['low']:,} | {step['before']:,} → {step['after']:,} |"
+        for step in steps
+    ]
+    return "\n".join(lines)
+
+
+def nearest_view(cameras: Tensor, camera: Tensor, extent: float) -> int:
+    """The training view that looks most alike: near, and in the same direction.
+
+    Args:
+        cameras: Camera to world. [C, 3, 4]
+        camera: The same of the view. [3, 4]
+        extent: Of the cameras in world units, the distance that counts as much as 1 rad.
+    """
+    distance = (cameras[:, :, 3] - camera[:, 3]).norm(dim=-1) / max(extent, 1e-12)
+    angle = (cameras[:, :, 2] @ camera[:, 2]).clamp(-1, 1).acos()
+    return int((distance + angle).argmin())
+
+
+class ViewerMarkdown(ViewerElement[str]):
+    """A text in the viewer; unlike a parameter's, its changes call nobody.
+
+    Args:
+        name: Of the element.
+        text: Makes the text, when it is installed and at every `refresh`.
+    """
+
+    def __init__(self, name: str, text: Callable[[], str]) -> None:
+        super().__init__(name)
+        self.text = text
+        self._shown = ""
+
+    def _create_gui_handle(self, viser_server: ViserServer) -> None:
+        self._shown = self.text()
+        self.gui_handle: Any = viser_server.gui.add_markdown(self._shown)
+
+    def install(self, viser_server: ViserServer) -> None:
+        self._create_gui_handle(viser_server)
+
+    def refresh(self) -> None:
+        """Send the text if it is another than before and there is a viewer."""
+        if self.gui_handle is not None and (text := self.text()) != self._shown:
+            self._shown = self.gui_handle.content = text
+
+
+class StructurePanel(torch.nn.Module):
+    """Elements of the viewer, and the picture that they choose.
+
+    A module because the viewer looks for elements in modules only; it has neither parameters nor state.
+
+    Args:
+        pipeline: Whose model is shown and whose strategy is changed.
+    """
+
+    def __init__(self, pipeline: SadgsPipeline) -> None:
+        super().__init__()
+        self._reference = weakref.ref(pipeline)  # as a submodule the pipeline would contain itself
+        self._observed: dict[str, Tensor] = {}
+        self._refreshed = 0.0
+        self._shown = OFF
+        strategy = pipeline.model.strategy
+        self.choice = ViewerDropdown(
+            "Show",
+            OFF,
+            CHOICES,
+            cb_hook=lambda _: self._told(self.choose),
+            hint="What the output type “structure” shows",
+        )
+        self.observe = ViewerButton("Observe all training views", cb_hook=lambda _: self._told(self.observe_now))
+        self.set_max_gaussians = ViewerNumber(
+            "max_gaussians",
+            strategy.max_gaussians,
+            cb_hook=lambda element: self._change("max_gaussians", element),
+            hint="Hard cap, from the next densification on",
+        )
+        self.set_split_exponent = self._slider("split_exponent", "p of n = ⌈η^p⌉, at the next structure step")
+        self.set_tau_split = self._slider(
+            "tau_split", "Share of observations that must violate, at the next structure step"
+        )
+        self.table = ViewerMarkdown("counts", self._describe)
+        self.viewer = ViewerControl()
+
+    def _slider(self, name: str, hint: str) -> ViewerSlider[float]:
+        value, (low, high) = float(getattr(self._pipeline.model.strategy, name)), RANGES[name]
+        return ViewerSlider(
+            name,
+            value,
+            min(low, value),  # the run's own options may go beyond
+            max(high, value),
+            0.05,
+            cb_hook=lambda element: self._change(name, element),
+            hint=hint,
+        )
+
+    @property
+    def _pipeline(self) -> SadgsPipeline:
+        """The pipeline that the panel belongs to; private, lest the viewer walk from here into it again."""
+        pipeline = self._reference()
+        assert pipeline is not None
+        return pipeline
+
+    def _describe(self) -> str:
+        model = self._pipeline.model
+        return describe(model.strategy, model.num_points, model.strategy_state)
+
+    def _change(self, name: str, element: ViewerParameter) -> None:
+        strategy = self._pipeline.model.strategy
+        try:
+            if element.value != getattr(strategy, name):
+                change(strategy, name, element.value)
+        except ValueError as error:
+            CONSOLE.print(f"[yellow]{error}[/]")
+            element.value = getattr(strategy, name)
+        self.table.refresh()
+
+    @staticmethod
+    def _told(act: Callable[[], None]) -> None:
+        """Do it, and say on the console what went wrong: the viewer's threads keep their errors to themselves."""
+        try:
+            act()
+        except (RuntimeError, ValueError) as error:  # memory that is full, or data that went away
+            CONSOLE.print(f"[yellow]The viewer's panel stays as it was: {escape(reason(error))}[/]")
+
+    def refresh(self) -> None:
+        """Show the present numbers, at most once a second; without a viewer this costs nothing."""
+        now = time.monotonic()
+        if self.table.gui_handle is not None and now - self._refreshed > 1.0:
+            self._refreshed = now
+            self.table.refresh()
+
+    def statistics(self) -> dict[str, Tensor] | None:
+        """The run's own observations since its last structure step; if there are none, those of `observe_now`."""
+        model = self._pipeline.model
+        live, n = model.strategy_state, model.num_points
+        if "n_total" in live and len(live["n_total"]) == n and bool((live["n_total"] > 0).any()):
+            return live
+        return self._observed if len(self._observed.get("n_total", ())) == n else None
+
+    def observe_now(self) -> None:
+        """Observe all training views with the present Gaussians."""
+        self._observed = self._pipeline.observe_training_views()
+
+    def choose(self) -> None:
+        """After a choice: make what it needs, and have the viewer show it.
+
+        Here and not when it is drawn, since the viewer breaks off drawing at any line when its camera moves: photos
+        that are undistorted a second time would be wrong.
+        """
+        chosen = self.choice.value
+        if chosen in OF_STATISTICS and self.statistics() is None:
+            self.observe_now()
+        elif chosen in OF_PHOTOS:
+            _ = self._pipeline.structure_tensors
+        self._shown = chosen
+        viewer = getattr(self.viewer, "viewer", None)  # set when the viewer was made
+        if viewer is not None:
+            output = viewer.control_panel._output_render  # nerfstudio 1.1 has no public way
+            name = "rgb" if chosen == OFF else OUTPUT
+            if name in output.options:
+                output.value = name
+
+    def outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
+        """What the viewer may show besides; nothing where evaluation or `ns-render` ask.
+
+        The output is there whatever is chosen: the viewer's thread fails where one goes missing.
+
+        Args:
+            camera: One camera, shape [1].
+            rendered: The model's outputs, `rgb` [H, W, 3] in [0, 1] among them.
+
+        Returns:
+            `structure`, [H, W, 3] in [0, 1]; or nothing.
+        """
+        if not in_viewer():
+            return {}
+        if self._shown == OFF:
+            return {OUTPUT: rendered["rgb"]}
+        picture = self.picture(self._shown, camera, rendered["rgb"])
+        return {OUTPUT: torch.from_numpy(picture).to(rendered["rgb"]) / 255}
+
+    @torch.no_grad()
+    def picture(self, choice: str, camera: Cameras, rgb: Tensor) -> Picture:
+        """One of `CHOICES` in a camera, with its legend.
+
+        Args:
+            choice: Any but "off".
+            camera: One camera, shape [1].
+            rgb: What it sees, in [0, 1]. [H, W, 3]
+        """
+        pipeline, (height, width) = self._pipeline, rgb.shape[:2]
+        constant = pipeline.config.frequency_constant
+        if choice in OF_STATISTICS:
+            return self._of_gaussians(choice, camera, width, height)
+        if choice in (PERIOD_HERE, ELLIPSES_HERE):
+            photo, tensor, name = to_picture(rgb), pipeline.structure_tensors_of_images(rgb[None])[0], "this rendering"
+        else:
+            cameras = pipeline.datamanager.train_dataset.cameras.camera_to_worlds
+            extent = float(pipeline.model.strategy_state["scene_scale"])
+            index = nearest_view(cameras, camera.camera_to_worlds[0].to(cameras), extent)
+            photo = to_picture(pipeline.photo(pipeline.datamanager.cached_train[index]))
+            tensor = decode(pipeline.structure_tensors[index])
+            name = f"the nearest training view, {pipeline.datamanager.train_dataset.image_filenames[index].name}"
+        scale = min(height / photo.shape[0], width / photo.shape[1])
+        size = max(round(scale * photo.shape[0]), 1), max(round(scale * photo.shape[1]), 1)
+        if choice in (ELLIPSES_HERE, ELLIPSES_NEAR):
+            drawn, what = (
+                visualization.draw_ellipses(photo, tensor, constant, size),
+                "S̄⁻¹ as ellipses, coloured by period,",
+            )
+        else:
+            drawn = cv2.resize(PERIOD(visualization.texture_period(tensor, constant)), size[::-1])
+            what = "Period of the texture, px,"
+        top, left = (height - size[0]) // 2, (width - size[1]) // 2
+        whole = np.zeros((height, width, 3), np.uint8)
+        whole[top : top + size[0], left : left + size[1]] = drawn
+        return visualization.annotate(whole, f"{what} of {name}", PERIOD)
+
+    def _of_gaussians(self, choice: str, camera: Cameras, width: int, height: int) -> Picture:
+        model, statistics = self._pipeline.model, self.statistics()
+        if statistics is None:
+            text = "No observations yet: press “Observe all training views”, or wait for some iterations."
+            return visualization.annotate(np.zeros((height, width, 3), np.uint8), text)
+        strategy = model.strategy
+        kept = {name: statistics[name] for name in ("eta_max", "n_total")}
+        kept |= {"children": strategy.children_now(statistics), "low": strategy.consistently_low(statistics)}
+        rows = model.cropped({**model.gauss_params, **kept})
+        if len(rows["means"]) == 0:
+            return visualization.annotate(np.zeros((height, width, 3), np.uint8), "No Gaussians in the crop box.")
+        viewmat = viewmats_from_camera_to_world(camera.camera_to_worlds)[0].to(model.device)
+        view = viewmat, camera.get_intrinsics_matrices()[0].to(model.device), width, height
+        options = {"rasterize_mode": model.config.rasterize_mode}
+        seen = f"{int((statistics['n_total'] > 0).sum()):,} of {model.num_points:,} Gaussians observed"
+        if choice == ETA_OF:
+            drawn, scale = visualization.eta_map(rows, rows, *view, **options), ETA
+            text = f"largest η: over 1 violates, under 0.1 is low ({seen})"
+        elif choice == CHILDREN_OF:
+            drawn, scale = visualization.children_map(rows, rows["children"], *view, **options), CHILDREN
+            split = int((kept["children"] > 1).any(dim=1).sum())
+            text = f"children at a structure step now: {split:,} Gaussians would split ({seen})"
+        else:
+            drawn, scale = visualization.share_map(rows, rows["low"], *view, **options), LOW
+            text = f"share of consistently low Gaussians, {int(kept['low'].sum()):,} in all ({seen})"
+        return visualization.annotate(scale(drawn), text, scale)

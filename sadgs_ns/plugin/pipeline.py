@@ -1,0 +1,410 @@
+"""nerfstudio glue: several views per iteration, and the structure tensors of the training images."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from typing import Any
+
+import torch
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
+from torch import Tensor
+
+from sadgs_ns import kernels
+from sadgs_ns.data.cameras import refuse_failed_undistortion, refuse_unsupported_cameras
+from sadgs_ns.data.parser_validation import findings_of
+from sadgs_ns.errors import InputError
+from sadgs_ns.method.codes import HIGHEST_FREQUENCY, encode
+from sadgs_ns.method.memory import STEP_BYTES
+from sadgs_ns.method.statistics import empty_statistics, observe
+from sadgs_ns.method.structure_tensor import (
+    ENERGY_BLUR,
+    FREQUENCY_CONSTANT,
+    NOISE_FLOOR,
+    multiscale_structure_tensor,
+)
+from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
+from sadgs_ns.plugin.model import SadgsModel, SadgsModelConfig
+from sadgs_ns.plugin.nonfinite import NonFiniteLog
+from sadgs_ns.plugin.optimizers import FusedAdam
+from sadgs_ns.plugin.panel import StructurePanel
+from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
+
+_PIXELS_PER_BATCH = 4_000_000
+"""Structure tensors are computed for as many images at once as fit this; each pixel takes at most about 300 bytes."""
+_NAMED_STEPS = 5
+"""Iterations of which a report of what was not finite names the images."""
+
+
+@dataclass
+class SadgsPipelineConfig(VanillaPipelineConfig):
+    """Full images, several of them per iteration, and their structure tensors."""
+
+    _target: type = field(default_factory=lambda: SadgsPipeline)
+    datamanager: FullImageDatamanagerConfig = field(
+        default_factory=lambda: SadgsDatamanagerConfig(
+            dataparser=NerfstudioDataParserConfig(load_3D_points=True), cache_images_type="uint8"
+        )
+    )
+    """Loads the images; `cache_images` "gpu" means the training device, whatever it is."""
+    model: SadgsModelConfig = field(default_factory=SadgsModelConfig)
+    """The Gaussians and their densification."""
+    views_per_iteration: int = 1
+    """Training views rendered for one optimizer step, at most as many as there are; the loss is their mean.
+    The paper uses 1 outdoors, 2 indoors. A preset's learning rates and AbsGS thresholds fit its own number."""
+    frequency_constant: float = FREQUENCY_CONSTANT
+    """c of ω_l = c / σ_l in 1/px, at most 4: the larger, the shorter every wavelength and the more is split."""
+    noise_floor: float = NOISE_FLOOR
+    """Amplitude, relative to an image's contrast, under which its structure counts as noise."""
+    energy_blur: float = ENERGY_BLUR
+    """Window, in multiples of σ_l, over which the energy of a scale is averaged; 0 measures it per pixel (eq. 4)."""
+
+    def check(self) -> None:
+        """See whether training can work with these options.
+
+        Raises:
+            InputError: If views_per_iteration or frequency_constant is out of range; as `SadgsModelConfig.check`.
+        """
+        if self.views_per_iteration < 1:
+            raise InputError(f"pipeline.views_per_iteration must be at least 1, got {self.views_per_iteration}.")
+        if not 0 < self.frequency_constant <= HIGHEST_FREQUENCY:
+            raise InputError(
+                f"pipeline.frequency_constant must be in (0, {HIGHEST_FREQUENCY:g}], got {self.frequency_constant}."
+            )
+        self.model.check()
+
+
+class SadgsPipeline(VanillaPipeline):
+    """Draws views, renders those of one size together, and feeds the model their structure tensors.
+
+    Raises:
+        InputError: As `SadgsPipelineConfig.check`, or if the data cannot be trained on.
+    """
+
+    config: SadgsPipelineConfig
+    datamanager: FullImageDatamanager
+
+    def __init__(self, config: SadgsPipelineConfig, *args: Any, **kwargs: Any) -> None:
+        config.check()
+        # Rendering new views ("inference") opens no image.
+        for finding in findings_of(config.datamanager, open_images=kwargs.get("test_mode") != "inference"):
+            if finding.severity == "warning":
+                CONSOLE.print(f"[yellow]{escape(finding.sentence)}[/]")
+        super().__init__(config, *args, **kwargs)
+        for dataset in (self.datamanager.train_dataset, self.datamanager.eval_dataset):
+            refuse_unsupported_cameras(dataset.cameras)
+        if self.device.type == "cpu":
+            self.datamanager.config.cache_images = "gpu"  # means the training device; "cpu" would pin memory for CUDA
+        parsed_on = getattr(self.datamanager.dataparser.config, "alpha_color", None)
+        if parsed_on is not None and parsed_on != config.model.background_color:
+            CONSOLE.print(
+                f"[yellow]The images were put on {parsed_on}, the Gaussians lie on {config.model.background_color}: "
+                f"consider --pipeline.model.background-color {parsed_on}.[/]"
+            )
+        if config.model.fused and self.device.type == "cuda" and not kernels.available(self.device):
+            CONSOLE.print(
+                "[yellow]Triton does not run here: without its kernels training takes about twice as long.[/]"
+            )
+        positions = self.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]  # [C, 3]
+        self.model.set_cameras(positions)
+        self.log = NonFiniteLog(self.device)
+        self.structure = StructurePanel(self)
+        self.model.viewer_outputs = self.structure.outputs
+
+    def _image_bytes(self) -> float:
+        """Memory of the training device that images, structure tensors and a step's pictures will take, in bytes."""
+        config, train = self.datamanager.config, self.datamanager.train_dataset.cameras
+        pixels = train.height * train.width  # [C, 1]
+        needed = STEP_BYTES * self.views_per_iteration * float(pixels.max())
+        if config.cache_images == "gpu":
+            held_out = self.datamanager.eval_dataset.cameras
+            cached = float(pixels.sum() + (held_out.height * held_out.width).sum())
+            needed += 3 * (1 if config.cache_images_type == "uint8" else 4) * cached
+            needed += 3 * float(pixels.sum())  # codes of S̄
+        return needed
+
+    @property
+    def model(self) -> SadgsModel:
+        """The unwrapped model."""
+        return self._model  # type: ignore[return-value]
+
+    @property
+    def views_per_iteration(self) -> int:
+        """As configured, but no more than there are: a view that is rendered twice in a step would count twice."""
+        return min(self.config.views_per_iteration, len(self.datamanager.train_dataset))
+
+    @cached_property
+    def train_cameras(self) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+        """World-to-camera matrices [4, 4] and intrinsics in px [3, 3] of all training views, each a tensor of its own.
+
+        Made once: asking nerfstudio's cameras for them in each step makes the host wait for the device.
+
+        Raises:
+            InputError: If a training image holds NaN or infinite pixels, masked or not: the loss multiplies by masks;
+                or if undistorting it failed.
+        """
+        dataset = self.datamanager.train_dataset
+        for index, data in enumerate(self.datamanager.cached_train):  # undistorting the images changes the intrinsics
+            if data["image"].is_floating_point() and not data["image"].isfinite().all():
+                name = dataset.image_filenames[index]
+                raise InputError(f"{name} holds NaN or infinite pixels: replace them, or leave the image out.")
+        cameras = dataset.cameras
+        refuse_failed_undistortion(cameras, dataset.image_filenames)
+        viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
+        return viewmats.to(self.device).unbind(), cameras.get_intrinsics_matrices().to(self.device).unbind()
+
+    @cached_property
+    def structure_tensors(self) -> list[Tensor]:
+        """Codes (`codes.encode`) of S̄ of every training image, uint8 [H, W, 3], where the images are cached."""
+        by_size = defaultdict(list)
+        for index, data in enumerate(self.datamanager.cached_train):
+            by_size[data["image"].shape[:2]].append(index)
+        tensors: list[Tensor] = [torch.empty(0)] * len(self.datamanager.cached_train)
+        for (height, width), indices in by_size.items():
+            batch_size = max(_PIXELS_PER_BATCH // (height * width), 1)
+            for start in range(0, len(indices), batch_size):
+                batch = indices[start : start + batch_size]
+                data = [self.datamanager.cached_train[index] for index in batch]
+                for index, tensor in zip(batch, self.structure_tensors_of(data), strict=True):
+                    tensor = tensor.to(self.datamanager.cached_train[index]["image"].device)
+                    # As nerfstudio pins images that it leaves on the host: a step's copy then stops nobody.
+                    on_host = self.device.type == "cuda" and tensor.device.type == "cpu"
+                    tensors[index] = tensor.pin_memory() if on_host else tensor
+        return tensors
+
+    def photo(self, data: dict[str, Any]) -> Tensor:
+        """An image of the datamanager as the loss sees it: on the training device and on the background. [H, W, 3]"""
+        background = self.model.photo_background.to(self.device)
+        return self.model.composite_with_background(self.model.get_gt_img(data["image"]), background).to(self.device)
+
+    def structure_tensors_of(self, data: list[dict[str, Any]]) -> Tensor:
+        """Codes of S̄ of the datamanager's images of one size, on the training device. uint8 [B, H, W, 3]"""
+        images = torch.stack([self.photo(d) for d in data])
+        masks = None
+        if any("mask" in d for d in data):
+            masks = torch.stack(
+                [d["mask"][..., 0].to(self.device) if "mask" in d else torch.ones_like(image[..., 0], dtype=torch.bool)
+                 for d, image in zip(data, images, strict=True)]
+            )  # fmt: skip
+        return encode(self.structure_tensors_of_images(images, masks), self.config.model.fused)
+
+    def structure_tensors_of_images(self, images: Tensor, masks: Tensor | None = None) -> Tensor:
+        """S̄ with this run's settings. [B, H, W, 3] in [0, 1], bool [B, H, W] or None → [B, H, W, 3]"""
+        return multiscale_structure_tensor(
+            images,
+            masks,
+            frequency_constant=self.config.frequency_constant,
+            noise_floor=self.config.noise_floor,
+            energy_blur=self.config.energy_blur,
+            fused=self.config.model.fused,
+        )
+
+    def train_viewmat(self, index: int) -> Tensor:
+        """World to camera of a training view, with the camera optimizer's correction where it is on. [4, 4]"""
+        viewmats, _ = self.train_cameras
+        if self.model.camera_optimizer.config.mode == "off":
+            return viewmats[index]
+        camera = self.datamanager.train_cameras[index : index + 1].to(self.device)
+        camera.metadata = {"cam_idx": index}
+        return viewmats_from_camera_to_world(self.model.camera_optimizer.apply_to_camera(camera))[0]
+
+    def stacked_cameras(self, indices: list[int]) -> tuple[Tensor, Tensor]:
+        """World-to-camera matrices [V, 4, 4] and intrinsics in px [V, 3, 3] of V training views."""
+        viewmats, Ks = [self.train_viewmat(index) for index in indices], [self.train_cameras[1][i] for i in indices]
+        n = len(indices)
+        if n == 1:
+            return viewmats[0][None], Ks[0][None]
+        # One copy on the device instead of two; both results are contiguous, as gsplat wants them.
+        flat_viewmats, flat_Ks = torch.cat([matrix.flatten() for matrix in viewmats + Ks]).split([16 * n, 9 * n])
+        return flat_viewmats.view(n, 4, 4), flat_Ks.view(n, 3, 3).detach()
+
+    @torch.no_grad()
+    def observe_training_views(self, progress: Callable[[range], Iterable[int]] = iter) -> dict[str, Tensor]:
+        """η's statistics of the Gaussians as they are, in one look at each training view.
+
+        Draws from a generator of its own: a run that is watched goes on as if it were not.
+
+        Args:
+            progress: Wraps the numbers of the views, to show how far it is.
+
+        Returns:
+            As `statistics.empty_statistics`.
+        """
+        self.model.set_crop(None)  # the viewer's, which sets it anew whenever it renders
+        strategy, params = self.model.strategy, self.model.gauss_params
+        generator = torch.Generator(self.device).manual_seed(0)
+        statistics = empty_statistics(self.model.num_points, self.device)
+        for index in progress(range(len(self.structure_tensors))):
+            tensor, (viewmats, Ks) = self.structure_tensors[index].to(self.device)[None], self.stacked_cameras([index])
+            _, _, info = self.model.render(viewmats, Ks, tensor.shape[2], tensor.shape[1], "RGB")
+            observe(
+                statistics,
+                params,
+                info | {"viewmats": viewmats, "Ks": Ks, "structure_tensors": tensor},
+                directional=strategy.directional_eta,
+                min_opacity=strategy.eta_min_opacity,
+                generator=generator,
+                fused=strategy.fused,
+            )
+        return statistics
+
+    def _next_view(self) -> tuple[int, dict[str, Any]]:
+        """Index and data of the next training view, in nerfstudio's order, without slicing its cameras for it."""
+        datamanager = self.datamanager
+        index = datamanager.train_unseen_cameras.pop(0)
+        if not datamanager.train_unseen_cameras:
+            datamanager.train_unseen_cameras = datamanager.sample_train_cameras()
+        data = datamanager.cached_train[index]
+        return index, {**data, "image": data["image"].to(self.device, non_blocking=True)}
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Those of data and model, and at the end a last look at what was not finite.
+
+        Raises:
+            InputError: If `memory_budget_gb` leaves no room for Gaussians.
+        """
+        if self.config.model.densify:
+            try:
+                line = self.model.strategy.fit_to_memory(self.model.gauss_params, self._image_bytes())
+            except ValueError as error:
+                raise InputError(f"pipeline.model.{error}") from error
+            if line is not None:
+                CONSOLE.print(line, highlight=False, soft_wrap=True)
+            self.structure.set_max_gaussians.value = self.model.strategy.max_gaussians
+        optimizers = training_callback_attributes.optimizers
+        for optimizer in optimizers.optimizers.values() if optimizers is not None else ():
+            if isinstance(optimizer, FusedAdam):
+                optimizer.log = self.log
+        after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN]
+        counts = TrainingCallback(after, lambda step: self.structure.refresh())
+        last = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self._report_nonfinite())
+        return [*super().get_training_callbacks(training_callback_attributes), counts, last]
+
+    def _report_nonfinite(self) -> None:
+        """Say in which of the last iterations, and with which images, a loss or gradient was not finite."""
+        wrong = self.log.read()
+        files = self.datamanager.train_dataset.image_filenames
+        for step, views, what in wrong[:_NAMED_STEPS]:
+            names = escape(" and ".join(files[view].name for view in views))
+            CONSOLE.print(
+                f"[yellow]Iteration {step + 1}, {names}: {what}; such gradients counted as 0, training goes on.[/]"
+            )
+        if len(wrong) > _NAMED_STEPS:
+            CONSOLE.print(f"[yellow]The same in {len(wrong) - _NAMED_STEPS} more of the last iterations.[/]")
+
+    def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
+        """Render the iteration's views and return the outputs of the last size, mean losses and mean metrics."""
+        groups: dict[torch.Size, list[tuple[int, dict[str, Any]]]] = defaultdict(list)
+        for _ in range(self.views_per_iteration):
+            index, data = self._next_view()
+            groups[data["image"].shape].append((index, data))
+        losses: dict[str, Tensor] = {}
+        metrics: dict[str, Any] = {}
+        outputs: dict[str, Any] = {}
+        observes = self.model.wants_structure_tensors(step)
+        for (height, width, _), views in groups.items():
+            indices = [index for index, _ in views]
+            batch = {"image": _stack([data["image"] for _, data in views])}
+            if any("mask" in data for _, data in views):
+                everything = torch.ones((height, width, 1), dtype=torch.bool, device=self.device)
+                batch["mask"] = _stack(
+                    [data.get("mask", everything).to(self.device, non_blocking=True) for _, data in views]
+                )
+            tensors = None
+            if observes:
+                tensors = _stack(
+                    [self.structure_tensors[index].to(self.device, non_blocking=True) for index in indices]
+                )
+            viewmats, Ks = self.stacked_cameras(indices)
+            outputs = self.model.get_training_outputs(viewmats, Ks, width, height, indices, tensors)
+            group_losses = self.model.get_loss_dict(outputs, batch)
+            weight = len(views) / self.views_per_iteration
+            for total, part in ((losses, group_losses), (metrics, self.model.get_metrics_dict(outputs, batch))):
+                for name, value in part.items():
+                    # The mean over one size, the usual case, is no work for the device, here or in the backward pass.
+                    total[name] = value if len(groups) == 1 else total.get(name, 0) + weight * value
+        if self.log.full:
+            self._report_nonfinite()
+        self.log.begin_step(step, [index for views in groups.values() for index, _ in views], losses["main_loss"])
+        return outputs, losses, metrics
+
+    def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
+        """Load a checkpoint's parameters and states.
+
+        nerfstudio would pass over missing ones: another method's checkpoint would go on from a mixture.
+
+        Raises:
+            InputError: If the checkpoint is of another method, or of other settings of the model.
+        """
+        loaded = {key.removeprefix("module."): value for key, value in loaded_state.items()}
+        for name, parameter in self.model.gauss_params.items():
+            value = loaded.get(f"_model.gauss_params.{name}")
+            if value is None:
+                raise InputError(f"The checkpoint has no {name} of Gaussians, so another method made it.")
+            if value.shape[1:] != parameter.shape[1:]:
+                raise InputError(
+                    f"The checkpoint's {name} have the shape {list(value.shape[1:])}, the model's "
+                    f"{list(parameter.shape[1:])}: set pipeline.model.sh-degree as it was."
+                )
+        if not {"_extra_state", "_model._extra_state"} <= loaded.keys():
+            raise InputError("The checkpoint lacks the state of structure-aware densification, so splatfacto made it.")
+        super().load_pipeline(loaded_state, step)
+
+    def _settings(self) -> dict[str, Any]:
+        """What decides how training goes on from a checkpoint, by the names of the options."""
+        strategy = asdict(self.config.model.strategy)
+        settings = {f"model.strategy.{name}": strategy[name] for name in strategy if name not in ("fused", "verbose")}
+        return {"views_per_iteration": self.config.views_per_iteration, **settings}
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Random states and the order of the views, so that a resumed run goes on as if never stopped.
+
+        With nerfstudio's farthest-point sampling of views, the order after the present round is drawn anew.
+        """
+        state: dict[str, Any] = {
+            "torch": torch.get_rng_state(),
+            "view_order": list(self.datamanager.train_unseen_cameras),
+            "settings": self._settings(),
+        }
+        if hasattr(self.datamanager, "random_generator"):
+            state["view_shuffle"] = self.datamanager.random_generator.getstate()
+        if self.device.type == "cuda":
+            state["cuda"] = torch.cuda.get_rng_state(self.device)
+        return state
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_extra_state` saved; the view order only where the data still has that many views.
+
+        Says where densification goes on with other settings than the checkpoint's run had.
+        """
+        now, changed = self._settings(), []
+        for name, before in state.get("settings", {}).items():
+            if name in now and now[name] != before:
+                changed.append(f"pipeline.{name} was {before} and is {now[name]}")
+        if changed:
+            CONSOLE.print(
+                "[yellow]The checkpoint's run had other settings; this one goes on with its own: "
+                f"{escape(', '.join(changed))}.[/]",
+                soft_wrap=True,
+            )
+        torch.set_rng_state(state["torch"].cpu())
+        if max(state["view_order"], default=0) < len(self.datamanager.train_dataset):
+            self.datamanager.train_unseen_cameras = list(state["view_order"])
+            if "view_shuffle" in state and hasattr(self.datamanager, "random_generator"):
+                self.datamanager.random_generator.setstate(state["view_shuffle"])
+        if "cuda" in state and self.device.type == "cuda":
+            torch.cuda.set_rng_state(state["cuda"].cpu(), self.device)
+
+
+def _stack(tensors: list[Tensor]) -> Tensor:
+    """`torch.stack`, but a single tensor is not copied."""
+    return tensors[0][None] if len(tensors) == 1 else torch.stack(tensors)

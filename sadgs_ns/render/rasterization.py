@@ -1,0 +1,117 @@
+"""The one place where Gaussians are rasterised: gsplat on CUDA, the torch splatter elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from sadgs_ns import kernels
+from sadgs_ns.render import splatter
+
+
+def rasterize(
+    means: Tensor,  # [N, 3]
+    quats: Tensor,  # [N, 4]
+    scales: Tensor,  # [N, 3]
+    opacities: Tensor,  # [N]
+    colors: Tensor | tuple[Tensor, Tensor],  # [(C,) N, D], [(C,) N, K, 3] or [N, 3] and [N, K - 1, 3]
+    viewmats: Tensor,  # [C, 4, 4]
+    Ks: Tensor,  # [C, 3, 3]
+    width: int,
+    height: int,
+    *,
+    sh_degree: int | None = None,
+    render_mode: Literal["RGB", "RGB+ED"] = "RGB",
+    absgrad: bool = False,
+    rasterize_mode: Literal["classic", "antialiased"] = "classic",
+    fused: bool = True,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Render N Gaussians into C pinhole cameras on the device of `means`, unpacked.
+
+    Args:
+        means: Centres in world space. [N, 3]
+        quats: Rotations as wxyz quaternions; need not have unit length. [N, 4]
+        scales: Standard deviations along the Gaussians' axes, in world units, > 0. [N, 3]
+        opacities: In [0, 1]. [N]
+        colors: Features [(C,) N, D] or, with `sh_degree`, spherical harmonics coefficients: [(C,) N, K, 3], or the pair
+            of those of degree 0 [N, 3] and of the others [N, K − 1, 3].
+        viewmats: World-to-camera transforms, OpenCV axes (x right, y down, z forward). [C, 4, 4]
+        Ks: Intrinsics in pixels. [C, 3, 3]
+        width: Image width in pixels.
+        height: Image height in pixels.
+        sh_degree: Degree to evaluate, (sh_degree + 1)^2 <= K; None takes `colors` as they are.
+        render_mode: "RGB" renders colours, "RGB+ED" appends the expected depth.
+        absgrad: Whether `backward` sets `info["means2d"].absgrad`. [C, N, 2]
+        rasterize_mode: "antialiased" compensates opacities for the screen-space blur.
+        fused: On CUDA, list in each tile only the Gaussians that reach it, and differentiate the compositing of three
+            channels, with Triton kernels; what is drawn is the same. Assumes rigid viewmats.
+
+    Returns:
+        Colours [C, height, width, X] with X = D or D + 1 by `render_mode`, alphas [C, height, width, 1] in [0, 1],
+        and what strategies read of gsplat's `info`, in which `radii` depends on the gsplat version: read it through
+        `visible`.
+
+    Raises:
+        ValueError: From the splatter, if a mode is unknown or a shape does not match. gsplat raises AssertionError; the
+            Triton kernels check nothing.
+    """
+    rasterization: Any = splatter.rasterization
+    fused = fused and kernels.available(means.device)
+    # Imported here, so that without a GPU nothing comes near gsplat's kernels, which are compiled when first used.
+    if fused:
+        from sadgs_ns.kernels.rasterization import rasterization
+    elif means.is_cuda:
+        from gsplat.rendering import rasterization
+    if isinstance(colors, tuple) and not fused:
+        colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
+    return rasterization(
+        means,
+        quats,
+        scales,
+        opacities,
+        colors,
+        viewmats,
+        Ks,
+        width,
+        height,
+        sh_degree=sh_degree,
+        packed=False,
+        render_mode=render_mode,
+        absgrad=absgrad,
+        rasterize_mode=rasterize_mode,
+    )
+
+
+def visible(info: Mapping[str, Any]) -> Tensor:
+    """Which Gaussians were drawn, from an `info` of gsplat 1.4 (one radius) or 1.5 (a radius per axis).
+
+    Args:
+        info: Third value of `rasterize`; `radii` is int [C, N] or [C, N, 2], in pixels, zero where culled.
+
+    Returns:
+        bool [C, N]
+    """
+    drawn = info["radii"] > 0
+    # Comparing ranks also tells packed 1.5 radii [nnz, 2] from unpacked 1.4 radii [C, N].
+    return drawn.all(dim=-1) if drawn.dim() == info["means2d"].dim() else drawn
+
+
+def viewmats_from_camera_to_world(
+    camera_to_worlds: Tensor,  # [C, 3, 4]
+) -> Tensor:
+    """World-to-camera transforms for `rasterize` from nerfstudio's camera poses.
+
+    Args:
+        camera_to_worlds: Camera-to-world poses, OpenGL axes (x right, y up, z backward), orthonormal. [C, 3, 4]
+
+    Returns:
+        World-to-camera, OpenCV axes (x right, y down, z forward). [C, 4, 4]
+    """
+    flip = camera_to_worlds.new_tensor([1.0, -1.0, -1.0])
+    rotations = (camera_to_worlds[:, :, :3] * flip).mT  # [C, 3, 3], the inverse of an orthonormal matrix
+    translations = -rotations @ camera_to_worlds[:, :, 3:]  # [C, 3, 1]
+    bottom = camera_to_worlds.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(camera_to_worlds), 1, 4)
+    return torch.cat([torch.cat([rotations, translations], dim=-1), bottom], dim=-2)

@@ -1,0 +1,142 @@
+"""`sadgs-doctor`: versions, device, weights and programs, and its exit code."""
+
+from __future__ import annotations
+
+import ctypes.util
+import importlib
+import re
+import shutil
+import subprocess
+import sys
+import warnings
+from importlib.metadata import version
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from sadgs_ns import kernels
+from sadgs_ns.cli import doctor
+from sadgs_ns.data.validation import Finding
+from sadgs_ns.demo.scene import write_scene
+
+CHECKOUT = Path(__file__).parents[2]
+
+
+def machine() -> dict[str, str]:
+    """Findings' sentences and their severities."""
+    return {finding.sentence: finding.severity for finding in doctor.check_machine()}
+
+
+def about(word: str) -> tuple[str, str]:
+    """The only finding that holds a word: severity and sentence."""
+    ((sentence, severity),) = [(s, severity) for s, severity in machine().items() if word in s]
+    return severity, sentence
+
+
+@pytest.fixture
+def cuda(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """Pretend that there is a GPU, on which everything works until the fields say otherwise."""
+    state = SimpleNamespace(backend=SimpleNamespace(_C=object()), compiles=True)
+
+    def available(device: torch.device) -> bool:
+        if not state.compiles:
+            warnings.warn("Triton's kernels do not run here: no C compiler", stacklevel=2)
+        return state.compiles
+
+    import_module = importlib.import_module
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (6_000_000_000, 8_000_000_000))
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "A GPU")
+    monkeypatch.setattr(kernels, "available", available)
+    monkeypatch.setattr(
+        importlib,
+        "import_module",
+        lambda name: state.backend if name == "gsplat.cuda._backend" else import_module(name),
+    )
+    return state
+
+
+def test_it_runs_as_a_module_prints_versions_and_finds_nothing_wrong_with_a_good_scene(tmp_path: Path):
+    write_scene(tmp_path / "scene", 32, 24, 9, 20)
+    command = [sys.executable, "-W", "ignore", "-m", "sadgs_ns.cli.doctor", str(tmp_path / "scene")]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    lines = result.stdout.splitlines()
+    assert lines[0].startswith(f"python {sys.version.split()[0]}, sadgs_ns ")
+    for package in ("torch", "gsplat", "nerfstudio"):
+        assert f"{package} {version(package)}" in lines[0].split(", ")
+    assert lines[-1] == f"note: {tmp_path / 'scene'}: nothing to complain about."
+    assert all(re.fullmatch(r"(note|warning|error): .+\.", line) for line in lines[1:])
+    assert result.returncode == int(any(line.startswith("error") for line in lines)), result.stdout + result.stderr
+
+
+def test_the_command_is_installed_under_its_name():
+    (entry,) = re.findall(r'^sadgs-doctor = "(.+):(.+)"$', (CHECKOUT / "pyproject.toml").read_text(), re.MULTILINE)
+    assert getattr(importlib.import_module(entry[0]), entry[1]) is doctor.main
+
+
+@pytest.mark.parametrize(("severity", "code"), [("note", 0), ("warning", 0), ("error", 1)])
+def test_only_an_error_makes_the_exit_code_1(
+    severity: Any, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(doctor, "check_machine", lambda: iter([Finding(severity, "Something is so.")]))
+    assert doctor.main([]) == code
+    assert f"{severity}: Something is so." in capsys.readouterr().out.splitlines()
+
+
+def test_a_missing_package_is_called_missing(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(doctor, "PACKAGES", ("torch", "no-such-package"))
+    assert doctor.versions()["no-such-package"] == "missing"
+
+
+def test_torch_and_torchvision_that_do_not_fit_are_an_error(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "torchvision", None)  # importing it then raises
+    (finding,) = doctor.check_machine()
+    assert finding.severity == "error"
+    assert re.fullmatch(r"torch cannot be used \(.+\): install the versions of constraints\.txt\.", finding.sentence)
+
+
+def test_a_machine_without_a_gpu_is_a_warning(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    severity, sentence = about("sees no GPU")
+    assert severity == "warning" and re.search(r"training runs on \d+ CPU cores", sentence)
+    assert not [s for s in machine() if "Triton" in s or "gsplat" in s]  # of no use there
+
+
+def test_a_gpu_s_memory_and_its_kernels_are_notes(cuda: SimpleNamespace):
+    assert about("A GPU") == ("note", f"GPU: A GPU, 6.0 of 8.0 GB free, CUDA {torch.version.cuda}.")
+    assert about("Triton") == ("note", "Triton compiles its kernels here.")
+    assert about("gsplat") == ("note", "gsplat has its CUDA kernels.")
+
+
+def test_kernels_that_do_not_compile_say_why(cuda: SimpleNamespace):
+    cuda.compiles, cuda.backend = False, SimpleNamespace(_C=None)
+    severity, sentence = about("Triton")
+    assert severity == "warning" and "(Triton's kernels do not run here: no C compiler): " in sentence
+    assert sentence.endswith("install a torch whose Triton is 3.5 or newer, a C compiler and Python's headers.")
+    severity, sentence = about("gsplat")
+    assert severity == "error" and "(neither prebuilt nor compiled): install its wheel" in sentence
+
+
+def test_lpips_weights_are_looked_for_where_torch_keeps_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    severity, sentence = about("LPIPS with AlexNet")
+    (path,) = re.findall(r"downloads them to (\S+\.pth)", sentence)
+    assert severity == "warning" and Path(path).is_relative_to(tmp_path)
+    assert about("LPIPS with VGG")[1].startswith("LPIPS with VGG, for benchmarks alone, has no weights: put them at ")
+    Path(path).parent.mkdir(parents=True)
+    Path(path).write_bytes(b"weights")
+    assert about("LPIPS with AlexNet") == ("note", f"LPIPS with AlexNet has its weights: {path}.")
+
+
+@pytest.mark.parametrize(("program", "package"), [("ffmpeg", "ffmpeg"), ("libusb-1.0", "libusb-1.0-0")])
+def test_what_nerfstudio_s_commands_need_is_looked_for(program: str, package: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(shutil, "which", lambda name: f"/bin/{name}" if name == "ffmpeg" else None)
+    monkeypatch.setattr(ctypes.util, "find_library", lambda name: f"lib{name}.so" if name == "usb-1.0" else None)
+    assert about(f"{program}: ")[0] == "note"
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    monkeypatch.setattr(ctypes.util, "find_library", lambda name: None)
+    severity, sentence = about(f"{program} is missing: ")
+    assert severity == "warning" and sentence.endswith(f"install the system's package {package}.")

@@ -1,0 +1,358 @@
+"""sadgs-export: the mathematics of changing frames, the file as foreign readers see it, and what errors say."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+import trimesh
+from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci, _spherical_harmonics
+from hypothesis import given
+from hypothesis import strategies as st
+from kill_and_resume import configure, set_up
+from plyfile import PlyData
+
+from sadgs_ns.cli import export
+from sadgs_ns.data.coordinates import Similarity, from_data, spherical_harmonics
+from sadgs_ns.demo.scene import SPARSE_FOLDER, write_scene
+from sadgs_ns.plugin.trainer import SadgsTrainer
+from sadgs_ns.render import splatter
+
+WIDTH, HEIGHT, VIEWS = 48, 36, 10
+PARAMS = {
+    "means": (3,),
+    "scales": (3,),
+    "quats": (4,),
+    "opacities": (1,),
+    "features_dc": (3,),
+    "features_rest": (15, 3),
+}
+SWAP = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
+"""What nerfstudio does with COLMAP's axes: a rotation."""
+
+
+def gaussians(n: int, seed: int = 0) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    return {name: torch.randn((n, *shape), generator=generator) for name, shape in PARAMS.items()}
+
+
+def random_orthogonal(seed: int, reflection: bool) -> np.ndarray:
+    matrix, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    return matrix * np.linalg.det(matrix) * (-1 if reflection else 1)
+
+
+def directions(n: int = 100) -> np.ndarray:
+    vectors = np.random.default_rng(5).normal(size=(n, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def write_run(folder: Path, params: dict[str, torch.Tensor], transform: Any = None, scale: float = 1.0) -> Path:
+    """What a training run leaves, as far as it is exported."""
+    (folder / "nerfstudio_models").mkdir(parents=True)
+    (folder / "config.yml").write_text("!!python/object/apply:os.abort []")  # nobody may read it
+    pipeline = {f"_model.gauss_params.{name}": value for name, value in params.items()}
+    state = {"step": 7, "pipeline": pipeline, "optimizers": {}, "scalers": {}}
+    torch.save(state, folder / "nerfstudio_models" / "step-000000007.ckpt")
+    if transform is not None:
+        noted = {"transform": np.asarray(transform).tolist(), "scale": scale}
+        (folder / "dataparser_transforms.json").write_text(json.dumps(noted))
+    return folder
+
+
+def read(path: Path, *names: str) -> np.ndarray:
+    vertex = PlyData.read(str(path))["vertex"]
+    return np.stack([vertex[name] for name in names], -1)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SadgsTrainer]:
+    """A scene, and a short run on it whose colours and opacities are made to differ as those of a long one."""
+    folder = tmp_path_factory.mktemp("export")
+    write_scene(folder / "scene", WIDTH, HEIGHT, VIEWS, points=300)
+    config = configure(folder / "scene", folder, iterations=12, save_every=0)
+    config.pipeline.datamanager.dataparser.scale_factor = 0.4  # type: ignore[attr-defined]  # the scene's is about 1
+    trainer = set_up(config)
+    trainer.train()
+    generator = torch.Generator().manual_seed(0)
+    params = trainer.pipeline.model.gauss_params
+    params["features_rest"].data = 0.3 * torch.randn(params["features_rest"].shape, generator=generator)
+    params["opacities"].data = torch.randn(params["opacities"].shape, generator=generator)
+    trainer.save_checkpoint(11)
+    trainer.config.save_config()
+    return folder / "scene", trainer
+
+
+# --- the mathematics ---
+
+
+def test_the_harmonics_are_gsplat_s_and_orthonormal():
+    basis = spherical_harmonics(directions(), 3)
+    for band in range(16):
+        coefficients = torch.eye(16, dtype=torch.float64)[band].repeat(100, 1)[..., None]
+        theirs = _spherical_harmonics(3, torch.from_numpy(directions()), coefficients)[:, 0]
+        np.testing.assert_allclose(basis[:, band], theirs, atol=2e-14)
+    identity = Similarity(1.0, np.eye(3), np.zeros(3)).harmonics(3)
+    np.testing.assert_allclose(identity, np.eye(16), atol=1e-14)
+    with pytest.raises(ValueError, match="degree 4: only 0 to 3"):
+        spherical_harmonics(directions(), 4)
+
+
+@given(seed=st.integers(0, 2**32 - 1), reflection=st.booleans(), degree=st.integers(0, 3))
+def test_rotated_harmonics_in_rotated_directions_give_the_colours_of_before(seed: int, reflection: bool, degree: int):
+    similarity = Similarity(2.0, random_orthogonal(seed, reflection), np.zeros(3))
+    coefficients = np.random.default_rng(seed).normal(size=((degree + 1) ** 2, 3))
+    before = spherical_harmonics(directions(), degree) @ coefficients
+    rotated = similarity.harmonics(degree) @ coefficients
+    after = spherical_harmonics(directions() @ similarity.orthogonal.T, degree) @ rotated
+    np.testing.assert_allclose(after, before, atol=1e-12)
+    there_and_back = similarity.inverse().harmonics(degree) @ similarity.harmonics(degree)
+    np.testing.assert_allclose(there_and_back, np.eye(len(there_and_back)), atol=1e-12)
+
+
+def test_swapped_axes_swap_harmonics_exactly_to_rounding():
+    """x' = y, y' = x, z' = −z: every harmonic becomes plus or minus one of the others."""
+    becomes = {0: 0, 1: 3, 2: -2, 3: 1, 4: 4, 5: -7, 6: 6, 7: -5, 8: -8}
+    becomes |= {9: -15, 10: -10, 11: 13, 12: -12, 13: 11, 14: 14, 15: -9}
+    expected = np.zeros((16, 16))
+    for before, after in becomes.items():
+        expected[abs(after), before] = -1 if after < 0 else 1
+    np.testing.assert_allclose(Similarity(1.0, SWAP, np.zeros(3)).harmonics(3), expected, atol=2e-15)
+
+
+@given(seed=st.integers(0, 2**32 - 1), reflection=st.booleans())
+def test_covariances_turn_with_the_world(seed: int, reflection: bool):
+    scale, orthogonal = 0.3, random_orthogonal(seed, reflection)
+    similarity = Similarity(scale, orthogonal, np.array([1.0, 2, 3]))
+    generator = np.random.default_rng(seed)
+    quats, scales, means = generator.normal(size=(5, 4)), generator.normal(size=(5, 3)), generator.normal(size=(5, 3))
+
+    def covariances(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
+        return _quat_scale_to_covar_preci(torch.tensor(quats), torch.tensor(scales).exp(), True, False)[0].numpy()  # type: ignore[union-attr]
+
+    after = covariances(similarity.rotations(quats), similarity.log_scales(scales))
+    expected = scale**2 * orthogonal @ covariances(quats, scales) @ orthogonal.T
+    np.testing.assert_allclose(after, expected, atol=1e-12 * np.abs(expected).max())
+    moved = similarity.positions(means)
+    np.testing.assert_allclose(moved[1] - moved[0], scale * orthogonal @ (means[1] - means[0]), atol=1e-12)
+    np.testing.assert_allclose(similarity.inverse().positions(moved), means, atol=1e-12)
+
+
+def test_a_float32_rotation_is_made_orthogonal():
+    written = random_orthogonal(3, reflection=False).astype(np.float32)
+    similarity = Similarity.of(np.c_[0.25 * written, [1, 2, 3]])
+    np.testing.assert_allclose(similarity.orthogonal @ similarity.orthogonal.T, np.eye(3), atol=1e-14)
+    assert similarity.scale == pytest.approx(0.25, abs=1e-7)
+
+
+# --- the file ---
+
+
+def test_the_export_in_colmap_s_frame_looks_through_colmap_s_cameras_as_the_model_does(
+    trained: tuple[Path, SadgsTrainer], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    scene, trainer = trained
+    model, dataset = trainer.pipeline.model.eval(), trainer.pipeline.datamanager.train_dataset
+    path = tmp_path / "splat.ply"
+    export.main([str(trainer.base_dir / "config.yml"), "--output", str(path), "--frame", "colmap"])
+    printed = capsys.readouterr().out
+    size = path.stat().st_size
+    assert f"{model.num_points:,} Gaussians, {size / 1e6:,.1f} MB, in the frame of colmap" in printed
+    means = read(path, "x", "y", "z")
+    rest = read(path, *(f"f_rest_{i}" for i in range(45))).reshape(-1, 3, 15).transpose(0, 2, 1)
+    harmonics = np.concatenate([read(path, "f_dc_0", "f_dc_1", "f_dc_2")[:, None], rest], 1)
+    quats, scales = read(path, *(f"rot_{i}" for i in range(4))), np.exp(read(path, "scale_0", "scale_1", "scale_2"))
+    opacities = torch.sigmoid(torch.from_numpy(read(path, "opacity")[:, 0]))
+    scale = trainer.pipeline.datamanager.train_dataparser_outputs.dataparser_scale
+    assert scale < 0.5
+    reconstruction = pycolmap.Reconstruction(scene / SPARSE_FOLDER)
+    for index in (0, len(dataset) - 1):
+        name = dataset.image_filenames[index].name
+        image = next(image for image in reconstruction.images.values() if image.name == name)
+        camera = reconstruction.cameras[image.camera_id]
+        pose: Any = image.cam_from_world  # a method from pycolmap 3.12 on
+        pose = pose() if callable(pose) else pose
+        viewmat = np.eye(4)
+        viewmat[:3] = pose.matrix()
+        render, _, _ = splatter.rasterization(
+            torch.from_numpy(means),
+            torch.from_numpy(quats),
+            torch.from_numpy(scales),
+            opacities,
+            torch.from_numpy(harmonics),
+            torch.from_numpy(viewmat).float()[None],
+            torch.from_numpy(camera.calibration_matrix()).float()[None],
+            camera.width,
+            camera.height,
+            near_plane=0.01 / scale,
+            sh_degree=3,
+        )
+        shown = model.get_outputs(dataset.cameras[index : index + 1])["rgb"]
+        assert float(shown.std()) > 0.05
+        error = (render[0].clamp(0, 1) - shown).square().mean()
+        assert float(-10 * error.log10()) > 70, name  # dB
+
+
+def test_without_rotating_the_harmonics_the_picture_would_differ(trained: tuple[Path, SadgsTrainer]):
+    """So that the test above tests them."""
+    _, trainer = trained
+    matrix = from_data(trainer.base_dir / "dataparser_transforms.json").inverse().harmonics(3)
+    rest = trainer.pipeline.model.gauss_params["features_rest"].detach().numpy()
+    assert np.abs(matrix[1:, 1:] @ rest - rest).max() > 0.3
+
+
+def test_nerfstudio_s_frame_keeps_the_parameters_and_colmap_s_returns_to_the_points(
+    trained: tuple[Path, SadgsTrainer], tmp_path: Path
+):
+    scene, trainer = trained
+    model = trainer.pipeline.model
+    assert export.export(trainer.base_dir, tmp_path / "splat.ply") == model.num_points
+    np.testing.assert_array_equal(read(tmp_path / "splat.ply", "x", "y", "z"), model.means.detach())
+    np.testing.assert_array_equal(read(tmp_path / "splat.ply", "f_rest_17")[:, 0], model.shs_rest.detach()[:, 2, 1])
+    # nerfstudio's own points, moved back, are COLMAP's.
+    points = trainer.pipeline.datamanager.train_dataset.metadata["points3D_xyz"].double().numpy()
+    back = from_data(trainer.base_dir / "dataparser_transforms.json").inverse().positions(points)
+    reconstruction = pycolmap.Reconstruction(scene / SPARSE_FOLDER)
+    expected = np.array([point.xyz for _, point in sorted(reconstruction.points3D.items())])
+    np.testing.assert_allclose(np.sort(back, 0), np.sort(expected, 0), atol=1e-5)
+
+
+@pytest.mark.parametrize("n", [1, 70_000])
+def test_a_foreign_reader_finds_every_gaussian(n: int, tmp_path: Path):
+    """70,000 are more than are written at a time."""
+    params = gaussians(n)
+    transform = np.c_[SWAP, [1.0, 2, 3]]
+    run = write_run(tmp_path / "run", params, transform, scale=0.5)
+    assert export.export(run, tmp_path / "splat.ply", "colmap") == n
+    cloud = trimesh.load(tmp_path / "splat.ply")
+    expected = (params["means"].double().numpy() / 0.5 - [1, 2, 3]) @ SWAP
+    np.testing.assert_allclose(cloud.vertices, expected, rtol=1e-6, atol=1e-6)  # type: ignore[union-attr]
+    vertex = PlyData.read(str(tmp_path / "splat.ply"))["vertex"]
+    assert vertex.count == n
+    np.testing.assert_allclose(vertex["scale_1"], params["scales"][:, 1] + np.log(2), rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(vertex["opacity"], params["opacities"][:, 0])
+    np.testing.assert_array_equal(vertex["f_dc_2"], params["features_dc"][:, 2])
+
+
+def test_what_is_not_finite_is_dropped_in_every_part_of_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    params = gaussians(140_000)
+    params["means"][0, 0] = torch.nan
+    params["features_rest"][69_000:, 2, 1] = torch.inf  # the last part is empty, and the count has a digit less
+    params["means"][5, 1] = 3e38  # finite, but not in a frame in which the unit is smaller
+    run = write_run(tmp_path / "run", params, np.eye(3, 4), scale=0.1)
+    assert export.export(run, tmp_path / "splat.ply", "colmap") == 68_998
+    assert "dropped 71002 of 140000 Gaussians that are not finite" in capsys.readouterr().out
+    vertex = PlyData.read(str(tmp_path / "splat.ply"))["vertex"]
+    assert vertex.count == 68_998 and all(np.isfinite(vertex[p.name]).all() for p in vertex.properties)
+    assert len(trimesh.load(tmp_path / "splat.ply").vertices) == 68_998  # type: ignore[union-attr]
+
+
+def test_colours_without_harmonics_become_those_of_degree_0(tmp_path: Path):
+    params = gaussians(5) | {"features_rest": torch.zeros(5, 0, 3)}
+    run = write_run(tmp_path / "run", params, np.eye(3, 4))
+    export.export(run, tmp_path / "splat.ply", "colmap")
+    shown = 0.5 + 0.28209479 * read(tmp_path / "splat.ply", "f_dc_0", "f_dc_1", "f_dc_2")
+    np.testing.assert_allclose(shown, torch.sigmoid(params["features_dc"]), atol=1e-6)
+    assert "f_rest_0" not in {p.name for p in PlyData.read(str(tmp_path / "splat.ply"))["vertex"].properties}
+
+
+def test_a_reflection_of_the_world_is_undone_as_well(tmp_path: Path):
+    params = gaussians(5)
+    mirror = np.diag([1.0, 1, -1])
+    run = write_run(tmp_path / "run", params, np.c_[mirror, np.zeros(3)])
+    export.export(run, tmp_path / "splat.ply", "colmap")
+    np.testing.assert_allclose(read(tmp_path / "splat.ply", "x", "y", "z"), params["means"] @ mirror, atol=1e-6)
+    # Of degree 1 only z, the second, changes sign.
+    np.testing.assert_allclose(
+        read(tmp_path / "splat.ply", "f_rest_0")[:, 0], params["features_rest"][:, 0, 0], atol=1e-6
+    )
+    np.testing.assert_allclose(
+        read(tmp_path / "splat.ply", "f_rest_1")[:, 0], -params["features_rest"][:, 1, 0], atol=1e-6
+    )
+
+
+# --- which run, and what goes wrong ---
+
+
+def test_the_run_is_its_folder_its_config_or_a_checkpoint_and_the_latest_is_taken(tmp_path: Path):
+    run = write_run(tmp_path / "run", gaussians(3))
+    models = run / "nerfstudio_models"
+    later = torch.load(models / "step-000000007.ckpt", weights_only=True)
+    later["pipeline"] = {f"_model.gauss_params.{name}": value for name, value in gaussians(9).items()}
+    torch.save(later, models / "step-000000011.ckpt")
+    counts = [export.export(path, tmp_path / "a.ply") for path in (run, run / "config.yml", models)]
+    assert counts == [9, 9, 9]
+    assert export.export(models / "step-000000007.ckpt", tmp_path / "a.ply") == 3
+
+
+def test_a_damaged_latest_checkpoint_is_passed_over_aloud(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    run = write_run(tmp_path / "run", gaussians(3))
+    (run / "nerfstudio_models" / "step-000000011.ckpt").write_bytes(b"half")
+    assert export.export(run, tmp_path / "a.ply") == 3
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "step-000000011.ckpt is cut off, damaged" in printed and "step-000000007.ckpt instead" in printed
+
+
+@pytest.mark.parametrize(
+    ("case", "sentence"),
+    [
+        ("no run", r".*nowhere does not exist: give the folder of a run, its config\.yml or a checkpoint .*\."),
+        ("no checkpoint", r".*run holds no checkpoint: give the folder .*\."),
+        ("damaged", r".*7\.ckpt is cut off, damaged .*: give another checkpoint step-\*\.ckpt of a run of sadgs .*\."),
+        ("no means", r".*7\.ckpt holds no means of Gaussians, so another method made it: give another .*\."),
+        ("wrong shape", r".*7\.ckpt holds no .* exported \(quats must .* \[3, 4\], got \[3, 3\]\): give another .*\."),
+        ("degree 4", r".*7\.ckpt holds no .* exported \(features_rest must hold .*, got 24\): give another .*\."),
+        ("no transform", r".*run holds no dataparser_transforms\.json, .*: give the run where it was made, or .*\."),
+        ("shear", r".*transforms\.json does not tell .* \(it is no rotation, scale and translation\): copy .*\."),
+        ("not json", r".*transforms\.json does not tell how to return to the data's frame \(.*\): copy it .*\."),
+        ("nan", r".*transforms\.json does not tell .*\): copy it from the run again, or export in .*\."),
+        ("suffix", r"--output .*a\.splat must end in \.ply, the one format that is written\."),
+        ("folder", r"--output .*a\.ply is a folder: name a file in it\."),
+    ],
+)  # fmt: skip
+def test_errors_are_one_sentence_and_leave_nothing(
+    case: str, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    params = gaussians(3)
+    if case == "no means":
+        del params["means"]
+    if case == "wrong shape":
+        params["quats"] = params["quats"][:, :3]
+    if case == "degree 4":
+        params["features_rest"] = torch.zeros(3, 24, 3)
+    transform = np.eye(3, 4)
+    transform[0, 1] = {"shear": 0.1, "nan": np.nan}.get(case, 0.0)
+    run = write_run(tmp_path / "run", params, None if case == "no transform" else transform)
+    checkpoint = run / "nerfstudio_models" / "step-000000007.ckpt"
+    if case == "not json":
+        (run / "dataparser_transforms.json").write_text("{")
+    if case == "no checkpoint":
+        checkpoint.unlink()
+    if case == "damaged":
+        checkpoint.write_bytes(checkpoint.read_bytes()[:-100])
+    output = tmp_path / ("a.splat" if case == "suffix" else "a.ply")
+    if case == "folder":
+        output.mkdir()
+    there = set(tmp_path.iterdir())
+    run = tmp_path / "nowhere" if case == "no run" else run
+    assert export.main([str(run), "--output", str(output), "--frame", "colmap"]) == 2
+    printed = capsys.readouterr().err
+    assert re.fullmatch(f"sadgs-export: {sentence}\n", printed), printed
+    assert set(tmp_path.iterdir()) == there
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+def test_a_full_disk_leaves_the_file_that_was_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    run = write_run(tmp_path / "run", gaussians(3))
+    output = tmp_path / "a.ply"
+    output.write_text("earlier")
+    partial = tmp_path / ".a.partial.ply"
+    partial.symlink_to("/dev/full")
+    assert export.main([str(run), "--output", str(output)]) == 2
+    assert "a.ply could not be written (No space left on device; " in capsys.readouterr().err
+    assert output.read_text() == "earlier" and not partial.is_symlink()

@@ -1,0 +1,612 @@
+"""Bad input: one sentence that names file and remedy, in training as in `sadgs-doctor`, and nothing left over."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import re
+import shutil
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.utils import colmap_parsing_utils
+from PIL import Image, ImageFile
+from runs import (
+    blender_data,
+    configure,
+    is_finite,
+    nerfstudio_data,
+    set_up,
+    train,
+)
+from scenes import HEIGHT, WIDTH
+
+from sadgs_ns.cli import doctor
+from sadgs_ns.data import colmap, validation
+from sadgs_ns.demo.scene import SPARSE_FOLDER, write_scene
+from sadgs_ns.errors import InputError, RunError
+from sadgs_ns.plugin import presets
+
+CHECKOUT = Path(__file__).parents[2]
+PLY = "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A good dataset in each layout, to be copied."""
+    folder = tmp_path_factory.mktemp("captures")
+    write_scene(folder / "colmap", WIDTH, HEIGHT, 10, 60)
+    nerfstudio_data(folder / "nerfstudio")
+    blender_data(folder / "blender", "white")
+    return folder
+
+
+def parser_of(data: Path) -> DataParserConfig:
+    """The parser for a copy of one of the captures, which keeps its name."""
+    if data.name == "nerfstudio":
+        return NerfstudioDataParserConfig(data=data, load_3D_points=True, downscale_factor=1)
+    if data.name == "blender":
+        return BlenderDataParserConfig(data=data)
+    return ColmapDataParserConfig(data=data, colmap_path=SPARSE_FOLDER, downscale_factor=1)
+
+
+@pytest.fixture
+def copied(captures: Path, tmp_path: Path) -> Callable[[str], Path]:
+    """Copies the capture of a layout."""
+    return lambda layout: Path(shutil.copytree(captures / layout, tmp_path / layout))
+
+
+def errors(data: Path) -> list[str]:
+    return [finding.sentence for finding in validation.check_data(data) if finding.severity == "error"]
+
+
+# --- ways to spoil a capture ---
+
+
+def overwrite(name: str, content: bytes | str) -> Callable[[Path], Any]:
+    return lambda data: (data / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+
+
+def remove(name: str) -> Callable[[Path], None]:
+    return lambda data: shutil.rmtree(data / name) if (data / name).is_dir() else (data / name).unlink()
+
+
+def cut(name: str, keep: float) -> Callable[[Path], None]:
+    """Keep this part of a file."""
+
+    def spoil(data: Path) -> None:
+        content = (data / name).read_bytes()
+        (data / name).write_bytes(content[: int(keep * len(content))])
+
+    return spoil
+
+
+def patch(name: str, offset: int, layout: str, value: Any) -> Callable[[Path], None]:
+    """Overwrite a number in a binary file."""
+
+    def spoil(data: Path) -> None:
+        content = bytearray((data / name).read_bytes())
+        struct.pack_into(layout, content, offset, value)
+        (data / name).write_bytes(content)
+
+    return spoil
+
+
+def picture(name: str, size: tuple[int, int] = (WIDTH, HEIGHT), mode: str = "RGB") -> Callable[[Path], None]:
+    return lambda data: Image.new(mode, size).save(data / name)
+
+
+def meta(change: Callable[[dict[str, Any]], Any], name: str = "transforms.json") -> Callable[[Path], None]:
+    """Change a transforms.json."""
+
+    def spoil(data: Path) -> None:
+        content = json.loads((data / name).read_text())
+        change(content)
+        (data / name).write_text(json.dumps(content))
+
+    return spoil
+
+
+def model(change: Callable[[dict, dict, dict], Any], ext: str = ".bin") -> Callable[[Path], None]:
+    """Change cameras, images and points of a COLMAP model, and write it with nerfstudio's code."""
+
+    def spoil(data: Path) -> None:
+        folder = data / SPARSE_FOLDER
+        parts = colmap_parsing_utils.read_model(str(folder), ".bin")
+        assert parts is not None
+        change(*parts)
+        shutil.rmtree(folder)
+        folder.mkdir()
+        colmap_parsing_utils.write_model(*parts, str(folder), ext)
+
+    return spoil
+
+
+def set_pose(frame: int, row: int, column: int, value: float) -> Callable[[dict[str, Any]], None]:
+    def change(content: dict[str, Any]) -> None:
+        content["frames"][frame]["transform_matrix"][row][column] = value
+
+    return change
+
+
+def in_one_place(content: dict[str, Any]) -> None:
+    for frame in content["frames"]:
+        for row in range(3):
+            frame["transform_matrix"][row][3] = 1.5
+
+
+def keep(number: int) -> Callable[[dict[str, Any]], None]:
+    return lambda content: content.update(frames=content["frames"][:number])
+
+
+def fisheye(cameras: dict, images: dict, points: dict) -> None:
+    cameras[2] = colmap_parsing_utils.Camera(2, "OPENCV_FISHEYE", WIDTH, HEIGHT, np.array([40, 40, 24, 18, 0, 0, 0, 0]))
+    images[1] = images[1]._replace(camera_id=2)
+
+
+def flip_middle_byte(name: str) -> Callable[[Path], None]:
+    """Flip a byte in the middle of a PNG's pixels."""
+
+    def spoil(data: Path) -> None:
+        content = bytearray((data / name).read_bytes())
+        content[len(content) // 2] ^= 0xFF
+        (data / name).write_bytes(content)
+
+    return spoil
+
+
+SPARSE = str(SPARSE_FOLDER)
+FIRST = "images/000.png"
+
+COLMAP = {
+    # images
+    "image-missing": (remove(FIRST), r"\S+/000\.png does not exist: put it there, or leave it out of .*\."),
+    "image-empty": (overwrite(FIRST, ""), r"\S+/000\.png has 0 bytes: copy it again, or leave .*\."),
+    "image-truncated": (cut(FIRST, 0.6), r"\S+/000\.png cannot be read as an image \(.+\): copy it again.*\."),
+    "image-corrupt": (flip_middle_byte(FIRST), r"\S+/000\.png cannot be read as an image \(.+\): copy it.*\."),
+    "image-not-one": (overwrite(FIRST, "hello"), r"\S+/000\.png is no image that Pillow knows: copy it.*\."),
+    "image-size": (
+        picture(FIRST, (40, 30)),
+        r"\S+/000\.png has 40 × 30 px, but its camera in \S+/images\.bin 48 × 36: use the images that .*\.",
+    ),
+    "image-mode": (picture(FIRST, mode="P"), r"\S+/000\.png has pixels of Pillow's mode P: convert it .*\."),
+    # poses
+    "no-poses": (remove("sparse"), r"\S+ holds 10 images but no camera poses: .*ns-process-data.*\."),
+    "no-images": (
+        model(lambda cameras, images, points: images.clear()),
+        r"\S+/images\.bin holds no pose, so there is no image to train on: run COLMAP's mapper again\.",
+    ),
+    "no-image-folder": (remove("images"), r"\S+ has poses of 10 images, but there is no folder \S+/images: .*"),
+    "nan-pose": (patch(f"{SPARSE}/images.bin", 12, "<d", np.nan), r"\S+: image 000\.png has NaN or .* pose.*"),
+    "no-rotation": (
+        model(lambda cameras, images, points: images.update({1: images[1]._replace(qvec=np.zeros(4))})),
+        r"\S+: image 000\.png has a rotation that is no unit quaternion: run COLMAP's mapper again\.",
+    ),
+    "camera-unknown": (
+        model(lambda cameras, images, points: images.update({1: images[1]._replace(camera_id=7)})),
+        r"\S+: image 000\.png has camera 7, which \S+/cameras\.bin lacks: .*\.",
+    ),
+    "cameras-mixed-fisheye": (model(fisheye), r"\S+/cameras\.bin mixes fisheye and other cameras, .*\."),
+    "camera-unsupported": (
+        model(lambda cameras, images, points: cameras.update({1: cameras[1]._replace(model="FOV", params=np.ones(5))})),
+        r"\S+: camera 1 has the model FOV, which nerfstudio cannot read: undistort the images with .*\.",
+    ),
+    "camera-focal": (
+        patch(f"{SPARSE}/cameras.bin", 32, "<d", -5.0),
+        r"\S+: camera 1 has focal length x = -5\.0, which must be positive: correct it\.",
+    ),
+    "one-view": (
+        model(lambda cameras, images, points: [images.pop(i) for i in range(2, 11)]),
+        r"\S+ has 1 view, which shows no depth: take at least 2 images, .*\.",
+    ),
+    # files
+    "cameras-truncated": (cut(f"{SPARSE}/cameras.bin", 0.5), r"\S+/cameras\.bin is cut off or corrupt \(.*"),
+    "cameras-empty": (overwrite(f"{SPARSE}/cameras.bin", ""), r"\S+/cameras\.bin is cut off or corrupt \(.*"),
+    "cameras-corrupt": (
+        patch(f"{SPARSE}/cameras.bin", 12, "<i", 99),
+        r"\S+/cameras\.bin is cut off or corrupt \(camera 1 has the unknown model 99\): copy it again, or .*\.",
+    ),
+    "images-missing": (remove(f"{SPARSE}/images.bin"), r"\S+/images\.bin cannot be read \(No such file.*"),
+    "images-truncated": (cut(f"{SPARSE}/images.bin", 0.5), r"\S+/images\.bin is cut off or corrupt \(.*"),
+    # keypoints of the first image: an exabyte
+    "images-corrupt-count": (
+        patch(f"{SPARSE}/images.bin", 8 + 64 + 8, "<Q", 2**60),
+        r"\S+/images\.bin is cut off or corrupt \(it ends after \d+ bytes, .*\): copy it again, or .*\.",
+    ),
+    "points-missing": (remove(f"{SPARSE}/points3D.bin"), r"\S+ has no points3D\.bin or \.txt: .*random points\."),
+    "points-empty": (
+        model(lambda cameras, images, points: points.clear()),
+        r"\S+/points3D\.bin holds no SfM point: .*--load-3D-points False.*\.",
+    ),
+    "points-truncated": (cut(f"{SPARSE}/points3D.bin", 0.9), r"\S+/points3D\.bin is cut off or corrupt \(.*"),
+    "points-nan": (
+        model(lambda cameras, images, points: points.update({1: points[1]._replace(xyz=np.full(3, np.nan))})),
+        r"\S+/points3D\.bin has NaN or infinity in a point: .*\.",
+    ),
+    "text-colour": (
+        lambda data: (
+            model(lambda *parts: None, ".txt")(data),
+            overwrite(f"{SPARSE}/points3D.txt", "1 0 0 0 256 0 0 1 1 0\n")(data),
+        ),
+        r"\S+/points3D\.txt is not COLMAP's text \(a colour is not in 0 … 255\): copy it again, .*",
+    ),
+    "text-corrupt": (
+        lambda data: (
+            model(lambda *parts: None, ".txt")(data),
+            overwrite(f"{SPARSE}/images.txt", "1 0.1 zero 0 0 0 0 0 1 000.png\n\n")(data),
+        ),
+        r"\S+/images\.txt is not COLMAP's text \(.*'zero'.*\): copy it again, or run COLMAP's mapper again\.",
+    ),
+}
+NERFSTUDIO = {
+    "folder-missing": (shutil.rmtree, r"\S+ does not exist: give --data the folder .*"),
+    "json-missing": (remove("transforms.json"), r"\S+ holds 10 images but no camera poses: .*"),
+    "json-corrupt": (cut("transforms.json", 0.5), r"\S+/transforms\.json is not readable JSON \(.*line.*\): .*"),
+    "json-list": (overwrite("transforms.json", "[]"), r"\S+ holds a list instead of an object with .*\."),
+    "json-no-frames": (meta(lambda m: m.update(frames=[])), r"\S+ lists no frames, so there is no image .*"),
+    "json-nan-pose": (meta(set_pose(3, 0, 0, np.nan)), r"\S+: frame images/003\.png has NaN or infinity.*"),
+    "json-short-pose": (
+        meta(lambda m: m["frames"][2].update(transform_matrix=[[1, 0, 0, 0]])),
+        r"\S+: frame images/002\.png has no pose of 4 × 4 numbers: .*\.",
+    ),
+    "json-no-focal": (meta(lambda m: m["frames"][1].pop("fl_x")), r"\S+: frame images/001\.png has no fl_x: .*"),
+    "json-camera-model": (meta(lambda m: m.update(camera_model="LENS")), r"\S+ has the camera model 'LENS'.*"),
+    "json-one-place": (meta(in_one_place), r"\S+ has all 10 cameras in one place, which shows no depth: .*"),
+    "json-one-view": (meta(keep(1)), r"\S+ has 1 view, which shows no depth: take at least 2 images, .*\."),
+    "json-size": (picture(FIRST, (36, 48)), r"\S+/000\.png has 36 × 48 px, but its camera in \S+ 48 × 36: .*"),
+    "json-image-missing": (remove("images/004.png"), r"\S+/images/004\.png does not exist: .*"),
+    "json-some-masks": (
+        meta(lambda m: m["frames"][0].update(mask_path="images/001.png")),
+        r"\S+ names masks for 1 of 10 frames: give all of them one, or none\.",
+    ),
+    "json-mask-size": (
+        lambda data: (
+            picture("mask.png", (10, 10), "L")(data),
+            meta(lambda m: [frame.update(mask_path="mask.png") for frame in m["frames"]])(data),
+        ),
+        r"\S+/mask\.png \(and 9 more\) is a mask of another size than \S+/000\.png: resize it\.",
+    ),
+    "ply-missing": (
+        meta(lambda m: m.update(ply_file_path="points.ply")),
+        r"\S+/points\.ply should hold the SfM points but cannot be read \(No such file .*\): .*random points\.",
+    ),
+    "ply-empty": (
+        lambda data: (
+            overwrite("p.ply", PLY.format(0))(data),
+            meta(lambda m: m.update(ply_file_path="p.ply"))(data),
+        ),
+        r"\S+/p\.ply should hold the SfM points but is empty: .*\.",
+    ),
+    "ply-truncated": (
+        lambda data: (
+            overwrite("p.ply", PLY.format(3) + "0 0 0\n1 1 1\n")(data),
+            meta(lambda m: m.update(ply_file_path="p.ply"))(data),
+        ),
+        r"\S+/p\.ply should hold the SfM points but is cut off: its header promises 3 points: .*\.",
+    ),
+    "ply-not-one": (
+        meta(lambda m: m.update(ply_file_path=FIRST)),
+        r"\S+/000\.png should hold the SfM points but is not a PLY file of points: .*\.",
+    ),
+}
+BLENDER = {
+    "blender-no-val": (remove("transforms_val.json"), r"\S+/transforms_val\.json does not exist: restore it.*"),
+    "blender-nan": (meta(set_pose(0, 1, 3, np.inf), "transforms_train.json"), r"\S+: frame \S+ has NaN or inf.*"),
+    "blender-size": (picture("images/005.png", (40, 30), "RGBA"), r"\S+/005\.png has 40 × 30 px, but its .*"),
+}
+CASES = {
+    **{name: ("colmap", *case) for name, case in COLMAP.items()},
+    **{name: ("nerfstudio", *case) for name, case in NERFSTUDIO.items()},
+    **{name: ("blender", *case) for name, case in BLENDER.items()},
+}
+"""A layout, how to spoil it, and the sentence that says so."""
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_bad_data_are_refused_in_one_sentence_by_training_and_doctor_alike(
+    case: str,
+    copied: Callable[[str], Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+):
+    layout, spoil, sentence = CASES[case]
+    data = copied(layout)
+    spoil(data)
+    config = configure(tmp_path / "out", parser_of(data))
+    with pytest.raises(InputError) as refused:
+        config.save_config()  # what ns-train does first
+    assert re.fullmatch(sentence, str(refused.value)), str(refused.value)
+    assert "\n" not in str(refused.value)
+    with pytest.raises(ValueError, match=re.escape(str(refused.value))):
+        set_up(config)  # what a program does
+    assert not (tmp_path / "out").exists()
+    monkeypatch.setattr(doctor, "check_machine", lambda: [])
+    capsys.readouterr()
+    assert doctor.main([str(data)]) == 1
+    assert f"error: {refused.value}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("layout", ["colmap", "nerfstudio", "blender"])
+def test_good_data_have_no_error_and_no_warning(layout: str, captures: Path):
+    assert [finding for finding in validation.check_data(captures / layout) if finding.severity != "note"] == []
+
+
+def test_a_run_checks_its_data_once_and_other_ways_to_a_pipeline_check_them_too(
+    captures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    checked: list[Path] = []
+    check_colmap = validation.check_colmap
+    monkeypatch.setattr(
+        validation, "check_colmap", lambda data, **kw: (checked.append(data), check_colmap(data, **kw))[1]
+    )
+    first = Path(shutil.copytree(captures / "colmap", tmp_path / "first"))
+    second = Path(shutil.copytree(captures / "colmap", tmp_path / "second"))
+    config = configure(tmp_path / "out", parser_of(first))
+    config.save_config()
+    set_up(config)
+    assert checked == [first]  # ns-train
+    set_up(config)
+    assert checked == [first, first]  # a program, ns-eval, sadgs-bench
+    config.save_config()
+    config.pipeline.datamanager.data = second
+    (second / FIRST).unlink()
+    with pytest.raises(InputError, match="does not exist"):
+        set_up(config)  # other settings than were checked
+    config.pipeline.datamanager.data = None
+    (first / FIRST).unlink()
+    with pytest.raises(InputError, match="does not exist"):
+        config.save_config()
+    with pytest.raises(InputError, match="does not exist"):
+        set_up(config)  # what was good before does not count
+
+
+def test_several_problems_of_one_kind_are_one_finding_and_other_kinds_are_counted(copied: Callable[[str], Path]):
+    data = copied("nerfstudio")
+    for index in (2, 5, 7):
+        (data / f"images/00{index}.png").write_bytes(b"")
+    (data / "images/003.png").unlink()
+    findings = validation.check_data(data)
+    assert len([finding for finding in findings if finding.severity == "error"]) == 2
+    with pytest.raises(
+        InputError, match=r"002\.png \(and 2 more\) has 0 bytes: .*\(`sadgs-doctor .*` shows 1 more\.\)"
+    ):
+        validation.refuse(findings, data)
+
+
+# --- what looks bad and is not ---
+
+
+def test_a_jpeg_with_bytes_after_its_end_is_good_and_one_cut_off_is_not(copied: Callable[[str], Path]):
+    data = copied("nerfstudio")
+    path = data / FIRST  # the name does not matter to Pillow
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)).save(path, "JPEG")
+    content = path.read_bytes()
+    path.write_bytes(content + b"trailing data of a phone's camera")
+    assert errors(data) == []
+    path.write_bytes(content[:-20])
+    (sentence,) = errors(data)
+    assert "000.png cannot be read as an image (image file is truncated" in sentence
+
+
+def test_a_png_that_lacks_only_its_last_chunk_is_good_as_it_is_to_nerfstudio(copied: Callable[[str], Path]):
+    data = copied("nerfstudio")
+    content = (data / FIRST).read_bytes()
+    (data / FIRST).write_bytes(content[:-12])
+    assert errors(data) == []
+
+
+def test_images_without_poses_beside_others_are_a_warning(copied: Callable[[str], Path]):
+    data = copied("colmap")
+    model(lambda cameras, images, points: (images.pop(3), images.pop(5)))(data)
+    (finding,) = validation.check_data(data)
+    assert finding.severity == "warning"
+    assert re.fullmatch(r"\S+/002\.png \(and 1 more\) has no pose in \S+ and is not used: .*\.", finding.sentence)
+
+
+def test_cameras_of_several_models_and_sizes_train_together(copied: Callable[[str], Path], tmp_path: Path):
+    data = copied("colmap")
+
+    def second_camera(cameras: dict, images: dict, points: dict) -> None:
+        params = np.array([30.0, 20.0, 15.0, 0.01])
+        cameras[2] = colmap_parsing_utils.Camera(2, "SIMPLE_RADIAL", 40, 30, params)
+        for index in (2, 4, 6):
+            images[index] = images[index]._replace(camera_id=2)
+            with Image.open(data / "images" / images[index].name) as image:
+                smaller = image.resize((40, 30))
+            smaller.save(data / "images" / images[index].name)
+
+    model(second_camera)(data)
+    assert validation.check_data(data) == []
+    config = configure(tmp_path / "out", parser_of(data), iterations=8)
+    config.pipeline.views_per_iteration = 2
+    trainer = train(config)
+    sizes = {tuple(data["image"].shape[:2]) for data in trainer.pipeline.datamanager.cached_train}
+    assert len(sizes) >= 2  # undistortion crops the second camera's
+    assert is_finite(trainer.pipeline.model)
+
+
+@pytest.mark.parametrize(("layout", "views", "training"), [("nerfstudio", 2, 2), ("colmap", 2, 1)])
+def test_one_or_two_training_views_train_with_a_warning(
+    layout: str,
+    views: int,
+    training: int,
+    copied: Callable[[str], Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+):
+    data = copied(layout)
+    if layout == "colmap":
+        model(lambda cameras, images, points: [images.pop(index) for index in range(views + 1, 11)])(data)
+    else:
+        meta(keep(views))(data)
+    trainer = train(configure(tmp_path / "out", parser_of(data), iterations=4))
+    assert len(trainer.pipeline.datamanager.train_dataset) == training
+    assert is_finite(trainer.pipeline.model)
+    printed = " ".join(capsys.readouterr().out.split())
+    assert f"leaves {training} training view{'s' * (training > 1)}: so few fix no shape; take 20 or more." in printed
+
+
+# --- what the checks assume of others ---
+
+
+def test_colmap_s_camera_models_are_those_that_nerfstudio_knows():
+    theirs = {i: (m.model_name, m.num_params) for i, m in colmap_parsing_utils.CAMERA_MODEL_IDS.items()}
+    assert dict(enumerate(colmap.CAMERA_PARAMETERS.items())) == theirs
+
+
+def test_colmap_s_text_and_binary_models_read_alike_and_as_nerfstudio_reads_them(
+    copied: Callable[[str], Path], tmp_path: Path
+):
+    data = copied("colmap")
+    binary = data / SPARSE_FOLDER
+    theirs = colmap_parsing_utils.read_model(str(binary), ".bin")
+    assert theirs is not None
+    text = tmp_path / "text"
+    text.mkdir()
+    colmap_parsing_utils.write_model(*theirs, str(text), ".txt")
+    for folder, ext in ((binary, "bin"), (text, "txt")):
+        (camera,) = colmap.read_cameras(folder / f"cameras.{ext}").values()
+        assert (camera.model, camera.width, camera.height) == ("PINHOLE", WIDTH, HEIGHT)
+        assert camera.params == tuple(theirs[0][1].params)
+        for (name, camera_id, pose), image in zip(
+            colmap.read_poses(folder / f"images.{ext}"), theirs[1].values(), strict=True
+        ):
+            assert (name, camera_id) == (image.name, 1)
+            assert pose == pytest.approx(np.concatenate([image.qvec, image.tvec]), abs=1e-12)
+            rotation = colmap_parsing_utils.qvec2rotmat(image.qvec)
+            assert colmap.camera_centre(pose) == pytest.approx(-rotation.T @ image.tvec)
+        positions, colors = colmap.read_points(folder / f"points3D.{ext}")
+        assert positions == pytest.approx(np.array([point.xyz for point in theirs[2].values()]), abs=1e-12)
+        assert (colors == np.array([point.rgb for point in theirs[2].values()])).all()
+
+
+@pytest.mark.parametrize("factor", [2, 3])
+def test_scaled_down_images_are_compared_with_scaled_down_cameras(
+    factor: int, copied: Callable[[str], Path], tmp_path: Path
+):
+    data = copied("nerfstudio")
+    meta(lambda m: [frame.update(w=47, h=35) for frame in m["frames"]])(data)
+    (data / f"images_{factor}").mkdir()
+    for path in (data / "images").iterdir():
+        Image.new("RGB", (47 // factor, 35 // factor)).save(data / f"images_{factor}" / path.name)
+    findings = validation.check_nerfstudio(data, downscale_factor=factor)
+    assert [finding for finding in findings if finding.severity == "error"] == []
+    parser = NerfstudioDataParserConfig(data=data, load_3D_points=True, downscale_factor=factor)
+    train(configure(tmp_path / "out", parser, iterations=1))  # nerfstudio agrees
+    (sentence,) = errors(data)
+    assert "has 48 × 36 px, but its camera" in sentence
+
+
+def test_two_hundred_photographs_are_not_decoded_and_take_under_a_second(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    rng = np.random.default_rng(0)
+    data = tmp_path / "photographs"
+    (data / "images").mkdir(parents=True)
+    image = Image.fromarray(rng.integers(0, 255, (1080, 1920, 3), np.uint8))
+    image.save(data / "images/0.jpg", quality=95)
+    pose = np.eye(4).tolist()
+    frame = {"fl_x": 900, "fl_y": 900, "cx": 960, "cy": 540, "w": 1920, "h": 1080}
+    frames = []
+    for index in range(200):
+        if index:
+            os.link(data / "images/0.jpg", data / f"images/{index}.jpg")
+        pose[0][3] = index
+        frames.append({**frame, "file_path": f"images/{index}.jpg", "transform_matrix": [row[:] for row in pose]})
+    (data / "transforms.json").write_text(json.dumps({"frames": frames}))
+
+    def decode(image: Image.Image) -> None:
+        raise AssertionError("an image was decoded")
+
+    monkeypatch.setattr(ImageFile.ImageFile, "load", decode)
+    start = time.perf_counter()
+    findings = validation.check_data(data)
+    seconds = time.perf_counter() - start
+    assert [finding for finding in findings if finding.severity != "note"] == []
+    assert seconds < 1
+
+
+# --- the command line ---
+
+
+def test_uncaught_errors_print_one_sentence_and_exit_with_1(tmp_path: Path):
+    for kind in ("InputError", "RunError"):
+        code = f"from sadgs_ns.errors import {kind}; raise {kind}('Nothing: do something.')"
+        result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+        assert (result.returncode, result.stderr) == (1, "error: Nothing: do something.\n")
+    for kind, ordinary in ((InputError, ValueError), (RunError, RuntimeError)):
+        assert issubclass(kind, ordinary) and str(kind("Nothing.")) == "Nothing."
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "sentence"),
+    [
+        ("max_num_iterations", 0, "max_num_iterations must be at least 1, got 0."),
+        ("use_grad_scaler", True, "sadgs trains in float32,"),
+        ("mixed_precision", True, "sadgs trains in float32,"),
+        ("load_dir", Path("nowhere"), "nowhere holds no checkpoint: give --load-dir the folder"),
+        ("load_checkpoint", Path("no.ckpt"), "no.ckpt does not exist: give --load-checkpoint a file"),
+        ("pipeline.views_per_iteration", 0, "pipeline.views_per_iteration must be at least 1, got 0."),
+        ("pipeline.frequency_constant", -1.0, "pipeline.frequency_constant must be in (0, 4], got -1.0."),
+        ("pipeline.model.refine_every", 50, "pipeline.model.refine_every has no effect on this method;"),
+        ("pipeline.model.ssim_lambda", 7.0, "pipeline.model.ssim_lambda must be in [0, 1], got 7."),
+        ("pipeline.model.initial_opacity", 1.0, "pipeline.model.initial_opacity must be in (0, 1), got 1."),
+        ("pipeline.model.opacity_reg", -1.0, "pipeline.model.opacity_reg must not be negative, got -1."),
+        ("pipeline.model.strategy.tau_split", 1.5, "pipeline.model.strategy.tau_split must be in [0, 1], got 1.5."),
+        (
+            "pipeline.model.strategy.max_gaussians",
+            0,
+            "pipeline.model.strategy.max_gaussians must be at least 1, got 0.",
+        ),
+    ],
+)
+def test_options_that_cannot_work_are_refused_in_one_sentence_before_anything_is_written(
+    option: str, value: Any, sentence: str, copied: Callable[[str], Path], tmp_path: Path
+):
+    config = configure(tmp_path / "out", parser_of(copied("colmap")))
+    *owners, name = option.split(".")
+    setattr(functools.reduce(getattr, owners, config), name, value)
+    with pytest.raises(InputError) as refused:
+        config.save_config()
+    assert str(refused.value).startswith(sentence) and "\n" not in str(refused.value)
+    with pytest.raises(InputError, match=re.escape(sentence)):
+        set_up(config)
+    assert not (tmp_path / "out").exists()
+
+
+def test_ns_train_on_bad_data_ends_with_the_sentence_alone(copied: Callable[[str], Path], tmp_path: Path):
+    data = copied("colmap")
+    (data / FIRST).write_bytes(b"")
+    command = [str(Path(sys.executable).with_name("ns-train")), "sadgs", "--output-dir", str(tmp_path / "out")]
+    command += ["--data", str(data), "--vis", "tensorboard", "colmap", "--colmap-path", SPARSE]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    assert result.returncode == 1
+    assert "Traceback" not in result.stdout + result.stderr
+    assert result.stderr.splitlines()[-1].startswith(f"error: {data / FIRST} has 0 bytes: copy it again, or leave it")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_preset_with_an_unknown_key_ends_nerfstudio_s_commands_with_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "p.yaml").write_text("description: A preset.\noptimizers: {}\nmax_iterations: 3\n")
+    monkeypatch.setattr(presets, "_configs", lambda: tmp_path)
+    with pytest.raises(InputError) as refused:
+        presets._registered("p")
+    assert re.fullmatch(
+        rf"{re.escape(str(tmp_path))}/p\.yaml has a mistake: p\.yaml: unknown key 'max_iterations'; known are .*\.",
+        str(refused.value),
+    )

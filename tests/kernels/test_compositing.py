@@ -1,0 +1,328 @@
+"""The compositing's backward pass against float64 autograd through the plain formula, and on CUDA against gsplat's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import scenes
+import torch
+from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
+from torch import Tensor
+
+from sadgs_ns.render import splatter
+
+compositing = pytest.importorskip("sadgs_ns.kernels.compositing", reason="Triton is not installed")
+rasterization = pytest.importorskip("sadgs_ns.kernels.rasterization", reason="Triton is not installed")
+tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not installed")
+
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+NAMES = ("means2d", "conics", "colors", "opacities", "absgrad")
+
+
+TINY = 0.05
+"""Standard deviation of the "tiny" kind in px; gsplat's own blur leaves none under 0.55."""
+
+
+def make_scene(
+    kind: str, num_views: int = 1, n: int = 60, width: int = 21, height: int = 18, tiny: float = TINY
+) -> dict[str, Any]:
+    """Projected Gaussians with their tile lists, and gradients of what they render."""
+    generator = torch.Generator().manual_seed(1)
+
+    def random(*shape: int) -> Tensor:
+        return torch.rand((num_views, n, *shape), generator=generator)
+
+    size = torch.tensor([width, height])
+    means2d = random(2) * size * 1.4 - size * 0.2
+    angles, sigmas = 3.2 * random(), 0.6 + 3 * random(2)
+    opacities = 0.05 + 0.85 * random()
+    if kind == "opaque":
+        opacities, sigmas = 0.95 + 0.05 * random(), 2 * sigmas + 2
+        opacities[:, ::3] = 1.0  # alpha is cut off at 0.999 around the centre
+    elif kind == "faint":
+        opacities = 0.012 * random()  # mostly below 1/255
+    elif kind == "long and thin":  # 0.3 px² is gsplat's blur; centres up to 100 px off
+        sigmas = torch.stack([20 + 80 * random(), torch.full((num_views, n), 0.56)], dim=-1)
+        means2d = size / 2 + 60 * (random() - 0.5)[..., None] * torch.stack([angles.cos(), angles.sin()], dim=-1)
+    elif kind == "tiny":
+        sigmas = torch.full((num_views, n, 2), tiny)
+        means2d = means2d.floor() + 0.5 + min(4 * tiny, 1.0) * random(2)
+    elif kind == "huge":
+        sigmas = 500 + 1000 * random(2)
+        means2d = means2d + 2000 * (random(2) - 0.5)
+        opacities = 0.3 * opacities
+    rotations = torch.stack([angles.cos(), -angles.sin(), angles.sin(), angles.cos()], dim=-1).unflatten(-1, (2, 2))
+    precisions = (rotations / sigmas[..., None, :] ** 2) @ rotations.mT
+    scene: dict[str, Any] = {
+        "means2d": means2d,
+        "conics": torch.stack([precisions[..., 0, 0], precisions[..., 0, 1], precisions[..., 1, 1]], dim=-1),
+        "colors": random(3),
+        "opacities": opacities,
+        "depths": random(),
+        "v_renders": torch.randn((num_views, height, width, 3), generator=generator),
+        "v_alphas": torch.randn((num_views, height, width, 1), generator=generator),
+    }
+    scene = {name: value.to(DEVICE) for name, value in scene.items()}
+    radii = torch.full((num_views, n), 10**6, dtype=torch.int32, device=DEVICE)
+    scene["starts"], scene["ids"] = tiles.intersect_tiles(
+        scene["means2d"], radii, scene["depths"], scene["conics"], scene["opacities"], width, height, 8
+    ).lists()
+    return scene
+
+
+def reference(scene: dict[str, Any]) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+    """Gradients by autograd in float64, alphas [C, height, width, 1] and last_ids [C, height, width]."""
+    num_views, height, width = scene["v_renders"].shape[:3]
+    n = scene["means2d"].shape[1]
+    means2d, conics, colors, opacities = (scene[name].double().cpu().requires_grad_() for name in NAMES[:4])
+    lists = scene["ids"].cpu().long().tensor_split(scene["starts"].cpu().flatten()[1:].long())
+    rows, columns = scene["starts"].shape[1:]
+    place = torch.full((num_views, n, rows, columns), -1)  # of each Gaussian in each tile's list
+    begin = 0
+    for number, listed in enumerate(lists):
+        tile = number % (rows * columns)
+        place[listed // n, listed % n, tile // columns, tile % columns] = begin + torch.arange(len(listed))
+        begin += len(listed)
+    place = place.repeat_interleave(8, 2).repeat_interleave(8, 3)[:, :, :height, :width].flatten(2)  # [C, N, P]
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    pixels = torch.stack([x, y], dim=-1).reshape(-1, 2)
+    order = scene["depths"].cpu().argsort(dim=1, stable=True)[..., None].expand_as(place)
+    delta = means2d[:, :, None] - pixels  # [C, N, P, 2]
+    delta.retain_grad()
+    a, b, c = conics[:, :, None].unbind(-1)
+    sigma = 0.5 * (a * delta[..., 0] ** 2 + c * delta[..., 1] ** 2) + b * delta[..., 0] * delta[..., 1]
+    alpha = (opacities[..., None] * torch.exp(-sigma)).clamp_max(0.999)
+    alpha = torch.where((place < 0) | (sigma < 0) | (alpha < 1 / 255), 0.0, alpha).gather(1, order)
+    left = (1 - alpha).cumprod(dim=1)
+    alpha = torch.where(left <= 1e-4, 0.0, alpha)
+    behind = (1 - alpha).cumprod(dim=1)
+    weights = alpha * torch.cat([torch.ones_like(behind[:, :1]), behind[:, :-1]], dim=1)
+    renders = weights.mT @ colors.gather(1, order[..., :3])  # [C, P, 3]
+    alphas = 1 - behind[:, -1]
+    loss = (renders * scene["v_renders"].double().cpu().flatten(1, 2)).sum()
+    (loss + (alphas * scene["v_alphas"].double().cpu().flatten(1)).sum()).backward()
+    gradients: dict[str, Any] = dict(zip(NAMES, (means2d.grad, conics.grad, colors.grad, opacities.grad), strict=False))
+    gradients["absgrad"] = delta.grad.abs().sum(dim=2)  # type: ignore[union-attr]
+    last_ids = torch.where(weights > 0, place.gather(1, order), 0).amax(dim=1).reshape(num_views, height, width)
+    return gradients, alphas.detach().reshape(num_views, height, width, 1), last_ids.int()
+
+
+def gradients_of(scene: dict[str, Any], alphas: Tensor, last_ids: Tensor, absgrad: bool = True) -> dict[str, Any]:
+    """Those of the kernel, in float64 on the CPU."""
+    results = compositing.composite_backward(
+        *(scene[name] for name in NAMES[:4]),
+        scene["starts"],
+        scene["ids"],
+        alphas.float().to(DEVICE),
+        last_ids.to(DEVICE),
+        scene["v_renders"],
+        scene["v_alphas"],
+        absgrad,
+    )
+    return {name: None if value is None else value.double().cpu() for name, value in zip(NAMES, results, strict=True)}
+
+
+# Largest error, relative to the largest gradient. The kernel is given alphas in float32, as gsplat's is: where 1e-4 of
+# the light is left, 1 - alpha has an error of up to 6e-4. Tiny Gaussians' offsets cancel against those of their tile.
+TOLERANCES = {"usual": 2e-6, "opaque": 3e-4, "faint": 2e-6, "long and thin": 3e-4, "tiny": 1e-3, "huge": 1e-4}
+
+
+@pytest.mark.parametrize("kind", TOLERANCES)
+def test_gradients_equal_float64_autograd(kind):
+    scene = make_scene(kind, num_views=2 if kind == "usual" else 1)
+    expected, alphas, last_ids = reference(scene)
+    if kind == "opaque":  # most lists end behind what is drawn
+        assert (alphas > 0.999).float().mean() > 0.3 and last_ids.max() < len(scene["ids"]) - 5
+    gradients = gradients_of(scene, alphas, last_ids)
+    for name, value in expected.items():
+        assert value.abs().max() > 0
+        error = (gradients[name] - value).abs().max() / value.abs().max()
+        assert error < (5e-4 if name == "absgrad" else TOLERANCES[kind]), (name, float(error))
+
+
+@pytest.mark.parametrize("sigma", [0.05, 0.1, 0.2, 0.55])
+def test_small_gaussians_err_as_the_module_says(sigma):
+    scene = make_scene("tiny", n=200, width=61, height=46, tiny=sigma)
+    expected, alphas, last_ids = reference(scene)
+    gradients = gradients_of(scene, alphas, last_ids)
+    errors = {name: float((gradients[name] - value).norm() / value.norm()) for name, value in expected.items()}
+    assert errors.pop("conics") < 2e-6 / sigma**2  # "about 1e-6"
+    assert errors.pop("absgrad") < (3e-4 if sigma < 0.5 else 1.5e-4)
+    assert max(errors.values()) < 1e-5, errors
+
+
+def test_without_absgrad_the_rest_is_the_same():
+    scene = make_scene("usual", n=30, width=9, height=9)
+    _, alphas, last_ids = reference(scene)
+    both = [gradients_of(scene, alphas, last_ids, absgrad) for absgrad in (True, False)]
+    assert both[0].pop("absgrad") is not None and both[1].pop("absgrad") is None
+    for name, value in both[0].items():
+        torch.testing.assert_close(both[1][name], value, atol=1e-6, rtol=1e-5)
+
+
+def test_without_a_gradient_of_alphas_it_counts_as_zero():
+    scene = make_scene("usual", n=30, width=9, height=9)
+    _, alphas, last_ids = reference(scene)
+    scene["v_alphas"] = torch.zeros_like(scene["v_alphas"])
+    expected = gradients_of(scene, alphas, last_ids)
+    scene["v_alphas"] = None
+    for name, value in gradients_of(scene, alphas, last_ids).items():
+        torch.testing.assert_close(value, expected[name], atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("broken", [float("nan"), float("inf"), -1e30])
+def test_a_broken_pixel_reaches_the_gaussians_that_it_sees_and_no_others(broken):
+    scene = make_scene("usual", width=8, height=8)
+    _, alphas, last_ids = reference(scene)
+    scene["v_renders"][0, 2, 3, 1] = 0
+    expected = gradients_of(scene, alphas, last_ids)
+    scene["v_renders"][0, 2, 3, 1] = broken
+    gradients = gradients_of(scene, alphas, last_ids)
+    delta = scene["means2d"][0].cpu() - torch.tensor([3.5, 2.5])
+    a, b, c = scene["conics"][0].cpu().unbind(-1)
+    sigma = 0.5 * (a * delta[:, 0] ** 2 + c * delta[:, 1] ** 2) + b * delta[:, 0] * delta[:, 1]
+    seen = scene["opacities"][0].cpu() * torch.exp(-sigma) >= 1 / 255
+    place = torch.full_like(seen, -1, dtype=torch.long)
+    place[scene["ids"].cpu().long()] = torch.arange(len(scene["ids"]))
+    seen &= (place >= 0) & (place <= last_ids[0, 2, 3])
+    assert 5 < seen.sum() < 55
+    for name in NAMES[:4]:
+        assert gradients[name][0, seen].isnan().all(), name
+        torch.testing.assert_close(gradients[name][0, ~seen], expected[name][0, ~seen], atol=1e-6, rtol=1e-5)
+
+
+def test_nothing_in_sight_has_gradients_of_zero():
+    scene = make_scene("usual", n=3)
+    scene["starts"], scene["ids"] = torch.zeros_like(scene["starts"]), scene["ids"][:0]
+    alphas, last_ids = torch.zeros(1, 18, 21, 1), torch.zeros(1, 18, 21, dtype=torch.int32)
+    assert all((value == 0).all() for value in gradients_of(scene, alphas, last_ids).values())
+
+
+def test_tiles_without_gaussians_stay_out_of_the_others_lists():
+    # The one Gaussian is first in the only list; pixels that draw nothing name the same place as their last.
+    scene = make_scene("usual", n=1, width=40, height=40)
+    scene["starts"], scene["ids"] = tiles.intersect_tiles(
+        scene["means2d"].fill_(20.0), torch.full((1, 1), 4, dtype=torch.int32, device=DEVICE), scene["depths"],
+        scene["conics"], scene["opacities"].fill_(0.9), 40, 40, 8,
+    ).lists()  # fmt: skip
+    assert 0 < len(scene["ids"]) < 10
+    expected, alphas, last_ids = reference(scene)
+    gradients = gradients_of(scene, alphas, last_ids)
+    for name in NAMES[:4]:
+        torch.testing.assert_close(gradients[name], expected[name], atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("through", ["colours and alphas", "colours", "alphas"])
+def test_autograd_gets_what_the_kernel_returns(monkeypatch, through):
+    scene = make_scene("usual", n=30, width=9, height=9)
+    for name, what in (("v_renders", "colours"), ("v_alphas", "alphas")):
+        if what not in through:
+            scene[name] = torch.zeros_like(scene[name])
+    expected, alphas, last_ids = reference(scene)
+    if DEVICE.type == "cpu":  # gsplat's forward pass needs CUDA
+        renders = torch.zeros(1, 9, 9, 3)
+        forward = lambda *_: (renders, alphas.float(), last_ids)  # noqa: E731
+        monkeypatch.setattr(compositing._wrapper, "_make_lazy_cuda_func", lambda name: forward)
+    inputs = {name: scene[name].clone() for name in NAMES[:4]}
+    for name in ("means2d", "colors"):
+        inputs[name].requires_grad_()
+    renders, alphas = compositing.rasterize_to_pixels(
+        *(inputs[name] for name in NAMES[:4]), 9, 9, scene["starts"], scene["ids"], True
+    )
+    outputs = {"v_renders": renders, "v_alphas": alphas}
+    used = [name for name in outputs if scene[name].any()]
+    torch.autograd.backward([outputs[name] for name in used], [scene[name] for name in used])
+    for name, value in expected.items():
+        found = inputs["means2d"].absgrad if name == "absgrad" else inputs[name].grad
+        if name in ("conics", "opacities"):
+            assert found is None
+        else:
+            torch.testing.assert_close(found.double().cpu(), value, atol=5e-4 * float(value.abs().max()), rtol=0)
+
+
+@pytest.mark.skipif(
+    torch.cuda.is_available(), reason="with CUDA, tests/test_rasterization.py takes gsplat's own kernels"
+)
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatch, mode):
+    """All that surrounds gsplat's two kernels, for two views; torch code stands in for these."""
+    width, height, depths = 32, 24, []
+
+    def project(means, _, quats, scales, viewmats, Ks, width, height, calc_compensations):
+        covariances = _quat_scale_to_covar_preci(quats, scales, True, False)[0]
+        assert covariances is not None
+        projected = _fully_fused_projection(
+            means, covariances, viewmats, Ks, width, height, calc_compensations=calc_compensations
+        )
+        depths[:] = [projected[2].detach()]
+        return projected
+
+    def draw(means2d, conics, colors, opacities, backgrounds, masks, width, height, tile_size, starts, ids):
+        values = (value.detach().clone() for value in (means2d, conics, colors, opacities))
+        scene = dict(zip(NAMES, values, strict=False)) | {"starts": starts, "ids": ids, "depths": depths[0]}
+        scene["v_renders"], scene["v_alphas"] = torch.ones(2, height, width, 3), torch.ones(2, height, width, 1)
+        with torch.enable_grad():
+            _, alphas, last_ids = reference(scene)
+        return torch.zeros(2, height, width, 3), alphas.float(), last_ids  # nobody looks at the colours
+
+    monkeypatch.setattr(rasterization, "fully_fused_projection", project)
+    monkeypatch.setattr(compositing._wrapper, "_make_lazy_cuda_func", lambda name: draw)
+    generator = torch.Generator().manual_seed(0)
+    viewmats = torch.eye(4).repeat(2, 1, 1)
+    viewmats[1, :3, :3] = torch.linalg.qr(torch.eye(3) + 0.05 * torch.randn(3, 3, generator=generator))[0]
+    viewmats[1, :3, :3] *= viewmats[1, :3, :3].diagonal().sign()
+    viewmats[1, :3, 3] = torch.tensor([0.2, 0.1, 0.3])
+    Ks = scenes.camera(width, height, 30.0)[1].repeat(2, 1, 1)
+    rest, v_renders = (0.1 * torch.randn(shape, generator=generator) for shape in ((60, 15, 3), (2, height, width, 3)))
+    results = []
+    for function, dtype in ((rasterization.rasterization, torch.float32), (splatter.rasterization, torch.float64)):
+        values = {name: p.detach() for name, p in scenes.random_params(60).items()} | {"rest": rest}
+        values = {name: value.to(dtype, copy=True).requires_grad_() for name, value in values.items()}
+        colors: Any = values["features_dc"], values["rest"]
+        if dtype == torch.float64:
+            colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
+        geometry = values["means"], values["quats"], values["scales"].exp(), torch.sigmoid(values["opacities"])
+        renders, _, info = function(
+            *geometry, colors, viewmats.to(dtype), Ks.to(dtype), width, height,
+            sh_degree=3, packed=False, render_mode="RGB", absgrad=True, rasterize_mode=mode,
+        )  # fmt: skip
+        renders.backward(v_renders.to(dtype))
+        results.append({name: value.grad for name, value in values.items()} | {"absgrad": info["means2d"].absgrad})
+    for name, expected in results[1].items():
+        error = (results[0][name].double() - expected).norm() / expected.norm()
+        assert error < (1e-4 if name == "absgrad" else 5e-6), (name, float(error))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat's kernels need CUDA")
+@pytest.mark.parametrize("kind", TOLERANCES)
+def test_gradients_are_as_close_to_float64_as_gsplats(kind):
+    """As norms: rounding moves a few pairs over a cut-off, in either's passes, and single values with them.
+
+    Where ours may err more than gsplat's, it is by what the module states.
+    """
+    from gsplat.cuda._wrapper import rasterize_to_pixels
+
+    scene = make_scene(kind, num_views=2, n=300, width=93, height=70)
+    expected, _, _ = reference(scene)
+    errors = []
+    for ours in (True, False):
+        means2d, conics, colors, opacities = inputs = [scene[name].clone().requires_grad_() for name in NAMES[:4]]
+        lists = scene["starts"], scene["ids"]
+        if ours:
+            outputs = compositing.rasterize_to_pixels(means2d, conics, colors, opacities, 93, 70, *lists, True)
+        else:
+            outputs = rasterize_to_pixels(
+                means2d, conics, colors, opacities, 93, 70, 8, *lists, absgrad=True
+            )  # fmt: skip
+        torch.autograd.backward(outputs, [scene["v_renders"], scene["v_alphas"]])
+        gradients: dict[str, Any] = dict(
+            zip(NAMES, [*(value.grad for value in inputs), means2d.absgrad], strict=True)
+        )  # fmt: skip
+        errors.append({k: float((gradients[k].double().cpu() - v).norm() / v.norm()) for k, v in expected.items()})
+    print(kind, *errors)
+    stated = {"absgrad": 1e-4}
+    if kind == "tiny":
+        stated = {"absgrad": 3e-4, "conics": 1e-6 / TINY**2}
+    for name, error in errors[0].items():
+        assert error < max(2 * errors[1][name], stated.get(name, 1e-5)), (name, error, errors[1][name])

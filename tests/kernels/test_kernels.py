@@ -1,0 +1,484 @@
+"""The Triton kernels against the torch code beside them: on the GPU, or in Triton's interpreter without one."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import scenes
+import torch
+from gsplat.cuda._torch_impl import _spherical_harmonics
+from torch import Tensor
+
+from sadgs_ns import kernels
+from sadgs_ns.bench.rasterizers import random_scene
+from sadgs_ns.method import losses
+from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients
+from sadgs_ns.method.codes import encode
+from sadgs_ns.method.statistics import empty_statistics, observe
+from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
+from sadgs_ns.plugin.optimizers import FusedAdam
+
+codes = pytest.importorskip("sadgs_ns.kernels.codes", reason="Triton is not installed")
+adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
+convolution = pytest.importorskip("sadgs_ns.kernels.convolution", reason="Triton is not installed")
+scale_space = pytest.importorskip("sadgs_ns.kernels.scale_space", reason="Triton is not installed")
+harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")
+observation = pytest.importorskip("sadgs_ns.kernels.statistics", reason="Triton is not installed")
+photometric = pytest.importorskip("sadgs_ns.kernels.losses", reason="Triton is not installed")
+screen_gradients = pytest.importorskip("sadgs_ns.kernels.absgs", reason="Triton is not installed")
+tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not installed")
+
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def recorded(monkeypatch: pytest.MonkeyPatch, module: Any, *names: str) -> list[str]:
+    """Names of those functions of a module that are called from now on: no reference may be compared with itself."""
+    calls: list[str] = []
+    for name in names:
+        run = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *a, name=name, run=run, **o: calls.append(name) or run(*a, **o))
+    return calls
+
+
+@pytest.mark.parametrize("shape", [(2, 37, 51, 3), (1, 11, 11, 3), (1, 20, 90, 3)], ids=str)
+def test_loss_and_gradient_equal_the_float64_reference(shape):
+    generator = torch.Generator().manual_seed(0)
+    target = torch.rand(shape, generator=generator)
+    noise = 0.1 * torch.randn(shape, generator=generator)
+    noise[:, : shape[1] // 2] = 0  # where both images agree, L1 has a kink: its gradient there is 0
+    results = []
+    for function, dtype in ((photometric.photometric_loss, torch.float32), (losses.photometric_loss, torch.float64)):
+        y = target.to(DEVICE, dtype)
+        x = (target + noise).to(DEVICE, dtype).requires_grad_()
+        loss, psnr = function(x, y, ssim_lambda=0.3, l2_lambda=1.5)
+        (3 * loss).backward()
+        assert x.grad is not None
+        results.append((loss.detach().double(), psnr.double(), x.grad.double()))
+    fast, reference = results
+    assert not torch.equal(reference[2], torch.zeros_like(reference[2]))
+    torch.testing.assert_close(fast[0], reference[0], atol=2e-6, rtol=0)
+    torch.testing.assert_close(fast[1], reference[1], atol=1e-5, rtol=0)
+    torch.testing.assert_close(fast[2], reference[2], atol=5e-5 * float(reference[2].abs().max()), rtol=0)
+
+
+def test_flat_images_have_a_finite_gradient():
+    x = torch.zeros((1, 16, 16, 3), device=DEVICE, requires_grad=True)
+    loss, _ = photometric.photometric_loss(x, torch.zeros_like(x), ssim_lambda=0.2, l2_lambda=2.0)
+    loss.backward()
+    assert x.grad is not None and abs(float(loss)) < 1e-6 and torch.isfinite(x.grad).all()
+
+
+@pytest.mark.parametrize("function", [photometric.photometric_loss, losses.photometric_loss])
+def test_psnr_carries_no_gradient(function):
+    x = torch.rand((1, 12, 12, 3), device=DEVICE, requires_grad=True)
+    _, psnr = function(x, torch.zeros_like(x), ssim_lambda=0.2, l2_lambda=2.0)
+    assert psnr > 0 and not psnr.requires_grad
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-9, 1e15, math.inf, math.nan])
+def test_psnr_of_extreme_errors_is_torchs(value):
+    x = torch.zeros((1, 12, 12, 3), device=DEVICE)
+    x[0, 3, 4, 1] = value
+    with np.errstate(all="ignore"):  # Triton's interpreter computes with numpy
+        _, actual = photometric.photometric_loss(x, torch.zeros_like(x), ssim_lambda=0.2, l2_lambda=2.0)
+    _, expected = losses.photometric_loss(x, torch.zeros_like(x), fused=False)
+    torch.testing.assert_close(actual, expected, rtol=1e-6, atol=0, equal_nan=True)
+
+
+def test_partial_sums_are_added_as_accurately_as_torch_adds_them():
+    """As many as two views of 1920×1080 leave, and no multiple of what is added at once."""
+    generator = torch.Generator().manual_seed(0)
+    differences, similarities = torch.rand((2, 12150), generator=generator), torch.rand(12240, generator=generator)
+    loss, psnr = torch.zeros((), device=DEVICE), torch.zeros((), device=DEVICE)
+    n = 12150 * 1024
+    weights = 0.8 / n, 0.2 / n, 2.0 / n
+    photometric._finish[1,](
+        differences.to(DEVICE), similarities.to(DEVICE), loss, psnr, n, 12150, 12240, 0.2, *weights, photometric._LANES
+    )  # fmt: skip
+    l1, l2, of_ssim = (float(values.double().sum()) for values in (*differences, similarities))
+    assert float(loss) == pytest.approx(weights[0] * l1 + 0.2 - weights[1] * of_ssim + weights[2] * l2, abs=3e-8)
+    assert float(psnr) == pytest.approx(-10 * math.log10(l2 / n), rel=1e-6)
+
+
+def test_kernels_are_for_the_current_cuda_device_only(monkeypatch):
+    monkeypatch.setattr(kernels, "_compiles", lambda device: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
+    names = ("cpu", "cuda", "cuda:0", "cuda:1")
+    assert [kernels.available(torch.device(name)) for name in names] == [False, True, False, True]
+
+
+def test_a_triton_that_compiles_is_found_and_one_that_does_not_is_told_once(monkeypatch):
+    assert kernels._compiles.__wrapped__(DEVICE)
+
+    def fail(device):
+        raise RuntimeError("Failed to find C compiler.\nPlease specify via CC")
+
+    monkeypatch.setattr("sadgs_ns.kernels.trial_kernel.probe", fail)
+    with pytest.warns(UserWarning, match=r"do not run here: Failed to find C compiler\.$"):
+        assert not kernels._compiles.__wrapped__(DEVICE)
+
+
+def test_an_old_triton_is_left_alone_and_named(monkeypatch):
+    monkeypatch.setattr("triton.__version__", "3.4.0")
+    with pytest.warns(UserWarning, match=r"do not run here: 3\.4\.0 is older than 3\.5 \(torch 2\.9\);"):
+        assert not kernels._compiles.__wrapped__(DEVICE)
+
+
+@pytest.mark.parametrize("shape", [(2, 3, 21, 34), (1, 1, 1, 40), (1, 2, 5, 3)], ids=str)
+@pytest.mark.parametrize("axis", [2, 3])
+def test_convolution_equals_torchs_in_float64(shape, axis):
+    generator = torch.Generator().manual_seed(0)
+    image, kernel = torch.randn(shape, generator=generator), torch.randn(9, generator=generator)
+    actual = convolution.correlate(image.to(DEVICE), kernel.to(DEVICE), axis)
+    weight = kernel.double().view((1, 1, -1, 1) if axis == 2 else (1, 1, 1, -1)).expand(shape[1], -1, -1, -1)
+    padding = (4, 0) if axis == 2 else (0, 4)
+    expected = torch.nn.functional.conv2d(image.double(), weight, padding=padding, groups=shape[1])
+    torch.testing.assert_close(actual.cpu().double(), expected, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("masked", [False, True, "transposed"])
+@pytest.mark.parametrize("energy_blur", [0.0, 2.0])
+def test_structure_tensors_are_the_same_with_the_kernels(monkeypatch, masked, energy_blur):
+    images = torch.rand((2, 9, 14, 3), generator=torch.Generator().manual_seed(0)).to(DEVICE)
+    masks = torch.ones((2, 9, 14), dtype=torch.bool, device=DEVICE) if masked else None
+    if masks is not None:
+        masks[0, 3:6, 5:7] = False
+        if masked == "transposed":  # the same in memory of another order
+            masks = masks.mT.contiguous().mT
+    options = {"num_levels": 2, "energy_blur": energy_blur, "gamma": 2.5}
+    expected = multiscale_structure_tensor(images.double(), masks, **options)
+    monkeypatch.setattr(kernels, "available", lambda device: True)
+    convolutions = recorded(monkeypatch, convolution, "correlate")
+    calls = recorded(monkeypatch, scale_space, "differentiate", "accumulate")
+    actual = multiscale_structure_tensor(images, masks, **options)
+    assert convolutions and set(calls) == {"differentiate", "accumulate"}
+    torch.testing.assert_close(actual.double(), expected, atol=1e-5 * float(expected.abs().max()), rtol=1e-4)
+
+
+def test_codes_are_the_references_or_their_neighbours(monkeypatch):
+    tensor = torch.rand((3, 100, 3), generator=torch.Generator().manual_seed(0)) ** 8 * torch.tensor([16.0, 1.0, 16.0])
+    tensor[0, :4] = torch.tensor([[0.0, 0, 0], [64, 0, 1e-12], [0, 0.1, 1], [8, -9, 8]])
+    expected = encode(tensor, fused=False).int()
+    monkeypatch.setattr(kernels, "available", lambda device: True)
+    calls = recorded(monkeypatch, codes, "encode")
+    actual = encode(tensor.to(DEVICE)).cpu().int()
+    assert len(calls) == 1
+    assert (actual - expected).abs().max() <= 1 and (actual != expected).float().mean() < 0.01
+    assert torch.equal(actual[0, :4], expected[0, :4])
+
+
+@pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
+@pytest.mark.parametrize(("degree", "num_others"), [(0, 15), (1, 15), (2, 15), (3, 15), (3, 24)])
+def test_colours_and_gradients_equal_gsplats_float64_harmonics(monkeypatch, degree, num_others, per_axis_radii):
+    generator = torch.Generator().manual_seed(degree)
+    shapes = (90, 3), (90, 3), (90, num_others, 3), (3, 3), (3, 90, 3)
+    *values, centres, weights = (torch.randn(shape, generator=generator) for shape in shapes)
+    viewmats, radii = scenes.cameras_at(centres), torch.randint(-1, 9, (3, 90, 2), generator=generator)
+    radii = radii if per_axis_radii else radii[..., 0].contiguous()
+    drawn = (radii > 0).all(dim=-1) if per_axis_radii else radii > 0
+    fast = [value.to(DEVICE, copy=True).requires_grad_() for value in values]
+    colors = harmonics.colors_from_harmonics(degree, *fast, viewmats.to(DEVICE), radii.to(DEVICE))
+    v_colors = (weights * drawn[..., None]).to(DEVICE)
+    if per_axis_radii:  # as compositing returns them
+        v_colors = torch.nn.functional.pad(v_colors, (6, 3))[..., 6:9]
+    # What is not written keeps what was in the memory before.
+    monkeypatch.setattr(torch, "empty_like", lambda tensor: torch.full_like(tensor, math.nan))
+    colors.backward(v_colors)
+    positions = scenes.centres_of(viewmats)
+    torch.testing.assert_close(positions[:, 0].float(), centres, atol=1e-5, rtol=1e-5)
+    slow = means, first, rest = [value.double().requires_grad_() for value in values]
+    coefficients = torch.cat([first[:, None], rest], dim=1).expand(3, -1, -1, -1)
+    expected = (_spherical_harmonics(degree, means - positions, coefficients) + 0.5).clamp_min(0)
+    (expected * weights * drawn[..., None]).sum().backward()
+    torch.testing.assert_close(colors[drawn.to(DEVICE)].double().cpu(), expected[drawn], atol=2e-6, rtol=2e-6)
+    assert (expected == 0).any() and (expected > 0).any()
+    for actual, reference in zip(fast, slow, strict=True):
+        assert actual.grad is not None
+        gradient = torch.zeros_like(reference) if reference.grad is None else reference.grad
+        torch.testing.assert_close(actual.grad.double().cpu(), gradient, atol=2e-5, rtol=2e-5)
+
+
+@pytest.mark.parametrize("directional", [False, True])
+@pytest.mark.parametrize("min_opacity", [0.0, 0.5])
+@pytest.mark.parametrize("kept", [Tensor.half, encode], ids=["float16", "8 bits"])
+def test_observation_equals_the_reference(monkeypatch, directional, min_opacity, kept):
+    n, width, height = 150, 40, 30
+    params = {name: p.detach() for name, p in scenes.random_params(n).items()}
+    params["opacities"] = params["opacities"][:, None]
+    params["scales"][::9] += 3  # reaches over the border
+    params["means"][::13, 2] = -1  # behind the camera
+    viewmats, Ks = scenes.camera(width, height, focal=40.0)
+    viewmats, Ks = viewmats.repeat(2, 1, 1), Ks.repeat(2, 1, 1)
+    viewmats[1, :3, :3] = torch.linalg.qr(torch.eye(3) + 0.1)[0]
+    viewmats[1, :3, 3] = torch.tensor([0.1, -0.2, 0.5])
+    flat = {name: torch.nn.Parameter(p.flatten() if name == "opacities" else p) for name, p in params.items()}
+    _, _, info = scenes.splat(flat, viewmats, Ks, width, height)
+    generator = torch.Generator().manual_seed(0)
+    factors = torch.randn((2, height, width, 2, 2), generator=generator)
+    tensors = factors @ factors.mT
+    info |= {"viewmats": viewmats, "Ks": Ks}
+    info["structure_tensors"] = kept(torch.stack([tensors[..., 0, 0], tensors[..., 0, 1], tensors[..., 1, 1]], -1))
+    results = []
+    monkeypatch.setattr(kernels, "available", lambda device: True)
+    calls = recorded(monkeypatch, observation, "observe_views")
+    for fused in (False, True):
+        statistics = {k: v.to(DEVICE) for k, v in empty_statistics(n, torch.device("cpu")).items()}
+        for seed in (1, 2):
+            observe(
+                statistics,
+                {name: torch.nn.Parameter(value.to(DEVICE)) for name, value in params.items()},
+                {
+                    name: value.detach().to(DEVICE) if isinstance(value, Tensor) else value
+                    for name, value in info.items()
+                },
+                directional=directional,
+                min_opacity=min_opacity,
+                generator=torch.Generator(DEVICE).manual_seed(seed),
+                fused=fused,
+            )
+        results.append(statistics)
+        assert len(calls) == 2 * fused
+    reference, fast = results
+    assert reference["n_total"].sum() > n / 2 and reference["n_low"].sum() > 0 and reference["n_high"].sum() > 0
+    assert (reference["n_total"] == 0).any()
+    for name in ("n_total", "n_high", "n_low"):
+        assert torch.equal(fast[name], reference[name]), name
+    torch.testing.assert_close(fast["eta_max"], reference["eta_max"], atol=1e-6, rtol=2e-5)
+
+
+@pytest.mark.parametrize("layout", ["parts of rows", "apart", "transposed"])
+@pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
+def test_screen_gradients_add_up_as_in_the_reference(monkeypatch, per_axis_radii, layout):
+    views, n = 3, 300
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.randn((views, n, 12), generator=generator)
+    rows[0, 1, :2], rows[1, 2, 10], rows[2, 3, 9] = math.nan, math.nan, math.inf
+    radii = torch.randint(-1, 4, (views, n, 2), generator=generator, dtype=torch.int32)
+    radii[:, 1:4], radii[:, 5] = 1, 0
+    radii = radii if per_axis_radii else radii[..., 1].contiguous()
+    rows = rows.to(DEVICE)  # before it is cut: a copy of a part would lie apart
+    parts = [rows[..., :2], rows[..., 9:11]]
+    if layout == "apart":
+        parts = [part.contiguous() for part in parts]
+    elif layout == "transposed":
+        parts = [part.mT.contiguous().mT for part in parts]
+    results = []
+    monkeypatch.setattr(kernels, "available", lambda device: True)
+    calls = recorded(monkeypatch, screen_gradients, "accumulate_gradients")
+    for fused in (False, True):
+        means2d = torch.zeros((views, n, 2), device=DEVICE)
+        means2d.grad, means2d.absgrad = parts  # type: ignore[attr-defined]
+        info = {"means2d": means2d, "radii": radii.to(DEVICE), "width": 64, "height": 48}
+        sums = empty_gradients(n, DEVICE)
+        for _ in range(2):
+            accumulate_gradients(sums, info, num_views=views, fused=fused)
+        results.append(sums)
+        assert len(calls) == 2 * fused
+    reference, fast = results
+    assert set(reference["grad_count"].unique().tolist()) == {0, 2, 4, 6} and reference["grad2d"][5] == 0
+    assert reference["absgrad2d"].isinf().nonzero().tolist() == [[3]] and not reference["grad2d"].isnan().any()
+    assert torch.equal(fast.pop("grad_count"), reference["grad_count"])
+    for name, value in fast.items():
+        torch.testing.assert_close(value, reference[name], atol=1e-5, rtol=1e-6)
+
+
+ADAM = {"betas": (0.9, 0.999), "eps": 1e-15}
+WIDTHS = [(3,), (15, 3), (), (4,), (1,)]  # a row of each parameter
+LRS = (0.1, 0.01, 0.3, 0.003, 0.02)
+
+
+def with_moments(start: list[Tensor]) -> tuple[tuple[Tensor, ...], ...]:
+    """Copies of parameters, and their moments."""
+    zeros = [tuple(torch.zeros_like(p, device=DEVICE) for p in start) for _ in range(2)]
+    return tuple(p.to(DEVICE).clone() for p in start), *zeros
+
+
+@pytest.mark.parametrize("rows", [0, 1, 37, 1024], ids="{} Gaussians".format)
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-5), (torch.float32, 2e-5)], ids=str)
+def test_adam_in_one_launch_equals_torchs_and_one_launch_for_each_parameter(rows, dtype, tolerance):
+    generator = torch.Generator().manual_seed(0)
+    start = [torch.randn((rows, *width), generator=generator) for width in WIDTHS]
+    expected = [torch.nn.Parameter(p.to(dtype, copy=True)) for p in start]
+    groups = [{"params": [p], "lr": lr} for p, lr in zip(expected, LRS, strict=True)]
+    optimizer = torch.optim.Adam(groups, **ADAM)
+    together, separate = with_moments(start), with_moments(start)
+    noted = torch.zeros(1, device=DEVICE)
+    for step in range(1, 6):
+        gradients = tuple(torch.randn(p.shape, generator=generator) for p in start)
+        for parameter, gradient in zip(expected, gradients, strict=True):
+            parameter.grad = gradient.to(dtype)
+        optimizer.step()
+        gradients = tuple(gradient.to(DEVICE) for gradient in gradients)
+        adam.adam_step(together[0], gradients, *together[1:], noted, steps=[step] * 5, lrs=LRS, **ADAM)
+        for gradient, lr, (p, m, v) in zip(gradients, LRS, zip(*separate, strict=True), strict=True):
+            adam.adam_step((p,), (gradient,), (m,), (v,), noted, steps=[step], lrs=[lr], **ADAM)
+    assert float(noted) == 0
+    for one, other in zip(together, separate, strict=True):
+        if torch.device("cpu") == DEVICE:
+            assert all(map(torch.equal, one, other))
+        else:  # compiled, a product and a sum may round once in one kernel and twice in another
+            torch.testing.assert_close(one, other, atol=1e-7, rtol=2e-6)
+    for actual, parameter in zip(together[0], expected, strict=True):
+        torch.testing.assert_close(actual.to("cpu", dtype), parameter.detach(), atol=tolerance, rtol=tolerance)
+
+
+def test_adam_counts_each_parameters_own_updates():
+    start = [torch.linspace(-1, 1, 50), torch.linspace(1, 2, 50)]
+    expected = [torch.nn.Parameter(p.double()) for p in start]
+    optimizers = [torch.optim.Adam([p], lr=0.1, eps=1e-15) for p in expected]
+    actual = with_moments(start)
+    noted = torch.zeros(1, device=DEVICE)
+    for step in range(1, 5):
+        for k in (0, 1) if step > 2 else (0,):  # the other one's gradients come late
+            expected[k].grad = torch.full_like(expected[k], step)
+            optimizers[k].step()
+        gradients = tuple(torch.full_like(p, step) for p in actual[0])
+        if step > 2:
+            adam.adam_step(actual[0], gradients, *actual[1:], noted, steps=[step, step - 2], lrs=[0.1, 0.1], **ADAM)
+        else:
+            first = [values[:1] for values in (actual[0], gradients, *actual[1:])]
+            adam.adam_step(*first, noted, steps=[step], lrs=[0.1], **ADAM)
+    for p, q in zip(actual[0], expected, strict=True):
+        torch.testing.assert_close(p.double().cpu(), q.detach(), atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -1e30])
+@pytest.mark.parametrize("k", range(len(WIDTHS)))
+def test_a_gradient_that_is_not_finite_is_noted_and_left_out_of_its_parameter_alone(k, wrong):
+    start = [torch.ones((37, *width)) for width in WIDTHS]
+    results = []
+    for value in (0.0, wrong):
+        parameters = with_moments(start)
+        noted = torch.zeros(1, device=DEVICE)
+        gradients = tuple(torch.full_like(p, 0.5) for p in parameters[0])
+        gradients[k].flatten()[-1:] = value  # within the block that is not full
+        adam.adam_step(parameters[0], gradients, *parameters[1:], noted, steps=[1] * 5, lrs=LRS, **ADAM)
+        assert bool(noted.isnan()) == (value != 0.0)
+        results.append([tensor for tensors in parameters for tensor in tensors])
+    assert all(map(torch.equal, *results))
+
+
+def test_optimizer_keeps_torchs_state_while_it_runs_the_kernel(monkeypatch):
+    states = []
+    for triton in (False, True):
+        monkeypatch.setattr(kernels, "available", lambda device, triton=triton: triton)
+        parameters = [torch.nn.Parameter(torch.linspace(-1, 1, 50, device=DEVICE)), torch.nn.Parameter(torch.zeros(3))]
+        optimizer = FusedAdam(parameters, lr=0.01)
+        for _ in range(3):
+            parameters[0].grad = parameters[0].detach().clone()  # the other parameter has no gradient
+            optimizer.step()
+        restored = FusedAdam([torch.nn.Parameter(p.detach().clone()) for p in parameters], lr=0.01)
+        restored.load_state_dict(optimizer.state_dict())
+        restored.param_groups[0]["params"][0].grad = torch.ones(50, device=DEVICE)
+        restored.step()
+        states.append((parameters, optimizer.state_dict()["state"], restored.param_groups[0]["params"]))
+    (slow, slow_state, slow_on), (fast, fast_state, fast_on) = states
+    for one, other in zip([*slow, *slow_on], [*fast, *fast_on], strict=True):
+        torch.testing.assert_close(other, one, atol=1e-6, rtol=1e-6)
+    assert slow_state.keys() == fast_state.keys() == {0}
+    assert slow_state[0].keys() == fast_state[0].keys()
+    assert float(fast_state[0]["step"]) == 3
+
+
+def projected_gaussians(num_views: int, n: int, width: int, height: int) -> dict[str, Tensor]:
+    """Ellipses of all sizes, some long and thin, some faint, some culled, some off the image."""
+    generator = torch.Generator().manual_seed(0)
+
+    def random(*shape: int) -> Tensor:
+        return torch.rand((num_views, n, *shape), generator=generator)
+
+    factors = torch.randn((num_views, n, 2, 2), generator=generator) * torch.exp(4 * random(1, 1) - 1)
+    factors[:, ::4, :, 1] *= 1e-3
+    covariances = factors @ factors.mT + 0.3 * torch.eye(2)
+    inverses = torch.linalg.inv(covariances.double()).float()
+    opacities = random()
+    opacities[:, ::7] = 0.003
+    radii = torch.ceil(3 * torch.linalg.eigvalsh(covariances)[..., -1].sqrt()).int()
+    radii[:, ::11] = 0
+    conics = torch.stack([inverses[..., 0, 0], inverses[..., 0, 1], inverses[..., 1, 1]], dim=-1)
+    conics[:, ::11] = torch.nan  # what gsplat leaves unwritten
+    return {
+        "means2d": random(2) * torch.tensor([width, height]) * 1.4 - torch.tensor([width, height]) * 0.2,
+        "radii": radii,
+        "depths": random(),
+        "conics": conics,
+        "opacities": opacities,
+    }
+
+
+@pytest.mark.parametrize(("tile_size", "radius_per_axis"), [(8, False), (16, True)])
+def test_tiles_list_the_gaussians_that_reach_them_and_hardly_more(tile_size, radius_per_axis):
+    width, height, n = 75, 50, 120
+    gaussians = projected_gaussians(2, n, width, height)
+    radii = gaussians["radii"][..., None].expand(-1, -1, 2).float()  # [C, N, 2]
+    if radius_per_axis:  # as gsplat 1.5
+        gaussians["radii"] = gaussians["radii"][..., None] * torch.tensor([1, 2], dtype=torch.int32)
+        radii = gaussians["radii"].float()
+    on_device = {name: value.to(DEVICE) for name, value in gaussians.items()}
+    starts, ids = tiles.intersect_tiles(**on_device, width=width, height=height, tile_size=tile_size).lists()
+    rows, columns = math.ceil(height / tile_size), math.ceil(width / tile_size)
+    assert starts.shape == (2, rows, columns)
+    lists = ids.cpu().tensor_split(starts.cpu().flatten().tolist()[1:])
+    n_listed = n_needed = n_square = 0
+    for number, listed in enumerate(lists):
+        view, row, column = number // (rows * columns), number // columns % rows, number % columns
+        depths = gaussians["depths"].flatten()[listed.long()]
+        assert (depths.diff() >= 0).all()
+        y, x = torch.meshgrid(torch.arange(tile_size) + 0.5, torch.arange(tile_size) + 0.5, indexing="ij")
+        pixels = torch.stack([x + column * tile_size, y + row * tile_size], dim=-1).reshape(1, -1, 2)
+        delta = (gaussians["means2d"][view, :, None] - pixels).double()  # [N, pixels, 2]
+        a, b, c = gaussians["conics"][view].double()[..., None].unbind(dim=1)
+        sigma = (a * delta[..., 0] ** 2 + c * delta[..., 1] ** 2) / 2 + b * delta[..., 0] * delta[..., 1]
+        reaches = (gaussians["opacities"][view, :, None] * torch.exp(-sigma) >= 1 / 255).any(dim=1)
+        low = ((gaussians["means2d"][view] - radii[view]) / tile_size).floor()
+        high = ((gaussians["means2d"][view] + radii[view]) / tile_size).ceil()
+        here = torch.tensor([column, row])
+        in_square = (radii[view] > 0).all(dim=1) & (low <= here).all(dim=1) & (high > here).all(dim=1)
+        needed = set((view * n + (reaches & in_square).nonzero().flatten()).tolist())
+        assert len(listed) == len(set(listed.tolist()))
+        assert needed <= set(listed.tolist()) <= set((view * n + in_square.nonzero().flatten()).tolist())
+        n_listed, n_needed, n_square = n_listed + len(listed), n_needed + len(needed), n_square + int(in_square.sum())
+    assert n_needed > 500
+    assert n_listed < 1.02 * n_needed < 0.7 * n_square
+
+
+def test_more_tiles_than_16_bits_number_are_listed_as_view_by_view():
+    n, width, height = 40, 1480, 1000  # 23,125 tiles a view, 69,375 in three
+    gaussians = {name: value.to(DEVICE) for name, value in projected_gaussians(3, n, width, height).items()}
+    starts, ids = tiles.intersect_tiles(**gaussians, width=width, height=height, tile_size=8).lists()
+    assert starts.shape == (3, 125, 185) and starts.numel() > 2**16
+    parts = []
+    for view in range(3):
+        alone = {name: value[view : view + 1] for name, value in gaussians.items()}
+        start, listed = tiles.intersect_tiles(**alone, width=width, height=height, tile_size=8).lists()
+        parts.append((start[0] + sum(len(ids) for _, ids in parts), listed + view * n))
+    assert torch.equal(starts, torch.stack([start for start, _ in parts]))
+    assert torch.equal(ids, torch.cat([listed for _, listed in parts])) and len(ids) > 500
+
+
+def test_no_gaussian_in_sight_makes_empty_lists():
+    gaussians = projected_gaussians(1, 5, 32, 32)
+    gaussians["radii"] = torch.zeros_like(gaussians["radii"])
+    on_device = {name: value.to(DEVICE) for name, value in gaussians.items()}
+    starts, ids = tiles.intersect_tiles(**on_device, width=32, height=32, tile_size=16).lists()
+    assert len(ids) == 0 and (starts == 0).all()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat's kernels need CUDA")
+@pytest.mark.parametrize("render_mode", ["RGB", "RGB+ED"])
+def test_rasterization_equals_gsplats_own(render_mode):
+    from gsplat import rasterization as gsplats
+
+    from sadgs_ns.kernels import rasterization as ours
+
+    scene = {name: value.float().cuda() for name, value in random_scene(3000, 128, seed=0).items()}
+    del scene["weights"]
+    shared = {"width": 128, "height": 128, "sh_degree": 3, "render_mode": render_mode, "packed": False}
+    shared |= {"rasterize_mode": "antialiased", "absgrad": False}
+    expected, expected_alphas, _ = gsplats(**scene, **shared, tile_size=ours.TILE_SIZE)
+    renders, alphas, _ = ours.rasterization(**scene, **shared)
+    assert torch.equal(alphas, expected_alphas)
+    torch.testing.assert_close(renders, expected, atol=1e-5, rtol=1e-5)

@@ -1,0 +1,136 @@
+"""Every Triton kernel compiles for NVIDIA's GPUs, which the interpreter does not show; no GPU is needed for that."""
+
+from __future__ import annotations
+
+import pytest
+from triton_compiler import run_with_the_compiler
+
+pytest.importorskip("triton", reason="Triton is not installed")
+
+COMPILE = """
+import importlib, pkgutil, sys
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+import sadgs_ns.kernels as package
+
+CONSTANTS = {
+    "GAUSSIAN": (0.25, 0.5, 0.25), "STRIP": 256, "RUN": 8, "ROWS": 16, "COLUMNS": 128, "TILE": 8, "LANES": 32,
+    "VIEWS": 2, "BLOCK": 1024, "HIGH": 1.0, "LOW": 0.1, "BLUR": 0.3, "MARGIN": 0.3, "EPSILON": 1e-5,
+    "DIRECTIONAL": False, "VERTICAL": False, "MAX": 1e18, "PIXELS": 1024, "TINY": 1e-38, "HIGHEST": 4.0,
+    "OCTAVES": 12.0, "WIDTHS": (3, 45, 1), "PER_GAUSSIAN": 2, "GAUSSIANS": 16, "STRIDE": 12, "ALPHAS": True,
+    "ABSGRAD": True, "PRECISION": "tf32x3",
+}
+INTEGERS = "n row height width taps num_gaussians num_views tile_width tile_height used stride start".split()
+INTEGERS += "channels weight_stride num_pairs rows view absolute_view absolute_row num_strips num_tiles".split()
+FLOATS = "exponent frequency sigma beta1 beta2 eps min_logit l1_weight ssim_weight l2_weight".split()
+FLOATS += "scale_x scale_y ssim_lambda".split()
+POINTERS = {
+    "radii": "*i32", "counts": "*i64", "order": "*i64", "ends": "*i64", "tiles": "*i16", "ids": "*i32", "drawn": "*i1",
+    "structure_tensors": "*u8", "starts": "*i32", "last_ids": "*i32",
+}
+TUPLES = {  # of Adam's kernel; the names mean single tensors elsewhere
+    **dict.fromkeys(["parameters", "gradients", "means", "squares"], ("*fp32",) * 3),
+    **dict.fromkeys(["rates", "scales"], ("fp32",) * 3),
+}
+
+compiled = []
+for module in pkgutil.iter_modules(package.__path__):
+    kernels = vars(importlib.import_module(f"sadgs_ns.kernels.{module.name}"))
+    for name, kernel in kernels.items():
+        # Kernels are launched from Python; the functions that they call return values and are compiled with them.
+        if not isinstance(kernel, triton.JITFunction) or "tl.program_id(" not in kernel.src and name != "_write_one":
+            continue
+        signature, constants = {}, {}
+        for i, parameter in enumerate(kernel.params):
+            if parameter.is_constexpr:
+                signature[parameter.name], constants[(i,)] = "constexpr", CONSTANTS[parameter.name]
+            elif name == "_update" and parameter.name in TUPLES:
+                signature[parameter.name] = TUPLES[parameter.name]
+            elif parameter.name in INTEGERS:
+                signature[parameter.name] = "i32"
+            elif parameter.name in FLOATS:
+                signature[parameter.name] = "fp32"
+            else:
+                signature[parameter.name] = POINTERS.get(parameter.name, "*fp32")
+        signatures = [signature] if name != "_list" else [signature, signature | {"tiles": "*i32"}]
+        for signature in signatures:
+            triton.compile(ASTSource(kernel, signature, constants), target=GPUTarget("cuda", int(sys.argv[1]), 32))
+        compiled.append(name)
+print(" ".join(compiled))
+"""
+
+
+@pytest.mark.parametrize("capability", [80, 90], ids=["A100", "H200"])
+def test_every_kernel_compiles(capability, tmp_path):
+    run = run_with_the_compiler(tmp_path, COMPILE, str(capability))
+    assert run.returncode == 0, run.stderr[-3000:]
+    expected = {"_blur_along_rows", "_similarity", "_spread_along_rows", "_gradient", "_count", "_list", "_observe"}
+    expected |= {"_forward", "_backward", "_update", "_correlate", "_differentiate", "_accumulate", "_write_one"}
+    expected |= {"_composite_backward", "_encode", "_accumulate_gradients", "_finish"}
+    assert set(run.stdout.split()) == expected
+
+
+WIDE = """
+import re
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+from sadgs_ns.kernels.adam import _update
+
+tensors, rates = ["parameters", "gradients", "means", "squares"], ["rates", "scales", "beta1", "beta2", "eps"]
+signature, aligned = {}, {}
+for i, parameter in enumerate(_update.params):
+    name = parameter.name
+    if name in tensors:
+        signature[name] = ("*fp32",) * 3
+        aligned |= {(i, k): [["tt.divisibility", 16]] for k in range(3)}
+    elif name in rates:
+        signature[name] = ("fp32",) * 3 if name in rates[:2] else "fp32"
+    else:
+        signature[name] = {"noted": "*fp32", "rows": "i32"}.get(name, "constexpr")
+constants = {"WIDTHS": (3, 45, 1), "MAX": 1e18, "BLOCK": 1024}
+ptx = triton.compile(ASTSource(_update, signature, constants, aligned), target=GPUTarget("cuda", 90, 32)).asm["ptx"]
+print(len(re.findall(r"ld\\.global\\.v4", ptx)), len(re.findall(r"st\\.global\\.v4", ptx)))
+"""
+
+
+def test_adam_reads_and_writes_memory_in_wide_words_whichever_parameter_it_is(tmp_path):
+    """Each of 128 threads has 8 numbers of a block: two words for each of four tensors, of which three are written."""
+    run = run_with_the_compiler(tmp_path, WIDE)
+    assert run.stdout.split() == ["8", "6"], run.stderr[-3000:]
+
+
+TIMED = """
+import time
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+from sadgs_ns.bench.timer import CompileTimer
+from sadgs_ns.kernels.trial_kernel import _write_one
+
+def compile():
+    triton.compile(ASTSource(_write_one, {"target": "*fp32"}, {}), target=GPUTarget("cuda", 90, 32))
+
+begin = time.perf_counter()
+with (timer := CompileTimer()):
+    compile()
+assert 0 < timer.seconds <= time.perf_counter() - begin
+seconds = timer.seconds
+with timer:
+    compile()
+assert timer.seconds == seconds, "the cache held it"
+triton.knobs.cache.dir += "-of-another-machine"
+compile()
+assert timer.seconds == seconds, "nobody listens"
+triton.knobs.cache.dir += "-and-another"
+with timer:
+    compile()
+assert timer.seconds > seconds
+print("done")
+"""
+
+
+def test_a_benchmark_knows_how_long_triton_compiled(tmp_path):
+    run = run_with_the_compiler(tmp_path / "cache", TIMED)
+    assert run.stdout.split() == ["done"], run.stderr[-3000:]

@@ -1,0 +1,351 @@
+"""Hard cases of the frequency analysis (docs/hard-cases.md): S̄ stays finite, semidefinite and bounded on any image."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+from torch import Tensor
+
+from sadgs_ns.method.eta import principal_eigenvalue, wavelength
+from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
+from sadgs_ns.plugin.model import SadgsModel
+from sadgs_ns.plugin.pipeline import SadgsPipeline
+
+unit_tensor = partial(multiscale_structure_tensor, frequency_constant=1.0)
+"""S̄ in units of c²: its trace is at most 1."""
+
+reproducible = partial(settings, derandomize=True, deadline=None, database=None)
+DTYPES = [torch.float16, torch.bfloat16, torch.float32, torch.float64]
+SIGNS = torch.tensor([1.0, -1.0, 1.0])
+"""What a flip or a quarter turn does to (xx, xy, yy), besides exchanging xx and yy."""
+
+
+def grating(period: float, degrees: float = 0.0, size: int = 96) -> Tensor:
+    """Grey sine grating of one channel. [1, size, size, 1]"""
+    y, x = torch.meshgrid(torch.arange(size) + 0.5, torch.arange(size) + 0.5, indexing="ij")
+    angle = math.radians(degrees)
+    return (0.5 + 0.5 * torch.sin(2 * math.pi / period * (x * math.cos(angle) + y * math.sin(angle))))[None, ..., None]
+
+
+def noise(*shape: int, seed: int = 0) -> Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed))
+
+
+def central(tensor: Tensor) -> Tensor:
+    """Mean of the central 16×16 px, where borders play a small part. [3]"""
+    height, width = tensor.shape[1:3]
+    return tensor[0, height // 2 - 8 : height // 2 + 8, width // 2 - 8 : width // 2 + 8].mean((0, 1))
+
+
+def degrees_of(tensor: Tensor) -> float:
+    xx, xy, yy = tensor.tolist()
+    return 0.5 * math.degrees(math.atan2(2 * xy, xx - yy)) % 180
+
+
+def apart(a: float, b: float) -> float:
+    """Between two axes, in degrees."""
+    return abs((a - b + 90) % 180 - 90)
+
+
+def assert_sound(tensor: Tensor) -> None:
+    """Finite, positive semidefinite up to rounding, trace at most c² = 1."""
+    assert tensor.isfinite().all()
+    xx, xy, yy = tensor.double().unbind(-1)
+    smaller = 0.5 * (xx + yy) - torch.hypot(0.5 * (xx - yy), xy)
+    assert (xx >= 0).all() and (yy >= 0).all()
+    assert (smaller >= -1e-6 * (xx + yy)).all()
+    assert (xx + yy).max() <= 1 + 1e-5
+
+
+# --- single images ---
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+@pytest.mark.parametrize("value", [0.0, 1 / 255, 0.7, 1e4])
+def test_a_constant_image_has_exactly_no_structure(dtype: torch.dtype, value: float):
+    tensor = unit_tensor(torch.full((1, 33, 50, 3), value, dtype=dtype))
+    assert tensor.eq(0).all() and wavelength(tensor).min() == pytest.approx(1e5)
+
+
+def test_a_line_of_one_pixel_is_the_shortest_wavelength_and_points_across():
+    image = torch.zeros(1, 65, 65, 3)
+    image[:, :, 32] = 1.0
+    tensor = unit_tensor(image)
+    assert_sound(tensor)
+    assert tensor[0, 32, 32, 0] > 0.98 and tensor[..., 2].max() < 1e-6
+    assert (tensor[0, 32, 32, 0] >= tensor[0, 32, :, 0]).all(), "strongest on the line"
+
+
+@pytest.mark.parametrize("pattern", ["stripes", "checkerboard"])
+def test_texture_at_the_nyquist_frequency_is_invisible(pattern: str):
+    """A symmetric derivative has no answer at a period of exactly 2 px; it reads as no texture, not as garbage."""
+    x = torch.arange(64)
+    values = (x + (x[:, None] if pattern == "checkerboard" else 0 * x[:, None])) % 2
+    tensor = unit_tensor(values.float()[None, ..., None])
+    assert_sound(tensor)
+    assert tensor[0, 28:36, 28:36].max() < 1e-6
+    assert wavelength(tensor[0, 32, 32]) > 1e4
+
+
+def test_texture_just_below_the_nyquist_frequency_is_seen():
+    period_3 = wavelength(central(unit_tensor(grating(3.0))))
+    assert wavelength(central(unit_tensor(grating(2.1)))) < 2 * period_3
+    assert wavelength(central(unit_tensor(grating(2.2)))) < 1.2 * period_3
+
+
+@pytest.mark.parametrize("scale", [1e-37, 1 / 255, 1.0, 1e4, 1e38])
+def test_amplitude_from_one_grey_level_to_hdr_changes_nothing(scale: float):
+    image = noise(1, 40, 50, 3)
+    torch.testing.assert_close(unit_tensor(scale * image), unit_tensor(image), rtol=0, atol=1e-6)
+
+
+def test_one_grey_level_of_difference_is_a_texture():
+    """An 8-bit image of only two neighbouring grey levels reads as the same pattern in black and white."""
+    pattern = (grating(8.0) > 0.5).float()
+    levels = (128 + pattern) / 255
+    torch.testing.assert_close(unit_tensor(levels), unit_tensor(pattern), rtol=0, atol=2e-3)
+
+
+def test_one_hdr_pixel_makes_the_rest_of_the_image_fade():
+    """ε is relative to the image's contrast, which one pixel of 10⁴ dominates; away from it nothing is left."""
+    image = noise(1, 96, 96, 3)
+    image[0, 5, 5] = 1e4
+    tensor = unit_tensor(image)
+    assert_sound(tensor)
+    assert tensor[0, 5, 5].sum() > 0.5 and tensor[0, 80:, 80:].max() < 1e-3
+
+
+def test_structure_on_a_pedestal_fades_only_where_float32_loses_it():
+    image = noise(1, 40, 50, 3)
+    assert unit_tensor(image + 100)[..., 0].min() > 0.25
+    drowned = unit_tensor(image + 1e6)
+    assert_sound(drowned)
+    assert drowned.max() < 1e-6
+
+
+def test_noise_is_short_and_nearly_isotropic():
+    tensor = unit_tensor(noise(1, 96, 96, 3))
+    assert_sound(tensor)
+    mean = tensor.mean((0, 1, 2))
+    assert abs(float(mean[0] - mean[2])) < 0.05 and abs(float(mean[1])) < 0.05 and mean[[0, 2]].sum() > 0.95
+
+
+# --- sizes, masks, alpha, what is not finite ---
+
+
+@pytest.mark.parametrize("height", [1, 2, 5])
+@pytest.mark.parametrize("width", [1, 2, 3, 31, 300])
+def test_images_of_any_size(height: int, width: int):
+    image = noise(2, height, width, 3)
+    tensor = unit_tensor(image)
+    assert_sound(tensor)
+    torch.testing.assert_close(unit_tensor(image.transpose(1, 2)).transpose(1, 2).flip(-1), tensor, rtol=0, atol=1e-6)
+    assert height * width > 1 or tensor.eq(0).all()
+
+
+def test_a_single_row_reads_a_grating_as_a_whole_image_does():
+    whole = unit_tensor(grating(9.0, size=192))[:, 96:97, 60:130, 0]
+    row = unit_tensor(grating(9.0, size=192)[:, 96:97])[..., 60:130, :]
+    assert row[..., 1:].abs().max() < 1e-6
+    torch.testing.assert_close(row[..., 0], whole, rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize("valid", [0, 1, 2])
+def test_masks_that_leave_almost_nothing(valid: int):
+    """Nothing, one pixel, or two that no kernel connects: no pair of pixels, no structure."""
+    mask = torch.zeros(1, 64, 80, dtype=torch.bool)
+    mask[0, 10, 10], mask[0, 60, 75] = valid > 0, valid > 1
+    assert unit_tensor(noise(1, 64, 80, 3), mask).eq(0).all()
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 3e38])
+@pytest.mark.parametrize("incremental", [False, True])
+def test_what_lies_under_a_mask_does_not_matter(value: float, incremental: bool):
+    image, mask = noise(1, 40, 50, 3), noise(1, 40, 50, seed=1) > 0.3
+    painted = torch.where(mask[..., None], image, value)
+    expected = unit_tensor(image, mask, incremental=incremental)
+    assert torch.equal(unit_tensor(painted, mask, incremental=incremental), expected)
+    assert_sound(expected)
+
+
+def test_transparent_pixels_are_the_background():
+    """Alpha is composited before S̄: hidden colours leave no trace, and the outline is an edge, as it is rendered."""
+    alpha = torch.zeros(1, 96, 96, 1)
+    alpha[:, :, :40] = 1.0
+    composite = partial(SadgsModel.composite_with_background, None)  # type: ignore[arg-type]  # no model is read
+    hidden = torch.where(alpha > 0, 0.5, noise(1, 96, 96, 3))
+    tensor = unit_tensor(composite(torch.cat([hidden, alpha], -1), torch.ones(3)))
+    edge = torch.where(alpha > 0, 0.5, torch.ones(1, 96, 96, 3))
+    assert torch.equal(tensor, unit_tensor(edge))
+    assert tensor[0, 48, 40, 0] > 0.1 and tensor[..., 2].max() < 1e-6
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_pixels_that_are_not_finite_are_refused_by_image(value: float):
+    images = noise(3, 20, 20, 3)
+    images[1, 7, 3, 2] = value
+    with pytest.raises(ValueError, match=r"images \[1\] of the batch hold NaN or infinite pixels"):
+        unit_tensor(images)
+
+
+def test_the_pipeline_names_the_file_whose_pixels_are_not_finite():
+    images = [noise(4, 5, 3), noise(4, 5, 3), torch.zeros(4, 5, 3, dtype=torch.uint8)]
+    images[1][2, 3, 0] = math.nan
+    dataset = SimpleNamespace(image_filenames=[Path(f"images/{name}.exr") for name in "abc"])
+    data = [{"image": image} for image in images]
+    pipeline = SimpleNamespace(datamanager=SimpleNamespace(train_dataset=dataset, cached_train=data))
+    with pytest.raises(ValueError, match=r"images/b\.exr holds NaN or infinite pixels: replace them"):
+        SadgsPipeline.train_cameras.func(pipeline)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("shape", [(1, 0, 5, 3), (1, 5, 0, 3), (1, 5, 5, 0), (0, 5, 5, 3)], ids=str)
+def test_empty_images_are_refused(shape: tuple[int, ...]):
+    with pytest.raises(ValueError, match="images must have pixels and channels"):
+        unit_tensor(torch.zeros(shape))
+
+
+# --- precision ---
+
+
+@pytest.mark.parametrize(
+    ("dtype", "computed", "rounded"),
+    [(torch.float32, 1e-6, 1e-6), (torch.float16, 1e-6, 2e-4), (torch.bfloat16, 1e-6, 2e-3)],
+    ids=str,
+)
+def test_each_dtype_agrees_with_float64(dtype: torch.dtype, computed: float, rounded: float):
+    """`computed`: error of the computation. `rounded`: with that of rounding the image to the dtype before it."""
+    image = (0.5 * grating(7.0, 20, size=80) + 0.5 * noise(1, 80, 80, 3)).double()
+    given_image = image.to(dtype)
+    tensor = unit_tensor(given_image)
+    assert tensor.dtype == torch.float32
+    assert (tensor - unit_tensor(given_image.double())).abs().max() < computed
+    assert (tensor - unit_tensor(image)).abs().max() < rounded
+
+
+# --- equivariance ---
+
+
+@pytest.mark.parametrize("period", [3.0, 7.0, 16.0])
+def test_gratings_at_every_angle(period: float):
+    """5° apart: wavelength within 1 %, direction within 0.5°, although the pixels are a square grid."""
+    tensors = {degrees: central(unit_tensor(grating(period, degrees, size=144))) for degrees in range(0, 180, 5)}
+    wavelengths = torch.stack([wavelength(tensor) for tensor in tensors.values()])
+    assert wavelengths.max() < 1.01 * wavelengths.min()
+    assert max(apart(degrees_of(tensor), degrees) for degrees, tensor in tensors.items()) < 0.5
+
+
+@reproducible(max_examples=20)
+@given(period=st.floats(2.5, 16.0), degrees=st.floats(0.0, 180.0))
+def test_direction_of_any_grating(period: float, degrees: float):
+    assert apart(degrees_of(central(unit_tensor(grating(period, degrees)))), degrees) < 1.0
+
+
+@pytest.mark.parametrize(("period", "error"), [(2.1, 9.0), (2.2, 3.5), (2.3, 1.5)])
+def test_directions_are_uncertain_near_the_nyquist_frequency(period: float, error: float):
+    """There the sampled derivative is smaller along the pixels' axes than between them."""
+    for degrees in range(0, 90, 15):
+        assert apart(degrees_of(central(unit_tensor(grating(period, degrees)))), degrees) < error
+
+
+@pytest.mark.parametrize("period", [5.0, 6.5, 8.0, 10.0, 12.0])
+def test_a_magnified_grating_has_a_longer_wavelength(period: float):
+    """Times 1.5, the step between levels: nearly that, for the levels end at σ = 1 and 5 px."""
+    small, large = (wavelength(central(unit_tensor(grating(p, 20, size=192)))) for p in (period, 1.5 * period))
+    assert 1.25 < large / small < 1.75
+
+
+def test_wavelengths_saturate_beyond_the_levels():
+    constant = 1 / (2 * math.pi)  # the wavelength then reads as a period
+    shortest, longest = 2 * math.pi, 2 * math.pi * 1.5**4
+    for period, size in ((2.5, 96), (4.0, 96), (48.0, 256), (100.0, 256)):
+        read = wavelength(central(multiscale_structure_tensor(grating(period, 20, size), frequency_constant=constant)))
+        assert read == pytest.approx(shortest if period < 5 else longest, rel=0.12)
+
+
+@reproducible(max_examples=20)
+@given(height=st.integers(1, 40), width=st.integers(1, 40), masked=st.booleans(), seed=st.integers(0, 1000))
+def test_flips_and_quarter_turns_are_exact(height: int, width: int, masked: bool, seed: int):
+    image = noise(1, height, width, 3, seed=seed).double()
+    mask = noise(1, height, width, seed=seed + 1) > 0.2 if masked else torch.ones(1, height, width, dtype=torch.bool)
+    tensor = unit_tensor(image, mask)
+    for axis in (1, 2):
+        flipped = unit_tensor(image.flip(axis), mask.flip(axis)).flip(axis)
+        torch.testing.assert_close(flipped * SIGNS, tensor, rtol=0, atol=1e-12)
+    turned = unit_tensor(image.rot90(1, (1, 2)), mask.rot90(1, (1, 2))).rot90(-1, (1, 2))
+    torch.testing.assert_close(turned.flip(-1) * SIGNS, tensor, rtol=0, atol=1e-12)
+
+
+# --- nearly isotropic tensors ---
+
+
+@reproducible(max_examples=200)
+@given(
+    trace=st.floats(-30, 30).map(lambda exponent: 10.0**exponent),
+    anisotropy=st.one_of(st.just(0.0), st.floats(-12, 0).map(lambda exponent: 10.0**exponent)),
+    angle=st.floats(0, math.pi),
+)
+def test_the_eigenvalue_of_a_nearly_isotropic_tensor_does_not_cancel(trace: float, anisotropy: float, angle: float):
+    """In float32, against float64 of the same float32 numbers, over 60 decades."""
+    half = 0.5 * trace
+    along, across = anisotropy * half * math.cos(2 * angle), anisotropy * half * math.sin(2 * angle)
+    tensor = torch.tensor([half + along, across, half - along], dtype=torch.float32)
+    xx, xy, yy = tensor.double().tolist()
+    expected = 0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy)
+    assert float(principal_eigenvalue(tensor)) == pytest.approx(expected, rel=3e-7)
+    assert 0 < float(wavelength(tensor)) <= 1e5 * (1 + 1e-6)
+
+
+# --- any image ---
+
+
+@reproducible(max_examples=60)
+@given(
+    image=arrays.arrays(
+        np.float32,
+        st.tuples(st.just(1), st.integers(1, 12), st.integers(1, 12), st.integers(1, 4)),
+        elements=st.floats(-(2.0**127), 2.0**127, width=32),
+    ),
+    dtype=st.sampled_from([torch.float32, torch.float64]),
+    incremental=st.booleans(),
+)
+def test_s_is_sound_for_any_finite_pixels(image: np.ndarray, dtype: torch.dtype, incremental: bool):
+    assert_sound(unit_tensor(torch.from_numpy(image).to(dtype), incremental=incremental))
+
+
+@reproducible(max_examples=60)
+@given(
+    shape=st.tuples(st.just(2), st.integers(1, 48), st.integers(1, 48), st.integers(1, 4)),
+    kind=st.sampled_from(["noise", "spikes", "steps", "ramp", "two levels"]),
+    scale=st.floats(-30, 30).map(lambda exponent: 10.0**exponent),
+    pedestal=st.sampled_from([0.0, 1.0, 1e3, 1e6]),
+    valid=st.sampled_from([1.0, 0.9, 0.3, 0.02, 0.0]),
+    noise_floor=st.sampled_from([0.0, 0.02, 1.0]),
+    energy_blur=st.sampled_from([0.0, 2.0]),
+    seed=st.integers(0, 1000),
+)
+def test_s_is_sound_for_any_texture_mask_and_setting(
+    shape, kind, scale, pedestal, valid, noise_floor, energy_blur, seed
+):
+    _, height, width, _ = shape
+    image = noise(*shape, seed=seed)
+    if kind == "spikes":
+        image = (image > 0.98) * 1e4
+    elif kind == "steps":
+        image = (image.cumsum(2) % 3).floor()
+    elif kind == "ramp":
+        image = torch.arange(height * width).reshape(1, height, width, 1).expand(shape).float()
+    elif kind == "two levels":
+        image = (image > 0.5).float() / 255
+    mask = noise(2, height, width, seed=seed + 1) < valid
+    tensor = unit_tensor((image + pedestal) * scale, mask, noise_floor=noise_floor, energy_blur=energy_blur)
+    assert_sound(tensor)
+    assert tensor[~mask].eq(0).all()

@@ -1,0 +1,517 @@
+"""Hard cases of splitting, pruning and optimizing; docs/hard-cases.md says what happens in each."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.scene_box import SceneBox
+from runs import configure, is_finite, set_up
+from scenes import adam, camera, random_params, training_step
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from sadgs_ns import kernels
+from sadgs_ns.method import memory
+from sadgs_ns.method import strategy as strategy_module
+from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow
+from sadgs_ns.method.initialization import bounding_box_points, neighbour_scales
+from sadgs_ns.method.split import children_per_axis, limit_growth
+from sadgs_ns.method.statistics import empty_statistics
+from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
+from sadgs_ns.plugin import nonfinite
+from sadgs_ns.plugin.model import SadgsModel, SadgsModelConfig
+from sadgs_ns.plugin.optimizers import FusedAdam
+
+CPU = torch.device("cpu")
+WIDTH, HEIGHT = 32, 24
+
+
+def short(**changes: Any) -> StructureAwareStrategy:
+    """Densification within 26 steps."""
+    defaults: dict[str, Any] = {
+        "structure_every": 10, "absgs_every": 4, "refine_start_iter": 2, "refine_stop_iter": 24, "reset_every": 0,
+        "eta_every": 1, "eta_min_opacity": 0.0, "final_prune_opacity": 0.0, "min_opacity": 0.0, "clone_grad2d": 0.0,
+    }  # fmt: skip
+    return StructureAwareStrategy(**{**defaults, **changes})
+
+
+def train(strategy: StructureAwareStrategy, params: dict[str, torch.nn.Parameter], steps: int = 22) -> list[int]:
+    """Train in a plain loop on a fine checker, in place; the number of Gaussians after each step."""
+    torch.manual_seed(0)
+    optimizers = adam(params)
+    state = strategy.initialize_state()
+    y, x = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
+    image = (0.25 + 0.5 * ((x // 3 + y // 3) % 2).float())[None, ..., None].repeat(1, 1, 1, 3)
+    tensors = multiscale_structure_tensor(image)
+    viewmats, Ks = camera(WIDTH, HEIGHT, focal=30.0)
+    numbers = []
+    for step in range(steps):
+        training_step(strategy, params, optimizers, state, step, image, tensors, viewmats, Ks)
+        numbers.append(len(params["means"]))
+    return numbers
+
+
+def finite_or_infinite_logits(params: Any) -> bool:
+    """Opacities of exactly 0 and 1 are infinite logits; nothing else may be infinite, and nothing NaN."""
+    others = all(bool(p.isfinite().all()) for name, p in params.items() if name != "opacities")
+    return others and not params["opacities"].isnan().any()
+
+
+def observed(n: int, eta_max: float) -> dict[str, Any]:
+    """A strategy's state in which every axis was seen ten times with one η."""
+    state: dict[str, Any] = {"scene_scale": 1.0, **empty_statistics(n, CPU), **empty_gradients(n, CPU)}
+    state["n_total"] += 10
+    state["n_high"] += 10 * (eta_max > 1)
+    state["n_low"] += 10 * (eta_max < 0.1)
+    state["eta_max"] += eta_max
+    return state
+
+
+# --- split ---
+
+
+@pytest.mark.parametrize("eta_max", [1e12, 3e38, math.inf])
+def test_all_violate_beyond_measure_and_fill_the_cap(eta_max: float):
+    params, state = random_params(50), observed(50, eta_max)
+    before = {name: p.detach().clone() for name, p in params.items()}
+    short(max_gaussians=50 + 3 * 511 + 100)._structure_step(params, adam(params, lr=0.0), state, 10)
+    assert len(params["means"]) == 50 + 3 * 511, "three parents of 8³ children fit, a fourth does not"
+    assert all(p.isfinite().all() for p in params.values())
+    torch.testing.assert_close(params["scales"][47:].amin(), before["scales"][:3].amin() - math.log(8 / 1.5))
+    assert not any(value.any() for value in state.values() if isinstance(value, Tensor))
+
+
+@pytest.mark.parametrize("eta_max", [0.5, math.nan])
+def test_where_none_violates_nothing_is_split(eta_max: float):
+    params, state = random_params(50), observed(50, eta_max)
+    before = params["means"].detach().clone()
+    short()._structure_step(params, adam(params, lr=0.0), state, 10)
+    assert torch.equal(params["means"], before)
+
+
+def test_an_eta_that_is_no_number_splits_nothing_even_where_it_counts_as_a_violation():
+    eta_max = torch.tensor([[math.nan, 9.0, math.inf]])
+    assert children_per_axis(eta_max, torch.ones(1, 3, dtype=torch.bool)).tolist() == [[1, 3, 8]]
+
+
+def test_a_parent_that_does_not_fit_does_not_block_the_smaller_ones():
+    growth = torch.tensor([511, 1, 7, 511, 3])
+    priority = torch.tensor([9.0, 1.0, 5.0, 7.0, 6.0])
+    assert limit_growth(growth, priority, 11).tolist() == [False, True, True, False, True]
+    assert limit_growth(growth, priority, 10).tolist() == [False, False, True, False, True]
+    assert limit_growth(growth, priority, 520).tolist() == [True, True, False, False, True]
+    assert limit_growth(growth, priority, math.inf).all()
+
+
+def test_growth_is_chosen_one_by_one_from_the_largest_violation():
+    generator = torch.Generator().manual_seed(0)
+    sizes = torch.tensor([0, 1, 2, 3, 7, 26, 63, 511])
+    for budget in [-3, 0, 1, 5, 50, 512, 700, 3000, 10**6]:
+        growth = sizes[torch.randint(0, 8, (200,), generator=generator)]
+        priority = torch.randint(0, 20, (200,), generator=generator).float()  # with ties
+        left, expected = budget, torch.zeros(200, dtype=torch.bool)
+        for i in sorted(range(200), key=lambda i: -priority[i]):
+            if 0 < growth[i] <= left:
+                expected[i], left = True, left - int(growth[i])
+        assert torch.equal(limit_growth(growth, priority, budget), expected)
+
+
+def test_a_cap_under_the_initial_number_stops_growth_only():
+    params = random_params(30)
+    start = params["means"].detach().clone()
+    assert train(short(max_gaussians=20), params) == [30] * 22
+    assert not torch.equal(params["means"], start) and all(p.isfinite().all() for p in params.values())
+
+
+def test_a_cap_that_allows_no_gaussian_is_refused():
+    with pytest.raises(ValueError, match=r"strategy\.max_gaussians must be at least 1, got 0\."):
+        StructureAwareStrategy(max_gaussians=0).initialize_state()
+
+
+def test_an_interval_or_exponent_of_zero_is_refused_at_the_start():
+    with pytest.raises(ValueError, match=r"strategy\.eta_every must be at least 1, got 0\."):
+        StructureAwareStrategy(eta_every=0).initialize_state()
+    with pytest.raises(ValueError, match=r"strategy\.split_exponent must be positive, got 0\."):
+        StructureAwareStrategy(split_exponent=0.0).initialize_state()
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "allowed"),
+    [
+        ("tau_split", 1.5, r"in \[0, 1\], got 1\.5"), ("tau_prune", math.nan, r"in \[0, 1\], got nan"),
+        ("min_opacity", -0.1, r"in \[0, 1\], got -0\.1"), ("memory_budget_gb", -3.0, "positive, got -3"),
+    ],
+)  # fmt: skip
+def test_an_option_out_of_its_range_is_refused_at_the_start(option: str, value: float, allowed: str):
+    with pytest.raises(ValueError, match=rf"strategy\.{option} must be {allowed}\."):
+        dataclasses.replace(StructureAwareStrategy(), **{option: value}).initialize_state()
+
+
+@pytest.mark.parametrize("child_scale", [0.5, 2.0, math.nan])
+def test_children_smaller_than_the_papers_or_as_large_as_a_parent_are_refused(child_scale: float):
+    with pytest.raises(ValueError, match=r"child_scale must be at least 1 and less than 2, got (0\.5|2|nan)\."):
+        StructureAwareStrategy(child_scale=child_scale).initialize_state()
+
+
+# --- memory ---
+
+
+def test_without_cuda_memory_is_not_planned():
+    params = random_params(5)
+    assert memory.affordable_growth(params, {}, memory.free_bytes(CPU)) == math.inf
+
+
+def test_what_is_kept_of_each_new_gaussian_is_counted():
+    """Adam's state, the statistics and the parameters with gradients, as they are after a split."""
+    params, state = random_params(50), observed(50, 4.0)
+    optimizers = adam(params)
+    for optimizer in optimizers.values():
+        optimizer.step()
+
+    def bytes_kept() -> int:
+        tensors = [v for v in state.values() if isinstance(v, Tensor)]
+        for p, optimizer in zip(params.values(), optimizers.values(), strict=True):
+            tensors += [p, p]  # and its gradient
+            tensors += [value for value in optimizer.state[p].values() if value.dim() > 0]
+        return sum(tensor.numel() * tensor.element_size() for tensor in tensors)
+
+    before = bytes_kept()
+    short()._structure_step(params, optimizers, state, 10)
+    grown = len(params["means"]) - 50
+    assert grown == 50 * 7
+    working = memory.WORKING_BYTES + 16  # quaternions are the widest rows
+    needed = bytes_kept() - before + grown * working + 50 * working
+    original = random_params(50)
+    assert memory.affordable_growth(original, observed(50, 4.0), needed) == grown
+    assert memory.affordable_growth(original, observed(50, 4.0), needed - 1) == grown - 1
+    assert memory.affordable_growth(original, observed(50, 4.0), 0) == 0
+
+
+@pytest.mark.parametrize("room", [0, 20])
+def test_a_split_that_would_not_fit_in_memory_is_reduced_with_a_warning_and_training_goes_on(
+    room: int, monkeypatch: pytest.MonkeyPatch
+):
+    asked: list[torch.device] = []
+
+    def scarce(device: torch.device) -> float:
+        asked.append(device)
+        # As if `room` more Gaussians fitted beside the next step's view: params of 14 numbers in 4 copies, 13 of state,
+        # the widest row of 4.
+        return (
+            memory.STEP_BYTES * WIDTH * HEIGHT
+            + (len(params["means"]) + room) * (memory.WORKING_BYTES + 16)
+            + room * 4 * (4 * 14 + 13)
+        )
+
+    monkeypatch.setattr(strategy_module, "free_bytes", scarce)
+    params = random_params(30)
+    params["scales"].data += 1.0
+    with pytest.warns(UserWarning, match=rf"Iteration 10: the device's memory holds {room} more Gaussians") as told:
+        numbers = train(short(absgs_every=0, tau_split=0.3, refine_stop_iter=19), params)
+    assert numbers[8] == 30 and 30 + room // 2 <= numbers[9] <= 30 + room and len(set(numbers[9:])) == 1
+    assert asked == [CPU] and len(told) == 1
+    assert all(p.isfinite().all() for p in params.values())
+
+
+def test_absgs_is_reduced_to_what_fits_in_memory_too(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(strategy_module, "affordable_growth", lambda params, state, free: 7)
+    params = random_params(30)
+    with pytest.warns(UserWarning, match=r"Iteration 4: the device's memory holds 7 more Gaussians"):
+        numbers = train(short(structure_every=0, refine_stop_iter=5), params, steps=6)
+    assert numbers == [30, 30, 30, 37, 37, 37]
+
+
+def test_enough_memory_gives_no_warning(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(strategy_module, "free_bytes", lambda device: 1e9)
+    params = random_params(30)
+    assert train(short(), params)[-1] > 30  # a warning would be an error
+
+
+# --- few Gaussians ---
+
+
+def test_one_gaussian_trains_and_splits():
+    params = random_params(1)
+    params["means"].data = torch.tensor([[0.0, 0.0, 4.0]])
+    params["scales"].data.fill_(0.0)
+    numbers = train(short(tau_split=0.3), params)
+    assert numbers[0] == 1 < numbers[-1]
+    assert all(p.isfinite().all() for p in params.values())
+
+
+def test_pruning_may_leave_one():
+    params, state = random_params(5), observed(5, 0.01)
+    params["opacities"].data = torch.logit(torch.tensor([0.01, 0.02, 0.9, 0.03, 0.04]))
+    kept = params["means"].detach()[2:3].clone()
+    short()._structure_step(params, adam(params, lr=0.0), state, 10)
+    assert torch.equal(params["means"], kept)
+
+
+def test_a_prune_that_would_leave_none_is_left_out():
+    params = random_params(6)
+    params["opacities"].data.fill_(-9.0)
+    numbers = train(short(min_opacity=0.5, final_prune_opacity=0.5, clone_grad2d=math.inf), params, steps=26)
+    assert numbers == [6] * 26 and all(p.isfinite().all() for p in params.values())
+
+
+@pytest.mark.parametrize("clamp_opacity", [0.8, 1.0])
+def test_opacities_of_exactly_zero_and_one(clamp_opacity: float):
+    """Logits of ±200 are 0 and 1 in float32, as are infinite ones."""
+    params = random_params(12)
+    logits = torch.tensor([200.0, -200.0, math.inf, -math.inf]).repeat(3)
+    params["opacities"].data = logits.clone()
+    assert set(torch.sigmoid(logits).tolist()) == {0.0, 1.0}
+    numbers = train(short(clamp_opacity=clamp_opacity, absgs_every=0, structure_every=9, tau_split=1.0), params, 12)
+    assert numbers[-1] == 12 and finite_or_infinite_logits(params)
+    opacities = torch.sigmoid(params["opacities"].detach())
+    expected = clamp_opacity * (logits > 0)
+    torch.testing.assert_close(opacities, expected, atol=0.01, rtol=0)
+
+    params["opacities"].data = logits.clone()
+    numbers = train(short(clamp_opacity=clamp_opacity, absgs_every=0, min_opacity=0.005, reset_every=11), params, 11)
+    assert numbers[-1] == 6, "those of opacity 0 are pruned"
+    assert params["opacities"].isfinite().all()
+    torch.testing.assert_close(
+        torch.sigmoid(params["opacities"].detach()), torch.full((6,), 0.1 * clamp_opacity), atol=0.01, rtol=0
+    )
+
+
+# --- initial points ---
+
+CLOUDS = {
+    "one": [[0.3, -0.2, 0.1]],
+    "two": [[0.0, 0, 0], [1.0, 0.5, 0]],
+    "three": [[0.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0.5]],
+    "duplicates": [[0.3, -0.2, 0.1]] * 40,
+    "pairs of duplicates": [[float(i // 2), i // 2 % 3, i // 2 % 2] for i in range(40)],
+    "collinear": [[0.1 * i, 0.0, 0.0] for i in range(40)],
+    "coplanar": [[0.1 * (i % 7), 0.1 * (i // 7), 0.5] for i in range(42)],
+}
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+def test_few_duplicate_and_collinear_points_start_and_train(name: str):
+    points = torch.tensor(CLOUDS[name])
+    config = SadgsModelConfig(camera_clearance=0.0)
+    colors = torch.full_like(points, 128)
+    model: SadgsModel = config.setup(
+        scene_box=SceneBox(torch.ones(2, 3)), num_train_data=1, seed_points=(points, colors)
+    )
+    params = model.gauss_params
+    assert len(params["means"]) >= len(points)
+    assert all(bool(p.isfinite().all()) for p in params.values())
+    optimizers = {key: FusedAdam([p], lr=0.01) for key, p in params.items()}
+    model.train()
+    model.optimizers = optimizers  # type: ignore[assignment]
+    viewmats, Ks = camera(WIDTH, HEIGHT, focal=30.0)
+    viewmats[:, 2, 3] = 4.0
+    for _ in range(2):
+        outputs = model.get_training_outputs(viewmats, Ks, WIDTH, HEIGHT, [0], torch.ones(1, HEIGHT, WIDTH, 3))
+        loss = model.get_loss_dict(outputs, {"image": torch.full((1, HEIGHT, WIDTH, 3), 0.5)})["main_loss"]
+        loss.backward()
+        assert loss.isfinite()
+        for key, optimizer in optimizers.items():
+            gradient = params[key].grad
+            assert gradient is None or gradient.isfinite().all(), key
+            optimizer.step()
+            optimizer.zero_grad()
+    assert is_finite(model)
+
+
+def test_a_flat_box_has_each_face_point_once_and_a_point_has_no_box():
+    for name, number in {"one": 0, "duplicates": 0, "collinear": 16 + 2, "coplanar": 256 + 4 * 16}.items():
+        faces, spacing = bounding_box_points(torch.tensor(CLOUDS[name]))
+        assert len(faces) == len(faces.unique(dim=0)) == number, name
+        assert spacing > 0
+
+
+def test_no_points_at_all_are_refused():
+    with pytest.raises(ValueError, match=r"There are no points to start from: give SfM points"):
+        neighbour_scales(torch.zeros(0, 3))
+
+
+# --- numbers that are not finite ---
+
+WRONG = [math.nan, math.inf, -math.inf, 1e30]
+
+
+@pytest.mark.parametrize("triton", [False, True])
+def test_adam_counts_gradients_it_could_not_recover_from_as_zero(triton: bool, monkeypatch: pytest.MonkeyPatch):
+    if triton:
+        pytest.importorskip("triton")
+    monkeypatch.setattr(kernels, "available", lambda device: triton)
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    results = []
+    for wrong in (torch.zeros(4), torch.tensor(WRONG)):
+        parameter = torch.nn.Parameter(torch.linspace(-1, 1, 1500, device=device))
+        optimizer = FusedAdam([parameter], lr=0.01, eps=1e-15)
+        for step in range(4):
+            parameter.grad = torch.linspace(-1, 2, 1500, device=device)
+            if step == 1:
+                parameter.grad[[3, 40, 1030, 1499]] = wrong.to(device)
+            optimizer.step()
+            noted = step >= 1 and bool(wrong.any())
+            assert optimizer.log.gradients.isnan().item() == noted
+        moments = [optimizer.state[parameter][name] for name in ("exp_avg", "exp_avg_sq")]
+        results.append([parameter.detach(), *moments])
+    for value, expected in zip(*results, strict=True):
+        assert torch.equal(value, expected) and value.isfinite().all()
+
+
+def test_a_gradient_just_under_the_bound_keeps_adam_finite():
+    parameter = torch.nn.Parameter(torch.zeros(2))
+    optimizer = FusedAdam([parameter], lr=0.01, eps=1e-15)
+    parameter.grad = torch.tensor([0.99 * nonfinite.MAX_GRADIENT, -0.99 * nonfinite.MAX_GRADIENT])
+    optimizer.step()
+    assert all(value.isfinite().all() for value in optimizer.state[parameter].values())
+    torch.testing.assert_close(parameter.detach(), torch.tensor([-0.01, 0.01]))
+
+
+def test_absgs_sums_skip_what_is_no_number_and_ignore_what_overflowed():
+    means2d = torch.zeros(2, 4, 2)
+    means2d.grad = torch.full((2, 4, 2), 1e-3)
+    means2d.grad[0, 1] = math.nan
+    means2d.grad[0, 2] = math.inf
+    means2d.absgrad = means2d.grad.clone()  # type: ignore[attr-defined]
+    gradients = empty_gradients(4, CPU)
+    info = {"means2d": means2d, "radii": torch.ones(2, 4), "width": 64, "height": 64}
+    accumulate_gradients(gradients, info, num_views=2)
+    assert gradients["grad2d"].isfinite().tolist() == [True, True, False, True]
+    torch.testing.assert_close(gradients["grad2d"][1], gradients["grad2d"][0] / 2)
+    params = random_params(4)
+    n_clone, n_split = grow(
+        params,
+        adam(params),
+        gradients,  # type: ignore[arg-type]
+        clone_threshold=1e-6,
+        split_threshold=1e-6,
+        size_threshold=10.0,
+        budget=100,
+    )
+    assert (n_clone, n_split) == (3, 0)
+
+
+class HostWaits(TorchDispatchMode):
+    """Counts operations that would make the host wait for a device."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.number = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.number += func.__name__.split(".")[0] in ("_local_scalar_dense", "nonzero", "is_nonzero", "equal")
+        return func(*args, **(kwargs or {}))
+
+
+def test_the_guard_never_waits_within_a_step():
+    log = nonfinite.NonFiniteLog(CPU, capacity=10)
+    gradient, loss = torch.tensor(WRONG), torch.tensor(math.nan)
+    with HostWaits() as waits:
+        for step in range(10):
+            assert not log.full
+            log.begin_step(step, [step], loss)
+            nonfinite.leave_out_nonfinite(gradient, log.gradients)
+    assert waits.number == 0 and log.full and not gradient.any()
+    with HostWaits() as waits:
+        float(loss)
+    assert waits.number == 1
+
+
+def test_the_log_names_steps_and_forgets_them_once_read():
+    log = nonfinite.NonFiniteLog(CPU, capacity=4)
+    log.begin_step(7, [3], torch.tensor(0.5))
+    log.begin_step(8, [1, 2], torch.tensor(math.inf))
+    log.begin_step(9, [0], torch.tensor(0.5))
+    log.gradients.fill_(math.nan)
+    assert log.read() == [(8, [1, 2], "the loss was inf"), (9, [0], "gradients were not finite")]
+    log.begin_step(10, [0], torch.tensor(0.5))
+    assert log.read() == [] and log.read() == []
+
+
+ITERATIONS = 16
+
+
+@pytest.mark.parametrize("views", [1, 2])
+@pytest.mark.parametrize("where", ["image", "gradient"])
+def test_an_image_that_makes_nan_is_named_and_does_not_poison_the_model(
+    where: str,
+    views: int,
+    colmap: ColmapDataParserConfig,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+):
+    """In the image: everything it shows gets NaN. In the gradient: the loss is fine, but not what flows back."""
+    config = configure(tmp_path, colmap, iterations=ITERATIONS)
+    config.pipeline.views_per_iteration = views
+    trainer = set_up(config)
+    pipeline, bad = trainer.pipeline, 5
+    assert len(pipeline.structure_tensors) == 8  # computed before the image breaks
+    name = pipeline.datamanager.train_dataset.image_filenames[bad].name
+    render_views, hit = pipeline.model.get_training_outputs, []
+
+    def poisoned(viewmats: Any, Ks: Any, width: int, height: int, cam_indices: list[int], *rest: Any) -> Any:
+        outputs = render_views(viewmats, Ks, width, height, cam_indices, *rest)
+        if bad in cam_indices:
+            hit.append(trainer.step + 1)
+            if where == "gradient":
+                rows = torch.arange(len(cam_indices), device=viewmats.device) == cam_indices.index(bad)
+                outputs["rgb"].register_hook(lambda g: torch.where(rows[:, None, None, None], torch.nan, g))
+        return outputs
+
+    pipeline.model.get_training_outputs = poisoned  # type: ignore[method-assign]
+    if where == "image":
+        _ = pipeline.train_cameras  # which looks for such images, once
+        image = pipeline.datamanager.cached_train[bad]["image"]
+        pipeline.datamanager.cached_train[bad]["image"] = torch.full(image.shape, math.nan)
+    before = pipeline.model.num_points
+    trainer.train()
+    printed = " ".join(capsys.readouterr().out.split())
+    assert len(hit) == 2 * views
+    what = "the loss was nan" if where == "image" else "gradients were not finite"
+    for iteration in hit:
+        (line,) = [part for part in printed.split("Iteration ") if part.startswith(f"{iteration}, ")]
+        assert name in line and what in line and line.count(".png") == views
+    assert printed.count("training goes on") == len(hit)
+    assert is_finite(pipeline.model) and pipeline.model.num_points > before
+    for optimizer in trainer.optimizers.optimizers.values():
+        for slots in optimizer.state.values():
+            assert all(value.isfinite().all() for value in slots.values())
+
+
+def test_many_bad_iterations_are_summed_up(
+    colmap: ColmapDataParserConfig,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+):
+    trainer = set_up(configure(tmp_path, colmap))
+    for step in range(9):
+        trainer.pipeline.log.begin_step(step, [step % 8], torch.tensor(math.nan))
+    trainer.pipeline._report_nonfinite()
+    printed = " ".join(capsys.readouterr().out.split())
+    assert printed.count("the loss was nan") == 5 and "The same in 4 more of the last iterations." in printed
+
+
+def test_the_log_is_read_before_it_overflows(
+    colmap: ColmapDataParserConfig,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+):
+    config = configure(tmp_path, colmap, iterations=5)
+    config.pipeline.model.densify = False
+    trainer = set_up(config)
+    trainer.pipeline.log._losses = trainer.pipeline.log._losses[:2]
+    _ = trainer.pipeline.train_cameras  # which looks for such images, once
+    image = trainer.pipeline.datamanager.cached_train[0]["image"]
+    for data in trainer.pipeline.datamanager.cached_train:
+        data["image"] = torch.full(image.shape, math.nan)
+    for step in range(5):
+        trainer.pipeline.get_train_loss_dict(step)
+    assert capsys.readouterr().out.count("the loss was nan") == 4
+    assert len(trainer.pipeline.log.read()) == 1

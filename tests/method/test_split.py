@@ -1,0 +1,170 @@
+"""Split plan and grid split: factors, bounds, cap, moments, optimizer state."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from gsplat.utils import normalized_quat_to_rotmat
+from scenes import adam, camera, random_params, splat
+
+from sadgs_ns.method.split import (
+    MAX_CHILDREN_PER_AXIS,
+    VARIANCE_EXTENT,
+    children_per_axis,
+    grid_offsets,
+    grid_split,
+    limit_growth,
+)
+
+
+def test_split_factor_is_the_ceiling_of_the_root():
+    eta_max = torch.tensor([[0.5, 1.0, 1.01], [4.0, 4.01, 9.5]])
+    violates = torch.tensor([[True, True, True], [True, True, False]])
+    assert children_per_axis(eta_max, violates).tolist() == [[1, 1, 2], [2, 3, 1]]
+
+
+@pytest.mark.parametrize(("exponent", "expected"), [(0.25, 2), (0.5, 3), (0.75, 5)])
+def test_split_exponent(exponent: float, expected: int):
+    assert children_per_axis(torch.full((1, 3), 8.0), torch.ones(1, 3, dtype=torch.bool), exponent)[0, 0] == expected
+
+
+@pytest.mark.parametrize("eta_max", [1e3, 1e12, 3e38, math.inf])
+@pytest.mark.parametrize("exponent", [0.25, 0.5, 0.75])
+def test_no_parent_explodes(eta_max: float, exponent: float):
+    counts = children_per_axis(torch.full((1, 3), eta_max), torch.ones(1, 3, dtype=torch.bool), exponent)
+    assert counts.tolist() == [[min(MAX_CHILDREN_PER_AXIS, math.ceil(min(eta_max, 1e30) ** exponent))] * 3]
+
+
+def test_budget_goes_to_the_largest_violations():
+    growth = torch.tensor([7, 1, 0, 3, 5])
+    priority = torch.tensor([2.0, 9.0, 99.0, 4.0, 3.0])
+    assert limit_growth(growth, priority, 9).tolist() == [False, True, False, True, True]
+    assert limit_growth(growth, priority, 8).tolist() == [False, True, False, True, False]
+    assert not limit_growth(growth, priority, 0).any()
+    assert not limit_growth(growth, priority, -5).any()
+    assert limit_growth(growth, priority, 10**9).tolist() == [True, True, False, True, True]
+
+
+def test_the_cap_is_never_exceeded():
+    generator = torch.Generator().manual_seed(0)
+    for budget in range(0, 400, 7):
+        growth = torch.randint(0, 60, (50,), generator=generator)
+        chosen = limit_growth(growth, torch.rand(50, generator=generator), budget)
+        assert int(growth[chosen].sum()) <= budget
+
+
+def test_grid_is_centred_and_its_variance_completes_the_child_s():
+    parents, grid = grid_offsets(torch.tensor([[1, 2, 3], [4, 1, 1]]))
+    assert parents.tolist() == [0] * 6 + [1] * 4
+    torch.testing.assert_close(grid[:6].mean(0), torch.zeros(3))
+    expected = torch.tensor([0.0, 1 - 1 / 4, 1 - 1 / 9])  # plus 1/n² of the child itself is 1
+    torch.testing.assert_close(grid[:6].square().mean(0), expected)
+    spacing = grid[7, 0] - grid[6, 0]
+    assert float(spacing) == pytest.approx(math.sqrt(12) / 4)
+
+
+@pytest.mark.parametrize("child_scale", [1.0, 1.5, 1.99])
+@pytest.mark.parametrize("counts", [[2, 1, 1], [2, 3, 1], [3, 3, 3], [8, 1, 5]])
+def test_split_keeps_the_parent_s_mean_and_covariance(counts: list[int], child_scale: float):
+    params = random_params(3, dtype=torch.float64)
+    parent = {name: value.detach()[1].clone() for name, value in params.items()}
+    n = torch.ones((3, 3), dtype=torch.long)
+    n[1] = torch.tensor(counts)
+    grid_split(params, adam(params, lr=0.0), {}, n, child_scale=child_scale)
+    children = {name: value.detach()[2:] for name, value in params.items()}
+    assert len(children["means"]) == math.prod(counts)
+    rotation = normalized_quat_to_rotmat(torch.nn.functional.normalize(parent["quats"], dim=-1))
+    covariance = rotation @ torch.diag((2 * parent["scales"]).exp()) @ rotation.T
+    child_rotation = normalized_quat_to_rotmat(torch.nn.functional.normalize(children["quats"], dim=-1))
+    own = child_rotation @ torch.diag_embed((2 * children["scales"]).exp()) @ child_rotation.mT
+    offset = children["means"] - parent["means"]
+    mixture = own.mean(0) + (offset.T @ offset) / len(offset)
+    torch.testing.assert_close(children["means"].mean(0), parent["means"], rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(mixture, covariance, rtol=1e-10, atol=1e-14)
+    for name in ("features_dc", "quats"):
+        torch.testing.assert_close(children[name], parent[name].expand_as(children[name]))
+    if child_scale == 1:  # the paper's are as opaque as the parent
+        torch.testing.assert_close(children["opacities"], parent["opacities"].expand_as(children["opacities"]))
+    # And the integral of opacity: opacity times the product of scales.
+    mass = [torch.sigmoid(p["opacities"].flatten()) * p["scales"].exp().prod(dim=-1) for p in (parent, children)]
+    torch.testing.assert_close(mass[1].sum(), mass[0].sum(), rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("logit", [-200.0, -30.0, 0.0, 30.0, 200.0])
+def test_children_of_extreme_opacity_have_finite_logits(logit: float):
+    params = random_params(1)
+    params["opacities"].data = torch.tensor([logit])
+    grid_split(params, adam(params, lr=0.0), {}, torch.tensor([[2, 3, 1]]), child_scale=1.5)
+    share = 1 / 1.5**2
+    expected = math.log(share) + logit if logit < 0 else math.log(share / (1 - share))
+    if abs(logit) >= 30:
+        assert params["opacities"].tolist() == pytest.approx([expected] * 6, rel=1e-6)
+    assert torch.sigmoid(params["opacities"]).tolist() == pytest.approx([share / (1 + math.exp(-logit))] * 6, rel=1e-5)
+
+
+def test_larger_children_fill_the_gaps_between_them():
+    """A flat, faint Gaussian across the view, 2 × 2 in its plane: the picture changes less than half as much."""
+    viewmats, Ks = camera(64, 64, focal=64.0)
+    errors = []
+    for child_scale in (1.0, 1.5):
+        params = random_params(1)
+        params["means"].data = torch.tensor([[0.0, 0.0, 4.0]])
+        params["scales"].data = torch.log(torch.tensor([[1.2, 1.2, 0.01]]))
+        params["quats"].data = torch.tensor([[1.0, 0.0, 0.0, 0.0]])
+        params["opacities"].data = torch.logit(torch.tensor([0.1]))
+        before = splat(params, viewmats, Ks, 64, 64)[1].detach()
+        grid_split(params, adam(params, lr=0.0), {}, torch.tensor([[2, 2, 1]]), child_scale=child_scale)
+        after = splat(params, viewmats, Ks, 64, 64)[1].detach()
+        errors.append(float((after - before).abs().mean() / before.mean()))
+    assert errors[1] < 0.5 * errors[0], errors
+
+
+def test_split_nearly_keeps_the_render():
+    """One flat, faint Gaussian across the view, 2 × 2 in its plane: seen at its own resolution, the picture stays.
+
+    Finer than that it does not: children of a grid that keeps the variance stand 3.5 of their own σ apart.
+    """
+    viewmats, Ks = camera(64, 64, focal=64.0)
+    params = random_params(1)
+    params["means"].data = torch.tensor([[0.0, 0.0, 4.0]])
+    params["scales"].data = torch.log(torch.tensor([[0.5, 0.4, 0.01]]))
+    params["quats"].data = torch.tensor([[1.0, 0.0, 0.0, 0.0]])
+    params["opacities"].data = torch.logit(torch.tensor([0.1]))
+
+    def alpha() -> torch.Tensor:
+        return splat(params, viewmats, Ks, 64, 64)[1].detach()
+
+    before = alpha()
+    grid_split(params, adam(params, lr=0.0), {}, torch.tensor([[2, 2, 1]]))
+    after = alpha()
+    assert len(params["means"]) == 4
+    assert float(after.sum()) == pytest.approx(float(before.sum()), rel=0.05)
+    coarse = [torch.nn.functional.avg_pool2d(a.permute(0, 3, 1, 2), 16) for a in (before, after)]  # 16 px: 2 parent σ
+    assert float((coarse[1] - coarse[0]).abs().mean()) < 0.15 * float(before.mean())
+
+
+def test_optimizer_state_and_statistics_follow():
+    params = random_params(5)
+    optimizers = adam(params)
+    state = {"n_total": torch.arange(5.0), "eta_max": torch.arange(15.0).view(5, 3), "scene_scale": 2.0}
+    counts = torch.ones((5, 3), dtype=torch.long)
+    counts[1, 0], counts[3, 2] = 2, 3
+    moments = optimizers["means"].state[params["means"]]["exp_avg"].clone()
+    kept = [0, 2, 4]
+    grid_split(params, optimizers, state, counts)
+    assert all(len(p) == 8 for p in params.values())
+    assert state["n_total"].tolist() == [0, 2, 4, 1, 1, 3, 3, 3] and len(state["eta_max"]) == 8
+    for name, optimizer in optimizers.items():
+        assert optimizer.param_groups[0]["params"][0] is params[name]
+        slots = optimizer.state[params[name]]
+        assert slots["exp_avg"].shape == params[name].shape and not slots["exp_avg"][3:].any()
+        assert float(slots["step"]) == 1
+    torch.testing.assert_close(optimizers["means"].state[params["means"]]["exp_avg"][:3], moments[kept])
+
+
+def test_a_smaller_extent_contracts_the_grid():
+    _, wide = grid_offsets(torch.tensor([[4, 1, 1]]), VARIANCE_EXTENT)
+    _, narrow = grid_offsets(torch.tensor([[4, 1, 1]]), 1.0)
+    torch.testing.assert_close(narrow * VARIANCE_EXTENT, wide)

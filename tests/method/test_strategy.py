@@ -1,0 +1,298 @@
+"""The strategy in a plain gsplat training loop, its schedule, AbsGS's two thresholds, and the cap."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from scenes import adam, camera, random_params, training_step
+
+from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow
+from sadgs_ns.method.statistics import empty_statistics
+from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
+
+WIDTH, HEIGHT = 64, 48
+
+
+def checker_images(views: int) -> torch.Tensor:
+    """[C, H, W, 3]"""
+    y, x = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
+    checker = ((x // 4 + y // 4) % 2).float()
+    return (0.25 + 0.5 * checker)[None, ..., None].repeat(views, 1, 1, 3)
+
+
+def train(strategy: StructureAwareStrategy, steps: int, *, per_axis_radii: bool = False, views: int = 1, n: int = 60):
+    """A training loop as gsplat's own, without nerfstudio; the hard cap is checked after every step."""
+    torch.manual_seed(0)
+    params = random_params(n)
+    params["scales"].data += 1.0  # up to 10 px, against squares of 4 px
+    optimizers = adam(params)
+    strategy.check_sanity(params, optimizers)
+    state = strategy.initialize_state(scene_scale=1.0)
+    images = checker_images(views)
+    tensors = multiscale_structure_tensor(images)
+    viewmats, Ks = (matrix.repeat(views, 1, 1) for matrix in camera(WIDTH, HEIGHT))
+    viewmats[:, 0, 3] = torch.linspace(-0.2, 0.2, views)
+    counts = []
+    for step in range(steps):
+        training_step(
+            strategy, params, optimizers, state, step, images, tensors, viewmats, Ks, per_axis_radii=per_axis_radii
+        )
+        counts.append(len(params["means"]))
+        assert counts[-1] <= strategy.max_gaussians
+        assert all(len(value) == counts[-1] for value in state.values() if isinstance(value, torch.Tensor))
+        assert all(p.isfinite().all() for p in params.values())
+    return params, state, counts
+
+
+def short(**changes: Any) -> StructureAwareStrategy:
+    """The schedule of 3,000 iterations, a hundredth as long."""
+    defaults: dict[str, Any] = {
+        "structure_every": 10, "absgs_every": 4, "refine_start_iter": 2, "refine_stop_iter": 24, "reset_every": 0,
+        "eta_every": 1, "eta_min_opacity": 0.0, "final_prune_opacity": 0.0, "min_opacity": 0.0,
+    }  # fmt: skip
+    return StructureAwareStrategy(**{**defaults, **changes})
+
+
+@pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
+@pytest.mark.parametrize("views", [1, 2])
+def test_drops_into_a_plain_gsplat_loop(per_axis_radii: bool, views: int):
+    _, state, counts = train(short(max_gaussians=3000), 22, per_axis_radii=per_axis_radii, views=views)
+    assert counts[-1] > 120, "a fine checker under coarse Gaussians must be split"
+    assert {"n_high", "n_low", "eta_max", "n_total", "grad2d", "absgrad2d", "grad_count"} <= set(state)
+
+
+def test_structure_step_splits_in_one_step_and_forgets_the_parents():
+    _, state, counts = train(short(absgs_every=0, tau_split=0.3), 12)
+    assert counts[8] == 60 and counts[9] > 100
+    assert float(state["n_total"].max()) <= 2, "two steps since the split"
+
+
+@pytest.mark.parametrize("cap", [60, 61, 150, 400])
+def test_the_hard_cap_holds_at_every_step(cap: int):
+    _, _, counts = train(short(max_gaussians=cap), 26)
+    assert max(counts) <= cap
+    if cap >= 150:
+        assert max(counts) > 60
+
+
+def test_nothing_happens_outside_the_window():
+    _, _, counts = train(short(refine_start_iter=12, refine_stop_iter=14, absgs_every=0), 26)
+    assert set(counts) == {60}
+    _, _, counts = train(short(refine_start_iter=12, refine_stop_iter=20, absgs_every=0), 26)
+    assert counts[18] == 60 and counts[19] > 60 and len(set(counts[19:])) == 1
+
+
+def test_window_fits_short_runs_and_keeps_long_ones():
+    for length, expected in ((3000, 1600), (300, 190), (30_000, 1600)):
+        strategy = StructureAwareStrategy()
+        strategy.fit_to_run(length)
+        assert strategy.refine_stop_iter == expected
+
+
+def test_a_run_too_short_to_densify_prepares_nothing_for_it():
+    strategy = StructureAwareStrategy(structure_every=50, absgs_every=10, refine_start_iter=500)
+    strategy.fit_to_run(700)  # 443 would be before 500
+    assert not any(strategy.observes(step) or strategy.needs_absgrad(step) for step in range(700))
+    assert strategy.refine_stop_iter == 0
+
+
+def test_eta_is_observed_only_where_a_structure_step_will_read_it():
+    strategy = StructureAwareStrategy(structure_every=500, refine_stop_iter=1900, eta_every=10)
+    assert strategy.observes(0) and strategy.observes(1490)
+    assert not strategy.observes(5) and not strategy.observes(1500) and not strategy.observes(2500)
+
+
+def test_gradients_are_kept_only_where_an_absgs_step_will_read_them():
+    strategy = StructureAwareStrategy(refine_start_iter=100, absgs_every=100, structure_every=500)
+    strategy.refine_stop_iter = 1600
+    needed = {step + 1 for step in range(3000) if strategy.needs_absgrad(step)}  # iterations
+    assert needed == set(range(1, 401)) | set(range(501, 901)) | set(range(1001, 1401)) | set(range(1501, 1601))
+    strategy.structure_every = 0
+    assert all(strategy.needs_absgrad(step) == (step < 1600) for step in range(3000))
+    strategy.absgs_every = 0
+    assert not any(strategy.needs_absgrad(step) for step in range(3000))
+
+
+def test_keeping_all_gradients_changes_nothing():
+    class Hoarder(StructureAwareStrategy):
+        def needs_absgrad(self, step: int) -> bool:
+            return step < self.refine_stop_iter
+
+    thrifty = short(clone_grad2d=2e-5, split_absgrad2d=4e-5)
+    plain, _, counts = train(thrifty, 26)
+    hoarded, _, same = train(Hoarder(**vars(thrifty)), 26)
+    assert counts == same and counts[3] > 60 and counts[9] > counts[8]
+    for name, parameter in plain.items():
+        assert torch.equal(parameter, hoarded[name])
+
+
+def test_opacity_schedule():
+    def opacities(**changes: Any) -> torch.Tensor:
+        params, _, _ = train(short(absgs_every=0, structure_every=0, **changes), 20)
+        return torch.sigmoid(params["opacities"]).detach()
+
+    plain = opacities()
+    reset = opacities(reset_every=20, refine_stop_iter=30)
+    torch.testing.assert_close(reset, 0.1 * plain, rtol=1e-4, atol=1e-5)
+    clamped, _, _ = train(short(absgs_every=0, tau_split=1.0, clamp_opacity=0.5), 10)
+    assert torch.sigmoid(clamped["opacities"]).max() <= 0.5 + 1e-6
+
+
+def test_no_reset_so_late_that_the_final_prune_takes_everything():
+    """1,900 iterations end densification at 1203: a reset at 1200 would leave no time to recover."""
+    late, _, _ = train(short(absgs_every=0, structure_every=0, reset_every=20, refine_stop_iter=21), 20)
+    plain, _, _ = train(short(absgs_every=0, structure_every=0), 20)
+    torch.testing.assert_close(late["opacities"], plain["opacities"])
+
+
+def test_statistics_end_with_densification():
+    _, state, _ = train(short(max_gaussians=3000), 26)
+    assert set(state) == {"scene_scale", "structure_steps"}
+
+
+def test_final_prune_removes_the_faint_once():
+    params, _, counts = train(short(absgs_every=0, structure_every=0, final_prune_opacity=0.5), 26)
+    assert counts[22] == 60 and 0 < counts[23] < 60
+    assert len(set(counts[23:])) == 1
+    assert len(params["means"]) == counts[-1]
+
+
+@pytest.mark.parametrize("end", ["with a structure step", "without"])
+def test_the_final_prune_spares_children_of_what_it_would_have_kept(end: str):
+    params = random_params(4)
+    params["opacities"].data = torch.logit(torch.tensor([0.05, 0.12, 0.5, 0.12]))
+    state = {"scene_scale": 1.0, **empty_statistics(4, torch.device("cpu")), **empty_gradients(4, torch.device("cpu"))}
+    state["n_total"] += 10
+    state["n_high"][:3, 0], state["eta_max"][:3, 0] = 10.0, 4.0  # all but the last are split in two
+    stop = 20 if end == "with a structure step" else 21
+    strategy = short(
+        refine_stop_iter=stop, structure_every=20, absgs_every=0, child_scale=1.5, final_prune_opacity=0.1,
+        reset_every=0, prune_opacity=0.0,
+    )  # fmt: skip
+    optimizers = adam(params, lr=0.0)
+    strategy.step_post_backward(params, optimizers, state, 19, [])
+    # 0.12 / 1.5 is under the final prune's 0.1: at the very end such children are new, later they had their chance.
+    faint, parents = params["opacities"].sigmoid() < 0.1, state["structure_steps"][0]["split"]
+    if end == "with a structure step":
+        assert parents == 2 and len(faint) == 5 and faint.sum() == 2
+    else:
+        assert parents == 3 and len(faint) == 7
+        strategy.step_post_backward(params, optimizers, state, 20, [])
+        assert len(params["means"]) == 3 and (params["opacities"].sigmoid() >= 0.1).all()
+
+
+def test_low_eta_and_low_opacity_together_prune():
+    params = random_params(4)
+    params["opacities"].data = torch.logit(torch.tensor([0.05, 0.05, 0.5, 0.05]))
+    state = {"scene_scale": 1.0, **empty_statistics(4, torch.device("cpu")), **empty_gradients(4, torch.device("cpu"))}
+    state["n_total"] += 10
+    state["n_low"][[0, 2]] = 10.0  # 0: low and faint; 1: faint only; 2: low only
+    state["n_low"][3] = torch.tensor([10.0, 10.0, 0.0])  # 3: faint, but one axis is not low
+    optimizers = adam(params, lr=0.0)
+    keep = params["means"].detach()[1:].clone()
+    short(clamp_opacity=1.0)._structure_step(params, optimizers, state, 10)
+    torch.testing.assert_close(params["means"].detach(), keep)
+
+
+def test_pruning_never_leaves_nothing():
+    params = random_params(5)
+    n = StructureAwareStrategy._prune(params, adam(params), {}, torch.ones(5, dtype=torch.bool))
+    assert n == 0 and len(params["means"]) == 5
+
+
+def gradient_state(grad: list[float], absgrad: list[float]) -> dict[str, torch.Tensor]:
+    return {"grad2d": torch.tensor(grad), "absgrad2d": torch.tensor(absgrad), "grad_count": torch.ones(len(grad))}
+
+
+def grow_with(params, state, budget: int = 1000, **options: bool) -> tuple[int, int]:
+    return grow(
+        params,
+        adam(params, lr=0.0),
+        state,
+        clone_threshold=2e-4,
+        split_threshold=4e-4,
+        size_threshold=0.1,
+        budget=budget,
+        **options,
+    )
+
+
+def test_absgs_clones_on_the_mean_and_splits_on_the_absolute_gradient():
+    """The two thresholds of AbsGS: a small Gaussian looks at one gradient, a large one at the other."""
+    params = random_params(4)
+    params["scales"].data = torch.log(torch.tensor([[0.05], [0.05], [0.5], [0.5]])).repeat(1, 3)
+    # Small: cloned by its mean gradient, not by its absolute one. Large: split by the absolute one only.
+    state = gradient_state([3e-4, 1e-4, 3e-4, 0.0], [0.0, 9e-4, 3e-4, 5e-4])
+    assert grow_with(params, state) == (1, 1)
+    assert len(params["means"]) == 6
+    scales = params["scales"].exp()[:, 0]
+    torch.testing.assert_close(scales.sort().values, torch.tensor([0.05, 0.05, 0.05, 0.3125, 0.3125, 0.5]))
+
+
+def test_absgs_halves_the_longest_axis_in_its_place():
+    params = random_params(4)
+    params["scales"].data = torch.log(torch.tensor([[0.05, 0.05, 0.05], [0.2, 0.4, 0.8], [0.5, 0.3, 0.1], [1, 1, 1]]))
+    params["quats"].data = torch.tensor([[1.0, 0, 0, 0]]).repeat(4, 1)
+    before = {name: parameter.detach().clone() for name, parameter in params.items()}
+    state = gradient_state([3e-4, 0.0, 0.0, 0.0], [0.0, 9e-4, 5e-4, 1e-4])
+    state["n_total"] = torch.arange(4.0)
+    assert grow_with(params, state, long_axis=True) == (1, 2)  # the first is small, the last has too small a gradient
+    assert state["n_total"].tolist() == [0, 3, 0, 1, 1, 2, 2]  # whole, clone, children in pairs
+    children = {name: parameter.detach()[3:].unflatten(0, (2, 2)) for name, parameter in params.items()}
+    parents = {name: value[[1, 2]] for name, value in before.items()}
+    axes = torch.tensor([[0.0, 0, 1], [1, 0, 0]])
+    torch.testing.assert_close(
+        children["scales"].exp(), (parents["scales"].exp() * (0.8 - 0.3 * axes))[:, None].repeat(1, 2, 1)
+    )
+    torch.testing.assert_close(children["means"].mean(dim=1), parents["means"])
+    offset = (children["means"][:, 1] - children["means"][:, 0]) / 2
+    torch.testing.assert_close(offset.abs(), axes * parents["scales"].exp() * 0.75**0.5)  # which keeps the covariance
+    for name in ("quats", "opacities", "features_dc"):
+        torch.testing.assert_close(children[name], parents[name][:, None].expand_as(children[name]))
+
+
+def test_absgs_spends_a_budget_on_the_steepest():
+    params = random_params(3)
+    params["scales"].data.fill_(-5.0)
+    means = params["means"].detach().clone()
+    assert grow_with(params, gradient_state([3e-4, 9e-4, 4e-4], [0.0] * 3), budget=1) == (1, 0)
+    torch.testing.assert_close(params["means"].detach()[3], means[1])
+
+
+def test_gradients_are_normalised_as_in_3dgs():
+    """Half the image per unit, times the number of views that the loss is a mean of; only where visible."""
+    means2d = torch.zeros(2, 3, 2)
+    means2d.grad = torch.tensor([3.0, 4.0]).expand(2, 3, 2) / torch.tensor([32.0, 24.0]) / 2
+    means2d.absgrad = 2 * means2d.grad  # type: ignore[attr-defined]
+    info = {"means2d": means2d, "radii": torch.tensor([[1, 1, 0], [0, 2, 0]]), "width": 64, "height": 48}
+    gradients = empty_gradients(3, torch.device("cpu"))
+    accumulate_gradients(gradients, info, num_views=2)
+    torch.testing.assert_close(gradients["grad2d"], torch.tensor([5.0, 10.0, 0.0]))
+    torch.testing.assert_close(gradients["absgrad2d"], torch.tensor([10.0, 20.0, 0.0]))
+    assert gradients["grad_count"].tolist() == [1, 2, 0]
+
+
+def test_wrong_use_is_named():
+    params = random_params(3)
+    strategy = StructureAwareStrategy()
+    with pytest.raises(ValueError, match=r"packed=False"):
+        strategy.step_post_backward(params, adam(params), strategy.initialize_state(), 0, {}, packed=True)
+    del params["quats"]
+    with pytest.raises(ValueError, match="lack \\['quats'\\]"):
+        strategy.check_sanity(params, adam(params))
+
+
+def test_what_would_be_split_now_keeps_to_the_cap():
+    statistics = empty_statistics(3, torch.device("cpu"))
+    statistics["n_total"][:] = 1
+    statistics["eta_max"][0, 0], statistics["eta_max"][1, 1] = 4.0, 9.0
+    statistics["n_high"][:] = (statistics["eta_max"] > 1).to(statistics["n_high"])
+    strategy = StructureAwareStrategy(max_gaussians=6)
+    assert strategy.children_now(statistics).tolist() == [[2, 1, 1], [1, 3, 1], [1, 1, 1]]
+    strategy.max_gaussians = 5  # room for two more: the larger η comes first
+    assert strategy.children_now(statistics).tolist() == [[1, 1, 1], [1, 3, 1], [1, 1, 1]]
+    strategy.max_gaussians = 2
+    assert (strategy.children_now(statistics) == 1).all()

@@ -1,0 +1,151 @@
+"""SfM points as nerfstudio's parsers give them, read once and faster."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import json
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
+from nerfstudio.data.utils import colmap_parsing_utils
+from plyfile import PlyData, PlyElement
+from runs import nerfstudio_data
+
+from sadgs_ns.data import ply
+from sadgs_ns.demo.scene import SPARSE_FOLDER
+from sadgs_ns.errors import InputError
+from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig
+
+READ = ("points3D_xyz", "points3D_rgb")
+
+
+def load(parser: DataParserConfig) -> SadgsDatamanager:
+    return SadgsDatamanagerConfig(dataparser=copy.deepcopy(parser)).setup(device="cpu")
+
+
+@pytest.fixture
+def reads(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """The files of points that nerfstudio's own parsers read from now on."""
+    paths: list[Path] = []
+
+    def noted(function: Callable[..., object]) -> Callable[..., object]:
+        def load_3d_points(self: object, path: Path, *args: object) -> object:
+            paths.append(path)
+            return function(self, path, *args)
+
+        return load_3d_points
+
+    for parser in (ColmapDataParser, Nerfstudio):
+        monkeypatch.setattr(parser, "_load_3D_points", noted(parser._load_3D_points))
+    return paths
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+@pytest.mark.parametrize("options", [{}, {"orientation_method": "none", "center_method": "none", "scale_factor": 3.0}])
+def test_colmap_s_points_are_nerfstudio_s_to_the_bit(
+    kind: str, options: dict, colmap: ColmapDataParserConfig, tmp_path: Path, reads: list[Path]
+):
+    data = Path(shutil.copytree(colmap.data, tmp_path / "scene"))
+    if kind == "txt":
+        model = colmap_parsing_utils.read_model(str(data / SPARSE_FOLDER), ".bin")
+        assert model is not None
+        for path in (data / SPARSE_FOLDER).iterdir():
+            path.unlink()
+        colmap_parsing_utils.write_model(*model, str(data / SPARSE_FOLDER), ".txt")
+    parser = dataclasses.replace(colmap, data=data, **options)
+    expected = parser.setup().get_dataparser_outputs("train").metadata
+    reads.clear()
+    datamanager = load(parser)
+    assert reads == []
+    for metadata in (datamanager.train_dataparser_outputs.metadata, datamanager.train_dataset.metadata):
+        for name in READ:
+            assert metadata[name].dtype == expected[name].dtype and torch.equal(metadata[name], expected[name])
+    assert datamanager.config.dataparser == parser  # it goes into the run's config.yml
+
+
+def test_matches_of_points_are_left_to_nerfstudio(colmap: ColmapDataParserConfig, reads: list[Path]):
+    datamanager = load(dataclasses.replace(colmap, max_2D_matches_per_3D_point=-1))
+    assert len(reads) == 1 and "points3D_points2D_xy" in datamanager.train_dataset.metadata
+
+
+POSITIONS = np.array([[0.0, 0.0, 1.0], [1.0, 0.5, 1.0], [-2.0, 0.25, 3.0]])
+COLORS = np.array([[9, 120, 255], [0, 1, 2], [254, 128, 77]])
+
+
+def ply_scene(folder: Path, text: bool = False, colors: np.ndarray | None = COLORS) -> DataParserConfig:
+    """A dataset with the points above in a PLY file."""
+    parser = nerfstudio_data(folder)
+    path = folder / "transforms.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "ply_file_path": "points.ply"}))
+    kind = [] if colors is None else [(name, colors.dtype.str) for name in ("red", "green", "blue")]
+    vertices = np.empty(len(POSITIONS), [(axis, "<f8") for axis in "xyz"] + kind)
+    for k in range(3):
+        vertices["xyz"[k]] = POSITIONS[:, k]
+        if colors is not None:
+            vertices[("red", "green", "blue")[k]] = colors[:, k]
+    PlyData([PlyElement.describe(vertices, "vertex")], text=text).write(str(folder / "points.ply"))
+    return parser
+
+
+@pytest.mark.parametrize("text", [True, False], ids=["text", "binary"])
+def test_points_of_a_ply_file_are_read_once_and_without_open3d(
+    text: bool, tmp_path: Path, reads: list[Path], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setitem(sys.modules, "open3d", None)  # importing it fails, as where it lacks a system library
+    mine: list[Path] = []
+    read = ply.read_points
+    monkeypatch.setattr(ply, "read_points", lambda path: mine.append(path) or read(path))
+    parser = ply_scene(tmp_path, text, COLORS.astype(np.uint8))
+    datamanager = load(parser)
+    assert reads == [] and mine == [tmp_path / "points.ply"]
+    assert datamanager.config.dataparser == parser  # it goes into the run's config.yml
+    outputs = datamanager.train_dataparser_outputs
+    homogeneous = torch.cat([torch.tensor(POSITIONS), torch.ones(3, 1)], dim=1)
+    expected = (homogeneous @ outputs.dataparser_transform.T.double() * outputs.dataparser_scale).float()
+    torch.testing.assert_close(outputs.metadata["points3D_xyz"], expected)
+    assert outputs.metadata["points3D_rgb"].tolist() == COLORS.tolist()
+
+
+def test_points_of_a_ply_file_are_nerfstudio_s(tmp_path: Path, open3d: None):
+    parser = ply_scene(tmp_path, colors=COLORS.astype(np.uint8))
+    expected = parser.setup().get_dataparser_outputs("train").metadata
+    metadata = load(parser).train_dataset.metadata
+    assert torch.equal(metadata["points3D_xyz"], expected["points3D_xyz"])
+    difference = metadata["points3D_rgb"].int() - expected["points3D_rgb"].int()
+    assert ((difference == 0) | (difference == 1)).all()  # nerfstudio rounds down after it divided by 255
+
+
+@pytest.mark.parametrize(
+    ("colors", "expected"),
+    [
+        (None, [[ply.GREY] * 3] * 3),
+        (COLORS.astype(np.float32) / 255, COLORS.tolist()),
+        (COLORS.astype(np.uint16), COLORS.tolist()),
+    ],
+    ids=["none", "fractions", "wide"],
+)
+def test_colours_of_a_ply_file(colors: np.ndarray | None, expected: list, tmp_path: Path):
+    metadata = load(ply_scene(tmp_path, colors=colors)).train_dataset.metadata
+    assert metadata["points3D_rgb"].dtype == torch.uint8 and metadata["points3D_rgb"].tolist() == expected
+
+
+def test_what_is_no_ply_file_of_points_is_named(tmp_path: Path):
+    (tmp_path / "points.ply").write_text("ply\nformat ascii 1.0\nelement face 1\nend_header\n")
+    with pytest.raises(InputError, match=r"points\.ply is not a PLY file of points \(.+\): restore it\.$"):
+        ply.read_points(tmp_path / "points.ply")
+
+
+def test_points_that_are_not_asked_for_are_not_read(colmap: ColmapDataParserConfig, reads: list[Path]):
+    parser = dataclasses.replace(colmap, load_3D_points=False)
+    datamanager = load(parser)
+    assert reads == [] and not datamanager.train_dataset.metadata.keys() & set(READ)
+    assert datamanager.config.dataparser == parser

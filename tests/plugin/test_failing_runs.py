@@ -1,0 +1,314 @@
+"""Runs that cannot go on: full and read-only disks, unusable checkpoints and full memory end them with one sentence."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from kill_and_resume import differences, parser_of
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.engine.trainer import Trainer
+from runs import checkpoint, configure, is_finite, set_up, train
+
+from sadgs_ns.cli.export import write_ply
+from sadgs_ns.errors import InputError, RunError, WriteError
+from sadgs_ns.plugin import checkpoints
+from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
+
+ITERATIONS = 6
+
+
+@pytest.fixture
+def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig:
+    return configure(tmp_path / "out", colmap, ITERATIONS)
+
+
+# --- the disk ---
+
+
+def fill_disk(partial: Path) -> None:
+    """Let what is written under this temporary name meet a full disk."""
+    if not Path("/dev/full").exists():
+        pytest.skip("only Linux has /dev/full")
+    partial.symlink_to("/dev/full")
+
+
+def test_an_output_folder_that_cannot_be_made_is_named_before_anything_is_written(
+    config: SadgsTrainerConfig, tmp_path: Path
+):
+    (tmp_path / "file").write_text("in the way")
+    config.output_dir = tmp_path / "file" / "out"
+    with pytest.raises(InputError, match=r"/file/out/\S+/config\.yml could not be written \(Not a directory; .*name "):
+        config.save_config()
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_read_only_output_folder_is_named(config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch):
+    def denied(path: Path, *args: Any, **kwargs: Any) -> None:
+        raise PermissionError(13, "Permission denied", str(path))  # root, as in containers, may write everywhere
+
+    monkeypatch.setattr(Path, "mkdir", denied)
+    with pytest.raises(InputError, match=r"config\.yml could not be written \(Permission denied; .*can be written;"):
+        config.save_config()
+
+
+def test_a_full_disk_leaves_the_previous_checkpoint_and_ends_training_with_one_sentence(config: SadgsTrainerConfig):
+    trainer = set_up(config)
+    trainer.save_checkpoint(1)
+    before = checkpoint(trainer, 1)
+    partial = trainer.checkpoint_dir.with_name(".nerfstudio_models.partial")
+    fill_disk(partial)
+    with pytest.raises(
+        WriteError, match=r"step-000000002\.ckpt could not be written \(.+ GB free there\): make room or"
+    ):
+        trainer.save_checkpoint(2)
+    fill_disk(partial)
+    with pytest.raises(
+        RunError, match=r"^\S+/step-000000005\.ckpt could not be written \(.+\): make room or [^\n]+\.$"
+    ):
+        trainer.train()
+    assert [path.name for path in trainer.checkpoint_dir.iterdir()] == ["step-000000001.ckpt"]
+    assert differences(checkpoint(trainer, 1), before) == []
+    assert list(config.output_dir.rglob("*.partial")) == []
+
+
+def test_a_logger_s_full_disk_is_one_sentence_and_other_errors_of_reading_are_themselves(config: SadgsTrainerConfig):
+    def failing(error: OSError) -> SadgsTrainer:
+        trainer = set_up(config)
+
+        def fail(step: int) -> None:
+            raise error
+
+        trainer.pipeline.get_train_loss_dict = fail  # type: ignore[assignment]
+        return trainer
+
+    with pytest.raises(RunError, match=r"^/x/events could not be written \(No space left on device; [^\n]+\.$"):
+        failing(OSError(28, "No space left on device", "/x/events")).train()
+    with pytest.raises(OSError, match=r"^broken data stream$"):
+        failing(OSError("broken data stream")).train()
+
+
+def test_a_full_disk_leaves_the_previous_export(tmp_path: Path):
+    def write(count: int) -> None:
+        parts: dict[str, Any] = {name: torch.zeros(count, 3) for name in ("means", "scales", "features_dc")}
+        write_ply(
+            tmp_path / "splat.ply",
+            **parts,
+            quats=torch.ones(count, 4),
+            opacities=torch.zeros(count, 1),
+            features_rest=torch.zeros(count, 0, 3),
+        )
+
+    write(10)
+    before = (tmp_path / "splat.ply").read_bytes()
+    fill_disk(tmp_path / ".splat.partial.ply")
+    with pytest.raises(WriteError, match=r"splat\.ply could not be written \(.+ GB free there\): make room or "):
+        write(10_000)
+    assert [path.name for path in tmp_path.iterdir()] == ["splat.ply"]
+    assert (tmp_path / "splat.ply").read_bytes() == before
+
+
+# --- checkpoints ---
+
+
+@pytest.fixture(scope="module")
+def saved(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkpoint after a few iterations."""
+    output = tmp_path_factory.mktemp("saved")
+    trainer = train(configure(output, parser_of(scene), ITERATIONS))
+    (path,) = trainer.checkpoint_dir.iterdir()
+    return path
+
+
+def rewrite(change: Callable[[dict[str, Any]], Any]) -> Callable[[Path], None]:
+    def spoil(path: Path) -> None:
+        state = torch.load(path, weights_only=True)
+        change(state)
+        torch.save(state, path)
+
+    return spoil
+
+
+def drop(state: dict[str, Any], part: str) -> None:
+    for key in [key for key in state if part in key]:
+        del state[key]
+
+
+def fewer_harmonics(state: dict[str, Any]) -> None:
+    key = "_model.gauss_params.features_rest"
+    state["pipeline"][key] = state["pipeline"][key][:, :8]
+
+
+CHECKPOINTS = {
+    "not-one": (
+        lambda path: path.write_bytes(b"hello"),
+        r"\S+5\.ckpt is cut off, damaged or not of tensors .* \(File is not a zip file\): give --load-dir .*\.",
+    ),
+    "truncated": (
+        lambda path: path.write_bytes(path.read_bytes()[:5000]),
+        r"\S+5\.ckpt is cut off, damaged or not of tensors .* \(File is not a zip file\): give --load-dir .*\.",
+    ),
+    "no-pipeline": (
+        rewrite(lambda state: state.pop("pipeline")),
+        r"\S+5\.ckpt is not a checkpoint that nerfstudio's trainer wrote \(it has no pipeline\): give --load-dir .*\.",
+    ),
+    "another-method": (
+        rewrite(lambda state: drop(state["pipeline"], "gauss_params")),
+        r"\S+ cannot be continued: The checkpoint has no features_dc of Gaussians, so another method made it; .*\.",
+    ),
+    "splatfacto": (
+        rewrite(lambda state: drop(state["pipeline"], "_extra_state")),
+        r"\S+ cannot be continued: The checkpoint lacks the state of structure-aware .*, so splatfacto made it; .*\.",
+    ),
+    "other-degree": (
+        rewrite(fewer_harmonics),
+        r"\S+ cannot be continued: The checkpoint's features_rest have the shape \[8, 3\], the model's \[15, 3\]: .*\.",
+    ),
+    "other-version": (
+        rewrite(lambda state: state["pipeline"]["_model._extra_state"].pop("strategy_state")),
+        r"\S+ is not a checkpoint of this version of sadgs \(KeyError: 'strategy_state'\): .*\.",
+    ),
+    "other-file": (
+        lambda path: path.with_name("notes.txt").write_text("mine"),
+        r"\S+/notes\.txt lies among the checkpoints and is none: move it elsewhere\.",
+    ),
+    "empty-folder": (lambda path: path.unlink(), r"\S+ holds no checkpoint: give --load-dir the folder .*\."),
+}
+
+
+@pytest.mark.parametrize("case", CHECKPOINTS)
+def test_a_checkpoint_that_cannot_be_continued_is_refused_in_one_sentence(
+    case: str, saved: Path, config: SadgsTrainerConfig, tmp_path: Path
+):
+    spoil, sentence = CHECKPOINTS[case]
+    (tmp_path / "models").mkdir()
+    spoil(Path(shutil.copy(saved, tmp_path / "models")))
+    config.load_dir = tmp_path / "models"
+    with pytest.raises(InputError) as refused:
+        set_up(config)
+    assert re.fullmatch(sentence, str(refused.value)), str(refused.value)
+
+
+@pytest.mark.parametrize("case", ["not-one", "truncated", "other-file", "empty-folder"])
+def test_a_checkpoint_that_is_none_is_refused_before_anything_is_written(
+    case: str, saved: Path, config: SadgsTrainerConfig, tmp_path: Path
+):
+    spoil, sentence = CHECKPOINTS[case]
+    (tmp_path / "models").mkdir()
+    spoil(Path(shutil.copy(saved, tmp_path / "models")))
+    config.load_dir, config.output_dir = tmp_path / "models", tmp_path / "out"
+    with pytest.raises(InputError) as refused:
+        config.save_config()
+    assert re.fullmatch(sentence, str(refused.value)), str(refused.value)
+    assert not config.output_dir.exists()
+
+
+def test_one_whole_checkpoint_among_damaged_ones_is_enough(saved: Path, tmp_path: Path):
+    shutil.copy(saved, tmp_path)
+    latest = tmp_path / "step-000000009.ckpt"
+    latest.write_bytes(b"cut off")
+    checkpoints.check_chosen(tmp_path, None, None)
+    with pytest.raises(InputError, match=r"9\.ckpt is cut off"):
+        checkpoints.check_chosen(tmp_path, 9, None)
+
+
+def test_a_step_or_file_without_a_checkpoint_is_named(saved: Path, tmp_path: Path):
+    with pytest.raises(InputError, match=r"no checkpoint of step 3: give --load-step one of 5\."):
+        checkpoints.checkpoint_path(saved.parent, 3, None)
+    with pytest.raises(InputError, match=r"\S+/none\.ckpt does not exist: give --load-checkpoint a file"):
+        checkpoints.checkpoint_path(None, None, tmp_path / "none.ckpt")
+    for step in (None, 5):
+        assert checkpoints.checkpoint_path(saved.parent, step, None) == saved
+    assert checkpoints.checkpoint_path(None, None, None) is None
+
+
+# --- the GPU's memory ---
+
+FULL = torch.cuda.OutOfMemoryError(
+    "CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has a total capacity of 8 GiB of which 1 MiB is free."
+)
+
+
+def fail_at(trainer: SadgsTrainer, step: int) -> None:
+    """Let the memory be full in the forward pass of this iteration."""
+    get_loss = trainer.pipeline.get_train_loss_dict
+
+    def full(step_: int | None = None, **kwargs: Any) -> Any:
+        number = kwargs.get("step", step_)
+        if number == step:
+            raise FULL
+        return get_loss(number)
+
+    trainer.pipeline.get_train_loss_dict = full  # type: ignore[method-assign]
+
+
+def test_full_memory_saves_what_was_trained_and_says_what_helps(config: SadgsTrainerConfig, tmp_path: Path):
+    trainer = set_up(config)
+    fail_at(trainer, 4)
+    with pytest.raises(RunError) as stopped:
+        trainer.train()
+    assert re.fullmatch(
+        r"The GPU's memory was full at iteration 4 with \d+ Gaussians \(CUDA out of memory\. Tried to allocate 2\.00 "
+        r"GiB\): lower --pipeline\.model\.strategy\.max-gaussians or --pipeline\.views-per-iteration, or take smaller "
+        r"images .*; what was trained is saved and goes on with --load-dir \S+/nerfstudio_models\.",
+        str(stopped.value),
+    )
+    state = checkpoint(trainer, 3)
+    parameters = {name: value.detach() for name, value in trainer.pipeline.model.gauss_params.items()}
+    assert all(torch.equal(state["pipeline"][f"_model.gauss_params.{k}"], v) for k, v in parameters.items())
+    config.load_dir, config.output_dir = trainer.checkpoint_dir, tmp_path / "resumed"
+    resumed = train(config)
+    assert checkpoint(resumed, 5)["step"] == 5 and is_finite(resumed.pipeline.model)
+
+
+def test_full_memory_after_a_step_saves_that_step(config: SadgsTrainerConfig):
+    trainer = set_up(config)
+
+    def full(step: int) -> None:
+        if step == 3:
+            raise FULL
+
+    trainer.eval_iteration = full  # type: ignore[method-assign] # after densification
+    with pytest.raises(RunError, match=r"full at iteration 3 .*saved and goes on"):
+        trainer.train()
+    state = checkpoint(trainer, 3)
+    assert state["step"] == 3 and state["schedulers"]["means"]["last_epoch"] == 4
+
+
+def _shorten(trainer: SadgsTrainer) -> None:
+    means = trainer.pipeline.model.gauss_params["means"]
+    means.data = means.data[:-1]
+
+
+def _take_out_moments(trainer: SadgsTrainer) -> None:
+    trainer.optimizers.optimizers["means"].state.clear()  # as gsplat does while it makes the longer ones
+
+
+@pytest.mark.parametrize("half_way", [_shorten, _take_out_moments])
+def test_full_memory_in_the_middle_of_densification_saves_no_torn_state(
+    config: SadgsTrainerConfig, half_way: Callable[[SadgsTrainer], None]
+):
+    def tear(trainer: SadgsTrainer) -> None:
+        if trainer.step == 3:
+            half_way(trainer)
+            raise FULL
+
+    with pytest.raises(RunError, match=r"nothing newer than the last checkpoint could be saved\.$"):
+        train(config, tear)
+    assert list(config.output_dir.rglob("*.ckpt")) == []
+
+
+def test_full_memory_at_the_start_is_one_sentence(config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch):
+    def full(*args: Any, **kwargs: Any) -> None:
+        raise FULL
+
+    monkeypatch.setattr(Trainer, "setup", full)
+    with pytest.raises(
+        RunError, match=r"^The GPU's memory is too small to start \(CUDA out of memory\. .*GiB\): lower"
+    ):
+        set_up(config)

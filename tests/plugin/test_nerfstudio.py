@@ -1,0 +1,569 @@
+"""Training, resuming, evaluating and exporting through nerfstudio, on the CPU and a tiny drawn scene."""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from kill_and_resume import differences, set_up
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.models.splatfacto import SplatfactoModel
+from nerfstudio.scripts.eval import ComputePSNR
+from plyfile import PlyData
+from runs import (
+    ITERATIONS,
+    SCHEDULE,
+    TRAIN_VIEWS,
+    blender_data,
+    checkpoint,
+    configure,
+    is_finite,
+    nerfstudio_data,
+    train,
+)
+from scenes import HEIGHT, POINTS, VIEWS, WIDTH
+
+from sadgs_ns.demo.scene import SPARSE_FOLDER
+from sadgs_ns.method.codes import decode
+from sadgs_ns.plugin.model import _load_lpips
+from sadgs_ns.plugin.trainer import SadgsTrainer
+
+
+@pytest.fixture(scope="module")
+def finished(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a run that `ns-train sadgs` made."""
+    output = tmp_path_factory.mktemp("cli")
+    options = {
+        "output-dir": output,
+        "experiment-name": "room",
+        "timestamp": "run",
+        "vis": "tensorboard",
+        "max-num-iterations": ITERATIONS,
+        "pipeline.views-per-iteration": 2,
+        **{f"pipeline.model.strategy.{name.replace('_', '-')}": value for name, value in SCHEDULE.items()},
+    }
+    parser = {
+        "data": scene,
+        "colmap-path": SPARSE_FOLDER,
+        "downscale-factor": 1,
+        "eval-mode": "interval",
+        "eval-interval": 8,
+    }
+    command = [str(Path(sys.executable).with_name("ns-train")), "sadgs"]
+    command += [word for name, value in options.items() for word in (f"--{name}", str(value))] + ["colmap"]
+    command += [word for name, value in parser.items() for word in (f"--{name}", str(value))]
+    environment = {name: value for name, value in os.environ.items() if name != "TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD"}
+    result = subprocess.run(command, capture_output=True, text=True, timeout=100, env=environment)
+    assert result.returncode == 0, result.stdout + result.stderr
+    return output / "room" / "sadgs" / "run"
+
+
+def test_ns_train_leaves_one_checkpoint_of_the_last_iteration_that_loads_safely(finished: Path):
+    (path,) = (finished / "nerfstudio_models").iterdir()
+    assert path.name == f"step-{ITERATIONS - 1:09d}.ckpt"
+    state = torch.load(path, weights_only=True)
+    assert state["step"] == ITERATIONS - 1
+    means = state["pipeline"]["_model.gauss_params.means"]
+    assert len(means) > POINTS and means.isfinite().all()
+
+
+def test_making_lpips_draws_no_number_that_training_would(monkeypatch: pytest.MonkeyPatch):
+    def weights(*args: object, **kwargs: object) -> torch.nn.Module:
+        return torch.nn.Linear(3, 3)  # draws its weights, as AlexNet does before it loads its own
+
+    monkeypatch.setattr("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", weights)
+    before = torch.random.get_rng_state()
+    assert _load_lpips(torch.device("cpu")) is not None
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
+def test_ns_eval_reports_psnr_and_ssim_and_says_once_why_lpips_is_missing(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.delenv("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", raising=False)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "no weights"))
+    for name in ("http_proxy", "https_proxy", "HTTP_PROXY", "HTTPS_PROXY"):
+        monkeypatch.setenv(name, "http://127.0.0.1:9")  # where nothing listens
+    ComputePSNR(load_config=finished / "config.yml", output_path=tmp_path / "output.json").main()
+    results = json.loads((tmp_path / "output.json").read_text())["results"]
+    assert 5 < results["psnr"] < 60 and 0 < results["ssim"] <= 1
+    assert not [name for name in results if "lpips" in name]
+    printed = capsys.readouterr().out
+    assert printed.count("LPIPS is not reported") == 1
+    assert "urlopen" in printed  # not for any other reason
+
+
+def test_ns_export_writes_every_gaussian_that_can_be_seen(finished: Path, tmp_path: Path, open3d: None):
+    from nerfstudio.scripts.exporter import ExportGaussianSplat  # which imports it
+
+    ExportGaussianSplat(load_config=finished / "config.yml", output_dir=tmp_path).main()
+    (path,) = (finished / "nerfstudio_models").iterdir()
+    opacities = torch.load(path, weights_only=True)["pipeline"]["_model.gauss_params.opacities"]
+    vertices = PlyData.read(tmp_path / "splat.ply")["vertex"]
+    assert len(vertices["x"]) == int((opacities >= -5.5373).sum()) > 0
+    assert {"f_dc_0", "f_rest_44", "opacity", "scale_2", "rot_3"} <= set(vertices.data.dtype.names)
+
+
+# --- training ---
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_each_iteration_takes_its_number_of_views_in_nerfstudio_s_order(
+    views: int, colmap: ColmapDataParserConfig, tmp_path: Path
+):
+    config = configure(tmp_path, colmap, iterations=3)
+    config.pipeline.views_per_iteration = views
+    trainer = set_up(config)
+    order = list(trainer.pipeline.datamanager.train_unseen_cameras)
+    assert len(order) == TRAIN_VIEWS
+    trainer.train()
+    assert trainer.pipeline.datamanager.train_unseen_cameras == order[3 * views :]
+
+
+def test_an_iteration_takes_no_more_views_than_there_are(colmap: ColmapDataParserConfig, tmp_path: Path):
+    config = configure(tmp_path, colmap, iterations=3)
+    config.pipeline.views_per_iteration = TRAIN_VIEWS + 3
+    seen: list[list[int]] = []
+
+    def note(trainer: SadgsTrainer) -> None:
+        seen.append(list(trainer.pipeline.datamanager.train_unseen_cameras))
+
+    trainer = train(config, note)
+    assert trainer.pipeline.views_per_iteration == TRAIN_VIEWS
+    assert len(seen) >= 3 and all(sorted(left) == list(range(TRAIN_VIEWS)) for left in seen), "a round each"
+
+
+def test_no_view_at_all_per_iteration_is_refused(colmap: ColmapDataParserConfig, tmp_path: Path):
+    config = configure(tmp_path, colmap)
+    config.pipeline.views_per_iteration = 0
+    with pytest.raises(ValueError, match=r"views_per_iteration must be at least 1, got 0\."):
+        set_up(config)
+
+
+def test_training_makes_the_training_views_more_alike(colmap: ColmapDataParserConfig, tmp_path: Path):
+    psnr: list[float] = []
+    config = configure(tmp_path, colmap, iterations=ITERATIONS)
+    config.pipeline.model.densify = False  # opacity resets set back so short a run
+
+    def measure(trainer: SadgsTrainer) -> None:
+        if trainer.step in (0, ITERATIONS - 1):
+            with torch.no_grad():
+                trainer.pipeline.eval()
+                metrics = [
+                    trainer.pipeline.model.get_metrics_dict(trainer.pipeline.model.get_outputs(camera), batch)["psnr"]
+                    for camera, batch in (trainer.pipeline.datamanager.next_train(0) for _ in range(TRAIN_VIEWS))
+                ]
+            psnr.append(float(sum(metrics)) / TRAIN_VIEWS)
+
+    train(config, measure)
+    assert psnr[1] > psnr[0] + 0.5
+
+
+def test_a_resumed_run_equals_one_that_was_never_stopped(colmap: ColmapDataParserConfig, tmp_path: Path):
+    middle, last = 7, 15  # after the structure step of iteration 6, before AbsGS at 9, and beyond the last of them
+    config = configure(tmp_path / "whole", colmap, iterations=last + 1)
+    config.pipeline.views_per_iteration = 2
+    config.steps_per_save, config.save_only_latest_checkpoint = middle, False
+    whole = train(config)
+    stopped, expected = checkpoint(whole, middle), checkpoint(whole, last)
+    numbers = [len(state["pipeline"]["_model.gauss_params.means"]) for state in (stopped, expected)]
+    assert POINTS < numbers[0] != numbers[1]
+
+    resumed_config = configure(tmp_path / "resumed", copy.deepcopy(colmap), iterations=last + 1)
+    resumed_config.pipeline.views_per_iteration = 2
+    resumed_config.load_dir, resumed_config.load_step = whole.checkpoint_dir, middle
+    steps: list[int] = []
+    resumed = train(resumed_config, lambda trainer: steps.append(trainer.step))
+
+    assert steps == list(range(middle + 1, last + 1))
+    assert differences(checkpoint(resumed, last), expected) == []
+    assert differences(stopped, expected) != []
+
+
+def test_resuming_with_other_settings_says_which(
+    finished: Path, colmap: ColmapDataParserConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    for views, tau_split in ((2, 0.8), (4, 0.7)):
+        config = configure(tmp_path / str(views), copy.deepcopy(colmap), iterations=ITERATIONS, tau_split=tau_split)
+        config.pipeline.views_per_iteration = views
+        config.load_dir = finished / "nerfstudio_models"
+        set_up(config)
+        printed = " ".join(capsys.readouterr().out.split())
+        assert ("other settings" in printed) == (views == 4)
+    assert (
+        "other settings; this one goes on with its own: pipeline.views_per_iteration was 2 and is 4, "
+        "pipeline.model.strategy.tau_split was 0.8 and is 0.7."
+    ) in printed
+
+
+def test_resuming_a_finished_run_trains_no_further(finished: Path, colmap: ColmapDataParserConfig, tmp_path: Path):
+    config = configure(tmp_path, colmap, iterations=ITERATIONS)
+    config.pipeline.views_per_iteration = 2
+    config.load_dir = finished / "nerfstudio_models"
+    steps: list[int] = []
+    trainer = train(config, lambda trainer: steps.append(trainer.step))
+    (path,) = config.load_dir.iterdir()
+    saved = torch.load(path, weights_only=True)
+    assert steps == []
+    assert differences(checkpoint(trainer, ITERATIONS - 1)["pipeline"], saved["pipeline"]) == []
+
+
+def test_max_gaussians_is_never_exceeded(colmap: ColmapDataParserConfig, tmp_path: Path):
+    cap = POINTS + 20
+    numbers: list[int] = []
+    config = configure(tmp_path, colmap, iterations=ITERATIONS, max_gaussians=cap, clone_grad2d=0.0)
+    train(config, lambda trainer: numbers.append(trainer.pipeline.model.num_points))
+    assert max(numbers) == cap
+
+
+def test_the_mean_opacity_weighs_in_the_loss_while_densification_runs(colmap: ColmapDataParserConfig, tmp_path: Path):
+    config = configure(
+        tmp_path,
+        colmap,
+        8,
+        absgs_every=0,
+        structure_every=0,
+        refine_stop_iter=4,
+        final_prune_opacity=0.0,
+        reset_every=0,
+    )
+    config.pipeline.model.opacity_reg = 100.0  # against which the images weigh nothing
+    black = {"rgb": torch.zeros((16, 16, 3)), "background": torch.zeros(3)}
+    opacities: list[float] = []
+    regularized: list[bool] = []
+
+    def look(trainer: SadgsTrainer) -> None:
+        model = trainer.pipeline.model
+        losses = model.get_loss_dict(dict(black), {"image": torch.zeros((16, 16, 3))})
+        regularized.append("opacity_reg" in losses)
+        opacities.append(float(torch.sigmoid(model.opacities.detach()).mean()))
+        if regularized[-1]:
+            assert float(losses["opacity_reg"]) == pytest.approx(100 * opacities[-1], rel=1e-5)
+
+    train(config, look)
+    assert regularized == [True] * 4 + [False] * 4
+    assert opacities[0] > opacities[1] > opacities[2] > opacities[3]
+
+
+def test_sfm_points_start_as_opaque_as_asked_and_no_others(colmap: ColmapDataParserConfig, tmp_path: Path):
+    config = configure(tmp_path, colmap)
+    config.pipeline.model.initial_opacity = 0.4
+    config.pipeline.model.bounding_box_points = True
+    model = set_up(config).pipeline.model
+    assert sorted({round(x, 4) for x in model.opacities.sigmoid().flatten().tolist()}) == [0.05, 0.4]
+    config.pipeline.model.random_init = True
+    model = set_up(config).pipeline.model
+    assert {round(x, 4) for x in model.opacities.sigmoid().flatten().tolist()} == {0.1}
+
+
+def test_more_initial_points_than_max_gaussians_are_thinned_out(
+    colmap: ColmapDataParserConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    trainer = set_up(configure(tmp_path, colmap, max_gaussians=50))
+    assert trainer.pipeline.model.num_points == 50
+    assert "Keeping a random 50 of 300 initial points" in capsys.readouterr().out
+
+
+def test_without_densification_the_number_of_gaussians_stays(colmap: ColmapDataParserConfig, tmp_path: Path):
+    config = configure(tmp_path, colmap, iterations=ITERATIONS)
+    config.pipeline.model.densify = False
+    trainer = set_up(config)
+    before = trainer.pipeline.model.means.detach().clone()
+    trainer.train()
+    assert trainer.pipeline.model.means.shape == before.shape
+    assert not torch.equal(trainer.pipeline.model.means, before)
+
+
+@pytest.mark.parametrize("iterations", [5, 12])
+def test_the_position_rate_ends_at_a_hundredth_whatever_the_length_of_the_run(
+    iterations: int, colmap: ColmapDataParserConfig, tmp_path: Path
+):
+    config = configure(tmp_path, colmap, iterations)
+    config.scale_position_lr = False
+    rates: list[float] = []
+    trainer = set_up(config)
+    rate = trainer.optimizers.schedulers["means"].get_last_lr
+    rates += rate()
+    trainer.train()
+    rates += rate()
+    assert rates == pytest.approx([1.6e-4, 1.6e-6])
+
+
+def test_one_switch_takes_all_kernels_out(colmap: ColmapDataParserConfig, tmp_path: Path):
+    config = configure(tmp_path, colmap)
+    config.pipeline.model.fused = False
+    trainer = set_up(config)
+    assert not trainer.pipeline.model.strategy.fused
+    assert not any(optimizer.defaults["fused"] for optimizer in trainer.optimizers.optimizers.values())
+
+
+def test_a_training_step_updates_the_gaussians_in_one_launch(
+    colmap: ColmapDataParserConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
+    launch, launched = adam.adam_step, []
+
+    def counted(parameters: tuple[torch.Tensor, ...], *args: Any, **kwargs: Any) -> None:
+        launched.append(len(parameters))
+        launch(parameters, *args, **kwargs)
+
+    monkeypatch.setattr(adam, "adam_step", counted)
+    trainer = set_up(configure(tmp_path, colmap, 3))
+    before = {name: parameter.detach().clone() for name, parameter in trainer.pipeline.model.gauss_params.items()}
+    for name in before:
+        trainer.optimizers.optimizers[name].triton = True  # type: ignore[attr-defined] # in its interpreter, without CUDA
+    trainer.train()
+    assert launched == [6] * 3
+    for name, parameter in trainer.pipeline.model.gauss_params.items():
+        assert parameter.isfinite().all() and (name == "features_rest" or not torch.equal(parameter, before[name]))
+
+
+def test_the_position_rate_grows_with_the_cameras_extent(colmap: ColmapDataParserConfig, tmp_path: Path):
+    trainer = set_up(configure(tmp_path, colmap))
+    extent = trainer.pipeline.model.strategy_state["scene_scale"]
+    assert extent != pytest.approx(1.0)
+    assert trainer.optimizers.schedulers["means"].get_last_lr() == pytest.approx([1.6e-4 * extent])
+
+
+def test_optimized_camera_poses_move(colmap: ColmapDataParserConfig, tmp_path: Path):
+    config = configure(tmp_path, colmap, iterations=4)
+    config.pipeline.model.camera_optimizer.mode = "SO3xR3"
+    trainer = train(config)
+    seen = trainer.pipeline.model.camera_optimizer.pose_adjustment.detach().abs().amax(dim=1) > 0
+    assert int(seen.sum()) == 4  # one view per iteration
+    assert is_finite(trainer.pipeline.model)
+
+
+def test_bilateral_grids_of_the_seen_views_are_trained(colmap: ColmapDataParserConfig, tmp_path: Path):
+    config = configure(tmp_path, colmap, iterations=2)
+    config.pipeline.views_per_iteration = 2
+    config.pipeline.model.use_bilateral_grid = True
+    trainer = set_up(config)
+    seen = trainer.pipeline.datamanager.train_unseen_cameras[:4]
+    before = trainer.pipeline.model.bil_grids.grids.detach().clone()
+    trainer.train()
+    change = (trainer.pipeline.model.bil_grids.grids - before).abs().amax(dim=(1, 2, 3, 4))
+    assert change[seen].min() > 1e-4
+    assert is_finite(trainer.pipeline.model)
+
+
+def test_several_devices_are_refused(colmap: ColmapDataParserConfig, tmp_path: Path):
+    with pytest.raises(ValueError, match=r"sadgs trains on one device"):
+        configure(tmp_path, colmap).setup(local_rank=0, world_size=2)
+
+
+# --- checkpoints ---
+
+
+def test_a_save_that_fails_leaves_the_previous_checkpoint_alone(
+    colmap: ColmapDataParserConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    trainer = set_up(configure(tmp_path, colmap))
+    trainer.save_checkpoint(1)
+
+    def full_disk(state: Any, path: Path) -> None:
+        path.write_bytes(b"half a checkpoint")
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(torch, "save", full_disk)
+    with pytest.raises(OSError, match="no space left"):
+        trainer.save_checkpoint(2)
+    assert [path.name for path in trainer.checkpoint_dir.iterdir()] == ["step-000000001.ckpt"]
+    assert list(tmp_path.rglob("*.partial")) == []
+    assert checkpoint(trainer, 1)["step"] == 1
+
+
+def test_what_a_killed_save_leaves_does_not_hinder_resuming(colmap: ColmapDataParserConfig, tmp_path: Path):
+    config = configure(tmp_path, colmap)
+    trainer = set_up(config)
+    trainer.save_checkpoint(1)
+    code = f"""
+import os, signal, torch
+from pathlib import Path
+from types import SimpleNamespace as Space
+from sadgs_ns.plugin.trainer import SadgsTrainer
+def killed(state, path):
+    path.write_bytes(b"half a checkpoint")
+    os.kill(os.getpid(), signal.SIGKILL)
+torch.save = killed
+part = Space(state_dict=dict)
+trainer = Space(checkpoint_dir=Path({str(trainer.checkpoint_dir)!r}), pipeline=part, grad_scaler=part,
+                optimizers=Space(optimizers={{}}, schedulers={{}}))
+SadgsTrainer.save_checkpoint(trainer, 2)
+"""
+    assert subprocess.run([sys.executable, "-W", "ignore", "-c", code], timeout=60).returncode == -9
+    assert len(list(tmp_path.rglob("*.partial"))) == 1
+    config.load_dir = trainer.checkpoint_dir
+    resumed = set_up(config)
+    assert resumed._start_step == 2
+    resumed.save_checkpoint(3)
+    assert list(tmp_path.rglob("*.partial")) == []
+
+
+# --- other data ---
+
+
+def test_views_of_two_sizes_train_together(tmp_path: Path):
+    sizes = [(WIDTH, HEIGHT), (40, 30)]
+    config = configure(tmp_path / "out", nerfstudio_data(tmp_path / "data", sizes), iterations=13)
+    config.pipeline.views_per_iteration = 2
+    numbers_of_sizes: list[int] = []
+    trainer = set_up(config)
+    pipeline = trainer.pipeline
+    get_loss, render_views = pipeline.get_train_loss_dict, pipeline.model.get_training_outputs
+    rendered: list[tuple[int, int]] = []
+
+    def count_sizes(step: int) -> Any:
+        rendered.clear()
+        result = get_loss(step)
+        numbers_of_sizes.append(len(rendered))
+        return result
+
+    def note_size(viewmats: Any, Ks: Any, width: int, height: int, *rest: Any) -> Any:
+        rendered.append((width, height))
+        return render_views(viewmats, Ks, width, height, *rest)
+
+    pipeline.get_train_loss_dict, pipeline.model.get_training_outputs = count_sizes, note_size  # type: ignore
+    trainer.train()
+    assert set(numbers_of_sizes) == {1, 2}
+    assert {tuple(tensor.shape[:2]) for tensor in pipeline.structure_tensors} == {(HEIGHT, WIDTH), (30, 40)}
+    assert is_finite(pipeline.model)
+
+
+@pytest.mark.parametrize("camera_optimizer", ["off", "SO3xR3"])
+def test_the_loss_of_views_is_the_mean_of_their_own(tmp_path: Path, camera_optimizer: Any):
+    """Each with its own camera, whether they are rendered together or, being of two sizes, one by one."""
+    config = configure(tmp_path / "out", nerfstudio_data(tmp_path / "data", [(WIDTH, HEIGHT), (40, 30)]), iterations=3)
+    config.pipeline.model.camera_optimizer.mode, config.pipeline.model.densify = camera_optimizer, False
+    pipeline = set_up(config).pipeline
+
+    def loss(*indices: int) -> torch.Tensor:
+        pipeline.config.views_per_iteration = len(indices)
+        pipeline.datamanager.train_unseen_cameras[:0] = indices
+        _, losses, metrics = pipeline.get_train_loss_dict(0)
+        assert metrics["gaussian_count"] == pytest.approx(pipeline.model.num_points)
+        return losses["main_loss"].detach()
+
+    alone = [loss(index) for index in range(5)]
+    assert len({round(float(value), 4) for value in alone}) == 5
+    for indices in [(0, 2), (3, 1), (0, 1), (4, 1, 2)]:
+        torch.testing.assert_close(loss(*indices), torch.stack([alone[i] for i in indices]).mean(), rtol=1e-5, atol=0)
+
+
+def test_images_in_bytes_become_what_two_operations_made_of_them(tmp_path: Path, colmap: ColmapDataParserConfig):
+    model = set_up(configure(tmp_path, colmap)).pipeline.model
+    image = torch.arange(256, dtype=torch.uint8).view(-1, 2, 1).expand(-1, -1, 3)
+    assert torch.equal(model.get_gt_img(image), image.float() / 255.0)
+    assert torch.equal(model.get_gt_img(image.double()), image.double())
+
+
+def test_masked_pixels_have_no_structure_and_no_part_in_the_loss(tmp_path: Path):
+    config = configure(tmp_path / "out", nerfstudio_data(tmp_path / "data", masks=True), iterations=7)
+    config.pipeline.views_per_iteration = 2
+    trainer = train(config)
+    pipeline = trainer.pipeline
+    for tensor in pipeline.structure_tensors:
+        assert (decode(tensor[:, : WIDTH // 2]) == 0).all()
+        assert decode(tensor[:, WIDTH // 2 :]).amax() > 0
+    data = pipeline.datamanager.cached_train[0]
+    background = torch.zeros(3)
+
+    def loss(rgb: torch.Tensor) -> torch.Tensor:
+        return pipeline.model.get_loss_dict({"rgb": rgb, "background": background}, data)["main_loss"]
+
+    rgb = torch.rand(HEIGHT, WIDTH, 3)
+    left, right = rgb.clone(), rgb.clone()
+    left[:, : WIDTH // 2] += 0.3
+    right[:, WIDTH // 2 :] += 0.3
+    assert loss(left) == loss(rgb) != loss(right)
+    assert is_finite(pipeline.model)
+
+
+def test_transparent_images_train_in_front_of_the_background(tmp_path: Path):
+    config = configure(tmp_path / "out", blender_data(tmp_path / "data", alpha_color=None), iterations=7)
+    config.pipeline.model.background_color = "white"
+    config.pipeline.model.random_init = True
+    trainer = set_up(config)
+    data = trainer.pipeline.datamanager.cached_train[0]
+    assert data["image"].shape[-1] == 4
+    target = trainer.pipeline.model.composite_with_background(data["image"] / 255, torch.ones(3))
+    assert (target[:, : WIDTH // 2] == 1).all() and target[:, WIDTH // 2 :].amin() < 1
+    trainer.pipeline.model.set_background(torch.zeros(3))  # as the viewer does whenever it draws
+    torch.testing.assert_close(trainer.pipeline.photo(data), target)
+    trainer.train()
+    assert is_finite(trainer.pipeline.model)
+
+
+def test_blender_data_train_with_the_alpha_colour_that_its_parser_gives_them(tmp_path: Path):
+    trainer = train(configure(tmp_path / "out", blender_data(tmp_path / "data", alpha_color="white")))
+    image = trainer.pipeline.datamanager.cached_train[0]["image"]
+    assert image.shape[-1] == 3 and (image[:, : WIDTH // 2] == 255).all()
+    assert is_finite(trainer.pipeline.model)
+
+
+def test_data_without_sfm_points_start_from_random_ones_and_say_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    trainer = set_up(configure(tmp_path / "out", nerfstudio_data(tmp_path / "data")))
+    assert 0 < trainer.pipeline.model.num_points <= POINTS
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "The data has no SfM points: starting from 300 random ones in a cube of side 10.0." in printed
+
+
+def test_random_points_on_request_need_no_warning(
+    colmap: ColmapDataParserConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    config = configure(tmp_path, colmap)
+    config.pipeline.model.random_init = True
+    set_up(config)
+    assert "no SfM points" not in capsys.readouterr().out
+
+
+# --- rendering ---
+
+
+@pytest.fixture(scope="module")
+def trained(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> SadgsTrainer:
+    """A few iterations, ready to render."""
+    parser = ColmapDataParserConfig(data=scene, colmap_path=SPARSE_FOLDER, downscale_factor=1, eval_mode="interval")
+    trainer = train(configure(tmp_path_factory.mktemp("trained"), parser))
+    trainer.pipeline.eval()
+    return trainer
+
+
+@torch.no_grad()
+def test_held_out_cameras_render_as_nerfstudio_expects(trained: SadgsTrainer):
+    pipeline = trained.pipeline
+    assert isinstance(pipeline.model, SplatfactoModel)  # what the viewer and the exporter ask for
+    assert len(pipeline.datamanager.eval_dataset) == VIEWS - TRAIN_VIEWS
+    for index in range(VIEWS - TRAIN_VIEWS):
+        camera = pipeline.datamanager.eval_dataset.cameras[index : index + 1]
+        outputs = pipeline.model.get_outputs_for_camera(camera)
+        channels = {"rgb": 3, "depth": 1, "accumulation": 1, "background": 3}
+        assert {name: tuple(value.shape) for name, value in outputs.items()} == {
+            name: (HEIGHT, WIDTH, count) for name, count in channels.items()
+        }
+        assert 0 <= outputs["rgb"].min() < outputs["rgb"].max() <= 1
+        assert outputs["depth"].min() > 0
+
+
+@torch.no_grad()
+def test_a_crop_box_hides_what_lies_outside(trained: SadgsTrainer):
+    model, camera = trained.pipeline.model, trained.pipeline.datamanager.eval_dataset.cameras[:1]
+
+    def accumulation(side: float, centre: float) -> torch.Tensor:
+        box = OrientedBox(R=torch.eye(3), T=torch.full((3,), centre), S=torch.full((3,), side))
+        return model.get_outputs_for_camera(camera, obb_box=box)["accumulation"]
+
+    everything = model.get_outputs_for_camera(camera)["accumulation"]
+    assert torch.equal(accumulation(1000.0, 0.0), everything)
+    middle = float(model.means.median())
+    assert 0 < accumulation(0.5, middle).sum() < everything.sum()
+    assert torch.equal(accumulation(0.5, 100.0), torch.zeros(HEIGHT, WIDTH, 1))
+    assert torch.equal(model.get_outputs_for_camera(camera)["accumulation"], everything)

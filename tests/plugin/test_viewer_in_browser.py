@@ -1,0 +1,96 @@
+"""The viewer's panel in a real browser: what is chosen there is drawn, what is set there reaches the run.
+
+Needs Chromium and takes a minute: `pytest -m slow tests/test_viewer_in_browser.py`.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import browser
+import numpy as np
+import pytest
+from browser import Page, open_page
+from kill_and_resume import configure, set_up
+from nerfstudio.viewer.render_state_machine import RenderStateMachine
+from nerfstudio.viewer.viewer import Viewer
+from PIL import Image
+
+from sadgs_ns.demo.scene import write_scene
+from sadgs_ns.plugin.panel import OUTPUT
+
+LABEL = "[...document.querySelectorAll('label')].filter(l => l.textContent == '{}')[0]"
+ELEMENT = "document.getElementById(" + LABEL + ".htmlFor)"
+OPTION = "[...document.querySelectorAll('[role=option]')].filter(o => o.textContent == '{}' && o.offsetParent)[0]"
+
+
+def eventually(condition: Callable[[], bool], seconds: float = 60) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.2)
+
+
+def select(page: Page, label: str, option: str) -> None:
+    page.click(ELEMENT.format(label))
+    page.wait_for(f"!!{OPTION.format(option)}")
+    page.click(OPTION.format(option))
+
+
+def _is_legend(path: Path) -> bool:
+    """Whether a strip above the scene has the legend's ground, (20, 20, 20), as far as JPEG leaves it."""
+    with Image.open(path) as image:
+        pixels = np.asarray(image.convert("RGB")).astype(int)[55:85, 20:600]
+    return bool((np.abs(pixels - 20).max(axis=-1) < 8).mean() > 0.4)
+
+
+def _has_legend(page: Page, path: Path) -> bool:
+    page.screenshot(path)
+    return _is_legend(path)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of viser, websockets and torchmetrics
+@pytest.mark.skipif(browser.CHROMIUM is None, reason="needs Chromium")
+def test_the_panel_shows_and_sets_what_is_chosen_in_a_browser(tmp_path: Path):
+    write_scene(tmp_path / "scene", 64, 48, 10, points=300)
+    config = configure(tmp_path / "scene", tmp_path / "runs", 30, save_every=0)
+    config.pipeline.model.strategy.eta_min_opacity = 0.0
+    config.save_config()
+    trainer = set_up(config)
+    trainer.train()
+    pipeline = trainer.pipeline
+    panel, strategy = pipeline.structure, pipeline.model.strategy
+    config.viewer.websocket_port_default = 7137  # the first free port from there
+    viewer = Viewer(config.viewer, tmp_path / "log", tmp_path, pipeline, train_lock=threading.Lock())
+    viewer.init_scene(pipeline.datamanager.train_dataset, "completed")
+    url = viewer.viewer_info[0].split(": ")[-1]
+    try:
+        with open_page(url, tmp_path / "profile") as page:
+            page.wait_for("document.body.innerText.includes('Custom Elements')")
+            assert f"{pipeline.model.num_points:,} Gaussians" in page.run("document.body.innerText")
+            eventually(lambda: OUTPUT in viewer.control_panel._output_render.options)
+            page.click("[...document.querySelectorAll('button')].filter(b => b.textContent.includes('Hide Train'))[0]")
+            page.screenshot(tmp_path / "rgb.png")
+            select(page, "Show", "η")
+            page.wait_for(f"{ELEMENT.format('Output type')}.value == '{OUTPUT}'")
+            assert panel.choice.value == "η" and panel.statistics() is not None
+            eventually(lambda: _has_legend(page, tmp_path / "eta.png"))
+            assert not _is_legend(tmp_path / "rgb.png")
+            page.click(ELEMENT.format("max_gaussians"))
+            page.run(f"{ELEMENT.format('max_gaussians')}.select()")
+            page.type("4567")
+            page.press("Enter", 13)
+            eventually(lambda: strategy.max_gaussians == 4567)
+            page.wait_for("document.body.innerText.includes('cap 4,567')")
+            select(page, "Show", "off")
+            page.wait_for(f"{ELEMENT.format('Output type')}.value == 'rgb'")
+    finally:
+        viewer.viser_server.stop()
+        for thread in threading.enumerate():  # one that still renders when Python ends would abort it
+            if isinstance(thread, RenderStateMachine):
+                thread.running = False
+                thread.join(30)

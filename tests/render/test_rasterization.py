@@ -1,0 +1,114 @@
+"""The seam between gsplat and the torch splatter, and the helpers that read what both return."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import Any
+from unittest.mock import Mock
+
+import pytest
+import torch
+
+from sadgs_ns.bench.rasterizers import random_scene, render_with_gradients
+from sadgs_ns.render import splatter
+from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world, visible
+
+
+def test_the_cpu_gets_the_splatter(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gsplat.rendering.rasterization", Mock(side_effect=AssertionError("gsplat on a CPU")))
+    scene: dict[str, Any] = random_scene(50, 32, seed=0)
+    del scene["weights"]
+    scene["means"][:5, 2] = -4.0  # behind the camera
+    options: dict[str, Any] = {"sh_degree": 3, "rasterize_mode": "antialiased", "render_mode": "RGB+ED"}
+    colors, alphas, info = rasterize(**scene, width=32, height=32, **options)
+    expected_colors, expected_alphas, expected_info = splatter.rasterization(**scene, width=32, height=32, **options)
+    assert torch.equal(colors, expected_colors) and torch.equal(alphas, expected_alphas)
+    assert torch.equal(visible(info), visible(expected_info))
+    assert 0 < visible(info).sum() < 50
+
+
+def test_cuda_gets_gsplat_unpacked(monkeypatch: pytest.MonkeyPatch) -> None:
+    gsplat = Mock(return_value=("colors", "alphas", {}))
+    monkeypatch.setattr("gsplat.rendering.rasterization", gsplat)
+    arguments: list[Any] = [Mock(is_cuda=True), *(Mock() for _ in range(6)), 32, 24]
+    assert rasterize(*arguments, absgrad=True)[:2] == ("colors", "alphas")
+    gsplat.assert_called_once_with(
+        *arguments,
+        sh_degree=None,
+        packed=False,
+        render_mode="RGB",
+        absgrad=True,
+        rasterize_mode="classic",
+    )
+
+
+def test_the_cpu_never_loads_gsplats_kernels() -> None:
+    program = """
+import sys
+from sadgs_ns.bench.rasterizers import random_scene, render_with_gradients
+import torch
+render_with_gradients(random_scene(20, 16, 0), "cpu", torch.float32)
+loaded = {"gsplat.cuda._backend", "gsplat.csrc", "gsplat_cuda"} & set(sys.modules)
+sys.exit(f"loaded {loaded}" if loaded else 0)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("radii", "means2d", "expected"),
+    [
+        ([[3, 0], [0, 7]], torch.zeros(2, 2, 2), [[True, False], [False, True]]),
+        ([[[3, 2], [0, 0]], [[0, 4], [7, 7]]], torch.zeros(2, 2, 2), [[True, False], [False, True]]),
+        ([[3, 2], [0, 4]], torch.zeros(2, 2), [True, False]),
+        ([3, 0], torch.zeros(2, 2), [True, False]),
+    ],
+    ids=["one radius", "radii per axis", "packed radii per axis", "packed radius"],
+)
+def test_visible(radii: list[Any], means2d: torch.Tensor, expected: list[Any]) -> None:
+    info = {"radii": torch.tensor(radii, dtype=torch.int32), "means2d": means2d}
+    assert visible(info).tolist() == expected
+
+
+def test_viewmat_by_hand() -> None:
+    # The camera stands at (1, 2, 3) and looks along world +x with world +z up: right is -y, back is -x.
+    camera_to_world = torch.tensor([[[0.0, 0.0, -1.0, 1.0], [-1.0, 0.0, 0.0, 2.0], [0.0, 1.0, 0.0, 3.0]]])
+    viewmats = viewmats_from_camera_to_world(camera_to_world)
+    expected = [[[0.0, -1.0, 0.0, 2.0], [0.0, 0.0, -1.0, 3.0], [1.0, 0.0, 0.0, -1.0], [0.0, 0.0, 0.0, 1.0]]]
+    assert viewmats.tolist() == expected
+
+
+@pytest.mark.filterwarnings("ignore:Using a non-tuple sequence:UserWarning")  # nerfstudio's indexing
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_viewmats_project_nerfstudios_rays_to_their_pixels(dtype: torch.dtype) -> None:
+    cameras = pytest.importorskip("nerfstudio.cameras.cameras")
+    generator = torch.Generator().manual_seed(0)
+    rotations = torch.linalg.qr(torch.randn(3, 3, 3, generator=generator))[0]
+    rotations *= torch.linalg.det(rotations)[:, None, None]
+    poses = torch.cat([rotations, torch.randn(3, 3, 1, generator=generator)], dim=-1)
+    camera = cameras.Cameras(poses, fx=40.0, fy=44.0, cx=15.0, cy=13.0, width=32, height=24)
+    viewmats = viewmats_from_camera_to_world(poses.to(dtype))
+    assert viewmats.dtype == dtype
+    for index in range(3):
+        rays = camera.generate_rays(camera_indices=index)
+        points = (rays.origins + 2.0 * rays.directions).reshape(-1, 3).to(dtype)  # [H * W, 3]
+        seen = points @ viewmats[index, :3, :3].T + viewmats[index, :3, 3]
+        assert (seen[:, 2] > 0).all()
+        pixels = seen @ camera[index].get_intrinsics_matrices().to(dtype).T
+        expected = camera.get_image_coords().flip(-1).reshape(-1, 2).to(dtype)  # pixel centres as (x, y)
+        torch.testing.assert_close(pixels[:, :2] / pixels[:, 2:], expected, rtol=0, atol=1e-3)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat needs a CUDA device")
+def test_gsplat_and_the_splatter_agree() -> None:
+    scene = random_scene(3000, 128, seed=0)
+    theirs = render_with_gradients(scene, "cuda", torch.float32)
+    ours = render_with_gradients(scene, "cpu", torch.float32)
+    assert (ours.pop("visible") != theirs.pop("visible")).sum() <= 3
+    for name in ("means2d", "conics"):
+        # gsplat leaves these uninitialised for culled Gaussians; the gradients below test them further.
+        del ours[name], theirs[name]
+    for name, expected in theirs.items():
+        # Rounding moves a few pairs over a cut-off, so single values may differ by more than rounding: compare norms.
+        assert (ours[name] - expected).norm() < 2e-3 * expected.norm(), name
