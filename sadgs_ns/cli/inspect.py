@@ -187,7 +187,7 @@ def _try(
 
 def structure_step(model: SadgsModel, statistics: dict[str, Tensor]) -> Step:
     """What a structure-aware step would split, without its pruning."""
-    counts, grid = model.strategy.children_now(statistics), model.strategy.child_grid
+    counts, grid = model.strategy.children_now(model.gauss_params, statistics), model.strategy.child_grid
     return _try(model, {}, lambda p, o, s: grid_split(p, o, s, counts, *grid))
 
 
@@ -215,7 +215,7 @@ def view_panels(pipeline: SadgsPipeline, view: View, statistics: dict[str, Tenso
     """The pictures of one view, by name."""
     model, constant = pipeline.model, pipeline.config.frequency_constant
     params, options = dict(model.gauss_params.items()), {"rasterize_mode": model.config.rasterize_mode}
-    counts = model.strategy.children_now(statistics)
+    counts = model.strategy.children_now(model.gauss_params, statistics)
     is_low = model.strategy.consistently_low(statistics)
     height, width = view.photo.shape[:2]
     enlarge = max(MIN_SIDE / max(height, width), 1.0)

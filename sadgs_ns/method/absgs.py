@@ -66,6 +66,7 @@ def grow(
     size_threshold: float,
     budget: float,
     long_axis: bool = False,
+    child_rows: str = "empty",
 ) -> tuple[int, int]:
     """Clone small Gaussians by their mean gradient, split large ones in two by their absolute gradient.
 
@@ -94,11 +95,24 @@ def grow(
     n_clone, n_split = int(is_clone.sum()), int(is_split.sum())
     if n_clone > 0:
         duplicate(params, optimizers, state, is_clone)  # type: ignore[arg-type]
+        if child_rows == "empty":
+            _forget_last(state, n_clone)
     if n_split > 0:
         is_split = torch.cat([is_split, is_split.new_zeros(n_clone)])  # clones are not split
         if long_axis:
             longest = F.one_hot(params["scales"].argmax(dim=-1), 3)  # [N, 3]
-            grid_split(params, optimizers, state, 1 + longest * is_split[:, None], others=_OTHER_AXES)
+            grid_split(
+                params, optimizers, state, 1 + longest * is_split[:, None], others=_OTHER_AXES, child_rows=child_rows
+            )
         else:
             split(params, optimizers, state, is_split)  # type: ignore[arg-type]
+            if child_rows == "empty":
+                _forget_last(state, 2 * n_split)
     return n_clone, n_split
+
+
+def _forget_last(state: MutableMapping[str, Any], num_children: int) -> None:
+    """Empty the rows of the newest Gaussians, which gsplat's operations append as copies of their parents' rows."""
+    for value in state.values():
+        if isinstance(value, Tensor):
+            value[-num_children:] = 0

@@ -108,12 +108,13 @@ def grid_split(
     extent: float = VARIANCE_EXTENT,
     child_scale: float = 1.0,
     others: float = 1.0,
+    child_rows: str = "empty",
 ) -> None:
     """Replace every Gaussian with more than one child by its grid of children, in place, as gsplat's `split` does.
 
     μ_child = μ + R (s ⊙ g) and s_child = s ⊘ n (paper, eq. 9); rotation, colour and opacity are copied. The order
-    afterwards is [unsplit, children grouped by parent]. Children start with zero optimizer moments and inherit the
-    parent's rows of every tensor in `state`.
+    afterwards is [unsplit, children grouped by parent]. Children start with zero optimizer moments and empty rows of
+    every tensor in `state`: what was observed of the parent, which was longer, does not hold for them.
 
     Such children stand √12 of their own standard deviations apart. Children k times as large (not in the paper) fill
     these gaps: their grid is narrower, so that the covariance stays, and their opacity 1/k for each axis that is split,
@@ -159,6 +160,11 @@ def grid_split(
         return torch.cat([v[rest], v.new_zeros((len(parents), *v.shape[1:]))])
 
     _update_param_with_optimizer(param_fn, optimizer_fn, params, optimizers)  # type: ignore[arg-type]
+    eta_before = state.get("eta_max")
     for key, value in state.items():
         if isinstance(value, Tensor):
-            state[key] = torch.cat([value[rest], value[parents]])
+            rows = value[parents] if child_rows != "empty" else value.new_zeros((len(parents), *value.shape[1:]))
+            if child_rows == "scaled" and key in ("eta_max", "n_high"):
+                shorter = eta_before[parents] * (-shrink).exp()
+                rows = rows * (shorter > 1) if key == "n_high" else shorter
+            state[key] = torch.cat([value[rest], rows])

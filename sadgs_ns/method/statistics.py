@@ -122,15 +122,16 @@ def observe(
         torch.maximum(statistics["eta_max"], violation, out=statistics["eta_max"])
 
 
-def consistent(counts: Tensor, n_total: Tensor, threshold: float) -> Tensor:
-    """Whether a response was seen in more than a fraction of the observations: N / N_total > τ.
+def consistent(counts: Tensor, n_total: Tensor, threshold: float, min_observations: int = 1) -> Tensor:
+    """Whether a response was seen in more than a fraction of the observations: N / N_total > τ (paper, section 3.4).
 
     Args:
         counts: `n_high` or `n_low`. [N, 3]
         n_total: [N]
         threshold: τ_split or τ_prune in [0, 1].
+        min_observations: Fewer observations than these say nothing: one of one would be all of them.
 
     Returns:
-        Per axis; False for a Gaussian that was never observed. bool [N, 3]
+        Per axis; False for a Gaussian with too few observations. bool [N, 3]
     """
-    return counts > threshold * n_total[:, None]
+    return (counts > threshold * n_total[:, None]) & (n_total >= min_observations)[:, None]

@@ -103,6 +103,12 @@ class StructureAwareStrategy(Strategy):
     """An opacity reset multiplies every opacity by this."""
     final_prune_opacity: float = 0.1
     """Opacity under which Gaussians are pruned when densification ends."""
+    min_observations: int = 3
+    """Observations of η that a Gaussian needs before a structure step splits it, or prunes it by low η."""
+    gate_at_split: bool = True
+    """Sweep: η of all visible Gaussians is observed, and those at least `eta_min_opacity` opaque are split."""
+    child_rows: str = "empty"
+    """Sweep: statistics of AbsGS's children: empty, scaled or kept."""
     fused: bool = True
     """Measure η, and add up AbsGS's gradients, in one Triton kernel each where these run (CUDA)."""
     verbose: bool = False
@@ -244,7 +250,7 @@ class StructureAwareStrategy(Strategy):
                     params,
                     view,
                     directional=self.directional_eta,
-                    min_opacity=self.eta_min_opacity,
+                    min_opacity=0.0 if self.gate_at_split else self.eta_min_opacity,
                     fused=self.fused,
                 )
 
@@ -288,26 +294,31 @@ class StructureAwareStrategy(Strategy):
 
     def consistently_low(self, statistics: Mapping[str, Tensor]) -> Tensor:
         """Gaussians that answered low on all three axes in more than τ_prune of their observations. bool [N]"""
-        return consistent(statistics["n_low"], statistics["n_total"], self.tau_prune).all(dim=1)
+        n_low, n_total = statistics["n_low"], statistics["n_total"]
+        return consistent(n_low, n_total, self.tau_prune, self.min_observations).all(dim=1)
 
-    def split_plan(self, statistics: Mapping[str, Tensor], budget: float) -> tuple[Tensor, Tensor]:
+    def split_plan(self, params: Params, statistics: Mapping[str, Tensor], budget: float) -> tuple[Tensor, Tensor]:
         """What a structure step makes of the statistics.
 
         Args:
+            params: gsplat's parameters.
             statistics: As made by `empty_statistics`.
             budget: Gaussians that may be added.
 
         Returns:
             n per axis that η asks for, int64 [N, 3]; and the Gaussians whose children fit the budget, bool [N].
         """
-        violates = consistent(statistics["n_high"], statistics["n_total"], self.tau_split)
+        n_high, n_total = statistics["n_high"], statistics["n_total"]
+        violates = consistent(n_high, n_total, self.tau_split, self.min_observations)
+        if self.gate_at_split:
+            violates &= (self._opacities(params) >= self.eta_min_opacity)[:, None]
         counts = children_per_axis(statistics["eta_max"], violates, self.split_exponent)  # [N, 3]
         worst = torch.where(violates, statistics["eta_max"], 0.0).amax(dim=1)  # [N]
         return counts, limit_growth(num_children(counts) - 1, worst, budget)
 
-    def children_now(self, statistics: Mapping[str, Tensor]) -> Tensor:
+    def children_now(self, params: Params, statistics: Mapping[str, Tensor]) -> Tensor:
         """n per axis that a structure step would split by now, 1 where whole or over the cap. int64 [N, 3]"""
-        counts, fits = self.split_plan(statistics, self.max_gaussians - len(statistics["n_total"]))
+        counts, fits = self.split_plan(params, statistics, self.max_gaussians - len(statistics["n_total"]))
         return torch.where(fits[:, None], counts, 1)
 
     def _structure_step(
@@ -324,7 +335,7 @@ class StructureAwareStrategy(Strategy):
         if self.clamp_opacity < 1:
             self._map_opacities(params, optimizers, lambda alpha: alpha.clamp_max(self.clamp_opacity))
         under_cap, in_memory = self._room(params, state, views)
-        counts, allowed = self.split_plan(state, min(under_cap, in_memory))
+        counts, allowed = self.split_plan(params, state, min(under_cap, in_memory))
         n_parents, n_wanted = int(allowed.sum()), int((counts > 1).any(dim=1).sum())
         if in_memory < min(int((num_children(counts) - 1).sum()), under_cap):
             _warn_of_memory(iteration, in_memory)
@@ -360,6 +371,7 @@ class StructureAwareStrategy(Strategy):
             size_threshold=self.small_scale * state["scene_scale"],
             budget=min(under_cap, in_memory),
             long_axis=self.absgs_long_axis,
+            child_rows=self.child_rows,
         )
         if in_memory <= n_clone + n_split < under_cap:
             _warn_of_memory(iteration, in_memory)

@@ -301,7 +301,10 @@ class StructurePanel(torch.nn.Module):
             return visualization.annotate(np.zeros((height, width, 3), np.uint8), text)
         strategy = model.strategy
         kept = {name: statistics[name] for name in ("eta_max", "n_total")}
-        kept |= {"children": strategy.children_now(statistics), "low": strategy.consistently_low(statistics)}
+        kept |= {
+            "children": strategy.children_now(self.pipeline.model.gauss_params, statistics),
+            "low": strategy.consistently_low(statistics),
+        }
         rows = model.cropped({**model.gauss_params, **kept})
         if len(rows["means"]) == 0:
             return visualization.annotate(np.zeros((height, width, 3), np.uint8), "No Gaussians in the crop box.")

@@ -249,7 +249,7 @@ class SadgsPipeline(VanillaPipeline):
                 params,
                 info | {"viewmats": viewmats, "Ks": Ks, "structure_tensors": tensor},
                 directional=strategy.directional_eta,
-                min_opacity=strategy.eta_min_opacity,
+                min_opacity=0.0,
                 generator=generator,
                 fused=strategy.fused,
             )

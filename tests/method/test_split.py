@@ -155,7 +155,8 @@ def test_optimizer_state_and_statistics_follow():
     kept = [0, 2, 4]
     grid_split(params, optimizers, state, counts)
     assert all(len(p) == 8 for p in params.values())
-    assert state["n_total"].tolist() == [0, 2, 4, 1, 1, 3, 3, 3] and len(state["eta_max"]) == 8
+    assert state["n_total"].tolist() == [0, 2, 4, 0, 0, 0, 0, 0], "nobody has observed the children"
+    assert state["eta_max"][:3].tolist() == [[0, 1, 2], [6, 7, 8], [12, 13, 14]] and not state["eta_max"][3:].any()
     for name, optimizer in optimizers.items():
         assert optimizer.param_groups[0]["params"][0] is params[name]
         slots = optimizer.state[params[name]]

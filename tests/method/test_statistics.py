@@ -92,7 +92,8 @@ def test_garbage_of_the_unseen_never_enters():
     assert all(value.isfinite().all() for value in statistics.values())
 
 
-def test_consistency_is_a_fraction_of_the_observations():
+def test_consistency_is_a_fraction_of_enough_observations():
     counts = torch.tensor([[9.0, 8.0, 0.0], [0.0, 0.0, 0.0]])
     total = torch.tensor([10.0, 0.0])
     assert consistent(counts, total, 0.8).tolist() == [[True, False, False], [False, False, False]]
+    assert not consistent(counts, total, 0.8, min_observations=11).any(), "fewer observations say nothing"

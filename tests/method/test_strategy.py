@@ -238,9 +238,7 @@ def test_absgs_halves_the_longest_axis_in_its_place():
     params["quats"].data = torch.tensor([[1.0, 0, 0, 0]]).repeat(4, 1)
     before = {name: parameter.detach().clone() for name, parameter in params.items()}
     state = gradient_state([3e-4, 0.0, 0.0, 0.0], [0.0, 9e-4, 5e-4, 1e-4])
-    state["n_total"] = torch.arange(4.0)
     assert grow_with(params, state, long_axis=True) == (1, 2)  # the first is small, the last has too small a gradient
-    assert state["n_total"].tolist() == [0, 3, 0, 1, 1, 2, 2]  # whole, clone, children in pairs
     children = {name: parameter.detach()[3:].unflatten(0, (2, 2)) for name, parameter in params.items()}
     parents = {name: value[[1, 2]] for name, value in before.items()}
     axes = torch.tensor([[0.0, 0, 1], [1, 0, 0]])
@@ -252,6 +250,21 @@ def test_absgs_halves_the_longest_axis_in_its_place():
     torch.testing.assert_close(offset.abs(), axes * parents["scales"].exp() * 0.75**0.5)  # which keeps the covariance
     for name in ("quats", "opacities", "features_dc"):
         torch.testing.assert_close(children[name], parents[name][:, None].expand_as(children[name]))
+
+
+@pytest.mark.parametrize("long_axis", [True, False])
+def test_absgs_leaves_statistics_with_the_gaussians_that_were_observed(long_axis: bool):
+    """A parent of η = 20, halved four times, would ask for 5 cells an axis; each child is seen anew."""
+    params = random_params(3)
+    params["scales"].data = torch.log(torch.tensor([[0.05], [0.8], [0.7]])).repeat(1, 3)
+    state = gradient_state([3e-4, 0.0, 0.0], [0.0, 9e-4, 1e-4]) | empty_statistics(3, torch.device("cpu"))
+    for name in ("n_high", "eta_max", "n_total"):
+        state[name] += torch.tensor([1.0, 20.0, 3.0]).view(3, *[1] * (state[name].dim() - 1))
+    assert grow_with(params, state, long_axis=long_axis) == (1, 1)
+    assert state["n_total"].tolist() == [1, 3, 0, 0, 0], "the cloned, the one left whole, the clone, two children"
+    for name in ("n_high", "n_low", "eta_max"):
+        assert not state[name][2:].any()
+    assert state["eta_max"][:2, 0].tolist() == [1, 3]
 
 
 def test_absgs_spends_a_budget_on_the_steepest():
@@ -290,9 +303,15 @@ def test_what_would_be_split_now_keeps_to_the_cap():
     statistics["n_total"][:] = 1
     statistics["eta_max"][0, 0], statistics["eta_max"][1, 1] = 4.0, 9.0
     statistics["n_high"][:] = (statistics["eta_max"] > 1).to(statistics["n_high"])
-    strategy = StructureAwareStrategy(max_gaussians=6)
-    assert strategy.children_now(statistics).tolist() == [[2, 1, 1], [1, 3, 1], [1, 1, 1]]
+    params = random_params(3)
+    strategy = StructureAwareStrategy(max_gaussians=6, min_observations=1, eta_min_opacity=0.0)
+    assert strategy.children_now(params, statistics).tolist() == [[2, 1, 1], [1, 3, 1], [1, 1, 1]]
     strategy.max_gaussians = 5  # room for two more: the larger η comes first
-    assert strategy.children_now(statistics).tolist() == [[1, 1, 1], [1, 3, 1], [1, 1, 1]]
+    assert strategy.children_now(params, statistics).tolist() == [[1, 1, 1], [1, 3, 1], [1, 1, 1]]
     strategy.max_gaussians = 2
-    assert (strategy.children_now(statistics) == 1).all()
+    assert (strategy.children_now(params, statistics) == 1).all()
+    strategy.max_gaussians, strategy.min_observations = 6, 2
+    assert (strategy.children_now(params, statistics) == 1).all(), "one observation is no consistency"
+    strategy.min_observations, strategy.eta_min_opacity = 1, 0.5
+    params["opacities"].data = torch.logit(torch.tensor([0.4, 0.6, 0.6]))
+    assert strategy.children_now(params, statistics).tolist() == [[1, 1, 1], [1, 3, 1], [1, 1, 1]]
