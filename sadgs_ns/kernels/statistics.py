@@ -9,7 +9,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from sadgs_ns.method.codes import HIGHEST_FREQUENCY, OCTAVES
+from sadgs_ns.method.codes import HIGHEST_FREQUENCY, MASKED, OCTAVES
 
 _LANES = 128
 
@@ -70,7 +70,7 @@ def _observe(
     means, quats, scales, opacities, drawn, means2d, conics, jitter, structure_tensors, viewmats, Ks,
     n_high, n_low, eta_max, n_total, n, num_views, width, height, min_logit,
     HIGH: tl.constexpr, LOW: tl.constexpr, BLUR: tl.constexpr, MARGIN: tl.constexpr, EPSILON: tl.constexpr,
-    HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, DIRECTIONAL: tl.constexpr, LANES: tl.constexpr,
+    HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, MASKED: tl.constexpr, DIRECTIONAL: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
     g = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
     candidate = (g < n) & (tl.load(opacities + g, g < n, float("-inf")) >= min_logit)
@@ -117,6 +117,7 @@ def _observe(
         s_xy = tl.load(pixel + 1, observed, 0).to(tl.float32)
         s_yy = tl.load(pixel + 2, observed, 0).to(tl.float32)
         if structure_tensors.dtype.element_ty == tl.uint8:
+            observed = observed & (s_xy != MASKED)
             frequency_x, frequency_y = _frequency(s_xx, HIGHEST, OCTAVES), _frequency(s_yy, HIGHEST, OCTAVES)
             s_xy = frequency_x * frequency_y * (s_xy - 127) / 127
             s_xx, s_yy = frequency_x * frequency_x, frequency_y * frequency_y
@@ -201,5 +202,5 @@ def observe_views(
     height, width = structure_tensors.shape[1:3]
     _observe[triton.cdiv(n, _LANES),](
         *(value.contiguous() for value in inputs), *statistics, n, num_views, width, height, min_logit,
-        *thresholds, *constants, HIGHEST_FREQUENCY, OCTAVES, directional, _LANES,
+        *thresholds, *constants, HIGHEST_FREQUENCY, OCTAVES, MASKED, directional, _LANES,
     )  # fmt: skip

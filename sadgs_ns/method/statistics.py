@@ -55,8 +55,8 @@ def observe(
 ) -> None:
     """Add one forward pass: one jittered sample per visible Gaussian and view, counted in place.
 
-    A Gaussian is observed in a view when the rasterizer drew it there, its sample lies inside the image, and its η is
-    finite on all axes: NaN and infinities of the projection or of S̄ are no observation.
+    A Gaussian is observed in a view when the rasterizer drew it there, its sample lies in the image and not on a masked
+    pixel, and its η is finite on all axes: NaN and infinities of the projection or of S̄ are no observation.
 
     Args:
         statistics: As made by `empty_statistics`.

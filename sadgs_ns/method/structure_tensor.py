@@ -187,7 +187,8 @@ def multiscale_structure_tensor(
         fused: Use our Triton kernels where they run: CUDA, float32.
 
     Returns:
-        S̄ as (xx, xy, yy) in 1/px², positive semidefinite, trace ≤ (c / σ_0)², 0 at masked pixels. [B, H, W, 3]
+        S̄ as (xx, xy, yy) in 1/px², positive semidefinite, trace ≤ (c / σ_0)²; NaN at masked pixels, where it is not
+        known. [B, H, W, 3]
 
     Raises:
         ValueError: If the images or masks have another shape, the images are empty or not floating point, or a valid
@@ -262,4 +263,7 @@ def multiscale_structure_tensor(
             numerator += scale_weight * (frequency_constant / sigma) ** 2 * normalised
             denominator += scale_weight
         previous = smoothed
-    return (numerator / denominator * valid).permute(0, 2, 3, 1).contiguous()
+    tensor = numerator / denominator
+    if masks is not None:
+        tensor = torch.where(valid > 0, tensor, torch.nan)
+    return tensor.permute(0, 2, 3, 1).contiguous()
