@@ -17,6 +17,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from sadgs_ns.kernels.limits import check_pixels
 from sadgs_ns.method.losses import WINDOW
 
 _WEIGHTS = [math.exp(-((k - WINDOW // 2) ** 2) / (2 * 1.5**2)) for k in range(WINDOW)]
@@ -227,5 +228,9 @@ def photometric_loss(
 
     Returns:
         The loss and PSNR in dB, both scalars.
+
+    Raises:
+        InputError: If the views have more pixels than the kernels can address (limits.py).
     """
+    check_pixels(*predicted.shape[:3])
     return _PhotometricLoss.apply(predicted.contiguous(), target.contiguous(), ssim_lambda, l2_lambda)  # type: ignore[return-value]

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from sadgs_ns.kernels import compositing
 from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
+from sadgs_ns.kernels.limits import check_gaussians, check_pixels
 from sadgs_ns.kernels.tiles import intersect_tiles
 from sadgs_ns.render.rasterization import visible
 
@@ -43,10 +44,13 @@ def rasterization(
 
     Raises:
         ValueError: If `packed`.
+        InputError: If Gaussians, pixels or tile pairs are more than the kernels can address (limits.py).
     """
     if packed:
         raise ValueError("exact tile lists are made of unpacked projections: packed=False")
     num_views = len(viewmats)
+    check_gaussians(num_views, len(means))
+    check_pixels(num_views, height, width)
     bound: dict[str, Any] = {"opacities": opacities} if _BOUNDS_RADII else {}
     radii, means2d, depths, conics, compensations = fully_fused_projection(
         means,

@@ -88,7 +88,7 @@ def _observe(
     high0, high1, high2, low0, low1, low2 = zero, zero, zero, zero, zero, zero
     most0, most1, most2, total = zero, zero, zero, zero
     for view in range(num_views):
-        at = view * n + g
+        at = view * tl.cast(n, tl.int64) + g
         seen = candidate & (tl.load(drawn + at, candidate, 0) != 0)
         # The sample, from the Cholesky factor of Σ2D; in float64, for a long thin Gaussian's determinant cancels.
         a = tl.load(conics + 3 * at, seen, 1.0).to(tl.float64)

@@ -222,7 +222,9 @@ def multiscale_structure_tensor(
 
     fused = fused and image.dtype == torch.float32 and kernels.available(image.device)
     if fused:
-        from sadgs_ns.kernels import scale_space
+        from sadgs_ns.kernels import limits, scale_space
+
+        limits.check_batch(*image.shape)
     filters = _Filters(truncation, fused)
     reach = _Reach(filters, weight, masks is not None)
     numerator = torch.zeros_like(image[:, :1]).repeat(1, 3, 1, 1)  # [B, 3, H, W]
