@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -110,21 +111,49 @@ def test_kernels_are_for_the_current_cuda_device_only(monkeypatch):
     assert [kernels.available(torch.device(name)) for name in names] == [False, True, False, True]
 
 
-def test_a_triton_that_compiles_is_found_and_one_that_does_not_is_told_once(monkeypatch):
-    assert kernels._compiles.__wrapped__(DEVICE)
+@pytest.fixture
+def nothing_tried(monkeypatch):
+    """A process in which nobody has asked for the kernels."""
+    monkeypatch.setattr(kernels, "_working", set())
+    monkeypatch.setattr(kernels, "_asked", Counter())
+    kernels._has_triton.cache_clear()
+    yield
+    kernels._has_triton.cache_clear()
 
-    def fail(device):
-        raise RuntimeError("Failed to find C compiler.\nPlease specify via CC")
 
-    monkeypatch.setattr("sadgs_ns.kernels.trial_kernel.probe", fail)
-    with pytest.warns(UserWarning, match=r"do not run here: Failed to find C compiler\.$"):
-        assert not kernels._compiles.__wrapped__(DEVICE)
+def test_a_triton_that_compiles_is_found(nothing_tried):
+    assert kernels._compiles(DEVICE)
 
 
-def test_an_old_triton_is_left_alone_and_named(monkeypatch):
+def test_a_failure_is_told_once_and_tried_again_and_a_success_is_kept(nothing_tried, monkeypatch):
+    """The trial fails twice, as while another program fills the memory, and is made at questions 1, 2 and 4."""
+    outcomes = [RuntimeError("CUDA error: out of memory.\nCompile with …"), RuntimeError("out of memory"), None]
+
+    def run_trial(device):
+        if (outcome := outcomes.pop(0)) is not None:
+            raise outcome
+
+    monkeypatch.setattr("sadgs_ns.kernels.trial.run_trial", run_trial)
+    with pytest.warns(
+        UserWarning, match=r"do not run here \(CUDA error: out of memory\); they are tried again"
+    ) as told:
+        answers = [kernels._compiles(DEVICE) for _ in range(20)]
+    assert answers == [False] * 3 + [True] * 17 and len(told) == 1 and not outcomes
+
+
+def test_a_failure_that_lasts_is_tried_at_ever_longer_intervals(nothing_tried, monkeypatch):
+    trials = []
+    monkeypatch.setattr("sadgs_ns.kernels.trial.run_trial", lambda device: trials.append(device) or 1 / 0)
+    with pytest.warns(UserWarning, match=r"\(division by zero\)"):
+        assert not any(kernels._compiles(DEVICE) for _ in range(1000))
+    assert len(trials) == 10
+
+
+def test_an_old_triton_is_left_alone_and_named(nothing_tried, monkeypatch):
     monkeypatch.setattr("triton.__version__", "3.4.0")
-    with pytest.warns(UserWarning, match=r"do not run here: 3\.4\.0 is older than 3\.5 \(torch 2\.9\);"):
-        assert not kernels._compiles.__wrapped__(DEVICE)
+    with pytest.warns(UserWarning, match=r"do not run here: 3\.4\.0 is older than 3\.5 \(torch 2\.9\);") as told:
+        assert not any(kernels._compiles(DEVICE) for _ in range(10))
+    assert len(told) == 1
 
 
 @pytest.mark.parametrize("shape", [(2, 3, 21, 34), (1, 1, 1, 40), (1, 2, 5, 3)], ids=str)

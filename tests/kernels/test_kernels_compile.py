@@ -107,7 +107,7 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 from sadgs_ns.bench.timer import CompileTimer
-from sadgs_ns.kernels.trial_kernel import _write_one
+from sadgs_ns.kernels.trial import _write_one
 
 def compile():
     triton.compile(ASTSource(_write_one, {"target": "*fp32"}, {}), target=GPUTarget("cuda", 90, 32))
