@@ -13,7 +13,6 @@ from sadgs_ns.kernels import compositing
 from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
 from sadgs_ns.kernels.limits import check_gaussians, check_pixels
 from sadgs_ns.kernels.tiles import intersect_tiles
-from sadgs_ns.render.rasterization import visible
 
 BACKWARD: Literal["moments", "gsplat"] = "moments"
 """Who differentiates the compositing of three channels: our kernel (compositing.py) or gsplat's, its reference."""
@@ -80,9 +79,9 @@ def rasterization(
             coefficients = colors.expand(num_views, -1, -1, -1)
             # gsplat inverts the matrices, which makes the host wait for the device.
             positions = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:]).mT  # [C, 1, 3]
-            colors = spherical_harmonics(
-                sh_degree, means - positions, coefficients, masks=visible({"radii": radii, "means2d": means2d})
-            )
+            drawn = radii > 0  # [C, N] of gsplat 1.4, [C, N, 2] of 1.5
+            drawn = drawn.all(dim=-1) if drawn.dim() == 3 else drawn
+            colors = spherical_harmonics(sh_degree, means - positions, coefficients, masks=drawn)
             colors = torch.clamp_min(colors + 0.5, 0.0)
     if render_mode == "RGB+ED":
         colors = torch.cat([colors, depths[..., None]], dim=-1)

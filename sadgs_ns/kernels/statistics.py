@@ -9,8 +9,6 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from sadgs_ns.method.codes import HIGHEST_FREQUENCY, MASKED, OCTAVES
-
 _LANES = 128
 
 
@@ -179,6 +177,7 @@ def observe_views(
     directional: bool,
     thresholds: tuple[float, float],
     constants: tuple[float, float, float],
+    code_range: tuple[float, float, int],
 ) -> None:
     """As the loop in `statistics.observe`, all views at once.
 
@@ -196,11 +195,12 @@ def observe_views(
         directional: Use η^(proj).
         thresholds: η above the first is high, below the second low.
         constants: gsplat's blur in px², its margin of the frustum, and ε of the wavelength in 1/px.
+        code_range: HIGHEST_FREQUENCY, OCTAVES and MASKED of `codes`.
     """
     inputs = (*params, drawn, means2d, conics, jitter, structure_tensors, viewmats, Ks)
     num_views, n = drawn.shape
     height, width = structure_tensors.shape[1:3]
     _observe[triton.cdiv(n, _LANES),](
         *(value.contiguous() for value in inputs), *statistics, n, num_views, width, height, min_logit,
-        *thresholds, *constants, HIGHEST_FREQUENCY, OCTAVES, MASKED, directional, _LANES,
+        *thresholds, *constants, *code_range, directional, _LANES,
     )  # fmt: skip

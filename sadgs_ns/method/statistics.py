@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from sadgs_ns import kernels
+from sadgs_ns.method.codes import HIGHEST_FREQUENCY, MASKED, OCTAVES
 from sadgs_ns.method.eta import (
     FRUSTUM_MARGIN,
     SCREEN_BLUR,
@@ -87,6 +88,7 @@ def observe(
             directional=directional,
             thresholds=(HIGH_ETA, LOW_ETA),
             constants=(SCREEN_BLUR, FRUSTUM_MARGIN, WAVELENGTH_EPSILON),
+            code_range=(HIGHEST_FREQUENCY, OCTAVES, MASKED),
         )
         return
     if min_opacity > 0:

@@ -35,6 +35,10 @@ tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not inst
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
+def fused_photometric_loss(predicted: Tensor, target: Tensor, **weights: float) -> tuple[Tensor, Tensor]:
+    return photometric.photometric_loss(predicted, target, losses.WINDOW, **weights)
+
+
 def recorded(monkeypatch: pytest.MonkeyPatch, module: Any, *names: str) -> list[str]:
     """Names of those functions of a module that are called from now on: no reference may be compared with itself."""
     calls: list[str] = []
@@ -51,7 +55,7 @@ def test_loss_and_gradient_equal_the_float64_reference(shape):
     noise = 0.1 * torch.randn(shape, generator=generator)
     noise[:, : shape[1] // 2] = 0  # where both images agree, L1 has a kink: its gradient there is 0
     results = []
-    for function, dtype in ((photometric.photometric_loss, torch.float32), (losses.photometric_loss, torch.float64)):
+    for function, dtype in ((fused_photometric_loss, torch.float32), (losses.photometric_loss, torch.float64)):
         y = target.to(DEVICE, dtype)
         x = (target + noise).to(DEVICE, dtype).requires_grad_()
         loss, psnr = function(x, y, ssim_lambda=0.3, l2_lambda=1.5)
@@ -67,12 +71,12 @@ def test_loss_and_gradient_equal_the_float64_reference(shape):
 
 def test_flat_images_have_a_finite_gradient():
     x = torch.zeros((1, 16, 16, 3), device=DEVICE, requires_grad=True)
-    loss, _ = photometric.photometric_loss(x, torch.zeros_like(x), ssim_lambda=0.2, l2_lambda=2.0)
+    loss, _ = fused_photometric_loss(x, torch.zeros_like(x), ssim_lambda=0.2, l2_lambda=2.0)
     loss.backward()
     assert x.grad is not None and abs(float(loss)) < 1e-6 and torch.isfinite(x.grad).all()
 
 
-@pytest.mark.parametrize("function", [photometric.photometric_loss, losses.photometric_loss])
+@pytest.mark.parametrize("function", [fused_photometric_loss, losses.photometric_loss])
 def test_psnr_carries_no_gradient(function):
     x = torch.rand((1, 12, 12, 3), device=DEVICE, requires_grad=True)
     _, psnr = function(x, torch.zeros_like(x), ssim_lambda=0.2, l2_lambda=2.0)
@@ -84,7 +88,7 @@ def test_psnr_of_extreme_errors_is_torchs(value):
     x = torch.zeros((1, 12, 12, 3), device=DEVICE)
     x[0, 3, 4, 1] = value
     with np.errstate(all="ignore"):  # Triton's interpreter computes with numpy
-        _, actual = photometric.photometric_loss(x, torch.zeros_like(x), ssim_lambda=0.2, l2_lambda=2.0)
+        _, actual = fused_photometric_loss(x, torch.zeros_like(x), ssim_lambda=0.2, l2_lambda=2.0)
     _, expected = losses.photometric_loss(x, torch.zeros_like(x), fused=False)
     torch.testing.assert_close(actual, expected, rtol=1e-6, atol=0, equal_nan=True)
 
@@ -319,6 +323,7 @@ def test_screen_gradients_add_up_as_in_the_reference(monkeypatch, per_axis_radii
 
 
 ADAM = {"betas": (0.9, 0.999), "eps": 1e-15}
+OURS = {**ADAM, "max_gradient": 1e18}
 WIDTHS = [(3,), (15, 3), (), (4,), (1,)]  # a row of each parameter
 LRS = (0.1, 0.01, 0.3, 0.003, 0.02)
 
@@ -345,9 +350,9 @@ def test_adam_in_one_launch_equals_torchs_and_one_launch_for_each_parameter(rows
             parameter.grad = gradient.to(dtype)
         optimizer.step()
         gradients = tuple(gradient.to(DEVICE) for gradient in gradients)
-        adam.adam_step(together[0], gradients, *together[1:], noted, steps=[step] * 5, lrs=LRS, **ADAM)
+        adam.adam_step(together[0], gradients, *together[1:], noted, steps=[step] * 5, lrs=LRS, **OURS)
         for gradient, lr, (p, m, v) in zip(gradients, LRS, zip(*separate, strict=True), strict=True):
-            adam.adam_step((p,), (gradient,), (m,), (v,), noted, steps=[step], lrs=[lr], **ADAM)
+            adam.adam_step((p,), (gradient,), (m,), (v,), noted, steps=[step], lrs=[lr], **OURS)
     assert float(noted) == 0
     for one, other in zip(together, separate, strict=True):
         if torch.device("cpu") == DEVICE:
@@ -370,10 +375,10 @@ def test_adam_counts_each_parameters_own_updates():
             optimizers[k].step()
         gradients = tuple(torch.full_like(p, step) for p in actual[0])
         if step > 2:
-            adam.adam_step(actual[0], gradients, *actual[1:], noted, steps=[step, step - 2], lrs=[0.1, 0.1], **ADAM)
+            adam.adam_step(actual[0], gradients, *actual[1:], noted, steps=[step, step - 2], lrs=[0.1, 0.1], **OURS)
         else:
             first = [values[:1] for values in (actual[0], gradients, *actual[1:])]
-            adam.adam_step(*first, noted, steps=[step], lrs=[0.1], **ADAM)
+            adam.adam_step(*first, noted, steps=[step], lrs=[0.1], **OURS)
     for p, q in zip(actual[0], expected, strict=True):
         torch.testing.assert_close(p.double().cpu(), q.detach(), atol=1e-5, rtol=1e-5)
 
@@ -388,7 +393,7 @@ def test_a_gradient_that_is_not_finite_is_noted_and_left_out_of_its_parameter_al
         noted = torch.zeros(1, device=DEVICE)
         gradients = tuple(torch.full_like(p, 0.5) for p in parameters[0])
         gradients[k].flatten()[-1:] = value  # within the block that is not full
-        adam.adam_step(parameters[0], gradients, *parameters[1:], noted, steps=[1] * 5, lrs=LRS, **ADAM)
+        adam.adam_step(parameters[0], gradients, *parameters[1:], noted, steps=[1] * 5, lrs=LRS, **OURS)
         assert bool(noted.isnan()) == (value != 0.0)
         results.append([tensor for tensors in parameters for tensor in tensors])
     assert all(map(torch.equal, *results))

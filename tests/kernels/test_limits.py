@@ -49,7 +49,7 @@ def test_too_many_gaussians_pixels_or_tile_pairs_are_refused_before_anything_run
         render(1, 10, 30_000)
     image = torch.empty((1, 30_000, 30_000, 3), device="meta")
     with pytest.raises(InputError, match="take fewer views at once, or smaller images"):
-        losses.photometric_loss(image, image, ssim_lambda=0.2, l2_lambda=2.0)
+        losses.photometric_loss(image, image, (1.0,), ssim_lambda=0.2, l2_lambda=2.0)
     empty = torch.empty(0)
     pending = tiles.PendingTiles([], empty, empty, torch.tensor([2**31]), None, 8, (1, 1, 1))
     with pytest.raises(InputError, match=r"pairs of a Gaussian and a tile .* are 2,147,483,648"):
