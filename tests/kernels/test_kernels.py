@@ -24,8 +24,7 @@ from sadgs_ns.plugin.optimizers import FusedAdam
 
 codes = pytest.importorskip("sadgs_ns.kernels.codes", reason="Triton is not installed")
 adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
-convolution = pytest.importorskip("sadgs_ns.kernels.convolution", reason="Triton is not installed")
-scale_space = pytest.importorskip("sadgs_ns.kernels.scale_space", reason="Triton is not installed")
+structure = pytest.importorskip("sadgs_ns.kernels.structure_tensor", reason="Triton is not installed")
 harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")
 observation = pytest.importorskip("sadgs_ns.kernels.statistics", reason="Triton is not installed")
 photometric = pytest.importorskip("sadgs_ns.kernels.losses", reason="Triton is not installed")
@@ -165,29 +164,31 @@ def test_an_old_triton_is_left_alone_and_named(nothing_tried, monkeypatch):
 def test_convolution_equals_torchs_in_float64(shape, axis):
     generator = torch.Generator().manual_seed(0)
     image, kernel = torch.randn(shape, generator=generator), torch.randn(9, generator=generator)
-    actual = convolution.correlate(image.to(DEVICE), kernel.to(DEVICE), axis)
+    actual = structure.correlate(image.to(DEVICE), kernel.to(DEVICE), axis)
     weight = kernel.double().view((1, 1, -1, 1) if axis == 2 else (1, 1, 1, -1)).expand(shape[1], -1, -1, -1)
     padding = (4, 0) if axis == 2 else (0, 4)
     expected = torch.nn.functional.conv2d(image.double(), weight, padding=padding, groups=shape[1])
     torch.testing.assert_close(actual.cpu().double(), expected, atol=1e-5, rtol=1e-5)
 
 
-@pytest.mark.parametrize("masked", [False, True, "transposed"])
-@pytest.mark.parametrize("energy_blur", [0.0, 2.0])
-def test_structure_tensors_are_the_same_with_the_kernels(monkeypatch, masked, energy_blur):
+@pytest.mark.parametrize(
+    ("masked", "energy_blur", "epsilon"),
+    [(False, 0.0, None), (False, 2.0, 1e-3), (True, 0.0, 1e-3), (True, 2.0, None), ("transposed", 2.0, None)],
+)
+def test_structure_tensors_are_the_same_with_the_kernels(monkeypatch, masked, energy_blur, epsilon):
     images = torch.rand((2, 9, 14, 3), generator=torch.Generator().manual_seed(0)).to(DEVICE)
     masks = torch.ones((2, 9, 14), dtype=torch.bool, device=DEVICE) if masked else None
     if masks is not None:
         masks[0, 3:6, 5:7] = False
         if masked == "transposed":  # the same in memory of another order
             masks = masks.mT.contiguous().mT
-    options = {"num_levels": 2, "energy_blur": energy_blur, "gamma": 2.5}
+    monkeypatch.setattr("sadgs_ns.method.structure_tensor.NUM_LEVELS", 2)
+    options = {"energy_blur": energy_blur, "epsilon": epsilon, "truncation": 1.5}
     expected = multiscale_structure_tensor(images.double(), masks, **options)
     monkeypatch.setattr(kernels, "available", lambda device: True)
-    convolutions = recorded(monkeypatch, convolution, "correlate")
-    calls = recorded(monkeypatch, scale_space, "differentiate", "accumulate")
+    calls = recorded(monkeypatch, structure, "correlate", "differentiate", "aggregate")
     actual = multiscale_structure_tensor(images, masks, **options)
-    assert convolutions and set(calls) == {"differentiate", "accumulate"}
+    assert set(calls) == {"correlate", "differentiate", "aggregate"}
     atol = 1e-5 * float(expected.nan_to_num().abs().max())
     torch.testing.assert_close(actual.double(), expected, atol=atol, rtol=1e-4, equal_nan=True)
 

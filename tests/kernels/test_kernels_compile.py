@@ -23,7 +23,7 @@ CONSTANTS = {
 }
 INTEGERS = "n row height width taps num_gaussians num_views tile_width tile_height used stride start".split()
 INTEGERS += "channels weight_stride num_pairs rows view absolute_view absolute_row num_strips num_tiles".split()
-FLOATS = "exponent frequency sigma beta1 beta2 eps min_logit l1_weight ssim_weight l2_weight".split()
+FLOATS = "exponent frequency beta1 beta2 eps min_logit l1_weight ssim_weight l2_weight".split()
 FLOATS += "scale_x scale_y ssim_lambda".split()
 POINTERS = {
     "radii": "*i32", "counts": "*i64", "order": "*i64", "ends": "*i64", "tiles": "*i16", "ids": "*i32", "drawn": "*i1",
@@ -66,7 +66,7 @@ def test_every_kernel_compiles(capability, tmp_path):
     run = run_with_the_compiler(tmp_path, COMPILE, str(capability))
     assert run.returncode == 0, run.stderr[-3000:]
     expected = {"_blur_along_rows", "_similarity", "_spread_along_rows", "_gradient", "_count", "_list", "_observe"}
-    expected |= {"_forward", "_backward", "_update", "_correlate", "_differentiate", "_accumulate", "_write_one"}
+    expected |= {"_forward", "_backward", "_update", "_correlate", "_differentiate", "_aggregate", "_write_one"}
     expected |= {"_composite_backward", "_encode", "_accumulate_gradients", "_finish"}
     assert set(run.stdout.split()) == expected
 
