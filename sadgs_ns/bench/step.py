@@ -85,7 +85,7 @@ class Step:
         self.viewmats[0, 2, 3] = 1.6
         self.Ks = torch.tensor([[[width * 0.8, 0, width / 2], [0, width * 0.8, height / 2], [0, 0, 1]]], device=device)
         self.target = uniform(0.0, 1.0, 1, height, width, 3)
-        self.structure_tensors = torch.randint(0, 256, (1, height, width, 3), dtype=torch.uint8, device=device)
+        self.structure_tensors = torch.randint(0, 255, (1, height, width, 3), dtype=torch.uint8, device=device)
         self.rendered = self.target.clone().requires_grad_()
         self.gradients: list[Tensor | None] = []
         self.calls = 0  # of `whole`

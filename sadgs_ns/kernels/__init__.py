@@ -1,44 +1,74 @@
-"""Triton kernels for CUDA; each computes what a torch function beside it computes, and a test holds both together."""
+"""Triton kernels for CUDA. Each computes what a torch function of the same name does; tests hold both together."""
 
 from __future__ import annotations
 
 import warnings
+from collections import Counter
 from functools import cache
 from importlib.util import find_spec
 
 import torch
 
+from sadgs_ns.errors import reason
+
 OLDEST_TRITON = (3, 5)
-"""Older ones do not compile all of the kernels: 3.4 knows no matrix products with 8 columns."""
+"""Older versions do not compile all of the kernels: Triton 3.4 has no matrix products with 8 columns."""
+
+_working: set[torch.device] = set()
+"""Devices on which a kernel has run."""
+_asked: Counter[torch.device] = Counter()
+"""How often `available` was asked about a device while no kernel had run there."""
 
 
 def available(device: torch.device) -> bool:
-    """Whether the kernels run on this device: it is CUDA's current one, on which Triton launches whatever tensors it is
-    given, and Triton, which comes with torch, compiles for it."""
-    return device.type == "cuda" and device.index in (None, torch.cuda.current_device()) and _compiles(device)
+    """Whether the kernels run on a device.
+
+    They do if it is CUDA's current device, on which Triton launches whatever tensors it is given, and if Triton, which
+    comes with torch, compiles for it: Triton also needs a C compiler, Python's headers and a GPU that it knows. One
+    small kernel is tried. Success is remembered. A failure may pass, as that of a full memory does, so the kernel is
+    tried again when the question is asked for the 2nd, 4th, 8th, … time; a warning tells the first failure.
+    """
+    if device.type != "cuda" or device.index not in (None, torch.cuda.current_device()):
+        return False
+    return _compiles(torch.device("cuda", torch.cuda.current_device()))
 
 
 @cache
-def _compiles(device: torch.device) -> bool:
-    """Try a small kernel once: Triton also needs a C compiler, Python's headers and a GPU that it knows."""
+def _has_triton() -> bool:
+    """Whether Triton is installed and new enough, which does not change while Python runs."""
     if find_spec("triton") is None:
         return False
     import triton
 
-    if tuple(map(int, triton.__version__.split(".")[:2])) < OLDEST_TRITON:
-        oldest = ".".join(map(str, OLDEST_TRITON))
-        warnings.warn(
-            f"Triton's kernels do not run here: {triton.__version__} is older than {oldest} (torch 2.9); "
-            "training takes about twice as long.",
-            stacklevel=3,
-        )
+    if tuple(map(int, triton.__version__.split(".")[:2])) >= OLDEST_TRITON:
+        return True
+    oldest = ".".join(map(str, OLDEST_TRITON))
+    warnings.warn(
+        f"Triton's kernels do not run here: {triton.__version__} is older than {oldest} (torch 2.9); "
+        "training takes about twice as long.",
+        stacklevel=4,
+    )
+    return False
+
+
+def _compiles(device: torch.device) -> bool:
+    """Whether a small kernel has run on a device, or does so now."""
+    if device in _working:
+        return True
+    if not _has_triton():
+        return False
+    _asked[device] += 1
+    if _asked[device] & (_asked[device] - 1):  # no power of two
         return False
     try:
-        from sadgs_ns.kernels.trial_kernel import probe
+        from sadgs_ns.kernels.trial import run_trial
 
-        probe(device)
-    except Exception as error:
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        warnings.warn(f"Triton's kernels do not run here: {reason}", stacklevel=3)
+        run_trial(device)
+    except Exception as error:  # Triton, the C compiler and CUDA each raise their own
+        if _asked[device] == 1:
+            warnings.warn(
+                f"Triton's kernels do not run here ({reason(error)}); they are tried again now and then.", stacklevel=3
+            )
         return False
+    _working.add(device)
     return True

@@ -11,8 +11,6 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from sadgs_ns.plugin.nonfinite import MAX_GRADIENT
-
 _BLOCK = 1024
 
 
@@ -72,10 +70,11 @@ def adam_step(
     lrs: Sequence[float],
     betas: tuple[float, float],
     eps: float,
+    max_gradient: float,
 ) -> None:
     """Update parameters and their moments in place, in one launch, as torch's Adam without weight decay.
 
-    A gradient that is NaN, or at least `finite.MAX_GRADIENT`, counts as 0.
+    A gradient that is NaN, or not below `max_gradient`, counts as 0.
 
     Args:
         parameters: One or more, contiguous float32, all of the same length. [N, ...] each
@@ -87,6 +86,7 @@ def adam_step(
         lrs: Learning rate of each.
         betas: Decay of the two running means, in [0, 1).
         eps: Added to the denominator.
+        max_gradient: Absolute value from which a gradient is left out.
     """
     beta1, beta2 = betas
     rates = tuple(lr / (1 - beta1**step) for lr, step in zip(lrs, steps, strict=True))
@@ -96,5 +96,5 @@ def adam_step(
     grid = (sum(-(-rows * width // _BLOCK) for width in widths),)
     _update[grid](
         parameters, gradients, exp_avgs, exp_avg_sqs, rates, scales, noted, rows, beta1, beta2, eps,
-        widths, MAX_GRADIENT, _BLOCK,
+        widths, max_gradient, _BLOCK,
     )  # fmt: skip

@@ -22,24 +22,31 @@ def _to_code(value, HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, TINY: tl.const
 
 
 @triton.jit(do_not_specialize=["n"])
-def _encode(tensor, codes, n, HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, TINY: tl.constexpr, PIXELS: tl.constexpr):
+def _encode(
+    tensor, codes, n,
+    HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, MASKED: tl.constexpr, TINY: tl.constexpr, PIXELS: tl.constexpr,
+):  # fmt: skip
     pixel = tl.program_id(0).to(tl.int64) * PIXELS + tl.arange(0, PIXELS)
     exists = pixel < n
     xx = tl.load(tensor + 3 * pixel, exists, 0.0)
     xy = tl.load(tensor + 3 * pixel + 1, exists, 0.0)
     yy = tl.load(tensor + 3 * pixel + 2, exists, 0.0)
+    # NaN is told by comparison, for Triton's maximum drops it on a GPU, and no integer is made of it.
+    known = (xx == xx) & (xy == xy) & (yy == yy)
+    xx, xy, yy = tl.where(known, xx, 0.0), tl.where(known, xy, 0.0), tl.where(known, yy, 0.0)
     product = tl.sqrt(tl.maximum(xx, 0.0)) * tl.sqrt(tl.maximum(yy, 0.0))
     correlation = tl.where(product > 0, xy / tl.maximum(product, TINY), 0.0)
     correlation = 127.5 + 127 * tl.minimum(tl.maximum(correlation, -1.0), 1.0)
+    correlation = tl.where(known, correlation, MASKED)
     tl.store(codes + 3 * pixel, _to_code(xx, HIGHEST, OCTAVES, TINY).to(tl.uint8), exists)
     tl.store(codes + 3 * pixel + 1, correlation.to(tl.uint8), exists)
     tl.store(codes + 3 * pixel + 2, _to_code(yy, HIGHEST, OCTAVES, TINY).to(tl.uint8), exists)
 
 
-def encode(tensor: Tensor, highest_frequency: float, octaves: float) -> Tensor:
+def encode(tensor: Tensor, highest_frequency: float, octaves: float, masked: int) -> Tensor:
     """As `codes.encode`; where rounding decides, a code may be its neighbour. float32 [..., 3] → uint8 [..., 3]"""
     tensor = tensor.contiguous()
     codes = torch.empty_like(tensor, dtype=torch.uint8)
     n = tensor.numel() // 3
-    _encode[triton.cdiv(n, _PIXELS),](tensor, codes, n, highest_frequency, octaves, _TINY, _PIXELS)
+    _encode[triton.cdiv(n, _PIXELS),](tensor, codes, n, highest_frequency, octaves, masked, _TINY, _PIXELS)
     return codes

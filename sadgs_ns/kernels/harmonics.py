@@ -137,14 +137,15 @@ def _forward(
     exists = drawn(radii, at, g < n, PER_GAUSSIAN)
     x, y, z, _ = _direction(means, viewmats, view, g, exists)
     basis = _basis(x, y, z)
+    others = rest + g.to(tl.int64) * stride  # in 32 bits, 45 g would overflow from 47.7 million Gaussians
     red = 0.2820947917738781 * tl.load(first + 3 * g, exists, 0.0) + 0.5
     green = 0.2820947917738781 * tl.load(first + 3 * g + 1, exists, 0.0) + 0.5
     blue = 0.2820947917738781 * tl.load(first + 3 * g + 2, exists, 0.0) + 0.5
     for k in tl.static_range(15):
         read = exists & (k < used)
-        red += basis[k] * tl.load(rest + stride * g + 3 * k, read, 0.0)
-        green += basis[k] * tl.load(rest + stride * g + 3 * k + 1, read, 0.0)
-        blue += basis[k] * tl.load(rest + stride * g + 3 * k + 2, read, 0.0)
+        red += basis[k] * tl.load(others + 3 * k, read, 0.0)
+        green += basis[k] * tl.load(others + 3 * k + 1, read, 0.0)
+        blue += basis[k] * tl.load(others + 3 * k + 2, read, 0.0)
     # A broken coefficient must show in the image, where it is found; a maximum that drops NaN would paint it black.
     tl.store(colors + 3 * at, tl.maximum(red, 0.0, tl.PropagateNan.ALL), g < n)
     tl.store(colors + 3 * at + 1, tl.maximum(green, 0.0, tl.PropagateNan.ALL), g < n)
@@ -189,6 +190,7 @@ def _backward(
     g = tl.program_id(0) * LANES + tl.arange(0, LANES)
     channel = tl.arange(0, 4)[None, :]
     mine = (g < n)[:, None] & (channel < 3)  # [LANES, 4]
+    at_others = (g.to(tl.int64) * stride)[:, None] + channel  # in 64 bits as forward
     earlier = mine & (start > 0)
     v_sum = tl.zeros([LANES, 4], tl.float32)
     v_x = tl.load(v_means + 3 * g, (g < n) & (start > 0), 0.0)
@@ -210,7 +212,7 @@ def _backward(
         dx = tl.zeros([LANES], tl.float32)
         dy, dz = dx, dx
         for k in tl.static_range(15):
-            shade = tl.sum(v * tl.load(rest + stride * g[:, None] + 3 * k + channel, seen & (k < used), 0.0), 1)
+            shade = tl.sum(v * tl.load(rest + at_others + 3 * k, seen & (k < used), 0.0), 1)
             dx, dy, dz = dx + by_x[k] * shade, dy + by_y[k] * shade, dz + by_z[k] * shade
         along = dx * x + dy * y + dz * z
         v_x += (dx - along * x) * inverse
@@ -220,7 +222,7 @@ def _backward(
     v_sum = 0.2820947917738781 * v_sum + tl.load(v_first + at_first, earlier, 0.0)
     tl.store(v_first + at_first, v_sum, mine)
     for k in tl.static_range(15):
-        at_rest = v_rest + stride * g[:, None] + 3 * k + channel
+        at_rest = v_rest + at_others + 3 * k
         value = tl.where(k < used, sums[k], 0.0) + tl.load(at_rest, earlier & (3 * k < stride), 0.0)
         tl.store(at_rest, value, mine & (3 * k < stride))
     tl.store(v_means + 3 * g, v_x, g < n)

@@ -17,10 +17,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from sadgs_ns.method.losses import WINDOW
+from sadgs_ns.kernels.limits import check_pixels
 
-_WEIGHTS = [math.exp(-((k - WINDOW // 2) ** 2) / (2 * 1.5**2)) for k in range(WINDOW)]
-_GAUSSIAN = tuple(weight / sum(_WEIGHTS) for weight in _WEIGHTS)
 _STRIP, _RUN, _COLUMNS = 256, 8, 128  # numbers a program handles: along a row, or in columns and along a row
 _LANES = 4096  # partial sums that are added at once
 
@@ -178,17 +176,20 @@ def _gradient(
 
 class _PhotometricLoss(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, x: Tensor, y: Tensor, ssim_lambda: float, l2_lambda: float) -> tuple[Tensor, Tensor]:
+    def forward(
+        ctx: Any, x: Tensor, y: Tensor, window: tuple[float, ...], ssim_lambda: float, l2_lambda: float
+    ) -> tuple[Tensor, Tensor]:
         views, height, width, _ = x.shape
         n, row = x.numel(), 3 * width
         blurred, slopes = x.new_empty((5, n)), x.new_empty((3, n))
         strips = triton.cdiv(n, _STRIP)
         tiles = (triton.cdiv(row, _COLUMNS), triton.cdiv(height, _RUN), views)
         differences, similarities = x.new_empty((2, strips)), x.new_empty(math.prod(tiles))
-        _blur_along_rows[strips,](x, y, blurred, differences, n, _GAUSSIAN, _STRIP)
-        _similarity[tiles](blurred, slopes, similarities, n, height, row, _GAUSSIAN, _RUN, _COLUMNS)
+        _blur_along_rows[strips,](x, y, blurred, differences, n, window, _STRIP)
+        _similarity[tiles](blurred, slopes, similarities, n, height, row, window, _RUN, _COLUMNS)
         ctx.save_for_backward(x, y, slopes)
-        n_valid = 3 * views * (height - WINDOW + 1) * (width - WINDOW + 1)
+        ctx.window = window
+        n_valid = 3 * views * (height - len(window) + 1) * (width - len(window) + 1)
         ctx.weights = (1 - ssim_lambda) / n, ssim_lambda / n_valid, l2_lambda / n
         loss, psnr = x.new_empty(()), x.new_empty(())
         _finish[1,](
@@ -201,31 +202,36 @@ class _PhotometricLoss(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, upstream: Tensor, _: Tensor) -> tuple[Tensor, None, None, None]:
+    def backward(ctx: Any, upstream: Tensor, _: Tensor) -> tuple[Tensor, None, None, None, None]:
         x, y, slopes = ctx.saved_tensors
         views, height, width, _ = x.shape
         n, row = x.numel(), 3 * width
         spread, gradient = torch.empty_like(slopes), torch.empty_like(x)
         tiles = (triton.cdiv(row, _COLUMNS), triton.cdiv(height, _RUN), views)
-        _spread_along_rows[triton.cdiv(n, _STRIP),](slopes, spread, n, _GAUSSIAN, _STRIP)
+        _spread_along_rows[triton.cdiv(n, _STRIP),](slopes, spread, n, ctx.window, _STRIP)
         _gradient[tiles](
-            x, y, spread, upstream, gradient, n, height, row, *ctx.weights, _GAUSSIAN, _RUN, _COLUMNS
+            x, y, spread, upstream, gradient, n, height, row, *ctx.weights, ctx.window, _RUN, _COLUMNS
         )  # fmt: skip
-        return gradient, None, None, None
+        return gradient, None, None, None, None
 
 
 def photometric_loss(
-    predicted: Tensor, target: Tensor, *, ssim_lambda: float, l2_lambda: float
+    predicted: Tensor, target: Tensor, window: tuple[float, ...], *, ssim_lambda: float, l2_lambda: float
 ) -> tuple[Tensor, Tensor]:
-    """As `losses.photometric_loss`, for views of at least 11×11 px; PSNR carries no gradient.
+    """As `losses.photometric_loss`, for views at least as large as SSIM's window; PSNR carries no gradient.
 
     Args:
         predicted: float32 [C, H, W, 3]
         target: float32 [C, H, W, 3]
+        window: Weights of SSIM's window along one axis, symmetric.
         ssim_lambda: λ in [0, 1].
         l2_lambda: λ_2 ≥ 0.
 
     Returns:
         The loss and PSNR in dB, both scalars.
+
+    Raises:
+        InputError: If the views have more pixels than the kernels can address (limits.py).
     """
-    return _PhotometricLoss.apply(predicted.contiguous(), target.contiguous(), ssim_lambda, l2_lambda)  # type: ignore[return-value]
+    check_pixels(*predicted.shape[:3])
+    return _PhotometricLoss.apply(predicted.contiguous(), target.contiguous(), window, ssim_lambda, l2_lambda)  # type: ignore[return-value]

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from sadgs_ns.kernels import compositing
 from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
+from sadgs_ns.kernels.limits import check_gaussians, check_pixels
 from sadgs_ns.kernels.tiles import intersect_tiles
-from sadgs_ns.render.rasterization import visible
 
 BACKWARD: Literal["moments", "gsplat"] = "moments"
 """Who differentiates the compositing of three channels: our kernel (compositing.py) or gsplat's, its reference."""
@@ -43,10 +43,13 @@ def rasterization(
 
     Raises:
         ValueError: If `packed`.
+        InputError: If Gaussians, pixels or tile pairs are more than the kernels can address (limits.py).
     """
     if packed:
         raise ValueError("exact tile lists are made of unpacked projections: packed=False")
     num_views = len(viewmats)
+    check_gaussians(num_views, len(means))
+    check_pixels(num_views, height, width)
     bound: dict[str, Any] = {"opacities": opacities} if _BOUNDS_RADII else {}
     radii, means2d, depths, conics, compensations = fully_fused_projection(
         means,
@@ -76,9 +79,9 @@ def rasterization(
             coefficients = colors.expand(num_views, -1, -1, -1)
             # gsplat inverts the matrices, which makes the host wait for the device.
             positions = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:]).mT  # [C, 1, 3]
-            colors = spherical_harmonics(
-                sh_degree, means - positions, coefficients, masks=visible({"radii": radii, "means2d": means2d})
-            )
+            drawn = radii > 0  # [C, N] of gsplat 1.4, [C, N, 2] of 1.5
+            drawn = drawn.all(dim=-1) if drawn.dim() == 3 else drawn
+            colors = spherical_harmonics(sh_degree, means - positions, coefficients, masks=drawn)
             colors = torch.clamp_min(colors + 0.5, 0.0)
     if render_mode == "RGB+ED":
         colors = torch.cat([colors, depths[..., None]], dim=-1)

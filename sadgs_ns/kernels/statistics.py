@@ -9,8 +9,6 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from sadgs_ns.method.codes import HIGHEST_FREQUENCY, OCTAVES
-
 _LANES = 128
 
 
@@ -70,7 +68,7 @@ def _observe(
     means, quats, scales, opacities, drawn, means2d, conics, jitter, structure_tensors, viewmats, Ks,
     n_high, n_low, eta_max, n_total, n, num_views, width, height, min_logit,
     HIGH: tl.constexpr, LOW: tl.constexpr, BLUR: tl.constexpr, MARGIN: tl.constexpr, EPSILON: tl.constexpr,
-    HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, DIRECTIONAL: tl.constexpr, LANES: tl.constexpr,
+    HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, MASKED: tl.constexpr, DIRECTIONAL: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
     g = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
     candidate = (g < n) & (tl.load(opacities + g, g < n, float("-inf")) >= min_logit)
@@ -88,7 +86,7 @@ def _observe(
     high0, high1, high2, low0, low1, low2 = zero, zero, zero, zero, zero, zero
     most0, most1, most2, total = zero, zero, zero, zero
     for view in range(num_views):
-        at = view * n + g
+        at = view * tl.cast(n, tl.int64) + g
         seen = candidate & (tl.load(drawn + at, candidate, 0) != 0)
         # The sample, from the Cholesky factor of Σ2D; in float64, for a long thin Gaussian's determinant cancels.
         a = tl.load(conics + 3 * at, seen, 1.0).to(tl.float64)
@@ -117,6 +115,7 @@ def _observe(
         s_xy = tl.load(pixel + 1, observed, 0).to(tl.float32)
         s_yy = tl.load(pixel + 2, observed, 0).to(tl.float32)
         if structure_tensors.dtype.element_ty == tl.uint8:
+            observed = observed & (s_xy != MASKED)
             frequency_x, frequency_y = _frequency(s_xx, HIGHEST, OCTAVES), _frequency(s_yy, HIGHEST, OCTAVES)
             s_xy = frequency_x * frequency_y * (s_xy - 127) / 127
             s_xx, s_yy = frequency_x * frequency_x, frequency_y * frequency_y
@@ -178,6 +177,7 @@ def observe_views(
     directional: bool,
     thresholds: tuple[float, float],
     constants: tuple[float, float, float],
+    code_range: tuple[float, float, int],
 ) -> None:
     """As the loop in `statistics.observe`, all views at once.
 
@@ -195,11 +195,12 @@ def observe_views(
         directional: Use η^(proj).
         thresholds: η above the first is high, below the second low.
         constants: gsplat's blur in px², its margin of the frustum, and ε of the wavelength in 1/px.
+        code_range: HIGHEST_FREQUENCY, OCTAVES and MASKED of `codes`.
     """
     inputs = (*params, drawn, means2d, conics, jitter, structure_tensors, viewmats, Ks)
     num_views, n = drawn.shape
     height, width = structure_tensors.shape[1:3]
     _observe[triton.cdiv(n, _LANES),](
         *(value.contiguous() for value in inputs), *statistics, n, num_views, width, height, min_logit,
-        *thresholds, *constants, HIGHEST_FREQUENCY, OCTAVES, directional, _LANES,
+        *thresholds, *constants, *code_range, directional, _LANES,
     )  # fmt: skip

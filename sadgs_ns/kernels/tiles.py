@@ -20,6 +20,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from sadgs_ns.kernels.limits import check_pairs
+
 _LANES = 32  # Gaussians a program handles: one warp, so that a large one holds up only 31 others
 
 
@@ -150,10 +152,15 @@ class PendingTiles:
     @torch.no_grad()
     def lists(self) -> tuple[Tensor, Tensor]:
         """Where each tile's list starts, int32 [C, tile rows, tile columns], and the indices in C·N that the lists
-        hold from front to back, int32 [number of pairs]."""
+        hold from front to back, int32 [number of pairs].
+
+        Raises:
+            InputError: If there are more pairs than 32 bits number.
+        """
         if self.arrived is not None:
             self.arrived.synchronize()
         num_pairs = int(self.num_pairs)
+        check_pairs(num_pairs)
         num_tiles, device = math.prod(self.tile_counts), self.ends.device
         # Tiles are numbered from -2^15, so that 16 bits tell 65,536 of them apart.
         tiles = torch.empty(num_pairs, dtype=torch.int16 if num_tiles <= 2**16 else torch.int32, device=device)

@@ -122,7 +122,8 @@ def sample_map(structure_tensors: Tensor, camera_ids: Tensor, points: Tensor) ->
         points: px. [M, 2]
 
     Returns:
-        S̄ in float32 or wider [M, 3] (0 outside the image), and whether the point lies inside the image. bool [M]
+        S̄ in float32 or wider [M, 3], and whether it is known [M]: the point lies inside the image, on a pixel whose S̄
+        is not NaN, as that of masked pixels is. Where it is not known, 0 is returned.
     """
     height, width = structure_tensors.shape[1:3]
     x, y = points.unbind(-1)
@@ -132,7 +133,8 @@ def sample_map(structure_tensors: Tensor, camera_ids: Tensor, points: Tensor) ->
     values = structure_tensors[camera_ids, row, column]
     is_code = values.dtype == torch.uint8
     values = decode(values) if is_code else values.to(torch.promote_types(values.dtype, torch.float32))
-    return values * inside[:, None], inside
+    known = inside & ~values.isnan().any(dim=1)
+    return torch.where(known[:, None], values, 0.0), known
 
 
 def eta(axes: Tensor, structure_tensor: Tensor, directional: bool = False) -> Tensor:

@@ -11,14 +11,14 @@ from torch import Tensor
 
 from sadgs_ns import kernels
 
-WINDOW = 11
-"""Width of SSIM's window in px."""
+WINDOW = tuple(_fspecial_gauss_1d(11, 1.5).flatten().tolist())
+"""SSIM's window along one axis: a Gaussian of σ = 1.5 px on 11 px."""
 
 
 @lru_cache(maxsize=8)
 def _window(device: torch.device, dtype: torch.dtype) -> Tensor:
-    """SSIM's window, σ 1.5 px, where the images are: made anew in each step, its copy would stop the host."""
-    return _fspecial_gauss_1d(WINDOW, 1.5).repeat(3, 1, 1, 1).to(device, dtype)
+    """SSIM's window on the device, for each channel [3, 1, 1, 11]. A copy of it in every step would stop the host."""
+    return torch.tensor(WINDOW, dtype=dtype, device=device).repeat(3, 1, 1, 1)
 
 
 def photometric_loss(
@@ -41,11 +41,11 @@ def photometric_loss(
     Raises:
         ValueError: From pytorch_msssim, if views are one pixel high or wide.
     """
-    suits = predicted.dtype == target.dtype == torch.float32 and min(predicted.shape[1:3]) >= WINDOW
+    suits = predicted.dtype == target.dtype == torch.float32 and min(predicted.shape[1:3]) >= len(WINDOW)
     if fused and suits and kernels.available(predicted.device):
         from sadgs_ns.kernels.losses import photometric_loss as fused_photometric_loss
 
-        return fused_photometric_loss(predicted, target, ssim_lambda=ssim_lambda, l2_lambda=l2_lambda)
+        return fused_photometric_loss(predicted, target, WINDOW, ssim_lambda=ssim_lambda, l2_lambda=l2_lambda)
     difference = predicted - target
     l1, l2 = difference.abs().mean(), difference.square().mean()
     # Contiguous: with channels-last strides cuDNN convolves, above all backwards, at a third of the speed.

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from sadgs_ns import kernels
+from sadgs_ns.method.codes import HIGHEST_FREQUENCY, MASKED, OCTAVES
 from sadgs_ns.method.eta import (
     FRUSTUM_MARGIN,
     SCREEN_BLUR,
@@ -55,8 +56,8 @@ def observe(
 ) -> None:
     """Add one forward pass: one jittered sample per visible Gaussian and view, counted in place.
 
-    A Gaussian is observed in a view when the rasterizer drew it there, its sample lies inside the image, and its η is
-    finite on all axes: NaN and infinities of the projection or of S̄ are no observation.
+    A Gaussian is observed in a view when the rasterizer drew it there, its sample lies in the image and not on a masked
+    pixel, and its η is finite on all axes: NaN and infinities of the projection or of S̄ are no observation.
 
     Args:
         statistics: As made by `empty_statistics`.
@@ -87,6 +88,7 @@ def observe(
             directional=directional,
             thresholds=(HIGH_ETA, LOW_ETA),
             constants=(SCREEN_BLUR, FRUSTUM_MARGIN, WAVELENGTH_EPSILON),
+            code_range=(HIGHEST_FREQUENCY, OCTAVES, MASKED),
         )
         return
     if min_opacity > 0:

@@ -8,6 +8,7 @@ invented outside the image, no edge appears at a mask, and an image may be small
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -68,98 +69,14 @@ def _kernel(sigma: float, order: int, dtype: torch.dtype, device: torch.device, 
     return gaussian_kernel(sigma, order, dtype, truncation).to(device)
 
 
-@dataclass(frozen=True)
-class _Filters:
-    """Separable filters with zeros outside the image."""
-
-    truncation: float
-    """Radius of every kernel, in multiples of its standard deviation."""
-    fused: bool
-    """Convolve with our Triton kernel."""
-
-    def convolve(self, image: Tensor, sigma: float, order: int, axis: int) -> Tensor:
-        """Correlate with a Gaussian or its derivative along one image axis.
-
-        Args:
-            image: [B, C, H, W]
-            sigma: px.
-            order: 0 or 1.
-            axis: 2 for rows (y), 3 for columns (x).
-        """
-        kernel = _kernel(sigma, order, image.dtype, image.device, self.truncation)
-        if self.fused:
-            from sadgs_ns.kernels.convolution import correlate
-
-            return correlate(image, kernel, axis)
-        channels, size, radius = image.shape[1], image.shape[axis], kernel.numel() // 2
-        if radius >= size:  # taps that can only ever meet zeros
-            kernel = kernel[radius - size + 1 : radius + size]
-            radius = size - 1
-        shape = (1, 1, -1, 1) if axis == 2 else (1, 1, 1, -1)
-        padding = (radius, 0) if axis == 2 else (0, radius)
-        weight = kernel.view(shape).expand(channels, -1, -1, -1)
-        # Full float32, and no search for the fastest algorithm: each of dozens of kernel sizes is used a few times.
-        with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=False, allow_tf32=False):
-            return F.conv2d(image, weight, padding=padding, groups=channels)
-
-    def blur(self, image: Tensor, sigma: float) -> Tensor:
-        """Separable Gaussian blur. [B, C, H, W] → [B, C, H, W]"""
-        return self.convolve(self.convolve(image, sigma, 0, 2), sigma, 0, 3)
-
-    def blur_and_gradient(self, image: Tensor, sigma: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Gaussian blur, and its exact x and y derivatives. Each [B, C, H, W], per px."""
-        rows = self.convolve(image, sigma, 0, 2)
-        derived_rows = self.convolve(image, sigma, 1, 2)
-        return (
-            self.convolve(rows, sigma, 0, 3),
-            self.convolve(rows, sigma, 1, 3),
-            self.convolve(derived_rows, sigma, 0, 3),
-        )
-
-
-@dataclass(frozen=True)
-class _Reach:
-    """What the filters make of the pixels' weights, by which their results are divided."""
-
-    filters: _Filters
-    weight: Tensor
-    """[B, 1, H, W], or [1, 1, H, W] of ones without masks."""
-    masked: bool
-
-    def blur(self, sigma: float) -> Tensor:
-        """Of `_Filters.blur`, positive. [1 or B, 1, H, W]"""
-        if self.masked:
-            blurred = self.filters.blur(self.weight, sigma)
-        else:  # a row of ones and a column tell all
-            blurred = self._along(sigma, 0, 2) * self._along(sigma, 0, 3)
-        return blurred.clamp_min(torch.finfo(blurred.dtype).tiny)
-
-    def blur_and_gradient(self, sigma: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Of `_Filters.blur_and_gradient`, the blur positive. Each [1 or B, 1, H, W]"""
-        if self.masked:
-            blurred, blurred_x, blurred_y = self.filters.blur_and_gradient(self.weight, sigma)
-        else:
-            down, across = self._along(sigma, 0, 2), self._along(sigma, 0, 3)
-            blurred, blurred_x, blurred_y = (
-                down * across,
-                down * self._along(sigma, 1, 3),
-                self._along(sigma, 1, 2) * across,
-            )
-        return blurred.clamp_min(torch.finfo(blurred.dtype).tiny), blurred_x, blurred_y
-
-    def _along(self, sigma: float, order: int, axis: int) -> Tensor:
-        return self.filters.convolve(self.weight[..., :1] if axis == 2 else self.weight[..., :1, :], sigma, order, axis)
-
-
 def multiscale_structure_tensor(
     images: Tensor,
     masks: Tensor | None = None,
     *,
     frequency_constant: float = FREQUENCY_CONSTANT,
-    gamma: float = GAMMA,
     noise_floor: float = NOISE_FLOOR,
     energy_blur: float = ENERGY_BLUR,
-    num_levels: int = NUM_LEVELS,
+    epsilon: float | None = None,
     truncation: float = TRUNCATION,
     incremental: bool = False,
     fused: bool = True,
@@ -167,8 +84,8 @@ def multiscale_structure_tensor(
     """Aggregate the per-scale structure tensors of a batch of images of one size (paper, eq. 2–5).
 
     S̄ = Σ_l E_l^γ ω_l² Ŝ_l / (Σ_l E_l^γ + ε), with Ŝ_l = S_l / (tr S_l + ε), at full resolution on every level.
-    Both ε are relative to the image's own contrast (`noise_floor`), so S̄ does not depend on exposure. Channels are
-    summed after Di Zenzo. I_{−1} is the unsmoothed image.
+    Both ε are relative to the image's own contrast (`noise_floor`), so that S̄ does not depend on exposure, unless
+    `epsilon` is given. Channels are summed after Di Zenzo. I_{−1} is the unsmoothed image.
 
     Args:
         images: Linear in the pixel value, any non-negative range, any floating dtype (computed in at least float32).
@@ -176,22 +93,83 @@ def multiscale_structure_tensor(
         masks: Valid pixels; the others, which may hold anything, NaN too, neither contribute nor receive a tensor.
             bool [B, H, W] or None for all.
         frequency_constant: c of ω_l = c / σ_l, in 1/px.
-        gamma: Exponent of the scale weights.
         noise_floor: Amplitude relative to the image's contrast under which S̄ fades to 0.
         energy_blur: Window, in multiples of σ_l, over which the band energy E_l² is averaged. E_l crosses zero twice a
             period; without the window S̄ follows the phase of the texture instead of its frequency.
-        num_levels: L + 1.
+        epsilon: ε > 0 of eq. 3 and 5 as the paper prints it, the same number for every image and level, in the units
+            of the pixel values; the released code takes 1e-6 with values in [0, 1]. `noise_floor` then has no effect.
         truncation: Radius of every kernel, in multiples of its standard deviation.
         incremental: Blur level l − 1 by √(σ_l² − σ_{l−1}²) instead of the image by σ_l: shorter kernels, but each
             level inherits what the one before it lost at borders and by truncation.
         fused: Use our Triton kernels where they run: CUDA, float32.
 
     Returns:
-        S̄ as (xx, xy, yy) in 1/px², positive semidefinite, trace ≤ (c / σ_0)², 0 at masked pixels. [B, H, W, 3]
+        S̄ as (xx, xy, yy) in 1/px², positive semidefinite, trace ≤ (c / σ_0)²; NaN at masked pixels, where it is not
+        known. [B, H, W, 3]
 
     Raises:
-        ValueError: If the images or masks have another shape, the images are empty or not floating point, or a valid
-            pixel is NaN or infinite.
+        ValueError: If the images or masks have another shape, the images are empty or not floating point, a valid
+            pixel is NaN or infinite, or `epsilon` is not positive.
+        InputError: If the images are larger, or more, than the Triton kernels can address (kernels/limits.py).
+    """
+    if epsilon is not None and not epsilon > 0:
+        raise ValueError(f"epsilon must be positive, or None for one relative to the contrast, got {epsilon:g}")
+    image, valid, brightest, contrast = _normalised(images, masks)
+    levels = [SCALE_STEP**level for level in range(NUM_LEVELS)]  # σ_l in px
+    if epsilon is None:
+        noise = (noise_floor * contrast).clamp_min(_ROUNDING_FLOOR)  # [B, 1, 1, 1]
+        trace_floors, weight_floor = [(noise / sigma) ** 2 for sigma in levels], noise**GAMMA
+    else:  # the image was divided by its brightest value, and so S_l by its square and E_l^γ by its power
+        smallest = torch.finfo(image.dtype).tiny
+        trace_floors = [(epsilon / brightest.square()).clamp_min(smallest)] * NUM_LEVELS
+        weight_floor = (epsilon / brightest**GAMMA).clamp_min(smallest)
+    operations = _operations(fused, image)
+    # Without masks the weights of all images are the same: one image's are kept.
+    sums = _WeightedSums(valid[:1] if masks is None else valid, masks is not None, truncation, operations.correlate)
+    numerator = torch.zeros_like(image[:, :1]).repeat(1, 3, 1, 1)  # [B, 3, H, W]
+    denominator = weight_floor.expand_as(valid).contiguous()  # [B, 1, H, W]
+    previous = image  # I_{l−1}
+    for level, sigma in enumerate(levels):
+        # The scale space: I_l and its gradient.
+        source, step = image, sigma
+        if incremental and level > 0:
+            source, step = previous * valid, math.sqrt(sigma**2 - levels[level - 1] ** 2)
+        blurs, totals = sums.blur_and_gradient(source, step), sums.total_and_gradient(step)
+        smoothed, products, energy = operations.differentiate(blurs, totals, sums.weight, previous)
+        # Eq. 2, the structure tensor: S_l is the mean of the gradient's products over a window of ρ_l.
+        rho = INTEGRATION_FACTOR * sigma
+        tensor = sums.blur(products, rho), sums.total(rho)
+        # Eq. 4, the band energy: E_l² is (I_{l−1} − I_l)², or its mean over a window.
+        window = energy_blur * sigma
+        total = torch.ones_like(sums.weight)
+        if window > 0:
+            energy, total = sums.blur(energy, window), sums.total(window)
+        # Eq. 3 and 5: normalise S_l, and add it with its weight E_l^γ ω_l².
+        frequency = frequency_constant / sigma
+        operations.aggregate(
+            tensor, (energy, total), trace_floors[level], numerator, denominator, 0.5 * GAMMA, frequency
+        )
+        previous = smoothed
+    result = numerator / denominator
+    if masks is not None:
+        result = torch.where(valid > 0, result, torch.nan)
+    return result.permute(0, 2, 3, 1).contiguous()
+
+
+def _normalised(images: Tensor, masks: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Check the images, and scale and centre their valid pixels.
+
+    Args:
+        images: [B, H, W, C]
+        masks: bool [B, H, W] or None.
+
+    Returns:
+        The images in [−1, 1] around a mean of 0, 0 where masked [B, C, H, W]; 1 at valid pixels and 0 at masked ones
+        [B, 1, H, W]; the largest absolute value, by which they were divided [B, 1, 1, 1]; and their contrast after
+        that, the root of the mean squared distance from the mean colour [B, 1, 1, 1].
+
+    Raises:
+        ValueError: As `multiscale_structure_tensor`.
     """
     if images.dim() != 4 or not images.is_floating_point():
         raise ValueError(f"images must be floating point [B, H, W, C], got {images.dtype} {tuple(images.shape)}")
@@ -201,65 +179,155 @@ def multiscale_structure_tensor(
         raise ValueError(f"masks must be [B, H, W] = {tuple(images.shape[:3])}, got {tuple(masks.shape)}")
     image = images.permute(0, 3, 1, 2).contiguous()  # [B, C, H, W]; with channels-last strides cuDNN is slower
     image = image.to(torch.promote_types(image.dtype, torch.float32))
-    # [B, 1, H, W]; a transposed mask would stay so, and hand its strides on to whatever it is combined with.
+    # A transposed mask would stay so, and hand its strides on to whatever it is combined with.
     valid = torch.ones_like(image[:, :1]) if masks is None else masks[:, None].to(image).contiguous()
-    # Without a mask the weights of all images are the same: keep one.
-    weight = valid[:1] if masks is None else valid
     image = torch.where(valid > 0, image, 0.0)  # a product would let NaN through
     if not image.isfinite().all():  # one would spread over the whole image: its contrast scales everything
         broken = (~image.isfinite()).flatten(1).any(dim=1).nonzero().flatten().tolist()
         raise ValueError(f"images {broken} of the batch hold NaN or infinite pixels; mask or replace those")
     brightest = image.abs().amax(dim=(1, 2, 3), keepdim=True).clamp_min(torch.finfo(image.dtype).tiny)
-    image = image / brightest  # now in [-1, 1]: HDR and tiny exposures behave alike
+    image = image / brightest  # HDR and tiny exposures then behave alike
     count = valid.sum(dim=(2, 3), keepdim=True).clamp_min(1)
     mean = image.sum(dim=(2, 3), keepdim=True) / count
-    # Centring costs nothing (every operator below is blind to a constant) and keeps float32 rounding relative to
-    # the contrast, not to the brightness.
+    # Every operator is blind to a constant, and without it float32 rounds relative to the contrast, not the brightness.
     image = (image - mean) * valid
-    contrast = (image.square().sum(dim=1, keepdim=True).sum(dim=(2, 3), keepdim=True) / count).sqrt()  # [B, 1, 1, 1]
-    noise = (noise_floor * contrast).clamp_min(_ROUNDING_FLOOR)  # [B, 1, 1, 1]
+    contrast = (image.square().sum(dim=1, keepdim=True).sum(dim=(2, 3), keepdim=True) / count).sqrt()
+    return image, valid, brightest, contrast
 
-    fused = fused and image.dtype == torch.float32 and kernels.available(image.device)
-    if fused:
-        from sadgs_ns.kernels import scale_space
-    filters = _Filters(truncation, fused)
-    reach = _Reach(filters, weight, masks is not None)
-    numerator = torch.zeros_like(image[:, :1]).repeat(1, 3, 1, 1)  # [B, 3, H, W]
-    denominator = (noise**gamma).expand_as(valid).contiguous()  # [B, 1, H, W]
-    previous = image
-    for level in range(num_levels):
-        sigma = SCALE_STEP**level
-        source, step = image, sigma
-        if incremental and level > 0:
-            source, step = previous * valid, math.sqrt(sigma**2 - SCALE_STEP ** (2 * level - 2))
-        blurs, reaches = filters.blur_and_gradient(source, step), reach.blur_and_gradient(step)
-        if fused:
-            smoothed, products, energy = scale_space.differentiate(blurs, reaches, weight, previous)
+
+@dataclass(frozen=True)
+class _WeightedSums:
+    """Gaussian blurs of the valid pixels and of the pixels' weights: their quotient is a weighted mean.
+
+    Outside the image there are zeros, which weigh nothing.
+    """
+
+    weight: Tensor
+    """1 at valid pixels and 0 at masked ones [B, 1, H, W], or [1, 1, H, W] of ones without masks."""
+    masked: bool
+    truncation: float
+    """Radius of every kernel, in multiples of its standard deviation."""
+    correlate: Callable[[Tensor, Tensor, int], Tensor]
+
+    def blur(self, image: Tensor, sigma: float) -> Tensor:
+        """Separable Gaussian blur. [B, C, H, W] → [B, C, H, W]"""
+        return self._along(self._along(image, sigma, 0, 2), sigma, 0, 3)
+
+    def blur_and_gradient(self, image: Tensor, sigma: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Gaussian blur, and its exact x and y derivatives per px. [B, C, H, W] → each [B, C, H, W]"""
+        rows, derived_rows = self._along(image, sigma, 0, 2), self._along(image, sigma, 1, 2)
+        return self._along(rows, sigma, 0, 3), self._along(rows, sigma, 1, 3), self._along(derived_rows, sigma, 0, 3)
+
+    def total(self, sigma: float) -> Tensor:
+        """`blur` of the weights, positive. [1 or B, 1, H, W]"""
+        total = self.blur(self.weight, sigma) if self.masked else self._unmasked(sigma, 0, 0)
+        return total.clamp_min(torch.finfo(total.dtype).tiny)
+
+    def total_and_gradient(self, sigma: float) -> tuple[Tensor, Tensor, Tensor]:
+        """`blur_and_gradient` of the weights, the blur positive. Each [1 or B, 1, H, W]"""
+        if self.masked:
+            total, total_x, total_y = self.blur_and_gradient(self.weight, sigma)
         else:
-            smoothed = blurs[0] / reaches[0]
-            # The derivative of the quotient.
-            gradient_x = (blurs[1] - smoothed * reaches[1]) / reaches[0]
-            gradient_y = (blurs[2] - smoothed * reaches[2]) / reaches[0]
-            products = torch.stack(
-                [gradient_x.square().sum(1), (gradient_x * gradient_y).sum(1), gradient_y.square().sum(1)], dim=1
-            )  # [B, 3, H, W]
-            products = products * weight
-            energy = (previous - smoothed).square().sum(1, keepdim=True) * weight
-        rho, window = INTEGRATION_FACTOR * sigma, energy_blur * sigma
-        products, integrated = filters.blur(products, rho), reach.blur(rho)
-        total = torch.ones_like(weight)
-        if energy_blur > 0:
-            energy, total = filters.blur(energy, window), reach.blur(window)
-        if fused:
-            sums = numerator, denominator
-            scale_space.accumulate(
-                (products, integrated), (energy, total), noise, sums, gamma / 2, frequency_constant / sigma, sigma
-            )
-        else:
-            tensor = products / integrated  # S_l, eq. 2
-            normalised = tensor / (tensor[:, :1] + tensor[:, 2:] + (noise / sigma) ** 2)  # Ŝ_l, eq. 3
-            scale_weight = (energy / total).clamp_min(0) ** (0.5 * gamma)  # E_l^γ, eq. 4
-            numerator += scale_weight * (frequency_constant / sigma) ** 2 * normalised
-            denominator += scale_weight
-        previous = smoothed
-    return (numerator / denominator * valid).permute(0, 2, 3, 1).contiguous()
+            total, total_x, total_y = (self._unmasked(sigma, *orders) for orders in ((0, 0), (1, 0), (0, 1)))
+        return total.clamp_min(torch.finfo(total.dtype).tiny), total_x, total_y
+
+    def _unmasked(self, sigma: float, order_x: int, order_y: int) -> Tensor:
+        """Blur of ones, which a row and a column of them tell. [1, 1, H, W]"""
+        down, across = self.weight[..., :1], self.weight[..., :1, :]
+        return self._along(down, sigma, order_y, 2) * self._along(across, sigma, order_x, 3)
+
+    def _along(self, image: Tensor, sigma: float, order: int, axis: int) -> Tensor:
+        kernel = _kernel(sigma, order, image.dtype, image.device, self.truncation)
+        return self.correlate(image, kernel, axis)
+
+
+@dataclass(frozen=True)
+class _Operations:
+    """The three operations that torch and Triton both have."""
+
+    correlate: Callable[[Tensor, Tensor, int], Tensor]
+    differentiate: Callable[..., tuple[Tensor, Tensor, Tensor]]
+    aggregate: Callable[..., None]
+
+
+def _operations(fused: bool, image: Tensor) -> _Operations:
+    """Triton's operations where they run and are wanted, else torch's."""
+    if not (fused and image.dtype == torch.float32 and kernels.available(image.device)):
+        return _Operations(_correlate, _differentiate, _aggregate)
+    from sadgs_ns.kernels import limits
+    from sadgs_ns.kernels import structure_tensor as kernel
+
+    limits.check_batch(*image.shape)
+    return _Operations(kernel.correlate, kernel.differentiate, kernel.aggregate)
+
+
+def _correlate(image: Tensor, kernel: Tensor, axis: int) -> Tensor:
+    """Correlate along one image axis with zeros outside.
+
+    Args:
+        image: [B, C, H, W]
+        kernel: K is odd. [K]
+        axis: 2 for rows (y), 3 for columns (x).
+    """
+    channels, size, radius = image.shape[1], image.shape[axis], kernel.numel() // 2
+    if radius >= size:  # taps that can only ever meet zeros
+        kernel = kernel[radius - size + 1 : radius + size]
+        radius = size - 1
+    shape = (1, 1, -1, 1) if axis == 2 else (1, 1, 1, -1)
+    padding = (radius, 0) if axis == 2 else (0, radius)
+    weight = kernel.view(shape).expand(channels, -1, -1, -1)
+    # Full float32, and no search for the fastest algorithm: each of dozens of kernel sizes is used a few times.
+    with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=False, allow_tf32=False):
+        return F.conv2d(image, weight, padding=padding, groups=channels)
+
+
+def _differentiate(
+    blurs: tuple[Tensor, Tensor, Tensor], totals: tuple[Tensor, Tensor, Tensor], weight: Tensor, previous: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Level I_l from blurs of the image, with the integrands of eq. 2 and 4.
+
+    Args:
+        blurs: The image's blur and its derivatives along x and y. Each [B, C, H, W]
+        totals: The same of the weights, the first positive. Each [1 or B, 1, H, W]
+        weight: Of the pixels. [1 or B, 1, H, W]
+        previous: I_{l−1}. [B, C, H, W]
+
+    Returns:
+        I_l [B, C, H, W]; and, times the weights, the products xx, xy, yy of its gradient, summed over the channels
+        [B, 3, H, W], and the squared difference from I_{l−1}, summed likewise [B, 1, H, W].
+    """
+    smoothed = blurs[0] / totals[0]
+    # The derivative of the quotient.
+    gradient_x = (blurs[1] - smoothed * totals[1]) / totals[0]
+    gradient_y = (blurs[2] - smoothed * totals[2]) / totals[0]
+    products = torch.stack(
+        [gradient_x.square().sum(1), (gradient_x * gradient_y).sum(1), gradient_y.square().sum(1)], dim=1
+    )
+    return smoothed, products * weight, (previous - smoothed).square().sum(1, keepdim=True) * weight
+
+
+def _aggregate(
+    tensor: tuple[Tensor, Tensor],
+    energy: tuple[Tensor, Tensor],
+    trace_floor: Tensor,
+    numerator: Tensor,
+    denominator: Tensor,
+    exponent: float,
+    frequency: float,
+) -> None:
+    """Add a level to the sums of eq. 5, in place.
+
+    Args:
+        tensor: The blurred products [B, 3, H, W], and the same blur of the weights [1 or B, 1, H, W].
+        energy: The blurred energy [B, 1, H, W], and the same blur of the weights.
+        trace_floor: ε of eq. 3. [B, 1, 1, 1]
+        numerator: [B, 3, H, W]
+        denominator: [B, 1, H, W]
+        exponent: γ / 2.
+        frequency: ω_l in 1/px.
+    """
+    structure = tensor[0] / tensor[1]  # S_l, eq. 2
+    normalised = structure / (structure[:, :1] + structure[:, 2:] + trace_floor)  # Ŝ_l, eq. 3
+    weight = (energy[0] / energy[1]).clamp_min(0) ** exponent  # E_l^γ, eq. 4
+    numerator += weight * frequency**2 * normalised
+    denominator += weight

@@ -14,7 +14,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from sadgs_ns import kernels
-from sadgs_ns.plugin.nonfinite import NonFiniteLog, leave_out_nonfinite
+from sadgs_ns.plugin.nonfinite import MAX_GRADIENT, NonFiniteLog, leave_out_nonfinite
 
 _ONE = torch.tensor(1.0, device="cpu")
 """Adding it to the count of steps costs the host a third of adding Python's 1."""
@@ -23,7 +23,7 @@ _ONE = torch.tensor(1.0, device="cpu")
 class FusedAdam(torch.optim.Adam):
     """torch's Adam, updated by our Triton kernel where that runs; state and results are torch's.
 
-    Gradients that are NaN, infinite or beyond `finite.MAX_GRADIENT` count as 0: parameters and moments stay finite.
+    Gradients that are NaN, infinite or beyond `nonfinite.MAX_GRADIENT` count as 0: parameters and moments stay finite.
 
     Args:
         params: Parameters, all on one device.
@@ -89,8 +89,9 @@ def step_together(optimizers: Iterable[FusedAdam]) -> None:
     for (log, betas, eps, _), updates in launches.items():
         parameters, gradients, exp_avgs, exp_avg_sqs, steps, lrs = zip(*updates, strict=True)
         adam_step(
-            parameters, gradients, exp_avgs, exp_avg_sqs, log.gradients, steps=steps, lrs=lrs, betas=betas, eps=eps
-        )
+            parameters, gradients, exp_avgs, exp_avg_sqs, log.gradients,
+            steps=steps, lrs=lrs, betas=betas, eps=eps, max_gradient=MAX_GRADIENT,
+        )  # fmt: skip
 
 
 class SadgsOptimizers(Optimizers):

@@ -92,7 +92,7 @@ def texture_period(structure_tensor: Tensor, frequency_constant: float = FREQUEN
         frequency_constant: c that S̄ was computed with, in 1/px.
 
     Returns:
-        px; NaN where S̄ is 0: no texture, or masked. [...]
+        px; NaN where S̄ is 0, so that there is no texture, and where it is NaN, at masked pixels. [...]
     """
     period = wavelength(structure_tensor)
     return torch.where(period < 0.999 / WAVELENGTH_EPSILON, 2 * torch.pi * frequency_constant * period, torch.nan)
@@ -119,7 +119,7 @@ class Ellipses:
 def structure_ellipses(
     structure_tensor: Tensor, frequency_constant: float = FREQUENCY_CONSTANT, spacing: float | None = None
 ) -> Ellipses:
-    """S̄⁻¹ on a regular grid of pixels, without those where there is no texture.
+    """S̄⁻¹ on a regular grid of pixels, without those that have no texture or are masked.
 
     Args:
         structure_tensor: S̄ as (xx, xy, yy) in 1/px². [H, W, 3]
@@ -132,7 +132,7 @@ def structure_ellipses(
         torch.arange(spacing / 2, height, spacing), torch.arange(spacing / 2, width, spacing), indexing="ij"
     )
     points = torch.stack([x.flatten(), y.flatten()], -1)  # [E, 2]
-    at = structure_tensor[points[:, 1].long(), points[:, 0].long()].double().cpu()
+    at = structure_tensor[points[:, 1].long(), points[:, 0].long()].double().cpu().nan_to_num(0.0)  # [E, 3]
     xx, xy, yy = at.unbind(-1)
     values, vectors = torch.linalg.eigh(torch.stack([xx, xy, xy, yy], -1).view(-1, 2, 2))  # ascending
     longest = SCALE_STEP ** (NUM_LEVELS - 1) / frequency_constant

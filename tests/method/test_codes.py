@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from sadgs_ns.method.codes import HIGHEST_FREQUENCY, OCTAVES, decode, encode
+from sadgs_ns.method.codes import HIGHEST_FREQUENCY, MASKED, OCTAVES, decode, encode
 from sadgs_ns.method.eta import principal_eigenvalue, sample_map
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 
@@ -36,10 +36,21 @@ def test_nothing_the_ends_of_the_range_and_what_lies_beyond():
     ]
 
 
+def test_masked_pixels_have_a_code_of_their_own():
+    """NaN stays NaN, and no tensor of a valid pixel reads as one, whatever its correlation."""
+    tensor = torch.tensor([[1.0, 0.5, 1.0], [1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [0.0, 0.0, 0.0]])
+    masked = tensor.clone()
+    masked[0], masked[1, 0], masked[2, 1] = torch.nan, torch.nan, torch.nan
+    assert encode(masked)[:3].tolist() == [[0, MASKED, 0]] * 3
+    assert decode(encode(masked))[:3].isnan().all() and torch.equal(encode(masked)[3], encode(tensor)[3])
+    assert decode(encode(tensor)).isfinite().all()
+
+
 def test_samples_of_codes_are_samples_of_what_they_stand_for():
     tensor = torch.rand((2, 5, 7, 3), generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 0.1, 1.0])
+    tensor[1, 4, 0] = torch.nan
     codes = encode(tensor)
-    points, cameras = torch.tensor([[0.5, 0.5], [6.9, 4.9], [7.1, 1.0]]), torch.tensor([0, 1, 1])
+    points, cameras = torch.tensor([[0.5, 0.5], [6.9, 4.9], [7.1, 1.0], [0.5, 4.5]]), torch.tensor([0, 1, 1, 1])
     for actual, expected in zip(
         sample_map(codes, cameras, points), sample_map(decode(codes), cameras, points), strict=True
     ):

@@ -10,6 +10,7 @@ from gsplat.cuda._torch_impl import _persp_proj, _quat_scale_to_covar_preci, _wo
 from scenes import camera, random_params
 from torch import Tensor
 
+from sadgs_ns.method.codes import encode
 from sadgs_ns.method.eta import (
     SCREEN_BLUR,
     eta,
@@ -136,6 +137,17 @@ def test_points_outside_the_image_are_no_observation():
     values, inside = sample_map(tensors, torch.tensor([0, 1, 1, 0, 0]), points)
     assert inside.tolist() == [True, False, True, False, False]
     assert values.dtype == torch.float32 and values[inside].eq(1).all() and values[~inside].eq(0).all()
+
+
+@pytest.mark.parametrize("kept", [Tensor.half, encode], ids=["float16", "8 bits"])
+def test_points_on_masked_pixels_are_no_observation(kept):
+    """Left half masked: points there are as unknown as those outside the image, and a smooth pixel is known to be."""
+    masks = torch.ones((1, HEIGHT, WIDTH), dtype=torch.bool)
+    masks[:, :, : WIDTH // 2] = False
+    tensors = kept(multiscale_structure_tensor(torch.full((1, HEIGHT, WIDTH, 3), 0.5), masks))
+    points = torch.tensor([[WIDTH / 2 - 0.1, 5.0], [WIDTH / 2 + 0.1, 5.0], [WIDTH + 0.1, 5.0]])
+    values, known = sample_map(tensors, torch.zeros(3, dtype=torch.long), points)
+    assert known.tolist() == [False, True, False] and values.eq(0).all()
 
 
 def test_eta_equals_the_brute_force_footprint_average():

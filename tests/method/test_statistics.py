@@ -8,7 +8,9 @@ import pytest
 import torch
 from scenes import camera, random_params, splat
 
+from sadgs_ns.method.codes import encode
 from sadgs_ns.method.statistics import consistent, empty_statistics, observe
+from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 
 WIDTH, HEIGHT = 64, 48
 
@@ -71,12 +73,29 @@ def test_faint_gaussians_are_not_observed_below_the_gate():
         assert float(statistics["n_total"].sum()) == seen
 
 
-def test_masked_or_textureless_pixels_are_low_not_high():
+def test_textureless_pixels_are_low_not_high():
     params = three_gaussians()
     params["scales"].data.fill_(-3.0)
     statistics = empty_statistics(3, torch.device("cpu"))
     observe(statistics, params, forward(params, [0.0, 0.0, 0.0], False))
     assert statistics["n_low"][0].tolist() == [1.0] * 3 and not statistics["n_high"].any()
+
+
+@pytest.mark.parametrize("kept", [torch.Tensor.half, encode], ids=["float16", "8 bits"])
+def test_masked_pixels_are_no_observation(kept):
+    """One half of a smooth image is masked: only the Gaussian over the other half gets its low response."""
+    params = three_gaussians()
+    params["means"].data = torch.tensor([[-1.0, 0.0, 4.0], [1.0, 0.0, 4.0], [0.0, 0.0, -4.0]])
+    params["scales"].data.fill_(-3.0)
+    masks = torch.ones((1, HEIGHT, WIDTH), dtype=torch.bool)
+    masks[:, :, : WIDTH // 2] = False
+    info = forward(params, [0.0, 0.0, 0.0], False)
+    info["structure_tensors"] = kept(multiscale_structure_tensor(torch.full((1, HEIGHT, WIDTH, 3), 0.5), masks))
+    statistics = empty_statistics(3, torch.device("cpu"))
+    observe(statistics, params, info)
+    assert statistics["n_total"].tolist() == [0.0, 1.0, 0.0]
+    assert statistics["n_low"].tolist() == [[0.0] * 3, [1.0] * 3, [0.0] * 3]
+    assert not statistics["n_high"].any() and (statistics["eta_max"] < 0.1).all()
 
 
 def test_garbage_of_the_unseen_never_enters():

@@ -32,13 +32,16 @@ def relative_change(tensor: Tensor, reference: Tensor) -> float:
     return float((tensor - reference).norm(dim=-1).mean() / reference.norm(dim=-1).mean())
 
 
-def reference_structure_tensor(image: Tensor, gamma: float = 3.0, energy_blur: float = 2.0) -> Tensor:
+def reference_structure_tensor(
+    image: Tensor, gamma: float = 3.0, energy_blur: float = 2.0, epsilon: float | None = None
+) -> Tensor:
     """Eq. 2–5 for the interior of one float64 image [H, W, C], level by level with scipy's filters. [H, W, 3]"""
     array = image.double().numpy()
-    array = array / abs(array).max()
+    if epsilon is None:
+        array = array / abs(array).max()
     contrast = math.sqrt((array - array.mean((0, 1))).var(axis=(0, 1)).sum())
     noise = max(NOISE_FLOOR * contrast, 1e-5)
-    numerator, denominator, previous = 0.0, noise**gamma, array
+    numerator, denominator, previous = 0.0, noise**gamma if epsilon is None else epsilon, array
 
     def blur(values, sigma, order=""):  # scipy's taps: truncated where ours are
         radius = math.ceil(3 * sigma)
@@ -53,22 +56,50 @@ def reference_structure_tensor(image: Tensor, gamma: float = 3.0, energy_blur: f
         smoothed, g_x, g_y = blur(array, sigma), blur(array, sigma, "x"), blur(array, sigma, "y")
         xx, xy, yy = (blur(p.sum(-1), 3 * sigma) for p in (g_x * g_x, g_x * g_y, g_y * g_y))
         energy = blur(((previous - smoothed) ** 2).sum(-1), energy_blur * sigma) ** (gamma / 2)
-        scale = energy / sigma**2 / (xx + yy + (noise / sigma) ** 2)
+        scale = energy / sigma**2 / (xx + yy + ((noise / sigma) ** 2 if epsilon is None else epsilon))
         numerator = numerator + torch.stack([torch.from_numpy(scale * s) for s in (xx, xy, yy)], -1)
         denominator, previous = denominator + energy, smoothed
     return numerator / torch.from_numpy(denominator)[..., None]
 
 
-def test_agrees_with_the_float64_reference_in_the_interior():
+@pytest.mark.parametrize("epsilon", [None, 1e-6, 1e-2])
+def test_agrees_with_the_float64_reference_in_the_interior(epsilon: float | None):
     generator = torch.Generator().manual_seed(0)
     image = torch.rand((160, 170, 3), generator=generator, dtype=torch.float64)
     image = image + grating(9.0, 0.4, 170)[0, :160].double()  # texture over noise
-    expected = reference_structure_tensor(image)
+    image = 0.7 * image  # the brightest value is not 1
+    expected = reference_structure_tensor(image, epsilon=epsilon)
     interior = (slice(70, -70), slice(70, -70))  # beyond the reach of the largest kernels, where borders play no part
     for dtype, tolerance in ((torch.float64, 1e-9), (torch.float32, 2e-5)):
         # The reference does not centre the image, so its own contrast is used for both.
-        actual = unit_tensor(image[None].to(dtype))[0].double()
+        actual = unit_tensor(image[None].to(dtype), epsilon=epsilon)[0].double()
         torch.testing.assert_close(actual[interior], expected[interior], rtol=tolerance, atol=tolerance)
+
+
+def test_an_absolute_epsilon_makes_the_wavelength_depend_on_contrast():
+    """As the paper prints it, ε hides a faint texture: at an amplitude of 0.01, E_l^3 is below 1e-6."""
+    period = {
+        (amplitude, epsilon): float(wavelength(unit_tensor(grating(8.0, amplitude=amplitude), epsilon=epsilon)).mean())
+        for amplitude in (0.5, 0.01)
+        for epsilon in (None, 1e-6)
+    }
+    assert period[0.01, None] == pytest.approx(period[0.5, None], rel=1e-3)
+    assert period[0.5, 1e-6] == pytest.approx(period[0.5, None], rel=0.05)
+    assert period[0.01, 1e-6] > 1.5 * period[0.5, 1e-6]
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-30, 1e-12, 1e9, 1e30])
+def test_an_absolute_epsilon_keeps_every_exposure_finite(scale: float):
+    tensor = unit_tensor(scale * grating(8.0), epsilon=1e-6)
+    assert tensor.isfinite().all() and (tensor[..., 0] + tensor[..., 2] <= 1 + 1e-5).all()
+    flat = unit_tensor(torch.full((1, 20, 20, 3), scale), epsilon=1e-6)
+    assert flat.isfinite().all()
+
+
+@pytest.mark.parametrize("epsilon", [0.0, -1.0, math.nan])
+def test_an_epsilon_that_is_not_positive_is_refused(epsilon: float):
+    with pytest.raises(ValueError, match="epsilon must be positive, or None"):
+        unit_tensor(grating(8.0), epsilon=epsilon)
 
 
 @pytest.mark.parametrize("period", [4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0])
@@ -158,12 +189,12 @@ def test_a_mask_makes_no_edge_and_no_difference_far_from_it():
     mask[:, 40:90, 50:80] = False
     painted = torch.where(mask[..., None], image, 0.0)
     masked = unit_tensor(painted, mask)
-    torch.testing.assert_close(masked, unit_tensor(image, mask), rtol=0, atol=0)
-    assert (masked[~mask] == 0).all()
+    torch.testing.assert_close(masked, unit_tensor(image, mask), rtol=0, atol=0, equal_nan=True)
+    assert masked[~mask].isnan().all() and masked[mask].isfinite().all()
     plain = unit_tensor(image)
     assert relative_change(masked[mask], plain[mask]) < 0.05
     edge = unit_tensor(painted)[mask][:, 2].max()  # yy, which a vertical grating does not have
-    assert edge > 0.3 and masked[..., 2].max() < 0.05 * edge
+    assert edge > 0.3 and masked[mask][:, 2].max() < 0.05 * edge
 
 
 def test_batch_equals_one_by_one_and_a_full_mask_equals_none():
@@ -198,7 +229,7 @@ def test_incremental_blur_does_not_see_what_lies_under_the_mask():
     mask[:, 40:90, 50:80] = False
     painted = torch.where(mask[..., None], image, 0.0)
     masked = unit_tensor(painted, mask, incremental=True)
-    torch.testing.assert_close(masked, unit_tensor(image, mask, incremental=True), rtol=0, atol=0)
+    torch.testing.assert_close(masked, unit_tensor(image, mask, incremental=True), rtol=0, atol=0, equal_nan=True)
     assert relative_change(masked[mask], unit_tensor(image)[mask]) < 0.05
 
 

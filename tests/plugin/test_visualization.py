@@ -66,6 +66,19 @@ def test_without_texture_there_is_no_wavelength_and_no_ellipse():
     assert len(np.unique(drawn)) == 1
 
 
+def test_masked_pixels_are_drawn_as_those_without_texture():
+    """The left half is masked: it is black in the map of periods and has no ellipses; the right half has both."""
+    image, mask = grating(8.0), torch.ones((1, HEIGHT, WIDTH), dtype=torch.bool)
+    mask[:, :, : WIDTH // 2] = False
+    tensor = multiscale_structure_tensor(image[None], mask)[0]
+    shown = PERIOD(visualization.texture_period(tensor))
+    assert not shown[:, : WIDTH // 2].any() and shown[:, WIDTH // 2 :].any(axis=-1).all()
+    ellipses = visualization.structure_ellipses(tensor)
+    assert len(ellipses.centers) > 0 and ellipses.centers[:, 0].min() > WIDTH / 2
+    assert len(visualization.structure_ellipses(torch.full_like(tensor, torch.nan)).centers) == 0
+    visualization.draw_ellipses(visualization.to_picture(image), tensor)
+
+
 @pytest.mark.parametrize("degrees", [0, 30, 90, 135])
 def test_ellipses_are_short_across_the_stripes_and_long_along_them(degrees: int):
     ellipses = visualization.structure_ellipses(structure_tensor(grating(8.0, math.radians(degrees))), spacing=16.0)

@@ -1,4 +1,4 @@
-"""The smallest kernel, to find out whether Triton works."""
+"""The smallest kernel, which shows whether Triton works on a device."""
 
 # pyright: reportArgumentType=false, reportIndexIssue=false
 # (Triton's launch syntax, kernel[grid](...), is not in its types.)
@@ -15,11 +15,11 @@ def _write_one(target):
     tl.store(target, 1.0)
 
 
-def probe(device: torch.device) -> None:
-    """Run a kernel on a device.
+def run_trial(device: torch.device) -> None:
+    """Run a kernel on a device, and wait for what it writes.
 
     Raises:
-        Exception: Whatever Triton raises where it cannot compile or launch one.
+        Exception: Whatever Triton raises where it cannot compile or launch a kernel.
         RuntimeError: If the kernel ran and did nothing.
     """
     target = torch.zeros(1, device=device)

@@ -1,0 +1,93 @@
+"""The largest sizes that the kernels can address, and their refusal beyond.
+
+Addresses are computed in 64 bits, except where that would cost registers or where gsplat's own kernels, which run in
+between, have 32. What remains limited, with C views in one step, N Gaussians and images of H × W px:
+
+| What | Largest | Because of |
+| --- | --- | --- |
+| C · N | MAX_ROWS | `compositing` and `harmonics` address rows of three numbers in 32 bits, as gsplat does |
+| C · H · W in one step | MAX_ROWS | `compositing` and `losses` do so with pixels |
+| H · W of an image with a structure tensor | MAX_ROWS | `structure_tensor` counts one image's pixels in 32 bits |
+| pairs of a Gaussian and a tile | MAX_PAIRS | lists of tiles, here and in gsplat, hold their places in 32 bits |
+| C, and images times channels of one batch | MAX_BLOCKS | CUDA launches no more blocks along an axis |
+| H | MAX_HEIGHT | the same: two rows of an image are a block of `structure_tensor` |
+
+N alone is limited by C · N; `absgs`, `adam`, `codes` and `statistics` have no limit of their own.
+"""
+
+from __future__ import annotations
+
+from sadgs_ns.errors import InputError
+
+MAX_ROWS = (2**31 - 256) // 3
+"""715,827,797. A block of 256 numbers that begins below three times this ends within 32 bits."""
+MAX_PAIRS = 2**31 - 1
+MAX_BLOCKS = 2**16 - 1
+MAX_HEIGHT = 2 * MAX_BLOCKS
+
+
+def _refuse_beyond(limit: int, size: int, what: str, remedy: str) -> None:
+    if size > limit:
+        raise InputError(f"{what} are {size:,}, and the Triton kernels can address {limit:,}: {remedy}.")
+
+
+def check_gaussians(num_views: int, num_gaussians: int) -> None:
+    """Refuse more Gaussians than one step can render.
+
+    Args:
+        num_views: C
+        num_gaussians: N
+
+    Raises:
+        InputError: If C or C · N is too large.
+    """
+    _refuse_beyond(MAX_BLOCKS, num_views, "The views of one step", "take fewer views at once")
+    what = f"The Gaussians of all views of one step, {num_views:,} × {num_gaussians:,},"
+    _refuse_beyond(MAX_ROWS, num_views * num_gaussians, what, "take fewer views at once, or fewer Gaussians")
+
+
+def check_pixels(num_views: int, height: int, width: int) -> None:
+    """Refuse more pixels than one step can render and compare.
+
+    Args:
+        num_views: C
+        height: H in px.
+        width: W in px.
+
+    Raises:
+        InputError: If C, H or C · H · W is too large.
+    """
+    _refuse_beyond(MAX_BLOCKS, num_views, "The views of one step", "take fewer views at once")
+    _refuse_beyond(MAX_HEIGHT, height, "The rows of an image", "make the images smaller")
+    what = f"The pixels of all views of one step, {num_views:,} × {height:,} × {width:,},"
+    _refuse_beyond(MAX_ROWS, num_views * height * width, what, "take fewer views at once, or smaller images")
+
+
+def check_batch(batch: int, channels: int, height: int, width: int) -> None:
+    """Refuse images that are too large, or too many at once, for the structure tensor's kernels.
+
+    Args:
+        batch: B
+        channels: C of an image.
+        height: H in px.
+        width: W in px.
+
+    Raises:
+        InputError: If B · max(C, 3), H or H · W is too large.
+    """
+    _refuse_beyond(MAX_BLOCKS, batch * max(channels, 3), "The planes of a batch of images", "take fewer at once")
+    _refuse_beyond(MAX_HEIGHT, height, "The rows of an image", "make the images smaller")
+    _refuse_beyond(MAX_ROWS, height * width, f"The pixels of an image, {height:,} × {width:,},", "make it smaller")
+
+
+def check_pairs(num_pairs: int) -> None:
+    """Refuse tile lists that are too long.
+
+    Args:
+        num_pairs: Of a Gaussian and a tile that it reaches, in all views.
+
+    Raises:
+        InputError: If they are too many.
+    """
+    remedy = "take fewer views at once, smaller images, or fewer and smaller Gaussians"
+    _refuse_beyond(MAX_PAIRS, num_pairs, "The pairs of a Gaussian and a tile of all views of one step", remedy)

@@ -1,0 +1,148 @@
+"""The three operations of `method.structure_tensor`: convolution along an axis, and what a level does to each pixel
+before and after the convolutions.
+
+cuDNN's depthwise convolutions take several times as long for these long kernels, and torch needs forty launches for the
+rest of a level.
+"""
+
+# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
+# (Triton's launch syntax, kernel[grid](...), is not in its types.)
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+_TILES = {2: (16, 64), 3: (2, 512)}
+"""Rows and columns that a program handles, by the axis: tall where the neighbours are above and below."""
+_PIXELS = 1024
+"""Pixels that a program handles where no neighbours matter."""
+_TINY = 1.1754943508222875e-38
+"""The smallest normal float32, whose logarithm is finite."""
+
+
+@triton.jit(do_not_specialize=["height", "width", "taps"])
+def _correlate(
+    image, kernel, result, height, width, taps,
+    VERTICAL: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr,
+):  # fmt: skip
+    row = tl.program_id(1) * ROWS + tl.arange(0, ROWS)[:, None]
+    column = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)[None, :]
+    inside = (row < height) & (column < width)
+    start = tl.program_id(2).to(tl.int64) * height * width
+    total = tl.zeros([ROWS, COLUMNS], tl.float32)
+    for k in range(taps):
+        step = k - taps // 2
+        if VERTICAL:
+            there = inside & (row + step >= 0) & (row + step < height)
+            value = tl.load(image + start + (row + step) * width + column, there, 0.0)
+        else:
+            there = inside & (column + step >= 0) & (column + step < width)
+            value = tl.load(image + start + row * width + column + step, there, 0.0)
+        total += tl.load(kernel + k) * value
+    tl.store(result + start + row * width + column, total, inside)
+
+
+@triton.jit(do_not_specialize=["n", "channels", "weight_stride"])
+def _differentiate(
+    blurred, blurred_x, blurred_y, total, total_x, total_y, weight, previous, products, energy,
+    n, channels, weight_stride, PIXELS: tl.constexpr,
+):  # fmt: skip
+    pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
+    exists = pixel < n
+    image = tl.program_id(1).to(tl.int64)
+    of_weight = image * weight_stride + pixel
+    within = tl.load(weight + of_weight, exists, 0.0)
+    totals = tl.load(total + of_weight, exists, 1.0)
+    slope_x = tl.load(total_x + of_weight, exists, 0.0)
+    slope_y = tl.load(total_y + of_weight, exists, 0.0)
+    xx = tl.zeros([PIXELS], tl.float32)
+    xy, yy, band = xx, xx, xx
+    for channel in range(channels):
+        at = (image * channels + channel) * n + pixel
+        smoothed = tl.load(blurred + at, exists, 0.0) / totals
+        x = (tl.load(blurred_x + at, exists, 0.0) - smoothed * slope_x) / totals
+        y = (tl.load(blurred_y + at, exists, 0.0) - smoothed * slope_y) / totals
+        difference = tl.load(previous + at, exists, 0.0) - smoothed
+        xx, xy, yy, band = xx + x * x, xy + x * y, yy + y * y, band + difference * difference
+        tl.store(blurred + at, smoothed, exists)
+    at = 3 * image * n + pixel
+    tl.store(products + at, xx * within, exists)
+    tl.store(products + at + n, xy * within, exists)
+    tl.store(products + at + 2 * n, yy * within, exists)
+    tl.store(energy + image * n + pixel, band * within, exists)
+
+
+@triton.jit(do_not_specialize=["n", "weight_stride", "exponent", "frequency"])
+def _aggregate(
+    products, total, energy, total_of_energy, trace_floor, numerator, denominator,
+    n, weight_stride, exponent, frequency, TINY: tl.constexpr, PIXELS: tl.constexpr,
+):  # fmt: skip
+    pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
+    exists = pixel < n
+    image = tl.program_id(1).to(tl.int64)
+    of_weight = image * weight_stride + pixel
+    totals = tl.load(total + of_weight, exists, 1.0)
+    at = 3 * image * n + pixel
+    xx = tl.load(products + at, exists, 0.0) / totals
+    xy = tl.load(products + at + n, exists, 0.0) / totals
+    yy = tl.load(products + at + 2 * n, exists, 0.0) / totals
+    band = tl.load(energy + image * n + pixel, exists, 0.0)
+    band = band / tl.load(total_of_energy + of_weight, exists, 1.0)
+    weight = tl.where(band > 0, tl.exp(exponent * tl.log(tl.maximum(band, TINY))), 0.0)
+    factor = weight * frequency * frequency / (xx + yy + tl.load(trace_floor + image))
+    tl.store(numerator + at, tl.load(numerator + at, exists, 0.0) + factor * xx, exists)
+    tl.store(numerator + at + n, tl.load(numerator + at + n, exists, 0.0) + factor * xy, exists)
+    tl.store(numerator + at + 2 * n, tl.load(numerator + at + 2 * n, exists, 0.0) + factor * yy, exists)
+    at = image * n + pixel
+    tl.store(denominator + at, tl.load(denominator + at, exists, 0.0) + weight, exists)
+
+
+def correlate(image: Tensor, kernel: Tensor, axis: int) -> Tensor:
+    """Correlate along one image axis with zeros outside, as torch's conv2d with the same kernel for every channel.
+
+    Args:
+        image: float32 [B, C, H, W]
+        kernel: float32 [K], K odd.
+        axis: 2 for rows (y), 3 for columns (x).
+    """
+    image = image.contiguous()
+    batch, channels, height, width = image.shape
+    result = torch.empty_like(image)
+    rows, columns = _TILES[axis]
+    grid = (triton.cdiv(width, columns), triton.cdiv(height, rows), batch * channels)
+    _correlate[grid](image, kernel, result, height, width, len(kernel), axis == 2, rows, columns)
+    return result
+
+
+def differentiate(
+    blurs: tuple[Tensor, Tensor, Tensor], totals: tuple[Tensor, Tensor, Tensor], weight: Tensor, previous: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """As `structure_tensor._differentiate`, in float32; the first of `blurs` is overwritten."""
+    batch, channels, height, width = blurs[0].shape
+    products, energy = (blurs[0].new_empty((batch, planes, height, width)) for planes in (3, 1))
+    n = height * width
+    _differentiate[triton.cdiv(n, _PIXELS), batch](
+        *blurs, *totals, weight, previous, products, energy,
+        n, channels, n * (len(weight) > 1), _PIXELS,
+    )  # fmt: skip
+    return blurs[0], products, energy
+
+
+def aggregate(
+    tensor: tuple[Tensor, Tensor],
+    energy: tuple[Tensor, Tensor],
+    trace_floor: Tensor,
+    numerator: Tensor,
+    denominator: Tensor,
+    exponent: float,
+    frequency: float,
+) -> None:
+    """As `structure_tensor._aggregate`, in float32."""
+    n = tensor[0].shape[2] * tensor[0].shape[3]
+    _aggregate[triton.cdiv(n, _PIXELS), len(tensor[0])](
+        *tensor, *energy, trace_floor, numerator, denominator,
+        n, n * (len(tensor[1]) > 1), exponent, frequency, _TINY, _PIXELS,
+    )  # fmt: skip

@@ -1,0 +1,82 @@
+"""Sizes that the kernels cannot address are refused, and those that they can are addressed in 64 bits."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from sadgs_ns.errors import InputError
+from sadgs_ns.kernels import limits
+
+harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")
+losses = pytest.importorskip("sadgs_ns.kernels.losses", reason="Triton is not installed")
+rasterization = pytest.importorskip("sadgs_ns.kernels.rasterization", reason="Triton is not installed")
+tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not installed")
+
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def test_the_largest_sizes_pass_and_one_more_is_refused():
+    limits.check_gaussians(1, limits.MAX_ROWS)
+    limits.check_pixels(1, 1, limits.MAX_ROWS)
+    limits.check_batch(1, 3, 1, limits.MAX_ROWS)
+    limits.check_pairs(limits.MAX_PAIRS)
+    for check, sizes in (
+        (limits.check_gaussians, (1, limits.MAX_ROWS + 1)),
+        (limits.check_gaussians, (limits.MAX_BLOCKS + 1, 1)),
+        (limits.check_pixels, (1, 1, limits.MAX_ROWS + 1)),
+        (limits.check_pixels, (1, limits.MAX_HEIGHT + 1, 1)),
+        (limits.check_batch, (1, 3, 1, limits.MAX_ROWS + 1)),
+        (limits.check_batch, (limits.MAX_BLOCKS // 3 + 1, 3, 1, 1)),
+        (limits.check_pairs, (limits.MAX_PAIRS + 1,)),
+    ):
+        with pytest.raises(InputError, match=r"^[^.]+ are [\d,]+, and the Triton kernels can address [\d,]+: [^.]+\.$"):
+            check(*sizes)
+
+
+def render(num_views: int, num_gaussians: int, side: int) -> None:
+    means, viewmats = torch.empty((num_gaussians, 3), device="meta"), torch.empty((num_views, 4, 4), device="meta")
+    rasterization.rasterization(
+        means, means, means, means, means, viewmats, viewmats, side, side,
+        sh_degree=None, packed=False, render_mode="RGB", absgrad=False, rasterize_mode="classic",
+    )  # fmt: skip
+
+
+def test_too_many_gaussians_pixels_or_tile_pairs_are_refused_before_anything_runs():
+    with pytest.raises(InputError, match=r"4 × 200,000,000, are 800,000,000, and .*: take fewer views at once, or"):
+        render(4, 200_000_000, 10)
+    with pytest.raises(InputError, match=r"1 × 30,000 × 30,000, are 900,000,000"):
+        render(1, 10, 30_000)
+    image = torch.empty((1, 30_000, 30_000, 3), device="meta")
+    with pytest.raises(InputError, match="take fewer views at once, or smaller images"):
+        losses.photometric_loss(image, image, (1.0,), ssim_lambda=0.2, l2_lambda=2.0)
+    empty = torch.empty(0)
+    pending = tiles.PendingTiles([], empty, empty, torch.tensor([2**31]), None, 8, (1, 1, 1))
+    with pytest.raises(InputError, match=r"pairs of a Gaussian and a tile .* are 2,147,483,648"):
+        pending.lists()
+
+
+def test_coefficients_beyond_32_bits_are_found_forward_and_backward():
+    """Three Gaussians whose rows of coefficients lie as far apart as those of 48 million: 2 · 2^30 overflows 32 bits.
+
+    Nothing but these rows is touched, so that the memory between them is never made; bytes need the least of it.
+    """
+    stride, n = 2**30, 3
+    means, viewmats = torch.tensor([[0.0, 0.0, 1.0]]).repeat(n, 1).to(DEVICE), torch.eye(4, device=DEVICE)[None]
+    rest, v_rest = (torch.empty(2 * stride + 45, dtype=torch.uint8, device=DEVICE) for _ in range(2))
+    for g in range(n):
+        rest[g * stride : g * stride + 45] = 0
+        rest[g * stride + 3 : g * stride + 6] = torch.tensor([g, 2, 3])  # of the harmonic 0.4886 z
+    first, radii = torch.zeros((n, 3), device=DEVICE), torch.ones((1, n), dtype=torch.int32, device=DEVICE)
+    colors = torch.empty((1, n, 3), device=DEVICE)
+    harmonics._forward[1, 1](means, viewmats, first, rest, radii, colors, n, 3, stride, 1, 128)
+    expected = 0.5 + 0.48860251190292 * torch.tensor([[[0.0, 2, 3], [1, 2, 3], [2, 2, 3]]])
+    torch.testing.assert_close(colors.cpu(), expected)
+    v_colors = torch.tensor([[[10.0, 20, 30], [40, 50, 60], [70, 80, 90]]], device=DEVICE)
+    v_means, v_first = torch.empty_like(means), torch.empty_like(first)
+    harmonics._backward[1,](
+        means, viewmats, rest, radii, colors, v_colors, v_means, v_first, v_rest, n, 0, 1, 3, stride, 3, 1, 32, 2
+    )  # fmt: skip
+    for g in range(n):
+        expected = (0.48860251190292 * v_colors[0, g]).byte()
+        assert torch.equal(v_rest[g * stride + 3 : g * stride + 6], expected)
