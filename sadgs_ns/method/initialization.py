@@ -110,8 +110,10 @@ def clear_of_cameras(means: Tensor, radii: Tensor, positions: Tensor) -> Tensor:
     Returns:
         bool [N]
     """
-    chunks = means.split(65_536)  # all distances at once would take gigabytes on a large capture
-    return torch.cat([torch.cdist(chunk, positions).amin(dim=1) for chunk in chunks]) >= radii
+    # A tree's distances are differences in float64: torch.cdist's matrix products cancel far from the origin.
+    tree = KDTree(positions.detach().cpu().double().numpy())
+    distances, _ = tree.query(means.detach().cpu().double().numpy(), workers=-1)  # [N]
+    return torch.from_numpy(distances).to(means.device) >= radii
 
 
 def camera_extent(positions: Tensor) -> float:

@@ -67,3 +67,13 @@ def test_points_are_clear_of_cameras_from_their_radius_on():
     means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]])
     positions = torch.tensor([[0.0, 0, 2], [9, 0, 0]])
     assert clear_of_cameras(means, torch.tensor([2.0, 2.5, 3.0]), positions).tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize("offset", [0.0, 1_000.0, 100_000.0])
+def test_distances_to_cameras_are_exact_far_from_the_origin(offset: float):
+    generator = torch.Generator().manual_seed(0)
+    means = torch.rand((5_000, 3), generator=generator) + offset
+    positions = torch.rand((40, 3), generator=generator) + offset
+    distances = (means.double()[:, None] - positions.double()).norm(dim=-1).amin(dim=1)  # [5000]
+    radii = distances.float() * torch.where(torch.arange(5_000) % 2 == 0, 0.99, 1.01)
+    assert torch.equal(clear_of_cameras(means, radii, positions), distances >= radii)
