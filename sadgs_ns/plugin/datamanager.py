@@ -17,7 +17,8 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sadgs_ns.data import colmap, image_paths, ply
+from sadgs_ns.data import colmap, ply
+from sadgs_ns.data.validation import names
 
 
 @dataclass
@@ -33,7 +34,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
     The checks are here rather than in the pipeline, because `ns-render dataset` makes a datamanager of its own.
 
     Raises:
-        InputError: As `colmap.read_poses`, `ply.read_points`, `paths.check_names` and `paths.check_paths`.
+        InputError: As `colmap.read_poses`, `ply.read_points`, `names.check_names` and `names.check_paths`.
     """
 
     def __init__(self, config: FullImageDatamanagerConfig, *args: Any, **kwargs: Any) -> None:
@@ -44,7 +45,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
             model = (config.data or parser.data) / parser.colmap_path
             kind = "txt" if (model / "cameras.txt").exists() else "bin"
             if (source := model / f"images.{kind}").is_file():
-                image_paths.check_names((name for name, _, _ in colmap.read_poses(source)), source)
+                names.check_names((name for name, _, _ in colmap.read_poses(source)), source)
             plain = parser._target is ColmapDataParser and parser.max_2D_matches_per_3D_point == 0
             if plain and parser.load_3D_points:
                 self._points = colmap.points_file(model)
@@ -54,7 +55,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         ):
             super().__init__(config, *args, **kwargs)  # type: ignore[arg-type]
         for dataset in (self.train_dataset, self.eval_dataset):
-            image_paths.check_paths(dataset.image_filenames)
+            names.check_paths(dataset.image_filenames)
 
     def create_train_dataset(self) -> InputDataset:
         """nerfstudio's, with COLMAP's points as nerfstudio would give them: it takes ten times as long to read them."""
