@@ -85,7 +85,9 @@ def _points_in_the_run(
     positions: NDArray[np.floating], colors: NDArray[np.uint8], transform: Tensor, scale: float
 ) -> dict[str, Tensor]:
     """Points as nerfstudio's metadata hold them. [P, 3] in the data's frame, [P, 3], [3, 4] into the run's"""
-    homogeneous = torch.from_numpy(np.pad(positions.astype(np.float32), ((0, 0), (0, 1)), constant_values=1))
+    with np.errstate(over="ignore"):  # numbers beyond float32 become infinite, and the model leaves them out
+        positions = positions.astype(np.float32)
+    homogeneous = torch.from_numpy(np.pad(positions, ((0, 0), (0, 1)), constant_values=1))
     return {"points3D_xyz": homogeneous @ transform.T * scale, "points3D_rgb": torch.from_numpy(colors)}
 
 

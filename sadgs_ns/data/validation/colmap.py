@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from sadgs_ns.data import colmap
 from sadgs_ns.data.validation.findings import Finding, collect_findings
-from sadgs_ns.data.validation.geometry import check_centres, check_number, check_positive
+from sadgs_ns.data.validation.geometry import Camera, View, check_points, check_positive, check_views
 from sadgs_ns.data.validation.images import (
     MAX_AUTO_RESOLUTION,
     Frame,
@@ -85,10 +86,11 @@ def check_colmap(
     training = training_images and training_images(len(poses))
     if (listed := data / "train_list.txt").is_file():
         training = len(listed.read_text(encoding="utf8").splitlines())
-    yield from check_number(len(poses), training, poses_path)
-    yield from check_centres(np.array([colmap.camera_centre(pose) for _, _, pose in poses]), poses_path)
+    views = _views(poses, used, poses_path, cameras_path)
+    yield from (of_views := list(check_views(views, training, poses_path)))
     if load_points:
-        yield from _check_points(model_folder)
+        wrong = any(finding.severity == "error" for finding in of_views)
+        yield from _check_points(model_folder, [] if wrong else views)
     if not open_images:
         return
     factor = downscale_factor
@@ -121,7 +123,7 @@ def _check_camera(camera: colmap.Camera, where: str) -> None:
             f"{where} has the model {camera.model}, which nerfstudio cannot read: undistort the images with "
             "`colmap image_undistorter`."
         )
-    focals = 1 if camera.model.startswith("SIMPLE") or "RADIAL" in camera.model else 2
+    focals = _number_of_focals(camera.model)
     values = {"width": camera.width, "height": camera.height}
     values |= {f"focal length {axis}": value for axis, value in zip("xy", camera.params[:focals], strict=False)}
     check_positive(values, where, list(values))
@@ -132,8 +134,41 @@ def _check_camera(camera: colmap.Camera, where: str) -> None:
         )
 
 
-def _check_points(model_folder: Path) -> Iterator[Finding]:
-    """Findings for the SfM points."""
+def _views(
+    poses: Sequence[colmap.Pose], cameras: Mapping[int, colmap.Camera], poses_path: Path, cameras_path: Path
+) -> list[View]:
+    """The poses with their cameras."""
+    described = {camera_id: _describe(camera) for camera_id, camera in cameras.items()}
+    quats = np.array([pose[[1, 2, 3, 0]] for _, _, pose in poses])  # xyzw [V, 4]
+    rotations = Rotation.from_quat(quats).as_matrix()  # [V, 3, 3]
+    return [
+        View(
+            f"{poses_path}: image {name}",
+            f"{cameras_path}: camera {camera_id}",
+            rotation,
+            -rotation.T @ pose[4:],
+            described[camera_id],
+        )
+        for (name, camera_id, pose), rotation in zip(poses, rotations, strict=True)
+    ]
+
+
+def _describe(camera: colmap.Camera) -> Camera:
+    """What COLMAP's parameters of a model that nerfstudio reads stand for."""
+    focals = _number_of_focals(camera.model)
+    fx, fy, (cx, cy, *rest) = camera.params[0], camera.params[focals - 1], camera.params[focals:]
+    tangential = rest[2:] if camera.model == "OPENCV" else ()
+    radial = rest[:2] if camera.model == "OPENCV" else rest
+    fisheye = "FISHEYE" in camera.model
+    return Camera(camera.width, camera.height, fx, fy, cx, cy, tuple(radial), tuple(tangential), fisheye)
+
+
+def _number_of_focals(model: str) -> int:
+    return 1 if model.startswith("SIMPLE") or "RADIAL" in model else 2
+
+
+def _check_points(model_folder: Path, views: Sequence[View]) -> Iterator[Finding]:
+    """Findings for the SfM points, and for how they lie to the views, if there are any."""
     path = colmap.points_file(model_folder)
     random = "add `--load-3D-points False` after `colmap` to start from random points"
     if path is None:
@@ -146,3 +181,5 @@ def _check_points(model_folder: Path) -> Iterator[Finding]:
         yield Finding("error", f"{path} has NaN or infinity in a point: run COLMAP's mapper again, or {random}.")
     if len(positions) == 0:
         yield Finding("error", f"{path} holds no SfM point: run COLMAP's mapper again, or {random}.")
+    elif views and np.isfinite(positions).all():
+        yield from check_points(positions, views, path)

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, ParamSpec
 
+import numpy as np
+
 from sadgs_ns.errors import InputError
 
 
@@ -30,7 +32,8 @@ def collect_findings(check: Callable[_Arguments, Iterator[Finding]]) -> Callable
     @functools.wraps(check)
     def findings(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> list[Finding]:
         try:
-            return list(check(*args, **kwargs))
+            with np.errstate(over="ignore", invalid="ignore"):  # numbers that are nearly infinite
+                return list(check(*args, **kwargs))
         except InputError as error:
             return [Finding("error", str(error))]
 

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sadgs_ns.data.validation.findings import Finding, collect_findings
-from sadgs_ns.data.validation.geometry import check_centres, check_number, check_positive
+from sadgs_ns.data.validation.geometry import Camera, View, check_ply, check_positive, check_views, finite
 from sadgs_ns.data.validation.images import MAX_AUTO_RESOLUTION, Frame, check_images, image_size, scaled_size
 from sadgs_ns.data.validation.layouts import COLMAP_FOLDERS, GIVE_POSES, find_reconstruction, no_layout
 from sadgs_ns.errors import InputError, reason
 
-_PLY_BYTES = {"short": 2, "ushort": 2, "int16": 2, "uint16": 2, "int": 4, "uint": 4, "int32": 4, "uint32": 4,
-              "float": 4, "float32": 4, "double": 8, "float64": 8}  # fmt: skip
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+"""nerfstudio's coefficients, in the order of its distortion_params."""
 
 
 @collect_findings
@@ -56,10 +56,13 @@ def check_nerfstudio(
     factor = downscale_factor
     if factor is None:
         factor = _smaller_copies(folder, Path(described[0]["file_path"])) if open_images else 1
-    frames = []
+    frames, views = [], []
     for frame in described:
-        image, values = Path(frame["file_path"]), {**frame, **meta}
-        check_positive(values, f"{path}: frame {image}", ("fl_x", "fl_y", "cx", "cy", "w", "h"))
+        image, values, where = Path(frame["file_path"]), {**frame, **meta}, f"{path}: frame {frame['file_path']}"
+        check_positive(values, where, ("fl_x", "fl_y", "cx", "cy", "w", "h"))
+        views.append(
+            view_of(frame, where, _camera(values, _distortion_of(meta) or _distortion_of(frame), model, where))
+        )
         mask = frame.get("mask_path")
         frames.append(
             Frame(
@@ -73,12 +76,12 @@ def check_nerfstudio(
         raise InputError(f"{path} names masks for {masked} of {len(frames)} frames: give all of them one, or none.")
     split = meta.get("train_filenames")
     count = len(split) if isinstance(split, list) else training_images and training_images(len(frames))
-    yield from check_number(len(frames), count, path)
-    yield from check_centres(np.array([frame["transform_matrix"] for frame in described])[:, :3, 3], path)
+    yield from (of_views := list(check_views(views, count, path)))
     if open_images:
         yield from check_images(frames, path, look_for_unused=factor == 1)
     if load_points:
-        yield from _check_ply(meta, path)
+        wrong = any(finding.severity == "error" for finding in of_views)
+        yield from _check_ply(meta, path, [] if wrong else views)
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -104,20 +107,53 @@ def frames_of(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
         where = f"{path}: frame {frame['file_path']}"
         try:
             pose = np.array(frame["transform_matrix"], dtype=np.float64)
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError, OverflowError):
             pose = np.empty(0)
         if pose.shape != (4, 4):
             raise InputError(f"{where} has no pose of 4 × 4 numbers: give it a transform_matrix, or remove the frame.")
         if not np.isfinite(pose).all():
             raise InputError(f"{where} has NaN or infinity in its pose: remove the frame, or compute the poses again.")
-        if abs(np.linalg.det(pose[:3, :3])) < 1e-9:
-            raise InputError(f"{where} has no rotation in its pose: remove the frame, or compute the poses again.")
+        if np.abs(pose[3, :3]).max() > 1e-6:
+            raise InputError(f"{where} has a last row in its pose that is not 0 0 0 1: transpose it, or correct it.")
         if not isinstance(frame.get("mask_path", ""), str):
             raise InputError(f"{where} has a mask_path that is no string: correct or remove it.")
     return frames
 
 
-def _check_ply(meta: dict[str, Any], path: Path) -> Iterator[Finding]:
+def view_of(frame: dict[str, Any], where: str, camera: Camera) -> View:
+    """A frame that `frames_of` found good, with its camera."""
+    pose = np.array(frame["transform_matrix"], dtype=np.float64)
+    return View(where, where, (pose[:3, :3] * [1, -1, -1]).T, pose[:3, 3], camera)  # OpenGL's camera axes to OpenCV's
+
+
+def _distortion_of(values: dict[str, Any]) -> dict[str, Any]:
+    """The coefficients that a frame, or all of them, have by name; nerfstudio takes all from one of the two."""
+    listed = values.get("distortion_params")
+    if isinstance(listed, list):
+        return dict(zip(_DISTORTION, listed, strict=False))
+    return {name: values[name] for name in _DISTORTION if name in values}
+
+
+def _camera(values: dict[str, Any], distortion: dict[str, Any], model: str, where: str) -> Camera:
+    """The camera that good values stand for.
+
+    Raises:
+        InputError: If a distortion coefficient is no number, or one that nerfstudio does not support.
+    """
+    size = (int(values["w"]), int(values["h"]))
+    pinhole = (*size, values["fl_x"], values["fl_y"], values["cx"], values["cy"])
+    k1, k2, k3, k4, p1, p2 = (finite(distortion.get(name, 0.0), name, where) for name in _DISTORTION)
+    if model == "FISHEYE624":
+        return Camera(*pinhole, fisheye=True)  # its coefficients have a meaning of their own
+    if model == "OPENCV_FISHEYE":
+        return Camera(*pinhole, radial=(k1, k2, k3, k4), fisheye=True)
+    if k4 != 0:
+        raise InputError(f"{where} has k4 = {k4:g}, which nerfstudio cannot undo: undistort the images yourself.")
+    return Camera(*pinhole, radial=(k1, k2, k3), tangential=(p1, p2))
+
+
+def _check_ply(meta: dict[str, Any], path: Path, views: Sequence[View]) -> Iterator[Finding]:
+    """Findings for the SfM points, and for how they lie to the views, if there are any."""
     name = meta.get("ply_file_path")
     if name is None:
         if (path.parent / COLMAP_FOLDERS[0]).exists():
@@ -125,31 +161,8 @@ def _check_ply(meta: dict[str, Any], path: Path) -> Iterator[Finding]:
         else:
             yield Finding("note", f"{path} has no ply_file_path: training will start from random points.")
         return
-    ply = path.parent / str(name)
     remedy = f"restore it, or remove ply_file_path from {path} to start from random points"
-    try:
-        problem = _ply_problem(ply.read_bytes())
-    except OSError as error:
-        problem = f"cannot be read ({reason(error)})"
-    if problem is not None:
-        yield Finding("error", f"{ply} should hold the SfM points but {problem}: {remedy}.")
-
-
-def _ply_problem(content: bytes) -> str | None:
-    """What is wrong with a PLY file of points, which come first in it; None if nothing."""
-    header, end, body = content.partition(b"end_header\n" if b"end_header\n" in content else b"end_header\r\n")
-    lines = [line.split() for line in header.decode("ascii", "replace").splitlines()]
-    counts = [line[2] for line in lines if line[:2] == ["element", "vertex"] and len(line) == 3]
-    types = [line[1] for line in lines if line[:1] == ["property"] and len(line) == 3]  # lists, of faces, have more
-    if not end or lines[:1] != [["ply"]] or len(counts) != 1 or not counts[0].isdecimal():
-        return "is not a PLY file of points"
-    if int(counts[0]) == 0:
-        return "is empty"
-    if ["format", "ascii", "1.0"] in lines:
-        there = body.count(b"\n") + (not body.endswith(b"\n"))
-    else:
-        there = len(body) // max(sum(_PLY_BYTES.get(kind, 1) for kind in types), 1)
-    return f"is cut off: its header promises {counts[0]} points" if there < int(counts[0]) else None
+    yield from check_ply(path.parent / str(name), views, remedy)
 
 
 def _smaller_copies(folder: Path, image: Path) -> int:
