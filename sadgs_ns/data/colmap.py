@@ -1,6 +1,8 @@
-"""COLMAP's reconstructions, text and binary, read only as far as it takes to check them.
+"""COLMAP's reconstructions, text and binary, read as far as checks and training need them.
 
-nerfstudio's readers trust the files: a corrupt length makes them ask for terabytes, and pycolmap ends the process.
+The libraries' readers trust the files: a corrupt length makes nerfstudio's and pycolmap's ask for terabytes. To find
+the lengths means to walk through the file as the functions here do, which take a tenth of the time of nerfstudio's
+functions, and less than it takes to import pycolmap.
 """
 
 from __future__ import annotations
