@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from sadgs_ns.errors import InputError, reason
 
@@ -63,13 +64,19 @@ class Similarity:
         return scales + math.log(self.scale)
 
     def rotations(self, quats: Array) -> Array:
-        """Rotations of Gaussians in the new frame; a Gaussian is its own point reflection. wxyz [N, 4] → [N, 4]"""
-        rotation = self.orthogonal * np.sign(np.linalg.det(self.orthogonal))
-        import pycolmap  # not above: training comes by here, and never needs it
+        """Rotations of Gaussians in the new frame; a Gaussian is its own point reflection.
 
-        x, y, z, w = pycolmap.Rotation3d(rotation).quat
-        product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-        return quats @ product.T
+        Args:
+            quats: wxyz, of any length. [N, 4]
+
+        Returns:
+            wxyz, of unit length; those without a direction stay as they are. [N, 4]
+        """
+        turn = Rotation.from_matrix(self.orthogonal * np.sign(np.linalg.det(self.orthogonal)))
+        lengths, turned = np.linalg.norm(quats, axis=1), quats.copy()
+        sound = (lengths > 0) & np.isfinite(lengths)  # scipy refuses the others
+        turned[sound] = (turn * Rotation.from_quat(quats[sound][:, [1, 2, 3, 0]])).as_quat()[:, [3, 0, 1, 2]]
+        return turned
 
     def harmonics(self, degree: int) -> Array:
         """D with c' = D c: coefficients, as seen in the new frame, of colours c that depend on the direction.

@@ -6,6 +6,8 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from sadgs_ns.outliers import CAMERA_SHARE, POINT_SHARE, far_outliers
+
 FACE_GRID = 16
 """Points along each side of a face (released code)."""
 FACE_OPACITY = 0.05
@@ -70,6 +72,25 @@ def neighbour_scales(points: Tensor, neighbours: int = 3) -> Tensor:
     return torch.from_numpy(distances[:, 1:].mean(1)).to(points).clamp_min(1e-6 * extent)
 
 
+def plausible_points(points: Tensor) -> Tensor:
+    """Which SfM points to start from: all but those that are not finite or lie absurdly far out.
+
+    A single wild point would otherwise decide the size of the bounding box and of the points on its faces.
+
+    Args:
+        points: World units. [P, 3]
+
+    Returns:
+        bool [P]
+    """
+    return ~_far_outliers(points, POINT_SHARE)
+
+
+def _far_outliers(positions: Tensor, share: float) -> Tensor:
+    """`outliers.far_outliers` of a tensor. [P, 3] → bool [P]"""
+    return torch.from_numpy(far_outliers(positions.detach().cpu().numpy(), share)).to(positions.device)
+
+
 def starting_points(
     points: Tensor, colors: Tensor, *, faces: bool, opacity: float = POINT_OPACITY
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -110,12 +131,16 @@ def clear_of_cameras(means: Tensor, radii: Tensor, positions: Tensor) -> Tensor:
     Returns:
         bool [N]
     """
-    chunks = means.split(65_536)  # all distances at once would take gigabytes on a large capture
-    return torch.cat([torch.cdist(chunk, positions).amin(dim=1) for chunk in chunks]) >= radii
+    # A tree's distances are differences in float64: torch.cdist's matrix products cancel far from the origin.
+    tree = KDTree(positions.detach().cpu().double().numpy())
+    distances, _ = tree.query(means.detach().cpu().double().numpy(), workers=-1)  # [N]
+    return torch.from_numpy(distances).to(means.device) >= radii
 
 
 def camera_extent(positions: Tensor) -> float:
     """Extent of the cameras as 3DGS defines it: 1.1 times the largest distance from their centre.
+
+    Cameras that lie absurdly far from the others (`outliers.far_outliers`) do not count.
 
     Args:
         positions: Camera centres in world units. [C, 3]
@@ -123,5 +148,6 @@ def camera_extent(positions: Tensor) -> float:
     Returns:
         World units; 1 for a single camera or coinciding ones, which have no extent.
     """
+    positions = positions[~_far_outliers(positions, CAMERA_SHARE)]
     extent = 1.1 * float((positions - positions.mean(0)).norm(dim=-1).max())
     return extent if extent > 0 else 1.0

@@ -1,9 +1,8 @@
-"""nerfstudio glue: nerfstudio's loader of whole images, behind checks of the names in the data."""
+"""nerfstudio's loader of whole images, behind checks of the images' names, and with a faster reader of SfM points."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+import copy
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,12 +16,13 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sadgs_ns.data import colmap, image_paths, ply
+from sadgs_ns.data import colmap, ply
+from sadgs_ns.data.validation import names
 
 
 @dataclass
 class SadgsDatamanagerConfig(FullImageDatamanagerConfig):
-    """nerfstudio's."""
+    """nerfstudio's options."""
 
     _target: type = field(default_factory=lambda: SadgsDatamanager)
 
@@ -33,31 +33,32 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
     The checks are here rather than in the pipeline, because `ns-render dataset` makes a datamanager of its own.
 
     Raises:
-        InputError: As `colmap.read_poses`, `ply.read_points`, `paths.check_names` and `paths.check_paths`.
+        InputError: As `colmap.read_poses`, `ply.read_points`, `names.check_names` and `names.check_paths`.
     """
 
     def __init__(self, config: FullImageDatamanagerConfig, *args: Any, **kwargs: Any) -> None:
-        parser = config.dataparser
+        parser = copy.copy(config.dataparser)  # changed below; the one that was given belongs to the run's config.yml
         self._points: Path | None = None
         """COLMAP's points, where nerfstudio does not read them itself."""
         if isinstance(parser, ColmapDataParserConfig):  # before it offers to make smaller images
             model = (config.data or parser.data) / parser.colmap_path
             kind = "txt" if (model / "cameras.txt").exists() else "bin"
             if (source := model / f"images.{kind}").is_file():
-                image_paths.check_names((name for name, _, _ in colmap.read_poses(source)), source)
+                names.check_names((name for name, _, _ in colmap.read_poses(source)), source)
             plain = parser._target is ColmapDataParser and parser.max_2D_matches_per_3D_point == 0
             if plain and parser.load_3D_points:
                 self._points = colmap.points_file(model)
-        with (
-            _set(parser, "load_3D_points", False) if self._points is not None else nullcontext(),
-            _set(parser, "_target", _Nerfstudio) if parser._target is Nerfstudio else nullcontext(),
-        ):
-            super().__init__(config, *args, **kwargs)  # type: ignore[arg-type]
+                parser.load_3D_points = self._points is None
+        if parser._target is Nerfstudio:
+            parser._target = _Nerfstudio
+        config = copy.copy(config)
+        config.dataparser = parser
+        super().__init__(config, *args, **kwargs)  # type: ignore[arg-type]
         for dataset in (self.train_dataset, self.eval_dataset):
-            image_paths.check_paths(dataset.image_filenames)
+            names.check_paths(dataset.image_filenames)
 
     def create_train_dataset(self) -> InputDataset:
-        """nerfstudio's, with COLMAP's points as nerfstudio would give them: it takes ten times as long to read them."""
+        """Add COLMAP's points to what nerfstudio makes; it would read the same ones in ten times the time."""
         if self._points is not None:
             outputs = self.train_dataparser_outputs
             points = colmap.read_points(self._points)
@@ -65,9 +66,11 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         return super().create_train_dataset()
 
     def create_eval_dataset(self) -> InputDataset:
-        """nerfstudio's, without reading the points a second time: nothing looks for them here."""
-        with _set(self.config.dataparser, "load_3D_points", False):
-            return super().create_eval_dataset()
+        """Make the dataset without reading the points a second time: nothing looks for them here."""
+        parser: Any = self.config.dataparser
+        if hasattr(parser, "load_3D_points"):
+            parser.load_3D_points = False
+        return super().create_eval_dataset()
 
 
 class _Nerfstudio(Nerfstudio):
@@ -83,20 +86,15 @@ class _Nerfstudio(Nerfstudio):
 def _points_in_the_run(
     positions: NDArray[np.floating], colors: NDArray[np.uint8], transform: Tensor, scale: float
 ) -> dict[str, Tensor]:
-    """Points as nerfstudio's metadata hold them. [P, 3] in the data's frame, [P, 3], [3, 4] into the run's"""
-    homogeneous = torch.from_numpy(np.pad(positions.astype(np.float32), ((0, 0), (0, 1)), constant_values=1))
+    """Points as nerfstudio's metadata hold them.
+
+    Args:
+        positions: In the data's frame. [P, 3]
+        colors: In 0 … 255. [P, 3]
+        transform: From the data's frame to the run's. [3, 4]
+        scale: Factor after the transform.
+    """
+    with np.errstate(over="ignore"):  # numbers beyond float32 become infinite, and the model leaves them out
+        positions = positions.astype(np.float32)
+    homogeneous = torch.from_numpy(np.pad(positions, ((0, 0), (0, 1)), constant_values=1))
     return {"points3D_xyz": homogeneous @ transform.T * scale, "points3D_rgb": torch.from_numpy(colors)}
-
-
-@contextmanager
-def _set(parser: Any, option: str, value: Any) -> Iterator[None]:
-    """For the duration, a parser's configuration, if it has the option, has this value; `config.yml` keeps its own."""
-    if not hasattr(parser, option):
-        yield
-        return
-    before = getattr(parser, option)
-    setattr(parser, option, value)
-    try:
-        yield
-    finally:
-        setattr(parser, option, before)

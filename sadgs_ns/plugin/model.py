@@ -30,9 +30,16 @@ from torch import Tensor
 
 from sadgs_ns.data.cameras import refuse_unsupported_cameras
 from sadgs_ns.errors import InputError
-from sadgs_ns.method.initialization import POINT_OPACITY, camera_extent, clear_of_cameras, starting_points
+from sadgs_ns.method.initialization import (
+    POINT_OPACITY,
+    camera_extent,
+    clear_of_cameras,
+    plausible_points,
+    starting_points,
+)
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.outliers import POINT_SHARE, REACH
 from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world
 
 WITHOUT_EFFECT = {
@@ -178,6 +185,13 @@ class SadgsModel(SplatfactoModel):
             means, colors, scales, opacities = starting_points(points, torch.rand((len(points), 3)), faces=False)
         else:
             points, colors = self.seed_points[0].float(), self.seed_points[1].float() / 255.0
+            plausible = plausible_points(points)  # [P]
+            if not plausible.all():
+                CONSOLE.print(
+                    f"[yellow]Leaving out {int((~plausible).sum())} of {len(points)} SfM points, which are not finite "
+                    f"or more than {REACH:g} times as far out as {POINT_SHARE:.0%} of them.[/]"
+                )
+                points, colors = points[plausible], colors[plausible]
             means, colors, scales, opacities = starting_points(
                 points, colors, faces=config.bounding_box_points, opacity=config.initial_opacity
             )

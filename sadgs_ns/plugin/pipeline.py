@@ -19,7 +19,7 @@ from torch import Tensor
 
 from sadgs_ns import kernels
 from sadgs_ns.data.cameras import refuse_failed_undistortion, refuse_unsupported_cameras
-from sadgs_ns.data.parser_validation import findings_of
+from sadgs_ns.data.validation.parsers import findings_of
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.codes import HIGHEST_FREQUENCY, encode
 from sadgs_ns.method.memory import STEP_BYTES

@@ -19,7 +19,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from sadgs_ns.atomic import atomic_path
-from sadgs_ns.data.parser_validation import check_ahead
+from sadgs_ns.data.validation.parsers import check_ahead
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
 from sadgs_ns.plugin import checkpoints
 from sadgs_ns.plugin.compilation import compile_kernels

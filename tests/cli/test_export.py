@@ -138,6 +138,8 @@ def test_covariances_turn_with_the_world(seed: int, reflection: bool):
     after = covariances(similarity.rotations(quats), similarity.log_scales(scales))
     expected = scale**2 * orthogonal @ covariances(quats, scales) @ orthogonal.T
     np.testing.assert_allclose(after, expected, atol=1e-12 * np.abs(expected).max())
+    broken = np.array([[0.0, 0, 0, 0], [np.nan, 0, 0, 0], [1, np.inf, 0, 0]])
+    assert not np.isfinite(similarity.rotations(broken)[1:]).all(axis=1).any()  # the export then drops them
     moved = similarity.positions(means)
     np.testing.assert_allclose(moved[1] - moved[0], scale * orthogonal @ (means[1] - means[0]), atol=1e-12)
     np.testing.assert_allclose(similarity.inverse().positions(moved), means, atol=1e-12)

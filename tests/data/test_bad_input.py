@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
@@ -32,6 +33,7 @@ from runs import (
     train,
 )
 from scenes import HEIGHT, WIDTH
+from torch import Tensor
 
 from sadgs_ns.cli import doctor
 from sadgs_ns.data import colmap, validation
@@ -167,6 +169,65 @@ def flip_middle_byte(name: str) -> Callable[[Path], None]:
     return spoil
 
 
+def move_points(change: Callable[[np.ndarray], np.ndarray], ext: str = ".bin") -> Callable[[Path], None]:
+    """Change the positions [P, 3] of a COLMAP model's points."""
+
+    def move(cameras: dict, images: dict, points: dict) -> None:
+        positions = change(np.array([point.xyz for point in points.values()]))
+        for (index, point), xyz in zip(list(points.items()), positions, strict=True):
+            points[index] = point._replace(xyz=xyz)
+
+    return model(move, ext)
+
+
+def move_cameras(change: Callable[[np.ndarray], np.ndarray], ext: str = ".bin") -> Callable[[Path], None]:
+    """Change the centres [V, 3] of a COLMAP model's cameras."""
+
+    def move(cameras: dict, images: dict, points: dict) -> None:
+        rotations = [colmap_parsing_utils.qvec2rotmat(image.qvec) for image in images.values()]
+        centres = [-rotation.T @ image.tvec for rotation, image in zip(rotations, images.values(), strict=True)]
+        for (index, image), rotation, centre in zip(
+            list(images.items()), rotations, change(np.array(centres)), strict=True
+        ):
+            images[index] = image._replace(tvec=-rotation @ centre)
+
+    return model(move, ext)
+
+
+def set_camera(kind: str, *params: float, ext: str = ".bin") -> Callable[[Path], None]:
+    """Give a COLMAP model this camera."""
+    camera = colmap_parsing_utils.Camera(1, kind, WIDTH, HEIGHT, np.array(params))
+    return model(lambda cameras, images, points: cameras.update({1: camera}), ext)
+
+
+def change_poses(*frames: int, name: str = "transforms.json", times: np.ndarray) -> Callable[[Path], None]:
+    """Multiply the poses of some frames with a matrix [4, 4] from the right."""
+
+    def change(content: dict[str, Any]) -> None:
+        for frame in frames:
+            pose = np.array(content["frames"][frame]["transform_matrix"]) @ times
+            content["frames"][frame]["transform_matrix"] = pose.tolist()
+
+    return meta(change, name)
+
+
+def with_points(positions: list[list[float]]) -> Callable[[Path], None]:
+    """Give a transforms.json a PLY file of points."""
+
+    def spoil(data: Path) -> None:
+        lines = "".join("{} {} {}\n".format(*position) for position in positions)
+        (data / "p.ply").write_text(PLY.format(len(positions)) + lines)
+        meta(lambda m: m.update(ply_file_path="p.ply"))(data)
+
+    return spoil
+
+
+def one_moved_by(distance: float) -> Callable[[np.ndarray], np.ndarray]:
+    """Move the fourth of some positions [N, 3] along an axis."""
+    return lambda positions: positions + distance * (np.arange(len(positions)) == 3)[:, None] * [1, 0, 0]
+
+
+MIRROR = np.diag([-1.0, 1, 1, 1])
 SPARSE = str(SPARSE_FOLDER)
 FIRST = "images/000.png"
 
@@ -206,6 +267,46 @@ COLMAP = {
     "camera-focal": (
         patch(f"{SPARSE}/cameras.bin", 32, "<d", -5.0),
         r"\S+: camera 1 has focal length x = -5\.0, which must be positive: correct it\.",
+    ),
+    "quaternion-length": (
+        model(lambda cameras, images, points: images.update({1: images[1]._replace(qvec=2 * images[1].qvec)}), ".txt"),
+        r"\S+: image 000\.png has a rotation that is no unit quaternion: run COLMAP's mapper again\.",
+    ),
+    "camera-center": (
+        set_camera("PINHOLE", 40, 40, 1e6, 18),
+        r"\S+: camera 1 has its principal point at \(1e\+06, 18\) px, outside its image of 48 × 36 px: correct .*\.",
+    ),
+    "camera-k1": (
+        set_camera("OPENCV", 40, 40, 24, 18, 50, 0, 0, 0, ext=".txt"),
+        r"\S+/cameras\.txt: camera 1 has the radial distortion 50, 0, which cannot be undone: calibrate .*\.",
+    ),
+    "camera-folds": (
+        set_camera("SIMPLE_RADIAL", 40, 24, 18, -3),
+        r"\S+: camera 1 has the radial distortion -3, which cannot be undone: calibrate the camera again, or .*\.",
+    ),
+    "camera-fisheye-0": (
+        set_camera("OPENCV_FISHEYE", 40, 40, 24, 18, 0, 0, 0, 0),
+        r"\S+: camera 1 is a fisheye with all distortion coefficients 0, and nerfstudio undistorts no such image: .*",
+    ),
+    "camera-p1": (
+        set_camera("OPENCV", 40, 40, 24, 18, 0, 0, 9, 0),
+        r"\S+: camera 1 has p1, p2 = 9, 0, which no lens has: calibrate the camera again\.",
+    ),
+    "poses-shifted": (
+        move_cameras(lambda centres: centres + 1e7),
+        r"\S+/images\.bin has its cameras 1\.73e\+07 units from the origin and only \S+ apart, which float32 cannot .*",
+    ),
+    "pose-far": (
+        move_cameras(one_moved_by(1e6), ".txt"),
+        r"\S+: image 003\.png has its camera \S+ times as far from the other cameras as those are .*: remove .*\.",
+    ),
+    "points-behind": (
+        move_points(lambda positions: positions + np.array([50, 50, 20])),
+        r"\S+/points3D\.bin has points that no camera can see in front of it: take points and poses of one .*\.",
+    ),
+    "points-too-far": (
+        move_points(lambda positions: 1e6 * positions, ".txt"),
+        r"\S+/points3D\.txt has its points \S+ times as far away as the cameras are apart, so that all images .*\.",
     ),
     "one-view": (
         model(lambda cameras, images, points: [images.pop(i) for i in range(2, 11)]),
@@ -278,6 +379,62 @@ NERFSTUDIO = {
         ),
         r"\S+/mask\.png \(and 9 more\) is a mask of another size than \S+/000\.png: resize it\.",
     ),
+    "json-mirrored": (
+        change_poses(4, 5, times=MIRROR),
+        r"\S+: frame images/004\.png \(and 1 more\) has a mirrored pose \(determinant −1\): negate one column .*\.",
+    ),
+    "json-stretched": (
+        change_poses(2, times=np.diag([2.0, 2, 2, 1])),
+        r"\S+: frame images/002\.png has a pose whose rotation is stretched, skewed or 0: remove what scales .*\.",
+    ),
+    "json-transposed": (
+        meta(lambda m: [f.update(transform_matrix=np.transpose(f["transform_matrix"]).tolist()) for f in m["frames"]]),
+        r"\S+: frame images/000\.png has a last row in its pose that is not 0 0 0 1: transpose it, or correct it\.",
+    ),
+    "json-width": (
+        meta(lambda m: [frame.update(w=48.5) for frame in m["frames"]]),
+        r"\S+: frame images/000\.png has w = 48\.5, which is no whole number of pixels: correct it\.",
+    ),
+    "json-center": (
+        meta(lambda m: m["frames"][1].update(cy=-1e6)),
+        r"\S+: frame images/001\.png has its principal point at \(24, -1e\+06\) px, outside its image of .*",
+    ),
+    "json-k1": (
+        meta(lambda m: m.update(k1=50)),
+        r"\S+: frame images/000\.png has the radial distortion 50, 0, 0, which cannot be undone: calibrate .*\.",
+    ),
+    "json-fisheye-0": (
+        meta(lambda m: m.update(camera_model="OPENCV_FISHEYE")),
+        r"\S+: frame images/000\.png is a fisheye with all distortion coefficients 0, and nerfstudio undistorts .*",
+    ),
+    "json-k1-nan": (
+        meta(lambda m: m["frames"][6].update(distortion_params=[float("nan"), 0, 0, 0, 0, 0])),
+        r"\S+: frame images/006\.png has k1 = nan, which is no finite number: correct it\.",
+    ),
+    "json-k4": (
+        meta(lambda m: m.update(k4=0.1)),
+        r"\S+: frame images/000\.png has k4 = 0\.1, which nerfstudio cannot undo: undistort the images yourself\.",
+    ),
+    "json-huge": (
+        meta(lambda m: m.update(fl_x=10**400)),
+        r"\S+: frame images/000\.png has fl_x = .*, which is no finite number: correct it\.",
+    ),
+    "json-shifted": (
+        meta(lambda m: [row.__setitem__(3, row[3] + 1e7) for f in m["frames"] for row in f["transform_matrix"][:3]]),
+        r"\S+ has its cameras 1\.73e\+07 units from the origin and only \S+ apart, which float32 cannot tell apart: .*",
+    ),
+    "json-far": (
+        meta(set_pose(3, 1, 3, 1e6)),
+        r"\S+: frame images/003\.png has its camera \S+ times as far from the other cameras as those are .*\.",
+    ),
+    "ply-too-far": (
+        with_points([[1e6, 0, 0], [1e6, 1, 0], [1e6, 0, 1], [1e6, 1, 1]]),
+        r"\S+/p\.ply has its points \S+ times as far away as the cameras are apart, so that all images .*",
+    ),
+    "ply-nan": (
+        with_points([[0, 0, 0], [1, float("nan"), 0]]),
+        r"\S+/p\.ply should hold the SfM points but has NaN or infinity in a point: restore it, or remove .*\.",
+    ),
     "ply-missing": (
         meta(lambda m: m.update(ply_file_path="points.ply")),
         r"\S+/points\.ply should hold the SfM points but cannot be read \(No such file .*\): .*random points\.",
@@ -298,12 +455,20 @@ NERFSTUDIO = {
     ),
     "ply-not-one": (
         meta(lambda m: m.update(ply_file_path=FIRST)),
-        r"\S+/000\.png should hold the SfM points but is not a PLY file of points: .*\.",
+        r"\S+/000\.png should hold the SfM points but is not a PLY file of points \(.+\): .*\.",
     ),
 }
 BLENDER = {
     "blender-no-val": (remove("transforms_val.json"), r"\S+/transforms_val\.json does not exist: restore it.*"),
     "blender-nan": (meta(set_pose(0, 1, 3, np.inf), "transforms_train.json"), r"\S+: frame \S+ has NaN or inf.*"),
+    "blender-mirrored": (
+        change_poses(1, name="transforms_test.json", times=MIRROR),
+        r"\S+/transforms_test\.json: frame \S+ has a mirrored pose \(determinant −1\): negate one column .*\.",
+    ),
+    "blender-degrees": (
+        meta(lambda m: m.update(camera_angle_x=40), "transforms_train.json"),
+        r"\S+/transforms_train\.json has camera_angle_x = 40, which is no angle of view in radians: correct it\.",
+    ),
     "blender-size": (picture("images/005.png", (40, 30), "RGBA"), r"\S+/005\.png has 40 × 30 px, but its .*"),
 }
 CASES = {
@@ -384,6 +549,88 @@ def test_several_problems_of_one_kind_are_one_finding_and_other_kinds_are_counte
         InputError, match=r"002\.png \(and 2 more\) has 0 bytes: .*\(`sadgs-doctor .*` shows 1 more\.\)"
     ):
         validation.refuse(findings, data)
+
+
+# --- what is unlikely ---
+
+UNLIKELY = {
+    "camera-center": (
+        set_camera("PINHOLE", 40, 40, 60, 18),
+        "warning",
+        r"\S+: camera 1 has its principal point at \(60, 18\) px, outside its image of 48 × 36 px: correct .*\.",
+    ),
+    "camera-corners": (
+        set_camera("SIMPLE_RADIAL", 40, 24, 18, -0.4),
+        "warning",
+        r"\S+: camera 1 has the radial distortion -0\.4, which cannot be undone in the image's corners: .*\.",
+    ),
+    "pose-far": (
+        move_cameras(one_moved_by(100)),
+        "warning",
+        r"\S+: image 003\.png has its camera \S+ times as far from the other cameras as those are .*: remove .*\.",
+    ),
+    "points-far": (
+        move_points(lambda positions: 1e4 * positions),
+        "warning",
+        r"\S+/points3D\.bin has its points \S+ times as far away as the cameras are apart, so that all images .*\.",
+    ),
+    "point-wild": (
+        move_points(one_moved_by(1e5), ".txt"),
+        "note",
+        r"\S+/points3D\.txt has 1 of 60 points more than 30 times as far out as 99% of them: training leaves .*\.",
+    ),
+    "point-beyond-bounds": (
+        move_points(one_moved_by(-1e30)),
+        "note",
+        r"\S+/points3D\.bin has 1 of 60 points more than 30 times as far out as 99% of them: training leaves .*\.",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", UNLIKELY)
+def test_unlikely_data_are_told_of_in_one_sentence(case: str, copied: Callable[[str], Path]):
+    spoil, severity, sentence = UNLIKELY[case]
+    data = copied("colmap")
+    spoil(data)
+    (finding,) = validation.check_data(data)
+    assert finding.severity == severity and re.fullmatch(sentence, finding.sentence), finding
+
+
+def test_points_behind_some_cameras_are_a_warning(copied: Callable[[str], Path]):
+    data = copied("nerfstudio")
+    with_points([[0.5, 0.5, 0.5]] * 4)(data)
+    assert [finding for finding in validation.check_data(data) if finding.severity != "note"] == []
+    change_poses(*range(6), times=np.diag([1.0, -1, -1, 1]))(data)  # OpenCV's axes instead of OpenGL's
+    (finding,) = [finding for finding in validation.check_data(data) if finding.severity != "note"]
+    assert finding.severity == "warning"
+    assert re.fullmatch(r"\S+/p\.ply has points that only 40% of the cameras can see .*\.", finding.sentence)
+
+
+@pytest.mark.parametrize("far", [1e5, 1e30, 1e200])
+def test_a_wild_point_does_not_change_what_training_starts_from(
+    far: float, copied: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    def start(data: Path) -> dict[str, Tensor]:
+        config = configure(tmp_path / "out", parser_of(data), iterations=1)
+        config.pipeline.model.bounding_box_points = True
+        model = set_up(config).pipeline.model
+        return {name: model.gauss_params[name].detach() for name in ("means", "scales", "opacities")}
+
+    data = copied("colmap")
+    move_points(lambda positions: positions[[0, 1, 2, 4, *range(4, 60)]])(data)  # the fourth, twice the fifth
+    sound = start(data)
+    assert "Leaving out" not in capsys.readouterr().out
+    move_points(one_moved_by(far))(data)
+    wild = start(data)
+    assert "Leaving out 1 of 60 SfM points, which are not finite or more than 30 times" in " ".join(
+        capsys.readouterr().out.split()
+    )
+    for name, value in sound.items():
+        assert len(wild[name]) == len(value) - 1
+        assert wild[name].isfinite().all()
+    torch.testing.assert_close(wild["means"][3:], sound["means"][4:])
+    faces = slice(-200, None)
+    torch.testing.assert_close(wild["scales"][faces], sound["scales"][faces])
 
 
 # --- what looks bad and is not ---
@@ -486,8 +733,6 @@ def test_colmap_s_text_and_binary_models_read_alike_and_as_nerfstudio_reads_them
         ):
             assert (name, camera_id) == (image.name, 1)
             assert pose == pytest.approx(np.concatenate([image.qvec, image.tvec]), abs=1e-12)
-            rotation = colmap_parsing_utils.qvec2rotmat(image.qvec)
-            assert colmap.camera_centre(pose) == pytest.approx(-rotation.T @ image.tvec)
         positions, colors = colmap.read_points(folder / f"points3D.{ext}")
         assert positions == pytest.approx(np.array([point.xyz for point in theirs[2].values()]), abs=1e-12)
         assert (colors == np.array([point.rgb for point in theirs[2].values()])).all()

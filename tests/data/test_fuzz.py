@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from sadgs_ns.data.parser_validation import refuse_bad_data
+from sadgs_ns.data.validation.parsers import refuse_bad_data
 from sadgs_ns.demo.scene import SPARSE_FOLDER, write_scene
 from sadgs_ns.errors import InputError
 from sadgs_ns.plugin import presets

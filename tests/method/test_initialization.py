@@ -10,6 +10,7 @@ from sadgs_ns.method.initialization import (
     camera_extent,
     clear_of_cameras,
     neighbour_scales,
+    plausible_points,
     starting_points,
 )
 
@@ -67,3 +68,37 @@ def test_points_are_clear_of_cameras_from_their_radius_on():
     means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]])
     positions = torch.tensor([[0.0, 0, 2], [9, 0, 0]])
     assert clear_of_cameras(means, torch.tensor([2.0, 2.5, 3.0]), positions).tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize("offset", [0.0, 1_000.0, 100_000.0])
+def test_distances_to_cameras_are_exact_far_from_the_origin(offset: float):
+    generator = torch.Generator().manual_seed(0)
+    means = torch.rand((5_000, 3), generator=generator) + offset
+    positions = torch.rand((40, 3), generator=generator) + offset
+    distances = (means.double()[:, None] - positions.double()).norm(dim=-1).amin(dim=1)  # [5000]
+    radii = distances.float() * torch.where(torch.arange(5_000) % 2 == 0, 0.99, 1.01)
+    assert torch.equal(clear_of_cameras(means, radii, positions), distances >= radii)
+
+
+def test_one_wild_camera_does_not_decide_the_extent():
+    positions = torch.rand((20, 3), generator=torch.Generator().manual_seed(0))
+    expected = camera_extent(positions)
+    for far in (1e2, 1e6, 1e30, torch.inf, torch.nan):
+        assert camera_extent(torch.cat([positions, torch.full((1, 3), far)])) == expected
+
+
+@pytest.mark.parametrize("number", [4, 60, 2_000])
+@pytest.mark.parametrize("far", [[1e5, 0, 0], [1e30, -1e30, 1e30], [torch.inf, 0, 0], [0, torch.nan, 0]])
+def test_a_wild_point_is_not_plausible_and_all_others_are(number: int, far: list[float]):
+    points = torch.rand((number, 3), generator=torch.Generator().manual_seed(0))
+    points[2] = torch.tensor(far)
+    assert (~plausible_points(points)).nonzero().tolist() == [[2]]
+
+
+def test_a_sound_cloud_with_a_far_background_is_plausible():
+    generator = torch.Generator().manual_seed(0)
+    near, background = (torch.randn((number, 3), generator=generator) for number in (1_000, 50))
+    assert plausible_points(torch.cat([near, 50 * background])).all()
+    assert plausible_points(torch.zeros((9, 3))).all()
+    assert plausible_points(torch.tensor([[0.0, 0, 0]] * 9 + [[5.0, 0, 0]])).all()  # most coincide
+    assert len(plausible_points(torch.zeros((0, 3)))) == 0

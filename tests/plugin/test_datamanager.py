@@ -29,7 +29,10 @@ READ = ("points3D_xyz", "points3D_rgb")
 
 
 def load(parser: DataParserConfig) -> SadgsDatamanager:
-    return SadgsDatamanagerConfig(dataparser=copy.deepcopy(parser)).setup(device="cpu")
+    config = SadgsDatamanagerConfig(dataparser=copy.deepcopy(parser))
+    datamanager = config.setup(device="cpu")
+    assert config.dataparser == parser  # it goes into the run's config.yml
+    return datamanager
 
 
 @pytest.fixture
@@ -69,7 +72,6 @@ def test_colmap_s_points_are_nerfstudio_s_to_the_bit(
     for metadata in (datamanager.train_dataparser_outputs.metadata, datamanager.train_dataset.metadata):
         for name in READ:
             assert metadata[name].dtype == expected[name].dtype and torch.equal(metadata[name], expected[name])
-    assert datamanager.config.dataparser == parser  # it goes into the run's config.yml
 
 
 def test_matches_of_points_are_left_to_nerfstudio(colmap: ColmapDataParserConfig, reads: list[Path]):
@@ -107,7 +109,6 @@ def test_points_of_a_ply_file_are_read_once_and_without_open3d(
     parser = ply_scene(tmp_path, text, COLORS.astype(np.uint8))
     datamanager = load(parser)
     assert reads == [] and mine == [tmp_path / "points.ply"]
-    assert datamanager.config.dataparser == parser  # it goes into the run's config.yml
     outputs = datamanager.train_dataparser_outputs
     homogeneous = torch.cat([torch.tensor(POSITIONS), torch.ones(3, 1)], dim=1)
     expected = (homogeneous @ outputs.dataparser_transform.T.double() * outputs.dataparser_scale).float()
@@ -148,4 +149,3 @@ def test_points_that_are_not_asked_for_are_not_read(colmap: ColmapDataParserConf
     parser = dataclasses.replace(colmap, load_3D_points=False)
     datamanager = load(parser)
     assert reads == [] and not datamanager.train_dataset.metadata.keys() & set(READ)
-    assert datamanager.config.dataparser == parser

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from PIL import ExifTags, Image
 
-from sadgs_ns.data.image_validation import IMAGE_SUFFIXES
+from sadgs_ns.data.validation.images import IMAGE_SUFFIXES
 
 _UNREAD_SUFFIXES = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"}
 """Of photos in formats that phones and cameras write and COLMAP does not read."""

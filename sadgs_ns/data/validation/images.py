@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
+import numpy as np
 from PIL import Image, UnidentifiedImageError
 
+from sadgs_ns.data.validation.findings import Finding
 from sadgs_ns.errors import reason
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"}
+MAX_AUTO_RESOLUTION = 1600
+"""px; nerfstudio looks for smaller copies of images that are larger than this."""
+Rounding = Literal["floor", "round", "ceil"]
 Size = tuple[int, int]
 """Width and height in px."""
 
@@ -42,6 +49,26 @@ class _Image:
 def image_size(path: Path) -> Size:
     """Width and height in px, zeros where they cannot be read."""
     return _inspect(path).size
+
+
+def scaled_size(size: Size, factor: int, rounding: Rounding) -> Size:
+    """A camera's width and height after nerfstudio scaled them down, in its float32."""
+    width, height = (float(np.float32(side) * np.float32(1.0 / factor)) for side in size)
+    to_int = {"floor": math.floor, "round": lambda value: math.floor(value + 0.5), "ceil": math.ceil}[rounding]
+    return to_int(width), to_int(height)
+
+
+def smaller_folder(folder: Path, factor: int) -> Path:
+    """Where nerfstudio keeps a folder's images scaled down."""
+    return folder.with_name(f"{folder.name}_{factor}") if factor > 1 else folder
+
+
+def check_images(frames: Sequence[Frame], source: Path, look_for_unused: bool = False) -> Iterator[Finding]:
+    """Findings for the frames' images and masks and, on demand, for images beside them."""
+    for sentence in image_problems(frames, source):
+        yield Finding("error", sentence)
+    if look_for_unused and (unused := unused_images(frames, source)) is not None:
+        yield Finding("warning", unused)
 
 
 def image_problems(frames: Sequence[Frame], source: Path) -> Iterator[str]:

@@ -1,0 +1,44 @@
+"""Checks of a synthetic scene in the layout of NeRF's: `transforms_train.json` and its siblings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+from sadgs_ns.data.validation.findings import Finding, collect_findings
+from sadgs_ns.data.validation.geometry import Camera, check_positive, check_rotations, check_views
+from sadgs_ns.data.validation.images import Frame, check_images, image_size
+from sadgs_ns.data.validation.layouts import no_layout
+from sadgs_ns.data.validation.transforms import frames_of, read_json, view_of
+from sadgs_ns.errors import InputError
+
+
+@collect_findings
+def check_blender(data: Path, *, open_images: bool = True) -> Iterator[Finding]:
+    """Findings for a synthetic scene in the layout of NeRF's: `transforms_train.json` and its siblings."""
+    if not (data / "transforms_train.json").is_file():
+        raise InputError(no_layout(data))
+    for split in ("train", "val", "test"):
+        path = data / f"transforms_{split}.json"
+        if split == "test" and not path.is_file():
+            yield Finding("warning", f"{path} does not exist: `ns-eval` will have nothing to measure.")
+            continue
+        meta = read_json(path)
+        described = frames_of(meta, path)
+        check_positive(meta, str(path), ["camera_angle_x"])
+        if not meta["camera_angle_x"] < math.pi:
+            angle = f"camera_angle_x = {meta['camera_angle_x']:g}"
+            raise InputError(f"{path} has {angle}, which is no angle of view in radians: correct it.")
+        images = [data / (frame["file_path"].replace("./", "") + ".png") for frame in described]
+        size = image_size(images[0])  # that of all cameras
+        width, height = size if open_images and any(size) else (1, 1)  # for the rest any will do
+        focal = 0.5 * width / math.tan(0.5 * meta["camera_angle_x"])
+        camera = Camera(width, height, focal, focal, width / 2, height / 2)
+        views = [view_of(frame, f"{path}: frame {frame['file_path']}", camera) for frame in described]
+        if split == "train":
+            yield from check_views(views, len(views), path)
+        else:
+            yield from check_rotations(views)
+        if open_images:
+            yield from check_images([Frame(image, size if any(size) else None) for image in images], path)

@@ -1,0 +1,52 @@
+"""What a check found, and how an error among it stops a run."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, ParamSpec
+
+import numpy as np
+
+from sadgs_ns.errors import InputError
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing to know about a data folder."""
+
+    severity: Literal["error", "warning", "note"]
+    """Whether training is refused, may disappoint, or just behaves in a way worth knowing."""
+    sentence: str
+    """Names the file and the remedy."""
+
+
+_Arguments = ParamSpec("_Arguments")
+
+
+def collect_findings(check: Callable[_Arguments, Iterator[Finding]]) -> Callable[_Arguments, list[Finding]]:
+    """The findings of a check, or of one that gave up with an InputError this alone."""
+
+    @functools.wraps(check)
+    def findings(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> list[Finding]:
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):  # numbers that are nearly infinite
+                return list(check(*args, **kwargs))
+        except InputError as error:
+            return [Finding("error", str(error))]
+
+    return findings
+
+
+def refuse(findings: Sequence[Finding], data: Path) -> None:
+    """Raise the first error among findings.
+
+    Raises:
+        InputError: With the error's sentence, and how many more there are.
+    """
+    errors = [finding.sentence for finding in findings if finding.severity == "error"]
+    if errors:
+        more = f" (`sadgs-doctor {data}` shows {len(errors) - 1} more.)" if len(errors) > 1 else ""
+        raise InputError(errors[0] + more)

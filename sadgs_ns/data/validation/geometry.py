@@ -1,0 +1,296 @@
+"""Checks of numbers that all layouts share: cameras, poses and points, with medians and quantiles rather than means."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sadgs_ns.data import ply
+from sadgs_ns.data.validation.findings import Finding
+from sadgs_ns.errors import InputError
+from sadgs_ns.outliers import CAMERA_SHARE, POINT_SHARE, REACH, far_outliers
+
+_FLOAT32_STEP = 2.0**-23
+"""Distance of a float32 to the next one, relative to its size; nerfstudio reads poses in float32."""
+_FEWEST_STEPS = 1_000
+"""Steps of float32 within the cameras' spread under which their positions are too coarse to train with."""
+_FARTHEST_CENTER = 10
+"""Image sizes; a principal point this far from the middle of its image is a mistake, and no crop's."""
+_STRONGEST_DISTORTION = 2.0
+"""Quotient of a pixel's distorted and undistorted radius from which on OpenCV's undistortion does not converge."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics, as all layouts give them."""
+
+    width: int
+    """px."""
+    height: int
+    """px."""
+    fx: float
+    """px."""
+    fy: float
+    """px."""
+    cx: float
+    """px from the left edge."""
+    cy: float
+    """px from the upper edge."""
+    radial: tuple[float, ...] = ()
+    """k1, k2, …; OpenCV's polynomial of the radius, or of the angle for a fisheye."""
+    tangential: tuple[float, ...] = ()
+    """p1, p2 as OpenCV defines them."""
+    fisheye: bool = False
+
+
+class View(NamedTuple):
+    """A camera somewhere."""
+
+    where: str
+    """The start of a sentence about its pose: file and image."""
+    where_camera: str
+    """The start of a sentence about its camera."""
+    rotation: NDArray[np.float64]
+    """World to camera, in OpenCV's axes. [3, 3]"""
+    centre: NDArray[np.float64]
+    """World units. [3]"""
+    camera: Camera
+
+
+def check_positive(values: Mapping[str, Any], where: str, names: Sequence[str]) -> None:
+    """See whether values are there and finite, widths and heights whole, and all but the principal point positive.
+
+    Args:
+        values: Any JSON values.
+        where: The start of a sentence about them.
+        names: Those that must be there.
+
+    Raises:
+        InputError: If one is not.
+    """
+    for name in names:
+        if name not in values:
+            raise InputError(f"{where} has no {name}: give it one, for all frames or this one.")
+        value = finite(values[name], name, where)
+        if name not in ("cx", "cy") and value <= 0:
+            raise InputError(f"{where} has {name} = {value}, which must be positive: correct it.")
+        if name in ("w", "h") and value != int(value):
+            raise InputError(f"{where} has {name} = {value}, which is no whole number of pixels: correct it.")
+
+
+def finite(value: Any, name: str, where: str) -> float:
+    """A JSON value that is a finite number.
+
+    Raises:
+        InputError: If it is not.
+    """
+    try:
+        if not isinstance(value, bool) and isinstance(value, int | float) and math.isfinite(value):
+            return value
+    except OverflowError:  # an integer beyond float64
+        value = "a number beyond all bounds"
+    raise InputError(f"{where} has {name} = {value!r}, which is no finite number: correct it.")
+
+
+def check_views(views: Sequence[View], training: int | None, source: Path) -> Iterator[Finding]:
+    """Findings for number, cameras, rotations and positions of the views.
+
+    Args:
+        views: All of them.
+        training: How many are trained on, where that is known.
+        source: The file that they are from.
+    """
+    yield from _check_number(len(views), training, source)
+    yield from check_rotations(views)
+    yield from _check_centres(views, source)
+    for camera, where in {view.camera: view.where_camera for view in reversed(views)}.items():  # the first view of each
+        yield from _check_camera(camera, where)
+
+
+def _check_number(views: int, training: int | None, source: Path) -> Iterator[Finding]:
+    if views < 2:
+        yield Finding("error", f"{source} has 1 view, which shows no depth: take at least 2 images, better 20 or more.")
+    elif training == 0:
+        yield Finding("error", f"{source} leaves no view for training: name some in its list of training images.")
+    elif training is not None and training < 3:
+        yield Finding(
+            "warning",
+            f"{source} leaves {training} training view{'s' * (training > 1)}: so few fix no shape; take 20 or more.",
+        )
+    elif training == views and views < 10:
+        yield Finding("note", f"{source} has {views} views, none of them held out: `ns-eval` cannot measure any.")
+
+
+def check_rotations(views: Sequence[View]) -> Iterator[Finding]:
+    """Findings for rotations that are none."""
+    rotations = np.stack([view.rotation for view in views])  # [V, 3, 3]
+    skewed = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > 0.01
+    mirrored = ~skewed & (np.linalg.det(rotations) < 0)
+    for wrong, what, remedy in (
+        (skewed, "a pose whose rotation is stretched, skewed or 0", "remove what scales its three columns"),
+        (mirrored, "a mirrored pose (determinant −1)", "negate one column of its rotation"),
+    ):
+        if wrong.any():
+            where = views[int(wrong.argmax())].where
+            yield Finding("error", f"{_and_more(where, wrong)} has {what}: {remedy}, or compute the poses again.")
+
+
+def _check_centres(views: Sequence[View], source: Path) -> Iterator[Finding]:
+    centres = np.stack([view.centre for view in views])  # [V, 3]
+    largest = np.abs(centres - centres.mean(axis=0)).max()
+    if len(centres) > 1 and largest <= 1e-9 * max(np.abs(centres).max(), 1.0):
+        yield Finding(
+            "error", f"{source} has all {len(centres)} cameras in one place, which shows no depth: move between images."
+        )
+        return
+    distances, spread = _distances(centres), _spread(centres)
+    offset = float(np.linalg.norm(np.median(centres, axis=0)))
+    if spread > 0 and offset * _FLOAT32_STEP * _FEWEST_STEPS > spread:
+        yield Finding(
+            "error",
+            f"{source} has its cameras {offset:.3g} units from the origin and only {spread:.3g} apart, which float32 "
+            "cannot tell apart: subtract their centre from all poses and points.",
+        )
+    far = far_outliers(centres, CAMERA_SHARE)
+    if far.any():
+        first = views[int(far.argmax())].where
+        times = f"{distances.max() / spread:.3g} times as far from the other cameras as those are from each other"
+        too_far = bool(distances.max() * _FLOAT32_STEP * _FEWEST_STEPS > spread)
+        yield Finding(
+            "error" if too_far else "warning",
+            f"{_and_more(first, far)} has its camera {times}: remove the image from the poses, or compute them again.",
+        )
+
+
+def _check_camera(camera: Camera, where: str) -> Iterator[Finding]:
+    width, height = camera.width, camera.height
+    off = max(abs(camera.cx / width - 0.5), abs(camera.cy / height - 0.5))  # image sizes from its middle
+    if off > 0.5:
+        center = f"its principal point at ({camera.cx:g}, {camera.cy:g}) px, outside its image of {width} × {height} px"
+        yield Finding(
+            "error" if off > _FARTHEST_CENTER else "warning", f"{where} has {center}: correct cx and cy, in pixels."
+        )
+    if any(abs(value) > 0.5 for value in camera.tangential):
+        coefficients = ", ".join(f"{value:g}" for value in camera.tangential)
+        yield Finding("error", f"{where} has p1, p2 = {coefficients}, which no lens has: calibrate the camera again.")
+    if not any(camera.radial):
+        if camera.fisheye and camera.radial:
+            yield Finding(
+                "error",
+                f"{where} is a fisheye with all distortion coefficients 0, and nerfstudio undistorts no such image: "
+                "undistort the images yourself, or give one coefficient a tiny value (k1 = 1e-9).",
+            )
+        return
+    coefficients = ", ".join(f"{value:g}" for value in camera.radial)
+    told = f"{where} has the radial distortion {coefficients}, which cannot be undone"
+    half_width, half_height = width / 2 / camera.fx, height / 2 / camera.fy
+    if not _can_be_undone(camera, min(half_width, half_height)):
+        yield Finding("error", f"{told}: calibrate the camera again, or undistort the images yourself.")
+    elif not camera.fisheye and not _can_be_undone(camera, math.hypot(half_width, half_height)):
+        yield Finding("warning", f"{told} in the image's corners: they will be wrong; calibrate the camera again.")
+
+
+def _can_be_undone(camera: Camera, radius: float) -> bool:
+    """Whether pixels up to a distorted radius, in focal lengths from the middle, each have one place that they show."""
+    undistorted = np.linspace(0, np.pi if camera.fisheye else 4 * radius, 2049)  # radii, or angles of a fisheye
+    with np.errstate(all="ignore"):  # large coefficients overflow
+        factor = np.polyval([*reversed(camera.radial), 1.0], undistorted**2)
+        distorted = undistorted * factor
+        falls = ~(np.diff(distorted) > 0)
+    end = int(falls.argmax()) if falls.any() else len(falls)  # so far it rises
+    if not distorted[end] >= radius:
+        return False
+    strength = factor[: end + 1][distorted[: end + 1] >= radius][0]
+    return bool(camera.fisheye or strength <= _STRONGEST_DISTORTION)
+
+
+def check_ply(path: Path, views: Sequence[View], remedy: str) -> Iterator[Finding]:
+    """Findings for a PLY file of SfM points, and for how they lie to the views, if there are any."""
+    try:
+        positions, _ = ply.read_points(path)
+    except InputError as error:
+        problem = str(error).removeprefix(f"{path} ").rpartition(": ")[0]
+    else:
+        problem = "is empty" if len(positions) == 0 else None
+        if not np.isfinite(positions).all():
+            problem = "has NaN or infinity in a point"
+        elif problem is None and views:
+            yield from check_points(positions, views, path)
+    if problem is not None:
+        yield Finding("error", f"{path} should hold the SfM points but {problem}: {remedy}.")
+
+
+def check_points(positions: NDArray[np.floating], views: Sequence[View], path: Path) -> Iterator[Finding]:
+    """Findings for SfM points beside the views that should show them.
+
+    Args:
+        positions: Finite, in the world of the views. [P, 3]
+        views: All of them.
+        path: The points' file.
+    """
+    positions = positions.astype(np.float64)
+    far = far_outliers(positions, POINT_SHARE)
+    if far.any():
+        yield Finding(
+            "note",
+            f"{path} has {far.sum()} of {len(far)} points more than {REACH:g} times as far out as {POINT_SHARE:.0%} of "
+            "them: training leaves them out.",
+        )
+    positions = positions[~far]
+    centres = np.stack([view.centre for view in views])  # [V, 3]
+    middle, spread = np.median(centres, axis=0), _spread(centres)
+    distance = float(np.median(np.linalg.norm(positions - middle, axis=1)))
+    remedy = "take points and poses of one reconstruction, in the same units and axes"
+    if spread > 0 and distance > 1e3 * spread:
+        yield Finding(
+            "error" if distance > 1e5 * spread else "warning",
+            f"{path} has its points {distance / spread:.3g} times as far away as the cameras are apart, so that all "
+            f"images see them from one direction: {remedy}.",
+        )
+        return
+    seeing = _share_of_views_with_points(positions, views)
+    if seeing < 0.5:
+        whom = f"only {seeing:.0%} of the cameras" if seeing else "no camera"
+        yield Finding(
+            "warning" if seeing else "error", f"{path} has points that {whom} can see in front of it: {remedy}."
+        )
+
+
+def _share_of_views_with_points(positions: NDArray[np.float64], views: Sequence[View]) -> float:
+    """Which part of the views has any of the points before it, on its image or not far beside it, in [0, 1].
+
+    Looks at a part of many views and of many points, evenly through them.
+    """
+    positions = positions[:: len(positions) // 10_000 + 1]  # [P, 3]
+    views = views[:: len(views) // 50 + 1]
+    seeing = 0
+    for view in views:
+        x, y, z = view.rotation @ (positions - view.centre).T  # [P] each
+        visible = z > 0
+        if not view.camera.fisheye:
+            camera = view.camera  # lenses and principal points move what is seen by less than half an image
+            visible &= np.abs(x * camera.fx + (camera.cx - camera.width / 2) * z) < camera.width * z
+            visible &= np.abs(y * camera.fy + (camera.cy - camera.height / 2) * z) < camera.height * z
+        seeing += bool(visible.any())
+    return seeing / len(views)
+
+
+def _distances(centres: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distances of centres [V, 3] from their median. [V]"""
+    return np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
+
+
+def _spread(centres: NDArray[np.float64]) -> float:
+    """How far from their median most of the centres [V, 3] lie; one of them, at least, does not count."""
+    return float(np.quantile(_distances(centres), CAMERA_SHARE, method="lower"))
+
+
+def _and_more(where: str, which: NDArray[np.bool_]) -> str:
+    """The first of the views that something is so of, and how many others there are."""
+    return f"{where} (and {which.sum() - 1} more)" if which.sum() > 1 else where

@@ -1,0 +1,173 @@
+"""Checks of a `transforms.json`, as `ns-process-data` writes it."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sadgs_ns.data.validation.findings import Finding, collect_findings
+from sadgs_ns.data.validation.geometry import Camera, View, check_ply, check_positive, check_views, finite
+from sadgs_ns.data.validation.images import MAX_AUTO_RESOLUTION, Frame, check_images, image_size, scaled_size
+from sadgs_ns.data.validation.layouts import COLMAP_FOLDERS, GIVE_POSES, find_reconstruction, no_layout
+from sadgs_ns.errors import InputError, reason
+
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+"""nerfstudio's coefficients, in the order of its distortion_params."""
+
+
+@collect_findings
+def check_nerfstudio(
+    data: Path,
+    *,
+    downscale_factor: int | None = None,
+    load_points: bool = True,
+    training_images: Callable[[int], int] | None = lambda count: math.ceil(0.9 * count),
+    open_images: bool = True,
+) -> Iterator[Finding]:
+    """Findings for a `transforms.json`, as `ns-process-data` writes it.
+
+    Args:
+        data: The folder, or the file itself.
+        downscale_factor: As of nerfstudio's parser: None chooses by size.
+        load_points: Whether the SfM points will be read.
+        training_images: How many of so many views are trained on; None if that depends on names.
+        open_images: Whether to look into the images, too.
+    """
+    path = data if data.suffix == ".json" else data / "transforms.json"
+    folder = path.parent
+    if not path.is_file():
+        if (found := find_reconstruction(data)) is not None:
+            raise InputError(
+                f"{path} does not exist, but {data / found} holds a COLMAP reconstruction: end the command with "
+                f"`colmap --colmap-path {found}`."
+            )
+        raise InputError(no_layout(data) if data.suffix != ".json" else f"{path} does not exist: {GIVE_POSES}.")
+    meta = read_json(path)
+    described = frames_of(meta, path)
+    model = meta.get("camera_model", "OPENCV")
+    perspective = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FISHEYE624")
+    if model not in perspective:
+        raise InputError(f"{path} has the camera model {model!r}: give one of {', '.join(perspective)}.")
+    factor = downscale_factor
+    if factor is None:
+        factor = _smaller_copies(folder, Path(described[0]["file_path"])) if open_images else 1
+    frames, views = [], []
+    for frame in described:
+        image, values, where = Path(frame["file_path"]), {**frame, **meta}, f"{path}: frame {frame['file_path']}"
+        check_positive(values, where, ("fl_x", "fl_y", "cx", "cy", "w", "h"))
+        views.append(
+            view_of(frame, where, _camera(values, _distortion_of(meta) or _distortion_of(frame), model, where))
+        )
+        mask = frame.get("mask_path")
+        frames.append(
+            Frame(
+                folder / (f"images_{factor}/{image.name}" if factor > 1 else image),
+                scaled_size((int(values["w"]), int(values["h"])), factor, "floor"),
+                None if mask is None else folder / (f"masks_{factor}/{Path(mask).name}" if factor > 1 else mask),
+            )
+        )
+    masked = sum(frame.mask is not None for frame in frames)
+    if 0 < masked < len(frames):
+        raise InputError(f"{path} names masks for {masked} of {len(frames)} frames: give all of them one, or none.")
+    split = meta.get("train_filenames")
+    count = len(split) if isinstance(split, list) else training_images and training_images(len(frames))
+    yield from (of_views := list(check_views(views, count, path)))
+    if open_images:
+        yield from check_images(frames, path, look_for_unused=factor == 1)
+    if load_points:
+        wrong = any(finding.severity == "error" for finding in of_views)
+        yield from _check_ply(meta, path, [] if wrong else views)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    try:
+        meta = json.loads(path.read_text(encoding="utf8"))
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist: restore it, or {GIVE_POSES}.") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not readable JSON ({reason(error)}): restore it, or {GIVE_POSES}.") from error
+    if not isinstance(meta, dict):
+        raise InputError(f"{path} holds a {type(meta).__name__} instead of an object with frames: {GIVE_POSES}.")
+    return meta
+
+
+def frames_of(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
+    """The frames, each with a file path and a pose that can be used."""
+    frames = meta.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise InputError(f"{path} lists no frames, so there is no image to train on: {GIVE_POSES}.")
+    for number, frame in enumerate(frames):
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+            raise InputError(f"{path}: frame {number} has no file_path: give it one, or remove the frame.")
+        where = f"{path}: frame {frame['file_path']}"
+        try:
+            pose = np.array(frame["transform_matrix"], dtype=np.float64)
+        except (KeyError, TypeError, ValueError, OverflowError):
+            pose = np.empty(0)
+        if pose.shape != (4, 4):
+            raise InputError(f"{where} has no pose of 4 × 4 numbers: give it a transform_matrix, or remove the frame.")
+        if not np.isfinite(pose).all():
+            raise InputError(f"{where} has NaN or infinity in its pose: remove the frame, or compute the poses again.")
+        if np.abs(pose[3, :3]).max() > 1e-6:
+            raise InputError(f"{where} has a last row in its pose that is not 0 0 0 1: transpose it, or correct it.")
+        if not isinstance(frame.get("mask_path", ""), str):
+            raise InputError(f"{where} has a mask_path that is no string: correct or remove it.")
+    return frames
+
+
+def view_of(frame: dict[str, Any], where: str, camera: Camera) -> View:
+    """A frame that `frames_of` found good, with its camera."""
+    pose = np.array(frame["transform_matrix"], dtype=np.float64)
+    return View(where, where, (pose[:3, :3] * [1, -1, -1]).T, pose[:3, 3], camera)  # OpenGL's camera axes to OpenCV's
+
+
+def _distortion_of(values: dict[str, Any]) -> dict[str, Any]:
+    """The coefficients that a frame, or all of them, have by name; nerfstudio takes all from one of the two."""
+    listed = values.get("distortion_params")
+    if isinstance(listed, list):
+        return dict(zip(_DISTORTION, listed, strict=False))
+    return {name: values[name] for name in _DISTORTION if name in values}
+
+
+def _camera(values: dict[str, Any], distortion: dict[str, Any], model: str, where: str) -> Camera:
+    """The camera that good values stand for.
+
+    Raises:
+        InputError: If a distortion coefficient is no number, or one that nerfstudio does not support.
+    """
+    size = (int(values["w"]), int(values["h"]))
+    pinhole = (*size, values["fl_x"], values["fl_y"], values["cx"], values["cy"])
+    k1, k2, k3, k4, p1, p2 = (finite(distortion.get(name, 0.0), name, where) for name in _DISTORTION)
+    if model == "FISHEYE624":
+        return Camera(*pinhole, fisheye=True)  # its coefficients have a meaning of their own
+    if model == "OPENCV_FISHEYE":
+        return Camera(*pinhole, radial=(k1, k2, k3, k4), fisheye=True)
+    if k4 != 0:
+        raise InputError(f"{where} has k4 = {k4:g}, which nerfstudio cannot undo: undistort the images yourself.")
+    return Camera(*pinhole, radial=(k1, k2, k3), tangential=(p1, p2))
+
+
+def _check_ply(meta: dict[str, Any], path: Path, views: Sequence[View]) -> Iterator[Finding]:
+    """Findings for the SfM points, and for how they lie to the views, if there are any."""
+    name = meta.get("ply_file_path")
+    if name is None:
+        if (path.parent / COLMAP_FOLDERS[0]).exists():
+            yield Finding("warning", f"{path} has no ply_file_path: nerfstudio will ask whether to make one; say yes.")
+        else:
+            yield Finding("note", f"{path} has no ply_file_path: training will start from random points.")
+        return
+    remedy = f"restore it, or remove ply_file_path from {path} to start from random points"
+    yield from check_ply(path.parent / str(name), views, remedy)
+
+
+def _smaller_copies(folder: Path, image: Path) -> int:
+    """The factor that nerfstudio's own parser chooses: it takes smaller copies only where they exist."""
+    factor, size = 1, image_size(folder / image)
+    while max(size) / factor > MAX_AUTO_RESOLUTION and (folder / f"images_{2 * factor}" / image.name).exists():
+        factor *= 2
+    return factor
