@@ -467,7 +467,7 @@ def test_an_image_that_makes_nan_is_named_and_does_not_poison_the_model(
 
     pipeline.model.get_training_outputs = poisoned  # type: ignore[method-assign]
     if where == "image":
-        _ = pipeline.train_cameras  # which looks for such images, once
+        _ = pipeline.views.cameras  # which looks for such images, once
         image = pipeline.datamanager.cached_train[bad]["image"]
         pipeline.datamanager.cached_train[bad]["image"] = torch.full(image.shape, math.nan)
     before = pipeline.model.num_points
@@ -507,7 +507,7 @@ def test_the_log_is_read_before_it_overflows(
     config.pipeline.model.densify = False
     trainer = set_up(config)
     trainer.pipeline.log._losses = trainer.pipeline.log._losses[:2]
-    _ = trainer.pipeline.train_cameras  # which looks for such images, once
+    _ = trainer.pipeline.views.cameras  # which looks for such images, once
     image = trainer.pipeline.datamanager.cached_train[0]["image"]
     for data in trainer.pipeline.datamanager.cached_train:
         data["image"] = torch.full(image.shape, math.nan)
