@@ -22,7 +22,6 @@ from sadgs_ns.data.cameras import refuse_unsupported_cameras
 from sadgs_ns.data.parser_validation import findings_of
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.codes import HIGHEST_FREQUENCY, encode
-from sadgs_ns.method.memory import STEP_BYTES
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.method.structure_tensor import (
     ENERGY_BLUR,
@@ -31,6 +30,7 @@ from sadgs_ns.method.structure_tensor import (
     multiscale_structure_tensor,
 )
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
+from sadgs_ns.plugin.memory_plan import fit_to_memory, training_size
 from sadgs_ns.plugin.model import SadgsModel, SadgsModelConfig
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
 from sadgs_ns.plugin.optimizers import FusedAdam
@@ -118,18 +118,6 @@ class SadgsPipeline(VanillaPipeline):
         self.log = NonFiniteLog(self.device)
         self.structure = StructurePanel(self)
         self.model.viewer_outputs = self.structure.outputs
-
-    def _image_bytes(self) -> float:
-        """Memory of the training device that images, structure tensors and a step's pictures will take, in bytes."""
-        config, train = self.datamanager.config, self.datamanager.train_dataset.cameras
-        pixels = train.height * train.width  # [C, 1]
-        needed = STEP_BYTES * self.views_per_iteration * float(pixels.max())
-        if config.cache_images == "gpu":
-            held_out = self.datamanager.eval_dataset.cameras
-            cached = float(pixels.sum() + (held_out.height * held_out.width).sum())
-            needed += 3 * (1 if config.cache_images_type == "uint8" else 4) * cached
-            needed += 3 * float(pixels.sum())  # codes of S̄
-        return needed
 
     @property
     def model(self) -> SadgsModel:
@@ -229,12 +217,16 @@ class SadgsPipeline(VanillaPipeline):
             InputError: If `memory_budget_gb` leaves no room for Gaussians.
         """
         if self.config.model.densify:
+            model, fused = self.model, self.config.model.fused and kernels.available(self.device)
+            size = training_size(self.datamanager, model.gauss_params, self.views_per_iteration, fused)  # type: ignore[arg-type]
             try:
-                line = self.model.strategy.fit_to_memory(self.model.gauss_params, self._image_bytes())
+                line, warning = fit_to_memory(model.strategy, model.gauss_params, size)  # type: ignore[arg-type]
             except ValueError as error:
                 raise InputError(f"pipeline.model.{error}") from error
             if line is not None:
                 CONSOLE.print(line, highlight=False, soft_wrap=True)
+            if warning is not None:
+                CONSOLE.print(f"[yellow]{escape(warning)}[/]", soft_wrap=True)
             self.structure.set_max_gaussians.value = self.model.strategy.max_gaussians
         optimizers = training_callback_attributes.optimizers
         for optimizer in optimizers.optimizers.values() if optimizers is not None else ():
