@@ -34,7 +34,7 @@ class WriteError(OSError):
         )
 
 
-def reason(error: Exception) -> str:
+def reason(error: BaseException) -> str:
     """An error of a library in a few words: its first line without the full stop."""
     text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     lines = text.strip().splitlines()

@@ -46,6 +46,7 @@ COMMANDS = {
     "kernels": ("approximations", "what each shortcut in the frequency analysis gets wrong, beside what it costs"),
     "step": ("step", "the parts of a training step, with and without our Triton kernels (CUDA)"),
     "validation": ("validation", "copies of scenes whose validation views are held out, for choosing constants"),
+    "memory": ("memory", "the memory plan beside the real peaks of training steps (CUDA)"),
     "rasterizers": ("rasterizers", "how far the CPU splatter and our tile lists are from gsplat (CUDA)"),
 }
 """What `sadgs-bench` does besides running a protocol, and the module that does it."""

@@ -133,7 +133,7 @@ def get_view(pipeline: SadgsPipeline, index: int, split: Literal["train", "eval"
         photo=pipeline.photo(data),
         structure_tensor=decode(pipeline.structure_tensors_of([data])[0]),
         viewmat=(
-            pipeline.train_viewmat(index)
+            pipeline.views.viewmat(index)
             if split == "train"
             else viewmats_from_camera_to_world(camera.camera_to_worlds)[0]
         ).to(pipeline.device),
@@ -153,7 +153,7 @@ def screen_gradients(pipeline: SadgsPipeline, progress: Callable[[range], Any]) 
     for index in progress(range(len(pipeline.datamanager.train_dataset))):
         data = pipeline.datamanager.cached_train[index]
         height, width = data["image"].shape[:2]
-        viewmats, Ks = pipeline.stacked_cameras([index])
+        viewmats, Ks = pipeline.views.stacked_cameras([index])
         with torch.enable_grad():
             render, alpha, info = model.render(viewmats.detach(), Ks, width, height, "RGB", absgrad=True)
             info["means2d"].retain_grad()

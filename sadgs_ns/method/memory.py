@@ -1,9 +1,17 @@
-"""How many Gaussians the device's memory holds, asked at the start and before more are made."""
+"""How much memory a training step takes on CUDA, and how many Gaussians may be added so that the next one fits.
+
+The bytes are counted from the code that allocates them: `kernels.rasterization` and gsplat's `fully_fused_projection`,
+`kernels.tiles`, `kernels.losses` and `kernels.compositing`. `sadgs-bench memory` compares the count with real peaks.
+
+A step is largest in one of three phases, in which different tensors are alive: while the tile lists are sorted, in the
+loss, and in the backward pass of rasterization. What a Gaussian keeps between steps comes on top of each.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -12,22 +20,66 @@ from torch import Tensor
 from sadgs_ns.method.split import Params
 
 COPIES = 4
-"""Tensors of a parameter's size that live between steps: itself, its gradient and Adam's two moments."""
-WORKING_BYTES = 4000
-"""Bytes a Gaussian takes during a step besides those: projections, tile lists, colours and their gradients. With them a
-Gaussian of degree 3 takes 5 kB; with images and the views of a step the README's runs took 3.1 to 4.6 kB (bonsai,
-south) and 7 kB (fox, four views of fewer Gaussians) when they had the most."""
-STEP_BYTES = 300
-"""Bytes a pixel of the views that are rendered together takes during a step, whoever computes the loss."""
-PLANNED_SHARE = 0.8
-"""Of the memory that is available at the start, what is planned with; the rest is for fragments and other programs."""
+"""Tensors of a parameter's size: the parameter, its gradient and Adam's two moments."""
+ACTIVATION_BYTES = 16
+"""Bytes of a Gaussian in every phase: exp(scales) 12, sigmoid(opacities) 4."""
+ACTIVATION_GRADIENT_BYTES = 28
+"""Bytes of a Gaussian in the backward pass: gradients of the activations 16, the second gradient of the means 12, since
+the projection and the harmonics each have one."""
+PROJECTION_BYTES = 52
+"""Bytes of a Gaussian and view from the projection to the end of the step: radii 4, means2d 8, depths 4, conics 12,
+opacities 4, colours 12; with antialiasing also compensations 4, and their products with the opacities 4."""
+DEPTH_SORT_BYTES = 40
+"""Bytes of a Gaussian and view besides, while Gaussians are sorted by depth: numbers of tiles 8, indices before 8 and
+after 8 the sort, sorted depths 4, the sort's buffers 12."""
+PROJECTION_GRADIENT_BYTES = 84
+"""Bytes of a Gaussian and view besides, in the backward pass: a row of 12 gradients 48, and those that the projection
+wants contiguous or that are kept for AbsGS: means2d 8 + 8, conics 12, depths 4, opacities 4."""
+PAIR_SORT_BYTES = 40
+"""Bytes of a pair of a Gaussian and a tile while pairs are sorted by tile, with tiles of 32 bits: tiles 4, Gaussians 4,
+sorted tiles 4, indices before 8 and after 8 the sort, the sort's buffers 12. With tiles of 16 bits they are 34."""
+PAIR_BYTES = 4
+"""Bytes of such a pair until the end of the step: the Gaussian in the tile's list."""
+PIXEL_BYTES = 54
+"""Bytes of a pixel in the backward pass of rasterization: the rendered colours 12 and those on the background 12,
+alphas 4, last Gaussians 4, gradient of the colours 12 and of alphas 4, image in bytes 3, codes of S̄ 3."""
+LOSS_PIXEL_BYTES = 162
+"""Bytes of a pixel in the loss, with our kernels: rendered colours 12, on the background 12 + 16, alphas 4, last
+Gaussians 4, image 12, five blurred maps 60, three slopes 36, image in bytes 3, codes of S̄ 3."""
+TORCH_LOSS_PIXEL_BYTES = 300
+"""The same without our kernels, where torch keeps about twenty maps for the loss; measured, not counted."""
+PAIRS_PER_GAUSSIAN = 12
+"""Pairs, of tiles of 8 px, that a trained Gaussian has in a view. docs/measurements.md has 10.5 (fox, 8.3 million pairs
+of 397,000 Gaussians in two views) and 11 (300,000 Gaussians of 2 to 5 px at 1920×1080)."""
+
+
+@dataclass(frozen=True)
+class StepSize:
+    """What a step renders, besides the number of Gaussians."""
+
+    views: int = 0
+    """Number of views."""
+    pixels: int = 0
+    """Number of pixels of all views."""
+    pairs: float = 0
+    """Number of pairs of a Gaussian and a tile that it reaches, in all views."""
+
+    @classmethod
+    def of(cls, infos: Sequence[Mapping[str, Any]]) -> StepSize:
+        """The size of a step that was rendered, from gsplat's `info` of each of its groups of views."""
+        return cls(
+            sum(info["n_cameras"] for info in infos),
+            sum(info["n_cameras"] * info["width"] * info["height"] for info in infos),
+            sum(len(info["flatten_ids"]) for info in infos),
+        )
 
 
 def available_bytes(device: torch.device) -> tuple[float, float]:
-    """What this process may take of the device's memory in all, what it has taken included, and how large that is.
+    """Bytes of the device's memory that this process may have in all, with what it has already, and bytes of all of it.
 
     Args:
-        device: Any; without CUDA both are infinity, since an operating system's memory is nothing to plan with.
+        device: Any device; without CUDA both numbers are infinite, because an operating system's memory is nothing to
+            plan with.
     """
     if device.type != "cuda":
         return math.inf, math.inf
@@ -39,48 +91,84 @@ def free_bytes(device: torch.device) -> float:
     """Bytes that new tensors may take: what the driver has left and what torch's allocator keeps unused.
 
     Args:
-        device: Any; infinity without CUDA.
+        device: Any device; infinitely many are free without CUDA.
     """
     available, _ = available_bytes(device)
     return available - torch.cuda.memory_allocated(device) if device.type == "cuda" else available
 
 
-def gaussian_bytes(params: Params, state: Mapping[str, Any]) -> int:
-    """What one more Gaussian takes in training, in bytes: what is kept of it, and what moves at a split or a step.
+def kept_bytes(params: Params, state: Mapping[str, Any]) -> int:
+    """Bytes that one Gaussian keeps: its parameters, their gradients and moments, and its statistics.
 
     Args:
         params: Parameters, each with leading dimension N.
         state: The strategy's state; its tensors have leading dimension N, or 0 before the first step.
     """
-    return _kept_bytes(params, state) + _moving_bytes(params)
-
-
-def affordable_growth(params: Params, state: Mapping[str, Any], free: float) -> float:
-    """How many Gaussians may be added so that adding them and the next training step fit.
-
-    Args:
-        params: Parameters, each with leading dimension N.
-        state: The strategy's state; its tensors have leading dimension N.
-        free: Bytes left, as `free_bytes` counts them; infinity allows infinitely many.
-
-    Returns:
-        ≥ 0, a whole number or infinity.
-    """
-    n = len(params["means"])
-    growth = (free - n * _moving_bytes(params)) / gaussian_bytes(params, state)
-    return max(math.floor(growth), 0) if math.isfinite(growth) else growth
-
-
-def _kept_bytes(params: Params, state: Mapping[str, Any]) -> int:
     tensors = [value for value in state.values() if isinstance(value, Tensor)]
     return COPIES * sum(map(_row_bytes, params.values())) + sum(map(_row_bytes, tensors))
 
 
-def _moving_bytes(params: Params) -> int:
-    """Each parameter is copied to its new length while the old one is still there, and the step's working memory, which
-    is free between steps, is needed again by all.
+def widest_bytes(params: Params) -> int:
+    """Bytes of a Gaussian's widest parameter, which is there twice while a split copies it to its new length.
+
+    Args:
+        params: Parameters, each with leading dimension N.
     """
-    return WORKING_BYTES + max(map(_row_bytes, params.values()))
+    return max(map(_row_bytes, params.values()))
+
+
+def step_bytes(num_gaussians: int, size: StepSize, fused: bool = True) -> dict[str, float]:
+    """Bytes that a step takes at its peak in each phase, besides what is kept between steps.
+
+    Args:
+        num_gaussians: Number of Gaussians, visible or not.
+        size: What the step renders.
+        fused: Whether the loss is computed by our kernels.
+
+    Returns:
+        Bytes by the names of the phases: "tile lists", "loss" and "backward".
+    """
+    return {name: a * num_gaussians + b + p * size.pairs for name, (a, b, p) in _phases(size, fused).items()}
+
+
+def affordable_growth(
+    params: Params, state: Mapping[str, Any], free: float, size: StepSize, fused: bool = True
+) -> float:
+    """How many Gaussians may be added so that adding them and the next training step fit.
+
+    Added Gaussians bring `PAIRS_PER_GAUSSIAN` pairs each in every view.
+
+    Args:
+        params: Parameters, each with leading dimension N.
+        state: The strategy's state; its tensors have leading dimension N, or 0 before the first step.
+        free: Bytes left, as `free_bytes` counts them; infinity allows infinitely many.
+        size: What the next step renders, with the pairs of the N Gaussians.
+        fused: Whether the loss is computed by our kernels.
+
+    Returns:
+        ≥ 0, a whole number or infinity.
+    """
+    if math.isinf(free):
+        return free
+    n, widest, new_pairs = len(params["means"]), widest_bytes(params), PAIRS_PER_GAUSSIAN * size.views
+    kept = kept_bytes(params, state)
+    growth = min(
+        (free - n * (a + widest) - b - p * size.pairs) / (kept + widest + a + p * new_pairs)
+        for a, b, p in _phases(size, fused).values()
+    )
+    return max(math.floor(growth), 0)
+
+
+def _phases(size: StepSize, fused: bool) -> dict[str, tuple[float, float, float]]:
+    """Bytes per Gaussian, bytes besides and bytes per pair, in each phase."""
+    projected = ACTIVATION_BYTES + PROJECTION_BYTES * size.views
+    loss = LOSS_PIXEL_BYTES if fused else TORCH_LOSS_PIXEL_BYTES
+    gradients = ACTIVATION_GRADIENT_BYTES + PROJECTION_GRADIENT_BYTES * size.views
+    return {
+        "tile lists": (projected + DEPTH_SORT_BYTES * size.views, 0.0, PAIR_SORT_BYTES),
+        "loss": (projected, loss * size.pixels, PAIR_BYTES),
+        "backward": (projected + gradients, PIXEL_BYTES * size.pixels, PAIR_BYTES),
+    }
 
 
 def _row_bytes(tensor: Tensor) -> int:

@@ -14,14 +14,7 @@ from gsplat.strategy.ops import _update_param_with_optimizer, remove
 from torch import Tensor
 
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow
-from sadgs_ns.method.memory import (
-    PLANNED_SHARE,
-    STEP_BYTES,
-    affordable_growth,
-    available_bytes,
-    free_bytes,
-    gaussian_bytes,
-)
+from sadgs_ns.method.memory import StepSize, affordable_growth, free_bytes
 from sadgs_ns.method.split import VARIANCE_EXTENT, Params, children_per_axis, grid_split, limit_growth, num_children
 from sadgs_ns.method.statistics import consistent, empty_statistics, observe
 
@@ -162,46 +155,6 @@ class StructureAwareStrategy(Strategy):
         self.refine_stop_iter = min(self.refine_stop_iter, num_iterations * 19 // 30)
         if self.refine_stop_iter < self.refine_start_iter:
             self.refine_stop_iter = 0
-
-    def fit_to_memory(self, params: Params, other_bytes: float) -> str | None:
-        """Lower `max_gaussians` to what the budget, or the device's free memory, holds; call before the first step.
-
-        The estimate errs on the safe side (`memory.WORKING_BYTES`). A cap under the present number of Gaussians adds
-        none and takes none away.
-
-        Args:
-            params: The initial Gaussians, on the device of training.
-            other_bytes: What images and rendering will take besides the Gaussians.
-
-        Returns:
-            A line for the user, None without CUDA, where nothing is changed.
-
-        Raises:
-            ValueError: If `memory_budget_gb` leaves no room for Gaussians.
-        """
-        device = params["means"].device
-        free, total = available_bytes(device)
-        if math.isinf(free):
-            return None
-        each = gaussian_bytes(params, self._empty_state(0, device))
-        why = ""
-        if self.memory_budget_gb is not None or self.max_gaussians == StructureAwareStrategy.max_gaussians:
-            given = self.memory_budget_gb
-            budget = PLANNED_SHARE * free if given is None else min(1e9 * given, free)
-            affordable = math.floor((budget - other_bytes) / each)
-            if given is not None and affordable < 1:
-                raise ValueError(
-                    f"strategy.memory_budget_gb is {given:g} and leaves no room for Gaussians: images and rendering "
-                    f"take {other_bytes / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; raise it, take fewer or "
-                    "smaller images, or lower pipeline.views-per-iteration."
-                )
-            if affordable < self.max_gaussians:
-                self.max_gaussians = max(affordable, 1)
-                why = f"; {free / 1e9:.1f} GB are free" if given is None else f"; memory_budget_gb is {given:g}"
-                if self.max_gaussians < (n := len(params["means"])):
-                    why += f", which holds no more than the {n:,} at the start: none will be added"
-        need = (other_bytes + each * max(self.max_gaussians, len(params["means"]))) / 1e9
-        return f"At most {self.max_gaussians:,} Gaussians: {need:.1f} GB of the card's {total / 1e9:.1f} GB{why}."
 
     def check_sanity(self, params: Params, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
         """Check names and optimizers.
@@ -385,9 +338,9 @@ class StructureAwareStrategy(Strategy):
 
     def _room(self, params: Params, state: Mapping[str, Any], views: Sequence[Info]) -> tuple[int, float]:
         """How many Gaussians may be added under the cap, and how many fit in the device's memory beside such views."""
-        pixels = sum(view["n_cameras"] * view["width"] * view["height"] for view in views)
-        free = free_bytes(params["means"].device) - STEP_BYTES * pixels
-        return self.max_gaussians - len(params["means"]), affordable_growth(params, state, free)
+        free = free_bytes(params["means"].device)
+        in_memory = affordable_growth(params, state, free, StepSize.of(views), self.fused)
+        return self.max_gaussians - len(params["means"]), in_memory
 
     @staticmethod
     def _opacities(params: Params) -> Tensor:

@@ -1,16 +1,18 @@
-"""nerfstudio glue: a run's Triton kernels, compiled side by side before it starts instead of one by one on its way."""
+"""Compiles a run's Triton kernels side by side before training starts, instead of one by one on the way."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import TYPE_CHECKING
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
 from torch import Tensor
 
 from sadgs_ns import kernels
+from sadgs_ns.errors import reason
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients
 from sadgs_ns.method.codes import encode
 from sadgs_ns.method.losses import photometric_loss
@@ -23,20 +25,23 @@ if TYPE_CHECKING:
     from sadgs_ns.plugin.pipeline import SadgsPipeline
 
 _GAUSSIANS, _SIZE = 64, 64
-"""Of the picture on which the kernels are tried, px wide and high."""
+"""Number of Gaussians, and width and height in px, of the picture on which the kernels are tried."""
 _PATIENCE = 2.0
-"""Seconds after which the user is told what takes so long."""
+"""Seconds after which the user is told what the run is waiting for."""
 
 
 def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
     """Launch the kernels of training once, on a few Gaussians and in threads, whose compilations then overlap.
 
     Triton keeps what it compiled on the disk: a machine's first run takes seconds here, a later one none. The run
-    itself is left as it was, random numbers included. What fails here fails again in training, which says why.
+    itself is left as it was, random numbers included.
+
+    A kernel that fails here does not stop the run, which may never need it: the user is told which ones failed and why,
+    in one sentence, and training tries them again where it needs them.
 
     Args:
-        pipeline: Set up.
-        optimizers: The run's, by the names of their parameters.
+        pipeline: A pipeline whose model and data are set up.
+        optimizers: The run's optimizers, by the names of their parameters.
     """
     model, device = pipeline.model, pipeline.device
     config, strategy = model.config, model.strategy
@@ -55,7 +60,7 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
     cameras = pipeline.datamanager.train_dataset.cameras
 
     def tile_lists() -> None:
-        # Of the run's size: whether tiles are numbered in 16 or in 32 bits depends on how many there are.
+        # The size is the run's: whether tiles are numbered in 16 or in 32 bits depends on how many there are.
         rasterize(
             means, quats, scales, opacities, means, viewmats, Ks, int(cameras.width.max()), int(cameras.height.max())
         )
@@ -77,7 +82,7 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
                 parameter = torch.nn.Parameter(blank(name))
                 parameter.grad = torch.zeros_like(parameter)
                 twins.append(FusedAdam([parameter], **{key: optimizer.defaults[key] for key in ("betas", "eps")}))
-                twins[-1].log = log  # together, like the run's
+                twins[-1].log = log  # all share one log, like the run's, and are stepped in one launch
         step_together(twins)
 
     def composite(absgrad: bool) -> None:
@@ -110,13 +115,29 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
             fused=strategy.fused,
         )
 
-    with ThreadPoolExecutor() as pool:
-        pending = [pool.submit(stage) for stage in (loss, structure, update)]
-        try:  # the projection, which all the others read
+    failures: dict[str, BaseException] = {}
+    pending: dict[str, Future[None]] = {}
+    with ThreadPoolExecutor() as pool:  # which waits for its threads, whatever happens
+        pending |= {"the loss": pool.submit(loss), "S̄": pool.submit(structure), "Adam": pool.submit(update)}
+        try:  # the other stages read this projection
             _, _, info = rasterize(means, quats, scales, opacities, means, *camera)
-        except Exception:
-            return
-        pending += [pool.submit(stage) for stage in (harmonics, observation, tile_lists)]
-        pending += [pool.submit(composite, absgrad) for absgrad in (True, False)]
-        if wait(pending, timeout=_PATIENCE).not_done:
+        except Exception as error:
+            failures["rasterization"] = error
+        else:
+            pending |= {
+                "spherical harmonics": pool.submit(harmonics),
+                "η": pool.submit(observation),
+                "tile lists": pool.submit(tile_lists),
+                "compositing with AbsGS": pool.submit(composite, True),
+                "compositing": pool.submit(composite, False),
+            }
+        if wait(pending.values(), timeout=_PATIENCE).not_done:
             CONSOLE.print("Compiling kernels for this GPU, once …")
+    failures |= {name: error for name, future in pending.items() if (error := future.exception()) is not None}
+    if failures:
+        why = escape(reason(next(iter(failures.values()))))
+        CONSOLE.print(
+            f"[yellow]The kernels of {', '.join(failures)} could not be compiled and tried before training ({why}): "
+            "training tries them again, and stops with an error of its own if it cannot do without them.[/]",
+            soft_wrap=True,
+        )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any
@@ -18,11 +18,10 @@ from rich.markup import escape
 from torch import Tensor
 
 from sadgs_ns import kernels
-from sadgs_ns.data.cameras import refuse_failed_undistortion, refuse_unsupported_cameras
+from sadgs_ns.data.cameras import refuse_unsupported_cameras
 from sadgs_ns.data.validation.parsers import findings_of
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.codes import HIGHEST_FREQUENCY, encode
-from sadgs_ns.method.memory import STEP_BYTES
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.method.structure_tensor import (
     ENERGY_BLUR,
@@ -31,11 +30,12 @@ from sadgs_ns.method.structure_tensor import (
     multiscale_structure_tensor,
 )
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
+from sadgs_ns.plugin.memory_plan import fit_to_memory, training_size
 from sadgs_ns.plugin.model import SadgsModel, SadgsModelConfig
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
 from sadgs_ns.plugin.optimizers import FusedAdam
 from sadgs_ns.plugin.panel import StructurePanel
-from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
+from sadgs_ns.plugin.views import TrainingViews
 
 _PIXELS_PER_BATCH = 4_000_000
 """Structure tensors are computed for as many images at once as fit this; each pixel takes at most about 300 bytes."""
@@ -114,21 +114,10 @@ class SadgsPipeline(VanillaPipeline):
             )
         positions = self.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]  # [C, 3]
         self.model.set_cameras(positions)
+        self.views = TrainingViews(self.datamanager, self.model)
         self.log = NonFiniteLog(self.device)
         self.structure = StructurePanel(self)
         self.model.viewer_outputs = self.structure.outputs
-
-    def _image_bytes(self) -> float:
-        """Memory of the training device that images, structure tensors and a step's pictures will take, in bytes."""
-        config, train = self.datamanager.config, self.datamanager.train_dataset.cameras
-        pixels = train.height * train.width  # [C, 1]
-        needed = STEP_BYTES * self.views_per_iteration * float(pixels.max())
-        if config.cache_images == "gpu":
-            held_out = self.datamanager.eval_dataset.cameras
-            cached = float(pixels.sum() + (held_out.height * held_out.width).sum())
-            needed += 3 * (1 if config.cache_images_type == "uint8" else 4) * cached
-            needed += 3 * float(pixels.sum())  # codes of S̄
-        return needed
 
     @property
     def model(self) -> SadgsModel:
@@ -139,26 +128,6 @@ class SadgsPipeline(VanillaPipeline):
     def views_per_iteration(self) -> int:
         """As configured, but no more than there are: a view that is rendered twice in a step would count twice."""
         return min(self.config.views_per_iteration, len(self.datamanager.train_dataset))
-
-    @cached_property
-    def train_cameras(self) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
-        """World-to-camera matrices [4, 4] and intrinsics in px [3, 3] of all training views, each a tensor of its own.
-
-        Made once: asking nerfstudio's cameras for them in each step makes the host wait for the device.
-
-        Raises:
-            InputError: If a training image holds NaN or infinite pixels, masked or not: the loss multiplies by masks;
-                or if undistorting it failed.
-        """
-        dataset = self.datamanager.train_dataset
-        for index, data in enumerate(self.datamanager.cached_train):  # undistorting the images changes the intrinsics
-            if data["image"].is_floating_point() and not data["image"].isfinite().all():
-                name = dataset.image_filenames[index]
-                raise InputError(f"{name} holds NaN or infinite pixels: replace them, or leave the image out.")
-        cameras = dataset.cameras
-        refuse_failed_undistortion(cameras, dataset.image_filenames)
-        viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
-        return viewmats.to(self.device).unbind(), cameras.get_intrinsics_matrices().to(self.device).unbind()
 
     @cached_property
     def structure_tensors(self) -> list[Tensor]:
@@ -206,25 +175,6 @@ class SadgsPipeline(VanillaPipeline):
             fused=self.config.model.fused,
         )
 
-    def train_viewmat(self, index: int) -> Tensor:
-        """World to camera of a training view, with the camera optimizer's correction where it is on. [4, 4]"""
-        viewmats, _ = self.train_cameras
-        if self.model.camera_optimizer.config.mode == "off":
-            return viewmats[index]
-        camera = self.datamanager.train_cameras[index : index + 1].to(self.device)
-        camera.metadata = {"cam_idx": index}
-        return viewmats_from_camera_to_world(self.model.camera_optimizer.apply_to_camera(camera))[0]
-
-    def stacked_cameras(self, indices: list[int]) -> tuple[Tensor, Tensor]:
-        """World-to-camera matrices [V, 4, 4] and intrinsics in px [V, 3, 3] of V training views."""
-        viewmats, Ks = [self.train_viewmat(index) for index in indices], [self.train_cameras[1][i] for i in indices]
-        n = len(indices)
-        if n == 1:
-            return viewmats[0][None], Ks[0][None]
-        # One copy on the device instead of two; both results are contiguous, as gsplat wants them.
-        flat_viewmats, flat_Ks = torch.cat([matrix.flatten() for matrix in viewmats + Ks]).split([16 * n, 9 * n])
-        return flat_viewmats.view(n, 4, 4), flat_Ks.view(n, 3, 3).detach()
-
     @torch.no_grad()
     def observe_training_views(self, progress: Callable[[range], Iterable[int]] = iter) -> dict[str, Tensor]:
         """η's statistics of the Gaussians as they are, in one look at each training view.
@@ -242,7 +192,10 @@ class SadgsPipeline(VanillaPipeline):
         generator = torch.Generator(self.device).manual_seed(0)
         statistics = empty_statistics(self.model.num_points, self.device)
         for index in progress(range(len(self.structure_tensors))):
-            tensor, (viewmats, Ks) = self.structure_tensors[index].to(self.device)[None], self.stacked_cameras([index])
+            tensor, (viewmats, Ks) = (
+                self.structure_tensors[index].to(self.device)[None],
+                self.views.stacked_cameras([index]),
+            )
             _, _, info = self.model.render(viewmats, Ks, tensor.shape[2], tensor.shape[1], "RGB")
             observe(
                 statistics,
@@ -255,15 +208,6 @@ class SadgsPipeline(VanillaPipeline):
             )
         return statistics
 
-    def _next_view(self) -> tuple[int, dict[str, Any]]:
-        """Index and data of the next training view, in nerfstudio's order, without slicing its cameras for it."""
-        datamanager = self.datamanager
-        index = datamanager.train_unseen_cameras.pop(0)
-        if not datamanager.train_unseen_cameras:
-            datamanager.train_unseen_cameras = datamanager.sample_train_cameras()
-        data = datamanager.cached_train[index]
-        return index, {**data, "image": data["image"].to(self.device, non_blocking=True)}
-
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
@@ -273,12 +217,16 @@ class SadgsPipeline(VanillaPipeline):
             InputError: If `memory_budget_gb` leaves no room for Gaussians.
         """
         if self.config.model.densify:
+            model, fused = self.model, self.config.model.fused and kernels.available(self.device)
+            size = training_size(self.datamanager, model.gauss_params, self.views_per_iteration, fused)  # type: ignore[arg-type]
             try:
-                line = self.model.strategy.fit_to_memory(self.model.gauss_params, self._image_bytes())
+                line, warning = fit_to_memory(model.strategy, model.gauss_params, size)  # type: ignore[arg-type]
             except ValueError as error:
                 raise InputError(f"pipeline.model.{error}") from error
             if line is not None:
                 CONSOLE.print(line, highlight=False, soft_wrap=True)
+            if warning is not None:
+                CONSOLE.print(f"[yellow]{escape(warning)}[/]", soft_wrap=True)
             self.structure.set_max_gaussians.value = self.model.strategy.max_gaussians
         optimizers = training_callback_attributes.optimizers
         for optimizer in optimizers.optimizers.values() if optimizers is not None else ():
@@ -304,8 +252,7 @@ class SadgsPipeline(VanillaPipeline):
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
         """Render the iteration's views and return the outputs of the last size, mean losses and mean metrics."""
         groups: dict[torch.Size, list[tuple[int, dict[str, Any]]]] = defaultdict(list)
-        for _ in range(self.views_per_iteration):
-            index, data = self._next_view()
+        for index, data in self.views.draw(self.views_per_iteration):
             groups[data["image"].shape].append((index, data))
         losses: dict[str, Tensor] = {}
         metrics: dict[str, Any] = {}
@@ -324,7 +271,7 @@ class SadgsPipeline(VanillaPipeline):
                 tensors = _stack(
                     [self.structure_tensors[index].to(self.device, non_blocking=True) for index in indices]
                 )
-            viewmats, Ks = self.stacked_cameras(indices)
+            viewmats, Ks = self.views.stacked_cameras(indices)
             outputs = self.model.get_training_outputs(viewmats, Ks, width, height, indices, tensors)
             group_losses = self.model.get_loss_dict(outputs, batch)
             weight = len(views) / self.views_per_iteration

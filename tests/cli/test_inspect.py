@@ -188,8 +188,8 @@ def test_observing_all_views_finds_what_training_finds(run: Path):
     model.strategy_state = model.strategy.initialize_state()
     model.step = 0
     for index in range(TRAIN_VIEWS):
-        tensors, Ks = pipeline.structure_tensors[index][None], pipeline.train_cameras[1][index][None]
-        viewmats = pipeline.train_viewmat(index)[None]
+        tensors, Ks = pipeline.structure_tensors[index][None], pipeline.views.cameras[1][index][None]
+        viewmats = pipeline.views.viewmat(index)[None]
         model.get_training_outputs(viewmats, Ks, WIDTH, HEIGHT, [index], tensors)
     trained = model.strategy_state
     # The places of the samples are drawn anew, so some fall inside the image here and outside there.

@@ -30,6 +30,7 @@ from sadgs_ns.method.eta import SCREEN_BLUR, eta, projected_axes, sample_footpri
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.plugin.model import SadgsModel
 from sadgs_ns.plugin.pipeline import SadgsPipeline, SadgsPipelineConfig
+from sadgs_ns.plugin.views import TrainingViews
 from sadgs_ns.render.rasterization import visible
 
 harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")
@@ -514,7 +515,7 @@ def test_a_fisheye_of_180_degrees_that_nerfstudio_makes_black_is_refused(tmp_pat
     datamanager: FullImageDatamanager = fisheye_data(tmp_path, k1=k1, focal=focal).setup(device="cpu")
     assert datamanager.cached_train[0]["image"].max() == 0
     with pytest.raises(ValueError, match=r"images/0\.png is a FISHEYE image that nerfstudio could not undistort"):
-        SadgsPipeline.train_cameras.func(SimpleNamespace(datamanager=datamanager))  # type: ignore[attr-defined]
+        _ = TrainingViews(datamanager, SimpleNamespace(device="cpu")).cameras  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

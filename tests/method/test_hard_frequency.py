@@ -18,7 +18,7 @@ from torch import Tensor
 from sadgs_ns.method.eta import principal_eigenvalue, wavelength
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.plugin.model import SadgsModel
-from sadgs_ns.plugin.pipeline import SadgsPipeline
+from sadgs_ns.plugin.views import TrainingViews
 
 unit_tensor = partial(multiscale_structure_tensor, frequency_constant=1.0)
 """S̄ in units of c²: its trace is at most 1."""
@@ -210,9 +210,9 @@ def test_the_pipeline_names_the_file_whose_pixels_are_not_finite():
     images[1][2, 3, 0] = math.nan
     dataset = SimpleNamespace(image_filenames=[Path(f"images/{name}.exr") for name in "abc"])
     data = [{"image": image} for image in images]
-    pipeline = SimpleNamespace(datamanager=SimpleNamespace(train_dataset=dataset, cached_train=data))
+    datamanager = SimpleNamespace(train_dataset=dataset, cached_train=data)
     with pytest.raises(ValueError, match=r"images/b\.exr holds NaN or infinite pixels: replace them"):
-        SadgsPipeline.train_cameras.func(pipeline)  # type: ignore[attr-defined]
+        _ = TrainingViews(datamanager, SimpleNamespace(device="cpu")).cameras  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("shape", [(1, 0, 5, 3), (1, 5, 0, 3), (1, 5, 5, 0), (0, 5, 5, 3)], ids=str)

@@ -21,6 +21,7 @@ from sadgs_ns.method import memory
 from sadgs_ns.method import strategy as strategy_module
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow
 from sadgs_ns.method.initialization import bounding_box_points, neighbour_scales
+from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.split import children_per_axis, limit_growth
 from sadgs_ns.method.statistics import empty_statistics
 from sadgs_ns.method.strategy import StructureAwareStrategy
@@ -165,7 +166,7 @@ def test_children_smaller_than_the_papers_or_as_large_as_a_parent_are_refused(ch
 
 def test_without_cuda_memory_is_not_planned():
     params = random_params(5)
-    assert memory.affordable_growth(params, {}, memory.free_bytes(CPU)) == math.inf
+    assert memory.affordable_growth(params, {}, memory.free_bytes(CPU), StepSize()) == math.inf
 
 
 def test_what_is_kept_of_each_new_gaussian_is_counted():
@@ -186,42 +187,41 @@ def test_what_is_kept_of_each_new_gaussian_is_counted():
     short()._structure_step(params, optimizers, state, 10)
     grown = len(params["means"]) - 50
     assert grown == 50 * 7
-    working = memory.WORKING_BYTES + 16  # quaternions are the widest rows
-    needed = bytes_kept() - before + grown * working + 50 * working
+    size = StepSize(views=1)
+    at_first, later = (max(memory.step_bytes(n, size).values()) for n in (50, 50 + grown))
+    pairs = memory.PAIRS_PER_GAUSSIAN * grown * memory.PAIR_SORT_BYTES
+    widest = 16  # quaternions
+    lists = memory.step_bytes(50 + grown, size)["tile lists"] + pairs
+    needed = bytes_kept() - before + (50 + grown) * widest + max(lists, later)
     original = random_params(50)
-    assert memory.affordable_growth(original, observed(50, 4.0), needed) == grown
-    assert memory.affordable_growth(original, observed(50, 4.0), needed - 1) == grown - 1
-    assert memory.affordable_growth(original, observed(50, 4.0), 0) == 0
+    assert memory.affordable_growth(original, observed(50, 4.0), needed, size) == grown
+    assert memory.affordable_growth(original, observed(50, 4.0), needed - 1, size) == grown - 1
+    assert memory.affordable_growth(original, observed(50, 4.0), at_first, size) == 0
 
 
 @pytest.mark.parametrize("room", [0, 20])
 def test_a_split_that_would_not_fit_in_memory_is_reduced_with_a_warning_and_training_goes_on(
     room: int, monkeypatch: pytest.MonkeyPatch
 ):
-    asked: list[torch.device] = []
+    asked: list[StepSize] = []
 
-    def scarce(device: torch.device) -> float:
-        asked.append(device)
-        # As if `room` more Gaussians fitted beside the next step's view: params of 14 numbers in 4 copies, 13 of state,
-        # the widest row of 4.
-        return (
-            memory.STEP_BYTES * WIDTH * HEIGHT
-            + (len(params["means"]) + room) * (memory.WORKING_BYTES + 16)
-            + room * 4 * (4 * 14 + 13)
-        )
+    def scarce(params: Any, state: Any, free: float, size: StepSize, fused: bool) -> int:
+        asked.append(size)
+        return room
 
-    monkeypatch.setattr(strategy_module, "free_bytes", scarce)
+    monkeypatch.setattr(strategy_module, "affordable_growth", scarce)
     params = random_params(30)
     params["scales"].data += 1.0
     with pytest.warns(UserWarning, match=rf"Iteration 10: the device's memory holds {room} more Gaussians") as told:
         numbers = train(short(absgs_every=0, tau_split=0.3, refine_stop_iter=19), params)
     assert numbers[8] == 30 and 30 + room // 2 <= numbers[9] <= 30 + room and len(set(numbers[9:])) == 1
-    assert asked == [CPU] and len(told) == 1
+    assert [(size.views, size.pixels) for size in asked] == [(1, WIDTH * HEIGHT)] and asked[0].pairs > 0
+    assert len(told) == 1
     assert all(p.isfinite().all() for p in params.values())
 
 
 def test_absgs_is_reduced_to_what_fits_in_memory_too(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(strategy_module, "affordable_growth", lambda params, state, free: 7)
+    monkeypatch.setattr(strategy_module, "affordable_growth", lambda *arguments: 7)
     params = random_params(30)
     with pytest.warns(UserWarning, match=r"Iteration 4: the device's memory holds 7 more Gaussians"):
         numbers = train(short(structure_every=0, refine_stop_iter=5), params, steps=6)
@@ -467,7 +467,7 @@ def test_an_image_that_makes_nan_is_named_and_does_not_poison_the_model(
 
     pipeline.model.get_training_outputs = poisoned  # type: ignore[method-assign]
     if where == "image":
-        _ = pipeline.train_cameras  # which looks for such images, once
+        _ = pipeline.views.cameras  # which looks for such images, once
         image = pipeline.datamanager.cached_train[bad]["image"]
         pipeline.datamanager.cached_train[bad]["image"] = torch.full(image.shape, math.nan)
     before = pipeline.model.num_points
@@ -507,7 +507,7 @@ def test_the_log_is_read_before_it_overflows(
     config.pipeline.model.densify = False
     trainer = set_up(config)
     trainer.pipeline.log._losses = trainer.pipeline.log._losses[:2]
-    _ = trainer.pipeline.train_cameras  # which looks for such images, once
+    _ = trainer.pipeline.views.cameras  # which looks for such images, once
     image = trainer.pipeline.datamanager.cached_train[0]["image"]
     for data in trainer.pipeline.datamanager.cached_train:
         data["image"] = torch.full(image.shape, math.nan)

@@ -1,7 +1,8 @@
-"""What a run's kernels are compiled by before it starts, and that the run does not notice."""
+"""The kernels that are compiled before a run starts: the run does not notice, unless one fails."""
 
 from __future__ import annotations
 
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -63,6 +64,7 @@ def test_tile_lists_are_tried_in_the_size_of_the_run(config: SadgsTrainerConfig,
 
     monkeypatch.setattr(compilation, "rasterize", rasterize)
     monkeypatch.setattr(kernels, "available", lambda device: True)
+    monkeypatch.setattr(trainer.pipeline, "structure_tensors_of_images", None)
     for name in ("encode", "photometric_loss", "step_together", "observe"):
         monkeypatch.setattr(compilation, name, None)  # the stages that need a GPU end at once
     compilation.compile_kernels(trainer.pipeline, trainer.optimizers.optimizers)
@@ -72,7 +74,9 @@ def test_tile_lists_are_tried_in_the_size_of_the_run(config: SadgsTrainerConfig,
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="on a GPU gsplat's part would not fail")
-def test_what_cannot_be_compiled_leaves_the_run_as_it_was(config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch):
+def test_what_cannot_be_compiled_leaves_the_run_as_it_was(
+    config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     """In Triton's interpreter the loss, S̄ and Adam run; tile lists need gsplat's projection, which needs CUDA."""
     pytest.importorskip("triton", reason="Triton is not installed")
     trainer = SadgsTrainer(config)
@@ -96,7 +100,37 @@ def test_what_cannot_be_compiled_leaves_the_run_as_it_was(config: SadgsTrainerCo
     random_state = torch.get_rng_state()
     compilation.compile_kernels(trainer.pipeline, trainer.optimizers.optimizers)
     assert sorted(launched) == ["encode", "photometric_loss", "rasterize", "step_together"]
+    assert "The kernels of rasterization could not be compiled and tried before training (" in capsys.readouterr().out
     assert torch.equal(torch.get_rng_state(), random_state)
     assert all(torch.equal(trainer.pipeline.model.gauss_params[name], value) for name, value in parameters.items())
     assert all(not optimizer.state for optimizer in trainer.optimizers.optimizers.values())
+    trainer.shutdown()
+
+
+def test_kernels_that_fail_are_told_in_one_sentence_and_the_run_goes_on(
+    config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    trainer = SadgsTrainer(config)
+    trainer.setup()
+
+    def full(*args, **options):
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB.\nOf no interest.")
+
+    monkeypatch.setattr(kernels, "available", lambda device: True)
+    monkeypatch.setattr(compilation, "rasterize", lambda *args, **options: (None, None, {}))
+    monkeypatch.setattr(trainer.pipeline, "structure_tensors_of_images", lambda image: image)
+    for name in ("step_together", "observe"):
+        monkeypatch.setattr(compilation, name, lambda *args, **options: None)
+    monkeypatch.setattr(compilation, "encode", full)
+    monkeypatch.setattr(compilation, "photometric_loss", full)
+    threads = threading.active_count()
+    capsys.readouterr()
+    compilation.compile_kernels(trainer.pipeline, trainer.optimizers.optimizers)
+    assert threading.active_count() == threads
+    told = " ".join(capsys.readouterr().out.split())
+    assert told.count("could not be compiled") == 1
+    assert "The kernels of the loss, S̄" in told
+    assert "(CUDA out of memory. Tried to allocate 2 GiB): training tries them again" in told
+    monkeypatch.undo()
+    trainer.train()
     trainer.shutdown()

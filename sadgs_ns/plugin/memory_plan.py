@@ -1,0 +1,179 @@
+"""The memory plan before the first step: how many Gaussians the device holds beside the images and a step's views."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
+from torch import Tensor
+
+from sadgs_ns.method import memory
+from sadgs_ns.method.absgs import empty_gradients
+from sadgs_ns.method.memory import StepSize
+from sadgs_ns.method.split import Params
+from sadgs_ns.method.statistics import empty_statistics
+from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
+
+PLANNED_SHARE = 0.8
+"""Share of the available memory that is planned with; the rest is for fragments and other programs."""
+CODE_BYTES = 3
+"""Bytes that the codes of S̄ take for each pixel of the training images (`method.codes`)."""
+SAMPLED_CAMERAS = 8
+"""Training cameras in which the pairs of the initial Gaussians are counted."""
+TILE_SIZE = 8
+"""Size of a tile in px, as `kernels.compositing.TILE_SIZE`, which cannot be imported without Triton."""
+_NEAR, _BLUR, _REACH = 0.01, 0.3, 3.0
+"""gsplat's near plane in world units, its screen-space blur in px², and the standard deviations that it draws."""
+
+
+@dataclass(frozen=True)
+class TrainingSize:
+    """What a run keeps and renders besides its Gaussians."""
+
+    image_bytes: float
+    """Bytes of images and codes of S̄ on the training device."""
+    step: StepSize
+    """The largest step of the run, with the pairs of the initial Gaussians."""
+    fused: bool = True
+    """Whether the loss is computed by our kernels."""
+
+
+def training_size(datamanager: FullImageDatamanager, params: Params, views: int, fused: bool) -> TrainingSize:
+    """Measure a run before its first step; no image is opened for it.
+
+    Args:
+        datamanager: Holds the cameras of the training and of the held-out images.
+        params: The initial Gaussians.
+        views: Views rendered in a step.
+        fused: Whether the loss is computed by our kernels.
+    """
+    config, cameras = datamanager.config, datamanager.train_dataset.cameras
+    pixels = cameras.height * cameras.width  # [C, 1]
+    image_bytes = 0.0
+    if config.cache_images == "gpu":
+        held_out = datamanager.eval_dataset.cameras
+        cached = float(pixels.sum() + (held_out.height * held_out.width).sum())
+        image_bytes = 3 * (1 if config.cache_images_type == "uint8" else 4) * cached + CODE_BYTES * float(pixels.sum())
+    return TrainingSize(
+        image_bytes, StepSize(views, views * int(pixels.max()), views * estimate_pairs(params, cameras)), fused
+    )
+
+
+@torch.no_grad()
+def estimate_pairs(params: Params, cameras: Cameras) -> int:
+    """Pairs of a Gaussian and a tile in the view that has most of them, of a few training cameras.
+
+    Each Gaussian counts as a sphere of its largest scale and in all tiles of the square around its projection: the
+    initial Gaussians are spheres, and where they are large, which is where memory runs out, the square is the image.
+
+    Args:
+        params: `means` [N, 3], log `scales` [N, 3], logit `opacities` [N] or [N, 1].
+        cameras: Training cameras. [C]
+    """
+    means, device = params["means"], params["means"].device
+    chosen = torch.linspace(0, len(cameras) - 1, min(SAMPLED_CAMERAS, len(cameras))).round().long()
+    chosen = chosen.to(cameras.camera_to_worlds.device)
+    viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds[chosen]).to(device)
+    Ks = cameras.get_intrinsics_matrices()[chosen].to(device)
+    sizes = torch.cat([cameras.width[chosen], cameras.height[chosen]], dim=-1)  # [C, 2]
+    scales = params["scales"].exp().amax(dim=-1)  # [N]
+    level = 2 * (255 * torch.sigmoid(params["opacities"].flatten())).clamp_min(1).log()
+    reach = level.sqrt().clamp_max(_REACH)  # [N] standard deviations at which a Gaussian is 1/255 opaque
+    return max(
+        _count_pairs(means, scales, reach, viewmat, K, size.to(means))
+        for viewmat, K, size in zip(viewmats, Ks, sizes, strict=True)
+    )
+
+
+def _count_pairs(
+    means: Tensor,  # [N, 3]
+    scales: Tensor,  # [N]
+    reach: Tensor,  # [N]
+    viewmat: Tensor,  # [4, 4]
+    K: Tensor,  # [3, 3]
+    size: Tensor,  # [2] width and height in px
+) -> int:
+    points = means @ viewmat[:3, :3].T + viewmat[:3, 3]  # [N, 3]
+    depths = points[:, 2:]  # [N, 1]
+    focals, center = K.diagonal()[:2], K[:2, 2]  # [2], [2]
+    means2d = focals * points[:, :2] / depths + center  # [N, 2]
+    radii = reach[:, None] * ((focals * scales[:, None] / depths).square() + _BLUR).sqrt()  # [N, 2]
+    tiles = (size / TILE_SIZE).ceil()
+    first = ((means2d - radii) / TILE_SIZE).floor().clamp_min(0).minimum(tiles)
+    last = ((means2d + radii) / TILE_SIZE).ceil().clamp_min(0).minimum(tiles)
+    counts = (last - first).prod(dim=-1)  # [N]
+    drawn = (depths[:, 0] > _NEAR) & (reach > 0) & counts.isfinite()
+    return int(torch.where(drawn, counts, 0.0).double().sum())
+
+
+def fit_to_memory(
+    strategy: StructureAwareStrategy, params: Params, size: TrainingSize
+) -> tuple[str | None, str | None]:
+    """Lower `max_gaussians` to what the budget, or the device's free memory, holds; call before the first step.
+
+    A cap under the present number of Gaussians adds none and takes none away. Without a budget, a `max_gaussians` that
+    is not the default stays as it is.
+
+    Args:
+        strategy: Its `max_gaussians` is lowered; its `memory_budget_gb` is the budget.
+        params: The initial Gaussians, on the device of training.
+        size: What the run keeps and renders besides.
+
+    Returns:
+        A line for the user, and a warning if the first step will probably not fit; both None without CUDA, where
+        nothing is changed.
+
+    Raises:
+        ValueError: If `memory_budget_gb` leaves no room for Gaussians.
+    """
+    device, n = params["means"].device, len(params["means"])
+    free, total = memory.available_bytes(device)
+    if math.isinf(free):
+        return None, None
+    state = empty_statistics(0, device) | empty_gradients(0, device)
+    each = memory.kept_bytes(params, state) + memory.widest_bytes(params)
+    fixed = size.image_bytes + max(memory.step_bytes(0, _with_pairs(size.step, 0), size.fused).values())
+
+    def need(num_gaussians: int, step: StepSize) -> float:
+        working = max(memory.step_bytes(num_gaussians, step, size.fused).values())
+        return size.image_bytes + each * num_gaussians + working
+
+    why = ""
+    given = strategy.memory_budget_gb
+    if given is not None or strategy.max_gaussians == StructureAwareStrategy.max_gaussians:
+        budget = PLANNED_SHARE * free if given is None else min(1e9 * given, free)
+        none = {name: value[:0] for name, value in params.items()}
+        left = budget - size.image_bytes
+        affordable = memory.affordable_growth(none, state, left, _with_pairs(size.step, 0), size.fused)  # type: ignore[arg-type]
+        if given is not None and affordable < 1:
+            raise ValueError(
+                f"strategy.memory_budget_gb is {given:g} and leaves no room for Gaussians: images and rendering "
+                f"take {fixed / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; raise it, take fewer or "
+                "smaller images, or lower pipeline.views-per-iteration."
+            )
+        if affordable < strategy.max_gaussians:
+            strategy.max_gaussians = max(int(affordable), 1)
+            why = f"; {free / 1e9:.1f} GB are free" if given is None else f"; memory_budget_gb is {given:g}"
+            if strategy.max_gaussians < n:
+                why += f", which holds no more than the {n:,} at the start: none will be added"
+    most = max(strategy.max_gaussians, n)
+    at_most = need(most, _with_pairs(size.step, memory.PAIRS_PER_GAUSSIAN * size.step.views * most))
+    line = (
+        f"At most {strategy.max_gaussians:,} Gaussians: {at_most / 1e9:.1f} GB of the card's {total / 1e9:.1f} GB{why}."
+    )
+    first = need(n, size.step)
+    if first <= free:
+        return line, None
+    return line, (
+        f"The first step will probably not fit the GPU's memory: {n:,} Gaussians, which reach "
+        f"{size.step.pairs / 1e6:,.0f} million tiles of {size.step.views} views, take {first / 1e9:.1f} GB with the "
+        f"images, and {free / 1e9:.1f} GB are free; lower --pipeline.views-per-iteration, or take smaller images."
+    )
+
+
+def _with_pairs(step: StepSize, pairs: float) -> StepSize:
+    return StepSize(step.views, step.pixels, pairs)

@@ -1,0 +1,90 @@
+"""Which views the steps of a run take: no view twice in a step, and all equally often."""
+
+from __future__ import annotations
+
+from collections import Counter
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
+
+from sadgs_ns.plugin.pipeline import SadgsPipeline
+from sadgs_ns.plugin.views import TrainingViews
+
+STEPS = 1000
+
+
+class Datamanager:
+    """nerfstudio's order of `total` views, without its images."""
+
+    def __init__(self, total: int, **options: Any) -> None:
+        self.config = FullImageDatamanagerConfig(**options)
+        cameras = SimpleNamespace(camera_to_worlds=torch.rand((total, 3, 4), generator=torch.manual_seed(0)))
+        self.cached_train = [{"image": torch.zeros(1, 1, 3)} for _ in range(total)]
+        self.train_dataset: Any = type("Dataset", (), {"cameras": cameras, "__len__": lambda _: total})()
+        self.train_unseen_cameras = self.sample_train_cameras()
+
+    sample_train_cameras = FullImageDatamanager.sample_train_cameras
+
+
+def views_of(datamanager: Any) -> TrainingViews:
+    return TrainingViews(datamanager, SimpleNamespace(device=torch.device("cpu")))  # type: ignore[arg-type]
+
+
+def steps_of(views: TrainingViews, number: int, steps: int = STEPS) -> list[list[int]]:
+    return [[index for index, _ in views.draw(number)] for _ in range(steps)]
+
+
+@pytest.mark.parametrize(
+    ("total", "number", "strategy"),
+    [(10, 4, "random"), (5, 4, "random"), (4, 4, "random"), (7, 3, "random"), (10, 1, "random"), (10, 4, "fps")],
+)
+def test_no_view_comes_twice_in_a_step_and_all_come_equally_often(total: int, number: int, strategy: Any):
+    views = views_of(Datamanager(total, train_cameras_sampling_strategy=strategy))
+    visits: Counter[int] = Counter()
+    for drawn in steps_of(views, number):
+        assert len(set(drawn)) == number
+        visits.update(drawn)
+        counts = [visits[index] for index in range(total)]
+        assert max(counts) - min(counts) <= 1
+
+
+@pytest.mark.parametrize(("total", "number"), [(10, 5), (10, 1), (4, 4)])
+def test_the_order_is_nerfstudio_s_where_rounds_end_with_steps(total: int, number: int):
+    drawn = steps_of(views_of(Datamanager(total)), number, steps=20)
+    order: list[int] = []
+    nerfstudio = Datamanager(total)
+    while len(order) < 20 * number:
+        order += nerfstudio.train_unseen_cameras
+        nerfstudio.train_unseen_cameras = nerfstudio.sample_train_cameras()
+    assert [index for step in drawn for index in step] == order[: 20 * number]
+
+
+def test_a_view_that_is_passed_over_comes_first_in_the_next_step():
+    datamanager = Datamanager(4)
+    datamanager.train_unseen_cameras = [2, 3]
+    datamanager.sample_train_cameras = lambda: [3, 0, 2, 1]  # type: ignore[method-assign]
+    assert steps_of(views_of(datamanager), 3, steps=2) == [[2, 3, 0], [3, 2, 1]]
+
+
+def test_a_round_of_fewer_views_than_a_step_takes_repeats_some():
+    datamanager = Datamanager(9, train_cameras_sampling_strategy="fps", fps_reset_every=2)
+    assert all(len(drawn) == 5 for drawn in steps_of(views_of(datamanager), 5, steps=50))
+
+
+@pytest.mark.parametrize(("total", "number"), [(10, 4), (5, 4), (7, 3)])
+def test_a_resumed_run_goes_on_with_the_views_of_the_run_that_was_never_stopped(total: int, number: int):
+    undisturbed = steps_of(views_of(Datamanager(total)), number, steps=60)
+    drawn = []
+    datamanager = Datamanager(total)
+    for _ in range(6):
+        drawn += steps_of(views_of(datamanager), number, steps=10)
+        pipeline: Any = SimpleNamespace(
+            datamanager=datamanager, device=torch.device("cpu"), _settings=dict, views_per_iteration=number
+        )
+        state = SadgsPipeline.get_extra_state(pipeline)
+        datamanager = pipeline.datamanager = Datamanager(total)
+        SadgsPipeline.set_extra_state(pipeline, state)
+    assert drawn == undisturbed
