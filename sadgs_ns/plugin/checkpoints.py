@@ -12,8 +12,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from sadgs_ns.errors import InputError, reason
 
-REMEDY = "give --load-dir the folder nerfstudio_models of a run of sadgs, or train from scratch"
+REMEDY = "give --load-dir the folder of a run of sadgs, or train from scratch"
 """For a checkpoint that cannot be used."""
+_FOLDER = "nerfstudio_models"
+"""Name of the folder of checkpoints in a run's folder."""
 _PARTS = ("step", "pipeline", "optimizers", "scalers")
 
 
@@ -46,16 +48,25 @@ def read(path: Path, remedy: str = REMEDY, mmap: bool = False) -> dict[str, Any]
     return state
 
 
-def checkpoint_path(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> Path | None:
-    """The checkpoint that nerfstudio's trainer will load for these options, or None.
+def checkpoint_paths(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> list[Path]:
+    """Checkpoints that nerfstudio's options for resuming name, in the order in which reading them is tried.
+
+    Args:
+        load_dir: A folder of checkpoints, or the folder of a run, which holds one. It takes precedence.
+        load_step: Step of the only checkpoint of `load_dir` to take; None is the latest, or a whole one before it.
+        load_checkpoint: A file.
 
     Raises:
         InputError: If there is none, or the folder holds something else, too.
     """
     if load_dir is None:
-        if load_checkpoint is not None and not load_checkpoint.is_file():
+        if load_checkpoint is None:
+            return []
+        if not load_checkpoint.is_file():
             raise InputError(f"{load_checkpoint} does not exist: give --load-checkpoint a file step-*.ckpt of a run.")
-        return load_checkpoint
+        return [load_checkpoint]
+    if (load_dir / _FOLDER).is_dir():
+        load_dir = load_dir / _FOLDER
     steps = {}
     for path in sorted(load_dir.iterdir()) if load_dir.is_dir() else []:
         match = re.fullmatch(r"step-(\d+)\.ckpt", path.name)
@@ -63,20 +74,22 @@ def checkpoint_path(load_dir: Path | None, load_step: int | None, load_checkpoin
             raise InputError(f"{path} lies among the checkpoints and is none: move it elsewhere.")
         steps[int(match[1])] = path
     if not steps:
-        raise InputError(f"{load_dir} holds no checkpoint: give --load-dir the folder nerfstudio_models of a run.")
-    if load_step is not None and load_step not in steps:
+        raise InputError(f"{load_dir} holds no checkpoint: give --load-dir the folder of a run of sadgs.")
+    if load_step is None:
+        return [steps[step] for step in sorted(steps, reverse=True)]
+    if load_step not in steps:
         there = ", ".join(map(str, sorted(steps)))
         raise InputError(f"{load_dir} holds no checkpoint of step {load_step}: give --load-step one of {there}.")
-    return steps[max(steps) if load_step is None else load_step]
+    return [steps[load_step]]
 
 
 def check_chosen(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> None:
     """See at a glance whether `read_chosen` will find a whole file; what it holds is seen when it is read.
 
     Raises:
-        InputError: As `checkpoint_path`, or if none of the files is whole.
+        InputError: As `checkpoint_paths`, or if none of the files is whole.
     """
-    tried = _tried(load_dir, load_step, load_checkpoint)
+    tried = checkpoint_paths(load_dir, load_step, load_checkpoint)
     if tried and not any(map(zipfile.is_zipfile, tried)):  # a zip file's table of contents is at its end
         read(tried[0])  # which says why it cannot be
 
@@ -91,17 +104,17 @@ def read_chosen(
     """Read the checkpoint that these options name; where they leave the step open, an earlier one if it is damaged.
 
     Args:
-        load_dir, load_step, load_checkpoint: As for `checkpoint_path`.
+        load_dir, load_step, load_checkpoint: As for `checkpoint_paths`.
         remedy, mmap: As for `read`.
 
     Returns:
         Its path and content; None where the options name none.
 
     Raises:
-        InputError: As `checkpoint_path`, and as `read`, of the first, if none can be read.
+        InputError: As `checkpoint_paths`, and as `read`, of the first, if none can be read.
     """
     errors = []
-    for path in _tried(load_dir, load_step, load_checkpoint):
+    for path in checkpoint_paths(load_dir, load_step, load_checkpoint):
         try:
             state = read(path, remedy, mmap)
         except InputError as error:
@@ -114,13 +127,3 @@ def read_chosen(
     if errors:
         raise errors[0]
     return None
-
-
-def _tried(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> list[Path]:
-    """The checkpoints that are tried one after the other until one can be read."""
-    path = checkpoint_path(load_dir, load_step, load_checkpoint)
-    if path is None:
-        return []
-    if load_dir is None or load_step is not None:
-        return [path]
-    return sorted(load_dir.glob("step-*.ckpt"), key=lambda p: int(p.stem[5:]), reverse=True)

@@ -1,16 +1,19 @@
-"""SIGINT and SIGTERM that wait until a training step is whole, and the command that goes on from there."""
+"""SIGINT, SIGTERM and SIGHUP that wait until a training step is whole, and the command that goes on from there."""
 
 from __future__ import annotations
 
+import os
 import shlex
 import signal
+import stat
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+"""Signals that ask a run to stop: Ctrl-C, a job's end, and a terminal that is gone, which Windows does not send."""
 _LOADING = ("load-dir", "load-step", "load-checkpoint")
 
 
@@ -23,10 +26,10 @@ class Interrupted(KeyboardInterrupt):
 
 
 class Interrupts:
-    """While entered, the first SIGINT or SIGTERM makes `poll` raise; a second one acts as it did before.
+    """While entered, the first of `SIGNALS` makes `poll` raise; a second one acts as it did before.
 
-    Signals are left alone outside the main thread, which cannot handle them, and where the program has a handler of its
-    own for SIGTERM.
+    Signals are left alone outside the main thread, which cannot handle them. So is a signal for which the program has a
+    handler of its own, or which it ignores, as SIGHUP under nohup.
 
     Args:
         waiting: Whether the program only waits for somebody, so that nobody polls: the signal then raises at once.
@@ -58,6 +61,8 @@ class Interrupts:
 
     def _handle(self, number: int, frame: object) -> None:
         self._restore()
+        if number == getattr(signal, "SIGHUP", None):
+            _drop_lost_output()
         self._received = number
         if self._waiting():
             self.poll()
@@ -66,6 +71,15 @@ class Interrupts:
         for number, previous in self._previous.items():
             signal.signal(number, previous)
         self._previous = {}
+
+
+def _drop_lost_output() -> None:
+    """Send output nowhere that went to a terminal or pipe that is gone: printing would raise before a run is saved."""
+    for descriptor in (1, 2):
+        if not os.isatty(descriptor) and not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, descriptor)
+            os.close(nowhere)
 
 
 def resume_command(argv: Sequence[str], method: str, folder: Path) -> str:

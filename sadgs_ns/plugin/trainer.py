@@ -16,6 +16,7 @@ import tyro
 import yaml
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from sadgs_ns.atomic import atomic_path
@@ -189,13 +190,21 @@ class SadgsTrainer(Trainer):
 
         Raises:
             RunError: If the GPU's memory is full or a checkpoint could not be saved.
-            SystemExit: SIGINT or SIGTERM came: with a checkpoint saved, a line printed that says how to go on, and the
+            SystemExit: SIGINT, SIGTERM or SIGHUP came: with a checkpoint saved, a line printed that says how to go on, and the
                 exit code that shells give these signals.
         """
         total = self.config.max_num_iterations
         self.step: int = max(self._start_step - 1, 0)  # names the checkpoint when nothing is left to do
         self._completed_step = self._saved_step = self._start_step - 1
         self.config.max_num_iterations = max(total - self._start_step, 0)
+        if self._start_step >= total:
+            writer.GLOBAL_BUFFER["step"] = self.step  # nerfstudio's table reads it, and an iteration would set it
+            CONSOLE.print(
+                f"This run is finished after {self._start_step} iterations: --max-num-iterations of more than "
+                f"{self._start_step} trains on.",
+                highlight=False,
+                soft_wrap=True,
+            )
         out_of_memory = ""
         self._set_clock(0.0)
         try:

@@ -219,12 +219,12 @@ def test_one_whole_checkpoint_among_damaged_ones_is_enough(saved: Path, tmp_path
 
 def test_a_step_or_file_without_a_checkpoint_is_named(saved: Path, tmp_path: Path):
     with pytest.raises(InputError, match=r"no checkpoint of step 3: give --load-step one of 5\."):
-        checkpoints.checkpoint_path(saved.parent, 3, None)
+        checkpoints.checkpoint_paths(saved.parent, 3, None)
     with pytest.raises(InputError, match=r"\S+/none\.ckpt does not exist: give --load-checkpoint a file"):
-        checkpoints.checkpoint_path(None, None, tmp_path / "none.ckpt")
+        checkpoints.checkpoint_paths(None, None, tmp_path / "none.ckpt")
     for step in (None, 5):
-        assert checkpoints.checkpoint_path(saved.parent, step, None) == saved
-    assert checkpoints.checkpoint_path(None, None, None) is None
+        assert checkpoints.checkpoint_paths(saved.parent, step, None) == [saved]
+    assert checkpoints.checkpoint_paths(None, None, None) == []
 
 
 # --- the GPU's memory ---

@@ -6,11 +6,12 @@ import os
 import re
 import shlex
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,13 +25,17 @@ from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.scripts.train import main as resume
+from nerfstudio.utils import writer
 from scenes import ITERATIONS
 
 from sadgs_ns.demo.scene import SPARSE_FOLDER
-from sadgs_ns.plugin.interrupts import resume_command
+from sadgs_ns.plugin.checkpoints import checkpoint_paths
+from sadgs_ns.plugin.interrupts import SIGNALS, resume_command
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 SCRIPT = Path(__file__).parents[1] / "kill_and_resume.py"
+TERMINAL = "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0)\n"
+"""Makes the standard input the terminal that controls the process, so that it is sent SIGHUP when that is gone."""
 
 
 def after(trainer: SadgsTrainer, at: int, act: Callable[[], None]) -> None:
@@ -195,7 +200,16 @@ def test_ctrl_c_on_ns_train_prints_the_command_that_resumes_it(
     assert [p.name for p in folder.iterdir()] == [f"step-{iterations - 1:09d}.ckpt"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.fixture
+def hang_up_by_default() -> Iterator[None]:
+    """Where the tests themselves run under nohup, SIGHUP is ignored, and would be by the runs."""
+    previous = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, previous)
+
+
+@pytest.mark.usefixtures("hang_up_by_default")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_an_interrupt_within_a_step_waits_for_its_end_and_resumes_to_the_same_model(
     number: signal.Signals, scene: Path, config: SadgsTrainerConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -211,11 +225,11 @@ def test_an_interrupt_within_a_step_waits_for_its_end_and_resumes_to_the_same_mo
         return get_loss(step)
 
     trainer.pipeline.get_train_loss_dict = interrupted  # type: ignore[method-assign]
-    handlers = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+    handlers = [signal.getsignal(n) for n in SIGNALS]
     with pytest.raises(SystemExit) as stopped:
         trainer.train()
     assert stopped.value.code == 128 + number
-    assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == handlers
+    assert [signal.getsignal(n) for n in SIGNALS] == handlers
     assert checkpoints(trainer) == ["step-000000004.ckpt"]
     line = one_line(capsys.readouterr().out, number.name)
     assert line == (
@@ -229,6 +243,38 @@ def test_an_interrupt_within_a_step_waits_for_its_end_and_resumes_to_the_same_mo
     name = f"step-{ITERATIONS - 1:09d}.ckpt"
     ends = [torch.load(t.checkpoint_dir / name, weights_only=True) for t in (whole, resumed)]
     assert differences(*ends) == []
+
+
+def test_a_terminal_that_is_gone_costs_nothing_that_was_trained(scene: Path, tmp_path: Path):
+    """As where ssh is cut off: the run loses the terminal that it prints to, and is sent SIGHUP."""
+    ours, theirs = os.openpty()
+    script = "import sys; from pathlib import Path; from kill_and_resume import configure, set_up\n"
+    script += f"config = configure(Path({str(scene)!r}), Path({str(tmp_path)!r}), 5000, save_every=0)\n"
+    script += "config.logging.local_writer.enable, config.pipeline.model.densify = True, False\n"
+    script += "trainer = set_up(config); trainer.train()\n"
+    process = subprocess.Popen(
+        [sys.executable, "-W", "ignore", "-c", TERMINAL + script],
+        stdin=theirs,
+        stdout=theirs,
+        stderr=theirs,
+        start_new_session=True,
+        cwd=SCRIPT.parent,
+        env={
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join([*map(str, SCRIPT.parents), os.environ.get("PYTHONPATH", "")]),
+        },
+    )
+    try:
+        os.close(theirs)
+        printed = b""
+        while b"10 (0.20%)" not in printed:  # a line of the table of progress
+            printed += os.read(ours, 4096)
+        os.close(ours)
+        assert process.wait(60) == 128 + signal.SIGHUP, printed.decode()
+    finally:
+        process.kill()
+    (path,) = tmp_path.rglob("*.ckpt")
+    assert torch.load(path, weights_only=True)["step"] > 0
 
 
 def test_an_interrupt_while_paused_before_the_first_iteration_leaves_nothing(
@@ -304,6 +350,61 @@ def test_a_handler_that_the_program_has_for_sigterm_stays(config: SadgsTrainerCo
 )
 def test_the_resume_command_keeps_every_other_option(argv: str, command: str):
     assert resume_command(argv.split(), "sadgs", Path("a b")) == command
+
+
+# --- finished runs ---
+
+
+@pytest.fixture(scope="module")
+def finished(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run that is finished."""
+    trainer = set_up(configure(scene, tmp_path_factory.mktemp("finished"), ITERATIONS, save_every=0))
+    trainer.train()
+    return trainer.base_dir
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of viser and websockets
+@pytest.mark.parametrize("vis", ["tensorboard", "viewer"])
+@pytest.mark.parametrize("option", ["load_dir", "load_checkpoint"])
+def test_opening_a_finished_run_says_how_to_train_on_and_ends_well(
+    option: str,
+    vis: str,
+    finished: Path,
+    config: SadgsTrainerConfig,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    (saved,) = (finished / "nerfstudio_models").iterdir()
+    setattr(config, option, finished if option == "load_dir" else saved)
+    config.vis, config.viewer.quit_on_train_completion = vis, True  # type: ignore[assignment]
+    config.logging.local_writer.enable = True
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        config.viewer.websocket_port = free.getsockname()[1]  # nerfstudio's own search leaves a socket open
+    monkeypatch.delitem(writer.GLOBAL_BUFFER, "step", raising=False)  # as in a process that has not trained
+    monkeypatch.setattr(writer, "EVENT_WRITERS", [])
+    config.save_config()
+    trainer = set_up(config)
+    try:
+        trainer.train()
+    finally:
+        trainer.shutdown()
+    line = one_line(capsys.readouterr().out, "This run is finished")
+    assert line == (
+        f"This run is finished after {ITERATIONS} iterations: --max-num-iterations of more than {ITERATIONS} trains on."
+    )
+    ends = [torch.load(path / saved.name, weights_only=True) for path in (saved.parent, trainer.checkpoint_dir)]
+    assert differences(*ends) == []
+
+
+def test_a_run_s_folder_does_as_well_as_its_folder_of_checkpoints(finished: Path, config: SadgsTrainerConfig):
+    (saved,) = (finished / "nerfstudio_models").iterdir()
+    for folder in (finished, saved.parent):
+        for step in (None, ITERATIONS - 1):
+            assert checkpoint_paths(folder, step, None) == [saved]
+    config.load_dir = finished
+    config.save_config()
+    assert set_up(config)._start_step == ITERATIONS
 
 
 # --- damaged checkpoints ---
