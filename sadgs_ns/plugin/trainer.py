@@ -35,6 +35,8 @@ _LESS_MEMORY = (
 _SAVING_SHARE = 0.01
 """The most of the time from one of the clock's checkpoints to the next that the saving may take."""
 
+_ONE_DEVICE = "sadgs trains on one device; set machine.num_devices and machine.num_machines to 1."
+
 
 def _memory(error: torch.cuda.OutOfMemoryError) -> str:
     """How much memory was asked for, and of whom: the first two of torch's many sentences."""
@@ -77,16 +79,62 @@ class SadgsTrainerConfig(TrainerConfig):
         """See whether training can work with these options.
 
         Raises:
-            InputError: If there is no iteration to do, or gradients would be scaled; as `SadgsPipelineConfig.check`.
+            InputError: If a number is out of its range, gradients would be scaled or accumulated, or the device is not
+                there; as `SadgsPipelineConfig.check`.
         """
-        if self.max_num_iterations < 1:
-            raise InputError(f"max_num_iterations must be at least 1, got {self.max_num_iterations}.")
+        for name, count in (
+            ("max_num_iterations", self.max_num_iterations),
+            ("logging.steps_per_log", self.logging.steps_per_log),
+        ):
+            if count < 1:
+                raise InputError(f"{name} must be at least 1, got {count}.")
+        for name in ("save", "eval_batch", "eval_image", "eval_all_images"):
+            if (steps := getattr(self, f"steps_per_{name}")) < 0:
+                raise InputError(f"steps_per_{name} must not be negative, got {steps}.")
+        if not self.seconds_per_save >= 0:
+            raise InputError(f"seconds_per_save must not be negative, got {self.seconds_per_save:g}.")
+        if self.load_step is not None and self.load_dir is None:
+            raise InputError(
+                f"load_step is {self.load_step}, but load_dir is not set: add --load-dir with the folder of a run."
+            )
+        port = self.viewer.websocket_port
+        if port is not None and not 1 <= port <= 65535:
+            raise InputError(f"viewer.websocket_port must be in [1, 65535], got {port}.")
+        if self.machine.num_devices * self.machine.num_machines != 1:
+            raise InputError(_ONE_DEVICE)
+        if self.machine.device_type == "cuda" and not torch.cuda.is_available():
+            raise InputError(
+                "machine.device_type is cuda, but torch finds no CUDA device: set it to cpu, or see what nvidia-smi says."
+            )
+        self._check_rates()
         if self.mixed_precision or self.use_grad_scaler:
             raise InputError(
                 "sadgs trains in float32, and its densification reads gradients as they are: leave mixed_precision and "
                 "use_grad_scaler off."
             )
+        if any(steps != 1 for steps in self.gradient_accumulation_steps.values()):
+            raise InputError(
+                "sadgs updates every parameter in every iteration, and densification would lose gradients that were "
+                "kept for later: leave gradient_accumulation_steps out, and set pipeline.views_per_iteration instead."
+            )
         self.pipeline.check()
+
+    def _check_rates(self) -> None:
+        """See whether the learning rates can train anything.
+
+        Raises:
+            InputError: If one is not in [0, 1], or a schedule's factor is not positive and finite.
+        """
+        for group, configs in self.optimizers.items():
+            rate, scheduler = configs["optimizer"].lr, configs.get("scheduler")
+            if not 0 <= rate <= 1:
+                raise InputError(f"optimizers.{group}.optimizer.lr must be in [0, 1], got {rate:g}.")
+            if isinstance(scheduler, RunLengthDecaySchedulerConfig):
+                for name in ("initial_factor", "final_factor"):
+                    if not 0 < (factor := getattr(scheduler, name)) < math.inf:
+                        raise InputError(
+                            f"optimizers.{group}.scheduler.{name} must be positive and finite, got {factor:g}."
+                        )
 
     def save_config(self) -> None:
         """Write `config.yml`, the first file of a run: not before options, checkpoint, data and folder are found good.
@@ -121,7 +169,7 @@ class SadgsTrainer(Trainer):
 
     def __init__(self, config: SadgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         if world_size > 1:
-            raise InputError(f"sadgs trains on one device; set machine.num_devices to 1, not {world_size}.")
+            raise InputError(_ONE_DEVICE)
         config.check()
         super().__init__(config, local_rank, world_size)
         self._stepping = False
@@ -190,8 +238,8 @@ class SadgsTrainer(Trainer):
 
         Raises:
             RunError: If the GPU's memory is full or a checkpoint could not be saved.
-            SystemExit: SIGINT, SIGTERM or SIGHUP came: with a checkpoint saved, a line printed that says how to go on, and the
-                exit code that shells give these signals.
+            SystemExit: SIGINT, SIGTERM or SIGHUP came: with a checkpoint saved, a line printed that says how to go on,
+                and the exit code that shells give these signals.
         """
         total = self.config.max_num_iterations
         self.step: int = max(self._start_step - 1, 0)  # names the checkpoint when nothing is left to do

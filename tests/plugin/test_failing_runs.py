@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shutil
 from collections.abc import Callable
@@ -26,6 +27,59 @@ ITERATIONS = 6
 @pytest.fixture
 def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig:
     return configure(tmp_path / "out", colmap, ITERATIONS)
+
+
+# --- options ---
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "sentence"),
+    [
+        ("gradient_accumulation_steps", {"means": 4}, "sadgs updates every parameter in every iteration, and "),
+        ("machine.num_devices", 2, "sadgs trains on one device; set machine.num_devices and machine.num_machines to 1"),
+        (
+            "machine.num_machines",
+            2,
+            "sadgs trains on one device; set machine.num_devices and machine.num_machines to 1",
+        ),
+        ("machine.device_type", "cuda", "machine.device_type is cuda, but torch finds no CUDA device: set it to cpu,"),
+        ("steps_per_save", -3, "steps_per_save must not be negative, got -3."),
+        ("seconds_per_save", math.nan, "seconds_per_save must not be negative, got nan."),
+        ("steps_per_eval_batch", -1, "steps_per_eval_batch must not be negative, got -1."),
+        ("steps_per_eval_image", -1, "steps_per_eval_image must not be negative, got -1."),
+        ("steps_per_eval_all_images", -1, "steps_per_eval_all_images must not be negative, got -1."),
+        ("logging.steps_per_log", 0, "logging.steps_per_log must be at least 1, got 0."),
+        ("viewer.websocket_port", 99999, "viewer.websocket_port must be in [1, 65535], got 99999."),
+        ("load_step", 3, "load_step is 3, but load_dir is not set: add --load-dir with the folder of a run."),
+        ("optimizers.means.optimizer.lr", math.nan, "optimizers.means.optimizer.lr must be in [0, 1], got nan."),
+        ("optimizers.quats.optimizer.lr", 1e9, "optimizers.quats.optimizer.lr must be in [0, 1], got 1e+09."),
+        ("optimizers.scales.optimizer.lr", -1.0, "optimizers.scales.optimizer.lr must be in [0, 1], got -1."),
+        (
+            "optimizers.means.scheduler.final_factor",
+            0.0,
+            "optimizers.means.scheduler.final_factor must be positive and finite, got 0.",
+        ),
+    ],
+)
+def test_options_with_which_no_run_can_work_are_refused_before_anything_is_written(
+    option: str, value: Any, sentence: str, config: SadgsTrainerConfig
+):
+    if value == "cuda" and torch.cuda.is_available():
+        pytest.skip("there is a CUDA device")
+    owner: Any = config
+    *owners, name = option.split(".")
+    for part in owners:
+        owner = owner[part] if isinstance(owner, dict) else getattr(owner, part)
+    setattr(owner, name, value)
+    with pytest.raises(InputError) as refused:
+        config.save_config()
+    assert str(refused.value).startswith(sentence) and "\n" not in str(refused.value)
+    assert not config.output_dir.exists()
+
+
+def test_accumulating_over_one_iteration_is_what_everybody_does(config: SadgsTrainerConfig):
+    config.gradient_accumulation_steps = {"means": 1}
+    config.check()
 
 
 # --- the disk ---
