@@ -10,9 +10,14 @@ from torch import Tensor
 MAX_GRADIENT = 1e18
 """A gradient at least this large counts as not finite: from 1.8e19 its square overflows for good in Adam."""
 
+HOPELESS_STEPS = 100
+"""A run stops after so many steps in a row in which something was not finite, if it also learns nothing any more."""
+
 
 class NonFiniteLog:
     """What happened in the training steps since it was last read.
+
+    `steps` counts all steps that were read, `streak` those at their end in which something was not finite.
 
     Args:
         device: Where losses and gradients are.
@@ -25,6 +30,7 @@ class NonFiniteLog:
         self._gradients = torch.zeros((capacity, 4), device=device)
         self._slots = self._gradients[:, :1].unbind()  # views made once: slicing takes the host long
         self._steps: list[tuple[int, list[int]]] = []
+        self.steps = self.streak = 0
 
     @property
     def full(self) -> bool:
@@ -61,6 +67,10 @@ class NonFiniteLog:
                 wrong.append((step, views, f"the loss was {loss}"))
             elif not math.isfinite(gradient):
                 wrong.append((step, views, "gradients were not finite"))
+            else:
+                self.streak = -1
+            self.streak += 1
+        self.steps += len(self._steps)
         self._steps.clear()
         self._gradients.zero_()
         return wrong
@@ -77,3 +87,13 @@ def leave_out_nonfinite(gradient: Tensor, noted: Tensor) -> None:
     wrong = ~(gradient.abs() < MAX_GRADIENT)  # NaN compares as False
     gradient.masked_fill_(wrong, 0.0)
     noted.masked_fill_(wrong.any(), torch.nan)
+
+
+def is_useless(gradient: Tensor) -> bool:
+    """Whether no element of a gradient changes its parameter; waits for the device.
+
+    Args:
+        gradient: Any shape, before or after `leave_out_nonfinite`.
+    """
+    size = gradient.abs()
+    return not bool(((size > 0) & (size < MAX_GRADIENT)).any())

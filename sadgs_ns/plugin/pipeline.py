@@ -30,6 +30,7 @@ from sadgs_ns.method.structure_tensor import (
     NOISE_FLOOR,
     multiscale_structure_tensor,
 )
+from sadgs_ns.plugin import nonfinite
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
 from sadgs_ns.plugin.model import SadgsModel, SadgsModelConfig
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
@@ -115,6 +116,7 @@ class SadgsPipeline(VanillaPipeline):
         positions = self.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]  # [C, 3]
         self.model.set_cameras(positions)
         self.log = NonFiniteLog(self.device)
+        self.stuck = ""  # says why, where nothing is learned any more
         self.structure = StructurePanel(self)
         self.model.viewer_outputs = self.structure.outputs
 
@@ -286,11 +288,20 @@ class SadgsPipeline(VanillaPipeline):
                 optimizer.log = self.log
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN]
         counts = TrainingCallback(after, lambda step: self.structure.refresh())
-        last = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self._report_nonfinite())
-        return [*super().get_training_callbacks(training_callback_attributes), counts, last]
+        after_step = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+        read = TrainingCallback(after_step, lambda step: self._report_nonfinite() if self.log.full else None)
+        last = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self._report_nonfinite(last=True))
+        # The log is read before densification makes new parameters, which have no gradients.
+        return [read, *super().get_training_callbacks(training_callback_attributes), counts, last]
 
-    def _report_nonfinite(self) -> None:
-        """Say in which of the last iterations, and with which images, a loss or gradient was not finite."""
+    def _report_nonfinite(self, last: bool = False) -> None:
+        """Say in which of the last iterations, and with which images, a loss or gradient was not finite.
+
+        Where that lasts, and the present gradients move nothing, `stuck` becomes the sentence that says so.
+
+        Args:
+            last: Whether the run ends here: then it may have been too short for `nonfinite.HOPELESS_STEPS`.
+        """
         wrong = self.log.read()
         files = self.datamanager.train_dataset.image_filenames
         for step, views, what in wrong[:_NAMED_STEPS]:
@@ -300,6 +311,16 @@ class SadgsPipeline(VanillaPipeline):
             )
         if len(wrong) > _NAMED_STEPS:
             CONSOLE.print(f"[yellow]The same in {len(wrong) - _NAMED_STEPS} more of the last iterations.[/]")
+        enough = nonfinite.HOPELESS_STEPS if not last else min(nonfinite.HOPELESS_STEPS, self.log.steps)
+        gradient = self.model.means.grad
+        if wrong and self.log.streak >= enough and gradient is not None and nonfinite.is_useless(gradient):
+            step, _, what = wrong[-1]
+            names = [files[view].name for view in dict.fromkeys(view for _, views, _ in wrong for view in views)]
+            more = f" and {len(names) - _NAMED_STEPS} more" if len(names) > _NAMED_STEPS else ""
+            self.stuck = (
+                f"Nothing was learned in the last {self.log.streak} iterations, up to iteration {step + 1}: {what} "
+                f"(images {', '.join(names[:_NAMED_STEPS])}{more})"
+            )
 
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
         """Render the iteration's views and return the outputs of the last size, mean losses and mean metrics."""
@@ -332,8 +353,6 @@ class SadgsPipeline(VanillaPipeline):
                 for name, value in part.items():
                     # The mean over one size, the usual case, is no work for the device, here or in the backward pass.
                     total[name] = value if len(groups) == 1 else total.get(name, 0) + weight * value
-        if self.log.full:
-            self._report_nonfinite()
         self.log.begin_step(step, [index for views in groups.values() for index, _ in views], losses["main_loss"])
         return outputs, losses, metrics
 

@@ -104,7 +104,7 @@ class SadgsTrainerConfig(TrainerConfig):
             raise InputError(_ONE_DEVICE)
         if self.machine.device_type == "cuda" and not torch.cuda.is_available():
             raise InputError(
-                "machine.device_type is cuda, but torch finds no CUDA device: set it to cpu, or see what nvidia-smi says."
+                "machine.device_type is cuda, but torch finds no CUDA device: set it to cpu, or install torch for CUDA."
             )
         self._check_rates()
         if self.mixed_precision or self.use_grad_scaler:
@@ -237,7 +237,7 @@ class SadgsTrainer(Trainer):
         """Train up to `max_num_iterations` in all; nerfstudio 1.1.5 trains that many more after resuming.
 
         Raises:
-            RunError: If the GPU's memory is full or a checkpoint could not be saved.
+            RunError: If the GPU's memory is full, a checkpoint could not be saved, or nothing is learned any more.
             SystemExit: SIGINT, SIGTERM or SIGHUP came: with a checkpoint saved, a line printed that says how to go on,
                 and the exit code that shells give these signals.
         """
@@ -259,6 +259,7 @@ class SadgsTrainer(Trainer):
             try:
                 with self._interrupts:
                     super().train()
+                    self._stop_if_stuck()
             except Interrupted as interrupted:
                 self._stop(interrupted, total)
         except torch.cuda.OutOfMemoryError as error:
@@ -311,6 +312,7 @@ class SadgsTrainer(Trainer):
         """nerfstudio calls this after every step, when densification is done."""
         self._completed_step, self._stepping = step, False
         self._interrupts.poll()
+        self._stop_if_stuck()
         if time.monotonic() >= self._save_due:
             self.save_checkpoint(step)
         super()._update_viewer_state(step)
@@ -318,6 +320,7 @@ class SadgsTrainer(Trainer):
     def _train_complete_viewer(self) -> None:
         """nerfstudio waits here for the viewer's user, for ever."""
         self._interrupts.poll()
+        self._stop_if_stuck()
         super()._train_complete_viewer()
 
     def _set_clock(self, took: float) -> None:
@@ -341,6 +344,24 @@ class SadgsTrainer(Trainer):
             text = f"{interrupted}: stopped and saved after {done} of {total} iterations; resume with: {command}"
         CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
         raise SystemExit(128 + interrupted.number)
+
+    def _stop_if_stuck(self) -> None:
+        """Save the Gaussians and leave if they learn nothing any more, because gradients are not finite.
+
+        Raises:
+            RunError: If so.
+        """
+        if not self.pipeline.stuck:
+            return
+        kept = "the Gaussians themselves are not finite: train anew, or from a checkpoint in which they are"
+        if all(bool(parameter.isfinite().all()) for parameter in self.pipeline.model.gauss_params.values()):
+            if self._completed_step > self._saved_step:
+                self.save_checkpoint(self._completed_step)
+            kept = f"the Gaussians as they are now are saved and go on with --load-dir {self.checkpoint_dir}"
+        raise RunError(
+            f"{self.pipeline.stuck}; look at them with sadgs-doctor, and lower the learning rates if you raised them; "
+            f"{kept}."
+        )
 
     def save_checkpoint(self, step: int) -> None:
         """Save under a temporary name, then rename: a killed save leaves the previous checkpoint as it was.
@@ -369,7 +390,7 @@ class SadgsTrainer(Trainer):
                 with partial.open("rb+") as file:
                     os.fsync(file.fileno())
         self._saved_step = step
-        if self.config.save_only_latest_checkpoint:
+        if self.config.save_only_latest_checkpoint and not self.pipeline.stuck:  # then an earlier one may be better
             for other in others:
                 other.unlink()
         self._set_clock(time.monotonic() - start)

@@ -13,12 +13,13 @@ import pytest
 import torch
 from kill_and_resume import differences, parser_of
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer
 from runs import checkpoint, configure, is_finite, set_up, train
 
 from sadgs_ns.cli.export import write_ply
 from sadgs_ns.errors import InputError, RunError, WriteError
-from sadgs_ns.plugin import checkpoints
+from sadgs_ns.plugin import checkpoints, nonfinite
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 ITERATIONS = 6
@@ -279,6 +280,94 @@ def test_a_step_or_file_without_a_checkpoint_is_named(saved: Path, tmp_path: Pat
     for step in (None, 5):
         assert checkpoints.checkpoint_paths(saved.parent, step, None) == [saved]
     assert checkpoints.checkpoint_paths(None, None, None) == []
+
+
+# --- runs that learn nothing ---
+
+
+def poison(trainer: SadgsTrainer, what: str) -> None:
+    """Let every loss, or every gradient of means, be NaN from now on; or the gradient of the first Gaussian alone."""
+    get_loss = trainer.pipeline.get_train_loss_dict
+
+    def poisoned(step: int) -> Any:
+        outputs, losses, metrics = get_loss(step)
+        if what == "loss":
+            losses["main_loss"] = losses["main_loss"] * math.nan
+            trainer.pipeline.log._losses[len(trainer.pipeline.log._steps) - 1] = math.nan
+        return outputs, losses, metrics
+
+    trainer.pipeline.get_train_loss_dict = poisoned  # type: ignore[method-assign]
+    if what != "loss":
+        rows = slice(None) if what == "gradients" else slice(1)
+
+        def spoil(gradient: torch.Tensor) -> torch.Tensor:
+            gradient = gradient.clone()
+            gradient[rows] = math.nan
+            return gradient
+
+        for parameter in trainer.pipeline.model.gauss_params.values():
+            parameter.register_hook(spoil)
+
+
+@pytest.mark.parametrize("what", ["loss", "gradients"])
+def test_a_run_that_learns_nothing_stops_with_one_sentence_and_a_finite_checkpoint(
+    what: str, config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    monkeypatch.setattr(nonfinite, "HOPELESS_STEPS", 8)
+    config.max_num_iterations, config.steps_per_save = 24, 3
+    config.pipeline.model.densify = False
+    trainer = set_up(config)
+    trainer.pipeline.log._losses = trainer.pipeline.log._losses[:4]  # read every 4 iterations
+    location = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+    trainer.callbacks.append(
+        TrainingCallback(location, lambda step: poison(trainer, what) if step == 4 else None)  # the second of a window
+    )
+    with pytest.raises(RunError) as stopped:
+        trainer.train()
+    said = "the loss was nan" if what == "loss" else "gradients were not finite"
+    assert re.fullmatch(
+        rf"Nothing was learned in the last 11 iterations, up to iteration 16: {said} \(images (\S+\.png, ){{3}}\S+\.png"
+        r"\); look at them with sadgs-doctor, and lower the learning rates if you raised them; the Gaussians as they are "
+        r"now are saved and go on with --load-dir \S+/nerfstudio_models\.",
+        str(stopped.value),
+    ), str(stopped.value)
+    assert is_finite(trainer.pipeline.model)
+    state = checkpoint(trainer, 15)
+    assert all(v.isfinite().all() for k, v in state["pipeline"].items() if "gauss_params" in k)
+    assert (trainer.checkpoint_dir / "step-000000012.ckpt").exists()  # it may be the better one
+    config.load_dir, config.output_dir = trainer.checkpoint_dir, tmp_path / "resumed"
+    assert is_finite(train(config).pipeline.model)
+
+
+def test_a_short_run_whose_every_gradient_is_nan_does_not_end_well(config: SadgsTrainerConfig):
+    config.pipeline.model.densify = False
+    trainer = set_up(config)
+    poison(trainer, "gradients")
+    with pytest.raises(
+        RunError, match=rf"^Nothing was learned in the last {ITERATIONS} iterations, up to iteration 6: gr"
+    ):
+        trainer.train()
+    assert checkpoint(trainer, ITERATIONS - 1)["step"] == ITERATIONS - 1
+
+
+def test_gaussians_that_are_not_finite_are_not_saved(config: SadgsTrainerConfig):
+    config.pipeline.model.densify = False
+    trainer = set_up(config)
+    trainer.pipeline.model.gauss_params["features_dc"].data.fill_(math.nan)
+    with pytest.raises(
+        RunError, match=r"; the Gaussians themselves are not finite: train anew, or from a checkpoint .+\.$"
+    ):
+        trainer.train()
+
+
+def test_one_gaussian_whose_gradient_is_always_nan_stops_nobody(
+    config: SadgsTrainerConfig, capsys: pytest.CaptureFixture[str]
+):
+    config.pipeline.model.densify = False
+    trainer = set_up(config)
+    poison(trainer, "one gradient")
+    trainer.train()
+    assert "gradients were not finite" in capsys.readouterr().out and is_finite(trainer.pipeline.model)
 
 
 # --- the GPU's memory ---
