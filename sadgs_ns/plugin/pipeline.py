@@ -116,6 +116,7 @@ class SadgsPipeline(VanillaPipeline):
         positions = self.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]  # [C, 3]
         self.model.set_cameras(positions)
         self.log = NonFiniteLog(self.device)
+        self._checkpoint_cap: int | None = None
         self.stuck = ""  # says why, where nothing is learned any more
         self.structure = StructurePanel(self)
         self.model.viewer_outputs = self.structure.outputs
@@ -281,6 +282,7 @@ class SadgsPipeline(VanillaPipeline):
                 raise InputError(f"pipeline.model.{error}") from error
             if line is not None:
                 CONSOLE.print(line, highlight=False, soft_wrap=True)
+            self._keep_cap()
             self.structure.set_max_gaussians.value = self.model.strategy.max_gaussians
         optimizers = training_callback_attributes.optimizers
         for optimizer in optimizers.optimizers.values() if optimizers is not None else ():
@@ -293,6 +295,23 @@ class SadgsPipeline(VanillaPipeline):
         last = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self._report_nonfinite(last=True))
         # The log is read before densification makes new parameters, which have no gradients.
         return [read, *super().get_training_callbacks(training_callback_attributes), counts, last]
+
+    def _keep_cap(self) -> None:
+        """Go on with the cap that the checkpoint's run had in effect; say so if memory now allows more, or less."""
+        strategy, before = self.model.strategy, self._checkpoint_cap
+        if before is None or strategy.max_gaussians == before:
+            return
+        if strategy.max_gaussians > before:
+            strategy.max_gaussians = before
+            text = f"At most {before:,} Gaussians, as in the checkpoint's run."
+        else:
+            now = strategy.max_gaussians
+            text = (
+                f"[yellow]The checkpoint's run had room for {before:,} Gaussians, the GPU's free memory now has for "
+                f"{now:,}, which is the cap from here on: stop this run and end other programs on the GPU to keep "
+                f"{before:,}.[/]"
+            )
+        CONSOLE.print(text, highlight=False, soft_wrap=True)
 
     def _report_nonfinite(self, last: bool = False) -> None:
         """Say in which of the last iterations, and with which images, a loss or gradient was not finite.
@@ -393,6 +412,7 @@ class SadgsPipeline(VanillaPipeline):
             "torch": torch.get_rng_state(),
             "view_order": list(self.datamanager.train_unseen_cameras),
             "settings": self._settings(),
+            "max_gaussians": self.model.strategy.max_gaussians,  # which may be lower than the setting
         }
         if hasattr(self.datamanager, "random_generator"):
             state["view_shuffle"] = self.datamanager.random_generator.getstate()
@@ -405,16 +425,16 @@ class SadgsPipeline(VanillaPipeline):
 
         Says where densification goes on with other settings than the checkpoint's run had.
         """
-        now, changed = self._settings(), []
-        for name, before in state.get("settings", {}).items():
-            if name in now and now[name] != before:
-                changed.append(f"pipeline.{name} was {before} and is {now[name]}")
+        now, before = self._settings(), state.get("settings", {})
+        changed = [name for name in before if name in now and now[name] != before[name]]
         if changed:
+            listed = ", ".join(f"pipeline.{name} was {before[name]} and is {now[name]}" for name in changed)
             CONSOLE.print(
-                "[yellow]The checkpoint's run had other settings; this one goes on with its own: "
-                f"{escape(', '.join(changed))}.[/]",
+                f"[yellow]The checkpoint's run had other settings; this one goes on with its own: {escape(listed)}.[/]",
                 soft_wrap=True,
             )
+        if not any(name.endswith(("max_gaussians", "memory_budget_gb")) for name in changed):
+            self._checkpoint_cap = state.get("max_gaussians")
         torch.set_rng_state(state["torch"].cpu())
         if max(state["view_order"], default=0) < len(self.datamanager.train_dataset):
             self.datamanager.train_unseen_cameras = list(state["view_order"])

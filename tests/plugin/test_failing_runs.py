@@ -327,8 +327,8 @@ def test_a_run_that_learns_nothing_stops_with_one_sentence_and_a_finite_checkpoi
     said = "the loss was nan" if what == "loss" else "gradients were not finite"
     assert re.fullmatch(
         rf"Nothing was learned in the last 11 iterations, up to iteration 16: {said} \(images (\S+\.png, ){{3}}\S+\.png"
-        r"\); look at them with sadgs-doctor, and lower the learning rates if you raised them; the Gaussians as they are "
-        r"now are saved and go on with --load-dir \S+/nerfstudio_models\.",
+        r"\); look at them with sadgs-doctor, and lower the learning rates if you raised them; the Gaussians as they "
+        r"are now are saved and go on with --load-dir \S+/nerfstudio_models\.",
         str(stopped.value),
     ), str(stopped.value)
     assert is_finite(trainer.pipeline.model)

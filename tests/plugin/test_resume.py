@@ -29,6 +29,7 @@ from nerfstudio.utils import writer
 from scenes import ITERATIONS
 
 from sadgs_ns.demo.scene import SPARSE_FOLDER
+from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin.checkpoints import checkpoint_paths
 from sadgs_ns.plugin.interrupts import SIGNALS, resume_command
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
@@ -405,6 +406,63 @@ def test_a_run_s_folder_does_as_well_as_its_folder_of_checkpoints(finished: Path
     config.load_dir = finished
     config.save_config()
     assert set_up(config)._start_step == ITERATIONS
+
+
+# --- the cap that the device's memory gives ---
+
+
+@pytest.fixture
+def plan(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    """Lets the memory plan of the next runs allow so many Gaussians, unless they ask for another cap themselves."""
+
+    def allow(cap: int) -> None:
+        def fit(strategy: StructureAwareStrategy, *_: Any) -> None:
+            if strategy.max_gaussians == 2000:  # of these tests' runs
+                strategy.max_gaussians = min(cap, strategy.max_gaussians)
+
+        monkeypatch.setattr(StructureAwareStrategy, "fit_to_memory", fit)
+
+    return allow
+
+
+@pytest.mark.parametrize(
+    ("now", "asked", "cap", "said"),
+    [
+        (500, 2000, 500, ""),
+        (1500, 2000, 500, "At most 500 Gaussians, as in the checkpoint's run."),
+        (
+            300,
+            2000,
+            300,
+            "The checkpoint's run had room for 500 Gaussians, the GPU's free memory now has for 300, which is the cap "
+            "from here on: stop this run and end other programs on the GPU to keep 500.",
+        ),
+        (1500, 900, 900, "pipeline.model.strategy.max_gaussians was 2000 and is 900."),
+    ],
+)
+def test_a_resumption_keeps_the_cap_or_says_why_it_is_lower(
+    now: int,
+    asked: int,
+    cap: int,
+    said: str,
+    config: SadgsTrainerConfig,
+    plan: Callable[[int], None],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+):
+    plan(500)
+    trainer = set_up(config)
+    trainer.save_checkpoint(1)
+    assert trainer.pipeline.model.strategy.max_gaussians == 500
+    plan(now)
+    config.load_dir, config.output_dir = trainer.checkpoint_dir, tmp_path / "resumed"
+    config.pipeline.model.strategy.max_gaussians = asked
+    capsys.readouterr()
+    resumed = set_up(config)
+    printed = capsys.readouterr().out
+    assert resumed.pipeline.model.strategy.max_gaussians == cap
+    assert resumed.pipeline.structure.set_max_gaussians.value == cap
+    assert said in printed and (said or "Gaussians" not in printed)
 
 
 # --- damaged checkpoints ---
