@@ -280,8 +280,10 @@ class SadgsPipeline(VanillaPipeline):
                 line = self.model.strategy.fit_to_memory(self.model.gauss_params, self._image_bytes())
             except ValueError as error:
                 raise InputError(f"pipeline.model.{error}") from error
-            if line is not None:
-                CONSOLE.print(line, highlight=False, soft_wrap=True)
+            if line is None:
+                cap = self.model.strategy.max_gaussians
+                line = f"At most {cap:,} Gaussians: this device's memory is not planned with, so this is max_gaussians."
+            CONSOLE.print(line, highlight=False, soft_wrap=True)
             self._keep_cap()
             self.structure.set_max_gaussians.value = self.model.strategy.max_gaussians
         optimizers = training_callback_attributes.optimizers

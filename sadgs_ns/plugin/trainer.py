@@ -32,6 +32,8 @@ _LESS_MEMORY = (
     "lower --pipeline.model.strategy.max-gaussians or --pipeline.views-per-iteration, or take smaller images "
     "(`--downscale-factor 2` after `nerfstudio-data` or `colmap`)"
 )
+_MEASURED_MEGAPIXELS = 1.0
+"""Images larger than this are warned of where an iteration takes several views: measured were .7 and, badly, 1.9."""
 _SAVING_SHARE = 0.01
 """The most of the time from one of the clock's checkpoints to the next that the saving may take."""
 
@@ -187,9 +189,34 @@ class SadgsTrainer(Trainer):
         """
         try:
             super().setup(*args, **kwargs)
+            self._say_what_was_chosen()
             compile_kernels(self.pipeline, self.optimizers.optimizers)
         except torch.cuda.OutOfMemoryError as error:
             raise RunError(f"The GPU's memory is too small to start ({_memory(error)}): {_LESS_MEMORY}.") from error
+
+    def _say_what_was_chosen(self) -> None:
+        """Print the run's size in one line, beside that of the memory plan, and what does not suit the data."""
+        cameras, config = self.pipeline.datamanager.train_dataset.cameras, self.config
+        views, asked, taken = len(cameras), config.pipeline.views_per_iteration, self.pipeline.views_per_iteration
+        megapixels = float((cameras.height * cameras.width).double().mean()) / 1e6
+        done = f", of which {self._start_step:,} are done" if self._start_step else ""
+        lines = [
+            f"{config.method_name} on {views:,} training views of {megapixels:.2g} megapixels: "
+            f"{config.max_num_iterations:,} iterations of {taken} view{'s' * (taken > 1)}{done}, so that each view is "
+            f"rendered about {config.max_num_iterations * taken / views:.0f} times."
+        ]
+        if asked > taken:
+            lines.append(
+                f"[yellow]pipeline.views_per_iteration is {asked}, but there are {views} training views: all are taken "
+                "each time.[/]"
+            )
+        if taken > 1 and megapixels > _MEASURED_MEGAPIXELS:
+            lines.append(
+                "[yellow]Training with several views an iteration was measured on images of up to 0.7 megapixels; "
+                "outdoors, on images of 1.9, it took twice as long as sadgs and was worse. Consider sadgs, or smaller "
+                "images.[/]"
+            )
+        CONSOLE.print("\n".join(lines), highlight=False, soft_wrap=True)
 
     def _load_checkpoint(self) -> None:
         """Resume as nerfstudio does, but with the safe loader, and from an earlier checkpoint if the latest is damaged.
