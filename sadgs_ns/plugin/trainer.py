@@ -139,21 +139,19 @@ class SadgsTrainerConfig(TrainerConfig):
                         )
 
     def save_config(self) -> None:
-        """Write `config.yml`, the first file of a run: not before options, checkpoint, data and folder are found good.
+        """Write `config.yml`, the first file of a run: not before options, checkpoint and data are found good.
 
         Raises:
             InputError: If they are not; nothing is written then.
+            WriteError: If the folder cannot be written.
         """
         self.check()
         checkpoints.check_chosen(self.load_dir, self.load_step, self.load_checkpoint)
         check_ahead(self.pipeline.datamanager)
         path = self.get_base_dir() / "config.yml"
         CONSOLE.log(f"Saving config to: {path}")
-        try:
-            with atomic_path(path) as partial:
-                partial.write_text(yaml.dump(self), "utf8")
-        except WriteError as error:
-            raise InputError(str(error)) from error
+        with atomic_path(path) as partial:
+            partial.write_text(yaml.dump(self), "utf8")
 
 
 SadgsTrainerConfig.__annotations__["prompt"] = tyro.conf.Suppress[str | None]  # hidden from help: for text to NeRF
@@ -264,7 +262,8 @@ class SadgsTrainer(Trainer):
         """Train up to `max_num_iterations` in all; nerfstudio 1.1.5 trains that many more after resuming.
 
         Raises:
-            RunError: If the GPU's memory is full, a checkpoint could not be saved, or nothing is learned any more.
+            RunError: If the GPU's memory is full, or nothing is learned any more.
+            WriteError: If a checkpoint or log could not be written.
             SystemExit: SIGINT, SIGTERM or SIGHUP came: with a checkpoint saved, a line printed that says how to go on,
                 and the exit code that shells give these signals.
         """
@@ -292,11 +291,9 @@ class SadgsTrainer(Trainer):
         except torch.cuda.OutOfMemoryError as error:
             out_of_memory = _memory(error)  # raised below, when the failed step's tensors are gone
         except OSError as error:
-            if error.errno is None and not isinstance(error, WriteError):
-                raise  # not from the disk
-            if not isinstance(error, WriteError):  # of a logger, such as tensorboard's
-                error = WriteError(Path(error.filename or self.base_dir), error)
-            raise RunError(str(error)) from error
+            if error.errno is None:  # a WriteError, or not of the disk
+                raise
+            raise WriteError(Path(error.filename or self.base_dir), error) from error  # of a logger, as tensorboard's
         finally:
             self.config.max_num_iterations = total
         if out_of_memory:

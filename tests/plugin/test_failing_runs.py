@@ -98,7 +98,7 @@ def test_an_output_folder_that_cannot_be_made_is_named_before_anything_is_writte
 ):
     (tmp_path / "file").write_text("in the way")
     config.output_dir = tmp_path / "file" / "out"
-    with pytest.raises(InputError, match=r"/file/out/\S+/config\.yml could not be written \(Not a directory; .*name "):
+    with pytest.raises(WriteError, match=r"/file/out/\S+/config\.yml could not be written \(Not a directory; .*name "):
         config.save_config()
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
@@ -108,7 +108,7 @@ def test_a_read_only_output_folder_is_named(config: SadgsTrainerConfig, monkeypa
         raise PermissionError(13, "Permission denied", str(path))  # root, as in containers, may write everywhere
 
     monkeypatch.setattr(Path, "mkdir", denied)
-    with pytest.raises(InputError, match=r"config\.yml could not be written \(Permission denied; .*can be written;"):
+    with pytest.raises(WriteError, match=r"config\.yml could not be written \(Permission denied; .*can be written;"):
         config.save_config()
 
 
@@ -124,7 +124,7 @@ def test_a_full_disk_leaves_the_previous_checkpoint_and_ends_training_with_one_s
         trainer.save_checkpoint(2)
     fill_disk(partial)
     with pytest.raises(
-        RunError, match=r"^\S+/step-000000005\.ckpt could not be written \(.+\): make room or [^\n]+\.$"
+        WriteError, match=r"^\S+/step-000000005\.ckpt could not be written \(.+\): make room or [^\n]+\.$"
     ):
         trainer.train()
     assert [path.name for path in trainer.checkpoint_dir.iterdir()] == ["step-000000001.ckpt"]
@@ -142,7 +142,7 @@ def test_a_logger_s_full_disk_is_one_sentence_and_other_errors_of_reading_are_th
         trainer.pipeline.get_train_loss_dict = fail  # type: ignore[assignment]
         return trainer
 
-    with pytest.raises(RunError, match=r"^/x/events could not be written \(No space left on device; [^\n]+\.$"):
+    with pytest.raises(WriteError, match=r"^/x/events could not be written \(No space left on device; [^\n]+\.$"):
         failing(OSError(28, "No space left on device", "/x/events")).train()
     with pytest.raises(OSError, match=r"^broken data stream$"):
         failing(OSError("broken data stream")).train()
