@@ -1,20 +1,17 @@
-"""SIGINT, SIGTERM and SIGHUP that wait until a training step is whole, and the command that goes on from there."""
+"""SIGINT, SIGTERM and SIGHUP that wait until a training step is whole."""
 
 from __future__ import annotations
 
 import os
-import shlex
 import signal
 import stat
 import threading
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable
 from types import TracebackType
 from typing import Any
 
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 """Signals that ask a run to stop: Ctrl-C, a job's end, and a terminal that is gone, which Windows does not send."""
-_LOADING = ("load-dir", "load-step", "load-checkpoint")
 
 
 class Interrupted(KeyboardInterrupt):
@@ -80,26 +77,3 @@ def _drop_lost_output() -> None:
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, descriptor)
             os.close(nowhere)
-
-
-def resume_command(argv: Sequence[str], method: str, folder: Path) -> str:
-    """The `ns-train` command that goes on from a folder of checkpoints, with all options of the one that was stopped.
-
-    Args:
-        argv: The stopped program's arguments, its own name first.
-        method: The method's name, ns-train's first argument.
-        folder: Of the checkpoints.
-
-    Returns:
-        The command; for any other program, the setting that does the same.
-    """
-    program, *words = argv
-    if Path(program).stem != "ns-train" or words[:1] != [method] or any(w.startswith("--load-config") for w in words):
-        return f"load_dir = {str(folder)!r}"  # a --load-config overrules the other options
-    kept, skip = [], False
-    for word in words[1:]:
-        option = word.partition("=")[0].removeprefix("--").replace("_", "-") if word.startswith("--") else None
-        if not skip and option not in _LOADING:
-            kept.append(word)
-        skip = not skip and option in _LOADING and "=" not in word
-    return shlex.join(["ns-train", method, "--load-dir", str(folder), *kept])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import os
-import sys
+import shlex
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,7 +24,7 @@ from sadgs_ns.data.parser_validation import check_ahead
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
 from sadgs_ns.plugin import checkpoints
 from sadgs_ns.plugin.compilation import compile_kernels
-from sadgs_ns.plugin.interrupts import Interrupted, Interrupts, resume_command
+from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
 from sadgs_ns.plugin.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig, SadgsOptimizers
 from sadgs_ns.plugin.pipeline import SadgsPipeline, SadgsPipelineConfig
 
@@ -148,10 +148,18 @@ class SadgsTrainerConfig(TrainerConfig):
         self.check()
         checkpoints.check_chosen(self.load_dir, self.load_step, self.load_checkpoint)
         check_ahead(self.pipeline.datamanager)
+        CONSOLE.log(f"Saving config to: {self.write()}")
+
+    def write(self) -> Path:
+        """Write `config.yml`; returns its path.
+
+        Raises:
+            WriteError: If the disk is full or the folder cannot be written.
+        """
         path = self.get_base_dir() / "config.yml"
-        CONSOLE.log(f"Saving config to: {path}")
         with atomic_path(path) as partial:
             partial.write_text(yaml.dump(self), "utf8")
+        return path
 
 
 SadgsTrainerConfig.__annotations__["prompt"] = tyro.conf.Suppress[str | None]  # hidden from help: for text to NeRF
@@ -355,7 +363,7 @@ class SadgsTrainer(Trainer):
         self._save_due = time.monotonic() + wait
 
     def _stop(self, interrupted: Interrupted, total: int) -> None:
-        """Save what was trained and leave; a run that had only its viewer left just ends."""
+        """Save what was trained, and in `config.yml` that it goes on there; a run that was done just ends."""
         if self._completed_step > self._saved_step:
             self.save_checkpoint(self._completed_step)
         done = self._completed_step + 1
@@ -364,7 +372,11 @@ class SadgsTrainer(Trainer):
         if done == self._start_step:
             text = f"{interrupted}: stopped before an iteration was done; the same command starts again."
         else:
-            command = resume_command(sys.argv, self.config.method_name or "", self.checkpoint_dir)
+            # nerfstudio takes all options from the file, so that it has to hold this one, too.
+            config = copy.copy(self.config)
+            config.max_num_iterations = total
+            config.load_dir, config.load_step, config.load_checkpoint = self.checkpoint_dir, None, None
+            command = shlex.join(["ns-train", str(config.method_name), "--load-config", str(config.write())])
             text = f"{interrupted}: stopped and saved after {done} of {total} iterations; resume with: {command}"
         CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
         raise SystemExit(128 + interrupted.number)

@@ -20,6 +20,7 @@ from typing import Any
 import pytest
 import torch
 import tyro
+import yaml
 from kill_and_resume import configure, differences, set_up
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
@@ -31,7 +32,7 @@ from scenes import ITERATIONS
 from sadgs_ns.demo.scene import SPARSE_FOLDER
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin.checkpoints import checkpoint_paths
-from sadgs_ns.plugin.interrupts import SIGNALS, resume_command
+from sadgs_ns.plugin.interrupts import SIGNALS
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 SCRIPT = Path(__file__).parents[1] / "kill_and_resume.py"
@@ -195,7 +196,7 @@ def test_ctrl_c_on_ns_train_prints_the_command_that_resumes_it(
     assert 5 < done < iterations
     assert line.startswith(f"SIGINT: stopped and saved after {done} of {iterations} iterations; resume with: ns-train ")
     words = shlex.split(line.partition("resume with: ")[2])
-    assert words[:4] == ["ns-train", "sadgs", "--load-dir", str(folder)]
+    assert words == ["ns-train", "sadgs", "--load-config", str(folder.with_name("config.yml"))]
     resume(tyro.cli(AnnotatedBaseConfigUnion, args=words[1:]))  # in this process, which has imported everything
     assert f"Resuming after step {done - 1} of {path}" in capsys.readouterr().out
     assert [p.name for p in folder.iterdir()] == [f"step-{iterations - 1:09d}.ckpt"]
@@ -235,11 +236,10 @@ def test_an_interrupt_within_a_step_waits_for_its_end_and_resumes_to_the_same_mo
     line = one_line(capsys.readouterr().out, number.name)
     assert line == (
         f"{number.name}: stopped and saved after 5 of {ITERATIONS} iterations; "
-        f"resume with: load_dir = {str(trainer.checkpoint_dir)!r}"
+        f"resume with: ns-train sadgs --load-config {trainer.base_dir / 'config.yml'}"
     )
 
-    config.load_dir = trainer.checkpoint_dir
-    resumed = set_up(config)
+    resumed = set_up(yaml.load((trainer.base_dir / "config.yml").read_text(), Loader=yaml.Loader))
     resumed.train()
     name = f"step-{ITERATIONS - 1:09d}.ckpt"
     ends = [torch.load(t.checkpoint_dir / name, weights_only=True) for t in (whole, resumed)]
@@ -334,23 +334,6 @@ def test_a_handler_that_the_program_has_for_sigterm_stays(config: SadgsTrainerCo
         signal.signal(signal.SIGTERM, previous)
     assert received == [signal.SIGTERM]
     assert checkpoints(trainer) == [f"step-{ITERATIONS - 1:09d}.ckpt"]
-
-
-@pytest.mark.parametrize(
-    ("argv", "command"),
-    [
-        ("/bin/ns-train sadgs --data d", "ns-train sadgs --load-dir 'a b' --data d"),
-        ("ns-train sadgs --vis viewer colmap --data d", "ns-train sadgs --load-dir 'a b' --vis viewer colmap --data d"),
-        ("ns-train sadgs --load-dir old --load-step 3 --data d", "ns-train sadgs --load-dir 'a b' --data d"),
-        ("ns-train sadgs --load_dir=old --data d", "ns-train sadgs --load-dir 'a b' --data d"),
-        ("ns-train sadgs --load-checkpoint c.ckpt --data d", "ns-train sadgs --load-dir 'a b' --data d"),
-        ("ns-train sadgs --load-config c.yml", "load_dir = 'a b'"),
-        ("ns-train splatfacto --data d", "load_dir = 'a b'"),
-        ("python -m something", "load_dir = 'a b'"),
-    ],
-)
-def test_the_resume_command_keeps_every_other_option(argv: str, command: str):
-    assert resume_command(argv.split(), "sadgs", Path("a b")) == command
 
 
 # --- finished runs ---
