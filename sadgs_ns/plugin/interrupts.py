@@ -10,8 +10,10 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Any
 
-SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
-"""Signals that ask a run to stop: Ctrl-C, a job's end, and a terminal that is gone, which Windows does not send."""
+HANG_UP: int | None = getattr(signal, "SIGHUP", None)
+"""The signal that says that the terminal is gone, as of an ssh that was cut off; Windows has none."""
+SIGNALS = (signal.SIGINT, signal.SIGTERM, *([] if HANG_UP is None else [HANG_UP]))
+"""Signals that ask a run to stop."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -23,7 +25,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 class Interrupts:
-    """While entered, the first of `SIGNALS` makes `poll` raise; a second one acts as it did before.
+    """While entered, the first of `SIGNALS` makes `poll` raise; a second one, unless SIGHUP, acts as it did before.
 
     Signals are left alone outside the main thread, which cannot handle them. So is a signal for which the program has a
     handler of its own, or which it ignores, as SIGHUP under nohup.
@@ -49,7 +51,9 @@ class Interrupts:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._restore()
+        for number, previous in self._previous.items():
+            signal.signal(number, previous)
+        self._previous = {}
 
     def poll(self) -> None:
         """Raise Interrupted if a signal has come."""
@@ -57,17 +61,15 @@ class Interrupts:
             raise Interrupted(self._received)
 
     def _handle(self, number: int, frame: object) -> None:
-        self._restore()
-        if number == getattr(signal, "SIGHUP", None):
-            _drop_lost_output()
+        if self._received is not None:
+            return  # where a connection drops, the shell sends one SIGHUP and the kernel another
         self._received = number
+        for another in self._previous.keys() - {HANG_UP}:
+            signal.signal(another, self._previous[another])
+        if number == HANG_UP:
+            _drop_lost_output()
         if self._waiting():
             self.poll()
-
-    def _restore(self) -> None:
-        for number, previous in self._previous.items():
-            signal.signal(number, previous)
-        self._previous = {}
 
 
 def _drop_lost_output() -> None:

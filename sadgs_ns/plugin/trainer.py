@@ -206,10 +206,11 @@ class SadgsTrainer(Trainer):
         views, asked, taken = len(cameras), config.pipeline.views_per_iteration, self.pipeline.views_per_iteration
         megapixels = float((cameras.height * cameras.width).double().mean()) / 1e6
         done = f", of which {self._start_step:,} are done" if self._start_step else ""
+        times = round(config.max_num_iterations * taken / views)
         lines = [
             f"{config.method_name} on {views:,} training views of {megapixels:.2g} megapixels: "
             f"{config.max_num_iterations:,} iterations of {taken} view{'s' * (taken > 1)}{done}, so that each view is "
-            f"rendered about {config.max_num_iterations * taken / views:.0f} times."
+            f"rendered about {times:,} time{'s' * (times != 1)}."
         ]
         if asked > taken:
             lines.append(
@@ -290,12 +291,12 @@ class SadgsTrainer(Trainer):
         out_of_memory = ""
         self._set_clock(0.0)
         try:
-            try:
-                with self._interrupts:
+            with self._interrupts:
+                try:
                     super().train()
                     self._stop_if_stuck()
-            except Interrupted as interrupted:
-                self._stop(interrupted, total)
+                except Interrupted as interrupted:
+                    self._stop(interrupted, total)
         except torch.cuda.OutOfMemoryError as error:
             out_of_memory = _memory(error)  # raised below, when the failed step's tensors are gone
         except OSError as error:

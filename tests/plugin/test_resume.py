@@ -246,6 +246,26 @@ def test_an_interrupt_within_a_step_waits_for_its_end_and_resumes_to_the_same_mo
     assert differences(*ends) == []
 
 
+@pytest.mark.usefixtures("hang_up_by_default")
+def test_a_second_hang_up_does_not_stop_the_saving(config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch):
+    """Where ssh is cut off, the shell sends one, and the kernel another when the shell ends."""
+    trainer = set_up(config)
+    for _ in range(2):
+        after(trainer, 3, lambda: send(signal.SIGHUP))
+    save = torch.save
+
+    def hung_up(*arguments: Any) -> None:
+        send(signal.SIGHUP)
+        save(*arguments)
+
+    monkeypatch.setattr(torch, "save", hung_up)
+    with pytest.raises(SystemExit) as stopped:
+        trainer.train()
+    assert stopped.value.code == 128 + signal.SIGHUP
+    assert checkpoints(trainer) == ["step-000000003.ckpt"]
+    assert signal.getsignal(signal.SIGHUP) == signal.SIG_DFL
+
+
 def test_a_terminal_that_is_gone_costs_nothing_that_was_trained(scene: Path, tmp_path: Path):
     """As where ssh is cut off: the run loses the terminal that it prints to, and is sent SIGHUP."""
     ours, theirs = os.openpty()

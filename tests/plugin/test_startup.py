@@ -42,7 +42,7 @@ def test_a_run_says_in_two_lines_what_it_chose(
     trainer, printed = says(config)
     views = len(trainer.pipeline.datamanager.train_dataset)
     size = f"{views} training views of {WIDTH * HEIGHT / 1e6:.2g} megapixels"
-    times = f"so that each view is rendered about {ITERATIONS * 4 / views:.0f} times."
+    times = f"so that each view is rendered about {round(ITERATIONS * 4 / views)} times."
     assert f"sadgs on {size}: {ITERATIONS} iterations of 4 views, {times}\n" in printed
     assert "At most 2,000 Gaussians: this device's memory is not planned with, so this is max_gaussians.\n" in printed
     assert "Consider" not in printed
