@@ -1,4 +1,4 @@
-"""SIGINT, SIGTERM and SIGHUP that wait until a training step is whole."""
+"""Handling of SIGINT, SIGTERM and SIGHUP, which stop a run only when a training step is whole."""
 
 from __future__ import annotations
 
@@ -25,13 +25,14 @@ class Interrupted(KeyboardInterrupt):
 
 
 class Interrupts:
-    """While entered, the first of `SIGNALS` makes `poll` raise; a second one, unless SIGHUP, acts as it did before.
+    """A context in which the first of `SIGNALS` makes `poll` raise, and a second SIGINT or SIGTERM acts as usual.
 
-    Signals are left alone outside the main thread, which cannot handle them. So is a signal for which the program has a
-    handler of its own, or which it ignores, as SIGHUP under nohup.
+    Signals are left alone outside the main thread, since other threads cannot handle them. A signal for which the
+    program has a handler of its own, or which it ignores, as SIGHUP under nohup, is left alone, too.
 
     Args:
-        waiting: Whether the program only waits for somebody, so that nobody polls: the signal then raises at once.
+        waiting: Returns whether the program only waits for somebody, so that nobody polls. The signal then raises at
+            once.
     """
 
     def __init__(self, waiting: Callable[[], bool]) -> None:
@@ -62,7 +63,7 @@ class Interrupts:
 
     def _handle(self, number: int, frame: object) -> None:
         if self._received is not None:
-            return  # where a connection drops, the shell sends one SIGHUP and the kernel another
+            return  # Where a connection drops, the shell sends one SIGHUP and the kernel another.
         self._received = number
         for another in self._previous.keys() - {HANG_UP}:
             signal.signal(another, self._previous[another])
@@ -73,7 +74,7 @@ class Interrupts:
 
 
 def _drop_lost_output() -> None:
-    """Send output nowhere that went to a terminal or pipe that is gone: printing would raise before a run is saved."""
+    """Discard output to a terminal or pipe that is gone, since printing there would raise before the run is saved."""
     for descriptor in (1, 2):
         if not os.isatty(descriptor) and not stat.S_ISREG(os.fstat(descriptor).st_mode):
             nowhere = os.open(os.devnull, os.O_WRONLY)

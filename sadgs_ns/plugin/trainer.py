@@ -32,21 +32,20 @@ _LESS_MEMORY = (
     "lower --pipeline.model.strategy.max-gaussians or --pipeline.views-per-iteration, or take smaller images "
     "(`--downscale-factor 2` after `nerfstudio-data` or `colmap`)"
 )
-_MEASURED_MEGAPIXELS = 1.0
-"""Images larger than this are warned of where an iteration takes several views: measured were .7 and, badly, 1.9."""
-_SAVING_SHARE = 0.01
-"""The most of the time from one of the clock's checkpoints to the next that the saving may take."""
-
 _ONE_DEVICE = "sadgs trains on one device; set machine.num_devices and machine.num_machines to 1."
+_MEASURED_MEGAPIXELS = 1.0
+"""Above this size of images a run with several views an iteration prints a warning; .7 and 1.9 have been measured."""
+_SAVING_SHARE = 0.01
+"""Largest share of the time between two checkpoints by the clock that saving may take."""
 
 
 def _memory(error: torch.cuda.OutOfMemoryError) -> str:
-    """How much memory was asked for, and of whom: the first two of torch's many sentences."""
+    """Return the first two of torch's many sentences, which say how much memory was asked for, and of whom."""
     return ". ".join(reason(error).split(". ")[:2]).rstrip(".")
 
 
 def available_machine() -> MachineConfig:
-    """CUDA where there is a device, the CPU elsewhere."""
+    """Return the machine's configuration, with CUDA where there is a device and the CPU elsewhere."""
     return MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu")
 
 
@@ -78,7 +77,7 @@ class SadgsTrainerConfig(TrainerConfig):
     """Multiply the position learning rate with the cameras' extent, as 3DGS does; splatfacto does not."""
 
     def check(self) -> None:
-        """See whether training can work with these options.
+        """Check whether training can work with these options.
 
         Raises:
             InputError: If a number is out of its range, gradients would be scaled or accumulated, or the device is not
@@ -122,7 +121,7 @@ class SadgsTrainerConfig(TrainerConfig):
         self.pipeline.check()
 
     def _check_rates(self) -> None:
-        """See whether the learning rates can train anything.
+        """Check whether the learning rates can train anything.
 
         Raises:
             InputError: If one is not in [0, 1], or a schedule's factor is not positive and finite.
@@ -139,7 +138,7 @@ class SadgsTrainerConfig(TrainerConfig):
                         )
 
     def save_config(self) -> None:
-        """Write `config.yml`, the first file of a run: not before options, checkpoint and data are found good.
+        """Write `config.yml`, the first file of a run, once options, checkpoint and data have been found good.
 
         Raises:
             InputError: If they are not; nothing is written then.
@@ -151,7 +150,7 @@ class SadgsTrainerConfig(TrainerConfig):
         CONSOLE.log(f"Saving config to: {self.write()}")
 
     def write(self) -> Path:
-        """Write `config.yml`; returns its path.
+        """Write `config.yml` and return its path.
 
         Raises:
             WriteError: If the disk is full or the folder cannot be written.
@@ -166,7 +165,7 @@ SadgsTrainerConfig.__annotations__["prompt"] = tyro.conf.Suppress[str | None]  #
 
 
 class SadgsTrainer(Trainer):
-    """Trains one model on one device.
+    """A trainer for one model on one device.
 
     Raises:
         InputError: If several devices are asked for; as `SadgsTrainerConfig.check`.
@@ -183,7 +182,7 @@ class SadgsTrainer(Trainer):
         self._stepping = False
         self._completed_step = self._saved_step = -1
         self._save_due = math.inf
-        # Paused or done, nerfstudio waits for the viewer's user.
+        # A run that is paused or done polls no signal, because nerfstudio waits for the viewer's user.
         self._interrupts = Interrupts(waiting=lambda: self.training_state != "training" and not self._stepping)
 
     def setup(self, *args: Any, **kwargs: Any) -> None:
@@ -201,7 +200,7 @@ class SadgsTrainer(Trainer):
             raise RunError(f"The GPU's memory is too small to start ({_memory(error)}): {_LESS_MEMORY}.") from error
 
     def _say_what_was_chosen(self) -> None:
-        """Print the run's size in one line, beside that of the memory plan, and what does not suit the data."""
+        """Print the run's size in one line, after the memory plan's, and warn of what does not suit the data."""
         cameras, config = self.pipeline.datamanager.train_dataset.cameras, self.config
         views, asked, taken = len(cameras), config.pipeline.views_per_iteration, self.pipeline.views_per_iteration
         megapixels = float((cameras.height * cameras.width).double().mean()) / 1e6
@@ -247,7 +246,7 @@ class SadgsTrainer(Trainer):
             raise
         except InputError as error:
             raise InputError(f"{path} cannot be continued: {str(error).rstrip('.')}; {checkpoints.REMEDY}.") from error
-        except Exception as error:  # a foreign file's parts lead to whatever they lead to
+        except Exception as error:  # The parts of a foreign file may raise anything.
             what = f"{type(error).__name__}: {reason(error)}"
             raise InputError(
                 f"{path} is not a checkpoint of this version of sadgs ({what}): {checkpoints.REMEDY}."
@@ -268,20 +267,20 @@ class SadgsTrainer(Trainer):
         return SadgsOptimizers(optimizers, self.pipeline.get_param_groups())
 
     def train(self) -> None:
-        """Train up to `max_num_iterations` in all; nerfstudio 1.1.5 trains that many more after resuming.
+        """Train up to `max_num_iterations` in all, where nerfstudio 1.1.5 would train that many more after resuming.
 
         Raises:
             RunError: If the GPU's memory is full, or nothing is learned any more.
             WriteError: If a checkpoint or log could not be written.
-            SystemExit: SIGINT, SIGTERM or SIGHUP came: with a checkpoint saved, a line printed that says how to go on,
-                and the exit code that shells give these signals.
+            SystemExit: If SIGINT, SIGTERM or SIGHUP came. A checkpoint is saved then, a line says how to go on, and the
+                exit code is the one that shells give these signals.
         """
         total = self.config.max_num_iterations
-        self.step: int = max(self._start_step - 1, 0)  # names the checkpoint when nothing is left to do
+        self.step: int = max(self._start_step - 1, 0)  # It names the checkpoint where nothing is left to do.
         self._completed_step = self._saved_step = self._start_step - 1
         self.config.max_num_iterations = max(total - self._start_step, 0)
         if self._start_step >= total:
-            writer.GLOBAL_BUFFER["step"] = self.step  # nerfstudio's table reads it, and an iteration would set it
+            writer.GLOBAL_BUFFER["step"] = self.step  # nerfstudio's table reads what only an iteration sets.
             CONSOLE.print(
                 f"This run is finished after {self._start_step} iterations: --max-num-iterations of more than "
                 f"{self._start_step} trains on.",
@@ -298,20 +297,22 @@ class SadgsTrainer(Trainer):
                 except Interrupted as interrupted:
                     self._stop(interrupted, total)
         except torch.cuda.OutOfMemoryError as error:
-            out_of_memory = _memory(error)  # raised below, when the failed step's tensors are gone
+            out_of_memory = _memory(error)  # The RunError is raised below, when the failed step's tensors are gone.
         except OSError as error:
-            if error.errno is None:  # a WriteError, or not of the disk
+            if error.errno is None:  # It is a WriteError, or it does not come from the disk.
                 raise
-            raise WriteError(Path(error.filename or self.base_dir), error) from error  # of a logger, as tensorboard's
+            # A logger, such as tensorboard's, could not write.
+            raise WriteError(Path(error.filename or self.base_dir), error) from error
         finally:
             self.config.max_num_iterations = total
         if out_of_memory:
             raise RunError(self._rescue(out_of_memory))
 
     def _rescue(self, out_of_memory: str) -> str:
-        """Save the state of before the present step, if it is whole; returns what to tell the user.
+        """Save the state before the present step if it is whole, and return what to tell the user.
 
-        Memory that ran out while Gaussians were split leaves the step's update in it, which is then made twice.
+        If memory ran out while Gaussians were split, the saved state holds the step's update already, and the resumed
+        run makes it a second time.
         """
         torch.cuda.empty_cache()
         model = self.pipeline.model
@@ -319,7 +320,7 @@ class SadgsTrainer(Trainer):
         for name, parameter in model.gauss_params.items():
             states = self.optimizers.optimizers[name].state
             if not states and parameter.numel() > 0:
-                lengths.add(-1)  # gsplat takes a state out while it rewrites it
+                lengths.add(-1)  # gsplat was rewriting the state, which it takes out meanwhile
             for state in states.values():
                 lengths |= {len(value) for value in state.values() if isinstance(value, torch.Tensor) and value.dim()}
         lengths |= {len(v) for v in model.strategy_state.values() if isinstance(v, torch.Tensor) and v.dim()}
@@ -337,12 +338,12 @@ class SadgsTrainer(Trainer):
         )
 
     def train_iteration(self, step: int) -> Any:
-        """nerfstudio's; from here to `_update_viewer_state` no signal may stop the run."""
+        """Run nerfstudio's iteration; no signal may stop the run from here to `_update_viewer_state`."""
         self._stepping = True
         return super().train_iteration(step)
 
     def _update_viewer_state(self, step: int) -> None:
-        """nerfstudio calls this after every step, when densification is done."""
+        """Stop or save where that is due; nerfstudio calls this after every step, when densification is done."""
         self._completed_step, self._stepping = step, False
         self._interrupts.poll()
         self._stop_if_stuck()
@@ -351,20 +352,20 @@ class SadgsTrainer(Trainer):
         super()._update_viewer_state(step)
 
     def _train_complete_viewer(self) -> None:
-        """nerfstudio waits here for the viewer's user, for ever."""
+        """Wait for the viewer's user, as nerfstudio does for ever, unless the run must stop."""
         self._interrupts.poll()
         self._stop_if_stuck()
         super()._train_complete_viewer()
 
     def _set_clock(self, took: float) -> None:
-        """Say when the next checkpoint is due, after one that took so many seconds."""
+        """Set when the next checkpoint is due, after one that took `took` seconds to save."""
         config = self.config
         by_clock = config.steps_per_save == 0 and config.seconds_per_save > 0
         wait = max(config.seconds_per_save, took / _SAVING_SHARE) if by_clock else math.inf
         self._save_due = time.monotonic() + wait
 
     def _stop(self, interrupted: Interrupted, total: int) -> None:
-        """Save what was trained, and in `config.yml` that it goes on there; a run that was done just ends."""
+        """Save a checkpoint, and in `config.yml` that the run goes on from it; a run that was done just ends."""
         if self._completed_step > self._saved_step:
             self.save_checkpoint(self._completed_step)
         done = self._completed_step + 1
@@ -373,7 +374,7 @@ class SadgsTrainer(Trainer):
         if done == self._start_step:
             text = f"{interrupted}: stopped before an iteration was done; the same command starts again."
         else:
-            # nerfstudio takes all options from the file, so that it has to hold this one, too.
+            # With --load-config nerfstudio takes all options from the file, so the file must name the checkpoints, too.
             config = copy.copy(self.config)
             config.max_num_iterations = total
             config.load_dir, config.load_step, config.load_checkpoint = self.checkpoint_dir, None, None
@@ -383,7 +384,7 @@ class SadgsTrainer(Trainer):
         raise SystemExit(128 + interrupted.number)
 
     def _stop_if_stuck(self) -> None:
-        """Save the Gaussians and leave if they learn nothing any more, because gradients are not finite.
+        """Save the Gaussians and end the run if they learn nothing any more because gradients are not finite.
 
         Raises:
             RunError: If so.
@@ -401,9 +402,9 @@ class SadgsTrainer(Trainer):
         )
 
     def save_checkpoint(self, step: int) -> None:
-        """Save under a temporary name, then rename: a killed save leaves the previous checkpoint as it was.
+        """Save under a temporary name and rename, so that a killed save leaves the previous checkpoint as it was.
 
-        The temporary file lies beside the folder of checkpoints: nerfstudio takes every file inside for one.
+        The temporary file lies beside the folder of checkpoints, because nerfstudio takes every file inside for one.
 
         Raises:
             WriteError: If the disk is full or the folder cannot be written.
@@ -421,13 +422,13 @@ class SadgsTrainer(Trainer):
         with atomic_path(path, beside=self.checkpoint_dir) as partial:
             try:
                 torch.save(state, partial)
-            except RuntimeError as error:  # so torch's writer calls a full disk
+            except RuntimeError as error:  # torch's writer reports a full disk so
                 raise OSError(reason(error)) from error
-            if others:  # about to be deleted: the new one must be on the disk, lest a power cut takes both
+            if others:  # These are about to be deleted, so the new one must survive a power cut first.
                 with partial.open("rb+") as file:
                     os.fsync(file.fileno())
         self._saved_step = step
-        if self.config.save_only_latest_checkpoint and not self.pipeline.stuck:  # then an earlier one may be better
+        if self.config.save_only_latest_checkpoint and not self.pipeline.stuck:  # An earlier one may then be better.
             for other in others:
                 other.unlink()
         self._set_clock(time.monotonic() - start)

@@ -1,4 +1,4 @@
-"""Killed and resumed: what SIGKILL, SIGINT and SIGTERM leave, and what a run goes on from."""
+"""Runs that are killed and resumed: what SIGKILL, SIGINT, SIGTERM and SIGHUP leave, and what a run goes on from."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ TERMINAL = "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0)\n"
 
 
 def after(trainer: SadgsTrainer, at: int, act: Callable[[], None]) -> None:
-    """Do something at the end of an iteration, after densification."""
+    """Call `act` at the end of an iteration, after densification."""
     location = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
     trainer.callbacks.append(TrainingCallback(location, lambda step: act() if step == at else None))
 
@@ -55,13 +55,13 @@ def checkpoints(trainer: SadgsTrainer) -> list[str]:
 
 
 def one_line(text: str, start: str) -> str:
-    """The only line that begins so."""
+    """Return the only line that begins so."""
     (line,) = (line for line in text.splitlines() if line.startswith(start))
     return line
 
 
 def kill_and_resume(*arguments: object) -> str:
-    """Run the script; its output."""
+    """Run the script and return its output."""
     command = [sys.executable, str(SCRIPT), *map(str, arguments)]
     result = subprocess.run(command, capture_output=True, text=True, timeout=1800)
     assert result.returncode == 0, result.stdout + result.stderr
