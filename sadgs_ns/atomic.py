@@ -1,4 +1,4 @@
-"""Files that appear complete or not at all."""
+"""Writing files so that they appear complete or not at all."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from sadgs_ns.errors import WriteError
 
 @contextmanager
 def atomic_path(path: Path, beside: Path | None = None) -> Iterator[Path]:
-    """A temporary path that becomes `path` when the block ends well, and vanishes when it raises.
+    """Give a temporary path that becomes `path` when the block ends well, and is removed when the block raises.
 
-    It is named after `beside` and the same each time, so that the next write replaces what a killed one left.
+    Its name is the same each time, so that the next write replaces what a killed one left.
 
     Args:
-        path: Made with its folder, or replaced.
-        beside: A neighbour of the temporary path: `path` itself, unless its folder takes no other files.
+        path: The file to write. Its folder is made if there is none, and a file that is there is replaced.
+        beside: The temporary path lies beside this one and is named after it; None takes `path` itself. It is for
+            folders that must hold no other files.
 
     Raises:
         WriteError: If the disk is full or the folder cannot be written.
@@ -33,5 +34,5 @@ def atomic_path(path: Path, beside: Path | None = None) -> Iterator[Path]:
     except OSError as error:
         raise WriteError(path, error) from error
     finally:
-        with suppress(OSError):  # where even the folder could not be made
+        with suppress(OSError):  # Even its folder may be missing.
             partial.unlink(missing_ok=True)

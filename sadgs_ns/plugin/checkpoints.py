@@ -1,4 +1,4 @@
-"""Which checkpoint a run resumes from, read so that nothing in the file is executed."""
+"""Choosing the checkpoint that a run resumes from, and reading it so that nothing in the file is executed."""
 
 from __future__ import annotations
 
@@ -12,9 +12,12 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from sadgs_ns.errors import InputError, reason
 
-REMEDY = "give --load-dir the folder nerfstudio_models of a run of sadgs, or train from scratch"
-"""For a checkpoint that cannot be used."""
+REMEDY = "give --load-dir the folder of a run of sadgs, or train from scratch"
+"""What errors advise about a checkpoint that cannot be used."""
+_FOLDER = "nerfstudio_models"
+"""Name of the folder of checkpoints in a run's folder."""
 _PARTS = ("step", "pipeline", "optimizers", "scalers")
+"""What nerfstudio's trainer writes into every checkpoint."""
 
 
 def read(path: Path, remedy: str = REMEDY, mmap: bool = False) -> dict[str, Any]:
@@ -23,18 +26,18 @@ def read(path: Path, remedy: str = REMEDY, mmap: bool = False) -> dict[str, Any]
     Args:
         path: The file.
         remedy: What errors advise.
-        mmap: Whether tensors stay in the file until they are used; for those who read a part of them.
+        mmap: Whether tensors stay in the file until they are used, which is quicker if only a part of them is.
 
     Raises:
-        InputError: It is cut off or damaged, or it holds anything but a checkpoint's tensors and plain values.
+        InputError: If it is cut off or damaged, or holds anything but a checkpoint's tensors and plain values.
     """
     try:
-        with zipfile.ZipFile(path) as file:  # torch itself does not look at the checksums
+        with zipfile.ZipFile(path) as file:  # torch itself does not check the checksums.
             if (damaged := file.testzip()) is not None:
                 raise zipfile.BadZipFile(f"wrong checksum of {damaged}")
         state = torch.load(path, map_location="cpu", weights_only=True, mmap=mmap or None)
-    except Exception as error:  # zip, pickle and tensors each raise their own
-        # Without torch's advice after it, to load the file unsafely.
+    except Exception as error:  # Damaged archives, pickles and tensors each raise their own.
+        # torch's message goes on with the advice to load the file unsafely, which is cut off here.
         what = re.split(r"(?<=[a-z])[.:]\s", reason(error), maxsplit=1)[0]
         raise InputError(
             f"{path} is cut off, damaged or not of tensors and plain values alone ({what}): {remedy}."
@@ -46,16 +49,28 @@ def read(path: Path, remedy: str = REMEDY, mmap: bool = False) -> dict[str, Any]
     return state
 
 
-def checkpoint_path(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> Path | None:
-    """The checkpoint that nerfstudio's trainer will load for these options, or None.
+def checkpoint_paths(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> list[Path]:
+    """Return the checkpoints that nerfstudio's options for resuming name, in the order in which they are to be tried.
+
+    Args:
+        load_dir: A folder of checkpoints, or the folder of a run, which holds one. It takes precedence.
+        load_step: Step of the only checkpoint of `load_dir` to take; None takes all, the latest first.
+        load_checkpoint: A file.
+
+    Returns:
+        Their paths; none if no option names any.
 
     Raises:
-        InputError: If there is none, or the folder holds something else, too.
+        InputError: If what is named does not exist or holds no checkpoint, or the folder holds something else, too.
     """
     if load_dir is None:
-        if load_checkpoint is not None and not load_checkpoint.is_file():
+        if load_checkpoint is None:
+            return []
+        if not load_checkpoint.is_file():
             raise InputError(f"{load_checkpoint} does not exist: give --load-checkpoint a file step-*.ckpt of a run.")
-        return load_checkpoint
+        return [load_checkpoint]
+    if (load_dir / _FOLDER).is_dir():
+        load_dir = load_dir / _FOLDER
     steps = {}
     for path in sorted(load_dir.iterdir()) if load_dir.is_dir() else []:
         match = re.fullmatch(r"step-(\d+)\.ckpt", path.name)
@@ -63,22 +78,24 @@ def checkpoint_path(load_dir: Path | None, load_step: int | None, load_checkpoin
             raise InputError(f"{path} lies among the checkpoints and is none: move it elsewhere.")
         steps[int(match[1])] = path
     if not steps:
-        raise InputError(f"{load_dir} holds no checkpoint: give --load-dir the folder nerfstudio_models of a run.")
-    if load_step is not None and load_step not in steps:
+        raise InputError(f"{load_dir} holds no checkpoint: give --load-dir the folder of a run of sadgs.")
+    if load_step is None:
+        return [steps[step] for step in sorted(steps, reverse=True)]
+    if load_step not in steps:
         there = ", ".join(map(str, sorted(steps)))
         raise InputError(f"{load_dir} holds no checkpoint of step {load_step}: give --load-step one of {there}.")
-    return steps[max(steps) if load_step is None else load_step]
+    return [steps[load_step]]
 
 
 def check_chosen(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> None:
-    """See at a glance whether `read_chosen` will find a whole file; what it holds is seen when it is read.
+    """Check quickly, without reading what they hold, whether one of the files for `read_chosen` is whole.
 
     Raises:
-        InputError: As `checkpoint_path`, or if none of the files is whole.
+        InputError: As `checkpoint_paths`, or if none of the files is whole.
     """
-    tried = _tried(load_dir, load_step, load_checkpoint)
-    if tried and not any(map(zipfile.is_zipfile, tried)):  # a zip file's table of contents is at its end
-        read(tried[0])  # which says why it cannot be
+    tried = checkpoint_paths(load_dir, load_step, load_checkpoint)
+    if tried and not any(map(zipfile.is_zipfile, tried)):  # A zip file's table of contents is at its end.
+        read(tried[0])  # It raises the error that says what is wrong.
 
 
 def read_chosen(
@@ -88,20 +105,20 @@ def read_chosen(
     remedy: str = REMEDY,
     mmap: bool = False,
 ) -> tuple[Path, dict[str, Any]] | None:
-    """Read the checkpoint that these options name; where they leave the step open, an earlier one if it is damaged.
+    """Read the checkpoint that these options name, or the one before it if it is damaged and no step was asked for.
 
     Args:
-        load_dir, load_step, load_checkpoint: As for `checkpoint_path`.
+        load_dir, load_step, load_checkpoint: As for `checkpoint_paths`.
         remedy, mmap: As for `read`.
 
     Returns:
-        Its path and content; None where the options name none.
+        Its path and content, or None if the options name none.
 
     Raises:
-        InputError: As `checkpoint_path`, and as `read`, of the first, if none can be read.
+        InputError: As `checkpoint_paths`; if none can be read, as `read` of the first.
     """
     errors = []
-    for path in _tried(load_dir, load_step, load_checkpoint):
+    for path in checkpoint_paths(load_dir, load_step, load_checkpoint):
         try:
             state = read(path, remedy, mmap)
         except InputError as error:
@@ -114,13 +131,3 @@ def read_chosen(
     if errors:
         raise errors[0]
     return None
-
-
-def _tried(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> list[Path]:
-    """The checkpoints that are tried one after the other until one can be read."""
-    path = checkpoint_path(load_dir, load_step, load_checkpoint)
-    if path is None:
-        return []
-    if load_dir is None or load_step is not None:
-        return [path]
-    return sorted(load_dir.glob("step-*.ckpt"), key=lambda p: int(p.stem[5:]), reverse=True)

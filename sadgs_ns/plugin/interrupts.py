@@ -1,17 +1,19 @@
-"""SIGINT and SIGTERM that wait until a training step is whole, and the command that goes on from there."""
+"""Handling of SIGINT, SIGTERM and SIGHUP, which stop a run only when a training step is whole."""
 
 from __future__ import annotations
 
-import shlex
+import os
 import signal
+import stat
 import threading
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable
 from types import TracebackType
 from typing import Any
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_LOADING = ("load-dir", "load-step", "load-checkpoint")
+HANG_UP: int | None = getattr(signal, "SIGHUP", None)
+"""The signal that says that the terminal is gone, as of an ssh that was cut off; Windows has none."""
+SIGNALS = (signal.SIGINT, signal.SIGTERM, *([] if HANG_UP is None else [HANG_UP]))
+"""Signals that ask a run to stop."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -23,13 +25,14 @@ class Interrupted(KeyboardInterrupt):
 
 
 class Interrupts:
-    """While entered, the first SIGINT or SIGTERM makes `poll` raise; a second one acts as it did before.
+    """A context in which the first of `SIGNALS` makes `poll` raise, and a second SIGINT or SIGTERM acts as usual.
 
-    Signals are left alone outside the main thread, which cannot handle them, and where the program has a handler of its
-    own for SIGTERM.
+    Signals are left alone outside the main thread, since other threads cannot handle them. A signal for which the
+    program has a handler of its own, or which it ignores, as SIGHUP under nohup, is left alone, too.
 
     Args:
-        waiting: Whether the program only waits for somebody, so that nobody polls: the signal then raises at once.
+        waiting: Returns whether the program only waits for somebody, so that nobody polls. The signal then raises at
+            once.
     """
 
     def __init__(self, waiting: Callable[[], bool]) -> None:
@@ -49,7 +52,9 @@ class Interrupts:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._restore()
+        for number, previous in self._previous.items():
+            signal.signal(number, previous)
+        self._previous = {}
 
     def poll(self) -> None:
         """Raise Interrupted if a signal has come."""
@@ -57,35 +62,21 @@ class Interrupts:
             raise Interrupted(self._received)
 
     def _handle(self, number: int, frame: object) -> None:
-        self._restore()
+        if self._received is not None:
+            return  # Where a connection drops, the shell sends one SIGHUP and the kernel another.
         self._received = number
+        for another in self._previous.keys() - {HANG_UP}:
+            signal.signal(another, self._previous[another])
+        if number == HANG_UP:
+            _drop_lost_output()
         if self._waiting():
             self.poll()
 
-    def _restore(self) -> None:
-        for number, previous in self._previous.items():
-            signal.signal(number, previous)
-        self._previous = {}
 
-
-def resume_command(argv: Sequence[str], method: str, folder: Path) -> str:
-    """The `ns-train` command that goes on from a folder of checkpoints, with all options of the one that was stopped.
-
-    Args:
-        argv: The stopped program's arguments, its own name first.
-        method: The method's name, ns-train's first argument.
-        folder: Of the checkpoints.
-
-    Returns:
-        The command; for any other program, the setting that does the same.
-    """
-    program, *words = argv
-    if Path(program).stem != "ns-train" or words[:1] != [method] or any(w.startswith("--load-config") for w in words):
-        return f"load_dir = {str(folder)!r}"  # a --load-config overrules the other options
-    kept, skip = [], False
-    for word in words[1:]:
-        option = word.partition("=")[0].removeprefix("--").replace("_", "-") if word.startswith("--") else None
-        if not skip and option not in _LOADING:
-            kept.append(word)
-        skip = not skip and option in _LOADING and "=" not in word
-    return shlex.join(["ns-train", method, "--load-dir", str(folder), *kept])
+def _drop_lost_output() -> None:
+    """Discard output to a terminal or pipe that is gone, since printing there would raise before the run is saved."""
+    for descriptor in (1, 2):
+        if not os.isatty(descriptor) and not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, descriptor)
+            os.close(nowhere)

@@ -29,6 +29,7 @@ from sadgs_ns.method.structure_tensor import (
     NOISE_FLOOR,
     multiscale_structure_tensor,
 )
+from sadgs_ns.plugin import nonfinite
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
 from sadgs_ns.plugin.memory_plan import fit_to_memory, training_size
 from sadgs_ns.plugin.model import SadgsModel, SadgsModelConfig
@@ -116,6 +117,8 @@ class SadgsPipeline(VanillaPipeline):
         self.model.set_cameras(positions)
         self.views = TrainingViews(self.datamanager, self.model)
         self.log = NonFiniteLog(self.device)
+        self._checkpoint_cap: int | None = None
+        self.stuck = ""  # says why, where nothing is learned any more
         self.structure = StructurePanel(self)
         self.model.viewer_outputs = self.structure.outputs
 
@@ -223,10 +226,13 @@ class SadgsPipeline(VanillaPipeline):
                 line, warning = fit_to_memory(model.strategy, model.gauss_params, size)  # type: ignore[arg-type]
             except ValueError as error:
                 raise InputError(f"pipeline.model.{error}") from error
-            if line is not None:
-                CONSOLE.print(line, highlight=False, soft_wrap=True)
+            if line is None:
+                cap = self.model.strategy.max_gaussians
+                line = f"At most {cap:,} Gaussians: this device's memory is not planned with, so this is max_gaussians."
+            CONSOLE.print(line, highlight=False, soft_wrap=True)
             if warning is not None:
                 CONSOLE.print(f"[yellow]{escape(warning)}[/]", soft_wrap=True)
+            self._keep_cap()
             self.structure.set_max_gaussians.value = self.model.strategy.max_gaussians
         optimizers = training_callback_attributes.optimizers
         for optimizer in optimizers.optimizers.values() if optimizers is not None else ():
@@ -234,11 +240,37 @@ class SadgsPipeline(VanillaPipeline):
                 optimizer.log = self.log
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN]
         counts = TrainingCallback(after, lambda step: self.structure.refresh())
-        last = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self._report_nonfinite())
-        return [*super().get_training_callbacks(training_callback_attributes), counts, last]
+        after_step = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+        read = TrainingCallback(after_step, lambda step: self._report_nonfinite() if self.log.full else None)
+        last = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self._report_nonfinite(last=True))
+        # The log is read before densification makes new parameters, which have no gradients.
+        return [read, *super().get_training_callbacks(training_callback_attributes), counts, last]
 
-    def _report_nonfinite(self) -> None:
-        """Say in which of the last iterations, and with which images, a loss or gradient was not finite."""
+    def _keep_cap(self) -> None:
+        """Go on with the cap that the checkpoint's run had in effect; say so if memory now allows more, or less."""
+        strategy, before = self.model.strategy, self._checkpoint_cap
+        if before is None or strategy.max_gaussians == before:
+            return
+        if strategy.max_gaussians > before:
+            strategy.max_gaussians = before
+            text = f"At most {before:,} Gaussians, as in the checkpoint's run."
+        else:
+            now = strategy.max_gaussians
+            text = (
+                f"[yellow]The checkpoint's run had room for {before:,} Gaussians, the GPU's free memory now has for "
+                f"{now:,}, which is the cap from here on: stop this run and end other programs on the GPU to keep "
+                f"{before:,}.[/]"
+            )
+        CONSOLE.print(text, highlight=False, soft_wrap=True)
+
+    def _report_nonfinite(self, last: bool = False) -> None:
+        """Say in which of the last iterations, and with which images, a loss or gradient was not finite.
+
+        Where that lasts, and the present gradients move nothing, `stuck` becomes the sentence that says so.
+
+        Args:
+            last: Whether the run ends here: then it may have been too short for `nonfinite.HOPELESS_STEPS`.
+        """
         wrong = self.log.read()
         files = self.datamanager.train_dataset.image_filenames
         for step, views, what in wrong[:_NAMED_STEPS]:
@@ -248,6 +280,16 @@ class SadgsPipeline(VanillaPipeline):
             )
         if len(wrong) > _NAMED_STEPS:
             CONSOLE.print(f"[yellow]The same in {len(wrong) - _NAMED_STEPS} more of the last iterations.[/]")
+        enough = nonfinite.HOPELESS_STEPS if not last else min(nonfinite.HOPELESS_STEPS, self.log.steps)
+        gradient = self.model.means.grad
+        if wrong and self.log.streak >= enough and gradient is not None and nonfinite.is_useless(gradient):
+            step, _, what = wrong[-1]
+            names = [files[view].name for view in dict.fromkeys(view for _, views, _ in wrong for view in views)]
+            more = f" and {len(names) - _NAMED_STEPS} more" if len(names) > _NAMED_STEPS else ""
+            self.stuck = (
+                f"Nothing was learned in the last {self.log.streak} iterations, up to iteration {step + 1}: {what} "
+                f"(images {', '.join(names[:_NAMED_STEPS])}{more})"
+            )
 
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
         """Render the iteration's views and return the outputs of the last size, mean losses and mean metrics."""
@@ -279,8 +321,6 @@ class SadgsPipeline(VanillaPipeline):
                 for name, value in part.items():
                     # The mean over one size, the usual case, is no work for the device, here or in the backward pass.
                     total[name] = value if len(groups) == 1 else total.get(name, 0) + weight * value
-        if self.log.full:
-            self._report_nonfinite()
         self.log.begin_step(step, [index for views in groups.values() for index, _ in views], losses["main_loss"])
         return outputs, losses, metrics
 
@@ -321,6 +361,7 @@ class SadgsPipeline(VanillaPipeline):
             "torch": torch.get_rng_state(),
             "view_order": list(self.datamanager.train_unseen_cameras),
             "settings": self._settings(),
+            "max_gaussians": self.model.strategy.max_gaussians,  # which may be lower than the setting
         }
         if hasattr(self.datamanager, "random_generator"):
             state["view_shuffle"] = self.datamanager.random_generator.getstate()
@@ -333,16 +374,16 @@ class SadgsPipeline(VanillaPipeline):
 
         Says where densification goes on with other settings than the checkpoint's run had.
         """
-        now, changed = self._settings(), []
-        for name, before in state.get("settings", {}).items():
-            if name in now and now[name] != before:
-                changed.append(f"pipeline.{name} was {before} and is {now[name]}")
+        now, before = self._settings(), state.get("settings", {})
+        changed = [name for name in before if name in now and now[name] != before[name]]
         if changed:
+            listed = ", ".join(f"pipeline.{name} was {before[name]} and is {now[name]}" for name in changed)
             CONSOLE.print(
-                "[yellow]The checkpoint's run had other settings; this one goes on with its own: "
-                f"{escape(', '.join(changed))}.[/]",
+                f"[yellow]The checkpoint's run had other settings; this one goes on with its own: {escape(listed)}.[/]",
                 soft_wrap=True,
             )
+        if not any(name.endswith(("max_gaussians", "memory_budget_gb")) for name in changed):
+            self._checkpoint_cap = state.get("max_gaussians")
         torch.set_rng_state(state["torch"].cpu())
         if max(state["view_order"], default=0) < len(self.datamanager.train_dataset):
             self.datamanager.train_unseen_cameras = list(state["view_order"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import os
-import sys
+import shlex
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +16,7 @@ import tyro
 import yaml
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from sadgs_ns.atomic import atomic_path
@@ -23,7 +24,7 @@ from sadgs_ns.data.validation.parsers import check_ahead
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
 from sadgs_ns.plugin import checkpoints
 from sadgs_ns.plugin.compilation import compile_kernels
-from sadgs_ns.plugin.interrupts import Interrupted, Interrupts, resume_command
+from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
 from sadgs_ns.plugin.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig, SadgsOptimizers
 from sadgs_ns.plugin.pipeline import SadgsPipeline, SadgsPipelineConfig
 
@@ -31,17 +32,20 @@ _LESS_MEMORY = (
     "lower --pipeline.model.strategy.max-gaussians or --pipeline.views-per-iteration, or take smaller images "
     "(`--downscale-factor 2` after `nerfstudio-data` or `colmap`)"
 )
+_ONE_DEVICE = "sadgs trains on one device; set machine.num_devices and machine.num_machines to 1."
+_MEASURED_MEGAPIXELS = 1.0
+"""Above this size of images a run with several views an iteration prints a warning; .7 and 1.9 have been measured."""
 _SAVING_SHARE = 0.01
-"""The most of the time from one of the clock's checkpoints to the next that the saving may take."""
+"""Largest share of the time between two checkpoints by the clock that saving may take."""
 
 
 def _memory(error: torch.cuda.OutOfMemoryError) -> str:
-    """How much memory was asked for, and of whom: the first two of torch's many sentences."""
+    """Return the first two of torch's many sentences, which say how much memory was asked for, and of whom."""
     return ". ".join(reason(error).split(". ")[:2]).rstrip(".")
 
 
 def available_machine() -> MachineConfig:
-    """CUDA where there is a device, the CPU elsewhere."""
+    """Return the machine's configuration, with CUDA where there is a device and the CPU elsewhere."""
     return MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu")
 
 
@@ -73,43 +77,95 @@ class SadgsTrainerConfig(TrainerConfig):
     """Multiply the position learning rate with the cameras' extent, as 3DGS does; splatfacto does not."""
 
     def check(self) -> None:
-        """See whether training can work with these options.
+        """Check whether training can work with these options.
 
         Raises:
-            InputError: If there is no iteration to do, or gradients would be scaled; as `SadgsPipelineConfig.check`.
+            InputError: If a number is out of its range, gradients would be scaled or accumulated, or the device is not
+                there; as `SadgsPipelineConfig.check`.
         """
-        if self.max_num_iterations < 1:
-            raise InputError(f"max_num_iterations must be at least 1, got {self.max_num_iterations}.")
+        for name, count in (
+            ("max_num_iterations", self.max_num_iterations),
+            ("logging.steps_per_log", self.logging.steps_per_log),
+        ):
+            if count < 1:
+                raise InputError(f"{name} must be at least 1, got {count}.")
+        for name in ("save", "eval_batch", "eval_image", "eval_all_images"):
+            if (steps := getattr(self, f"steps_per_{name}")) < 0:
+                raise InputError(f"steps_per_{name} must not be negative, got {steps}.")
+        if not self.seconds_per_save >= 0:
+            raise InputError(f"seconds_per_save must not be negative, got {self.seconds_per_save:g}.")
+        if self.load_step is not None and self.load_dir is None:
+            raise InputError(
+                f"load_step is {self.load_step}, but load_dir is not set: add --load-dir with the folder of a run."
+            )
+        port = self.viewer.websocket_port
+        if port is not None and not 1 <= port <= 65535:
+            raise InputError(f"viewer.websocket_port must be in [1, 65535], got {port}.")
+        if self.machine.num_devices * self.machine.num_machines != 1:
+            raise InputError(_ONE_DEVICE)
+        if self.machine.device_type == "cuda" and not torch.cuda.is_available():
+            raise InputError(
+                "machine.device_type is cuda, but torch finds no CUDA device: set it to cpu, or install torch for CUDA."
+            )
+        self._check_rates()
         if self.mixed_precision or self.use_grad_scaler:
             raise InputError(
                 "sadgs trains in float32, and its densification reads gradients as they are: leave mixed_precision and "
                 "use_grad_scaler off."
             )
+        if any(steps != 1 for steps in self.gradient_accumulation_steps.values()):
+            raise InputError(
+                "sadgs updates every parameter in every iteration, and densification would lose gradients that were "
+                "kept for later: leave gradient_accumulation_steps out, and set pipeline.views_per_iteration instead."
+            )
         self.pipeline.check()
 
+    def _check_rates(self) -> None:
+        """Check whether the learning rates can train anything.
+
+        Raises:
+            InputError: If one is not in [0, 1], or a schedule's factor is not positive and finite.
+        """
+        for group, configs in self.optimizers.items():
+            rate, scheduler = configs["optimizer"].lr, configs.get("scheduler")
+            if not 0 <= rate <= 1:
+                raise InputError(f"optimizers.{group}.optimizer.lr must be in [0, 1], got {rate:g}.")
+            if isinstance(scheduler, RunLengthDecaySchedulerConfig):
+                for name in ("initial_factor", "final_factor"):
+                    if not 0 < (factor := getattr(scheduler, name)) < math.inf:
+                        raise InputError(
+                            f"optimizers.{group}.scheduler.{name} must be positive and finite, got {factor:g}."
+                        )
+
     def save_config(self) -> None:
-        """Write `config.yml`, the first file of a run: not before options, checkpoint, data and folder are found good.
+        """Write `config.yml`, the first file of a run, once options, checkpoint and data have been found good.
 
         Raises:
             InputError: If they are not; nothing is written then.
+            WriteError: If the folder cannot be written.
         """
         self.check()
         checkpoints.check_chosen(self.load_dir, self.load_step, self.load_checkpoint)
         check_ahead(self.pipeline.datamanager)
+        CONSOLE.log(f"Saving config to: {self.write()}")
+
+    def write(self) -> Path:
+        """Write `config.yml` and return its path.
+
+        Raises:
+            WriteError: If the disk is full or the folder cannot be written.
+        """
         path = self.get_base_dir() / "config.yml"
-        CONSOLE.log(f"Saving config to: {path}")
-        try:
-            with atomic_path(path) as partial:
-                partial.write_text(yaml.dump(self), "utf8")
-        except WriteError as error:
-            raise InputError(str(error)) from error
+        with atomic_path(path) as partial:
+            partial.write_text(yaml.dump(self), "utf8")
+        return path
 
 
 SadgsTrainerConfig.__annotations__["prompt"] = tyro.conf.Suppress[str | None]  # hidden from help: for text to NeRF
 
 
 class SadgsTrainer(Trainer):
-    """Trains one model on one device.
+    """A trainer for one model on one device.
 
     Raises:
         InputError: If several devices are asked for; as `SadgsTrainerConfig.check`.
@@ -120,13 +176,13 @@ class SadgsTrainer(Trainer):
 
     def __init__(self, config: SadgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         if world_size > 1:
-            raise InputError(f"sadgs trains on one device; set machine.num_devices to 1, not {world_size}.")
+            raise InputError(_ONE_DEVICE)
         config.check()
         super().__init__(config, local_rank, world_size)
         self._stepping = False
         self._completed_step = self._saved_step = -1
         self._save_due = math.inf
-        # Paused or done, nerfstudio waits for the viewer's user.
+        # A run that is paused or done polls no signal, because nerfstudio waits for the viewer's user.
         self._interrupts = Interrupts(waiting=lambda: self.training_state != "training" and not self._stepping)
 
     def setup(self, *args: Any, **kwargs: Any) -> None:
@@ -138,9 +194,35 @@ class SadgsTrainer(Trainer):
         """
         try:
             super().setup(*args, **kwargs)
+            self._say_what_was_chosen()
             compile_kernels(self.pipeline, self.optimizers.optimizers)
         except torch.cuda.OutOfMemoryError as error:
             raise RunError(f"The GPU's memory is too small to start ({_memory(error)}): {_LESS_MEMORY}.") from error
+
+    def _say_what_was_chosen(self) -> None:
+        """Print the run's size in one line, after the memory plan's, and warn of what does not suit the data."""
+        cameras, config = self.pipeline.datamanager.train_dataset.cameras, self.config
+        views, asked, taken = len(cameras), config.pipeline.views_per_iteration, self.pipeline.views_per_iteration
+        megapixels = float((cameras.height * cameras.width).double().mean()) / 1e6
+        done = f", of which {self._start_step:,} are done" if self._start_step else ""
+        times = round(config.max_num_iterations * taken / views)
+        lines = [
+            f"{config.method_name} on {views:,} training views of {megapixels:.2g} megapixels: "
+            f"{config.max_num_iterations:,} iterations of {taken} view{'s' * (taken > 1)}{done}, so that each view is "
+            f"rendered about {times:,} time{'s' * (times != 1)}."
+        ]
+        if asked > taken:
+            lines.append(
+                f"[yellow]pipeline.views_per_iteration is {asked}, but there are {views} training views: all are taken "
+                "each time.[/]"
+            )
+        if taken > 1 and megapixels > _MEASURED_MEGAPIXELS:
+            lines.append(
+                "[yellow]Training with several views an iteration was measured on images of up to 0.7 megapixels; "
+                "outdoors, on images of 1.9, it took twice as long as sadgs and was worse. Consider sadgs, or smaller "
+                "images.[/]"
+            )
+        CONSOLE.print("\n".join(lines), highlight=False, soft_wrap=True)
 
     def _load_checkpoint(self) -> None:
         """Resume as nerfstudio does, but with the safe loader, and from an earlier checkpoint if the latest is damaged.
@@ -164,7 +246,7 @@ class SadgsTrainer(Trainer):
             raise
         except InputError as error:
             raise InputError(f"{path} cannot be continued: {str(error).rstrip('.')}; {checkpoints.REMEDY}.") from error
-        except Exception as error:  # a foreign file's parts lead to whatever they lead to
+        except Exception as error:  # The parts of a foreign file may raise anything.
             what = f"{type(error).__name__}: {reason(error)}"
             raise InputError(
                 f"{path} is not a checkpoint of this version of sadgs ({what}): {checkpoints.REMEDY}."
@@ -185,42 +267,52 @@ class SadgsTrainer(Trainer):
         return SadgsOptimizers(optimizers, self.pipeline.get_param_groups())
 
     def train(self) -> None:
-        """Train up to `max_num_iterations` in all; nerfstudio 1.1.5 trains that many more after resuming.
+        """Train up to `max_num_iterations` in all, where nerfstudio 1.1.5 would train that many more after resuming.
 
         Raises:
-            RunError: If the GPU's memory is full or a checkpoint could not be saved.
-            SystemExit: SIGINT or SIGTERM came: with a checkpoint saved, a line printed that says how to go on, and the
-                exit code that shells give these signals.
+            RunError: If the GPU's memory is full, or nothing is learned any more.
+            WriteError: If a checkpoint or log could not be written.
+            SystemExit: If SIGINT, SIGTERM or SIGHUP came. A checkpoint is saved then, a line says how to go on, and the
+                exit code is the one that shells give these signals.
         """
         total = self.config.max_num_iterations
-        self.step: int = max(self._start_step - 1, 0)  # names the checkpoint when nothing is left to do
+        self.step: int = max(self._start_step - 1, 0)  # It names the checkpoint where nothing is left to do.
         self._completed_step = self._saved_step = self._start_step - 1
         self.config.max_num_iterations = max(total - self._start_step, 0)
+        if self._start_step >= total:
+            writer.GLOBAL_BUFFER["step"] = self.step  # nerfstudio's table reads what only an iteration sets.
+            CONSOLE.print(
+                f"This run is finished after {self._start_step} iterations: --max-num-iterations of more than "
+                f"{self._start_step} trains on.",
+                highlight=False,
+                soft_wrap=True,
+            )
         out_of_memory = ""
         self._set_clock(0.0)
         try:
-            try:
-                with self._interrupts:
+            with self._interrupts:
+                try:
                     super().train()
-            except Interrupted as interrupted:
-                self._stop(interrupted, total)
+                    self._stop_if_stuck()
+                except Interrupted as interrupted:
+                    self._stop(interrupted, total)
         except torch.cuda.OutOfMemoryError as error:
-            out_of_memory = _memory(error)  # raised below, when the failed step's tensors are gone
+            out_of_memory = _memory(error)  # The RunError is raised below, when the failed step's tensors are gone.
         except OSError as error:
-            if error.errno is None and not isinstance(error, WriteError):
-                raise  # not from the disk
-            if not isinstance(error, WriteError):  # of a logger, such as tensorboard's
-                error = WriteError(Path(error.filename or self.base_dir), error)
-            raise RunError(str(error)) from error
+            if error.errno is None:  # It is a WriteError, or it does not come from the disk.
+                raise
+            # A logger, such as tensorboard's, could not write.
+            raise WriteError(Path(error.filename or self.base_dir), error) from error
         finally:
             self.config.max_num_iterations = total
         if out_of_memory:
             raise RunError(self._rescue(out_of_memory))
 
     def _rescue(self, out_of_memory: str) -> str:
-        """Save the state of before the present step, if it is whole; returns what to tell the user.
+        """Save the state before the present step if it is whole, and return what to tell the user.
 
-        Memory that ran out while Gaussians were split leaves the step's update in it, which is then made twice.
+        If memory ran out while Gaussians were split, the saved state holds the step's update already, and the resumed
+        run makes it a second time.
         """
         torch.cuda.empty_cache()
         model = self.pipeline.model
@@ -228,7 +320,7 @@ class SadgsTrainer(Trainer):
         for name, parameter in model.gauss_params.items():
             states = self.optimizers.optimizers[name].state
             if not states and parameter.numel() > 0:
-                lengths.add(-1)  # gsplat takes a state out while it rewrites it
+                lengths.add(-1)  # gsplat was rewriting the state, which it takes out meanwhile
             for state in states.values():
                 lengths |= {len(value) for value in state.values() if isinstance(value, torch.Tensor) and value.dim()}
         lengths |= {len(v) for v in model.strategy_state.values() if isinstance(v, torch.Tensor) and v.dim()}
@@ -246,32 +338,34 @@ class SadgsTrainer(Trainer):
         )
 
     def train_iteration(self, step: int) -> Any:
-        """nerfstudio's; from here to `_update_viewer_state` no signal may stop the run."""
+        """Run nerfstudio's iteration; no signal may stop the run from here to `_update_viewer_state`."""
         self._stepping = True
         return super().train_iteration(step)
 
     def _update_viewer_state(self, step: int) -> None:
-        """nerfstudio calls this after every step, when densification is done."""
+        """Stop or save where that is due; nerfstudio calls this after every step, when densification is done."""
         self._completed_step, self._stepping = step, False
         self._interrupts.poll()
+        self._stop_if_stuck()
         if time.monotonic() >= self._save_due:
             self.save_checkpoint(step)
         super()._update_viewer_state(step)
 
     def _train_complete_viewer(self) -> None:
-        """nerfstudio waits here for the viewer's user, for ever."""
+        """Wait for the viewer's user, as nerfstudio does for ever, unless the run must stop."""
         self._interrupts.poll()
+        self._stop_if_stuck()
         super()._train_complete_viewer()
 
     def _set_clock(self, took: float) -> None:
-        """Say when the next checkpoint is due, after one that took so many seconds."""
+        """Set when the next checkpoint is due, after one that took `took` seconds to save."""
         config = self.config
         by_clock = config.steps_per_save == 0 and config.seconds_per_save > 0
         wait = max(config.seconds_per_save, took / _SAVING_SHARE) if by_clock else math.inf
         self._save_due = time.monotonic() + wait
 
     def _stop(self, interrupted: Interrupted, total: int) -> None:
-        """Save what was trained and leave; a run that had only its viewer left just ends."""
+        """Save a checkpoint, and in `config.yml` that the run goes on from it; a run that was done just ends."""
         if self._completed_step > self._saved_step:
             self.save_checkpoint(self._completed_step)
         done = self._completed_step + 1
@@ -280,15 +374,37 @@ class SadgsTrainer(Trainer):
         if done == self._start_step:
             text = f"{interrupted}: stopped before an iteration was done; the same command starts again."
         else:
-            command = resume_command(sys.argv, self.config.method_name or "", self.checkpoint_dir)
+            # With --load-config nerfstudio takes all options from the file, so the file must name the checkpoints, too.
+            config = copy.copy(self.config)
+            config.max_num_iterations = total
+            config.load_dir, config.load_step, config.load_checkpoint = self.checkpoint_dir, None, None
+            command = shlex.join(["ns-train", str(config.method_name), "--load-config", str(config.write())])
             text = f"{interrupted}: stopped and saved after {done} of {total} iterations; resume with: {command}"
         CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
         raise SystemExit(128 + interrupted.number)
 
-    def save_checkpoint(self, step: int) -> None:
-        """Save under a temporary name, then rename: a killed save leaves the previous checkpoint as it was.
+    def _stop_if_stuck(self) -> None:
+        """Save the Gaussians and end the run if they learn nothing any more because gradients are not finite.
 
-        The temporary file lies beside the folder of checkpoints: nerfstudio takes every file inside for one.
+        Raises:
+            RunError: If so.
+        """
+        if not self.pipeline.stuck:
+            return
+        kept = "the Gaussians themselves are not finite: train anew, or from a checkpoint in which they are"
+        if all(bool(parameter.isfinite().all()) for parameter in self.pipeline.model.gauss_params.values()):
+            if self._completed_step > self._saved_step:
+                self.save_checkpoint(self._completed_step)
+            kept = f"the Gaussians as they are now are saved and go on with --load-dir {self.checkpoint_dir}"
+        raise RunError(
+            f"{self.pipeline.stuck}; look at them with sadgs-doctor, and lower the learning rates if you raised them; "
+            f"{kept}."
+        )
+
+    def save_checkpoint(self, step: int) -> None:
+        """Save under a temporary name and rename, so that a killed save leaves the previous checkpoint as it was.
+
+        The temporary file lies beside the folder of checkpoints, because nerfstudio takes every file inside for one.
 
         Raises:
             WriteError: If the disk is full or the folder cannot be written.
@@ -306,13 +422,13 @@ class SadgsTrainer(Trainer):
         with atomic_path(path, beside=self.checkpoint_dir) as partial:
             try:
                 torch.save(state, partial)
-            except RuntimeError as error:  # so torch's writer calls a full disk
+            except RuntimeError as error:  # torch's writer reports a full disk so
                 raise OSError(reason(error)) from error
-            if others:  # about to be deleted: the new one must be on the disk, lest a power cut takes both
+            if others:  # These are about to be deleted, so the new one must survive a power cut first.
                 with partial.open("rb+") as file:
                     os.fsync(file.fileno())
         self._saved_step = step
-        if self.config.save_only_latest_checkpoint:
+        if self.config.save_only_latest_checkpoint and not self.pipeline.stuck:  # An earlier one may then be better.
             for other in others:
                 other.unlink()
         self._set_clock(time.monotonic() - start)

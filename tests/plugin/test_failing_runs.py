@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shutil
 from collections.abc import Callable
@@ -12,12 +13,13 @@ import pytest
 import torch
 from kill_and_resume import differences, parser_of
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer
 from runs import checkpoint, configure, is_finite, set_up, train
 
 from sadgs_ns.cli.export import write_ply
 from sadgs_ns.errors import InputError, RunError, WriteError
-from sadgs_ns.plugin import checkpoints
+from sadgs_ns.plugin import checkpoints, nonfinite
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 ITERATIONS = 6
@@ -26,6 +28,59 @@ ITERATIONS = 6
 @pytest.fixture
 def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig:
     return configure(tmp_path / "out", colmap, ITERATIONS)
+
+
+# --- options ---
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "sentence"),
+    [
+        ("gradient_accumulation_steps", {"means": 4}, "sadgs updates every parameter in every iteration, and "),
+        ("machine.num_devices", 2, "sadgs trains on one device; set machine.num_devices and machine.num_machines to 1"),
+        (
+            "machine.num_machines",
+            2,
+            "sadgs trains on one device; set machine.num_devices and machine.num_machines to 1",
+        ),
+        ("machine.device_type", "cuda", "machine.device_type is cuda, but torch finds no CUDA device: set it to cpu,"),
+        ("steps_per_save", -3, "steps_per_save must not be negative, got -3."),
+        ("seconds_per_save", math.nan, "seconds_per_save must not be negative, got nan."),
+        ("steps_per_eval_batch", -1, "steps_per_eval_batch must not be negative, got -1."),
+        ("steps_per_eval_image", -1, "steps_per_eval_image must not be negative, got -1."),
+        ("steps_per_eval_all_images", -1, "steps_per_eval_all_images must not be negative, got -1."),
+        ("logging.steps_per_log", 0, "logging.steps_per_log must be at least 1, got 0."),
+        ("viewer.websocket_port", 99999, "viewer.websocket_port must be in [1, 65535], got 99999."),
+        ("load_step", 3, "load_step is 3, but load_dir is not set: add --load-dir with the folder of a run."),
+        ("optimizers.means.optimizer.lr", math.nan, "optimizers.means.optimizer.lr must be in [0, 1], got nan."),
+        ("optimizers.quats.optimizer.lr", 1e9, "optimizers.quats.optimizer.lr must be in [0, 1], got 1e+09."),
+        ("optimizers.scales.optimizer.lr", -1.0, "optimizers.scales.optimizer.lr must be in [0, 1], got -1."),
+        (
+            "optimizers.means.scheduler.final_factor",
+            0.0,
+            "optimizers.means.scheduler.final_factor must be positive and finite, got 0.",
+        ),
+    ],
+)
+def test_options_with_which_no_run_can_work_are_refused_before_anything_is_written(
+    option: str, value: Any, sentence: str, config: SadgsTrainerConfig
+):
+    if value == "cuda" and torch.cuda.is_available():
+        pytest.skip("there is a CUDA device")
+    owner: Any = config
+    *owners, name = option.split(".")
+    for part in owners:
+        owner = owner[part] if isinstance(owner, dict) else getattr(owner, part)
+    setattr(owner, name, value)
+    with pytest.raises(InputError) as refused:
+        config.save_config()
+    assert str(refused.value).startswith(sentence) and "\n" not in str(refused.value)
+    assert not config.output_dir.exists()
+
+
+def test_accumulating_over_one_iteration_is_what_everybody_does(config: SadgsTrainerConfig):
+    config.gradient_accumulation_steps = {"means": 1}
+    config.check()
 
 
 # --- the disk ---
@@ -43,7 +98,7 @@ def test_an_output_folder_that_cannot_be_made_is_named_before_anything_is_writte
 ):
     (tmp_path / "file").write_text("in the way")
     config.output_dir = tmp_path / "file" / "out"
-    with pytest.raises(InputError, match=r"/file/out/\S+/config\.yml could not be written \(Not a directory; .*name "):
+    with pytest.raises(WriteError, match=r"/file/out/\S+/config\.yml could not be written \(Not a directory; .*name "):
         config.save_config()
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
@@ -53,7 +108,7 @@ def test_a_read_only_output_folder_is_named(config: SadgsTrainerConfig, monkeypa
         raise PermissionError(13, "Permission denied", str(path))  # root, as in containers, may write everywhere
 
     monkeypatch.setattr(Path, "mkdir", denied)
-    with pytest.raises(InputError, match=r"config\.yml could not be written \(Permission denied; .*can be written;"):
+    with pytest.raises(WriteError, match=r"config\.yml could not be written \(Permission denied; .*can be written;"):
         config.save_config()
 
 
@@ -69,7 +124,7 @@ def test_a_full_disk_leaves_the_previous_checkpoint_and_ends_training_with_one_s
         trainer.save_checkpoint(2)
     fill_disk(partial)
     with pytest.raises(
-        RunError, match=r"^\S+/step-000000005\.ckpt could not be written \(.+\): make room or [^\n]+\.$"
+        WriteError, match=r"^\S+/step-000000005\.ckpt could not be written \(.+\): make room or [^\n]+\.$"
     ):
         trainer.train()
     assert [path.name for path in trainer.checkpoint_dir.iterdir()] == ["step-000000001.ckpt"]
@@ -87,7 +142,7 @@ def test_a_logger_s_full_disk_is_one_sentence_and_other_errors_of_reading_are_th
         trainer.pipeline.get_train_loss_dict = fail  # type: ignore[assignment]
         return trainer
 
-    with pytest.raises(RunError, match=r"^/x/events could not be written \(No space left on device; [^\n]+\.$"):
+    with pytest.raises(WriteError, match=r"^/x/events could not be written \(No space left on device; [^\n]+\.$"):
         failing(OSError(28, "No space left on device", "/x/events")).train()
     with pytest.raises(OSError, match=r"^broken data stream$"):
         failing(OSError("broken data stream")).train()
@@ -219,12 +274,100 @@ def test_one_whole_checkpoint_among_damaged_ones_is_enough(saved: Path, tmp_path
 
 def test_a_step_or_file_without_a_checkpoint_is_named(saved: Path, tmp_path: Path):
     with pytest.raises(InputError, match=r"no checkpoint of step 3: give --load-step one of 5\."):
-        checkpoints.checkpoint_path(saved.parent, 3, None)
+        checkpoints.checkpoint_paths(saved.parent, 3, None)
     with pytest.raises(InputError, match=r"\S+/none\.ckpt does not exist: give --load-checkpoint a file"):
-        checkpoints.checkpoint_path(None, None, tmp_path / "none.ckpt")
+        checkpoints.checkpoint_paths(None, None, tmp_path / "none.ckpt")
     for step in (None, 5):
-        assert checkpoints.checkpoint_path(saved.parent, step, None) == saved
-    assert checkpoints.checkpoint_path(None, None, None) is None
+        assert checkpoints.checkpoint_paths(saved.parent, step, None) == [saved]
+    assert checkpoints.checkpoint_paths(None, None, None) == []
+
+
+# --- runs that learn nothing ---
+
+
+def poison(trainer: SadgsTrainer, what: str) -> None:
+    """Let every loss, or every gradient of means, be NaN from now on; or the gradient of the first Gaussian alone."""
+    get_loss = trainer.pipeline.get_train_loss_dict
+
+    def poisoned(step: int) -> Any:
+        outputs, losses, metrics = get_loss(step)
+        if what == "loss":
+            losses["main_loss"] = losses["main_loss"] * math.nan
+            trainer.pipeline.log._losses[len(trainer.pipeline.log._steps) - 1] = math.nan
+        return outputs, losses, metrics
+
+    trainer.pipeline.get_train_loss_dict = poisoned  # type: ignore[method-assign]
+    if what != "loss":
+        rows = slice(None) if what == "gradients" else slice(1)
+
+        def spoil(gradient: torch.Tensor) -> torch.Tensor:
+            gradient = gradient.clone()
+            gradient[rows] = math.nan
+            return gradient
+
+        for parameter in trainer.pipeline.model.gauss_params.values():
+            parameter.register_hook(spoil)
+
+
+@pytest.mark.parametrize("what", ["loss", "gradients"])
+def test_a_run_that_learns_nothing_stops_with_one_sentence_and_a_finite_checkpoint(
+    what: str, config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    monkeypatch.setattr(nonfinite, "HOPELESS_STEPS", 8)
+    config.max_num_iterations, config.steps_per_save = 24, 3
+    config.pipeline.model.densify = False
+    trainer = set_up(config)
+    trainer.pipeline.log._losses = trainer.pipeline.log._losses[:4]  # read every 4 iterations
+    location = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+    trainer.callbacks.append(
+        TrainingCallback(location, lambda step: poison(trainer, what) if step == 4 else None)  # the second of a window
+    )
+    with pytest.raises(RunError) as stopped:
+        trainer.train()
+    said = "the loss was nan" if what == "loss" else "gradients were not finite"
+    assert re.fullmatch(
+        rf"Nothing was learned in the last 11 iterations, up to iteration 16: {said} \(images (\S+\.png, ){{3}}\S+\.png"
+        r"\); look at them with sadgs-doctor, and lower the learning rates if you raised them; the Gaussians as they "
+        r"are now are saved and go on with --load-dir \S+/nerfstudio_models\.",
+        str(stopped.value),
+    ), str(stopped.value)
+    assert is_finite(trainer.pipeline.model)
+    state = checkpoint(trainer, 15)
+    assert all(v.isfinite().all() for k, v in state["pipeline"].items() if "gauss_params" in k)
+    assert (trainer.checkpoint_dir / "step-000000012.ckpt").exists()  # it may be the better one
+    config.load_dir, config.output_dir = trainer.checkpoint_dir, tmp_path / "resumed"
+    assert is_finite(train(config).pipeline.model)
+
+
+def test_a_short_run_whose_every_gradient_is_nan_does_not_end_well(config: SadgsTrainerConfig):
+    config.pipeline.model.densify = False
+    trainer = set_up(config)
+    poison(trainer, "gradients")
+    with pytest.raises(
+        RunError, match=rf"^Nothing was learned in the last {ITERATIONS} iterations, up to iteration 6: gr"
+    ):
+        trainer.train()
+    assert checkpoint(trainer, ITERATIONS - 1)["step"] == ITERATIONS - 1
+
+
+def test_gaussians_that_are_not_finite_are_not_saved(config: SadgsTrainerConfig):
+    config.pipeline.model.densify = False
+    trainer = set_up(config)
+    trainer.pipeline.model.gauss_params["features_dc"].data.fill_(math.nan)
+    with pytest.raises(
+        RunError, match=r"; the Gaussians themselves are not finite: train anew, or from a checkpoint .+\.$"
+    ):
+        trainer.train()
+
+
+def test_one_gaussian_whose_gradient_is_always_nan_stops_nobody(
+    config: SadgsTrainerConfig, capsys: pytest.CaptureFixture[str]
+):
+    config.pipeline.model.densify = False
+    trainer = set_up(config)
+    poison(trainer, "one gradient")
+    trainer.train()
+    assert "gradients were not finite" in capsys.readouterr().out and is_finite(trainer.pipeline.model)
 
 
 # --- the GPU's memory ---

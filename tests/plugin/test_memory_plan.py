@@ -15,6 +15,7 @@ from nerfstudio.cameras.cameras import Cameras
 from scenes import camera, random_params, splat
 
 from sadgs_ns.demo.scene import write_scene
+from sadgs_ns.errors import InputError
 from sadgs_ns.method import memory
 from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.strategy import StructureAwareStrategy
@@ -284,5 +285,5 @@ def test_a_budget_for_nothing_ends_ns_train_with_one_sentence(card: Any, tmp_pat
     config = configure(tmp_path / "scene", tmp_path, iterations=24, save_every=0)
     config.pipeline.model.strategy.memory_budget_gb = 1e-6
     card(8, 8)
-    with pytest.raises(SystemExit, match=r"^pipeline\.model\.strategy\.memory_budget_gb is 1e-06 and leaves no room"):
+    with pytest.raises(InputError, match=r"^pipeline\.model\.strategy\.memory_budget_gb is 1e-06 and leaves no room"):
         set_up(config)

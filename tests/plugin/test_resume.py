@@ -1,4 +1,4 @@
-"""Killed and resumed: what SIGKILL, SIGINT and SIGTERM leave, and what a run goes on from."""
+"""Runs that are killed and resumed: what SIGKILL, SIGINT, SIGTERM and SIGHUP leave, and what a run goes on from."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import os
 import re
 import shlex
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,22 +20,28 @@ from typing import Any
 import pytest
 import torch
 import tyro
+import yaml
 from kill_and_resume import configure, differences, set_up
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.scripts.train import main as resume
+from nerfstudio.utils import writer
 from scenes import ITERATIONS
 
 from sadgs_ns.demo.scene import SPARSE_FOLDER
-from sadgs_ns.plugin.interrupts import resume_command
+from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.plugin.checkpoints import checkpoint_paths
+from sadgs_ns.plugin.interrupts import SIGNALS
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 SCRIPT = Path(__file__).parents[1] / "kill_and_resume.py"
+TERMINAL = "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0)\n"
+"""Makes the standard input the terminal that controls the process, so that it is sent SIGHUP when that is gone."""
 
 
 def after(trainer: SadgsTrainer, at: int, act: Callable[[], None]) -> None:
-    """Do something at the end of an iteration, after densification."""
+    """Call `act` at the end of an iteration, after densification."""
     location = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
     trainer.callbacks.append(TrainingCallback(location, lambda step: act() if step == at else None))
 
@@ -48,13 +55,13 @@ def checkpoints(trainer: SadgsTrainer) -> list[str]:
 
 
 def one_line(text: str, start: str) -> str:
-    """The only line that begins so."""
+    """Return the only line that begins so."""
     (line,) = (line for line in text.splitlines() if line.startswith(start))
     return line
 
 
 def kill_and_resume(*arguments: object) -> str:
-    """Run the script; its output."""
+    """Run the script and return its output."""
     command = [sys.executable, str(SCRIPT), *map(str, arguments)]
     result = subprocess.run(command, capture_output=True, text=True, timeout=1800)
     assert result.returncode == 0, result.stdout + result.stderr
@@ -189,13 +196,22 @@ def test_ctrl_c_on_ns_train_prints_the_command_that_resumes_it(
     assert 5 < done < iterations
     assert line.startswith(f"SIGINT: stopped and saved after {done} of {iterations} iterations; resume with: ns-train ")
     words = shlex.split(line.partition("resume with: ")[2])
-    assert words[:4] == ["ns-train", "sadgs", "--load-dir", str(folder)]
+    assert words == ["ns-train", "sadgs", "--load-config", str(folder.with_name("config.yml"))]
     resume(tyro.cli(AnnotatedBaseConfigUnion, args=words[1:]))  # in this process, which has imported everything
     assert f"Resuming after step {done - 1} of {path}" in capsys.readouterr().out
     assert [p.name for p in folder.iterdir()] == [f"step-{iterations - 1:09d}.ckpt"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.fixture
+def hang_up_by_default() -> Iterator[None]:
+    """Where the tests themselves run under nohup, SIGHUP is ignored, and would be by the runs."""
+    previous = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, previous)
+
+
+@pytest.mark.usefixtures("hang_up_by_default")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_an_interrupt_within_a_step_waits_for_its_end_and_resumes_to_the_same_model(
     number: signal.Signals, scene: Path, config: SadgsTrainerConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -211,24 +227,75 @@ def test_an_interrupt_within_a_step_waits_for_its_end_and_resumes_to_the_same_mo
         return get_loss(step)
 
     trainer.pipeline.get_train_loss_dict = interrupted  # type: ignore[method-assign]
-    handlers = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+    handlers = [signal.getsignal(n) for n in SIGNALS]
     with pytest.raises(SystemExit) as stopped:
         trainer.train()
     assert stopped.value.code == 128 + number
-    assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == handlers
+    assert [signal.getsignal(n) for n in SIGNALS] == handlers
     assert checkpoints(trainer) == ["step-000000004.ckpt"]
     line = one_line(capsys.readouterr().out, number.name)
     assert line == (
         f"{number.name}: stopped and saved after 5 of {ITERATIONS} iterations; "
-        f"resume with: load_dir = {str(trainer.checkpoint_dir)!r}"
+        f"resume with: ns-train sadgs --load-config {trainer.base_dir / 'config.yml'}"
     )
 
-    config.load_dir = trainer.checkpoint_dir
-    resumed = set_up(config)
+    resumed = set_up(yaml.load((trainer.base_dir / "config.yml").read_text(), Loader=yaml.Loader))
     resumed.train()
     name = f"step-{ITERATIONS - 1:09d}.ckpt"
     ends = [torch.load(t.checkpoint_dir / name, weights_only=True) for t in (whole, resumed)]
     assert differences(*ends) == []
+
+
+@pytest.mark.usefixtures("hang_up_by_default")
+def test_a_second_hang_up_does_not_stop_the_saving(config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch):
+    """Where ssh is cut off, the shell sends one, and the kernel another when the shell ends."""
+    trainer = set_up(config)
+    for _ in range(2):
+        after(trainer, 3, lambda: send(signal.SIGHUP))
+    save = torch.save
+
+    def hung_up(*arguments: Any) -> None:
+        send(signal.SIGHUP)
+        save(*arguments)
+
+    monkeypatch.setattr(torch, "save", hung_up)
+    with pytest.raises(SystemExit) as stopped:
+        trainer.train()
+    assert stopped.value.code == 128 + signal.SIGHUP
+    assert checkpoints(trainer) == ["step-000000003.ckpt"]
+    assert signal.getsignal(signal.SIGHUP) == signal.SIG_DFL
+
+
+def test_a_terminal_that_is_gone_costs_nothing_that_was_trained(scene: Path, tmp_path: Path):
+    """As where ssh is cut off: the run loses the terminal that it prints to, and is sent SIGHUP."""
+    ours, theirs = os.openpty()
+    script = "import sys; from pathlib import Path; from kill_and_resume import configure, set_up\n"
+    script += f"config = configure(Path({str(scene)!r}), Path({str(tmp_path)!r}), 5000, save_every=0)\n"
+    script += "config.logging.local_writer.enable, config.pipeline.model.densify = True, False\n"
+    script += "trainer = set_up(config); trainer.train()\n"
+    process = subprocess.Popen(
+        [sys.executable, "-W", "ignore", "-c", TERMINAL + script],
+        stdin=theirs,
+        stdout=theirs,
+        stderr=theirs,
+        start_new_session=True,
+        cwd=SCRIPT.parent,
+        env={
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join([*map(str, SCRIPT.parents), os.environ.get("PYTHONPATH", "")]),
+        },
+    )
+    try:
+        os.close(theirs)
+        printed = b""
+        while b"10 (0.20%)" not in printed:  # a line of the table of progress
+            printed += os.read(ours, 4096)
+        os.close(ours)
+        assert process.wait(60) == 128 + signal.SIGHUP, printed.decode()
+    finally:
+        process.kill()
+    (path,) = tmp_path.rglob("*.ckpt")
+    assert torch.load(path, weights_only=True)["step"] > 0
 
 
 def test_an_interrupt_while_paused_before_the_first_iteration_leaves_nothing(
@@ -289,21 +356,116 @@ def test_a_handler_that_the_program_has_for_sigterm_stays(config: SadgsTrainerCo
     assert checkpoints(trainer) == [f"step-{ITERATIONS - 1:09d}.ckpt"]
 
 
+# --- finished runs ---
+
+
+@pytest.fixture(scope="module")
+def finished(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run that is finished."""
+    trainer = set_up(configure(scene, tmp_path_factory.mktemp("finished"), ITERATIONS, save_every=0))
+    trainer.train()
+    return trainer.base_dir
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of viser and websockets
+@pytest.mark.parametrize("vis", ["tensorboard", "viewer"])
+@pytest.mark.parametrize("option", ["load_dir", "load_checkpoint"])
+def test_opening_a_finished_run_says_how_to_train_on_and_ends_well(
+    option: str,
+    vis: str,
+    finished: Path,
+    config: SadgsTrainerConfig,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    (saved,) = (finished / "nerfstudio_models").iterdir()
+    setattr(config, option, finished if option == "load_dir" else saved)
+    config.vis, config.viewer.quit_on_train_completion = vis, True  # type: ignore[assignment]
+    config.logging.local_writer.enable = True
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        config.viewer.websocket_port = free.getsockname()[1]  # nerfstudio's own search leaves a socket open
+    monkeypatch.delitem(writer.GLOBAL_BUFFER, "step", raising=False)  # as in a process that has not trained
+    monkeypatch.setattr(writer, "EVENT_WRITERS", [])
+    config.save_config()
+    trainer = set_up(config)
+    try:
+        trainer.train()
+    finally:
+        trainer.shutdown()
+    line = one_line(capsys.readouterr().out, "This run is finished")
+    assert line == (
+        f"This run is finished after {ITERATIONS} iterations: --max-num-iterations of more than {ITERATIONS} trains on."
+    )
+    ends = [torch.load(path / saved.name, weights_only=True) for path in (saved.parent, trainer.checkpoint_dir)]
+    assert differences(*ends) == []
+
+
+def test_a_run_s_folder_does_as_well_as_its_folder_of_checkpoints(finished: Path, config: SadgsTrainerConfig):
+    (saved,) = (finished / "nerfstudio_models").iterdir()
+    for folder in (finished, saved.parent):
+        for step in (None, ITERATIONS - 1):
+            assert checkpoint_paths(folder, step, None) == [saved]
+    config.load_dir = finished
+    config.save_config()
+    assert set_up(config)._start_step == ITERATIONS
+
+
+# --- the cap that the device's memory gives ---
+
+
+@pytest.fixture
+def plan(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    """Lets the memory plan of the next runs allow so many Gaussians, unless they ask for another cap themselves."""
+
+    def allow(cap: int) -> None:
+        def fit(strategy: StructureAwareStrategy, *_: Any) -> None:
+            if strategy.max_gaussians == 2000:  # of these tests' runs
+                strategy.max_gaussians = min(cap, strategy.max_gaussians)
+
+        monkeypatch.setattr(StructureAwareStrategy, "fit_to_memory", fit)
+
+    return allow
+
+
 @pytest.mark.parametrize(
-    ("argv", "command"),
+    ("now", "asked", "cap", "said"),
     [
-        ("/bin/ns-train sadgs --data d", "ns-train sadgs --load-dir 'a b' --data d"),
-        ("ns-train sadgs --vis viewer colmap --data d", "ns-train sadgs --load-dir 'a b' --vis viewer colmap --data d"),
-        ("ns-train sadgs --load-dir old --load-step 3 --data d", "ns-train sadgs --load-dir 'a b' --data d"),
-        ("ns-train sadgs --load_dir=old --data d", "ns-train sadgs --load-dir 'a b' --data d"),
-        ("ns-train sadgs --load-checkpoint c.ckpt --data d", "ns-train sadgs --load-dir 'a b' --data d"),
-        ("ns-train sadgs --load-config c.yml", "load_dir = 'a b'"),
-        ("ns-train splatfacto --data d", "load_dir = 'a b'"),
-        ("python -m something", "load_dir = 'a b'"),
+        (500, 2000, 500, ""),
+        (1500, 2000, 500, "At most 500 Gaussians, as in the checkpoint's run."),
+        (
+            300,
+            2000,
+            300,
+            "The checkpoint's run had room for 500 Gaussians, the GPU's free memory now has for 300, which is the cap "
+            "from here on: stop this run and end other programs on the GPU to keep 500.",
+        ),
+        (1500, 900, 900, "pipeline.model.strategy.max_gaussians was 2000 and is 900."),
     ],
 )
-def test_the_resume_command_keeps_every_other_option(argv: str, command: str):
-    assert resume_command(argv.split(), "sadgs", Path("a b")) == command
+def test_a_resumption_keeps_the_cap_or_says_why_it_is_lower(
+    now: int,
+    asked: int,
+    cap: int,
+    said: str,
+    config: SadgsTrainerConfig,
+    plan: Callable[[int], None],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+):
+    plan(500)
+    trainer = set_up(config)
+    trainer.save_checkpoint(1)
+    assert trainer.pipeline.model.strategy.max_gaussians == 500
+    plan(now)
+    config.load_dir, config.output_dir = trainer.checkpoint_dir, tmp_path / "resumed"
+    config.pipeline.model.strategy.max_gaussians = asked
+    capsys.readouterr()
+    resumed = set_up(config)
+    printed = capsys.readouterr().out
+    assert resumed.pipeline.model.strategy.max_gaussians == cap
+    assert resumed.pipeline.structure.set_max_gaussians.value == cap
+    assert said in printed and (said or "checkpoint's run" not in printed)
 
 
 # --- damaged checkpoints ---
