@@ -12,6 +12,7 @@ from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from torch.cuda.amp.grad_scaler import GradScaler
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
+from tyro.conf import Suppress
 
 from sadgs_ns import kernels
 from sadgs_ns.plugin.nonfinite import NonFiniteLog, leave_out_nonfinite
@@ -129,10 +130,18 @@ class SadgsOptimizers(Optimizers):
 
 @dataclass
 class FusedAdamOptimizerConfig(AdamOptimizerConfig):
-    """Adam in one kernel."""
+    """Adam; only its rate is an option of the command line."""
 
     _target: type = FusedAdam
-    fused: bool = True
+    lr: float = 1e-3
+    """Learning rate; where there is a schedule, its factors multiply it."""
+    eps: Suppress[float] = 1e-15
+    """What Adam adds to the root of the second moment; as in 3DGS."""
+    max_norm: Suppress[float | None] = None
+    """Norm to which gradients are clipped."""
+    weight_decay: Suppress[float] = 0.0
+    """Adam's penalty on the size of parameters."""
+    fused: Suppress[bool] = True
     """Update in a single kernel: ours for all parameters on CUDA, torch's for each elsewhere."""
 
 
@@ -145,7 +154,7 @@ class RunLengthDecaySchedulerConfig(SchedulerConfig):
     """Learning rate at the first iteration, relative to the optimizer's."""
     final_factor: float = 1.0
     """Learning rate at the last iteration, relative to the optimizer's."""
-    max_steps: int | None = None
+    max_steps: Suppress[int | None] = None
     """Iterations until `final_factor`; None is the length of the run."""
 
 

@@ -27,7 +27,6 @@ from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.method.structure_tensor import (
     ENERGY_BLUR,
     FREQUENCY_CONSTANT,
-    NOISE_FLOOR,
     multiscale_structure_tensor,
 )
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
@@ -49,11 +48,9 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
 
     _target: type = field(default_factory=lambda: SadgsPipeline)
     datamanager: FullImageDatamanagerConfig = field(
-        default_factory=lambda: SadgsDatamanagerConfig(
-            dataparser=NerfstudioDataParserConfig(load_3D_points=True), cache_images_type="uint8"
-        )
+        default_factory=lambda: SadgsDatamanagerConfig(dataparser=NerfstudioDataParserConfig(load_3D_points=True))
     )
-    """Loads the images; `cache_images` "gpu" means the training device, whatever it is."""
+    """How images are loaded and drawn."""
     model: SadgsModelConfig = field(default_factory=SadgsModelConfig)
     """The Gaussians and their densification."""
     views_per_iteration: int = 1
@@ -61,8 +58,6 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     The paper uses 1 outdoors, 2 indoors. A preset's learning rates and AbsGS thresholds fit its own number."""
     frequency_constant: float = FREQUENCY_CONSTANT
     """c of ω_l = c / σ_l in 1/px, at most 4: the larger, the shorter every wavelength and the more is split."""
-    noise_floor: float = NOISE_FLOOR
-    """Amplitude, relative to an image's contrast, under which its structure counts as noise."""
     energy_blur: float = ENERGY_BLUR
     """Window, in multiples of σ_l, over which the energy of a scale is averaged; 0 measures it per pixel (eq. 4)."""
 
@@ -201,7 +196,6 @@ class SadgsPipeline(VanillaPipeline):
             images,
             masks,
             frequency_constant=self.config.frequency_constant,
-            noise_floor=self.config.noise_floor,
             energy_blur=self.config.energy_blur,
             fused=self.config.model.fused,
         )
@@ -272,7 +266,7 @@ class SadgsPipeline(VanillaPipeline):
         Raises:
             InputError: If `memory_budget_gb` leaves no room for Gaussians.
         """
-        if self.config.model.densify:
+        if self.config.model.strategy.refine_stop_iter > 0:
             try:
                 line = self.model.strategy.fit_to_memory(self.model.gauss_params, self._image_bytes())
             except ValueError as error:
