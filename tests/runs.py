@@ -55,6 +55,15 @@ def configure(output: Path, parser: DataParserConfig, iterations: int = 6, **str
     return config
 
 
+def as_saved_before_the_folders(config: str) -> str:
+    """What a config.yml said when all files of the package lay in one folder."""
+    text = config.replace("sadgs_ns.plugin.", "sadgs_ns.").replace("sadgs_ns.method.", "sadgs_ns.")
+    for name in ("MachineConfig", "ViewerConfig"):
+        text = text.replace(f"sadgs_ns.trainer.Sadgs{name}", f"nerfstudio.configs.base_config.{name}")
+    assert "sadgs_ns.model.SadgsModelConfig" in text and "sadgs_ns.strategy.StructureAwareStrategy" in text
+    return text
+
+
 def train(config: SadgsTrainerConfig, after_step: Callable[[SadgsTrainer], None] | None = None) -> SadgsTrainer:
     """Train to the end, calling `after_step` after each iteration's densification."""
     trainer = set_up(config)

@@ -288,9 +288,10 @@ class SadgsModel(SplatfactoModel):
         """
         absgrad = self.strategy.needs_absgrad(self.step)
         render, alpha, info = self.render(viewmats, Ks, width, height, "RGB", absgrad)
-        info |= {"viewmats": viewmats.detach(), "Ks": Ks, "structure_tensors": structure_tensors}
-        self.strategy.step_pre_backward(self.gauss_params, self.optimizers, self.strategy_state, self.step, info)
-        self.infos.append(info)
+        if self.step < self.strategy.refine_stop_iter:
+            info |= {"viewmats": viewmats.detach(), "Ks": Ks, "structure_tensors": structure_tensors}
+            self.strategy.step_pre_backward(self.gauss_params, self.optimizers, self.strategy_state, self.step, info)
+            self.infos.append(info)
         background = self._get_background_color()
         rgb = render[..., :3] if self.config.background_color == "black" else render[..., :3] + (1 - alpha) * background
         if self.config.use_bilateral_grid:

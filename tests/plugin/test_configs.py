@@ -21,6 +21,7 @@ import yaml
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
+from runs import as_saved_before_the_folders
 
 import sadgs_ns.plugin.model
 from sadgs_ns.method.strategy import StructureAwareStrategy
@@ -231,13 +232,9 @@ def test_the_strategy_and_all_it_needs_import_without_nerfstudio(tmp_path: Path)
 # --- runs of earlier versions ---
 
 
-def as_saved_before_the_folders(config: SadgsTrainerConfig, *options: str) -> str:
-    """What config.yml said when the package's files lay in one folder, with more options of the model."""
-    text = yaml.dump(config).replace("sadgs_ns.plugin.", "sadgs_ns.").replace("sadgs_ns.method.", "sadgs_ns.")
-    for name in ("MachineConfig", "ViewerConfig"):
-        text = text.replace(f"sadgs_ns.trainer.Sadgs{name}", f"nerfstudio.configs.base_config.{name}")
-    assert "sadgs_ns.model.SadgsModelConfig" in text and "sadgs_ns.strategy.StructureAwareStrategy" in text
-    return text.replace("    ssim_lambda:", "".join(f"    {option}\n" for option in options) + "    ssim_lambda:")
+def with_options(config: str, *options: str) -> str:
+    """A config.yml with more options of the model."""
+    return config.replace("    ssim_lambda:", "".join(f"    {option}\n" for option in options) + "    ssim_lambda:")
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -245,7 +242,8 @@ def test_the_config_of_a_run_made_before_the_folders_is_read_as_it_would_be_writ
     name: str, capsys: pytest.CaptureFixture[str]
 ):
     options = ("densify: true", "num_downscales: 0", "warmup_length: 500", "eval_num_rays_per_chunk: 4096")
-    config = yaml.load(as_saved_before_the_folders(preset(name), *options), Loader=yaml.Loader)
+    text = with_options(as_saved_before_the_folders(yaml.dump(preset(name))), *options)
+    config = yaml.load(text, Loader=yaml.Loader)
     assert isinstance(config, SadgsTrainerConfig)
     assert yaml.dump(config.pipeline) == yaml.dump(preset(name).pipeline)
     assert yaml.dump(config.optimizers) == yaml.dump(preset(name).optimizers)
@@ -262,7 +260,7 @@ def test_options_that_are_missing_in_an_older_config_get_their_defaults():
 
 
 def test_options_that_this_version_lacks_are_named_where_they_changed_the_run(capsys: pytest.CaptureFixture[str]):
-    text = as_saved_before_the_folders(preset("sadgs"), "densify: false", "l2_lambda: 2.0", "some_option: [1]")
+    text = with_options(yaml.dump(preset("sadgs")), "densify: false", "l2_lambda: 2.0", "some_option: [1]")
     config = yaml.load(text, Loader=yaml.Loader)
     assert not hasattr(config.pipeline.model, "densify")
     printed = " ".join(capsys.readouterr().out.split())

@@ -23,6 +23,7 @@ from runs import (
     ITERATIONS,
     SCHEDULE,
     TRAIN_VIEWS,
+    as_saved_before_the_folders,
     blender_data,
     checkpoint,
     configure,
@@ -106,8 +107,8 @@ def test_a_run_whose_config_names_the_package_s_earlier_files_is_loaded(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.delenv("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", raising=False)
-    text = (finished / "config.yml").read_text().replace("sadgs_ns.plugin.", "sadgs_ns.")
-    (tmp_path / "config.yml").write_text(text.replace("sadgs_ns.method.", "sadgs_ns."))
+    text = as_saved_before_the_folders((finished / "config.yml").read_text())
+    (tmp_path / "config.yml").write_text(text)
     _, pipeline, _, step = eval_setup(tmp_path / "config.yml")
     assert isinstance(pipeline.model, SadgsModel) and pipeline.model.num_points > POINTS
     assert step == ITERATIONS - 1
