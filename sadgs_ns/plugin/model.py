@@ -1,8 +1,9 @@
-"""nerfstudio glue: a splatfacto model whose Gaussians follow the structure-aware strategy."""
+"""The model that nerfstudio trains: splatfacto's, with the structure-aware strategy and this package's rasterizer."""
 
 from __future__ import annotations
 
 import copy
+import math
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -67,7 +68,7 @@ class SadgsModelConfig(InstantiateConfig):
     """Opacity at which SfM points start, in (0, 1); random ones start at 0.1.
     Half opaque ones gave a better LPIPS indoors, and a worse one outdoors (docs/measurements.md)."""
     sh_degree: int = 3
-    """Degree of the spherical harmonics that make colours depend on the direction of view, 0 to 3."""
+    """Degree of the spherical harmonics that make colours depend on the direction of view, 0 to 4."""
     rasterize_mode: Literal["classic", "antialiased"] = "classic"
     """How Gaussians smaller than a pixel are drawn: "classic" as in 3DGS, "antialiased" fades them by their size.
     Viewers of PLY files expect "classic"."""
@@ -98,6 +99,12 @@ class SadgsModelConfig(InstantiateConfig):
             raise InputError(f"pipeline.model.initial_opacity must be in (0, 1), got {self.initial_opacity:g}.")
         if not self.opacity_reg >= 0:
             raise InputError(f"pipeline.model.opacity_reg must not be negative, got {self.opacity_reg:g}.")
+        if not 0 <= self.sh_degree <= 4:
+            raise InputError(f"pipeline.model.sh_degree must be in [0, 4], got {self.sh_degree}.")
+        if self.num_random < 1:
+            raise InputError(f"pipeline.model.num_random must be at least 1, got {self.num_random}.")
+        if not 0 < self.random_scale < math.inf:
+            raise InputError(f"pipeline.model.random_scale must be positive and finite, got {self.random_scale:g}.")
         try:
             self.strategy.check()
         except ValueError as error:
@@ -105,7 +112,9 @@ class SadgsModelConfig(InstantiateConfig):
 
 
 class SadgsModel(SplatfactoModel):
-    """Gaussians, their renderings and losses; what splatfacto's viewer, evaluation and export expect of a model.
+    """The Gaussians, how they are rendered, and the loss of a rendering.
+
+    nerfstudio's viewer, evaluation and exporter treat it as a splatfacto model.
 
     Args:
         config: The model's configuration.
@@ -118,7 +127,8 @@ class SadgsModel(SplatfactoModel):
     def populate_modules(self) -> None:
         """Make parameters, metrics and the strategy.
 
-        Overrides splatfacto's, which needs CUDA and LPIPS weights. LPIPS is loaded when it is first asked for.
+        This replaces splatfacto's method, which needs CUDA and the weights of LPIPS. Here LPIPS is loaded when it is
+        first asked for.
 
         Raises:
             InputError: As `SadgsModelConfig.check`.
@@ -138,7 +148,7 @@ class SadgsModel(SplatfactoModel):
         self.infos: list[dict[str, Any]] = []
         self.crop_box: OrientedBox | None = None
         self.viewer_outputs: Callable[[Cameras, dict[str, Tensor]], dict[str, Tensor]] | None = None
-        # "random" concerns training; viewers show it as viser's own background.
+        # A random background is for training; viewers show viser's own instead.
         self.background_color = (
             torch.tensor([0.1490, 0.1647, 0.2157])
             if config.background_color == "random"
@@ -198,7 +208,7 @@ class SadgsModel(SplatfactoModel):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Splatfacto's two callbacks, after fitting the schedule to the length of the run."""
+        """Fit the schedule to the length of the run and return splatfacto's two callbacks."""
         if training_callback_attributes.trainer is not None:
             iterations = training_callback_attributes.trainer.config.max_num_iterations
             self.strategy.fit_to_run(iterations)
@@ -220,11 +230,15 @@ class SadgsModel(SplatfactoModel):
         self.infos = []
 
     def wants_structure_tensors(self, step: int) -> bool:
-        """Whether η will be observed at this step."""
+        """Tell whether the strategy will observe η at this step."""
         return self.strategy.observes(step)
 
     def cropped(self, values: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-        """Rows of tensors [N, …] of the Gaussians inside the crop box, which the viewer may set; all in training."""
+        """Return the rows that belong to Gaussians inside the viewer's crop box; in training, all rows.
+
+        Args:
+            values: Tensors by name, each with one row per Gaussian. [N, …]
+        """
         if self.crop_box is None or self.training:
             return values
         inside = self.crop_box.within(self.means)
@@ -239,7 +253,19 @@ class SadgsModel(SplatfactoModel):
         render_mode: Literal["RGB", "RGB+ED"],
         absgrad: bool = False,
     ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-        """Rasterize the Gaussians inside the crop box, if there is one. viewmats [C, 4, 4], Ks [C, 3, 3]"""
+        """Rasterize the Gaussians; in the viewer, those inside its crop box.
+
+        Args:
+            viewmats: World to camera. [C, 4, 4]
+            Ks: Intrinsics in px. [C, 3, 3]
+            width: px.
+            height: px.
+            render_mode: "RGB+ED" adds the expected depth as a fourth channel.
+            absgrad: Whether the backward pass also sums absolute screen gradients, for AbsGS.
+
+        Returns:
+            Colours, not clamped, and depth [C, H, W, 3 or 4]; accumulated opacity [C, H, W, 1]; gsplat's meta.
+        """
         params = self.cropped(dict(self.gauss_params.items()))
         if self.config.sh_degree > 0:
             colors: Tensor | tuple[Tensor, Tensor] = (params["features_dc"], params["features_rest"])
@@ -276,8 +302,8 @@ class SadgsModel(SplatfactoModel):
         """Render training views of one size and let the strategy see the forward pass.
 
         Args:
-            viewmats: [C, 4, 4]
-            Ks: px. [C, 3, 3]
+            viewmats: World to camera. [C, 4, 4]
+            Ks: Intrinsics in px. [C, 3, 3]
             width: px.
             height: px.
             cam_indices: The views' indices among the training cameras, C of them.
@@ -332,7 +358,11 @@ class SadgsModel(SplatfactoModel):
         }
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """What `get_outputs` returns inside a crop box, and what the viewer's panel adds.
+        """Render one camera as `get_outputs` does, inside a crop box, and add the pictures of the viewer's panel.
+
+        Args:
+            camera: One camera, shape [1].
+            obb_box: The crop box; None renders all Gaussians.
 
         Raises:
             InputError: If the camera is no pinhole; the viewer, whose thread would end, is shown nothing instead.
@@ -348,12 +378,18 @@ class SadgsModel(SplatfactoModel):
         return outputs if self.viewer_outputs is None else outputs | self.viewer_outputs(camera, outputs)
 
     def get_gt_img(self, image: Tensor) -> Tensor:
-        """An image as the loss compares it: on the model's device and in [0, 1], from uint8 in one launch, not two."""
+        """Return an image as the loss compares it, on the model's device and in [0, 1].
+
+        splatfacto converts and divides bytes in two launches; this takes one.
+
+        Args:
+            image: uint8, or floats in [0, 1]. [H, W, 3 or 4]
+        """
         image = image.to(self.device)
         return image / 255.0 if image.dtype == torch.uint8 else image
 
     def _get_background_color(self) -> Tensor:
-        """Splatfacto's, but black and white are not made anew in each step. [3]"""
+        """Return the background's colour [3]; unlike splatfacto, without making black and white anew in each step."""
         grey = {"black": 0.0, "white": 1.0}.get(self.config.background_color)
         return super()._get_background_color() if grey is None else _constant_color(grey, self.device)
 
@@ -370,7 +406,7 @@ class SadgsModel(SplatfactoModel):
         return image
 
     def get_metrics_dict(self, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Any]:
-        """PSNR of the batch and the number of Gaussians; in training PSNR costs nothing beyond the loss."""
+        """Return PSNR of the batch and the number of Gaussians; in training, PSNR comes with the loss."""
         if "psnr" not in outputs:
             return super().get_metrics_dict(outputs, batch)  # type: ignore[arg-type]
         metrics: dict[str, Any] = {"psnr": outputs["psnr"], "gaussian_count": self.num_points}
@@ -380,7 +416,7 @@ class SadgsModel(SplatfactoModel):
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: Mapping[str, Any], metrics_dict: Mapping[str, Any] | None = None
     ) -> dict[str, Tensor]:
-        """Photometric loss of views of one size, and splatfacto's regularizers where they are on.
+        """Return the photometric loss of views of one size, and the regularizers that are on.
 
         Args:
             outputs: `rgb` [C, H, W, 3] or [H, W, 3], and `background`. In training, PSNR is added as `psnr`.
@@ -413,14 +449,14 @@ class SadgsModel(SplatfactoModel):
         return losses
 
     def psnr(self, predicted: Tensor, target: Tensor) -> Tensor:
-        """PSNR in dB of images in [0, 1]."""
-        # A second of imports that training does not need.
+        """Return PSNR in dB of images in [0, 1], [1, 3, H, W] or [H, W, 3]."""
+        # The import takes a second, and training does not need it.
         from torchmetrics.functional.image import peak_signal_noise_ratio
 
         return peak_signal_noise_ratio(predicted, target, data_range=1.0)
 
     def lpips(self, predicted: Tensor, target: Tensor) -> Tensor:
-        """LPIPS (AlexNet) of images [1, 3, H, W] in [0, 1], NaN where its weights cannot be loaded.
+        """Return LPIPS (AlexNet) of images [1, 3, H, W] in [0, 1], or NaN where its weights cannot be loaded.
 
         The weights are loaded at the first call, so that neither training nor rendering needs them.
         """
@@ -432,12 +468,12 @@ class SadgsModel(SplatfactoModel):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """PSNR, SSIM and, where its weights are at hand, LPIPS of one held-out view."""
+        """Return PSNR, SSIM and, where its weights can be loaded, LPIPS of one held-out view."""
         metrics, images = super().get_image_metrics_and_images(outputs, batch)
         return {name: value for name, value in metrics.items() if "lpips" not in name or value == value}, images
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What a checkpoint needs besides parameters: the step and the strategy's state."""
+        """Return what a checkpoint needs besides parameters: the step and the strategy's state."""
         return {"step": self.step, "strategy_state": dict(self.strategy_state)}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -459,7 +495,7 @@ class SadgsModel(SplatfactoModel):
 
 
 def in_viewer() -> bool:
-    """Whether this is a thread in which nerfstudio's viewer draws."""
+    """Tell whether this is a thread in which nerfstudio's viewer draws."""
     from nerfstudio.viewer.render_state_machine import RenderStateMachine
 
     return isinstance(threading.current_thread(), RenderStateMachine)

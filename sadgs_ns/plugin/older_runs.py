@@ -8,7 +8,6 @@ others are no longer known. The constructors that are registered here, for our o
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 from typing import Any
 
 import yaml
@@ -54,8 +53,9 @@ def read_with(trainer_config: type[TrainerConfig]) -> None:
 
     def whole(loader: yaml.Loader, node: Any) -> TrainerConfig:
         config = trainer_config.__new__(trainer_config)
-        vars(config).update(loader.construct_mapping(node, deep=True))
-        if left_out := sorted(_bring_up_to_date(config, "")):
+        for name, value in loader.construct_mapping(node, deep=True).items():
+            setattr(config, str(name), value)
+        if left_out := _bring_up_to_date(config, ""):
             CONSOLE.print(
                 "[yellow]The config.yml is of another version of sadgs; of its options this version leaves out "
                 f"{escape(', '.join(left_out))}: rendering is the same, more training may not be.[/]"
@@ -79,28 +79,32 @@ def read_with(trainer_config: type[TrainerConfig]) -> None:
         )
 
 
-def _bring_up_to_date(config: Any, path: str) -> Iterator[str]:
+def _bring_up_to_date(config: Any, path: str) -> list[str]:
     """Give our classes in a configuration the options that they lack, and take those that they no longer have.
 
-    Yields:
-        What was taken and is not as it was by default, such as `pipeline.model.densify=False`.
+    Args:
+        config: The configuration, or a part of it.
+        path: What leads to the part, such as `pipeline.`.
+
+    Returns:
+        The options that were taken and might change a run, such as `pipeline.model.densify=False`.
     """
     if isinstance(config, dict):
-        for name, value in config.items():
-            yield from _bring_up_to_date(value, f"{path}{name}.")
-        return
+        return [left for name, value in config.items() for left in _bring_up_to_date(value, f"{path}{name}.")]
     if not dataclasses.is_dataclass(config) or not type(config).__module__.startswith("sadgs_ns."):
-        return
+        return []
     options = {option.name: option for option in dataclasses.fields(config)}
     for name, option in options.items():
         if name not in vars(config):
             made = option.default_factory is not dataclasses.MISSING
             setattr(config, name, option.default_factory() if made else option.default)  # type: ignore[misc]
-    usual = {**vars(SplatfactoModelConfig()), **CONSTANTS}
-    for name, value in list(vars(config).items()):
+    harmless = {**vars(SplatfactoModelConfig()), **CONSTANTS}  # options of splatfacto's densification had no effect
+    left_out: list[str] = []
+    for name, value in sorted(vars(config).items()):
         if name in options:
-            yield from _bring_up_to_date(value, f"{path}{name}.")
+            left_out += _bring_up_to_date(value, f"{path}{name}.")
         else:
             delattr(config, name)
-            if name not in usual or usual[name] != value:
-                yield f"{path}{name}={value!r}"
+            if name not in harmless or harmless[name] != value:
+                left_out.append(f"{path}{name}={value!r}")
+    return left_out

@@ -24,6 +24,7 @@ from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
 from runs import as_saved_before_the_folders
 
 import sadgs_ns.plugin.model
+from sadgs_ns.errors import InputError
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin import presets
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
@@ -210,6 +211,31 @@ def test_the_help_shows_what_users_of_splatfacto_look_for_and_of_optimizers_only
 def test_help_texts_break_their_lines_between_sentences_as_tyro_does_not_join_them(cls: type):
     texts = [s.value.value for s in body_of(cls)[1:] if is_string(s)]  # type: ignore[attr-defined]
     assert texts and not [text for text in texts if not all(line.endswith(".") for line in text.strip().splitlines())]
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "sentence"),
+    [
+        ("sh_degree", 5, "pipeline.model.sh_degree must be in [0, 4], got 5."),
+        ("sh_degree", -1, "pipeline.model.sh_degree must be in [0, 4], got -1."),
+        ("num_random", 0, "pipeline.model.num_random must be at least 1, got 0."),
+        ("random_scale", 0.0, "pipeline.model.random_scale must be positive and finite, got 0."),
+        ("random_scale", float("nan"), "pipeline.model.random_scale must be positive and finite, got nan."),
+        ("ssim_lambda", 1.5, "pipeline.model.ssim_lambda must be in [0, 1], got 1.5."),
+        ("initial_opacity", 1.0, "pipeline.model.initial_opacity must be in (0, 1), got 1."),
+        ("opacity_reg", -1.0, "pipeline.model.opacity_reg must not be negative, got -1."),
+    ],
+)
+def test_options_of_the_model_that_are_out_of_range_are_refused(option: str, value: Any, sentence: str):
+    with pytest.raises(InputError) as refused:
+        dataclasses.replace(SadgsModelConfig(), **{option: value}).check()
+    assert str(refused.value) == sentence
+
+
+def test_gaussians_are_neither_added_nor_removed_where_densification_ends_at_0():
+    strategy = StructureAwareStrategy(refine_stop_iter=0)
+    strategy.fit_to_run(3000)
+    assert not any(strategy.observes(step) or strategy.needs_absgrad(step) for step in range(3000))
 
 
 def test_the_device_is_the_cpu_where_there_is_no_cuda(monkeypatch: pytest.MonkeyPatch):
