@@ -33,7 +33,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from sadgs_ns.demo.__main__ import fit_schedule
 from sadgs_ns.demo.scene import EVAL_INTERVAL, SPARSE_FOLDER, write_scene
-from sadgs_ns.plugin.presets import load_preset
+from sadgs_ns.plugin.presets import sadgs
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 PLACES = ("within a step", "after a split", "saving", "after renaming", "after a step", "from outside")
@@ -63,7 +63,7 @@ def parser_of(scene: Path) -> ColmapDataParserConfig:
 
 def configure(scene: Path, output: Path, iterations: int, save_every: int, seed: int = 42) -> SadgsTrainerConfig:
     """The demo's settings, with checkpoints on the way and all attempts in one folder."""
-    config: SadgsTrainerConfig = copy.deepcopy(load_preset("sadgs").config)  # type: ignore[assignment]
+    config: SadgsTrainerConfig = copy.deepcopy(sadgs.config)  # type: ignore[assignment]
     config.output_dir, config.experiment_name, config.timestamp = output, "test", "run"
     config.vis = "tensorboard"
     config.machine.device_type, config.machine.seed = "cpu", seed

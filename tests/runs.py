@@ -21,7 +21,7 @@ from scenes import HEIGHT, POINTS, VIEWS, WIDTH
 
 from sadgs_ns.demo.scene import arc_views, render, room_surfaces
 from sadgs_ns.plugin.model import SadgsModel
-from sadgs_ns.plugin.presets import load_preset
+from sadgs_ns.plugin.presets import sadgs
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 TRAIN_VIEWS = 8
@@ -42,7 +42,7 @@ SCHEDULE = {
 
 def configure(output: Path, parser: DataParserConfig, iterations: int = 6, **strategy: Any) -> SadgsTrainerConfig:
     """The preset on other data, with the tests' schedule, without viewer and evaluation."""
-    config: SadgsTrainerConfig = copy.deepcopy(load_preset("sadgs").config)  # type: ignore[assignment]
+    config: SadgsTrainerConfig = copy.deepcopy(sadgs.config)  # type: ignore[assignment]
     config.output_dir, config.experiment_name, config.timestamp = output, "test", "run"
     config.vis = "tensorboard"
     config.max_num_iterations = iterations
@@ -53,6 +53,15 @@ def configure(output: Path, parser: DataParserConfig, iterations: int = 6, **str
     config.pipeline.model.num_random = POINTS
     config.pipeline.model.strategy = dataclasses.replace(config.pipeline.model.strategy, **{**SCHEDULE, **strategy})
     return config
+
+
+def as_saved_before_the_folders(config: str) -> str:
+    """What a config.yml said when all files of the package lay in one folder."""
+    text = config.replace("sadgs_ns.plugin.", "sadgs_ns.").replace("sadgs_ns.method.", "sadgs_ns.")
+    for name in ("MachineConfig", "ViewerConfig"):
+        text = text.replace(f"sadgs_ns.trainer.Sadgs{name}", f"nerfstudio.configs.base_config.{name}")
+    assert "sadgs_ns.model.SadgsModelConfig" in text and "sadgs_ns.strategy.StructureAwareStrategy" in text
+    return text
 
 
 def train(config: SadgsTrainerConfig, after_step: Callable[[SadgsTrainer], None] | None = None) -> SadgsTrainer:

@@ -32,10 +32,9 @@ from sadgs_ns.cli.export import write_ply
 from sadgs_ns.cli.inspect import get_view
 from sadgs_ns.demo.scene import EVAL_INTERVAL, SPARSE_FOLDER, SceneDescription, expected_wavelength_map, write_scene
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.plugin import visualization
+from sadgs_ns.plugin import presets, visualization
 from sadgs_ns.plugin.model import SadgsModel
 from sadgs_ns.plugin.pipeline import SadgsPipeline
-from sadgs_ns.plugin.presets import load_preset
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 from sadgs_ns.plugin.visualization import ETA, PERIOD, Panel
 
@@ -127,7 +126,7 @@ def run_config(
         densify: Whether Gaussians are added or removed at all.
         split: Whether structure steps are among what does so.
     """
-    config: SadgsTrainerConfig = copy.deepcopy(load_preset(PRESET).config)  # type: ignore[assignment]
+    config: SadgsTrainerConfig = copy.deepcopy(presets.sadgs.config)  # type: ignore[assignment]
     config.output_dir, config.experiment_name, config.timestamp = output / "runs", label, "latest"
     config.vis = "tensorboard"
     config.max_num_iterations = iterations
@@ -137,10 +136,12 @@ def run_config(
     config.pipeline.datamanager.dataparser = ColmapDataParserConfig(
         data=scene, colmap_path=SPARSE_FOLDER, downscale_factor=1, eval_mode="interval", eval_interval=EVAL_INTERVAL
     )
-    config.pipeline.model.densify = densify
-    fit_schedule(config.pipeline.model.strategy, iterations, max_gaussians)
+    strategy = config.pipeline.model.strategy
+    fit_schedule(strategy, iterations, max_gaussians)
+    if not densify:
+        strategy.refine_stop_iter = 0
     if not split:
-        config.pipeline.model.strategy.structure_every = 0
+        strategy.structure_every = 0
     config.optimizers["opacities"]["optimizer"].lr = OPACITY_LR
     return config
 
@@ -163,8 +164,7 @@ def train(config: SadgsTrainerConfig, label: str, on_step: Callable[[int, int], 
 
     def at_structure_step(step: int) -> bool:
         return (
-            config.pipeline.model.densify
-            and strategy.structure_every > 0
+            strategy.structure_every > 0
             and step < strategy.refine_stop_iter
             and (step + 1) % strategy.structure_every == 0
         )

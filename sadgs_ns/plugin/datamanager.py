@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from numpy.typing import NDArray
 from torch import Tensor
+from tyro.conf import Suppress
 
 from sadgs_ns.data import colmap, ply
 from sadgs_ns.data.validation import names
@@ -22,9 +23,35 @@ from sadgs_ns.data.validation import names
 
 @dataclass
 class SadgsDatamanagerConfig(FullImageDatamanagerConfig):
-    """nerfstudio's options."""
+    """nerfstudio's; what its loader of whole images does not read is no option of the command line."""
 
     _target: type = field(default_factory=lambda: SadgsDatamanager)
+    data: Suppress[Path | None] = None
+    """Folder of the data; `--data` sets it."""
+    masks_on_gpu: Suppress[bool] = False
+    """Not read where whole images are cached."""
+    images_on_gpu: Suppress[bool] = False
+    """Not read where whole images are cached."""
+    eval_num_images_to_sample_from: Suppress[int] = -1
+    """Not read where whole images are cached."""
+    eval_num_times_to_repeat_images: Suppress[int] = -1
+    """Not read where whole images are cached."""
+    eval_image_indices: Suppress[tuple[int, ...] | None] = (0,)
+    """Not read where whole images are cached."""
+    camera_res_scale_factor: float = 1.0
+    """Factor by which images and cameras are scaled when they are loaded; 0.5 trains at half the resolution."""
+    cache_images: Literal["cpu", "gpu"] = "gpu"
+    """Where the images are kept: "gpu" is the device of training, whatever it is."""
+    cache_images_type: Literal["uint8", "float32"] = "uint8"
+    """Type in which the images are kept; "uint8" takes a quarter of the memory."""
+    max_thread_workers: Suppress[int | None] = None
+    """Threads that load images; None leaves their number to Python."""
+    train_cameras_sampling_strategy: Literal["random", "fps"] = "random"
+    """Order of the training views: "random" takes each once a round; "fps" takes views far from each other first."""
+    train_cameras_sampling_seed: int = 42
+    """Seed of the order of the training views."""
+    fps_reset_every: Suppress[int] = 100
+    """Views after which "fps" starts again; it draws no more than there are."""
 
 
 class SadgsDatamanager(FullImageDatamanager[InputDataset]):

@@ -1,27 +1,23 @@
-"""nerfstudio glue: a splatfacto model whose Gaussians follow the structure-aware strategy."""
+"""The model that nerfstudio trains: splatfacto's, with the structure-aware strategy and this package's rasterizer."""
 
 from __future__ import annotations
 
 import copy
+import math
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Any, Literal
 
 import torch
-import tyro
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.configs.base_config import InstantiateConfig
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.model_components.lib_bilagrid import BilateralGrid, total_variation_loss
-from nerfstudio.models.splatfacto import (
-    RGB2SH,
-    SplatfactoModel,
-    SplatfactoModelConfig,
-    num_sh_bases,
-    random_quat_tensor,
-)
+from nerfstudio.models.splatfacto import RGB2SH, SplatfactoModel, num_sh_bases, random_quat_tensor
 from nerfstudio.utils.colors import get_color
 from nerfstudio.utils.rich_utils import CONSOLE
 from pytorch_msssim import SSIM
@@ -42,93 +38,90 @@ from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.outliers import POINT_SHARE, REACH
 from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world
 
-WITHOUT_EFFECT = {
-    "warmup_length": "strategy.refine_start_iter",
-    "refine_every": "strategy.absgs_every and strategy.structure_every",
-    "resolution_schedule": "nothing: sadgs trains at full resolution from the start",
-    "cull_alpha_thresh": "strategy.min_opacity",
-    "cull_scale_thresh": "nothing: sadgs does not prune by size",
-    "reset_alpha_every": "strategy.reset_every",
-    "densify_grad_thresh": "strategy.clone_grad2d and strategy.split_absgrad2d",
-    "use_absgrad": "strategy.absgs_every",
-    "densify_size_thresh": "strategy.small_scale",
-    "n_split_samples": "strategy.split_exponent",
-    "cull_screen_size": "nothing: sadgs does not prune by size",
-    "split_screen_size": "nothing: η compares sizes with the texture instead",
-    "stop_screen_size_at": "nothing: sadgs has no screen-size rule",
-    "stop_split_at": "strategy.refine_stop_iter",
-    "output_depth_during_training": "nothing: no loss of this method reads depth",
-}
-"""Fields inherited from splatfacto that this method does not read, and what replaces each here."""
-
-OF_RAYS = ("enable_collider", "collider_params", "loss_coefficients", "eval_num_rays_per_chunk", "prompt")
-"""Fields that nerfstudio gives every model, and that no model of Gaussians reads."""
+CAMERA_CLEARANCE = 2.0
+"""Initial Gaussians nearer to a camera than this many of their standard deviations are dropped. The paper keeps them;
+on the scene `south` dropping them brought 1.7 dB, elsewhere nothing (docs/measurements.md)."""
+BILATERAL_GRID_SHAPE = (16, 16, 8)
+"""Cells of a view's bilateral grid in x, y and guidance, as in splatfacto and in "Bilateral Guided Radiance Field
+Processing"."""
+MAX_SCALE_RATIO = 10.0
+"""Ratio of the longest to the shortest scale from which scale regularization acts, as in splatfacto."""
 
 
 @dataclass
-class SadgsModelConfig(SplatfactoModelConfig):
-    """Splatfacto's model with structure-aware densification."""
+class SadgsModelConfig(InstantiateConfig):
+    """Options of the Gaussians, their loss and their densification.
+
+    The model is a splatfacto model, because nerfstudio's viewer and exporter ask for one; its configuration is not one
+    of splatfacto's, most of whose options concern a densification that this method replaces.
+    """
 
     _target: type = field(default_factory=lambda: SadgsModel)
     strategy: StructureAwareStrategy = field(default_factory=StructureAwareStrategy)
     """When and how Gaussians are split, cloned and pruned."""
-    densify: bool = True
-    """Whether Gaussians are added or removed at all; without it only the initial ones are optimized."""
+    camera_optimizer: CameraOptimizerConfig = field(default_factory=CameraOptimizerConfig)
+    """Whether and how the cameras' poses are refined in training."""
     background_color: Literal["random", "black", "white"] = "black"
-    """Colour behind the Gaussians."""
-    num_downscales: int = 0
-    """Training starts at full resolution; only 0 is accepted."""
-    sh_degree_interval: int = 1
-    """Iterations between spherical-harmonic degrees: all of them are on from the fourth iteration."""
-    ssim_lambda: float = 0.6
-    """Weight of SSIM against L1 in the loss. The paper's 0.2 resolves less detail for as many Gaussians."""
-    l2_lambda: float = 2.0
-    """Weight of the squared error that is added to the loss for faster convergence."""
-    opacity_reg: float = 0.01
-    """Weight of the mean opacity in the loss while densification runs: what no image needs fades until it is pruned.
-    Larger leaves fewer Gaussians; 0 is off, as in the paper."""
-    fused: bool = True
-    """Train with Triton kernels where they run (CUDA): tile lists, compositing, harmonics, loss, S̄, η, AbsGS and Adam.
-    Without, torch and gsplat compute the same, more slowly."""
+    """Colour behind the Gaussians; "random" draws one for each iteration."""
+    random_init: bool = False
+    """Start from random points even where the data has SfM points."""
+    num_random: int = 50000
+    """Number of random points to start from, where there are no SfM points or they are not wanted."""
+    random_scale: float = 10.0
+    """Side of the cube around the origin in which random points are drawn, in the run's units."""
     bounding_box_points: bool = True
-    """Also start from points on the faces of the SfM points' bounding box."""
+    """Also start from points on the faces of the SfM points' bounding box, which become sky and far background."""
     initial_opacity: float = POINT_OPACITY
     """Opacity at which SfM points start, in (0, 1); random ones start at 0.1.
     Half opaque ones gave a better LPIPS indoors, and a worse one outdoors (docs/measurements.md)."""
-    camera_clearance: float = 2.0
-    """Initial Gaussians nearer to a camera than this many of their standard deviations are dropped; 0 keeps all."""
+    sh_degree: int = 3
+    """Degree of the spherical harmonics that make colours depend on the direction of view, 0 to 4."""
+    rasterize_mode: Literal["classic", "antialiased"] = "classic"
+    """How Gaussians smaller than a pixel are drawn: "classic" as in 3DGS, "antialiased" fades them by their size.
+    Viewers of PLY files expect "classic"."""
+    ssim_lambda: float = 0.6
+    """Weight of SSIM against L1 in the loss, in [0, 1]. The paper's 0.2 resolves less detail for as many Gaussians."""
+    opacity_reg: float = 0.01
+    """Weight of the mean opacity in the loss while densification runs: what no image needs fades until it is pruned.
+    Larger leaves fewer Gaussians; 0 is off, as in the paper."""
+    use_scale_regularization: bool = False
+    """Penalize Gaussians more than ten times as long as thick (PhysGaussian), against spikes."""
+    use_bilateral_grid: bool = False
+    """Learn a colour correction for each training image (bilateral grids), for photos with changing exposure."""
+    color_corrected_metrics: bool = False
+    """Also report metrics after fitting the colours of each rendering to its photo, as suits a bilateral grid."""
+    fused: bool = True
+    """Train with Triton kernels where they run (CUDA): tile lists, compositing, harmonics, loss, S̄, η, AbsGS and Adam.
+    Without, torch and gsplat compute the same, more slowly."""
 
     def check(self) -> None:
         """See whether training can work with these options.
 
         Raises:
-            InputError: If one is out of its range, or was set and has no effect on this method.
+            InputError: If one is out of its range.
         """
-        _refuse_fields_without_effect(self)
         if not 0 <= self.ssim_lambda <= 1:
             raise InputError(f"pipeline.model.ssim_lambda must be in [0, 1], got {self.ssim_lambda:g}.")
         if not 0 < self.initial_opacity < 1:
             raise InputError(f"pipeline.model.initial_opacity must be in (0, 1), got {self.initial_opacity:g}.")
-        for name in ("l2_lambda", "opacity_reg", "camera_clearance"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"pipeline.model.{name} must not be negative, got {getattr(self, name):g}.")
+        if not self.opacity_reg >= 0:
+            raise InputError(f"pipeline.model.opacity_reg must not be negative, got {self.opacity_reg:g}.")
+        if not 0 <= self.sh_degree <= 4:
+            raise InputError(f"pipeline.model.sh_degree must be in [0, 4], got {self.sh_degree}.")
+        if self.num_random < 1:
+            raise InputError(f"pipeline.model.num_random must be at least 1, got {self.num_random}.")
+        if not 0 < self.random_scale < math.inf:
+            raise InputError(f"pipeline.model.random_scale must be positive and finite, got {self.random_scale:g}.")
         try:
             self.strategy.check()
         except ValueError as error:
             raise InputError(f"pipeline.model.{error}") from error
 
 
-# tyro reads these for `ns-train sadgs --help`, which would repeat splatfacto's texts.
-for _name, _hint in get_type_hints(SplatfactoModelConfig).items():
-    if _name in WITHOUT_EFFECT:
-        _text = f"Splatfacto's, refused here: use {WITHOUT_EFFECT[_name]}.".replace("use nothing: ", "")
-        SadgsModelConfig.__annotations__[_name] = Annotated[_hint, tyro.conf.arg(help=_text)]
-    elif _name in OF_RAYS:
-        SadgsModelConfig.__annotations__[_name] = tyro.conf.Suppress[_hint]
-
-
 class SadgsModel(SplatfactoModel):
-    """Gaussians, their renderings and losses; what splatfacto's viewer, evaluation and export expect of a model.
+    """The Gaussians, how they are rendered, and the loss of a rendering.
+
+    nerfstudio's viewer, evaluation and exporter treat it as a splatfacto model.
 
     Args:
         config: The model's configuration.
@@ -141,7 +134,8 @@ class SadgsModel(SplatfactoModel):
     def populate_modules(self) -> None:
         """Make parameters, metrics and the strategy.
 
-        Overrides splatfacto's, which needs CUDA and LPIPS weights. LPIPS is loaded when it is first asked for.
+        This replaces splatfacto's method, which needs CUDA and the weights of LPIPS. Here LPIPS is loaded when it is
+        first asked for.
 
         Raises:
             InputError: As `SadgsModelConfig.check`.
@@ -161,7 +155,7 @@ class SadgsModel(SplatfactoModel):
         self.infos: list[dict[str, Any]] = []
         self.crop_box: OrientedBox | None = None
         self.viewer_outputs: Callable[[Cameras, dict[str, Tensor]], dict[str, Tensor]] | None = None
-        # "random" concerns training; viewers show it as viser's own background.
+        # A random background is for training; viewers show viser's own instead.
         self.background_color = (
             torch.tensor([0.1490, 0.1647, 0.2157])
             if config.background_color == "random"
@@ -169,7 +163,7 @@ class SadgsModel(SplatfactoModel):
         )
         self.photo_background = self.background_color  # for the run; the viewer exchanges the other while it draws
         if config.use_bilateral_grid:
-            x, y, w = config.grid_shape
+            x, y, w = BILATERAL_GRID_SHAPE
             self.bil_grids = BilateralGrid(num=self.num_train_data, grid_X=x, grid_Y=y, grid_W=w)
 
     def _initial_gaussians(self) -> dict[str, Tensor]:
@@ -219,9 +213,7 @@ class SadgsModel(SplatfactoModel):
             positions: Camera centres in world units. [C, 3]
         """
         self.strategy_state["scene_scale"] = camera_extent(positions)
-        if self.config.camera_clearance == 0:
-            return
-        radii = self.config.camera_clearance * self.scales.detach().exp().amax(dim=1)  # [N]
+        radii = CAMERA_CLEARANCE * self.scales.detach().exp().amax(dim=1)  # [N]
         keep = clear_of_cameras(self.means.detach(), radii, positions.to(self.means))  # [N]
         if keep.any():
             for parameter in self.gauss_params.values():
@@ -230,11 +222,12 @@ class SadgsModel(SplatfactoModel):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Splatfacto's two callbacks, after fitting the schedule to the length of the run."""
+        """Fit the schedule to the length of the run and return splatfacto's two callbacks."""
         if training_callback_attributes.trainer is not None:
             iterations = training_callback_attributes.trainer.config.max_num_iterations
             self.strategy.fit_to_run(iterations)
-            if self.config.densify and self.strategy.refine_stop_iter < self.strategy.structure_every:
+            too_short = self.strategy.refine_stop_iter < self.strategy.structure_every
+            if too_short and self.config.strategy.refine_stop_iter > 0:
                 CONSOLE.print(
                     f"[yellow]{iterations} iterations are too few for a structure-aware split: densification ends at "
                     f"{self.strategy.refine_stop_iter}, the first split would come at {self.strategy.structure_every}. "
@@ -244,18 +237,22 @@ class SadgsModel(SplatfactoModel):
 
     def step_post_backward(self, step: int) -> None:
         """Hand the step's forward passes to the strategy."""
-        if self.config.densify and self.infos:
+        if self.infos:
             self.strategy.step_post_backward(
                 self.gauss_params, self.optimizers, self.strategy_state, self.step, self.infos
             )
         self.infos = []
 
     def wants_structure_tensors(self, step: int) -> bool:
-        """Whether η will be observed at this step."""
-        return self.config.densify and self.strategy.observes(step)
+        """Tell whether the strategy will observe η at this step."""
+        return self.strategy.observes(step)
 
     def cropped(self, values: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-        """Rows of tensors [N, …] of the Gaussians inside the crop box, which the viewer may set; all in training."""
+        """Return the rows that belong to Gaussians inside the viewer's crop box; in training, all rows.
+
+        Args:
+            values: Tensors by name, each with one row per Gaussian. [N, …]
+        """
         if self.crop_box is None or self.training:
             return values
         inside = self.crop_box.within(self.means)
@@ -270,11 +267,24 @@ class SadgsModel(SplatfactoModel):
         render_mode: Literal["RGB", "RGB+ED"],
         absgrad: bool = False,
     ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-        """Rasterize the Gaussians inside the crop box, if there is one. viewmats [C, 4, 4], Ks [C, 3, 3]"""
+        """Rasterize the Gaussians; in the viewer, those inside its crop box.
+
+        Args:
+            viewmats: World to camera. [C, 4, 4]
+            Ks: Intrinsics in px. [C, 3, 3]
+            width: px.
+            height: px.
+            render_mode: "RGB+ED" adds the expected depth as a fourth channel.
+            absgrad: Whether the backward pass also sums absolute screen gradients, for AbsGS.
+
+        Returns:
+            Colours, not clamped, and depth [C, H, W, 3 or 4]; accumulated opacity [C, H, W, 1]; gsplat's meta.
+        """
         params = self.cropped(dict(self.gauss_params.items()))
         if self.config.sh_degree > 0:
             colors: Tensor | tuple[Tensor, Tensor] = (params["features_dc"], params["features_rest"])
-            sh_degree = min(self.step // self.config.sh_degree_interval, self.config.sh_degree)
+            # Each iteration adds a degree: 3DGS's 1,000 iterations between them leave too few of so short a run.
+            sh_degree = min(self.step, self.config.sh_degree)
         else:
             colors, sh_degree = torch.sigmoid(params["features_dc"]), None  # [N, 3]
         return rasterize(
@@ -306,8 +316,8 @@ class SadgsModel(SplatfactoModel):
         """Render training views of one size and let the strategy see the forward pass.
 
         Args:
-            viewmats: [C, 4, 4]
-            Ks: px. [C, 3, 3]
+            viewmats: World to camera. [C, 4, 4]
+            Ks: Intrinsics in px. [C, 3, 3]
             width: px.
             height: px.
             cam_indices: The views' indices among the training cameras, C of them.
@@ -316,9 +326,9 @@ class SadgsModel(SplatfactoModel):
         Returns:
             `rgb` [C, H, W, 3], not clamped, and `background` [3].
         """
-        absgrad = self.config.densify and self.strategy.needs_absgrad(self.step)
+        absgrad = self.strategy.needs_absgrad(self.step)
         render, alpha, info = self.render(viewmats, Ks, width, height, "RGB", absgrad)
-        if self.config.densify:
+        if self.step < self.strategy.refine_stop_iter:
             info |= {"viewmats": viewmats.detach(), "Ks": Ks, "structure_tensors": structure_tensors}
             self.strategy.step_pre_backward(self.gauss_params, self.optimizers, self.strategy_state, self.step, info)
             self.infos.append(info)
@@ -362,7 +372,11 @@ class SadgsModel(SplatfactoModel):
         }
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """What `get_outputs` returns inside a crop box, and what the viewer's panel adds.
+        """Render one camera as `get_outputs` does, inside a crop box, and add the pictures of the viewer's panel.
+
+        Args:
+            camera: One camera, shape [1].
+            obb_box: The crop box; None renders all Gaussians.
 
         Raises:
             InputError: If the camera is no pinhole; the viewer, whose thread would end, is shown nothing instead.
@@ -378,12 +392,18 @@ class SadgsModel(SplatfactoModel):
         return outputs if self.viewer_outputs is None else outputs | self.viewer_outputs(camera, outputs)
 
     def get_gt_img(self, image: Tensor) -> Tensor:
-        """An image as the loss compares it: on the model's device and in [0, 1], from uint8 in one launch, not two."""
+        """Return an image as the loss compares it, on the model's device and in [0, 1].
+
+        splatfacto converts and divides bytes in two launches; this takes one.
+
+        Args:
+            image: uint8, or floats in [0, 1]. [H, W, 3 or 4]
+        """
         image = image.to(self.device)
         return image / 255.0 if image.dtype == torch.uint8 else image
 
     def _get_background_color(self) -> Tensor:
-        """Splatfacto's, but black and white are not made anew in each step. [3]"""
+        """Return the background's colour [3]; unlike splatfacto, without making black and white anew in each step."""
         grey = {"black": 0.0, "white": 1.0}.get(self.config.background_color)
         return super()._get_background_color() if grey is None else _constant_color(grey, self.device)
 
@@ -400,7 +420,7 @@ class SadgsModel(SplatfactoModel):
         return image
 
     def get_metrics_dict(self, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Any]:
-        """PSNR of the batch and the number of Gaussians; in training PSNR costs nothing beyond the loss."""
+        """Return PSNR of the batch and the number of Gaussians; in training, PSNR comes with the loss."""
         if "psnr" not in outputs:
             return super().get_metrics_dict(outputs, batch)  # type: ignore[arg-type]
         metrics: dict[str, Any] = {"psnr": outputs["psnr"], "gaussian_count": self.num_points}
@@ -410,7 +430,7 @@ class SadgsModel(SplatfactoModel):
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: Mapping[str, Any], metrics_dict: Mapping[str, Any] | None = None
     ) -> dict[str, Tensor]:
-        """Photometric loss of views of one size, and splatfacto's regularizers where they are on.
+        """Return the photometric loss of views of one size, and the regularizers that are on.
 
         Args:
             outputs: `rgb` [C, H, W, 3] or [H, W, 3], and `background`. In training, PSNR is added as `psnr`.
@@ -426,7 +446,6 @@ class SadgsModel(SplatfactoModel):
             predicted.reshape(-1, height, width, 3),
             target.reshape(-1, height, width, 3),
             ssim_lambda=self.config.ssim_lambda,
-            l2_lambda=self.config.l2_lambda,
             fused=self.config.fused,
         )
         losses = {"main_loss": loss}
@@ -435,8 +454,8 @@ class SadgsModel(SplatfactoModel):
             if self.config.use_scale_regularization and self.step % 10 == 0:
                 scales = self.scales.exp()
                 ratio = scales.amax(dim=-1) / scales.amin(dim=-1)
-                losses["scale_reg"] = 0.1 * (ratio - self.config.max_gauss_ratio).clamp_min(0).mean()
-            if self.config.opacity_reg > 0 and self.config.densify and self.step < self.strategy.refine_stop_iter:
+                losses["scale_reg"] = 0.1 * (ratio - MAX_SCALE_RATIO).clamp_min(0).mean()
+            if self.config.opacity_reg > 0 and self.step < self.strategy.refine_stop_iter:
                 losses["opacity_reg"] = self.config.opacity_reg * torch.sigmoid(self.opacities).mean()
             self.camera_optimizer.get_loss_dict(losses)
             if self.config.use_bilateral_grid:
@@ -444,14 +463,14 @@ class SadgsModel(SplatfactoModel):
         return losses
 
     def psnr(self, predicted: Tensor, target: Tensor) -> Tensor:
-        """PSNR in dB of images in [0, 1]."""
-        # A second of imports that training does not need.
+        """Return PSNR in dB of images in [0, 1], [1, 3, H, W] or [H, W, 3]."""
+        # The import takes a second, and training does not need it.
         from torchmetrics.functional.image import peak_signal_noise_ratio
 
         return peak_signal_noise_ratio(predicted, target, data_range=1.0)
 
     def lpips(self, predicted: Tensor, target: Tensor) -> Tensor:
-        """LPIPS (AlexNet) of images [1, 3, H, W] in [0, 1], NaN where its weights cannot be loaded.
+        """Return LPIPS (AlexNet) of images [1, 3, H, W] in [0, 1], or NaN where its weights cannot be loaded.
 
         The weights are loaded at the first call, so that neither training nor rendering needs them.
         """
@@ -463,12 +482,12 @@ class SadgsModel(SplatfactoModel):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """PSNR, SSIM and, where its weights are at hand, LPIPS of one held-out view."""
+        """Return PSNR, SSIM and, where its weights can be loaded, LPIPS of one held-out view."""
         metrics, images = super().get_image_metrics_and_images(outputs, batch)
         return {name: value for name, value in metrics.items() if "lpips" not in name or value == value}, images
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What a checkpoint needs besides parameters: the step and the strategy's state."""
+        """Return what a checkpoint needs besides parameters: the step and the strategy's state."""
         return {"step": self.step, "strategy_state": dict(self.strategy_state)}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -490,7 +509,7 @@ class SadgsModel(SplatfactoModel):
 
 
 def in_viewer() -> bool:
-    """Whether this is a thread in which nerfstudio's viewer draws."""
+    """Tell whether this is a thread in which nerfstudio's viewer draws."""
     from nerfstudio.viewer.render_state_machine import RenderStateMachine
 
     return isinstance(threading.current_thread(), RenderStateMachine)
@@ -504,17 +523,6 @@ def _say_once(text: str) -> None:
 @lru_cache(maxsize=8)
 def _constant_color(grey: float, device: torch.device) -> Tensor:
     return torch.full((3,), grey, device=device)
-
-
-def _refuse_fields_without_effect(config: SadgsModelConfig) -> None:
-    defaults = {f.name: f.default for f in fields(SplatfactoModelConfig)}
-    for name, replacement in WITHOUT_EFFECT.items():
-        if getattr(config, name) != defaults[name]:
-            raise InputError(f"pipeline.model.{name} has no effect on this method; use {replacement}.")
-    if config.num_downscales != 0:
-        raise InputError(
-            "pipeline.model.num_downscales must be 0: this method trains at full resolution from the start."
-        )
 
 
 def _load_lpips(device: torch.device) -> torch.nn.Module | None:

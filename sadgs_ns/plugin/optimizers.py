@@ -1,4 +1,4 @@
-"""nerfstudio glue: fused Adam and learning rates that decay over the run's own length."""
+"""The optimizers: Adam in one launch for all parameters, and learning rates that decay over the run's own length."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from torch.cuda.amp.grad_scaler import GradScaler
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
+from tyro.conf import Suppress
 
 from sadgs_ns import kernels
 from sadgs_ns.plugin.nonfinite import MAX_GRADIENT, NonFiniteLog, leave_out_nonfinite
@@ -21,14 +22,14 @@ _ONE = torch.tensor(1.0, device="cpu")
 
 
 class FusedAdam(torch.optim.Adam):
-    """torch's Adam, updated by our Triton kernel where that runs; state and results are torch's.
+    """torch's Adam, updated by our Triton kernel where that runs; its state and its results are torch's.
 
     Gradients that are NaN, infinite or beyond `nonfinite.MAX_GRADIENT` count as 0: parameters and moments stay finite.
 
     Args:
         params: Parameters, all on one device.
         fused: Use the Triton kernel on CUDA, torch's fused implementation elsewhere.
-        **options: As torch's.
+        **options: Further options of torch's Adam.
     """
 
     def __init__(self, params: Iterable[torch.Tensor], *, fused: bool = True, **options: Any) -> None:
@@ -36,10 +37,10 @@ class FusedAdam(torch.optim.Adam):
         plain = not any(options.get(name) for name in ("weight_decay", "amsgrad", "maximize"))
         self.triton = fused and plain and kernels.available(parameters[0].device)
         """Whether the Triton kernel is used."""
-        # torch's own keeps the step count on the device, which would make the host wait for it.
+        # torch's fused Adam keeps the step count on the device, and our kernel would make the host wait for it.
         super().__init__(parameters, fused=fused and not self.triton, **options)
         self.log = NonFiniteLog(parameters[0].device, capacity=1)
-        """Where it is noted that a gradient was left out; the pipeline puts its own here."""
+        """Log of gradients that were left out; the pipeline puts its own here."""
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
@@ -63,10 +64,10 @@ class FusedAdam(torch.optim.Adam):
 def step_together(optimizers: Iterable[FusedAdam]) -> None:
     """Step several optimizers; parameters of one length whose betas, eps and log agree are updated in one launch.
 
-    Results are, to the bit, those of one optimizer after the other.
+    The results equal, to the bit, those of one optimizer after the other.
 
     Args:
-        optimizers: Such as use the Triton kernel.
+        optimizers: Optimizers that use the Triton kernel.
     """
     from sadgs_ns.kernels.adam import adam_step
 
@@ -95,18 +96,19 @@ def step_together(optimizers: Iterable[FusedAdam]) -> None:
 
 
 class SadgsOptimizers(Optimizers):
-    """nerfstudio's, but all parameters that `FusedAdam` updates in Triton are updated in one launch.
+    """nerfstudio's set of optimizers, which updates in one launch all parameters that `FusedAdam` updates in Triton.
 
-    At 300k Gaussians the GPU waits for the host, which spent a quarter of a step on six optimizers. Gradients that are
-    scaled or clipped (max_norm), and other optimizers, go nerfstudio's way. Hooks on the `step` of those that are
-    updated together are not called.
+    At 300k Gaussians the GPU waits for the host, which spent a quarter of a step on six optimizers. Parameters whose
+    gradients are scaled or clipped (max_norm), and those of other optimizers, are updated as in nerfstudio. Hooks on
+    the `step` of optimizers that are updated together are not called.
     """
 
     def zero_grad_some(self, param_groups: list[str]) -> None:
         """Forget the gradients of the named parameters; torch's own way takes the host 60 times as long."""
         for name in param_groups:
             optimizer = self.optimizers[name]
-            # nerfstudio keeps those of the start, which densification replaces: their memory, and what it would clip.
+            # nerfstudio would keep the parameters of the start, which densification has replaced: they would hold
+            # memory, and gradients would be clipped on them instead of on the present ones.
             self.parameters[name] = optimizer.param_groups[0]["params"]
             if not isinstance(optimizer, FusedAdam):
                 optimizer.zero_grad()
@@ -130,10 +132,18 @@ class SadgsOptimizers(Optimizers):
 
 @dataclass
 class FusedAdamOptimizerConfig(AdamOptimizerConfig):
-    """Adam in one kernel."""
+    """Adam; only its rate is an option of the command line."""
 
     _target: type = FusedAdam
-    fused: bool = True
+    lr: float = 1e-3
+    """Learning rate; where there is a schedule, its factors multiply it."""
+    eps: Suppress[float] = 1e-15
+    """What Adam adds to the root of the second moment; as in 3DGS."""
+    max_norm: Suppress[float | None] = None
+    """Norm to which gradients are clipped."""
+    weight_decay: Suppress[float] = 0.0
+    """Adam's penalty on the size of parameters."""
+    fused: Suppress[bool] = True
     """Update in a single kernel: ours for all parameters on CUDA, torch's for each elsewhere."""
 
 
@@ -146,7 +156,7 @@ class RunLengthDecaySchedulerConfig(SchedulerConfig):
     """Learning rate at the first iteration, relative to the optimizer's."""
     final_factor: float = 1.0
     """Learning rate at the last iteration, relative to the optimizer's."""
-    max_steps: int | None = None
+    max_steps: Suppress[int | None] = None
     """Iterations until `final_factor`; None is the length of the run."""
 
 

@@ -26,7 +26,6 @@ from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.method.structure_tensor import (
     ENERGY_BLUR,
     FREQUENCY_CONSTANT,
-    NOISE_FLOOR,
     multiscale_structure_tensor,
 )
 from sadgs_ns.plugin import nonfinite
@@ -50,11 +49,9 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
 
     _target: type = field(default_factory=lambda: SadgsPipeline)
     datamanager: FullImageDatamanagerConfig = field(
-        default_factory=lambda: SadgsDatamanagerConfig(
-            dataparser=NerfstudioDataParserConfig(load_3D_points=True), cache_images_type="uint8"
-        )
+        default_factory=lambda: SadgsDatamanagerConfig(dataparser=NerfstudioDataParserConfig(load_3D_points=True))
     )
-    """Loads the images; `cache_images` "gpu" means the training device, whatever it is."""
+    """How images are loaded and drawn."""
     model: SadgsModelConfig = field(default_factory=SadgsModelConfig)
     """The Gaussians and their densification."""
     views_per_iteration: int = 1
@@ -62,8 +59,6 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     The paper uses 1 outdoors, 2 indoors. A preset's learning rates and AbsGS thresholds fit its own number."""
     frequency_constant: float = FREQUENCY_CONSTANT
     """c of ω_l = c / σ_l in 1/px, at most 4: the larger, the shorter every wavelength and the more is split."""
-    noise_floor: float = NOISE_FLOOR
-    """Amplitude, relative to an image's contrast, under which its structure counts as noise."""
     energy_blur: float = ENERGY_BLUR
     """Window, in multiples of σ_l, over which the energy of a scale is averaged; 0 measures it per pixel (eq. 4)."""
 
@@ -173,7 +168,6 @@ class SadgsPipeline(VanillaPipeline):
             images,
             masks,
             frequency_constant=self.config.frequency_constant,
-            noise_floor=self.config.noise_floor,
             energy_blur=self.config.energy_blur,
             fused=self.config.model.fused,
         )
@@ -219,7 +213,7 @@ class SadgsPipeline(VanillaPipeline):
         Raises:
             InputError: If `memory_budget_gb` leaves no room for Gaussians.
         """
-        if self.config.model.densify:
+        if self.config.model.strategy.refine_stop_iter > 0:
             model, fused = self.model, self.config.model.fused and kernels.available(self.device)
             size = training_size(self.datamanager, model.gauss_params, self.views_per_iteration, fused)  # type: ignore[arg-type]
             try:

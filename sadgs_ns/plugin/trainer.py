@@ -9,20 +9,20 @@ import shlex
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
-import tyro
 import yaml
-from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
+from tyro.conf import Suppress
 
 from sadgs_ns.atomic import atomic_path
 from sadgs_ns.data.validation.parsers import check_ahead
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
-from sadgs_ns.plugin import checkpoints
+from sadgs_ns.plugin import checkpoints, older_runs
 from sadgs_ns.plugin.compilation import compile_kernels
 from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
 from sadgs_ns.plugin.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig, SadgsOptimizers
@@ -44,9 +44,50 @@ def _memory(error: torch.cuda.OutOfMemoryError) -> str:
     return ". ".join(reason(error).split(". ")[:2]).rstrip(".")
 
 
-def available_machine() -> MachineConfig:
-    """Return the machine's configuration, with CUDA where there is a device and the CPU elsewhere."""
-    return MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu")
+@dataclass
+class SadgsMachineConfig(MachineConfig):
+    """nerfstudio's, for one machine."""
+
+    seed: int = 42
+    """Seed of everything that is drawn at random."""
+    num_devices: int = 1
+    """Number of devices to train on; this method trains on one."""
+    device_type: Literal["cpu", "cuda", "mps"] = field(
+        default_factory=lambda: "cuda" if torch.cuda.is_available() else "cpu"
+    )
+    """Kind of device to train on; CUDA where there is one."""
+    num_machines: Suppress[int] = 1
+    """Number of machines; this method trains on one."""
+    machine_rank: Suppress[int] = 0
+    """Rank of this machine among several."""
+    dist_url: Suppress[str] = "auto"
+    """Where several devices meet."""
+
+
+@dataclass
+class SadgsViewerConfig(ViewerConfig):
+    """nerfstudio's, but listening on this machine only."""
+
+    websocket_host: str = "127.0.0.1"
+    """Address at which the viewer listens: this machine only; 0.0.0.0 opens it to the network."""
+    websocket_port: int | None = None
+    """Port at which the viewer listens; None is 7007, or the next free one."""
+    quit_on_train_completion: bool = False
+    """End the command when training is done, instead of keeping the viewer open."""
+    max_num_display_images: int = 512
+    """Number of training images shown as cameras in the viewer, -1 for all; training takes all images anyway."""
+    make_share_url: bool = False
+    """Print an address at which others can open the viewer, through a server of viser's makers."""
+    websocket_port_default: Suppress[int] = 7007
+    """Port that is tried first where `websocket_port` is None."""
+    relative_log_filename: Suppress[str] = "viewer_log_filename.txt"
+    """Name of the viewer's log."""
+    num_rays_per_chunk: Suppress[int] = 32768
+    """Gaussians are not drawn in rays."""
+    camera_frustum_scale: Suppress[float] = 0.1
+    """Size of the cameras at the start; a slider in the viewer sets it, too."""
+    default_composite_depth: Suppress[bool] = True
+    """Whether cameras behind the splat are hidden at the start; a box in the viewer sets it, too."""
 
 
 @dataclass
@@ -54,12 +95,18 @@ class SadgsTrainerConfig(TrainerConfig):
     """nerfstudio's trainer with this method's defaults."""
 
     _target: type = field(default_factory=lambda: SadgsTrainer)
-    machine: MachineConfig = field(default_factory=available_machine)
-    """Machine; the device is CUDA where there is one."""
+    output_dir: Path = Path("outputs")
+    """Folder in which each run gets a folder of its own."""
+    experiment_name: str | None = None
+    """Name of the run's folder; None takes that of the data."""
+    timestamp: str = "{timestamp}"
+    """Name of the folder inside the experiment's and the method's; by default it is the time of the start."""
+    machine: SadgsMachineConfig = field(default_factory=SadgsMachineConfig)
+    """Device and seed."""
     pipeline: SadgsPipelineConfig = field(default_factory=SadgsPipelineConfig)
     """Data and model."""
-    viewer: ViewerConfig = field(default_factory=lambda: ViewerConfig(websocket_host="127.0.0.1"))
-    """The viewer. It listens on this machine only; a websocket_host of 0.0.0.0 opens it to the network."""
+    viewer: SadgsViewerConfig = field(default_factory=SadgsViewerConfig)
+    """The viewer in the browser."""
     max_num_iterations: int = 3000
     """Length of the run in optimizer steps; schedules stretch to it."""
     steps_per_save: int = 0
@@ -73,8 +120,44 @@ class SadgsTrainerConfig(TrainerConfig):
     """Steps between metrics of one held-out view, where a logger such as tensorboard is on."""
     steps_per_eval_all_images: int = 0
     """Steps between metrics of all held-out views; 0 is never. `ns-eval` measures them after training."""
-    scale_position_lr: bool = True
-    """Multiply the position learning rate with the cameras' extent, as 3DGS does; splatfacto does not."""
+    data: Path | None = None
+    """Folder of the data."""
+    project_name: str | None = "nerfstudio-project"
+    """Name of the project in wandb and comet."""
+    vis: Literal[
+        "viewer", "wandb", "tensorboard", "comet", "viewer+wandb", "viewer+tensorboard", "viewer+comet", "viewer_legacy"
+    ] = "viewer"
+    """Where the run can be watched. With a viewer the command waits at the end, until Ctrl+C."""
+    save_only_latest_checkpoint: bool = True
+    """Keep the latest checkpoint only, instead of all."""
+    load_dir: Path | None = None
+    """Folder of checkpoints (nerfstudio_models) from which the run goes on."""
+    load_step: int | None = None
+    """Step of the checkpoint in `load_dir`; None takes the latest."""
+    load_checkpoint: Path | None = None
+    """Checkpoint from which the run goes on."""
+    load_config: Path | None = None
+    """The config.yml of a run whose options are taken, instead of all others; nerfstudio executes what it says."""
+    start_paused: bool = False
+    """Wait for a click in the viewer before training starts."""
+    method_name: Suppress[str | None] = None
+    """The preset's name."""
+    prompt: Suppress[str | None] = None
+    """Read by methods that make scenes from text."""
+    relative_model_dir: Suppress[Path] = Path("nerfstudio_models")
+    """Folder of the checkpoints inside the run's."""
+    load_scheduler: Suppress[bool] = True
+    """Whether schedules go on where the checkpoint left them."""
+    logging: Suppress[LoggingConfig] = field(default_factory=LoggingConfig)
+    """What nerfstudio prints, and how often."""
+    mixed_precision: Suppress[bool] = False
+    """Refused: this method trains in float32."""
+    use_grad_scaler: Suppress[bool] = False
+    """Refused: densification reads gradients as they are."""
+    log_gradients: Suppress[bool] = False
+    """Whether gradients' norms are logged at each step."""
+    gradient_accumulation_steps: Suppress[dict[str, int]] = field(default_factory=dict)
+    """`pipeline.views_per_iteration` takes its place."""
 
     def check(self) -> None:
         """Check whether training can work with these options.
@@ -161,7 +244,7 @@ class SadgsTrainerConfig(TrainerConfig):
         return path
 
 
-SadgsTrainerConfig.__annotations__["prompt"] = tyro.conf.Suppress[str | None]  # hidden from help: for text to NeRF
+older_runs.read_with(SadgsTrainerConfig)
 
 
 class SadgsTrainer(Trainer):
@@ -257,13 +340,13 @@ class SadgsTrainer(Trainer):
         """Build the optimizers with schedules as long as the run, fused where the model is."""
         optimizers: dict[str, Any] = copy.deepcopy(dict(self.config.optimizers))
         for group in optimizers.values():
-            scheduler, optimizer = group["scheduler"], group["optimizer"]
+            scheduler, optimizer = group.setdefault("scheduler", None), group["optimizer"]
             if isinstance(optimizer, FusedAdamOptimizerConfig):
                 optimizer.fused &= self.config.pipeline.model.fused
             if isinstance(scheduler, RunLengthDecaySchedulerConfig) and scheduler.max_steps is None:
                 scheduler.max_steps = self.config.max_num_iterations
-        if self.config.scale_position_lr:
-            optimizers["means"]["optimizer"].lr *= self.pipeline.model.strategy_state["scene_scale"]
+        # Positions move in proportion to the cameras' extent, as in 3DGS; splatfacto does not do so.
+        optimizers["means"]["optimizer"].lr *= self.pipeline.model.strategy_state["scene_scale"]
         return SadgsOptimizers(optimizers, self.pipeline.get_param_groups())
 
     def train(self) -> None:

@@ -212,7 +212,9 @@ def test_observing_leaves_the_run_as_it_was(early: SadgsPipeline):
 
 def test_the_structure_step_makes_the_children_of_the_plan(early: SadgsPipeline):
     model, statistics = early.model, early.observe_training_views()
-    counts, fits = model.strategy.split_plan(model.gauss_params, statistics, model.strategy.max_gaussians - model.num_points)
+    counts, fits = model.strategy.split_plan(
+        model.gauss_params, statistics, model.strategy.max_gaussians - model.num_points
+    )
     children = torch.where(fits, counts.prod(dim=1), 1)
     step = inspect.structure_step(model, statistics)
     assert int(children.max()) > 1

@@ -39,7 +39,6 @@ from sadgs_ns.cli import doctor
 from sadgs_ns.data import colmap, validation
 from sadgs_ns.demo.scene import SPARSE_FOLDER, write_scene
 from sadgs_ns.errors import InputError, RunError
-from sadgs_ns.plugin import presets
 
 CHECKOUT = Path(__file__).parents[2]
 PLY = "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
@@ -808,7 +807,6 @@ def test_uncaught_errors_print_one_sentence_and_exit_with_1():
         ("load_checkpoint", Path("no.ckpt"), "no.ckpt does not exist: give --load-checkpoint a file"),
         ("pipeline.views_per_iteration", 0, "pipeline.views_per_iteration must be at least 1, got 0."),
         ("pipeline.frequency_constant", -1.0, "pipeline.frequency_constant must be in (0, 4], got -1.0."),
-        ("pipeline.model.refine_every", 50, "pipeline.model.refine_every has no effect on this method;"),
         ("pipeline.model.ssim_lambda", 7.0, "pipeline.model.ssim_lambda must be in [0, 1], got 7."),
         ("pipeline.model.initial_opacity", 1.0, "pipeline.model.initial_opacity must be in (0, 1), got 1."),
         ("pipeline.model.opacity_reg", -1.0, "pipeline.model.opacity_reg must not be negative, got -1."),
@@ -844,16 +842,3 @@ def test_ns_train_on_bad_data_ends_with_the_sentence_alone(copied: Callable[[str
     assert "Traceback" not in result.stdout + result.stderr
     assert result.stderr.splitlines()[-1].startswith(f"error: {data / FIRST} has 0 bytes: copy it again, or leave it")
     assert not (tmp_path / "out").exists()
-
-
-def test_a_preset_with_an_unknown_key_ends_nerfstudio_s_commands_with_one_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    (tmp_path / "p.yaml").write_text("description: A preset.\noptimizers: {}\nmax_iterations: 3\n")
-    monkeypatch.setattr(presets, "_configs", lambda: tmp_path)
-    with pytest.raises(InputError) as refused:
-        presets._registered("p")
-    assert re.fullmatch(
-        rf"{re.escape(str(tmp_path))}/p\.yaml has a mistake: p\.yaml: unknown key 'max_iterations'; known are .*\.",
-        str(refused.value),
-    )

@@ -300,7 +300,7 @@ CLOUDS = {
 @pytest.mark.parametrize("name", CLOUDS)
 def test_few_duplicate_and_collinear_points_start_and_train(name: str):
     points = torch.tensor(CLOUDS[name])
-    config = SadgsModelConfig(camera_clearance=0.0)
+    config = SadgsModelConfig()
     colors = torch.full_like(points, 128)
     model: SadgsModel = config.setup(
         scene_box=SceneBox(torch.ones(2, 3)), num_train_data=1, seed_points=(points, colors)
@@ -505,7 +505,7 @@ def test_the_log_is_read_before_it_overflows(
     capsys: pytest.CaptureFixture[str],
 ):
     config = configure(tmp_path, colmap, iterations=5)
-    config.pipeline.model.densify = False
+    config.pipeline.model.strategy.refine_stop_iter = 0
     trainer = set_up(config)
     trainer.pipeline.log._losses = trainer.pipeline.log._losses[:2]
     _ = trainer.pipeline.views.cameras  # which looks for such images, once

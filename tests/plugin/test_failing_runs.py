@@ -315,7 +315,7 @@ def test_a_run_that_learns_nothing_stops_with_one_sentence_and_a_finite_checkpoi
 ):
     monkeypatch.setattr(nonfinite, "HOPELESS_STEPS", 8)
     config.max_num_iterations, config.steps_per_save = 24, 3
-    config.pipeline.model.densify = False
+    config.pipeline.model.strategy.refine_stop_iter = 0
     trainer = set_up(config)
     trainer.pipeline.log._losses = trainer.pipeline.log._losses[:4]  # read every 4 iterations
     location = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
@@ -340,7 +340,7 @@ def test_a_run_that_learns_nothing_stops_with_one_sentence_and_a_finite_checkpoi
 
 
 def test_a_short_run_whose_every_gradient_is_nan_does_not_end_well(config: SadgsTrainerConfig):
-    config.pipeline.model.densify = False
+    config.pipeline.model.strategy.refine_stop_iter = 0
     trainer = set_up(config)
     poison(trainer, "gradients")
     with pytest.raises(
@@ -351,7 +351,7 @@ def test_a_short_run_whose_every_gradient_is_nan_does_not_end_well(config: Sadgs
 
 
 def test_gaussians_that_are_not_finite_are_not_saved(config: SadgsTrainerConfig):
-    config.pipeline.model.densify = False
+    config.pipeline.model.strategy.refine_stop_iter = 0
     trainer = set_up(config)
     trainer.pipeline.model.gauss_params["features_dc"].data.fill_(math.nan)
     with pytest.raises(
@@ -363,7 +363,7 @@ def test_gaussians_that_are_not_finite_are_not_saved(config: SadgsTrainerConfig)
 def test_one_gaussian_whose_gradient_is_always_nan_stops_nobody(
     config: SadgsTrainerConfig, capsys: pytest.CaptureFixture[str]
 ):
-    config.pipeline.model.densify = False
+    config.pipeline.model.strategy.refine_stop_iter = 0
     trainer = set_up(config)
     poison(trainer, "one gradient")
     trainer.train()

@@ -17,11 +17,13 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.scripts.eval import ComputePSNR
+from nerfstudio.utils.eval_utils import eval_setup
 from plyfile import PlyData
 from runs import (
     ITERATIONS,
     SCHEDULE,
     TRAIN_VIEWS,
+    as_saved_before_the_folders,
     blender_data,
     checkpoint,
     configure,
@@ -33,7 +35,7 @@ from scenes import HEIGHT, POINTS, VIEWS, WIDTH
 
 from sadgs_ns.demo.scene import SPARSE_FOLDER
 from sadgs_ns.method.codes import decode
-from sadgs_ns.plugin.model import _load_lpips
+from sadgs_ns.plugin.model import SadgsModel, _load_lpips
 from sadgs_ns.plugin.trainer import SadgsTrainer
 
 
@@ -101,6 +103,17 @@ def test_ns_eval_reports_psnr_and_ssim_and_says_once_why_lpips_is_missing(
     assert "urlopen" in printed  # not for any other reason
 
 
+def test_a_run_whose_config_names_the_package_s_earlier_files_is_loaded(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.delenv("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", raising=False)
+    text = as_saved_before_the_folders((finished / "config.yml").read_text())
+    (tmp_path / "config.yml").write_text(text)
+    _, pipeline, _, step = eval_setup(tmp_path / "config.yml")
+    assert isinstance(pipeline.model, SadgsModel) and pipeline.model.num_points > POINTS
+    assert step == ITERATIONS - 1
+
+
 def test_ns_export_writes_every_gaussian_that_can_be_seen(finished: Path, tmp_path: Path, open3d: None):
     from nerfstudio.scripts.exporter import ExportGaussianSplat  # which imports it
 
@@ -151,7 +164,7 @@ def test_no_view_at_all_per_iteration_is_refused(colmap: ColmapDataParserConfig,
 def test_training_makes_the_training_views_more_alike(colmap: ColmapDataParserConfig, tmp_path: Path):
     psnr: list[float] = []
     config = configure(tmp_path, colmap, iterations=ITERATIONS)
-    config.pipeline.model.densify = False  # opacity resets set back so short a run
+    config.pipeline.model.strategy.refine_stop_iter = 0  # opacity resets set back so short a run
 
     def measure(trainer: SadgsTrainer) -> None:
         if trainer.step in (0, ITERATIONS - 1):
@@ -274,7 +287,7 @@ def test_more_initial_points_than_max_gaussians_are_thinned_out(
 
 def test_without_densification_the_number_of_gaussians_stays(colmap: ColmapDataParserConfig, tmp_path: Path):
     config = configure(tmp_path, colmap, iterations=ITERATIONS)
-    config.pipeline.model.densify = False
+    config.pipeline.model.strategy.refine_stop_iter = 0
     trainer = set_up(config)
     before = trainer.pipeline.model.means.detach().clone()
     trainer.train()
@@ -287,14 +300,14 @@ def test_the_position_rate_ends_at_a_hundredth_whatever_the_length_of_the_run(
     iterations: int, colmap: ColmapDataParserConfig, tmp_path: Path
 ):
     config = configure(tmp_path, colmap, iterations)
-    config.scale_position_lr = False
     rates: list[float] = []
     trainer = set_up(config)
+    start = 1.6e-4 * trainer.pipeline.model.strategy_state["scene_scale"]
     rate = trainer.optimizers.schedulers["means"].get_last_lr
     rates += rate()
     trainer.train()
     rates += rate()
-    assert rates == pytest.approx([1.6e-4, 1.6e-6])
+    assert rates == pytest.approx([start, start / 100])
 
 
 def test_one_switch_takes_all_kernels_out(colmap: ColmapDataParserConfig, tmp_path: Path):
@@ -442,7 +455,8 @@ def test_views_of_two_sizes_train_together(tmp_path: Path):
 def test_the_loss_of_views_is_the_mean_of_their_own(tmp_path: Path, camera_optimizer: Any):
     """Each with its own camera, whether they are rendered together or, being of two sizes, one by one."""
     config = configure(tmp_path / "out", nerfstudio_data(tmp_path / "data", [(WIDTH, HEIGHT), (40, 30)]), iterations=3)
-    config.pipeline.model.camera_optimizer.mode, config.pipeline.model.densify = camera_optimizer, False
+    config.pipeline.model.camera_optimizer.mode = camera_optimizer
+    config.pipeline.model.strategy.refine_stop_iter = 0
     pipeline = set_up(config).pipeline
 
     def loss(*indices: int) -> torch.Tensor:

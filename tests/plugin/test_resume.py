@@ -176,7 +176,7 @@ def test_ctrl_c_on_ns_train_prints_the_command_that_resumes_it(
     iterations = 150
     command = [program, "sadgs", "--output-dir", str(tmp_path), "--experiment-name", "a run", "--timestamp", "first"]
     command += ["--max-num-iterations", str(iterations), "--steps-per-save", "5", "--vis", "tensorboard"]
-    command += ["--pipeline.model.densify", "False", "--machine.device-type", "cpu"]
+    command += ["--pipeline.model.strategy.refine-stop-iter", "0", "--machine.device-type", "cpu"]
     command += ["colmap", "--data", str(scene), "--colmap-path", str(SPARSE_FOLDER), "--downscale-factor", "1"]
     folder = tmp_path / "a run" / "sadgs" / "first" / "nerfstudio_models"
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
