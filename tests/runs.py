@@ -33,9 +33,9 @@ SCHEDULE = {
     "refine_start_iter": 1,
     "refine_stop_iter": 15,
     "eta_every": 1,
-    "eta_min_opacity": 0.0,
+    "split_min_opacity": 0.0,
+    "min_observations": 1,
     "reset_every": 0,
-    "final_prune_opacity": 0.01,
 }
 """Densification for the few iterations of these tests."""
 

@@ -28,7 +28,7 @@ def rows_of_hard_cases(document: str) -> list[tuple[str, str]]:
         text = re.findall(r"^## Hard cases$.*?(?=^## )", text, re.MULTILINE | re.DOTALL)[0]
     rows = []
     for section in re.split(r"^## ", text, flags=re.MULTILINE)[1:]:
-        modules = re.findall(r"tests/test_\w+\.py", section)
+        modules = re.findall(r"tests/(?:\w+/)?test_\w+\.py", section)
         table = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("| ")]
         table = [cells for cells in table if not cells[0].startswith("**")][2:]  # without groups and header
         assert {len(cells) for cells in table} == {3}
@@ -44,7 +44,7 @@ def test_every_hard_case_names_a_test_that_there_is(document: str, at_least: int
         names = re.findall(r"`([^`]+)`", cell)
         assert names or cell == "the same", cell
         for name in names:
-            found = re.fullmatch(r"(?:(tests/test_\w+\.py)::)?(test_\w+)?(?:\[(.+)\])?", name)
+            found = re.fullmatch(r"(?:(tests/(?:\w+/)?test_\w+\.py)::)?(test_\w+)?(?:\[(.+)\])?", name)
             assert found, name
             tests, cases = names_in(found[1] or module)
             if found[2] is None:

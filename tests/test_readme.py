@@ -31,8 +31,8 @@ class Short(StructureAwareStrategy):
     refine_stop_iter: int = 24
     reset_every: int = 0
     eta_every: int = 1
-    eta_min_opacity: float = 0.0
-    final_prune_opacity: float = 0.0
+    split_min_opacity: float = 0.0
+    min_observations: int = 1
 
 
 def block() -> str:

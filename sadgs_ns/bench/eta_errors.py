@@ -238,10 +238,10 @@ def split_errors(statistics: Mapping[str, Tensor], reference: Mapping[str, Tenso
         return (s["n_high"] / s["n_total"].clamp_min(1)[:, None])[seen]  # [S, 3]
 
     def violates(s: Mapping[str, Tensor]) -> Tensor:
-        return consistent(s["n_high"], s["n_total"], strategy.tau_split)[seen]  # [S, 3]
+        return consistent(s["n_high"], s["n_total"], strategy.tau_split, strategy.min_observations)[seen]  # [S, 3]
 
     def grid(s: Mapping[str, Tensor]) -> Tensor:
-        return children_per_axis(s["eta_max"][seen], violates(s), strategy.split_exponent)  # [S, 3]
+        return children_per_axis(s["eta_max"][seen], violates(s))  # [S, 3]
 
     errors = (ratio(statistics) - ratio(reference)).abs()
     actual, expected = grid(statistics), grid(reference)

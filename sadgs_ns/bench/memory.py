@@ -107,7 +107,7 @@ class Training:
         info["means2d"].retain_grad()
         tensors = torch.stack(self.codes)
         seen = info | {"viewmats": self.viewmats, "Ks": self.Ks, "structure_tensors": tensors}
-        observe(self.state, p, seen, min_opacity=0.3)  # type: ignore[arg-type]
+        observe(self.state, p, seen)  # type: ignore[arg-type]
         after("tile lists")
         target = torch.stack(self.images) / 255.0
         rgb = renders + (1 - alphas) * torch.ones(3, device=renders.device)

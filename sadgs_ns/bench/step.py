@@ -132,7 +132,7 @@ class Step:
 
     def observe(self) -> None:
         """One observation of η."""
-        observe(self.state, self.params, self.info, min_opacity=0.3, fused=self.fused)  # type: ignore[arg-type]
+        observe(self.state, self.params, self.info, fused=self.fused)  # type: ignore[arg-type]
 
     def optimize(self) -> None:
         """Adam on all parameters."""

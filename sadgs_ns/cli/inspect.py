@@ -26,6 +26,7 @@ from sadgs_ns.errors import InputError, reason
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow
 from sadgs_ns.method.codes import decode
 from sadgs_ns.method.split import grid_split, num_children
+from sadgs_ns.method.strategy import SMALL_SCALE
 from sadgs_ns.plugin import checkpoints, visualization
 from sadgs_ns.plugin.model import SadgsModel
 from sadgs_ns.plugin.pipeline import SadgsPipeline
@@ -187,8 +188,8 @@ def _try(
 
 def structure_step(model: SadgsModel, statistics: dict[str, Tensor]) -> Step:
     """What a structure-aware step would split, without its pruning."""
-    counts, grid = model.strategy.children_now(model.gauss_params, statistics), model.strategy.child_grid
-    return _try(model, {}, lambda p, o, s: grid_split(p, o, s, counts, *grid))
+    counts, child_scale = model.strategy.children_now(model.gauss_params, statistics), model.strategy.child_scale
+    return _try(model, {}, lambda p, o, s: grid_split(p, o, s, counts, child_scale))
 
 
 def conventional_step(model: SadgsModel, gradients: dict[str, Tensor]) -> Step:
@@ -205,7 +206,7 @@ def conventional_step(model: SadgsModel, gradients: dict[str, Tensor]) -> Step:
                 state,
                 clone_threshold=strategy.clone_grad2d,
                 split_threshold=strategy.split_absgrad2d,
-                size_threshold=strategy.small_scale * extent,
+                size_threshold=SMALL_SCALE * extent,
                 budget=strategy.max_gaussians - model.num_points,
             ),
         )

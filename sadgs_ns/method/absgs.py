@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, MutableMapping
 from typing import Any
 
@@ -66,7 +67,6 @@ def grow(
     size_threshold: float,
     budget: float,
     long_axis: bool = False,
-    child_rows: str = "empty",
 ) -> tuple[int, int]:
     """Clone small Gaussians by their mean gradient, split large ones in two by their absolute gradient.
 
@@ -95,19 +95,17 @@ def grow(
     n_clone, n_split = int(is_clone.sum()), int(is_split.sum())
     if n_clone > 0:
         duplicate(params, optimizers, state, is_clone)  # type: ignore[arg-type]
-        if child_rows == "empty":
-            _forget_last(state, n_clone)
+        _forget_last(state, n_clone)
     if n_split > 0:
         is_split = torch.cat([is_split, is_split.new_zeros(n_clone)])  # clones are not split
         if long_axis:
-            longest = F.one_hot(params["scales"].argmax(dim=-1), 3)  # [N, 3]
-            grid_split(
-                params, optimizers, state, 1 + longest * is_split[:, None], others=_OTHER_AXES, child_rows=child_rows
-            )
+            halved = F.one_hot(params["scales"].argmax(dim=-1), 3) * is_split[:, None]  # [N, 3]
+            # The other axes are shortened on the parents, which the next line replaces by their children.
+            params["scales"].data += math.log(_OTHER_AXES) * (is_split[:, None].long() - halved)
+            grid_split(params, optimizers, state, 1 + halved)
         else:
             split(params, optimizers, state, is_split)  # type: ignore[arg-type]
-            if child_rows == "empty":
-                _forget_last(state, 2 * n_split)
+            _forget_last(state, 2 * n_split)
     return n_clone, n_split
 
 

@@ -22,20 +22,17 @@ VARIANCE_EXTENT = math.sqrt(3.0)
 [−√3, √3] have variance 1 − 1/n², and each child adds 1/n²."""
 
 
-def children_per_axis(eta_max: Tensor, violates: Tensor, exponent: float = 0.5) -> Tensor:
-    """Split factor n_k = ⌈η_k^p⌉ on the axes that violate consistently, 1 elsewhere (paper, eq. 8).
+def children_per_axis(eta_max: Tensor, violates: Tensor) -> Tensor:
+    """Split factor n_k = ⌈√η_k⌉ on the axes that violate consistently, 1 elsewhere (paper, eq. 8).
 
     Args:
         eta_max: Largest η observed per axis, ≥ 0; one that is no number splits nothing. [N, 3]
         violates: Axes that violate consistently over the views. bool [N, 3]
-        exponent: p; the paper uses 1/2 and compares 1/4 and 3/4.
 
     Returns:
         n in 1 … MAX_CHILDREN_PER_AXIS. int64 [N, 3]
     """
-    bound = float(MAX_CHILDREN_PER_AXIS)
-    # Clamped before the power: η of 1e12 must not overflow on its way to the bound.
-    counts = eta_max.clamp(1.0, bound ** (1.0 / exponent)).pow(exponent).ceil().clamp_max(bound)
+    counts = eta_max.clamp_min(1.0).sqrt().ceil().clamp_max(MAX_CHILDREN_PER_AXIS)
     # NaN is no violation: as an integer it could be anything.
     return torch.where(violates & (counts >= 1), counts, 1.0).long()
 
@@ -76,14 +73,11 @@ def limit_growth(growth: Tensor, priority: Tensor, budget: float) -> Tensor:
     return allowed
 
 
-def grid_offsets(
-    counts: Tensor, extent: float = VARIANCE_EXTENT, dtype: torch.dtype = torch.float32
-) -> tuple[Tensor, Tensor]:
-    """Centred regular grids of n_x × n_y × n_z cell centres.
+def grid_offsets(counts: Tensor, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:
+    """Place the cell centres of regular grids of n_x × n_y × n_z cells, centred on their parents.
 
     Args:
         counts: n of each parent. int64 [P, 3]
-        extent: Half-width of the grid in parent standard deviations.
         dtype: Of the coordinates.
 
     Returns:
@@ -96,7 +90,7 @@ def grid_offsets(
     n_x, n_y, n_z = counts[parents].unbind(1)
     cells = torch.stack([local % n_x, local // n_x % n_y, local // (n_x * n_y)], dim=1)  # [Q, 3]
     n = torch.stack([n_x, n_y, n_z], dim=1)
-    return parents, (2 * cells - n + 1).to(dtype) * (extent / n.to(dtype))
+    return parents, (2 * cells - n + 1).to(dtype) * (VARIANCE_EXTENT / n.to(dtype))
 
 
 @torch.no_grad()
@@ -105,10 +99,7 @@ def grid_split(
     optimizers: MutableMapping[str, torch.optim.Optimizer],
     state: MutableMapping[str, Any],
     counts: Tensor,
-    extent: float = VARIANCE_EXTENT,
     child_scale: float = 1.0,
-    others: float = 1.0,
-    child_rows: str = "empty",
 ) -> None:
     """Replace every Gaussian with more than one child by its grid of children, in place, as gsplat's `split` does.
 
@@ -125,23 +116,21 @@ def grid_split(
         optimizers: One per parameter.
         state: The strategy's state; its tensors have leading dimension N.
         counts: n per axis. int64 [N, 3]
-        extent: Half-width of the child grid in parent standard deviations, for children of s ⊘ n.
         child_scale: k in [1, 2).
-        others: Factor on the scales of those axes of a parent that are not split.
     """
     is_split = (counts > 1).any(dim=1)
     rest = torch.where(~is_split)[0]
     selected = torch.where(is_split)[0]
-    local_parents, grid = grid_offsets(counts[selected], extent, params["scales"].dtype)
+    local_parents, grid = grid_offsets(counts[selected], params["scales"].dtype)
     parents = selected[local_parents]  # [Q]
     n = counts[parents].to(params["scales"].dtype)  # [Q, 3]
-    is_axis_split = n > 1
+    is_axis_split = n > 1  # [Q, 3]
     # An axis that is not split has one cell, in the middle: any factor does.
     grid = grid * ((1 - (child_scale / n) ** 2) / (1 - (1 / n) ** 2).clamp_min(0.75)).clamp_min(0).sqrt()
     rotmats = normalized_quat_to_rotmat(F.normalize(params["quats"][parents], dim=-1))  # [Q, 3, 3]
     # Not a batched matrix product: cuBLAS takes 3×3 matrices 65,535 at a time.
     offsets = (rotmats * (params["scales"][parents].exp() * grid)[:, None]).sum(dim=-1)  # [Q, 3]
-    shrink = torch.where(is_axis_split, (n / child_scale).log(), -math.log(others))  # [Q, 3]
+    shrink = torch.where(is_axis_split, (n / child_scale).log(), 0.0)  # [Q, 3]
     log_share = -math.log(child_scale) * is_axis_split.sum(dim=1).to(n.dtype)  # [Q]
 
     def param_fn(name: str, p: Tensor) -> Tensor:
@@ -156,15 +145,10 @@ def grid_split(
             children = log_q - torch.logaddexp(torch.log(-torch.expm1(log_q)), -children)
         return torch.nn.Parameter(torch.cat([p[rest], children]), requires_grad=p.requires_grad)
 
-    def optimizer_fn(key: str, v: Tensor) -> Tensor:
+    def with_empty_children(key: str, v: Tensor) -> Tensor:
         return torch.cat([v[rest], v.new_zeros((len(parents), *v.shape[1:]))])
 
-    _update_param_with_optimizer(param_fn, optimizer_fn, params, optimizers)  # type: ignore[arg-type]
-    eta_before = state.get("eta_max")
+    _update_param_with_optimizer(param_fn, with_empty_children, params, optimizers)  # type: ignore[arg-type]
     for key, value in state.items():
         if isinstance(value, Tensor):
-            rows = value[parents] if child_rows != "empty" else value.new_zeros((len(parents), *value.shape[1:]))
-            if child_rows == "scaled" and key in ("eta_max", "n_high"):
-                shorter = eta_before[parents] * (-shrink).exp()
-                rows = rows * (shorter > 1) if key == "n_high" else shorter
-            state[key] = torch.cat([value[rest], rows])
+            state[key] = with_empty_children(key, value)

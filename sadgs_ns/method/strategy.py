@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, MutableMapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -15,14 +15,24 @@ from torch import Tensor
 
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow
 from sadgs_ns.method.memory import StepSize, affordable_growth, free_bytes
-from sadgs_ns.method.split import VARIANCE_EXTENT, Params, children_per_axis, grid_split, limit_growth, num_children
+from sadgs_ns.method.split import Params, children_per_axis, grid_split, limit_growth, num_children
 from sadgs_ns.method.statistics import consistent, empty_statistics, observe
 
 Info = Mapping[str, Any]
 
-_SHARES = ("eta_min_opacity", "tau_split", "tau_prune", "prune_opacity", "min_opacity", "clamp_opacity", "reset_factor",
-           "final_prune_opacity")  # fmt: skip
-"""Options that are fractions or opacities."""
+TAU_PRUNE = 0.8
+"""τ_prune: fraction of observations that must be low (η < 0.1) on every axis before a faint Gaussian is pruned (paper,
+section 3.4)."""
+PRUNE_OPACITY = 0.1
+"""τ_α: opacity under which a Gaussian with consistently low η is pruned (paper, section 3.4)."""
+SMALL_SCALE = 0.001
+"""Largest scale, relative to the scene's extent, at which AbsGS counts a Gaussian as small (3DGS)."""
+CLAMP_OPACITY = 0.8
+"""Structure steps lower opacities to at most this, so that what lies behind gets gradients again (released code)."""
+RESET_FACTOR = 0.1
+"""Factor of an opacity reset on every opacity (released code)."""
+FINAL_PRUNE_OPACITY = 0.1
+"""Opacity under which Gaussians are pruned when densification ends (released code)."""
 
 
 @dataclass
@@ -57,77 +67,46 @@ class StructureAwareStrategy(Strategy):
     refine_start_iter: int = 100
     """First iteration at which densification may run."""
     refine_stop_iter: int = 1600
-    """Last iteration at which densification may run; opacities under `final_prune_opacity` are pruned there."""
+    """Last iteration at which densification may run; Gaussians less than 0.1 opaque are pruned there. 0 leaves the
+    number of Gaussians as it is."""
     eta_every: int = 10
     """Iterations between η observations; the paper observes at every one, which costs time and brings nothing."""
-    directional_eta: bool = False
-    """Measure η along each axis's own direction (paper, eq. 7) instead of against the shortest wavelength (eq. 6)."""
-    eta_min_opacity: float = 0.3
-    """Opacity in [0, 1] from which a Gaussian's η is observed, high or low; 0, as in the paper, takes all visible ones.
-    Pruning by low η then only concerns Gaussians that were this opaque since the last structure step."""
     tau_split: float = 0.8
-    """Fraction of observations that must violate (η > 1) before an axis is split."""
-    split_exponent: float = 0.5
-    """p of the split factor n = ⌈η^p⌉."""
-    split_extent: float = VARIANCE_EXTENT
-    """Half-width of the child grid in parent standard deviations; √3 keeps the parent's covariance."""
+    """Fraction of a Gaussian's observations that must violate (η > 1) before an axis is split."""
+    min_observations: int = 3
+    """Observations of η that a Gaussian needs before a structure step splits it, or prunes it for low η; the paper asks
+    for none, and then one of one is enough."""
+    split_min_opacity: float = 0.3
+    """Opacity in [0, 1] that a Gaussian needs to be split by a structure step; 0, as in the paper, splits all."""
     child_scale: float = 1.5
     """k in [1, 2): children are k times the paper's s/n long on the axes that are split, which closes their gaps.
     They stand closer and are 1/k as opaque an axis, which keeps the covariance and the mass; 1 is the paper's."""
-    tau_prune: float = 0.8
-    """Fraction of observations that must be low (η < 0.1) on every axis before a faint Gaussian is pruned."""
-    prune_opacity: float = 0.1
-    """Opacity under which a Gaussian with consistently low η is pruned."""
     clone_grad2d: float = 3e-4
     """AbsGS: normalised mean screen gradient at which a small Gaussian is cloned; AbsGS's own is 2e-4."""
     split_absgrad2d: float = 6e-4
     """AbsGS: normalised mean absolute screen gradient at which a large Gaussian is split; AbsGS's own is 4e-4."""
     absgs_long_axis: bool = True
     """AbsGS halves a large Gaussian's longest axis in its place, instead of drawing the places of two at random."""
-    small_scale: float = 0.001
-    """AbsGS: largest scale, relative to the scene's extent, at which a Gaussian counts as small."""
     min_opacity: float = 0.02
     """Opacity under which every densification step prunes; AbsGS's own is 0.005."""
-    clamp_opacity: float = 0.8
-    """Structure steps lower opacities to at most this, so that what lies behind gets gradients again; 1 is off."""
     reset_every: int = 1200
     """Iterations between opacity resets inside the densification window; 0 turns them off."""
-    reset_factor: float = 0.1
-    """An opacity reset multiplies every opacity by this."""
-    final_prune_opacity: float = 0.1
-    """Opacity under which Gaussians are pruned when densification ends."""
-    min_observations: int = 3
-    """Observations of η that a Gaussian needs before a structure step splits it, or prunes it by low η."""
-    gate_at_split: bool = True
-    """Sweep: η of all visible Gaussians is observed, and those at least `eta_min_opacity` opaque are split."""
-    child_rows: str = "empty"
-    """Sweep: statistics of AbsGS's children: empty, scaled or kept."""
-    fused: bool = True
-    """Measure η, and add up AbsGS's gradients, in one Triton kernel each where these run (CUDA)."""
-    verbose: bool = False
-    """Print a line at each densification step."""
-
-    @property
-    def child_grid(self) -> tuple[float, float]:
-        """The last arguments of `grid_split`."""
-        return self.split_extent, self.child_scale
+    fused: bool = field(default=True, init=False)
+    """Whether η is measured, and AbsGS's gradients are added up, in one Triton kernel each where these run (CUDA)."""
 
     def check(self) -> None:
         """See whether densification can work with these options.
 
         Raises:
-            ValueError: If `max_gaussians`, `eta_every`, `split_exponent` or `memory_budget_gb` is not positive, a
+            ValueError: If `max_gaussians`, `eta_every`, `min_observations` or `memory_budget_gb` is not positive, a
                 fraction or an opacity not in [0, 1], or `child_scale` not in [1, 2).
         """
-        if self.max_gaussians < 1:
-            raise ValueError(f"strategy.max_gaussians must be at least 1, got {self.max_gaussians}.")
-        if self.eta_every < 1:
-            raise ValueError(f"strategy.eta_every must be at least 1, got {self.eta_every}.")
-        if not self.split_exponent > 0:
-            raise ValueError(f"strategy.split_exponent must be positive, got {self.split_exponent:g}.")
+        for name in ("max_gaussians", "eta_every", "min_observations"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"strategy.{name} must be at least 1, got {getattr(self, name)}.")
         if not 1 <= self.child_scale < 2:
             raise ValueError(f"strategy.child_scale must be at least 1 and less than 2, got {self.child_scale:g}.")
-        for name in _SHARES:
+        for name in ("tau_split", "split_min_opacity", "min_opacity"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"strategy.{name} must be in [0, 1], got {getattr(self, name):g}.")
         if self.memory_budget_gb is not None and not self.memory_budget_gb > 0:
@@ -202,8 +181,6 @@ class StructureAwareStrategy(Strategy):
                     state,
                     params,
                     view,
-                    directional=self.directional_eta,
-                    min_opacity=0.0 if self.gate_at_split else self.eta_min_opacity,
                     fused=self.fused,
                 )
 
@@ -238,17 +215,17 @@ class StructureAwareStrategy(Strategy):
                 self._absgs_step(params, optimizers, state, iteration, views)
             if iteration == self.refine_stop_iter:
                 if not _due(iteration, self.structure_every):  # whose step has done so
-                    self._prune(params, optimizers, state, self._opacities(params) < self.final_prune_opacity)
+                    self._prune(params, optimizers, state, self._opacities(params) < FINAL_PRUNE_OPACITY)
                 for key in self._empty_state(0, torch.device("cpu")):
                     state.pop(key, None)  # nobody reads them any more: neither memory nor checkpoints should hold them
             elif _due(iteration, self.reset_every) and iteration <= self.refine_stop_iter - self.reset_every // 4:
                 # A reset just before the final prune would leave nothing that had time to recover.
-                self._map_opacities(params, optimizers, lambda opacities: opacities * self.reset_factor)
+                self._map_opacities(params, optimizers, lambda opacities: opacities * RESET_FACTOR)
 
     def consistently_low(self, statistics: Mapping[str, Tensor]) -> Tensor:
         """Gaussians that answered low on all three axes in more than τ_prune of their observations. bool [N]"""
         n_low, n_total = statistics["n_low"], statistics["n_total"]
-        return consistent(n_low, n_total, self.tau_prune, self.min_observations).all(dim=1)
+        return consistent(n_low, n_total, TAU_PRUNE, self.min_observations).all(dim=1)
 
     def split_plan(self, params: Params, statistics: Mapping[str, Tensor], budget: float) -> tuple[Tensor, Tensor]:
         """What a structure step makes of the statistics.
@@ -263,9 +240,8 @@ class StructureAwareStrategy(Strategy):
         """
         n_high, n_total = statistics["n_high"], statistics["n_total"]
         violates = consistent(n_high, n_total, self.tau_split, self.min_observations)
-        if self.gate_at_split:
-            violates &= (self._opacities(params) >= self.eta_min_opacity)[:, None]
-        counts = children_per_axis(statistics["eta_max"], violates, self.split_exponent)  # [N, 3]
+        violates &= (self._opacities(params) >= self.split_min_opacity)[:, None]
+        counts = children_per_axis(statistics["eta_max"], violates)  # [N, 3]
         worst = torch.where(violates, statistics["eta_max"], 0.0).amax(dim=1)  # [N]
         return counts, limit_growth(num_children(counts) - 1, worst, budget)
 
@@ -281,19 +257,16 @@ class StructureAwareStrategy(Strategy):
         is_low = self.consistently_low(state)
         n_before, n_low = len(is_low), int(is_low.sum())
         # The final prune, before children are made: those are fainter, and would go with what they replace.
-        faint = max(self.min_opacity, self.final_prune_opacity if iteration == self.refine_stop_iter else 0.0)
-        n_pruned = self._prune(
-            params, optimizers, state, (opacities < faint) | (is_low & (opacities < self.prune_opacity))
-        )
-        if self.clamp_opacity < 1:
-            self._map_opacities(params, optimizers, lambda alpha: alpha.clamp_max(self.clamp_opacity))
+        faint = max(self.min_opacity, FINAL_PRUNE_OPACITY if iteration == self.refine_stop_iter else 0.0)
+        n_pruned = self._prune(params, optimizers, state, (opacities < faint) | (is_low & (opacities < PRUNE_OPACITY)))
+        self._map_opacities(params, optimizers, lambda alpha: alpha.clamp_max(CLAMP_OPACITY))
         under_cap, in_memory = self._room(params, state, views)
         counts, allowed = self.split_plan(params, state, min(under_cap, in_memory))
         n_parents, n_wanted = int(allowed.sum()), int((counts > 1).any(dim=1).sum())
         if in_memory < min(int((num_children(counts) - 1).sum()), under_cap):
             _warn_of_memory(iteration, in_memory)
         if n_parents > 0:
-            grid_split(params, optimizers, state, torch.where(allowed[:, None], counts, 1), *self.child_grid)
+            grid_split(params, optimizers, state, torch.where(allowed[:, None], counts, 1), self.child_scale)
         # What was learned about parents says nothing about their children.
         self._clear_statistics(params, state)
         state.setdefault("structure_steps", []).append(
@@ -307,11 +280,6 @@ class StructureAwareStrategy(Strategy):
                 "after": len(params["means"]),
             }
         )
-        if self.verbose:
-            print(
-                f"Iteration {iteration}: {n_parents} of {n_wanted} violating Gaussians split, {n_pruned} pruned. "
-                f"Now having {len(params['means'])}."
-            )
 
     def _absgs_step(self, params: Any, optimizers: Any, state: Any, iteration: int, views: Sequence[Info] = ()) -> None:
         under_cap, in_memory = self._room(params, state, views)
@@ -321,20 +289,14 @@ class StructureAwareStrategy(Strategy):
             state,
             clone_threshold=self.clone_grad2d,
             split_threshold=self.split_absgrad2d,
-            size_threshold=self.small_scale * state["scene_scale"],
+            size_threshold=SMALL_SCALE * state["scene_scale"],
             budget=min(under_cap, in_memory),
             long_axis=self.absgs_long_axis,
-            child_rows=self.child_rows,
         )
         if in_memory <= n_clone + n_split < under_cap:
             _warn_of_memory(iteration, in_memory)
-        n_pruned = self._prune(params, optimizers, state, self._opacities(params) < self.min_opacity)
+        self._prune(params, optimizers, state, self._opacities(params) < self.min_opacity)
         state.update(empty_gradients(len(params["means"]), params["means"].device))
-        if self.verbose:
-            print(
-                f"Iteration {iteration}: {n_clone} Gaussians cloned, {n_split} split in two, {n_pruned} pruned. "
-                f"Now having {len(params['means'])}."
-            )
 
     def _room(self, params: Params, state: Mapping[str, Any], views: Sequence[Info]) -> tuple[int, float]:
         """How many Gaussians may be added under the cap, and how many fit in the device's memory beside such views."""

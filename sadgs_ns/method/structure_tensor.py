@@ -26,7 +26,7 @@ INTEGRATION_FACTOR = 3.0
 """ρ_l = INTEGRATION_FACTOR · σ_l px (paper, section 3.2)."""
 GAMMA = 3.0
 """Exponent of the scale weights E_l^γ (paper, eq. 5)."""
-FREQUENCY_CONSTANT = 0.4
+FREQUENCY_CONSTANT = 0.75
 """c of ω_l = c / σ_l in 1/px. The paper leaves it open; docs/measurements.md holds the sweeps that settled it."""
 NOISE_FLOOR = 0.02
 """Amplitude, relative to the image's own contrast, under which structure counts as noise: the ε of eq. 3 and 5."""

@@ -109,8 +109,6 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
             empty_statistics(n, device),
             params,  # type: ignore[arg-type]
             info | {"structure_tensors": image.byte().repeat(views, 1, 1, 1), "viewmats": viewmats, "Ks": Ks},
-            directional=strategy.directional_eta,
-            min_opacity=0.0,
             generator=torch.Generator(device).manual_seed(0),
             fused=strategy.fused,
         )

@@ -40,6 +40,17 @@ CONSTANTS: dict[str, Any] = {
     "sh_degree_interval": 1,
     "l2_lambda": 2.0,
     "camera_clearance": 2.0,
+    "directional_eta": False,
+    "split_exponent": 0.5,
+    "split_extent": 3**0.5,
+    "tau_prune": 0.8,
+    "prune_opacity": 0.1,
+    "small_scale": 0.001,
+    "clamp_opacity": 0.8,
+    "reset_factor": 0.1,
+    "final_prune_opacity": 0.1,
+    "eta_min_opacity": 0.3,
+    "verbose": False,
 }
 """Removed options at the values that the method has kept: a run with these lacks nothing."""
 

@@ -51,7 +51,7 @@ OF_PHOTOS = (PERIOD_NEAR, ELLIPSES_NEAR)
 """Choices that need the training photos."""
 OF_STATISTICS = (ETA_OF, CHILDREN_OF, LOW_OF)
 """Choices that need observations of the training views."""
-RANGES = {"tau_split": (0.0, 1.0), "split_exponent": (0.1, 1.0), "max_gaussians": (1, 100_000_000)}
+RANGES = {"tau_split": (0.0, 1.0), "max_gaussians": (1, 100_000_000)}
 """Fields of the strategy that may be changed while it trains, and between which values."""
 ROWS = 8
 """Structure steps in the table, the last ones."""
@@ -152,7 +152,6 @@ class StructurePanel(torch.nn.Module):
             cb_hook=lambda element: self._change("max_gaussians", element),
             hint="Hard cap, from the next densification on",
         )
-        self.set_split_exponent = self._slider("split_exponent", "p of n = ⌈η^p⌉, at the next structure step")
         self.set_tau_split = self._slider(
             "tau_split", "Share of observations that must violate, at the next structure step"
         )

@@ -198,8 +198,6 @@ class SadgsPipeline(VanillaPipeline):
                 statistics,
                 params,
                 info | {"viewmats": viewmats, "Ks": Ks, "structure_tensors": tensor},
-                directional=strategy.directional_eta,
-                min_opacity=0.0,
                 generator=generator,
                 fused=strategy.fused,
             )

@@ -28,6 +28,7 @@ from sadgs_ns.demo.scene import write_scene
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin import visualization
+from sadgs_ns.method.codes import MASKED
 from sadgs_ns.plugin.model import _say_once
 from sadgs_ns.plugin.panel import CHOICES, OFF, OUTPUT, StructurePanel, change, describe, nearest_view
 from sadgs_ns.plugin.pipeline import SadgsPipeline
@@ -46,7 +47,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = configure(folder / "scene", folder / "runs", ITERATIONS, save_every=8)
     config.save_only_latest_checkpoint = False
     config.pipeline.model.bounding_box_points = False
-    config.pipeline.model.strategy.eta_min_opacity = 0.0
+    config.pipeline.model.strategy.split_min_opacity = 0.0
+    config.pipeline.model.strategy.min_observations = 1
     config.save_config()
     set_up(config).train()
     return config.get_base_dir() / "config.yml"
@@ -275,7 +277,7 @@ def a_camera(pipeline: SadgsPipeline, index: int = 0) -> Cameras:
 def test_the_viewer_finds_the_elements_in_their_order(panel: StructurePanel):
     found = parse_object(pipeline_of(panel), ViewerElement, "Custom Elements")
     assert [path.removeprefix("Custom Elements/structure/") for path, _ in found] == [
-        "choice", "observe", "set_max_gaussians", "set_split_exponent", "set_tau_split", "table",
+        "choice", "observe", "set_max_gaussians", "set_tau_split", "table",
     ]  # fmt: skip
 
 
@@ -370,9 +372,10 @@ def test_a_finished_run_is_observed_when_eta_is_asked_for(panel: StructurePanel)
     assert panel.statistics() is None, "they are of other Gaussians"
 
 
-def test_where_no_gaussian_is_opaque_enough_the_panel_says_that_none_was_observed(panel: StructurePanel):
+def test_where_every_pixel_is_masked_the_panel_says_that_none_was_observed(panel: StructurePanel):
     pipeline = pipeline_of(panel)
-    pipeline.model.strategy.eta_min_opacity = 1.0
+    for codes in pipeline.structure_tensors:
+        codes[..., 1] = MASKED
     panel.choice.value = "η"
     panel.choose()
     statistics = panel.statistics()
@@ -401,13 +404,9 @@ def test_sliders_reach_the_strategy_and_the_plan(panel: StructurePanel):
         panel.set_tau_split.value = tau
         panel.set_tau_split.cb_hook(panel.set_tau_split)
         assert strategy.tau_split == tau
-        counts, _ = strategy.split_plan(statistics, math.inf)
+        counts, _ = strategy.split_plan(pipeline.model.gauss_params, statistics, math.inf)
         split.append(int((counts > 1).any(dim=1).sum()))
     assert split[0] == 0 < split[1] < split[2]
-    panel.set_split_exponent.value = 1.0
-    panel.set_split_exponent.cb_hook(panel.set_split_exponent)
-    more, _ = strategy.split_plan(statistics, math.inf)
-    assert int(more.prod(dim=1).sum()) > int(counts.prod(dim=1).sum())
     panel.set_max_gaussians.value = 777
     panel.set_max_gaussians.cb_hook(panel.set_max_gaussians)
     assert strategy.max_gaussians == 777 and type(strategy.max_gaussians) is int
@@ -419,7 +418,6 @@ def test_sliders_reach_the_strategy_and_the_plan(panel: StructurePanel):
     ("name", "values"),
     [
         ("tau_split", [math.nan, -0.1, 1.1, math.inf, "0.5"]),
-        ("split_exponent", [math.nan, 0.0, 0.05, 2.0]),
         ("max_gaussians", [0, -5, math.nan, math.inf, 10**12]),
     ],
 )

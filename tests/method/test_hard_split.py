@@ -39,7 +39,7 @@ def short(**changes: Any) -> StructureAwareStrategy:
     """Densification within 26 steps."""
     defaults: dict[str, Any] = {
         "structure_every": 10, "absgs_every": 4, "refine_start_iter": 2, "refine_stop_iter": 24, "reset_every": 0,
-        "eta_every": 1, "eta_min_opacity": 0.0, "final_prune_opacity": 0.0, "min_opacity": 0.0, "clone_grad2d": 0.0,
+        "eta_every": 1, "split_min_opacity": 0.0, "min_observations": 1, "min_opacity": 0.0, "clone_grad2d": 0.0,
     }  # fmt: skip
     return StructureAwareStrategy(**{**defaults, **changes})
 
@@ -77,6 +77,12 @@ def observed(n: int, eta_max: float) -> dict[str, Any]:
 
 
 # --- split ---
+
+
+@pytest.fixture(autouse=True)
+def no_final_prune(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Faint Gaussians stay at the end of densification, where a test does not say otherwise."""
+    monkeypatch.setattr(strategy_module, "FINAL_PRUNE_OPACITY", 0.0)
 
 
 @pytest.mark.parametrize("eta_max", [1e12, 3e38, math.inf])
@@ -137,17 +143,17 @@ def test_a_cap_that_allows_no_gaussian_is_refused():
         StructureAwareStrategy(max_gaussians=0).initialize_state()
 
 
-def test_an_interval_or_exponent_of_zero_is_refused_at_the_start():
+def test_an_interval_of_zero_is_refused_at_the_start():
     with pytest.raises(ValueError, match=r"strategy\.eta_every must be at least 1, got 0\."):
         StructureAwareStrategy(eta_every=0).initialize_state()
-    with pytest.raises(ValueError, match=r"strategy\.split_exponent must be positive, got 0\."):
-        StructureAwareStrategy(split_exponent=0.0).initialize_state()
+    with pytest.raises(ValueError, match=r"strategy\.min_observations must be at least 1, got 0\."):
+        StructureAwareStrategy(min_observations=0).initialize_state()
 
 
 @pytest.mark.parametrize(
     ("option", "value", "allowed"),
     [
-        ("tau_split", 1.5, r"in \[0, 1\], got 1\.5"), ("tau_prune", math.nan, r"in \[0, 1\], got nan"),
+        ("tau_split", 1.5, r"in \[0, 1\], got 1\.5"), ("split_min_opacity", math.nan, r"in \[0, 1\], got nan"),
         ("min_opacity", -0.1, r"in \[0, 1\], got -0\.1"), ("memory_budget_gb", -3.0, "positive, got -3"),
     ],
 )  # fmt: skip
@@ -255,32 +261,32 @@ def test_pruning_may_leave_one():
     assert torch.equal(params["means"], kept)
 
 
-def test_a_prune_that_would_leave_none_is_left_out():
+def test_a_prune_that_would_leave_none_is_left_out(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(strategy_module, "FINAL_PRUNE_OPACITY", 0.5)
     params = random_params(6)
     params["opacities"].data.fill_(-9.0)
-    numbers = train(short(min_opacity=0.5, final_prune_opacity=0.5, clone_grad2d=math.inf), params, steps=26)
+    numbers = train(short(min_opacity=0.5, clone_grad2d=math.inf), params, steps=26)
     assert numbers == [6] * 26 and all(p.isfinite().all() for p in params.values())
 
 
-@pytest.mark.parametrize("clamp_opacity", [0.8, 1.0])
-def test_opacities_of_exactly_zero_and_one(clamp_opacity: float):
+def test_opacities_of_exactly_zero_and_one():
     """Logits of ±200 are 0 and 1 in float32, as are infinite ones."""
     params = random_params(12)
     logits = torch.tensor([200.0, -200.0, math.inf, -math.inf]).repeat(3)
     params["opacities"].data = logits.clone()
     assert set(torch.sigmoid(logits).tolist()) == {0.0, 1.0}
-    numbers = train(short(clamp_opacity=clamp_opacity, absgs_every=0, structure_every=9, tau_split=1.0), params, 12)
+    numbers = train(short(absgs_every=0, structure_every=9, tau_split=1.0), params, 12)
     assert numbers[-1] == 12 and finite_or_infinite_logits(params)
     opacities = torch.sigmoid(params["opacities"].detach())
-    expected = clamp_opacity * (logits > 0)
+    expected = strategy_module.CLAMP_OPACITY * (logits > 0)
     torch.testing.assert_close(opacities, expected, atol=0.01, rtol=0)
 
     params["opacities"].data = logits.clone()
-    numbers = train(short(clamp_opacity=clamp_opacity, absgs_every=0, min_opacity=0.005, reset_every=11), params, 11)
+    numbers = train(short(absgs_every=0, min_opacity=0.005, reset_every=11), params, 11)
     assert numbers[-1] == 6, "those of opacity 0 are pruned"
     assert params["opacities"].isfinite().all()
     torch.testing.assert_close(
-        torch.sigmoid(params["opacities"].detach()), torch.full((6,), 0.1 * clamp_opacity), atol=0.01, rtol=0
+        torch.sigmoid(params["opacities"].detach()), torch.full((6,), 0.1 * strategy_module.CLAMP_OPACITY), atol=0.01, rtol=0
     )
 
 

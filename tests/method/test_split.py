@@ -11,7 +11,6 @@ from scenes import adam, camera, random_params, splat
 
 from sadgs_ns.method.split import (
     MAX_CHILDREN_PER_AXIS,
-    VARIANCE_EXTENT,
     children_per_axis,
     grid_offsets,
     grid_split,
@@ -25,16 +24,10 @@ def test_split_factor_is_the_ceiling_of_the_root():
     assert children_per_axis(eta_max, violates).tolist() == [[1, 1, 2], [2, 3, 1]]
 
 
-@pytest.mark.parametrize(("exponent", "expected"), [(0.25, 2), (0.5, 3), (0.75, 5)])
-def test_split_exponent(exponent: float, expected: int):
-    assert children_per_axis(torch.full((1, 3), 8.0), torch.ones(1, 3, dtype=torch.bool), exponent)[0, 0] == expected
-
-
 @pytest.mark.parametrize("eta_max", [1e3, 1e12, 3e38, math.inf])
-@pytest.mark.parametrize("exponent", [0.25, 0.5, 0.75])
-def test_no_parent_explodes(eta_max: float, exponent: float):
-    counts = children_per_axis(torch.full((1, 3), eta_max), torch.ones(1, 3, dtype=torch.bool), exponent)
-    assert counts.tolist() == [[min(MAX_CHILDREN_PER_AXIS, math.ceil(min(eta_max, 1e30) ** exponent))] * 3]
+def test_no_parent_explodes(eta_max: float):
+    counts = children_per_axis(torch.full((1, 3), eta_max), torch.ones(1, 3, dtype=torch.bool))
+    assert counts.tolist() == [[MAX_CHILDREN_PER_AXIS] * 3]
 
 
 def test_budget_goes_to_the_largest_violations():
@@ -163,9 +156,3 @@ def test_optimizer_state_and_statistics_follow():
         assert slots["exp_avg"].shape == params[name].shape and not slots["exp_avg"][3:].any()
         assert float(slots["step"]) == 1
     torch.testing.assert_close(optimizers["means"].state[params["means"]]["exp_avg"][:3], moments[kept])
-
-
-def test_a_smaller_extent_contracts_the_grid():
-    _, wide = grid_offsets(torch.tensor([[4, 1, 1]]), VARIANCE_EXTENT)
-    _, narrow = grid_offsets(torch.tensor([[4, 1, 1]]), 1.0)
-    torch.testing.assert_close(narrow * VARIANCE_EXTENT, wide)

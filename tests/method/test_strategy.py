@@ -8,12 +8,19 @@ import pytest
 import torch
 from scenes import adam, camera, random_params, training_step
 
+from sadgs_ns.method import strategy as strategy_module
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow
 from sadgs_ns.method.statistics import empty_statistics
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 
 WIDTH, HEIGHT = 64, 48
+
+
+@pytest.fixture(autouse=True)
+def no_final_prune(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Faint Gaussians stay at the end of densification, where a test does not say otherwise."""
+    monkeypatch.setattr(strategy_module, "FINAL_PRUNE_OPACITY", 0.0)
 
 
 def checker_images(views: int) -> torch.Tensor:
@@ -51,7 +58,7 @@ def short(**changes: Any) -> StructureAwareStrategy:
     """The schedule of 3,000 iterations, a hundredth as long."""
     defaults: dict[str, Any] = {
         "structure_every": 10, "absgs_every": 4, "refine_start_iter": 2, "refine_stop_iter": 24, "reset_every": 0,
-        "eta_every": 1, "eta_min_opacity": 0.0, "final_prune_opacity": 0.0, "min_opacity": 0.0,
+        "eta_every": 1, "split_min_opacity": 0.0, "min_observations": 1, "min_opacity": 0.0,
     }  # fmt: skip
     return StructureAwareStrategy(**{**defaults, **changes})
 
@@ -129,7 +136,7 @@ def test_keeping_all_gradients_changes_nothing():
         assert torch.equal(parameter, hoarded[name])
 
 
-def test_opacity_schedule():
+def test_opacity_schedule(monkeypatch: pytest.MonkeyPatch):
     def opacities(**changes: Any) -> torch.Tensor:
         params, _, _ = train(short(absgs_every=0, structure_every=0, **changes), 20)
         return torch.sigmoid(params["opacities"]).detach()
@@ -137,7 +144,8 @@ def test_opacity_schedule():
     plain = opacities()
     reset = opacities(reset_every=20, refine_stop_iter=30)
     torch.testing.assert_close(reset, 0.1 * plain, rtol=1e-4, atol=1e-5)
-    clamped, _, _ = train(short(absgs_every=0, tau_split=1.0, clamp_opacity=0.5), 10)
+    monkeypatch.setattr(strategy_module, "CLAMP_OPACITY", 0.5)
+    clamped, _, _ = train(short(absgs_every=0, tau_split=1.0), 10)
     assert torch.sigmoid(clamped["opacities"]).max() <= 0.5 + 1e-6
 
 
@@ -153,25 +161,24 @@ def test_statistics_end_with_densification():
     assert set(state) == {"scene_scale", "structure_steps"}
 
 
-def test_final_prune_removes_the_faint_once():
-    params, _, counts = train(short(absgs_every=0, structure_every=0, final_prune_opacity=0.5), 26)
+def test_final_prune_removes_the_faint_once(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(strategy_module, "FINAL_PRUNE_OPACITY", 0.5)
+    params, _, counts = train(short(absgs_every=0, structure_every=0), 26)
     assert counts[22] == 60 and 0 < counts[23] < 60
     assert len(set(counts[23:])) == 1
     assert len(params["means"]) == counts[-1]
 
 
 @pytest.mark.parametrize("end", ["with a structure step", "without"])
-def test_the_final_prune_spares_children_of_what_it_would_have_kept(end: str):
+def test_the_final_prune_spares_children_of_what_it_would_have_kept(end: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(strategy_module, "FINAL_PRUNE_OPACITY", 0.1)
     params = random_params(4)
     params["opacities"].data = torch.logit(torch.tensor([0.05, 0.12, 0.5, 0.12]))
     state = {"scene_scale": 1.0, **empty_statistics(4, torch.device("cpu")), **empty_gradients(4, torch.device("cpu"))}
     state["n_total"] += 10
     state["n_high"][:3, 0], state["eta_max"][:3, 0] = 10.0, 4.0  # all but the last are split in two
     stop = 20 if end == "with a structure step" else 21
-    strategy = short(
-        refine_stop_iter=stop, structure_every=20, absgs_every=0, child_scale=1.5, final_prune_opacity=0.1,
-        reset_every=0, prune_opacity=0.0,
-    )  # fmt: skip
+    strategy = short(refine_stop_iter=stop, structure_every=20, absgs_every=0, child_scale=1.5, reset_every=0)
     optimizers = adam(params, lr=0.0)
     strategy.step_post_backward(params, optimizers, state, 19, [])
     # 0.12 / 1.5 is under the final prune's 0.1: at the very end such children are new, later they had their chance.
@@ -184,7 +191,8 @@ def test_the_final_prune_spares_children_of_what_it_would_have_kept(end: str):
         assert len(params["means"]) == 3 and (params["opacities"].sigmoid() >= 0.1).all()
 
 
-def test_low_eta_and_low_opacity_together_prune():
+def test_low_eta_and_low_opacity_together_prune(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(strategy_module, "CLAMP_OPACITY", 1.0)
     params = random_params(4)
     params["opacities"].data = torch.logit(torch.tensor([0.05, 0.05, 0.5, 0.05]))
     state = {"scene_scale": 1.0, **empty_statistics(4, torch.device("cpu")), **empty_gradients(4, torch.device("cpu"))}
@@ -193,7 +201,7 @@ def test_low_eta_and_low_opacity_together_prune():
     state["n_low"][3] = torch.tensor([10.0, 10.0, 0.0])  # 3: faint, but one axis is not low
     optimizers = adam(params, lr=0.0)
     keep = params["means"].detach()[1:].clone()
-    short(clamp_opacity=1.0)._structure_step(params, optimizers, state, 10)
+    short()._structure_step(params, optimizers, state, 10)
     torch.testing.assert_close(params["means"].detach(), keep)
 
 
@@ -304,7 +312,7 @@ def test_what_would_be_split_now_keeps_to_the_cap():
     statistics["eta_max"][0, 0], statistics["eta_max"][1, 1] = 4.0, 9.0
     statistics["n_high"][:] = (statistics["eta_max"] > 1).to(statistics["n_high"])
     params = random_params(3)
-    strategy = StructureAwareStrategy(max_gaussians=6, min_observations=1, eta_min_opacity=0.0)
+    strategy = StructureAwareStrategy(max_gaussians=6, min_observations=1, split_min_opacity=0.0)
     assert strategy.children_now(params, statistics).tolist() == [[2, 1, 1], [1, 3, 1], [1, 1, 1]]
     strategy.max_gaussians = 5  # room for two more: the larger η comes first
     assert strategy.children_now(params, statistics).tolist() == [[1, 1, 1], [1, 3, 1], [1, 1, 1]]
@@ -312,6 +320,6 @@ def test_what_would_be_split_now_keeps_to_the_cap():
     assert (strategy.children_now(params, statistics) == 1).all()
     strategy.max_gaussians, strategy.min_observations = 6, 2
     assert (strategy.children_now(params, statistics) == 1).all(), "one observation is no consistency"
-    strategy.min_observations, strategy.eta_min_opacity = 1, 0.5
+    strategy.min_observations, strategy.split_min_opacity = 1, 0.5
     params["opacities"].data = torch.logit(torch.tensor([0.4, 0.6, 0.6]))
     assert strategy.children_now(params, statistics).tolist() == [[1, 1, 1], [1, 3, 1], [1, 1, 1]]

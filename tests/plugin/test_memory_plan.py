@@ -263,7 +263,7 @@ def test_ns_train_says_the_cap_at_the_start_and_keeps_it(
     config.pipeline.model.bounding_box_points = False
     strategy = config.pipeline.model.strategy
     strategy.max_gaussians, strategy.clone_grad2d, strategy.refine_start_iter = DEFAULT, 0.0, 1
-    strategy.final_prune_opacity = strategy.min_opacity = strategy.prune_opacity = 0.0
+    strategy.min_opacity = 0.0
     images = VIEWS * WIDTH * HEIGHT * 3 + 8 * WIDTH * HEIGHT * 3
     unbounded = copy.deepcopy(config)
     loss = 300 * WIDTH * HEIGHT  # in torch, since the device is the CPU; no phase takes more for so few Gaussians

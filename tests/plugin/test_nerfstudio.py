@@ -245,7 +245,6 @@ def test_the_mean_opacity_weighs_in_the_loss_while_densification_runs(colmap: Co
         absgs_every=0,
         structure_every=0,
         refine_stop_iter=4,
-        final_prune_opacity=0.0,
         reset_every=0,
     )
     config.pipeline.model.opacity_reg = 100.0  # against which the images weigh nothing

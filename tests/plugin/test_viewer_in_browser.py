@@ -58,7 +58,7 @@ def _has_legend(page: Page, path: Path) -> bool:
 def test_the_panel_shows_and_sets_what_is_chosen_in_a_browser(tmp_path: Path):
     write_scene(tmp_path / "scene", 64, 48, 10, points=300)
     config = configure(tmp_path / "scene", tmp_path / "runs", 30, save_every=0)
-    config.pipeline.model.strategy.eta_min_opacity = 0.0
+    config.pipeline.model.strategy.split_min_opacity = 0.0
     config.save_config()
     trainer = set_up(config)
     trainer.train()
