@@ -1,4 +1,4 @@
-"""`absgs.accumulate_gradients` in one kernel."""
+"""`method.absgs.accumulate_gradients` in one kernel."""
 
 # pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
 # (Triton's launch syntax, kernel[grid](...), is not in its types.)
@@ -11,24 +11,25 @@ from torch import Tensor
 
 from sadgs_ns.kernels.visibility import drawn
 
-_LANES = 256  # Gaussians a program handles
+_LANES = 256
+"""Gaussians that one program handles."""
 
 
 @triton.jit
 def _norm(gradient, at, seen, scale_x, scale_y):
-    """Length of a gradient, 0 where it is NaN."""
+    """Length of a gradient [LANES], 0 where it is NaN."""
     x, y = scale_x * tl.load(gradient + at, seen, 0.0), scale_y * tl.load(gradient + at + 1, seen, 0.0)
     length = tl.sqrt(x * x + y * y)
     return tl.where(length == length, length, 0.0)
 
 
-# Row lengths are not specialised: a kernel for those that 16 divides would compile anew as Gaussians are added.
+# Lengths are not specialised: Triton would compile another kernel when densification makes one that 16 divides.
 @triton.jit(do_not_specialize=["n", "num_views", "view", "row", "absolute_view", "absolute_row"])
 def _accumulate_gradients(
     radii, gradient, absolute, grad2d, absgrad2d, grad_count, n, num_views, view, row, absolute_view, absolute_row,
     scale_x, scale_y, PER_GAUSSIAN: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
-    """Rows of the gradients are `row` numbers apart, and views `view`."""
+    """Add one backward pass; rows of the gradients lie `row` numbers apart, and views `view` numbers."""
     g = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
     total = tl.zeros([LANES], tl.float32)
     absolute_total, count = total, total
@@ -51,17 +52,17 @@ def accumulate_gradients(
     absolute: Tensor,
     scales: tuple[float, float],
 ) -> None:
-    """As `absgs.accumulate_gradients`; a gradient longer than 1e19 counts as infinite.
+    """Do what `method.absgs.accumulate_gradients` does; a gradient longer than 1e19 counts as infinite.
 
     Args:
-        sums: grad2d, absgrad2d and grad_count, contiguous float32 [N], updated in place.
-        radii: px, of gsplat 1.4 [C, N] or 1.5 [C, N, 2]; not positive where culled.
-        gradient: By the centres in px, float32; may be part of the rows of a larger tensor. [C, N, 2]
-        absolute: The absolute one, likewise. [C, N, 2]
-        scales: What x and y of the gradients are multiplied by.
+        sums: grad2d, absgrad2d and grad_count, contiguous float32, updated in place. Each [N]
+        radii: px, int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5; not positive where a Gaussian was culled.
+        gradient: Of the loss by the centres in px, float32; it may be part of the rows of a larger tensor. [C, N, 2]
+        absolute: Sum over the pixels of that gradient's absolute values, with the same freedom of layout. [C, N, 2]
+        scales: Factors of the x and y components of both gradients.
     """
     num_views, n = radii.shape[:2]
-    # Parts of rows are read where they are; only a copy would give other layouts neighbouring x and y.
+    # The kernel reads parts of rows where they lie, but expects x and y side by side: other layouts are copied.
     gradient, absolute = (value if value.stride(2) == 1 else value.contiguous() for value in (gradient, absolute))
     _accumulate_gradients[triton.cdiv(n, _LANES),](
         radii.contiguous(), gradient, absolute, *sums, n, num_views, gradient.stride(0), gradient.stride(1),

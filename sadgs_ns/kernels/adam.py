@@ -1,4 +1,7 @@
-"""Adam, one launch for all parameters; torch's fused one reaches a third of the memory's bandwidth on Gaussians."""
+"""Adam for all parameters in one launch.
+
+On parameters of Gaussians torch's fused Adam reaches a third of the memory's bandwidth.
+"""
 
 # pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false
 # (Triton's launch syntax, kernel[grid](...), and its functions are not in its types.)
@@ -12,10 +15,12 @@ import triton.language as tl
 from torch import Tensor
 
 _BLOCK = 1024
+"""Numbers that one program updates."""
 
 
 @triton.jit
 def _moments_and_step(g, m, v, rate, scale, beta1, beta2, eps, noted, i, exists, MAX: tl.constexpr):
+    """New moments of a block, and the change of its parameters; notes a gradient that must be left out."""
     usable = tl.abs(g) < MAX  # NaN compares as false
     tl.store(noted + i * 0, float("nan"), exists & ~usable)
     g = tl.where(usable, g, 0.0)
@@ -29,22 +34,25 @@ def _update(
     parameters, gradients, means, squares, rates, scales, noted, rows, beta1, beta2, eps,
     WIDTHS: tl.constexpr, MAX: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    # Each program updates a block of one parameter. Sizes are made here of `rows`: as a tuple, Triton would look at
-    # which of them 16 divides, and compile anew when densification changes that.
+    """Update a block of one of the parameters, which together are covered by the grid.
+
+    The parameters' sizes are computed from `rows` here. If they were passed as a tuple, Triton would specialise the
+    kernel on which of them 16 divides, and compile anew when densification changes that.
+    """
     block = tl.program_id(0).to(tl.int64)
     n = rows.to(tl.int64) * WIDTHS[0]
     parameter, gradient, mean, square, rate, scale = (
         parameters[0], gradients[0], means[0], squares[0], rates[0], scales[0]
     )  # fmt: skip
     for k in tl.static_range(1, len(WIDTHS)):
-        if block * BLOCK >= n:  # it is of a later one
+        if block * BLOCK >= n:  # the block belongs to a later parameter
             block -= tl.cdiv(n, BLOCK)
             n = rows.to(tl.int64) * WIDTHS[k]
             parameter, gradient, mean, square, rate, scale = (
                 parameters[k], gradients[k], means[k], squares[k], rates[k], scales[k]
             )  # fmt: skip
     i = block * BLOCK + tl.arange(0, BLOCK)
-    if (block + 1) * BLOCK <= n:  # without a mask, memory is read in wide words
+    if (block + 1) * BLOCK <= n:  # the block is whole: without a mask, memory is read in wide words
         g, m, v = tl.load(gradient + i), tl.load(mean + i), tl.load(square + i)
         m, v, change = _moments_and_step(g, m, v, rate, scale, beta1, beta2, eps, noted, i, i < n, MAX)
         tl.store(mean + i, m)

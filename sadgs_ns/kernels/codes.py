@@ -1,4 +1,4 @@
-"""`codes.encode` in one kernel."""
+"""`method.codes.encode` in one kernel."""
 
 # pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
 # (Triton's launch syntax, kernel[grid](...), is not in its types.)
@@ -10,13 +10,15 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-_PIXELS = 1024  # a program handles
-_TINY = 1.1754943508222875e-38  # the smallest normal float32, whose logarithm is finite
+_PIXELS = 1024
+"""Pixels that one program handles."""
+_TINY = 1.1754943508222875e-38
+"""The smallest normal float32, whose logarithm is finite."""
 
 
 @triton.jit
 def _to_code(value, HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, TINY: tl.constexpr):
-    """Of a squared frequency. Codes are not negative: adding a half rounds them."""
+    """Code of a squared frequency plus a half, so that cutting the fraction off rounds it: codes are not negative."""
     octaves = 0.5 * tl.log2(tl.maximum(value, TINY) / (HIGHEST * HIGHEST))
     return tl.minimum(tl.maximum(255 + 254 * octaves / OCTAVES, 0.0), 255.0) + 0.5
 
@@ -44,7 +46,17 @@ def _encode(
 
 
 def encode(tensor: Tensor, highest_frequency: float, octaves: float, masked: int) -> Tensor:
-    """As `codes.encode`; where rounding decides, a code may be its neighbour. float32 [..., 3] → uint8 [..., 3]"""
+    """Do what `method.codes.encode` does; where rounding decides, a code may be its neighbour.
+
+    Args:
+        tensor: S̄ as (xx, xy, yy) in 1/px², finite or NaN, float32. [..., 3]
+        highest_frequency: HIGHEST_FREQUENCY of `method.codes`, in 1/px.
+        octaves: OCTAVES of `method.codes`.
+        masked: MASKED of `method.codes`.
+
+    Returns:
+        uint8 [..., 3]
+    """
     tensor = tensor.contiguous()
     codes = torch.empty_like(tensor, dtype=torch.uint8)
     n = tensor.numel() // 3

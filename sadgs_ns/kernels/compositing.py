@@ -27,12 +27,15 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 TILE_SIZE = 8
-"""px. Two pixels for each lane of the one warp that a tile gets."""
+"""px. Each lane of the one warp that a tile gets has two pixels."""
 PRECISION = "tf32x3"
-"""How Triton multiplies float32 on tensor cores: of each factor's two parts of 11 bits, three products. "tf32", of
-which one product is made, takes a fifth less time and errs by 4e-4 instead of 2e-5; "ieee" takes twice the time."""
+"""How Triton multiplies float32 on tensor cores. "tf32x3" makes three products of the two parts of 11 bits that each
+factor is cut into. "tf32" makes one, takes a fifth less time and errs by 4e-4 instead of 2e-5; "ieee" takes twice the
+time."""
 _GAUSSIANS, _WARPS = 16, 1
-_STRIDE = 12  # gradients of centre 2, conic 3, opacity 1, colour 3; absolute gradient of the centre 2; 1 unused
+"""Gaussians of a batch, and warps of a program."""
+_STRIDE = 12
+"""Numbers in a row of gradients: centre 2, conic 3, opacity 1, colour 3, the centre's absolute gradient 2, unused 1."""
 
 
 @triton.jit
@@ -49,7 +52,7 @@ if isinstance(_add, triton.JITFunction):
 
     @triton.jit
     def _reciprocal(value):
-        """One instruction; Triton's division spends four more on denormals."""
+        """1 / value in one instruction; Triton's division spends four more on denormals."""
         return tl.inline_asm_elementwise(
             "rcp.approx.ftz.f32 $0, $1;", "=r,r", [value], tl.float32, is_pure=True, pack=1
         )  # fmt: skip
@@ -62,14 +65,14 @@ else:  # Triton's interpreter, which knows no PTX
 
 @triton.jit
 def _row(values, ROW: tl.constexpr):
-    """One row of a block. Adding -0.0 changes nothing, so the compiler leaves no sum."""
+    """One row of a block. Adding −0.0 changes nothing, so that the compiler removes the sum."""
     rows = tl.arange(0, values.shape[0])[:, None]
     return tl.sum(tl.where(rows == ROW, values, -0.0), axis=0)
 
 
 @triton.jit
 def _rounded(values):
-    """To the nearest that tensor cores read, so that errors average out."""
+    """Values rounded to the nearest that tensor cores read, which cut the rest off: errors then average out."""
     return ((values.to(tl.int32, bitcast=True) + 4096) & -8192).to(tl.float32, bitcast=True)
 
 
@@ -99,16 +102,17 @@ def _join4(c0, c1, c2, c3):
 
 @triton.jit
 def _load_gaussians(means2d, conics, colors, opacities, g):
-    """Centre and opacity, conic, and colour of Gaussians [N, 1]: 3 x [N, 4].
+    """Centre and opacity, conic, and colour of the Gaussians with indices g [N, 1]: three blocks [N, 4].
 
-    A block of at least as many values as threads is spread over the threads; of a smaller one Triton would have every
-    thread load everything.
+    Triton spreads a block over the threads if it has at least as many values; of a smaller one every thread would load
+    everything.
     """
     k = tl.arange(0, 4)[None, :]
     centres = tl.load(tl.where(k < 2, means2d + 2 * g + k, opacities + g))
     k = tl.minimum(k, 2)
     rgb = tl.load(colors + 3 * g + k)
-    # A colour that is no number makes its pixels NaN; what lies in front elsewhere must not become NaN from 0 * NaN.
+    # A colour that is not finite makes the pixels that see it NaN. Elsewhere its weight is 0, but 0 · NaN would reach
+    # the gradients of the Gaussians in front of it: here it counts as 0.
     return centres, tl.load(conics + 3 * g + k), tl.where(tl.abs(rgb) < float("inf"), rgb, 0.0)
 
 
@@ -121,8 +125,8 @@ def _composite_backward(
 ):  # fmt: skip
     """Add one tile's share to the gradients [C * N, STRIDE].
 
-    Blocks are [Gaussians, pixels], from the back. With one warp, a thread holds all Gaussians of its two pixels, and
-    what accumulates from Gaussian to Gaussian stays in its registers.
+    The kernel goes through the list from the back, in blocks [Gaussians, pixels]. With one warp, a thread holds all
+    Gaussians of its two pixels, and what accumulates from Gaussian to Gaussian stays in its registers.
     """
     PIXELS: tl.constexpr = TILE * TILE
     FAINTEST = tl.constexpr(0x3B808081)  # bits of 1/255
@@ -140,7 +144,7 @@ def _composite_backward(
     if tile + 1 < tl.num_programs(0):
         end = tl.load(starts + tile + 1)
     end = tl.minimum(end, tl.max(last) + 1)
-    # Offsets from the tile's centre: small, and exact in 11 bits.
+    # Pixels are counted from the tile's centre: these offsets are small, and exact in 11 bits.
     x, y = x.to(tl.float32) - (TILE - 1) / 2, y.to(tl.float32) - (TILE - 1) / 2
     scaled_x, scaled_y = SCALE * x, SCALE * y
     centre_x, centre_y = column.to(tl.float32) * TILE + TILE / 2, row.to(tl.float32) * TILE + TILE / 2
@@ -157,7 +161,7 @@ def _composite_backward(
     finite = finite & (red == red) & (green == green) & (blue == blue) & (v_alpha == v_alpha)
     red, green, blue = tl.where(finite, red, 0.0), tl.where(finite, green, 0.0), tl.where(finite, blue, 0.0)
     transmittance = 1 - tl.load(alphas + at, inside, 0.0)
-    # Colour behind the present Gaussian times its gradient; alpha is minus a background of one.
+    # The colour behind the present Gaussian times the pixel's gradient; alpha counts as minus a background of one.
     behind = tl.where(finite, -v_alpha, 0.0) * transmittance
 
     k = tl.arange(0, 8)[None, :]
@@ -179,7 +183,7 @@ def _composite_backward(
         mean_x, mean_y, opacity, _ = _split4(next_centre)
         a, b, c, _ = _split4(next_conic)
         r, g_, b_, _ = _split4(next_rgb)
-        # The next batch is on its way while this one is computed.
+        # The next batch is loaded while this one is computed.
         next_g = tl.load(ids + tl.maximum(position - GAUSSIANS, start))
         next_centre, next_conic, next_rgb = _load_gaussians(means2d, conics, colors, opacities, next_g[:, None])
         mean_x -= centre_x
@@ -206,10 +210,10 @@ def _composite_backward(
         share = tl.associative_scan(tl.where(first_row, share + behind[None, :], share), 0, _add)
         behind = _row(share, GAUSSIANS - 1)
         by_color = tl.dot(weight, v_rgb, input_precision=PRECISION)
-        # front * color - what is behind / (1 - alpha), with the Gaussian's own share in what is behind
+        # This is front · color − behind / (1 − alpha), where `share` includes the Gaussian's own share in `behind`.
         v_sigma = tl.where(alpha < 0.999, alpha * ratio * (share - color * front), 0.0)
         if ABSGRAD:
-            # A thread's two pixels first.
+            # Each thread adds its two pixels first.
             slope_x = tl.abs(v_sigma * (a[:, None] * dx + b[:, None] * dy))
             slope_x = tl.sum(tl.reshape(slope_x, [GAUSSIANS, 2, PIXELS // 2]), axis=1)
             slope_y = tl.abs(v_sigma * (b[:, None] * dx + c[:, None] * dy))
@@ -249,7 +253,7 @@ def composite_backward(
     v_alphas: Tensor | None,
     absgrad: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]:
-    """Gradients of gsplat's compositing of three channels in tiles of TILE_SIZE. Tensors are contiguous, in float32.
+    """Gradients of gsplat's compositing of three channels in tiles of TILE_SIZE; all tensors are contiguous float32.
 
     A pixel whose gradient is not finite, or at least 1e18, makes the gradients of the Gaussians that it sees NaN, and
     of no others.
@@ -286,11 +290,11 @@ def composite_backward(
 
 
 class _RasterizeToPixels(_wrapper._RasterizeToPixels):
-    """gsplat's function, whose forward pass saves the same tensors in 1.4 and 1.5, with another backward pass."""
+    """gsplat's autograd function, which saves the same tensors in 1.4 and 1.5, with another backward pass."""
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor]:
-        ctx.set_materialize_grads(False)  # where nothing depends on alphas, their gradient would be an image of zeros
+        ctx.set_materialize_grads(False)  # torch would fill an image with zeros where nothing depends on alphas
         return _wrapper._RasterizeToPixels.forward(ctx, *inputs)
 
     @staticmethod
@@ -328,8 +332,8 @@ def rasterize_to_pixels(
         conics: In 1/px². [C, N, 3]
         colors: [C, N, 3]
         opacities: In [0, 1]. [C, N]
-        width: px.
-        height: px.
+        width: Of the images in px.
+        height: Of the images in px.
         isect_offsets: Where each tile's list starts, int32 [C, tile rows, tile columns].
         flatten_ids: Indices in C·N, int32 [number of pairs].
         absgrad: Whether to sum the absolute gradients of the centres, too.

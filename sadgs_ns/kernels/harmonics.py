@@ -1,7 +1,7 @@
-"""Colours from spherical harmonics, read and differentiated in place; in place of gsplat's `spherical_harmonics`.
+"""Colours of Gaussians from spherical harmonics, instead of gsplat's `spherical_harmonics`.
 
-gsplat takes all coefficients in one tensor, once per view; the parameters are two tensors, which the views share. Here
-nothing is concatenated or expanded, and the gradients arrive summed over the views.
+gsplat takes all coefficients in one tensor, once per view, while the parameters are two tensors, which the views share.
+Here nothing is concatenated or expanded, and the gradients arrive summed over the views.
 """
 
 # pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false
@@ -20,13 +20,15 @@ from sadgs_ns.kernels.visibility import drawn
 
 MAX_DEGREE = 3
 """Highest degree that the kernels know."""
-_LANES, _BACKWARD_LANES = 128, 32  # Gaussians a program handles; with four threads for each backwards
-_VIEWS = 2  # how many views' gradients are summed in registers; more views take more launches
+_LANES, _BACKWARD_LANES = 128, 32
+"""Gaussians that one program handles, forward and backward, where each has four threads."""
+_VIEWS = 2
+"""Views whose gradients one launch sums in registers; more views take more launches."""
 
 
 @triton.jit
 def _minus_centre(viewmat, column):
-    """A coordinate of the camera's centre, −Rᵀ t, with the sign changed."""
+    """A coordinate of Rᵀ t, which is minus the camera's centre."""
     x = tl.load(viewmat + column) * tl.load(viewmat + 3)
     y = tl.load(viewmat + 4 + column) * tl.load(viewmat + 7)
     return x + y + tl.load(viewmat + 8 + column) * tl.load(viewmat + 11)
@@ -34,7 +36,7 @@ def _minus_centre(viewmat, column):
 
 @triton.jit
 def _direction(means, viewmats, view, g, exists):
-    """Unit vector from the camera to the Gaussian, and the inverse of its length."""
+    """Unit vector from the camera to each Gaussian, and the inverse of their distance."""
     viewmat = viewmats + 16 * view
     x = tl.load(means + 3 * g, exists, 1.0) + _minus_centre(viewmat, 0)
     y = tl.load(means + 3 * g + 1, exists, 0.0) + _minus_centre(viewmat, 1)
@@ -131,6 +133,7 @@ def _slopes(x, y, z):
 def _forward(
     means, viewmats, first, rest, radii, colors, n, used, stride, PER_GAUSSIAN: tl.constexpr, LANES: tl.constexpr
 ):  # fmt: skip
+    """Colours of LANES Gaussians in one view; rows of `rest` lie `stride` numbers apart."""
     g = tl.program_id(0) * LANES + tl.arange(0, LANES)
     view = tl.program_id(1)
     at = view * n + g
@@ -154,6 +157,7 @@ def _forward(
 
 @triton.jit
 def _add(sums, basis, v):
+    """Sums of the coefficients' gradients [LANES, 4] with one view's added."""
     return (
         sums[0] + basis[0][:, None] * v,
         sums[1] + basis[1][:, None] * v,
@@ -173,7 +177,7 @@ def _add(sums, basis, v):
     )
 
 
-# The colours' gradients may be parts of rows: whether these lie at 16 bytes would compile anew.
+# The colours' gradients may be parts of rows that begin at no multiple of 16 bytes: Triton would compile a new kernel.
 @triton.jit(
     do_not_specialize=["n", "start", "num_views", "used", "stride", "row"],
     do_not_specialize_on_alignment=["v_colors"],
@@ -182,10 +186,10 @@ def _backward(
     means, viewmats, rest, radii, colors, v_colors, v_means, v_first, v_rest, n, start, num_views, used, stride, row,
     PER_GAUSSIAN: tl.constexpr, LANES: tl.constexpr, VIEWS: tl.constexpr,
 ):  # fmt: skip
-    """Gradients from VIEWS views, added to those from the views before `start`.
+    """Add the gradients of VIEWS views to those of the views before `start`.
 
-    A Gaussian's three channels lie in neighbouring threads, as in memory; the fourth does nothing. Rows of the colours'
-    gradients are `row` numbers apart.
+    Three neighbouring threads have the three channels of a Gaussian, as they lie in memory; a fourth does nothing. Rows
+    of the colours' gradients lie `row` numbers apart.
     """
     g = tl.program_id(0) * LANES + tl.arange(0, LANES)
     channel = tl.arange(0, 4)[None, :]
@@ -255,7 +259,7 @@ class _Colors(torch.autograd.Function):
         written = rest.shape[1] < (MAX_DEGREE + 1) ** 2
         v_rest = torch.empty_like(rest) if written else torch.zeros_like(rest)
         row, stride = v_colors.stride(1), rest.shape[1] * 3
-        if v_colors.stride() != (n * row, row, 1):  # parts of rows, as compositing makes them, are read where they are
+        if v_colors.stride() != (n * row, row, 1):  # parts of rows, which compositing makes, are read where they lie
             v_colors, row = v_colors.contiguous(), 3
         for start in range(0, num_views, _VIEWS):
             _backward[triton.cdiv(n, _BACKWARD_LANES),](
@@ -268,18 +272,18 @@ class _Colors(torch.autograd.Function):
 def colors_from_harmonics(
     degree: int, means: Tensor, first: Tensor, rest: Tensor, viewmats: Tensor, radii: Tensor
 ) -> Tensor:
-    """max(Σ_k Y_k(direction) · coefficient_k + 0.5, 0), the colours that 3DGS gives Gaussians seen from cameras.
+    """Colours that 3DGS gives Gaussians seen from cameras: max(Σ_k Y_k(direction) · coefficient_k + 0.5, 0).
 
     Args:
         degree: Highest degree to use, 0 … 3.
         means: Centres in world space, float32. [N, 3]
-        first: Coefficient of degree 0. [N, 3]
-        rest: The others, at least those that `degree` needs. [N, K − 1, 3]
+        first: Coefficients of degree 0. [N, 3]
+        rest: Coefficients of the higher degrees, at least of those that `degree` needs. [N, K − 1, 3]
         viewmats: World-to-camera transforms, rigid, which get no gradient. [C, 4, 4]
-        radii: px, of gsplat 1.4 [C, N] or 1.5 [C, N, 2]; where one is not positive, the colour means nothing.
+        radii: px, int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5; where one is not positive, the colour means nothing.
 
     Returns:
-        [C, N, 3]
+        Not negative. [C, N, 3]
     """
     tensors = (value.contiguous() for value in (means, first, rest, viewmats, radii))
     return _Colors.apply(*tensors, (degree + 1) ** 2 - 1)  # type: ignore[return-value]

@@ -1,7 +1,8 @@
-"""`losses.photometric_loss` in five kernels: two separable blurs and the sums forward, the blurs' adjoints backward.
+"""`method.losses.photometric_loss` in five kernels: separable blurs and sums forward, the blurs' adjoints backward.
 
-Images stay [C, H, W, 3]: a row is 3W numbers, a horizontal neighbour 3 numbers away. The window is symmetric, so the
-adjoint of a blur is the same blur of the zero-padded map. Sizes are not specialised: other images would compile anew.
+Images stay [C, H, W, 3]: a row has 3W numbers, and a horizontal neighbour lies 3 numbers away. The window is symmetric,
+so that the adjoint of a blur is the same blur of the zero-padded map. Sizes are not specialised, since Triton would
+compile the kernels anew for other images.
 """
 
 # pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
@@ -19,13 +20,17 @@ from torch import Tensor
 
 from sadgs_ns.kernels.limits import check_pixels
 
-_STRIP, _RUN, _COLUMNS = 256, 8, 128  # numbers a program handles: along a row, or in columns and along a row
-_LANES = 4096  # partial sums that are added at once
+_STRIP = 256
+"""Numbers along the rows that one program handles."""
+_RUN, _COLUMNS = 8, 128
+"""Rows and columns of numbers that one program handles."""
+_LANES = 4096
+"""Partial sums that are added at once."""
 
 
 @triton.jit(do_not_specialize=["n"])
 def _blur_along_rows(x, y, blurred, sums, n, GAUSSIAN: tl.constexpr, STRIP: tl.constexpr):
-    """E[x], E[y], E[x²], E[y²], E[xy], and partial sums of |x − y| and (x − y)².
+    """Blur x, y, x², y² and xy along the rows, and sum |x − y| and (x − y)² in parts.
 
     The window begins at each number. Where it leaves the row, what is written is never read.
     """
@@ -51,9 +56,9 @@ def _blur_along_rows(x, y, blurred, sums, n, GAUSSIAN: tl.constexpr, STRIP: tl.c
 
 @triton.jit
 def _blur_along_columns(x, i, row, begin, end, exists, GAUSSIAN: tl.constexpr, RUN: tl.constexpr):
-    """RUN blurred numbers one below the other, of columns from i on, whose rows from begin to end exist.
+    """RUN blurred numbers below each other in the columns from i on, of which the rows from `begin` to `end` exist.
 
-    Each number is read once for all of them. With loads for each by itself the kernels took 255 registers, now 96.
+    Each number is loaded once for all of them: with loads for each by itself the kernels took 255 registers, not 96.
     """
     zero = tl.zeros_like(i).to(tl.float32)
     blurred = ()
@@ -75,7 +80,10 @@ def _blur_along_columns(x, i, row, begin, end, exists, GAUSSIAN: tl.constexpr, R
 def _similarity(
     blurred, slopes, sums, n, height, row, GAUSSIAN: tl.constexpr, RUN: tl.constexpr, COLUMNS: tl.constexpr
 ):
-    """Blur along columns; sums of SSIM, and its derivatives by E[x], E[x²] and E[xy], 0 where there is no window."""
+    """Blur along the columns, sum SSIM in parts, and write its derivatives by E[x], E[x²] and E[xy].
+
+    The derivatives are 0 where no whole window begins.
+    """
     c = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)
     first = tl.program_id(1) * RUN
     exists = c < row - 3 * (len(GAUSSIAN) - 1)
@@ -109,7 +117,7 @@ def _similarity(
 
 @triton.jit
 def _total(values, count, LANES: tl.constexpr):
-    """Sum of all, in an order that is always the same. Each lane adds few, so that rounding stays that of a tree."""
+    """Sum of all values in an order that is always the same; each lane adds few, so that rounding stays a tree's."""
     sums = tl.zeros([LANES], tl.float32)
     for start in range(0, count, LANES):
         i = start + tl.arange(0, LANES)
@@ -122,7 +130,7 @@ def _finish(
     differences, similarities, loss, psnr, n, num_strips, num_tiles, ssim_lambda, l1_weight, ssim_weight, l2_weight,
     LANES: tl.constexpr,
 ):  # fmt: skip
-    """The loss and PSNR of the partial sums, in a program that runs once."""
+    """Compute the loss and PSNR from the partial sums, in one program."""
     absolute, square = _total(differences, num_strips, LANES), _total(differences + num_strips, num_strips, LANES)
     of_ssim = ssim_lambda - ssim_weight * _total(similarities, num_tiles, LANES)
     tl.store(loss + tl.program_id(0), l1_weight * absolute + of_ssim + l2_weight * square)
@@ -133,7 +141,7 @@ def _finish(
 
 @triton.jit(do_not_specialize=["n"])
 def _spread_along_rows(slopes, spread, n, GAUSSIAN: tl.constexpr, STRIP: tl.constexpr):
-    """Adjoint of the blur along rows, of all three derivatives. Beyond a row's start lie the zeros of another's end."""
+    """Adjoint of the blur along the rows, of three derivatives; before a row's start lie the zeros of another's end."""
     i = tl.program_id(0) * STRIP + tl.arange(0, STRIP)
     size = tl.cast(n, tl.int64)
     by_x = tl.zeros([STRIP], tl.float32)
@@ -154,7 +162,7 @@ def _gradient(
     x, y, spread, upstream, gradient, n, height, row, l1_weight, ssim_weight, l2_weight,
     GAUSSIAN: tl.constexpr, RUN: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
-    """Adjoint of the blur along columns, and the gradient of the whole loss by x."""
+    """Adjoint of the blur along the columns, and with it the gradient of the whole loss by x."""
     c = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)
     first = tl.program_id(1) * RUN
     exists = c < row
@@ -197,7 +205,7 @@ class _PhotometricLoss(torch.autograd.Function):
             num_warps=8,
         )  # fmt: skip
         ctx.mark_non_differentiable(psnr)
-        ctx.set_materialize_grads(False)  # PSNR's would be filled with zeros on the device
+        ctx.set_materialize_grads(False)  # torch would fill PSNR's gradient with zeros on the device
         return loss, psnr
 
     @staticmethod
@@ -218,17 +226,17 @@ class _PhotometricLoss(torch.autograd.Function):
 def photometric_loss(
     predicted: Tensor, target: Tensor, window: tuple[float, ...], *, ssim_lambda: float, l2_lambda: float
 ) -> tuple[Tensor, Tensor]:
-    """As `losses.photometric_loss`, for views at least as large as SSIM's window; PSNR carries no gradient.
+    """Do what `method.losses.photometric_loss` does, for views at least as large as SSIM's window.
 
     Args:
-        predicted: float32 [C, H, W, 3]
-        target: float32 [C, H, W, 3]
+        predicted: Rendered views, float32. [C, H, W, 3]
+        target: Training views in [0, 1], float32. [C, H, W, 3]
         window: Weights of SSIM's window along one axis, symmetric.
         ssim_lambda: λ in [0, 1].
         l2_lambda: λ_2 ≥ 0.
 
     Returns:
-        The loss and PSNR in dB, both scalars.
+        The loss, and PSNR in dB without gradient; both scalars.
 
     Raises:
         InputError: If the views have more pixels than the kernels can address (limits.py).

@@ -15,11 +15,11 @@ from sadgs_ns.kernels.limits import check_gaussians, check_pixels
 from sadgs_ns.kernels.tiles import intersect_tiles
 
 BACKWARD: Literal["moments", "gsplat"] = "moments"
-"""Who differentiates the compositing of three channels: our kernel (compositing.py) or gsplat's, its reference."""
+"""Which kernel differentiates the compositing of three channels: ours (compositing.py), or gsplat's as a reference."""
 TILE_SIZE = compositing.TILE_SIZE
-"""px. gsplat's default of 16 saves list entries; with exact lists, pixels saved weigh more (docs/measurements.md)."""
+"""px. gsplat's default of 16 saves list entries; with exact lists, saved pixels matter more (docs/measurements.md)."""
 _BOUNDS_RADII = "opacities" in inspect.signature(fully_fused_projection).parameters
-"""gsplat 1.5 takes opacities to bound the radii."""
+"""Whether the installed gsplat takes opacities to bound the radii, as 1.5 does."""
 
 
 def rasterization(
@@ -39,7 +39,8 @@ def rasterization(
     absgrad: bool,
     rasterize_mode: Literal["classic", "antialiased"],
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Render as the installed `gsplat.rasterization(..., tile_size=TILE_SIZE)` does; see `rasterization.rasterize`.
+    """Render as the installed `gsplat.rasterization(..., tile_size=TILE_SIZE)` does; see
+    `render.rasterization.rasterize`.
 
     Raises:
         ValueError: If `packed`.
@@ -63,8 +64,8 @@ def rasterization(
         calc_compensations=rasterize_mode == "antialiased",
         **bound,
     )
-    # Copied once, for the tiles and for compositing. Not by `expand`: torch reduces its gradient over the views, even
-    # over one, ten times as slowly as it adds.
+    # One copy serves the tiles and compositing. `expand` would be slower: torch reduces its gradient over the views,
+    # even over one, ten times as slowly as it adds.
     opacities = torch.stack([opacities] * num_views) if compensations is None else opacities * compensations
     # The host waits for the lists' length: the colours are computed meanwhile.
     pending_tiles = intersect_tiles(means2d, radii, depths, conics, opacities, width, height, TILE_SIZE)

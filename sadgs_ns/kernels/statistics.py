@@ -1,4 +1,4 @@
-"""`statistics.observe` in one kernel: project the axes, sample S̄ in the footprint, update the counts."""
+"""`method.statistics.observe` in one kernel: project the axes, sample S̄ in the footprint, update the counts."""
 
 # pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false
 # (Triton's launch syntax, kernel[grid](...), and its functions are not in its types.)
@@ -10,10 +10,12 @@ import triton.language as tl
 from torch import Tensor
 
 _LANES = 128
+"""Gaussians that one program handles."""
 
 
 @triton.jit
 def _hypot(a, b):
+    """√(a² + b²) without overflow."""
     a, b = tl.abs(a), tl.abs(b)
     large = tl.maximum(tl.maximum(a, b), 1e-37)
     small = tl.minimum(a, b) / large
@@ -22,14 +24,14 @@ def _hypot(a, b):
 
 @triton.jit
 def _matrix_row(matrix, row, x, y, z):
-    """Row of a 3×3 matrix, of which rows are 4 apart, times a vector."""
+    """One row of a 3×3 matrix, whose rows lie 4 numbers apart, times a vector."""
     at = matrix + 4 * row
     return tl.load(at) * x + tl.load(at + 1) * y + tl.load(at + 2) * z
 
 
 @triton.jit
 def _screen_axis(viewmat, x, y, z, scale, jxx, jxz, jyy, jyz):
-    """J W times an axis of the Gaussian, x and y, in px."""
+    """J W times one axis of the Gaussian: x and y in px."""
     to_right, down = _matrix_row(viewmat, 0, x, y, z), _matrix_row(viewmat, 1, x, y, z)
     forward = _matrix_row(viewmat, 2, x, y, z)
     return (jxx * to_right + jxz * forward) * scale, (jyy * down + jyz * forward) * scale
@@ -37,6 +39,7 @@ def _screen_axis(viewmat, x, y, z, scale, jxx, jxz, jyy, jyz):
 
 @triton.jit
 def _eta(u, v, xx, xy, yy, EPSILON: tl.constexpr, DIRECTIONAL: tl.constexpr):
+    """η of one axis (u, v), as in `method.eta.eta`."""
     length = _hypot(u, v)
     if DIRECTIONAL:
         u, v = u / length, v / length  # lengths² overflow
@@ -48,18 +51,20 @@ def _eta(u, v, xx, xy, yy, EPSILON: tl.constexpr, DIRECTIONAL: tl.constexpr):
 
 @triton.jit
 def _frequency(code, HIGHEST: tl.constexpr, OCTAVES: tl.constexpr):
-    """As in `codes.decode`."""
+    """Frequency of a code in 1/px, as in `method.codes.decode`."""
     return tl.where(code > 0, HIGHEST * tl.exp2(OCTAVES * ((code - 1) / 254 - 1)), 0.0)
 
 
 @triton.jit
 def _add_axis(n_high, n_low, eta_max, at, high, low, most, changed):
+    """Add what the views brought for one axis to the statistics in memory."""
     tl.store(n_high + at, tl.load(n_high + at, changed, 0.0) + high, changed)
     tl.store(n_low + at, tl.load(n_low + at, changed, 0.0) + low, changed)
     tl.store(eta_max + at, tl.maximum(tl.load(eta_max + at, changed, 0.0), most), changed)
 
 
-# One view's intrinsics and codes may be part of a tensor of several: whether they lie at 16 bytes would compile anew.
+# One view's intrinsics and codes may be part of a tensor of several views, and begin at no multiple of 16 bytes: Triton
+# would compile another kernel for that.
 @triton.jit(
     do_not_specialize=["n", "num_views", "width", "height"],
     do_not_specialize_on_alignment=["structure_tensors", "Ks"],
@@ -70,6 +75,7 @@ def _observe(
     HIGH: tl.constexpr, LOW: tl.constexpr, BLUR: tl.constexpr, MARGIN: tl.constexpr, EPSILON: tl.constexpr,
     HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, MASKED: tl.constexpr, DIRECTIONAL: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
+    """Observe LANES Gaussians in all views."""
     g = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
     candidate = (g < n) & (tl.load(opacities + g, g < n, float("-inf")) >= min_logit)
     x = tl.load(means + 3 * g, candidate, 0.0)
@@ -88,12 +94,12 @@ def _observe(
     for view in range(num_views):
         at = view * tl.cast(n, tl.int64) + g
         seen = candidate & (tl.load(drawn + at, candidate, 0) != 0)
-        # The sample, from the Cholesky factor of Σ2D; in float64, for a long thin Gaussian's determinant cancels.
+        # The sample comes from the Cholesky factor of Σ2D, in float64: a long thin Gaussian's determinant cancels.
         a = tl.load(conics + 3 * at, seen, 1.0).to(tl.float64)
         b = tl.load(conics + 3 * at + 1, seen, 0.0).to(tl.float64)
         c = tl.load(conics + 3 * at + 2, seen, 1.0).to(tl.float64)
         determinant = a * c - b * b
-        # Triton's maximum drops NaN on a GPU, so what is not finite is told by comparison, here, of S̄ and of η.
+        # Triton's maximum drops NaN on a GPU, so comparisons find what is not finite: here, in S̄ and in η.
         seen = seen & (tl.abs(determinant) < float("inf"))
         inverse = 1 / tl.maximum(tl.maximum(determinant, 1.1920928955078125e-07 * a * c), 2.2250738585072014e-308)
         xx = tl.maximum(c * inverse - BLUR, 0.0)
@@ -179,23 +185,23 @@ def observe_views(
     constants: tuple[float, float, float],
     code_range: tuple[float, float, int],
 ) -> None:
-    """As the loop in `statistics.observe`, all views at once.
+    """Do what the loop in `method.statistics.observe` does, for all views at once.
 
     Args:
         statistics: n_high, n_low, eta_max [N, 3] and n_total [N], float32, updated in place.
-        params: means [N, 3], quats [N, 4], log scales [N, 3] and logit opacities, N of them.
+        params: means [N, 3], quats [N, 4], log scales [N, 3] and logit opacities [N] or [N, 1], float32.
         drawn: Which Gaussians the forward pass drew. bool [C, N]
         means2d: px. [C, N, 2]
         conics: 1/px². [C, N, 3]
         jitter: In [0, 1). [C, N, 2]
-        structure_tensors: S̄, or its codes of `codes.encode`. [C, H, W, 3]
-        viewmats: [C, 4, 4]
-        Ks: px. [C, 3, 3]
-        min_logit: Logit of the opacity from which a Gaussian is observed.
+        structure_tensors: S̄ in 1/px², or its codes of `codes.encode`. [C, H, W, 3]
+        viewmats: World to camera. [C, 4, 4]
+        Ks: Intrinsics in px. [C, 3, 3]
+        min_logit: Logit of the opacity from which on a Gaussian is observed.
         directional: Use η^(proj).
-        thresholds: η above the first is high, below the second low.
+        thresholds: η above the first is high, and below the second it is low.
         constants: gsplat's blur in px², its margin of the frustum, and ε of the wavelength in 1/px.
-        code_range: HIGHEST_FREQUENCY, OCTAVES and MASKED of `codes`.
+        code_range: HIGHEST_FREQUENCY, OCTAVES and MASKED of `method.codes`.
     """
     inputs = (*params, drawn, means2d, conics, jitter, structure_tensors, viewmats, Ks)
     num_views, n = drawn.shape

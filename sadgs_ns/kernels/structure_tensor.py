@@ -101,11 +101,11 @@ def _aggregate(
 
 
 def correlate(image: Tensor, kernel: Tensor, axis: int) -> Tensor:
-    """Correlate along one image axis with zeros outside, as torch's conv2d with the same kernel for every channel.
+    """Do what `_correlate` of `method.structure_tensor` does, in float32.
 
     Args:
         image: float32 [B, C, H, W]
-        kernel: float32 [K], K odd.
+        kernel: K is odd, float32. [K]
         axis: 2 for rows (y), 3 for columns (x).
     """
     image = image.contiguous()
@@ -120,7 +120,7 @@ def correlate(image: Tensor, kernel: Tensor, axis: int) -> Tensor:
 def differentiate(
     blurs: tuple[Tensor, Tensor, Tensor], totals: tuple[Tensor, Tensor, Tensor], weight: Tensor, previous: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """As `structure_tensor._differentiate`, in float32; the first of `blurs` is overwritten."""
+    """Do what `_differentiate` of `method.structure_tensor` does, in float32; the first of `blurs` is overwritten."""
     batch, channels, height, width = blurs[0].shape
     products, energy = (blurs[0].new_empty((batch, planes, height, width)) for planes in (3, 1))
     n = height * width
@@ -140,7 +140,7 @@ def aggregate(
     exponent: float,
     frequency: float,
 ) -> None:
-    """As `structure_tensor._aggregate`, in float32."""
+    """Do what `_aggregate` of `method.structure_tensor` does, in float32."""
     n = tensor[0].shape[2] * tensor[0].shape[3]
     _aggregate[triton.cdiv(n, _PIXELS), len(tensor[0])](
         *tensor, *energy, trace_floor, numerator, denominator,

@@ -1,4 +1,4 @@
-"""Which Gaussians reach which tile of the image, exactly: the lists that gsplat's `rasterize_to_pixels` walks through.
+"""Exact lists of the Gaussians that reach each tile of the image, which gsplat's `rasterize_to_pixels` walks through.
 
 gsplat lists a Gaussian in every tile that its 3σ square (1.4) or rectangle (1.5) touches. Most of a long, thin or faint
 Gaussian's square lies outside the ellipse in which it is at least 1/255 opaque, and there the rasterizer skips it pixel
@@ -22,7 +22,8 @@ from torch import Tensor
 
 from sadgs_ns.kernels.limits import check_pairs
 
-_LANES = 32  # Gaussians a program handles: one warp, so that a large one holds up only 31 others
+_LANES = 32
+"""Gaussians that one program handles: one warp of them, so that a large Gaussian holds up only 31 others."""
 
 
 @triton.jit
@@ -30,13 +31,19 @@ def _load_ellipse(
     means2d, radii, conics, opacities, g, exists, tile_width, tile_height,
     PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr,
 ):  # fmt: skip
-    """Centre, conic, level 2 ln(255 α), reach in y, and the tile rows and columns that gsplat would list."""
+    """What decides which tiles the Gaussians with indices g in C · N reach.
+
+    Returns:
+        The centre x, y; the conic a, b, c; the level 2 ln(255 α) at which the ellipse ends; the conic's determinant;
+        whether these are proper numbers, without which every tile of gsplat's is listed; and the first and one past the
+        last column and row of tiles.
+    """
     rx = tl.load(radii + PER_GAUSSIAN * g, exists, 0).to(tl.float32)
     ry = rx
     if PER_GAUSSIAN == 2:
         ry = tl.load(radii + 2 * g + 1, exists, 0).to(tl.float32)
     opacity = 255.0 * tl.load(opacities + g, exists, 0.0)
-    drawn = exists & (rx > 0) & (ry > 0) & (opacity >= 1)  # gsplat leaves the rest of what it culls unwritten
+    drawn = exists & (rx > 0) & (ry > 0) & (opacity >= 1)  # gsplat leaves what it culls unwritten
     x, y = tl.load(means2d + 2 * g, drawn, 0.0), tl.load(means2d + 2 * g + 1, drawn, 0.0)
     drawn = drawn & (tl.abs(x) < float("inf")) & (tl.abs(y) < float("inf"))
     x, y = tl.where(drawn, x, 0.0), tl.where(drawn, y, 0.0)
@@ -46,7 +53,7 @@ def _load_ellipse(
     # The determinant of a thin Gaussian's conic cancels in float32, and so does its exponent in gsplat: the level is
     # raised by what rounding may add there.
     determinant = (a.to(tl.float64) * c.to(tl.float64) - b.to(tl.float64) * b.to(tl.float64)).to(tl.float32)
-    proper = (determinant > 1e-30) & (determinant < float("inf"))  # otherwise every tile of gsplat's
+    proper = (determinant > 1e-30) & (determinant < float("inf"))  # otherwise every tile of gsplat's is listed
     a, b, c = tl.where(proper, a, 1.0), tl.where(proper, b, 0.0), tl.where(proper, c, 1.0)
     determinant = tl.where(proper, determinant, 1.0)
     level = 2 * tl.log(tl.where(drawn, opacity, 1.0)) * (1 + 1e-6 * a * c / determinant) + 1e-4
@@ -64,15 +71,15 @@ def _load_ellipse(
 
 @triton.jit
 def _columns_of_row(row, x, y, a, b, c, level, determinant, proper, first_column, last_column, TILE: tl.constexpr):
-    """First and one past the last tile of a row that the ellipse meets."""
-    low = row * TILE + 0.5 - y  # of pixel centres
+    """First and one past the last column of the tiles in a row that the ellipse meets."""
+    low = row * TILE + 0.5 - y  # the row's first pixel centres, from the Gaussian's
     high = low + (TILE - 1)
     reach_x = tl.sqrt(level * c / determinant)
     rightmost = tl.minimum(tl.maximum(-b / c * reach_x, low), high)  # where the ellipse within the row extends furthest
     leftmost = tl.minimum(tl.maximum(b / c * reach_x, low), high)
     right = (-b * rightmost + tl.sqrt(tl.maximum(a * level - determinant * rightmost * rightmost, 0.0))) / a + 0.01
     left = (-b * leftmost - tl.sqrt(tl.maximum(a * level - determinant * leftmost * leftmost, 0.0))) / a - 0.01
-    # Clipped on both sides: an ellipse of billions of px must not overflow integers.
+    # Both sides are clipped, so that an ellipse of billions of px does not overflow integers.
     low, high = first_column.to(tl.float32), last_column.to(tl.float32)
     first = tl.minimum(tl.maximum(tl.ceil((x + left + 0.5) / TILE) - 1, low), high)
     last = tl.minimum(tl.maximum(tl.floor((x + right - 0.5) / TILE) + 1, low), high)
@@ -84,7 +91,7 @@ def _count(
     means2d, radii, conics, opacities, counts, n, tile_width, tile_height,
     PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
-    """Number of tiles per Gaussian and view."""
+    """Count the tiles that each Gaussian reaches in each view."""
     g = tl.program_id(0) * LANES + tl.arange(0, LANES)
     x, y, a, b, c, level, determinant, proper, first_column, last_column, first_row, last_row = _load_ellipse(
         means2d, radii, conics, opacities, g, g < n, tile_width, tile_height, PER_GAUSSIAN, TILE
@@ -104,7 +111,7 @@ def _list(
     means2d, radii, conics, opacities, order, ends, tiles, ids, n, num_gaussians, tile_width, tile_height,
     PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
-    """Tile and Gaussian of each pair, nearest Gaussians first."""
+    """Write the tile and the Gaussian of each pair, the nearest Gaussians first."""
     lane = tl.program_id(0) * LANES + tl.arange(0, LANES)
     exists = lane < n
     g = tl.load(order + lane, exists, 0).to(tl.int32)
@@ -129,30 +136,36 @@ def _list(
 
 @lru_cache(maxsize=8)
 def _tile_numbers(num_tiles: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Of all tiles, in their order."""
+    """Numbers of all tiles in ascending order, which begin at −2^15. [num_tiles]"""
     return torch.arange(-(2**15), num_tiles - 2**15, dtype=dtype, device=device)
 
 
 @dataclass(frozen=True)
 class PendingTiles:
-    """Tile lists whose length is on its way to the host, which may have something else done meanwhile."""
+    """Tile lists whose length is on its way to the host, which may give the device other work meanwhile."""
 
     ellipses: list[Tensor]
+    """means2d [C, N, 2], radii [C, N(, 2)], conics [C, N, 3] and opacities [C, N]."""
     order: Tensor
-    """Gaussians of all views from front to back. int64 [C * N]"""
+    """Indices in C · N of the Gaussians of all views, from front to back. int64 [C * N]"""
     ends: Tensor
-    """Where each one's pairs end, in this order. int64 [C * N]"""
+    """Where the pairs of each Gaussian end, in this order. int64 [C * N]"""
     num_pairs: Tensor
-    """The last of them, in the host's memory once `arrived`. int64 [1]"""
+    """The last of `ends`, which is in the host's memory once `arrived` has happened. int64 [1]"""
     arrived: torch.cuda.Event | None
+    """None where the host need not wait."""
     tile_size: int
+    """px."""
     tile_counts: tuple[int, int, int]
-    """Views, and rows and columns of tiles."""
+    """Numbers of views, and of rows and columns of tiles in each."""
 
     @torch.no_grad()
     def lists(self) -> tuple[Tensor, Tensor]:
-        """Where each tile's list starts, int32 [C, tile rows, tile columns], and the indices in C·N that the lists
-        hold from front to back, int32 [number of pairs].
+        """Wait for the length and make the lists.
+
+        Returns:
+            Where each tile's list starts, int32 [C, tile rows, tile columns]; and the indices in C · N that the lists
+            hold, from front to back, int32 [number of pairs].
 
         Raises:
             InputError: If there are more pairs than 32 bits number.
@@ -162,7 +175,7 @@ class PendingTiles:
         num_pairs = int(self.num_pairs)
         check_pairs(num_pairs)
         num_tiles, device = math.prod(self.tile_counts), self.ends.device
-        # Tiles are numbered from -2^15, so that 16 bits tell 65,536 of them apart.
+        # Tiles are numbered from −2^15, so that 16 bits tell 65,536 of them apart.
         tiles = torch.empty(num_pairs, dtype=torch.int16 if num_tiles <= 2**16 else torch.int32, device=device)
         ids = torch.empty(num_pairs, dtype=torch.int32, device=device)
         n = len(self.order)
@@ -190,27 +203,27 @@ def intersect_tiles(
 
     Args:
         means2d: px. [C, N, 2]
-        radii: px, of gsplat 1.4 [C, N] or 1.5 [C, N, 2]; not positive where culled.
+        radii: px, int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5; not positive where a Gaussian was culled.
         depths: Along the viewing axis. [C, N]
         conics: (a, b, c) of the inverse of the blurred Σ2D, in 1/px². [C, N, 3]
         opacities: In [0, 1]. [C, N]
-        width: px.
-        height: px.
-        tile_size: px, a power of two.
+        width: Of the image in px.
+        height: Of the image in px.
+        tile_size: Side of a tile in px, a power of two.
 
     Returns:
-        What has the lists, when they are asked for: by then the host should have given the device other work.
+        An object that makes the lists when it is asked for them; by then the host should have given the device work.
     """
     num_views, num_gaussians = means2d.shape[:2]
     tile_width, tile_height = triton.cdiv(width, tile_size), triton.cdiv(height, tile_size)
     ellipses = [value.contiguous() for value in (means2d, radii, conics, opacities)]
     n, device = num_views * num_gaussians, means2d.device
-    counts = torch.empty(n, dtype=torch.int64, device=device)  # as cumsum would convert them
+    counts = torch.empty(n, dtype=torch.int64, device=device)  # cumsum would convert others
     _count[triton.cdiv(n, _LANES),](
         *ellipses, counts, n, tile_width, tile_height, radii.dim() - 1, tile_size, _LANES, num_warps=1
     )  # fmt: skip
-    # Sorting the Gaussians by depth and then their pairs by tile, in 16 bits up to 4.2 megapixels of all views (with
-    # tiles of 8 px) and in 32 beyond, moves a fraction of the bytes that sorting pairs by both in 64 bits does. Both
+    # The Gaussians are sorted by depth, and then their pairs by tile: in 16 bits up to 4.2 megapixels of all views (in
+    # tiles of 8 px), in 32 beyond. That moves a fraction of the bytes of one sort of the pairs by both in 64 bits. Both
     # sorts are stable, as gsplat's is.
     order = depths.flatten().argsort(stable=True)
     ends = counts[order].cumsum(0)

@@ -1,4 +1,4 @@
-"""S̄ in three bytes a pixel: as much as the image that it was computed from."""
+"""S̄ in three bytes a pixel, which is as much as the image takes that it was computed from."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from torch import Tensor
 from sadgs_ns import kernels
 
 MASKED = 255
-"""Second byte of a masked pixel, whose S̄ is NaN; those of correlations end at 254."""
+"""Second byte of a masked pixel, whose S̄ is NaN; the codes of correlations end at 254."""
 HIGHEST_FREQUENCY = 4.0
 """1/px. S̄'s trace is at most c²/px² by construction, so this is the largest c that can be stored."""
 OCTAVES = 12.0
-"""Frequencies down to 2⁻¹² of the highest one have a code of their own: wavelengths of 0.25 to 1,024 px."""
+"""Frequencies down to 2⁻¹² of the highest one, which are wavelengths of 0.25 to 1,024 px, have codes of their own."""
 
 
 def encode(tensor: Tensor, fused: bool = True) -> Tensor:
-    """√xx and √yy on a logarithmic scale, and the correlation xy / √(xx yy).
+    """Encode √xx and √yy on a logarithmic scale, and the correlation xy / √(xx yy) on a linear one.
 
     A logarithm keeps the relative error of every wavelength the same (at most 1.7 %), and a correlation within ±1 keeps
     S̄ positive semidefinite. A pixel of which any number is NaN, as `multiscale_structure_tensor` gives masked ones,
@@ -46,7 +46,14 @@ def encode(tensor: Tensor, fused: bool = True) -> Tensor:
 
 
 def decode(codes: Tensor) -> Tensor:
-    """S̄ in float32 from `encode`, NaN at masked pixels. uint8 [..., 3] → [..., 3]"""
+    """Read S̄ back from its codes.
+
+    Args:
+        codes: As made by `encode`, uint8. [..., 3]
+
+    Returns:
+        S̄ as (xx, xy, yy) in 1/px², float32; NaN at masked pixels. [..., 3]
+    """
     x, correlation, y = codes.float().unbind(-1)
 
     def frequency(code: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 """η at the visible Gaussians: projected axes against the local wavelength (paper, section 3.3, eq. 1, 6, 7).
 
-Pure tensor functions over the observations of one training step. An observation is a pair (camera, Gaussian) that the
+All functions take the observations of one training step. An observation is a pair (camera, Gaussian) that the
 forward pass found visible; M is their number.
 """
 
@@ -16,7 +16,7 @@ from sadgs_ns.method.codes import decode
 WAVELENGTH_EPSILON = 1e-5
 """ε of Λ_min = 1 / (√λ_1 + ε) in 1/px: a textureless region has a wavelength of 10⁵ px, not infinity."""
 SCREEN_BLUR = 0.3
-"""px²; gsplat adds this to the diagonal of Σ2D before it inverts it (its `eps2d`)."""
+"""What gsplat adds to the diagonal of Σ2D before it inverts it, its `eps2d`, in px²."""
 FRUSTUM_MARGIN = 0.3
 """gsplat evaluates the projection Jacobian at most this fraction of half the image beyond the image's border."""
 
@@ -24,7 +24,7 @@ FRUSTUM_MARGIN = 0.3
 def principal_eigenvalue(structure_tensor: Tensor) -> Tensor:
     """Larger eigenvalue λ_1 of symmetric 2×2 tensors, in closed form.
 
-    Both terms are non-negative, so nothing cancels, however close to isotropic the tensor is.
+    Both terms are non-negative, so that nothing cancels, however close to isotropic the tensor is.
 
     Args:
         structure_tensor: (xx, xy, yy). [..., 3]
@@ -57,10 +57,10 @@ def projected_axes(
 
     Args:
         means: World positions, in front of the camera. [M, 3]
-        quats: wxyz, not necessarily normalised. [M, 4]
+        quats: Rotations as wxyz quaternions, which need not have unit length. [M, 4]
         scales: Standard deviations along the axes, world units, > 0. [M, 3]
-        viewmats: World to camera, one per observation. [M, 4, 4]
-        Ks: Intrinsics in px, one per observation. [M, 3, 3]
+        viewmats: World to camera, one for each observation. [M, 4, 4]
+        Ks: Intrinsics in px, one for each observation. [M, 3, 3]
         width: Image width in px.
         height: Image height in px.
 
@@ -80,7 +80,7 @@ def projected_axes(
 
 
 def sample_footprint(means2d: Tensor, conics: Tensor, jitter: Tensor) -> Tensor:
-    """One point in each Gaussian's footprint, uniformly distributed where the jitter is.
+    """Draw one point in each Gaussian's footprint, uniformly if the jitter is uniform.
 
     The footprint is the 2σ ellipse of Σ2D: a uniform point in it has mean μ_2D and covariance Σ2D. gsplat's conic
     contains its screen-space blur, which is taken out again; what rounding makes negative is set to 0. Rounded to
@@ -118,8 +118,8 @@ def sample_map(structure_tensors: Tensor, camera_ids: Tensor, points: Tensor) ->
 
     Args:
         structure_tensors: S̄ of each camera's image, any floating dtype, or its codes of `codes.encode`. [C, H, W, 3]
-        camera_ids: Which image. [M]
-        points: px. [M, 2]
+        camera_ids: Index of the image of each point. int64 [M]
+        points: In px, pixel centres at half-integers. [M, 2]
 
     Returns:
         S̄ in float32 or wider [M, 3], and whether it is known [M]: the point lies inside the image, on a pixel whose S̄

@@ -33,13 +33,14 @@ def photometric_loss(
         target: Training views in [0, 1]. [C, H, W, 3]
         ssim_lambda: λ in [0, 1].
         l2_lambda: λ_2 ≥ 0.
-        fused: Take the Triton kernels where they run and hold: CUDA, float32, views of at least 11×11 px.
+        fused: Use the Triton kernels where they run (CUDA) and apply (float32, views of at least 11×11 px).
 
     Returns:
-        The loss, and PSNR in dB for values in [0, 1], without gradient; both scalars.
+        The loss, and PSNR in dB for values in [0, 1], without gradient; both are scalars.
 
     Raises:
         ValueError: From pytorch_msssim, if views are one pixel high or wide.
+        InputError: If the views have more pixels than the Triton kernels can address (kernels/limits.py).
     """
     suits = predicted.dtype == target.dtype == torch.float32 and min(predicted.shape[1:3]) >= len(WINDOW)
     if fused and suits and kernels.available(predicted.device):
@@ -48,7 +49,7 @@ def photometric_loss(
         return fused_photometric_loss(predicted, target, WINDOW, ssim_lambda=ssim_lambda, l2_lambda=l2_lambda)
     difference = predicted - target
     l1, l2 = difference.abs().mean(), difference.square().mean()
-    # Contiguous: with channels-last strides cuDNN convolves, above all backwards, at a third of the speed.
+    # The copies are contiguous: with channels-last strides cuDNN convolves at a third of the speed, above all backward.
     similarity = ssim(
         predicted.permute(0, 3, 1, 2).contiguous(),
         target.permute(0, 3, 1, 2).contiguous(),

@@ -1,8 +1,8 @@
 """Image → multi-scale structure tensor map S̄ (paper, section 3.2, eq. 2–5).
 
-Pure tensor functions. Borders and masks are handled in one way, by normalised convolution: every blur is a weighted
-mean over the valid pixels that the kernel reaches, and the derivative is the exact derivative of that mean. Nothing is
-invented outside the image, no edge appears at a mask, and an image may be smaller than the largest kernel.
+Borders and masks are handled in one way, by normalised convolution: every blur is a weighted mean over the valid pixels
+that the kernel reaches, and the derivative is the exact derivative of that mean. Nothing is invented outside the image,
+no edge appears at a mask, and an image may be smaller than the largest kernel.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ SCALE_STEP = 1.5
 INTEGRATION_FACTOR = 3.0
 """ρ_l = INTEGRATION_FACTOR · σ_l px (paper, section 3.2)."""
 GAMMA = 3.0
-"""Exponent of the scale weights E_l^γ (paper, eq. 5)."""
+"""γ, the exponent of the scale weights E_l^γ (paper, eq. 5)."""
 FREQUENCY_CONSTANT = 0.75
-"""c of ω_l = c / σ_l in 1/px. The paper leaves it open; docs/measurements.md holds the sweeps that settled it."""
+"""c of ω_l = c / σ_l, in 1/px. The paper leaves it open; docs/measurements.md holds the sweeps that settled it."""
 NOISE_FLOOR = 0.02
 """Amplitude, relative to the image's own contrast, under which structure counts as noise: the ε of eq. 3 and 5."""
 ENERGY_BLUR = 2.0
@@ -42,12 +42,12 @@ _ROUNDING_FLOOR = 1e-5
 def gaussian_kernel(
     sigma: float, order: int = 0, dtype: torch.dtype = torch.float32, truncation: float = TRUNCATION
 ) -> Tensor:
-    """Sampled 1-D Gaussian, or its derivative, ready for cross-correlation.
+    """Sample a 1-D Gaussian, or its derivative, for cross-correlation.
 
     Args:
         sigma: Standard deviation in px, > 0.
         order: 0 for the Gaussian (sums to 1), 1 for its first derivative (a unit ramp gives exactly 1).
-        dtype: Of the kernel, which is computed in float64.
+        dtype: Type of the result, which is computed in float64.
         truncation: Radius in standard deviations, > 0.
 
     Returns:
@@ -65,7 +65,7 @@ def gaussian_kernel(
 
 @lru_cache(maxsize=256)
 def _kernel(sigma: float, order: int, dtype: torch.dtype, device: torch.device, truncation: float) -> Tensor:
-    """`gaussian_kernel`, kept on the device: made anew for each batch of images, it would take most of the time."""
+    """`gaussian_kernel` [K], kept on the device: to make it anew for each batch of images takes most of the time."""
     return gaussian_kernel(sigma, order, dtype, truncation).to(device)
 
 

@@ -1,1 +1,1 @@
-"""Rasterization: one entrance, gsplat and Triton kernels on CUDA, a torch splatter elsewhere."""
+"""Rasterization has one entrance: gsplat and Triton kernels draw on CUDA, a torch splatter elsewhere."""

@@ -1,4 +1,4 @@
-"""The one place where Gaussians are rasterised: gsplat on CUDA, the torch splatter elsewhere."""
+"""The one entrance to rasterization: gsplat or our Triton kernels on CUDA, the torch splatter elsewhere."""
 
 from __future__ import annotations
 
@@ -55,12 +55,15 @@ def rasterize(
         `visible`.
 
     Raises:
-        ValueError: From the splatter, if a mode is unknown or a shape does not match. gsplat raises AssertionError; the
-            Triton kernels check nothing.
+        ValueError: From the splatter, if a mode is unknown or a shape does not match. gsplat raises AssertionError; our
+            Triton kernels do not check shapes.
+        InputError: If there are more Gaussians, pixels or tile pairs than the Triton kernels can address
+            (kernels/limits.py).
     """
     rasterization: Any = splatter.rasterization
     fused = fused and kernels.available(means.device)
-    # Imported here, so that without a GPU nothing comes near gsplat's kernels, which are compiled when first used.
+    # gsplat compiles its CUDA kernels when they are first used. These imports stand here so that nothing touches them
+    # without a GPU.
     if fused:
         from sadgs_ns.kernels.rasterization import rasterization
     elif means.is_cuda:
@@ -86,7 +89,7 @@ def rasterize(
 
 
 def visible(info: Mapping[str, Any]) -> Tensor:
-    """Which Gaussians were drawn, from an `info` of gsplat 1.4 (one radius) or 1.5 (a radius per axis).
+    """Tell which Gaussians were drawn, from an `info` of gsplat 1.4 (one radius) or 1.5 (a radius for each axis).
 
     Args:
         info: Third value of `rasterize`; `radii` is int [C, N] or [C, N, 2], in pixels, zero where culled.
@@ -95,14 +98,14 @@ def visible(info: Mapping[str, Any]) -> Tensor:
         bool [C, N]
     """
     drawn = info["radii"] > 0
-    # Comparing ranks also tells packed 1.5 radii [nnz, 2] from unpacked 1.4 radii [C, N].
+    # The comparison of ranks also tells packed radii of 1.5 [nnz, 2] from unpacked radii of 1.4 [C, N].
     return drawn.all(dim=-1) if drawn.dim() == info["means2d"].dim() else drawn
 
 
 def viewmats_from_camera_to_world(
     camera_to_worlds: Tensor,  # [C, 3, 4]
 ) -> Tensor:
-    """World-to-camera transforms for `rasterize` from nerfstudio's camera poses.
+    """Make world-to-camera transforms for `rasterize` from camera poses as nerfstudio has them.
 
     Args:
         camera_to_worlds: Camera-to-world poses, OpenGL axes (x right, y up, z backward), orthonormal. [C, 3, 4]

@@ -24,22 +24,22 @@ from torch.autograd.function import once_differentiable
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RasterizeMode = Literal["classic", "antialiased"]
 
-# gsplat's compositing constants.
+# These are the constants of gsplat's compositing.
 _MAX_ALPHA = 0.999
 _MIN_ALPHA = 1.0 / 255.0
 _MIN_TRANSMITTANCE = 1e-4
 # exp(-sigma) is invisible long before this. Beyond 87 it would be subnormal, which is many times slower to compute.
 _MAX_SIGMA = 60.0
 
-# The most (pixel, Gaussian) pairs held at a time, if a segment of one tile has fewer. About ten temporaries have this
-# many elements.
+# This many (pixel, Gaussian) pairs are held at a time at most, unless a segment of one tile has more. About ten
+# temporaries have this many elements.
 _CHUNK_PAIRS = 1 << 18
 # Tile lists are composited in segments of at most this many Gaussians, so that opaque tiles can stop early.
 _SEGMENT = 128
 
 
 class _Tiles(NamedTuple):
-    """Which Gaussians each tile draws, front to back. T = C * tile_height * tile_width."""
+    """Lists of the Gaussians that each tile draws, front to back. T = C * tile_height * tile_width."""
 
     size: int  # pixels per side
     origins: Tensor  # [T, 2] pixel coordinates of the tile's corner
@@ -49,7 +49,7 @@ class _Tiles(NamedTuple):
 
 
 class _Segment(NamedTuple):
-    """Part of the lists of B tiles, padded to the same length L. S = tile size."""
+    """Part of the lists of B tiles, padded to the same length L. S is the tile size."""
 
     ids: Tensor  # [B, L] indices into the flattened [C * N]
     dx: Tensor  # [B, 1, S, L] means2d - pixel centre
@@ -216,10 +216,13 @@ def _project(
     near_plane: float,
     far_plane: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """EWA projection: means2d [C, N, 2], depths, conics [C, N, 3], compensations, covars2d [C, N, 2, 2], valid [C, N].
+    """Project the Gaussians as EWA splatting does.
 
     gsplat's own `_fully_fused_projection` is not used because its radii differ between versions and from its kernels,
     and because its gradients are NaN for Gaussians in the camera plane.
+
+    Returns:
+        means2d [C, N, 2], depths [C, N], conics [C, N, 3], compensations [C, N], covars2d [C, N, 2, 2], valid [C, N].
     """
     covars, _ = _quat_scale_to_covar_preci(quats, scales, compute_preci=False)
     assert covars is not None
@@ -229,7 +232,7 @@ def _project(
     # Culled Gaussians are projected from somewhere harmless, or dividing by their depth could put NaN in gradients.
     means_c = torch.where(valid[..., None], means_c, means_c.new_tensor([0.0, 0.0, 1.0]))
     means2d, covars2d = _persp_proj(means_c, covars_c, Ks, width, height)
-    # So are those too large for the determinant's range (billions of px), which have no inverse.
+    # Gaussians of billions of px, whose determinant overflows, have no inverse and are culled, too.
     valid = valid & _determinant(covars2d.detach()).isfinite()
     covars2d = torch.where(valid[..., None, None], covars2d, torch.eye(2, dtype=means.dtype, device=means.device))
 
@@ -245,7 +248,7 @@ def _project(
 
 
 def _determinant(matrices: Tensor) -> Tensor:
-    """[..., 2, 2] → [...]; torch.linalg.det goes through an LU decomposition."""
+    """Determinants [...] of matrices [..., 2, 2]; torch.linalg.det would make LU decompositions."""
     return matrices[..., 0, 0] * matrices[..., 1, 1] - matrices[..., 0, 1] * matrices[..., 1, 0]
 
 
@@ -285,7 +288,7 @@ def _bin_into_tiles(
     height: int,
     tile_size: int,
 ) -> tuple[Tensor, Tensor, Tensor, _Tiles]:
-    """gsplat's `tiles_per_gauss` [C, N], `isect_ids` [n_isects] and `flatten_ids` [n_isects], and the tiles' lists."""
+    """Make gsplat's `tiles_per_gauss` [C, N], `isect_ids` and `flatten_ids` [n_isects], and the tiles' lists."""
     C, N = depths.shape
     device = means2d.device
     tile_width, tile_height = math.ceil(width / tile_size), math.ceil(height / tile_size)
@@ -307,7 +310,7 @@ def _bin_into_tiles(
     tile_y = low.reshape(-1, 2)[flatten_ids, 1] + nth // columns
     tile_ids = tile_y * tile_width + tile_x
     camera_ids = flatten_ids // max(N, 1)
-    # camera | tile | bits of the float32 depth, whose order is that of the depths because these are not negative.
+    # A key has the camera, the tile and the bits of the float32 depth, whose order is that of depths ≥ 0.
     depth_bits = depths.flatten().float().view(torch.int32).long()[flatten_ids]
     isect_ids = (camera_ids << (32 + n_tiles.bit_length())) | (tile_ids << 32) | depth_bits
     isect_ids, order = isect_ids.sort(stable=True)
@@ -323,7 +326,7 @@ def _bin_into_tiles(
 
 
 class _Composite(torch.autograd.Function):
-    """Front-to-back alpha compositing of tile lists: [T, S * S, D + 1], the last channel being alpha."""
+    """Front-to-back alpha compositing of tile lists into [T, S * S, D + 1], whose last channel is alpha."""
 
     @staticmethod
     def forward(
@@ -338,8 +341,8 @@ class _Composite(torch.autograd.Function):
         # Alpha is the image of Gaussians of colour one.
         values = torch.cat([colors, torch.ones_like(colors[..., :1])], dim=-1).flatten(0, 1)  # [C * N, D + 1]
         canvas = values.new_zeros(len(tiles.counts), tiles.size**2, values.shape[-1])
-        # Per chunk, the transmittance at the start of each segment: the backward pass starts from the last one. This
-        # is all that is kept per pair of the long lists, one number for `_SEGMENT` pairs.
+        # The transmittance at the start of each segment is kept for each chunk, since the backward pass starts from the
+        # last one. Of the pairs of long lists nothing else is kept: one number for `_SEGMENT` pairs.
         ctx.starts = []
         for chunk, length in _chunks(tiles):
             starts = [values.new_ones(len(chunk), tiles.size, tiles.size)]
@@ -367,7 +370,7 @@ class _Composite(torch.autograd.Function):
         grads = means2d.new_zeros(opacities.numel(), sum(sizes))  # [C * N, 6 + D (+ 2)]
         for (chunk, length), starts in zip(_chunks(tiles), ctx.starts, strict=True):
             v_colors, v_alphas = v_canvas[chunk].split([D, 1], dim=-1)  # [B, S * S, D], [B, S * S, 1]
-            # What lies behind a Gaussian, dotted with v_colors. Behind the last one it is minus what is left to cover.
+            # This is what lies behind a Gaussian, dotted with v_colors: behind the last, minus what is left to cover.
             behind = (canvas[chunk][..., -1:] - 1.0) * v_alphas  # [B, S * S, 1]
             for index in reversed(range(len(starts))):
                 begin = index * _SEGMENT
@@ -446,7 +449,8 @@ def _segment_gradients(
     # Nothing flows through a Gaussian that is not drawn or whose alpha is cut off at the top.
     v_sigmas = v_alphas.mul_(alphas).neg_().masked_fill_((weights == 0) | (alphas >= _MAX_ALPHA), 0.0)
 
-    # Moments of v_sigmas over the pixels. dx depends on the column only and dy on the row only: sum the other first.
+    # These are moments of v_sigmas over the pixels. dx depends on the column only and dy on the row only, so that the
+    # other axis is summed first.
     columns, rows = v_sigmas.sum(dim=1, keepdim=True), v_sigmas.sum(dim=2, keepdim=True)  # [B, 1, S, L], [B, S, 1, L]
     mixed = (v_sigmas * dx).sum(dim=2, keepdim=True)  # [B, S, 1, L]
     total, mx, my, mxx, mxy, myy = (
