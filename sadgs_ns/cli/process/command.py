@@ -71,12 +71,12 @@ def process(
     Args:
         source: A folder of photos, searched with its subfolders, or a video.
         out: Folder for the scene; made if it does not exist, continued if an earlier run was interrupted.
-        matching: Which pairs are matched; "auto" is sequential for videos, exhaustive up to `stages.EXHAUSTIVE_LIMIT` photos,
-            and beyond that by GPS positions or a vocabulary.
+        matching: Which pairs are matched; "auto" is sequential for videos, exhaustive for at most
+            `stages.EXHAUSTIVE_LIMIT` photos, and by GPS positions or a vocabulary for more.
         frames: How many frames of a video are taken.
         max_size: Longest side of the undistorted photos in px; 0 keeps them as they are.
-        camera_per_photo: Every photo has a focal length of its own. Otherwise those of one size share a camera, unless
-            EXIF tells of several cameras or focal lengths.
+        camera_per_photo: Whether every photo has a focal length of its own. Otherwise photos of one size share a
+            camera, unless EXIF tells of several cameras or focal lengths.
 
     Returns:
         What was registered and what was not.
