@@ -33,16 +33,14 @@ def versions() -> dict[str, str]:
 
 
 def check_machine() -> Iterator[Finding]:
-    """Findings for torch, its device, the kernels, LPIPS's weights and what nerfstudio's commands need.
+    """Check torch, its device, the kernels, LPIPS's weights and what nerfstudio's commands need.
 
     Notes say what is well. Nothing is downloaded; on CUDA a small kernel is compiled, and gsplat's, if they never were.
     """
     try:
         import torch
         import torchvision  # noqa: F401
-    except (
-        Exception
-    ) as error:  # whatever a broken installation raises; for torch and torchvision that do not fit, an OSError
+    except Exception as error:  # a broken installation raises anything; versions that do not fit, an OSError
         yield Finding("error", f"torch cannot be used ({reason(error)}): install the versions of constraints.txt.")
         return
     if torch.cuda.is_available():

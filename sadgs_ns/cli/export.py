@@ -24,7 +24,7 @@ _PREFIX = "_model.gauss_params."
 _DEGREE_0 = 0.5 / np.sqrt(np.pi)
 """The spherical harmonic of degree 0."""
 _REMEDY = "give another checkpoint step-*.ckpt of a run of sadgs or splatfacto"
-"""For a checkpoint that cannot be used."""
+"""What to do about a checkpoint that cannot be used."""
 
 
 def write_ply(

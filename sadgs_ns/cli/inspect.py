@@ -35,13 +35,13 @@ from sadgs_ns.plugin.visualization import CHILDREN, ETA, LOW, PERIOD, Panel, to_
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 SEED = 0
-"""Of the random colours and of AbsGS's children."""
+"""Seed of the random colours and of AbsGS's children."""
 MIN_SIDE = 900
 """Least longer side of a picture with ellipses, px."""
 MIN_RENDER_SIDE = 640
 """Least longer side of a rendering in random colours, px: on smaller ones Gaussians could not be told apart."""
 _REMEDY = "give another with --load-step, or another run of sadgs"
-"""For a checkpoint that cannot be used."""
+"""What to do about a checkpoint that cannot be used."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class View:
 
     @property
     def camera(self) -> tuple[Tensor, Tensor, int, int]:
-        """What `pictures.blend` asks for: viewmat, K, width, height."""
+        """viewmat, K, width and height, as `visualization.blend` takes them."""
         height, width = self.photo.shape[:2]
         return self.viewmat, self.K, width, height
 

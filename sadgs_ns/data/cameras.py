@@ -1,4 +1,4 @@
-"""Which of nerfstudio's cameras this method renders right: pinholes, and fisheyes that nerfstudio undistorts."""
+"""Checks of nerfstudio's cameras: this method renders pinholes, and fisheyes that nerfstudio undistorts."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from sadgs_ns.errors import InputError
 
 _UNDISTORTED = (CameraType.FISHEYE, CameraType.FISHEYE624)
-"""Types whose images nerfstudio's FullImageDatamanager turns into pinhole images, if they have distortion."""
+"""Types whose images nerfstudio's FullImageDatamanager turns into pinhole images, if a coefficient is not 0."""
 
 
 def refuse_unsupported_cameras(cameras: Cameras) -> None:
-    """Let pass what is, or is made, a pinhole camera.
+    """Refuse cameras that neither are pinholes nor become pinholes.
 
     nerfstudio gives full images of any camera type to a splatting model, and undistorts those of perspective and
     fisheye cameras that have a distortion coefficient other than 0. The others would be rendered, wrongly, as pinholes.
 
     Args:
-        cameras: Of one or several images, shape [C].
+        cameras: The cameras of one or several images, shape [C].
 
     Raises:
-        ValueError: If one of them is neither; it names the type, the first such camera and the remedy.
+        InputError: Names the first such camera, its type and the remedy.
     """
     types = cameras.camera_type.flatten().cpu()  # [C]
     distorted = torch.zeros_like(types, dtype=torch.bool)
@@ -46,17 +46,17 @@ def refuse_unsupported_cameras(cameras: Cameras) -> None:
 
 
 def refuse_failed_undistortion(cameras: Cameras, names: Sequence[Path]) -> None:
-    """Refuse fisheye images that nerfstudio's undistortion lost.
+    """Refuse fisheye images that became black when nerfstudio undistorted them.
 
     Near a field of view of 180° OpenCV's new intrinsics have a focal length of almost 0, or their centre far outside
-    the image, which is then black.
+    the image.
 
     Args:
-        cameras: After their images were undistorted, shape [C].
+        cameras: The cameras after their images were undistorted, shape [C].
         names: Their image files, C of them.
 
     Raises:
-        ValueError: If there is one; it names the file and the remedy.
+        InputError: Names the first such file and the remedy.
     """
     sizes = torch.cat([cameras.width, cameras.height], dim=-1)  # [C, 2] px
     focals, centers = torch.cat([cameras.fx, cameras.fy], dim=-1), torch.cat([cameras.cx, cameras.cy], dim=-1)

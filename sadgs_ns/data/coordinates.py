@@ -16,14 +16,14 @@ from sadgs_ns.errors import InputError, reason
 Array = NDArray[np.float64]
 
 TRANSFORMS_NAME = "dataparser_transforms.json"
-"""Where nerfstudio's trainer writes, beside `config.yml`, how it moved the data's cameras and points."""
+"""File beside `config.yml` in which nerfstudio's trainer writes how it moved the data's cameras and points."""
 _TOLERANCE = 1e-4
 """How far a transform, written in float32, may be from a similarity, relative to its scale."""
 
 
 @dataclass(frozen=True)
 class Similarity:
-    """x ↦ scale · orthogonal · x + translation, from one world frame to another."""
+    """A map x ↦ scale · orthogonal · x + translation from one world frame to another."""
 
     scale: float
     """> 0."""
@@ -51,7 +51,7 @@ class Similarity:
         raise ValueError("it is no rotation, scale and translation")
 
     def inverse(self) -> Similarity:
-        """The way back."""
+        """The map back."""
         back = self.orthogonal.T
         return Similarity(1 / self.scale, back, -back @ self.translation / self.scale)
 

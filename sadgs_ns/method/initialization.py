@@ -1,4 +1,4 @@
-"""Where the first Gaussians go: SfM points and the faces of their bounding box (paper, section 3.6)."""
+"""The Gaussians that training starts from: SfM points and the faces of their bounding box (paper, section 3.6)."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ FACE_GREY = 0.5
 
 
 def bounding_box_points(points: Tensor, grid: int = FACE_GRID) -> tuple[Tensor, float]:
-    """Regular grids on the six faces of the axis-aligned bounding box.
+    """Make regular grids on the six faces of the axis-aligned bounding box.
 
     Args:
         points: SfM points in world units. [P, 3]
         grid: Points along each side of a face.
 
     Returns:
-        6·grid² points [6·grid², 3] and the spacing that their scale starts from, mean box extent / grid, world units.
-        Where the box is flat, faces coincide and every place has one point; where it is a single point there are none.
+        6·grid² points [6·grid², 3], and the spacing that their scale starts from, mean box extent / grid, world units.
+        Where the box is flat, faces coincide and every place has one point; a box without extent has no points.
     """
     low, high = points.amin(0), points.amax(0)
     if (low == high).all():
@@ -47,13 +47,13 @@ def bounding_box_points(points: Tensor, grid: int = FACE_GRID) -> tuple[Tensor, 
 
 
 def neighbour_scales(points: Tensor, neighbours: int = 3) -> Tensor:
-    """Initial scale of each point: the mean distance to its nearest neighbours, as splatfacto does.
+    """The initial scale of each point, which is the mean distance to its nearest neighbours (3DGS, splatfacto).
 
     Duplicates have distance 0; the scale is then a millionth of the cloud's extent, so that its logarithm is finite.
 
     Args:
         points: World units. [P, 3]
-        neighbours: At most this many; fewer where the cloud is smaller.
+        neighbours: How many neighbours count, or all others where the cloud is smaller.
 
     Returns:
         World units, > 0. [P]
@@ -94,13 +94,13 @@ def _far_outliers(positions: Tensor, share: float) -> Tensor:
 def starting_points(
     points: Tensor, colors: Tensor, *, faces: bool, opacity: float = POINT_OPACITY
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The points that training starts from, with the size and opacity of each.
+    """The points that training starts from, with the scale and opacity of each.
 
     Args:
         points: World units. [P, 3]
         colors: In [0, 1]. [P, 3]
         faces: Whether to add `bounding_box_points`.
-        opacity: Of the points that are given, in [0, 1].
+        opacity: Opacity of the points that are given, in [0, 1].
 
     Returns:
         Points in world units [N, 3], colours in [0, 1] [N, 3], scales in world units, > 0 [N], opacities in [0, 1] [N].
@@ -138,7 +138,7 @@ def clear_of_cameras(means: Tensor, radii: Tensor, positions: Tensor) -> Tensor:
 
 
 def camera_extent(positions: Tensor) -> float:
-    """Extent of the cameras as 3DGS defines it: 1.1 times the largest distance from their centre.
+    """The extent of the cameras, which is 1.1 times the largest distance from their centre (3DGS).
 
     Cameras that lie absurdly far from the others (`outliers.far_outliers`) do not count.
 

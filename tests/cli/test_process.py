@@ -15,9 +15,10 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from PIL import Image
 from rich.progress import Progress
 
-from sadgs_ns.cli.process import command as module
-from sadgs_ns.cli.process.command import main, process, sequential_pairs
+from sadgs_ns.cli.process import command as program
+from sadgs_ns.cli.process.command import main, process
 from sadgs_ns.cli.process.photos import photos_by_camera
+from sadgs_ns.cli.process.stages import Summary, match, sequential_pairs
 from sadgs_ns.cli.process.video import sharpest_frames
 from sadgs_ns.demo.scene import write_scene
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
@@ -42,7 +43,7 @@ def photos(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def processed(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, module.Summary]:
+def processed(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Summary]:
     out = tmp_path_factory.mktemp("out") / "scene"
     return out, process(photos, out)
 
@@ -99,7 +100,7 @@ def test_an_interrupted_run_goes_on(photos: Path, tmp_path: Path, monkeypatch, c
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(module, "reconstruct", stop)
+        patched.setattr(program, "reconstruct", stop)
         assert main([str(photos), str(tmp_path / "out")]) == 130
     assert "the same command goes on" in capsys.readouterr().err
     database = tmp_path / "out" / "work" / "database.db"
@@ -169,7 +170,7 @@ def heic(folder: Path) -> None:
 
 def test_photos_that_are_not_read_are_told_beside_those_that_are(tmp_path: Path, monkeypatch, capsys):
     heic(tmp_path / "photos")
-    monkeypatch.setattr(module, "process", lambda **options: module.Summary(9, 9, 100, 0.5, {}))
+    monkeypatch.setattr(program, "process", lambda **options: Summary(9, 9, 100, 0.5, {}))
     assert main([str(tmp_path / "photos"), str(tmp_path / "out")]) == 0
     assert "9 of 9 photos registered" in (printed := capsys.readouterr().out)
     assert "Its 4 .HEIC files are not read: convert them to one of bmp, jpeg, jpg, png" in printed
@@ -192,7 +193,7 @@ def test_names_may_hold_spaces(scene: Path, tmp_path: Path, monkeypatch: pytest.
     assert all((tmp_path / "out" / frame["file_path"]).is_file() for frame in frames) and len(frames) == 20
     neighbours: list[Path] = []  # of a film: these photos' neighbours stand apart
     monkeypatch.setattr(pycolmap, "match_sequential", lambda database, **options: neighbours.append(database))
-    module.match(["a 1.png", "a 2.png"], tmp_path / "db", tmp_path, "sequential", False, Progress())
+    match(["a 1.png", "a 2.png"], tmp_path / "db", tmp_path, "sequential", False, Progress())
     assert neighbours == [tmp_path / "db"]
 
 
@@ -256,7 +257,7 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         runs.append(sorted(itertools.chain(*groups)))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(module, "extract", stop)
+    monkeypatch.setattr(program, "extract", stop)
     return runs
 
 
@@ -271,7 +272,7 @@ def test_a_film_whose_frames_were_being_written_goes_on(tmp_path: Path, monkeypa
         patched.setattr("sadgs_ns.cli.process.video.sharpest_frames", interrupted)
         assert main(command) == 130 and len(list((tmp_path / "out").rglob("*.jpg"))) == 4
     assert main(command) == 130 and taken == [[f"{i:05d}.jpg" for i in range(6)]]
-    monkeypatch.setattr(module, "film_frames", None)  # a third run reads none again
+    monkeypatch.setattr(program, "video_frames", None)  # a third run reads none again
     assert main(command) == 130 and taken[0] == taken[1]
 
 

@@ -605,6 +605,22 @@ def test_points_behind_some_cameras_are_a_warning(copied: Callable[[str], Path])
     assert re.fullmatch(r"\S+/p\.ply has points that only 40% of the cameras can see .*\.", finding.sentence)
 
 
+def test_points_beside_a_blender_scene_are_checked(copied: Callable[[str], Path]):
+    data = copied("blender")
+
+    def check(*positions: list[float]) -> list[str]:
+        lines = "".join("{} {} {}\n".format(*position) for position in positions)
+        (data / "p.ply").write_text(PLY.format(len(positions)) + lines)
+        findings = validation.check_blender(data, ply_path=Path("p.ply"))
+        return [finding.sentence for finding in findings if finding.severity == "error"]
+
+    assert check([0.5, 0.5, 0.5], [1, 1, 1]) == []
+    (sentence,) = check([50, 50, 20], [51, 50, 20])
+    assert re.fullmatch(r"\S+/p\.ply has points that no camera can see in front of it: .*\.", sentence)
+    (sentence,) = check()
+    assert re.fullmatch(r"\S+/p\.ply should hold the SfM points but is empty: restore it, or leave .*\.", sentence)
+
+
 @pytest.mark.parametrize("far", [1e5, 1e30, 1e200])
 def test_a_wild_point_does_not_change_what_training_starts_from(
     far: float, copied: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]

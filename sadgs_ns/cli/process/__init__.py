@@ -1,1 +1,1 @@
-"""`sadgs-process`: photos or a video → a COLMAP scene."""
+"""`sadgs-process`: from photos or a video to a scene for training."""

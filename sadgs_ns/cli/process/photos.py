@@ -11,7 +11,7 @@ from PIL import ExifTags, Image
 from sadgs_ns.data.validation.images import IMAGE_SUFFIXES
 
 _UNREAD_SUFFIXES = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"}
-"""Of photos in formats that phones and cameras write and COLMAP does not read."""
+"""Suffixes of formats that phones and cameras write and COLMAP does not read."""
 
 
 def photos_not_read(folder: Path) -> str:
@@ -24,7 +24,7 @@ def photos_not_read(folder: Path) -> str:
 
 
 def find_photos(source: Path, out: Path) -> list[str]:
-    """The names of a folder's photos, relative to it; a scene that is made in the same folder is none of them.
+    """The names of a folder's photos, relative to it, without those of a scene that is made in the same folder.
 
     Raises:
         ValueError: If there are fewer than three photos.

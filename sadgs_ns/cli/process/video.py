@@ -1,4 +1,4 @@
-"""Photos from a film: the sharpest frames of its stretches."""
+"""Photos from a video: the sharpest frame of each of its stretches."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ def sharpest_frames(video: Path, count: int) -> Iterator[tuple[int, np.ndarray]]
             best = (sharpness, frame)
 
 
-def film_frames(video: Path, count: int) -> Iterator[tuple[int, np.ndarray]]:
-    """The `sharpest_frames` of a video that has enough of them, which is known when this returns.
+def video_frames(video: Path, count: int) -> Iterator[tuple[int, np.ndarray]]:
+    """The `sharpest_frames` of a video, which has at least three if this returns.
 
     Raises:
-        ValueError: If it is no video or gives fewer than three frames.
+        ValueError: If the file is no video, or gives fewer than three frames.
     """
     if video.suffix.lower() not in VIDEO_SUFFIXES:
         raise ValueError(f"{video} is neither a folder of photos nor a video ({', '.join(sorted(VIDEO_SUFFIXES))}).")
@@ -54,7 +54,7 @@ def film_frames(video: Path, count: int) -> Iterator[tuple[int, np.ndarray]]:
 
 
 def write_frames(frames: Iterable[tuple[int, np.ndarray]], folder: Path) -> None:
-    """Write them to a folder as numbered photos.
+    """Write frames to a folder as numbered photos.
 
     Raises:
         OSError: If one cannot be written.

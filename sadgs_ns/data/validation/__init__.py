@@ -17,7 +17,14 @@ __all__ = ["Finding", "check_blender", "check_colmap", "check_data", "check_nerf
 
 
 def check_data(data: Path) -> list[Finding]:
-    """Findings for a folder in whatever layout it has: nerfstudio's, COLMAP's or Blender's, with default options."""
+    """Check a folder in whatever layout it has, nerfstudio's, COLMAP's or Blender's, with the parsers' default options.
+
+    Args:
+        data: The folder, or a file in the layout of `transforms.json`.
+
+    Returns:
+        What was found; nothing if all is well.
+    """
     if data.is_file() or (data / "transforms.json").is_file():
         return check_nerfstudio(data)
     if (data / "transforms_train.json").is_file():

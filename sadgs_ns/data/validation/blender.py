@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from sadgs_ns.data.validation.findings import Finding, collect_findings
-from sadgs_ns.data.validation.geometry import Camera, check_positive, check_rotations, check_views
+from sadgs_ns.data.validation.geometry import Camera, check_ply, check_positive, check_rotations, check_views
 from sadgs_ns.data.validation.images import Frame, check_images, image_size
 from sadgs_ns.data.validation.layouts import no_layout
 from sadgs_ns.data.validation.transforms import frames_of, read_json, view_of
@@ -15,8 +15,14 @@ from sadgs_ns.errors import InputError
 
 
 @collect_findings
-def check_blender(data: Path, *, open_images: bool = True) -> Iterator[Finding]:
-    """Findings for a synthetic scene in the layout of NeRF's: `transforms_train.json` and its siblings."""
+def check_blender(data: Path, *, ply_path: Path | None = None, open_images: bool = True) -> Iterator[Finding]:
+    """Check a synthetic scene in the layout of NeRF's: `transforms_train.json` and its siblings.
+
+    Args:
+        data: The folder.
+        ply_path: SfM points, relative to the folder, as of nerfstudio's parser.
+        open_images: Whether to look into the images, too.
+    """
     if not (data / "transforms_train.json").is_file():
         raise InputError(no_layout(data))
     for split in ("train", "val", "test"):
@@ -37,7 +43,11 @@ def check_blender(data: Path, *, open_images: bool = True) -> Iterator[Finding]:
         camera = Camera(width, height, focal, focal, width / 2, height / 2)
         views = [view_of(frame, f"{path}: frame {frame['file_path']}", camera) for frame in described]
         if split == "train":
-            yield from check_views(views, len(views), path)
+            yield from (of_views := list(check_views(views, len(views), path)))
+            if ply_path is not None:
+                wrong = any(finding.severity == "error" for finding in of_views)
+                remedy = "restore it, or leave `--ply-path` out to start from random points"
+                yield from check_ply(data / ply_path, [] if wrong else views, remedy)
         else:
             yield from check_rotations(views)
         if open_images:

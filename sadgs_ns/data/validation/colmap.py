@@ -25,7 +25,7 @@ from sadgs_ns.data.validation.layouts import COLMAP_FOLDERS, find_reconstruction
 from sadgs_ns.errors import InputError
 
 UNSUPPORTED_CAMERAS = {"FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}
-"""COLMAP's camera models that nerfstudio cannot read."""
+"""Those of COLMAP's camera models that nerfstudio cannot read."""
 
 
 @collect_findings
@@ -41,7 +41,7 @@ def check_colmap(
     training_images: Callable[[int], int] | None = lambda count: count - math.ceil(count / 8),
     open_images: bool = True,
 ) -> Iterator[Finding]:
-    """Findings for a COLMAP reconstruction, binary or text.
+    """Check a COLMAP reconstruction, binary or text.
 
     Args:
         data: The folder that the other paths are relative to.
@@ -117,7 +117,7 @@ def check_colmap(
 
 
 def _check_camera(camera: colmap.Camera, where: str) -> None:
-    """Raise InputError if nerfstudio cannot read it or a value makes no sense."""
+    """Raise InputError if nerfstudio cannot read a camera or one of its values makes no sense."""
     if camera.model not in colmap.CAMERA_PARAMETERS or camera.model in UNSUPPORTED_CAMERAS:
         raise InputError(
             f"{where} has the model {camera.model}, which nerfstudio cannot read: undistort the images with "
@@ -137,7 +137,7 @@ def _check_camera(camera: colmap.Camera, where: str) -> None:
 def _views(
     poses: Sequence[colmap.Pose], cameras: Mapping[int, colmap.Camera], poses_path: Path, cameras_path: Path
 ) -> list[View]:
-    """The poses with their cameras."""
+    """The poses and their cameras, as the checks of geometry take them."""
     described = {camera_id: _describe(camera) for camera_id, camera in cameras.items()}
     quats = np.array([pose[[1, 2, 3, 0]] for _, _, pose in poses])  # xyzw [V, 4]
     rotations = Rotation.from_quat(quats).as_matrix()  # [V, 3, 3]
@@ -168,7 +168,7 @@ def _number_of_focals(model: str) -> int:
 
 
 def _check_points(model_folder: Path, views: Sequence[View]) -> Iterator[Finding]:
-    """Findings for the SfM points, and for how they lie to the views, if there are any."""
+    """Check the SfM points and, if there are views, how the points lie to them."""
     path = colmap.points_file(model_folder)
     random = "add `--load-3D-points False` after `colmap` to start from random points"
     if path is None:

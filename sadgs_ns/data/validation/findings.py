@@ -27,7 +27,7 @@ _Arguments = ParamSpec("_Arguments")
 
 
 def collect_findings(check: Callable[_Arguments, Iterator[Finding]]) -> Callable[_Arguments, list[Finding]]:
-    """The findings of a check, or of one that gave up with an InputError this alone."""
+    """Make a list of a check's findings; where the check gives up with an InputError, that is the only finding."""
 
     @functools.wraps(check)
     def findings(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> list[Finding]:

@@ -17,7 +17,7 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.outliers import CAMERA_SHARE, POINT_SHARE, REACH, far_outliers
 
 _FLOAT32_STEP = 2.0**-23
-"""Distance of a float32 to the next one, relative to its size; nerfstudio reads poses in float32."""
+"""Distance of a float32 to the next one, relative to its size; nerfstudio centres poses in float32."""
 _FEWEST_STEPS = 1_000
 """Steps of float32 within the cameras' spread under which their positions are too coarse to train with."""
 _FARTHEST_CENTER = 10
@@ -99,7 +99,7 @@ def finite(value: Any, name: str, where: str) -> float:
 
 
 def check_views(views: Sequence[View], training: int | None, source: Path) -> Iterator[Finding]:
-    """Findings for number, cameras, rotations and positions of the views.
+    """Check number, cameras, rotations and positions of the views.
 
     Args:
         views: All of them.
@@ -128,7 +128,7 @@ def _check_number(views: int, training: int | None, source: Path) -> Iterator[Fi
 
 
 def check_rotations(views: Sequence[View]) -> Iterator[Finding]:
-    """Findings for rotations that are none."""
+    """Check that the rotations of the views are rotations."""
     rotations = np.stack([view.rotation for view in views])  # [V, 3, 3]
     skewed = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > 0.01
     mirrored = ~skewed & (np.linalg.det(rotations) < 0)
@@ -211,7 +211,7 @@ def _can_be_undone(camera: Camera, radius: float) -> bool:
 
 
 def check_ply(path: Path, views: Sequence[View], remedy: str) -> Iterator[Finding]:
-    """Findings for a PLY file of SfM points, and for how they lie to the views, if there are any."""
+    """Check a PLY file of SfM points and, if there are views, how the points lie to them."""
     try:
         positions, _ = ply.read_points(path)
     except InputError as error:
@@ -227,7 +227,7 @@ def check_ply(path: Path, views: Sequence[View], remedy: str) -> Iterator[Findin
 
 
 def check_points(positions: NDArray[np.floating], views: Sequence[View], path: Path) -> Iterator[Finding]:
-    """Findings for SfM points beside the views that should show them.
+    """Check SfM points against the views that should show them.
 
     Args:
         positions: Finite, in the world of the views. [P, 3]

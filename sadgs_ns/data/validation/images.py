@@ -1,4 +1,4 @@
-"""Looks at image files, mostly at their headers alone, and says in half a sentence each what is wrong with them."""
+"""Checks of image files, which mostly look at their headers alone."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sadgs_ns.errors import reason
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"}
 MAX_AUTO_RESOLUTION = 1600
-"""px; nerfstudio looks for smaller copies of images that are larger than this."""
+"""Longest side in px; nerfstudio looks for smaller copies of images that are larger."""
 Rounding = Literal["floor", "round", "ceil"]
 Size = tuple[int, int]
 """Width and height in px."""
@@ -30,13 +30,13 @@ class Frame:
 
     image: Path
     size: Size | None
-    """None where the image itself decides."""
+    """What the camera says, or None where nothing but the image tells."""
     mask: Path | None = None
 
 
 @dataclass(frozen=True)
 class _Image:
-    """What a look at an image file told."""
+    """What is known of an image file."""
 
     size: Size = (0, 0)
     """Zeros where it is unknown."""
@@ -59,12 +59,18 @@ def scaled_size(size: Size, factor: int, rounding: Rounding) -> Size:
 
 
 def smaller_folder(folder: Path, factor: int) -> Path:
-    """Where nerfstudio keeps a folder's images scaled down."""
+    """The folder in which nerfstudio keeps copies of a folder's images that are smaller by a factor."""
     return folder.with_name(f"{folder.name}_{factor}") if factor > 1 else folder
 
 
 def check_images(frames: Sequence[Frame], source: Path, look_for_unused: bool = False) -> Iterator[Finding]:
-    """Findings for the frames' images and masks and, on demand, for images beside them."""
+    """Check the frames' images and masks.
+
+    Args:
+        frames: All frames.
+        source: The file that the frames' sizes are from.
+        look_for_unused: Whether to warn of images beside the frames' that no frame uses.
+    """
     for sentence in image_problems(frames, source):
         yield Finding("error", sentence)
     if look_for_unused and (unused := unused_images(frames, source)) is not None:

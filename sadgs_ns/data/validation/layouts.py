@@ -7,7 +7,7 @@ from pathlib import Path
 from sadgs_ns.data.validation.images import images_in
 
 COLMAP_FOLDERS = ("colmap/sparse/0", "sparse/0", "sparse", "colmap")
-"""Where a reconstruction is looked for; nerfstudio's default is the first."""
+"""Folders in which a reconstruction is looked for; nerfstudio's default is the first."""
 GIVE_POSES = "compute poses with `sadgs-process PHOTOS FOLDER` or `ns-process-data`"
 
 

@@ -1,4 +1,4 @@
-"""What the names of a data set's images may be: nerfstudio writes files by them, and passes them to a shell."""
+"""Checks of the names of images, by which nerfstudio writes files, and which it passes to a shell."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from pathlib import Path, PurePosixPath
 from sadgs_ns.errors import InputError
 
 _SHELL = set('"$`\\')
-"""What a shell reads within double quotes, which are all that nerfstudio puts around a name when it runs ffmpeg."""
+"""Characters that a shell acts on within double quotes; nerfstudio puts names between such when it runs ffmpeg."""
 
 
 def check_names(names: Iterable[str], source: Path) -> None:
     """Refuse names of images that leave their folder, or that a shell would act on.
 
-    nerfstudio's downscaled copies lie under the names, and a shell makes them.
+    nerfstudio gives its downscaled copies these names, and has a shell make them.
 
     Args:
         names: Relative to the folder of images.
@@ -32,15 +32,15 @@ def check_names(names: Iterable[str], source: Path) -> None:
 
 
 def check_paths(paths: Sequence[Path]) -> None:
-    """Refuse images of which one lies outside the folder that all have in common, by way of "..".
+    """Refuse images if one of them leaves the folder that all have in common by "..".
 
-    `ns-render dataset` writes each below its output folder under its path from there.
+    `ns-render dataset` writes each image below its output folder, under the image's path from that common folder.
 
     Raises:
         InputError: Names the first such path.
     """
     if not paths or len({path.is_absolute() for path in paths}) > 1:
-        return  # of a mixture it makes nothing
+        return  # absolute and relative paths have no folder in common
     shared = commonpath(paths)
     for path in paths:
         if ".." in path.relative_to(shared).parts:

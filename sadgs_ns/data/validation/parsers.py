@@ -1,4 +1,4 @@
-"""nerfstudio glue: checks data with its parser's settings, once a run, before anything is written."""
+"""Checks of data with the settings of nerfstudio's parsers, made once a run, before anything is written."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def check_ahead(config: FullImageDatamanagerConfig) -> None:
 
 
 def findings_of(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[validation.Finding]:
-    """Those of `check_ahead`, once, or of a check now."""
+    """The findings of `check_ahead`, once, if it checked these settings, or else those of a check now."""
     while _checked:
         settings, findings = _checked.pop()
         if settings == config:
@@ -71,7 +71,7 @@ def refuse_bad_data(config: FullImageDatamanagerConfig, open_images: bool = True
             open_images=open_images,
         )
     elif isinstance(parser, BlenderDataParserConfig):
-        findings = validation.check_blender(data, open_images=open_images)
+        findings = validation.check_blender(data, ply_path=parser.ply_path, open_images=open_images)
     else:
         findings = []
     validation.refuse(findings, data)
@@ -79,7 +79,7 @@ def refuse_bad_data(config: FullImageDatamanagerConfig, open_images: bool = True
 
 
 def _training_images(parser: ColmapDataParserConfig | NerfstudioDataParserConfig) -> Callable[[int], int] | None:
-    """How many of so many views the parser trains on; None if that depends on their names."""
+    """A function that says how many of so many views the parser trains on; None if that depends on their names."""
     if parser.eval_mode == "filename":
         return None
 

@@ -29,7 +29,7 @@ def check_nerfstudio(
     training_images: Callable[[int], int] | None = lambda count: math.ceil(0.9 * count),
     open_images: bool = True,
 ) -> Iterator[Finding]:
-    """Findings for a `transforms.json`, as `ns-process-data` writes it.
+    """Check a `transforms.json`, as `ns-process-data` writes it.
 
     Args:
         data: The folder, or the file itself.
@@ -153,7 +153,7 @@ def _camera(values: dict[str, Any], distortion: dict[str, Any], model: str, wher
 
 
 def _check_ply(meta: dict[str, Any], path: Path, views: Sequence[View]) -> Iterator[Finding]:
-    """Findings for the SfM points, and for how they lie to the views, if there are any."""
+    """Check the SfM points and, if there are views, how the points lie to them."""
     name = meta.get("ply_file_path")
     if name is None:
         if (path.parent / COLMAP_FOLDERS[0]).exists():
