@@ -29,6 +29,7 @@ from sadgs_ns.method.split import grid_split, num_children
 from sadgs_ns.plugin import checkpoints, visualization
 from sadgs_ns.plugin.model import SadgsModel
 from sadgs_ns.plugin.pipeline import SadgsPipeline
+from sadgs_ns.plugin.structure_maps import observe_training_views
 from sadgs_ns.plugin.trainer import SadgsTrainerConfig
 from sadgs_ns.plugin.visualization import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
@@ -130,8 +131,8 @@ def get_view(pipeline: SadgsPipeline, index: int, split: Literal["train", "eval"
     camera = dataset.cameras[index : index + 1]
     return View(
         name=dataset.image_filenames[index].name,
-        photo=pipeline.photo(data),
-        structure_tensor=decode(pipeline.structure_tensors_of([data])[0]),
+        photo=pipeline.structure_maps.photo(data),
+        structure_tensor=decode(pipeline.structure_maps.codes_of([data])[0]),
         viewmat=(
             pipeline.views.viewmat(index)
             if split == "train"
@@ -308,13 +309,13 @@ def inspect_run(
 
     pipeline, iterations = load_run(path, load_step, data)
     view = get_view(pipeline, index, split)
-    statistics = pipeline.observe_training_views(progress("η in all training views"))
+    statistics = observe_training_views(pipeline.structure_maps, progress("η in all training views"))
     gradients = screen_gradients(pipeline, progress("gradients of all training views"))
     model = pipeline.model
     seen = statistics["n_total"] > 0
     violating = (statistics["eta_max"] > 1).any(dim=1)
     console.print(
-        f"{path}: {model.num_points} Gaussians after {iterations} iterations. In {len(pipeline.structure_tensors)} "
+        f"{path}: {model.num_points} Gaussians after {iterations} iterations. In {len(pipeline.views)} "
         f"training views {int(seen.sum())} were observed, {int(violating.sum())} with η over 1 in one of them.",
         soft_wrap=True,
         highlight=False,

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import time
-import weakref
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -32,14 +31,13 @@ from sadgs_ns.errors import reason
 from sadgs_ns.method.codes import decode
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin import visualization
-from sadgs_ns.plugin.model import in_viewer
+from sadgs_ns.plugin.model import SadgsModel, in_viewer
+from sadgs_ns.plugin.structure_maps import StructureMaps, observe_training_views
 from sadgs_ns.plugin.visualization import CHILDREN, ETA, LOW, PERIOD, Picture, to_picture
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 if TYPE_CHECKING:
     from viser import ViserServer
-
-    from sadgs_ns.plugin.pipeline import SadgsPipeline
 
 OUTPUT = "structure"
 """Name of the panel's picture among the viewer's output types."""
@@ -128,16 +126,16 @@ class StructurePanel(torch.nn.Module):
     A module because the viewer looks for elements in modules only; it has neither parameters nor state.
 
     Args:
-        pipeline: Whose model is shown and whose strategy is changed.
+        maps: The run's structure tensors, whose views have the model that is shown and the strategy that is changed.
     """
 
-    def __init__(self, pipeline: SadgsPipeline) -> None:
+    def __init__(self, maps: StructureMaps) -> None:
         super().__init__()
-        self._reference = weakref.ref(pipeline)  # as a submodule the pipeline would contain itself
+        self._maps = maps
         self._observed: dict[str, Tensor] = {}
         self._refreshed = 0.0
         self._shown = OFF
-        strategy = pipeline.model.strategy
+        strategy = self._model.strategy
         self.choice = ViewerDropdown(
             "Show",
             OFF,
@@ -160,7 +158,7 @@ class StructurePanel(torch.nn.Module):
         self.viewer = ViewerControl()
 
     def _slider(self, name: str, hint: str) -> ViewerSlider[float]:
-        value, (low, high) = float(getattr(self._pipeline.model.strategy, name)), RANGES[name]
+        value, (low, high) = float(getattr(self._model.strategy, name)), RANGES[name]
         return ViewerSlider(
             name,
             value,
@@ -172,18 +170,16 @@ class StructurePanel(torch.nn.Module):
         )
 
     @property
-    def _pipeline(self) -> SadgsPipeline:
-        """The pipeline that the panel belongs to; private, lest the viewer walk from here into it again."""
-        pipeline = self._reference()
-        assert pipeline is not None
-        return pipeline
+    def _model(self) -> SadgsModel:
+        """The model; the name is private, lest the viewer walk from here into it again."""
+        return self._maps.views.model
 
     def _describe(self) -> str:
-        model = self._pipeline.model
+        model = self._model
         return describe(model.strategy, model.num_points, model.strategy_state)
 
     def _change(self, name: str, element: ViewerParameter) -> None:
-        strategy = self._pipeline.model.strategy
+        strategy = self._model.strategy
         try:
             if element.value != getattr(strategy, name):
                 change(strategy, name, element.value)
@@ -209,7 +205,7 @@ class StructurePanel(torch.nn.Module):
 
     def statistics(self) -> dict[str, Tensor] | None:
         """The run's own observations since its last structure step; if there are none, those of `observe_now`."""
-        model = self._pipeline.model
+        model = self._model
         live, n = model.strategy_state, model.num_points
         if "n_total" in live and len(live["n_total"]) == n and bool((live["n_total"] > 0).any()):
             return live
@@ -217,7 +213,7 @@ class StructurePanel(torch.nn.Module):
 
     def observe_now(self) -> None:
         """Observe all training views with the present Gaussians."""
-        self._observed = self._pipeline.observe_training_views()
+        self._observed = observe_training_views(self._maps)
 
     def choose(self) -> None:
         """After a choice: make what it needs, and have the viewer show it.
@@ -229,7 +225,7 @@ class StructurePanel(torch.nn.Module):
         if chosen in OF_STATISTICS and self.statistics() is None:
             self.observe_now()
         elif chosen in OF_PHOTOS:
-            _ = self._pipeline.structure_tensors
+            _ = self._maps.codes
         self._shown = chosen
         viewer = getattr(self.viewer, "viewer", None)  # set when the viewer was made
         if viewer is not None:
@@ -266,19 +262,19 @@ class StructurePanel(torch.nn.Module):
             camera: One camera, shape [1].
             rgb: What it sees, in [0, 1]. [H, W, 3]
         """
-        pipeline, (height, width) = self._pipeline, rgb.shape[:2]
-        constant = pipeline.config.frequency_constant
+        maps, datamanager, (height, width) = self._maps, self._maps.views.datamanager, rgb.shape[:2]
+        constant = maps.frequency_constant
         if choice in OF_STATISTICS:
             return self._of_gaussians(choice, camera, width, height)
         if choice in (PERIOD_HERE, ELLIPSES_HERE):
-            photo, tensor, name = to_picture(rgb), pipeline.structure_tensors_of_images(rgb[None])[0], "this rendering"
+            photo, tensor, name = to_picture(rgb), maps.of_images(rgb[None])[0], "this rendering"
         else:
-            cameras = pipeline.datamanager.train_dataset.cameras.camera_to_worlds
-            extent = float(pipeline.model.strategy_state["scene_scale"])
+            cameras = datamanager.train_dataset.cameras.camera_to_worlds
+            extent = float(self._model.strategy_state["scene_scale"])
             index = nearest_view(cameras, camera.camera_to_worlds[0].to(cameras), extent)
-            photo = to_picture(pipeline.photo(pipeline.datamanager.cached_train[index]))
-            tensor = decode(pipeline.structure_tensors[index])
-            name = f"the nearest training view, {pipeline.datamanager.train_dataset.image_filenames[index].name}"
+            photo = to_picture(maps.photo(datamanager.cached_train[index]))
+            tensor = decode(maps.codes[index])
+            name = f"the nearest training view, {datamanager.train_dataset.image_filenames[index].name}"
         scale = min(height / photo.shape[0], width / photo.shape[1])
         size = max(round(scale * photo.shape[0]), 1), max(round(scale * photo.shape[1]), 1)
         if choice in (ELLIPSES_HERE, ELLIPSES_NEAR):
@@ -295,7 +291,7 @@ class StructurePanel(torch.nn.Module):
         return visualization.annotate(whole, f"{what} of {name}", PERIOD)
 
     def _of_gaussians(self, choice: str, camera: Cameras, width: int, height: int) -> Picture:
-        model, statistics = self._pipeline.model, self.statistics()
+        model, statistics = self._model, self.statistics()
         if statistics is None:
             text = "No observations yet: press “Observe all training views”, or wait for some iterations."
             return visualization.annotate(np.zeros((height, width, 3), np.uint8), text)

@@ -27,10 +27,12 @@ from sadgs_ns.cli import inspect
 from sadgs_ns.demo.scene import write_scene
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.plugin import panel as panel_module
 from sadgs_ns.plugin import visualization
 from sadgs_ns.plugin.model import _say_once
 from sadgs_ns.plugin.panel import CHOICES, OFF, OUTPUT, StructurePanel, change, describe, nearest_view
 from sadgs_ns.plugin.pipeline import SadgsPipeline
+from sadgs_ns.plugin.structure_maps import observe_training_views
 from sadgs_ns.render import rasterization
 
 WIDTH, HEIGHT, TRAIN_VIEWS, EVAL_VIEWS = 48, 36, 8, 2
@@ -70,7 +72,7 @@ def panel(run: Path) -> StructurePanel:
 
 
 def pipeline_of(panel: StructurePanel) -> SadgsPipeline:
-    return panel._pipeline
+    return panel.keeps[0]  # type: ignore[index,return-value]
 
 
 # --- the command line ---
@@ -182,13 +184,13 @@ def test_a_gpu_that_is_full_is_one_sentence(
 def test_observing_all_views_finds_what_training_finds(run: Path):
     """Training's own code, shown every view once and nothing learned in between."""
     pipeline, _ = inspect.load_run(run, load_step=8)
-    observed, model = pipeline.observe_training_views(), pipeline.model
+    observed, model = observe_training_views(pipeline.structure_maps), pipeline.model
     model.train()
     model.optimizers = {}
     model.strategy_state = model.strategy.initialize_state()
     model.step = 0
     for index in range(TRAIN_VIEWS):
-        tensors, Ks = pipeline.structure_tensors[index][None], pipeline.views.cameras[1][index][None]
+        tensors, Ks = pipeline.structure_maps.codes[index][None], pipeline.views.cameras[1][index][None]
         viewmats = pipeline.views.viewmat(index)[None]
         model.get_training_outputs(viewmats, Ks, WIDTH, HEIGHT, [index], tensors)
     trained = model.strategy_state
@@ -202,8 +204,8 @@ def test_observing_all_views_finds_what_training_finds(run: Path):
 
 def test_observing_leaves_the_run_as_it_was(early: SadgsPipeline):
     before, random = early.state_dict()["_model.gauss_params.means"].clone(), torch.get_rng_state()
-    first = early.observe_training_views()
-    torch.testing.assert_close(early.observe_training_views(), first)
+    first = observe_training_views(early.structure_maps)
+    torch.testing.assert_close(observe_training_views(early.structure_maps), first)
     inspect.screen_gradients(early, iter)
     assert torch.equal(torch.get_rng_state(), random)
     assert torch.equal(early.model.means, before)
@@ -211,7 +213,7 @@ def test_observing_leaves_the_run_as_it_was(early: SadgsPipeline):
 
 
 def test_the_structure_step_makes_the_children_of_the_plan(early: SadgsPipeline):
-    model, statistics = early.model, early.observe_training_views()
+    model, statistics = early.model, observe_training_views(early.structure_maps)
     counts, fits = model.strategy.split_plan(statistics, model.strategy.max_gaussians - model.num_points)
     children = torch.where(fits, counts.prod(dim=1), 1)
     step = inspect.structure_step(model, statistics)
@@ -382,10 +384,10 @@ def test_where_no_gaussian_is_opaque_enough_the_panel_says_that_none_was_observe
 def test_what_fails_in_a_viewer_s_thread_is_told(
     panel: StructurePanel, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    def full() -> None:
+    def full(maps: Any) -> None:
         raise RuntimeError("CUDA out of memory.\nOf no interest.")
 
-    monkeypatch.setattr(pipeline_of(panel), "observe_training_views", full)
+    monkeypatch.setattr(panel_module, "observe_training_views", full)
     panel.observe.cb_hook(panel.observe)
     told = " ".join(capsys.readouterr().out.split())
     assert told == "The viewer's panel stays as it was: CUDA out of memory"
@@ -393,7 +395,7 @@ def test_what_fails_in_a_viewer_s_thread_is_told(
 
 def test_sliders_reach_the_strategy_and_the_plan(panel: StructurePanel):
     pipeline = pipeline_of(panel)
-    strategy, statistics = pipeline.model.strategy, pipeline.observe_training_views()
+    strategy, statistics = pipeline.model.strategy, observe_training_views(pipeline.structure_maps)
     split = []
     for tau in (1.0, 0.5, 0.0):
         panel.set_tau_split.value = tau
