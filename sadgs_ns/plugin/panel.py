@@ -30,10 +30,10 @@ from torch import Tensor
 from sadgs_ns.errors import reason
 from sadgs_ns.method.codes import decode
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.plugin import visualization
+from sadgs_ns.plugin import color_scales, gaussian_maps, texture
+from sadgs_ns.plugin.color_scales import CHILDREN, ETA, LOW, PERIOD, Picture, to_picture
 from sadgs_ns.plugin.model import SadgsModel, in_viewer
 from sadgs_ns.plugin.structure_maps import StructureMaps, observe_training_views
-from sadgs_ns.plugin.visualization import CHILDREN, ETA, LOW, PERIOD, Picture, to_picture
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 if TYPE_CHECKING:
@@ -279,40 +279,40 @@ class StructurePanel(torch.nn.Module):
         size = max(round(scale * photo.shape[0]), 1), max(round(scale * photo.shape[1]), 1)
         if choice in (ELLIPSES_HERE, ELLIPSES_NEAR):
             drawn, what = (
-                visualization.draw_ellipses(photo, tensor, constant, size),
+                texture.draw_ellipses(photo, tensor, constant, size),
                 "S̄⁻¹ as ellipses, coloured by period,",
             )
         else:
-            drawn = cv2.resize(PERIOD(visualization.texture_period(tensor, constant)), size[::-1])
+            drawn = cv2.resize(PERIOD(texture.texture_period(tensor, constant)), size[::-1])
             what = "Period of the texture, px,"
         top, left = (height - size[0]) // 2, (width - size[1]) // 2
         whole = np.zeros((height, width, 3), np.uint8)
         whole[top : top + size[0], left : left + size[1]] = drawn
-        return visualization.annotate(whole, f"{what} of {name}", PERIOD)
+        return color_scales.annotate(whole, f"{what} of {name}", PERIOD)
 
     def _of_gaussians(self, choice: str, camera: Cameras, width: int, height: int) -> Picture:
         model, statistics = self._model, self.statistics()
         if statistics is None:
             text = "No observations yet: press “Observe all training views”, or wait for some iterations."
-            return visualization.annotate(np.zeros((height, width, 3), np.uint8), text)
+            return color_scales.annotate(np.zeros((height, width, 3), np.uint8), text)
         strategy = model.strategy
         kept = {name: statistics[name] for name in ("eta_max", "n_total")}
         kept |= {"children": strategy.children_now(statistics), "low": strategy.consistently_low(statistics)}
         rows = model.cropped({**model.gauss_params, **kept})
         if len(rows["means"]) == 0:
-            return visualization.annotate(np.zeros((height, width, 3), np.uint8), "No Gaussians in the crop box.")
+            return color_scales.annotate(np.zeros((height, width, 3), np.uint8), "No Gaussians in the crop box.")
         viewmat = viewmats_from_camera_to_world(camera.camera_to_worlds)[0].to(model.device)
         view = viewmat, camera.get_intrinsics_matrices()[0].to(model.device), width, height
         options = {"rasterize_mode": model.config.rasterize_mode}
         seen = f"{int((statistics['n_total'] > 0).sum()):,} of {model.num_points:,} Gaussians observed"
         if choice == ETA_OF:
-            drawn, scale = visualization.eta_map(rows, rows, *view, **options), ETA
+            drawn, scale = gaussian_maps.eta_map(rows, rows, *view, **options), ETA
             text = f"largest η: over 1 violates, under 0.1 is low ({seen})"
         elif choice == CHILDREN_OF:
-            drawn, scale = visualization.children_map(rows, rows["children"], *view, **options), CHILDREN
+            drawn, scale = gaussian_maps.children_map(rows, rows["children"], *view, **options), CHILDREN
             split = int((kept["children"] > 1).any(dim=1).sum())
             text = f"children at a structure step now: {split:,} Gaussians would split ({seen})"
         else:
-            drawn, scale = visualization.share_map(rows, rows["low"], *view, **options), LOW
+            drawn, scale = gaussian_maps.share_map(rows, rows["low"], *view, **options), LOW
             text = f"share of consistently low Gaussians, {int(kept['low'].sum()):,} in all ({seen})"
-        return visualization.annotate(scale(drawn), text, scale)
+        return color_scales.annotate(scale(drawn), text, scale)

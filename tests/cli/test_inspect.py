@@ -27,8 +27,8 @@ from sadgs_ns.cli import inspect
 from sadgs_ns.demo.scene import write_scene
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.plugin import color_scales, gaussian_maps, texture
 from sadgs_ns.plugin import panel as panel_module
-from sadgs_ns.plugin import visualization
 from sadgs_ns.plugin.model import _say_once
 from sadgs_ns.plugin.panel import CHOICES, OFF, OUTPUT, StructurePanel, change, describe, nearest_view
 from sadgs_ns.plugin.pipeline import SadgsPipeline
@@ -310,7 +310,7 @@ def test_drawing_which_the_viewer_may_break_off_loads_no_photo(choice: str, pane
     assert torch.equal(outputs[OUTPUT], outputs["rgb"])
     assert "cached_train" not in vars(pipeline.datamanager)
     panel.choose()
-    assert "cached_train" in vars(pipeline.datamanager) and "structure_tensors" in vars(pipeline)
+    assert "cached_train" in vars(pipeline.datamanager) and "codes" in vars(pipeline.structure_maps)
     outputs = in_the_viewer(lambda: pipeline.model.get_outputs_for_camera(a_camera(pipeline)))
     assert not torch.equal(outputs[OUTPUT], outputs["rgb"])
 
@@ -323,7 +323,7 @@ def test_the_pictures_survive_tiny_windows_and_crop_boxes(panel: StructurePanel,
         rendered.append(len(means))
         return rasterization.rasterize(means, *args, **options)
 
-    monkeypatch.setattr(visualization, "rasterize", rasterize)
+    monkeypatch.setattr(gaussian_maps, "rasterize", rasterize)
     pipeline = pipeline_of(panel)
     camera = a_camera(pipeline)
     camera.rescale_output_resolution(0.2)
@@ -484,4 +484,4 @@ def test_what_the_panel_draws_of_a_training_view_is_what_the_command_draws(panel
     expected = inspect.view_panels(pipeline, view, statistics)["eta"].picture
     assert (np.abs(drawn.astype(int) - expected) <= 2).mean() > 0.99
     near = panel.picture("wavelength of the nearest photo", a_camera(pipeline, 2), rgb)
-    assert np.array_equal(near, visualization.PERIOD(visualization.texture_period(view.structure_tensor)))
+    assert np.array_equal(near, color_scales.PERIOD(texture.texture_period(view.structure_tensor)))
