@@ -32,7 +32,7 @@ viridis."""
 
 @dataclass(frozen=True)
 class Scale:
-    """Which colour a value has, and how a legend says so."""
+    """A colour scale: which colour a value has, and what a legend says of it."""
 
     label: str
     colors: str
@@ -45,29 +45,29 @@ class Scale:
 
     @property
     def norm(self) -> Normalize:
-        """Value → [0, 1]; values beyond the ends have the colours of the ends."""
+        """Maps values to [0, 1]; those beyond the ends get the colours of the ends."""
         return (LogNorm if self.log else Normalize)(self.low, self.high, clip=True)
 
     @property
     def colormap(self) -> Colormap:
-        """[0, 1] → colour."""
+        """Maps [0, 1] to colours."""
         return matplotlib.colormaps[self.colors].with_extremes(bad=NOTHING)
 
     def __call__(self, values: Tensor) -> Picture:
-        """Colour a map; NaN is black. [H, W] → [H, W, 3]"""
+        """Colour a map of values [H, W]; NaN becomes black. [H, W, 3]"""
         shown = self.norm(np.ma.masked_invalid(values.detach().float().cpu().numpy()))
         return self.colormap(shown, bytes=True)[..., :3]  # type: ignore[return-value]
 
 
 PERIOD = Scale("period of the texture", "viridis", 3, 60, (3, 5, 10, 20, 40), unit="px")
 ETA = Scale("largest η", "PuOr_r", 1 / 30, 30, (0.03, 0.1, 0.3, 1, 3, 10, 30))
-"""Centred at 1: violet Gaussians are finer than the texture, orange ones violate."""
+"""The scale is centred at 1: violet Gaussians are finer than the texture, orange ones violate."""
 CHILDREN = Scale("children, 16 or more at the end", "cividis", 1, 16, (1, 2, 4, 8, 16))
 LOW = Scale("share of consistently low Gaussians", "cividis", 0, 1, (0, 0.25, 0.5, 0.75, 1), log=False)
 
 
 def to_picture(image: Tensor) -> Picture:
-    """[H, W, 3] in [0, 1] → RGB."""
+    """An image in [0, 1] as a picture. [H, W, 3]"""
     return (255 * image.detach().float().clamp(0, 1)).round().byte().cpu().numpy()
 
 
@@ -87,7 +87,13 @@ def _bar(scale: Scale, width: int, height: int) -> Image.Image:
 def annotate(picture: Picture, text: str, scale: Scale | None = None) -> Picture:
     """A picture with a line of text, and the scale's colours and numbers, at its upper edge.
 
-    For the viewer, whose pictures have no margin, and whose axes lie at the lower edge; tiny ones stay as they are.
+    This is for the viewer, whose pictures have no margin, and whose axes lie at the lower edge. Tiny pictures stay as
+    they are.
+
+    Args:
+        picture: [H, W, 3]
+        text: One line.
+        scale: The scale to show, or None for the text alone.
     """
     height, width = picture.shape[:2]
     if height < 120 or width < 160:
@@ -112,7 +118,7 @@ def annotate(picture: Picture, text: str, scale: Scale | None = None) -> Picture
 
 @dataclass(frozen=True)
 class Panel:
-    """A picture of a figure."""
+    """A picture of a figure, with its title and scale."""
 
     title: str
     picture: Picture
@@ -123,9 +129,9 @@ def draw(path: Path, panels: Sequence[Panel], columns: int | None = None) -> Non
     """Write pictures side by side as PNG, each with its title and a colour bar.
 
     Args:
-        path: Written whole or not at all.
-        panels: At least one.
-        columns: None puts all in one row.
+        path: The file, which is written whole or not at all.
+        panels: The pictures, at least one.
+        columns: Pictures in a row; None puts all in one row.
 
     Raises:
         WriteError: If it cannot be written.

@@ -13,7 +13,7 @@ from sadgs_ns.method.split import num_children
 from sadgs_ns.render.rasterization import rasterize
 
 MIN_COVER = 0.05
-"""Share of a pixel that Gaussians with a value must make up, lest it count as empty."""
+"""Share of a pixel that Gaussians with a value must make up; otherwise the pixel counts as empty."""
 
 
 @torch.no_grad()
@@ -26,18 +26,19 @@ def blend(
     height: int,
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
 ) -> tuple[Tensor, Tensor]:
-    """Values of Gaussians blended like their colours, front to back.
+    """Blend values of Gaussians as their colours are blended, front to back.
 
     Args:
         params: `means` [N, 3], `quats` [N, 4], log `scales` [N, 3], logit `opacities` [N] or [N, 1].
-        values: [N, D]
-        viewmat: World to camera. [4, 4]
-        K: px. [3, 3]
-        width, height: px.
+        values: D values for each Gaussian. [N, D]
+        viewmat: World-to-camera matrix. [4, 4]
+        K: Intrinsics in px. [3, 3]
+        width: Width of the image in px.
+        height: Height of the image in px.
         rasterize_mode: As for `rasterize`.
 
     Returns:
-        [H, W, D], and how much of each pixel is covered [H, W, 1].
+        The blended values [H, W, D], and how much of each pixel is covered, in [0, 1] [H, W, 1].
     """
     render, alpha, _ = rasterize(
         params["means"],
@@ -60,10 +61,11 @@ def eta_map(params: Mapping[str, Tensor], statistics: Mapping[str, Tensor], *vie
     Args:
         params: As for `blend`.
         statistics: `eta_max` [N, 3] and `n_total` [N]; Gaussians that were never observed count for nothing.
-        view, options: The rest of `blend`'s.
+        view: The positional arguments of `blend` after its first two.
+        options: The keyword arguments of `blend`.
 
     Returns:
-        NaN where hardly anything observed is drawn. [H, W]
+        η, or NaN where hardly anything observed is drawn. [H, W]
     """
     largest = statistics["eta_max"].amax(dim=1)
     known = ((statistics["n_total"] > 0) & (largest > 0)).float()
@@ -73,20 +75,32 @@ def eta_map(params: Mapping[str, Tensor], statistics: Mapping[str, Tensor], *vie
 
 
 def children_map(params: Mapping[str, Tensor], counts: Tensor, *view, **options) -> Tensor:
-    """Number of children of the Gaussians that make up each pixel, a geometric mean. counts: n per axis, [N, 3]
+    """Number of children of the Gaussians that make up each pixel, as a geometric mean.
+
+    Args:
+        params: As for `blend`.
+        counts: Number of children along each axis, ≥ 1. [N, 3]
+        view: The positional arguments of `blend` after its first two.
+        options: The keyword arguments of `blend`.
 
     Returns:
-        ≥ 1; NaN where hardly anything is drawn. [H, W]
+        A number ≥ 1, or NaN where hardly anything is drawn. [H, W]
     """
     total, cover = blend(params, num_children(counts)[:, None].float().log(), *view, **options)
     return torch.where(cover > MIN_COVER, (total / cover).exp(), torch.nan)[..., 0]
 
 
 def share_map(params: Mapping[str, Tensor], chosen: Tensor, *view, **options) -> Tensor:
-    """How much of what is drawn at each pixel the chosen Gaussians are. chosen: bool [N]
+    """Share of what is drawn at each pixel that the chosen Gaussians make up.
+
+    Args:
+        params: As for `blend`.
+        chosen: Which Gaussians are chosen. bool [N]
+        view: The positional arguments of `blend` after its first two.
+        options: The keyword arguments of `blend`.
 
     Returns:
-        In [0, 1]; NaN where hardly anything is drawn. [H, W]
+        A share in [0, 1], or NaN where hardly anything is drawn. [H, W]
     """
     total, cover = blend(params, chosen[:, None].float(), *view, **options)
     return torch.where(cover > MIN_COVER, total / cover, torch.nan)[..., 0]
@@ -101,12 +115,12 @@ def random_colors(number: int, generator: torch.Generator) -> Tensor:
 
 
 def recolor(colors: Tensor, origins: Tensor, generator: torch.Generator) -> Tensor:
-    """Colours after a densification step: those that are whole keep theirs, children get new ones.
+    """Colours after a densification step: Gaussians that stayed whole keep theirs, children get new ones.
 
     Args:
-        colors: Before the step. [N, 3]
-        origins: The Gaussian of before that each one was or came from. int64 [M]
-        generator: On the CPU.
+        colors: Colours before the step. [N, 3]
+        origins: Index, before the step, of the Gaussian that each one was or came from. int64 [M]
+        generator: A generator on the CPU.
 
     Returns:
         [M, 3]

@@ -1,4 +1,4 @@
-"""nerfstudio glue: what the viewer shows of the method, and the settings that can be changed while it trains.
+"""The viewer's panel: what it shows of the method, and the settings that can be changed while a run trains.
 
 The viewer finds the elements by walking the pipeline, and shows them in alphabetical order of their attributes.
 """
@@ -50,13 +50,18 @@ OF_PHOTOS = (PERIOD_NEAR, ELLIPSES_NEAR)
 OF_STATISTICS = (ETA_OF, CHILDREN_OF, LOW_OF)
 """Choices that need observations of the training views."""
 RANGES = {"tau_split": (0.0, 1.0), "split_exponent": (0.1, 1.0), "max_gaussians": (1, 100_000_000)}
-"""Fields of the strategy that may be changed while it trains, and between which values."""
+"""Fields of the strategy that may be changed while a run trains, each with its smallest and largest value."""
 ROWS = 8
-"""Structure steps in the table, the last ones."""
+"""Number of structure steps in the table, which shows the last ones."""
 
 
 def change(strategy: StructureAwareStrategy, name: str, value: float) -> None:
     """Set one of `RANGES`' fields; the next densification acts on it.
+
+    Args:
+        strategy: The strategy that is changed.
+        name: Name of the field.
+        value: Its new value.
 
     Raises:
         ValueError: If the value is no number in the field's range; the field is then as before.
@@ -68,7 +73,13 @@ def change(strategy: StructureAwareStrategy, name: str, value: float) -> None:
 
 
 def describe(strategy: StructureAwareStrategy, num_points: int, state: dict[str, Any]) -> str:
-    """Number of Gaussians, and those of the last structure steps, as Markdown."""
+    """The number of Gaussians now, and a table of those in the last structure steps, as Markdown.
+
+    Args:
+        strategy: The strategy, whose cap is told.
+        num_points: Number of Gaussians.
+        state: The strategy's state, which lists the structure steps.
+    """
     lines = [f"**{num_points:,} Gaussians** (cap {strategy.max_gaussians:,})", ""]
     steps = state.get("structure_steps", [])[-ROWS:]
     if not steps:
@@ -82,12 +93,12 @@ def describe(strategy: StructureAwareStrategy, num_points: int, state: dict[str,
 
 
 def nearest_view(cameras: Tensor, camera: Tensor, extent: float) -> int:
-    """The training view that looks most alike: near, and in the same direction.
+    """Index of the training view that looks most like a camera's: it is near, and looks in the same direction.
 
     Args:
-        cameras: Camera to world. [C, 3, 4]
-        camera: The same of the view. [3, 4]
-        extent: Of the cameras in world units, the distance that counts as much as 1 rad.
+        cameras: Camera-to-world poses of the training views. [C, 3, 4]
+        camera: Camera-to-world pose of the camera. [3, 4]
+        extent: Extent of the training cameras in world units: the distance that counts as much as 1 rad.
     """
     distance = (cameras[:, :, 3] - camera[:, 3]).norm(dim=-1) / max(extent, 1e-12)
     angle = (cameras[:, :, 2] @ camera[:, 2]).clamp(-1, 1).acos()
@@ -95,11 +106,11 @@ def nearest_view(cameras: Tensor, camera: Tensor, extent: float) -> int:
 
 
 class ViewerMarkdown(ViewerElement[str]):
-    """A text in the viewer; unlike a parameter's, its changes call nobody.
+    """A text in the viewer; unlike a parameter, it calls nobody when it changes.
 
     Args:
-        name: Of the element.
-        text: Makes the text, when it is installed and at every `refresh`.
+        name: Name of the element.
+        text: Makes the text, when the element is installed and at every `refresh`.
     """
 
     def __init__(self, name: str, text: Callable[[], str]) -> None:
@@ -115,7 +126,7 @@ class ViewerMarkdown(ViewerElement[str]):
         self._create_gui_handle(viser_server)
 
     def refresh(self) -> None:
-        """Send the text if it is another than before and there is a viewer."""
+        """Send the text to the viewer, if there is one and the text has changed."""
         if self.gui_handle is not None and (text := self.text()) != self._shown:
             self._shown = self.gui_handle.content = text
 
@@ -123,7 +134,7 @@ class ViewerMarkdown(ViewerElement[str]):
 class StructurePanel(torch.nn.Module):
     """Elements of the viewer, and the picture that they choose.
 
-    A module because the viewer looks for elements in modules only; it has neither parameters nor state.
+    It is a module because the viewer looks for elements in modules only; it has neither parameters nor state.
 
     Args:
         maps: The run's structure tensors, whose views have the model that is shown and the strategy that is changed.
@@ -162,7 +173,7 @@ class StructurePanel(torch.nn.Module):
         return ViewerSlider(
             name,
             value,
-            min(low, value),  # the run's own options may go beyond
+            min(low, value),  # the run's own options may lie beyond the range
             max(high, value),
             0.05,
             cb_hook=lambda element: self._change(name, element),
@@ -190,21 +201,21 @@ class StructurePanel(torch.nn.Module):
 
     @staticmethod
     def _told(act: Callable[[], None]) -> None:
-        """Do it, and say on the console what went wrong: the viewer's threads keep their errors to themselves."""
+        """Call `act`, and say on the console what went wrong: the viewer's threads keep their errors to themselves."""
         try:
             act()
         except (RuntimeError, ValueError) as error:  # memory that is full, or data that went away
             CONSOLE.print(f"[yellow]The viewer's panel stays as it was: {escape(reason(error))}[/]")
 
     def refresh(self) -> None:
-        """Show the present numbers, at most once a second; without a viewer this costs nothing."""
+        """Show the present numbers in the table, at most once a second; without a viewer this costs nothing."""
         now = time.monotonic()
         if self.table.gui_handle is not None and now - self._refreshed > 1.0:
             self._refreshed = now
             self.table.refresh()
 
     def statistics(self) -> dict[str, Tensor] | None:
-        """The run's own observations since its last structure step; if there are none, those of `observe_now`."""
+        """The run's own observations since its last structure step, or those of `observe_now` if there are none."""
         model = self._model
         live, n = model.strategy_state, model.num_points
         if "n_total" in live and len(live["n_total"]) == n and bool((live["n_total"] > 0).any()):
@@ -216,10 +227,10 @@ class StructurePanel(torch.nn.Module):
         self._observed = observe_training_views(self._maps)
 
     def choose(self) -> None:
-        """After a choice: make what it needs, and have the viewer show it.
+        """Make what the present choice needs, and have the viewer show it.
 
-        Here and not when it is drawn, since the viewer breaks off drawing at any line when its camera moves: photos
-        that are undistorted a second time would be wrong.
+        This happens here and not when the picture is drawn, since the viewer breaks off drawing at any line when its
+        camera moves: photos that are undistorted a second time would be wrong.
         """
         chosen = self.choice.value
         if chosen in OF_STATISTICS and self.statistics() is None:
@@ -235,9 +246,9 @@ class StructurePanel(torch.nn.Module):
                 output.value = name
 
     def outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
-        """What the viewer may show besides; nothing where evaluation or `ns-render` ask.
+        """What the viewer may show besides the model's own outputs; evaluation and `ns-render` get nothing.
 
-        The output is there whatever is chosen: the viewer's thread fails where one goes missing.
+        The output exists whatever is chosen, because the viewer's thread fails where one goes missing.
 
         Args:
             camera: One camera, shape [1].
@@ -255,10 +266,10 @@ class StructurePanel(torch.nn.Module):
 
     @torch.no_grad()
     def picture(self, choice: str, camera: Cameras, rgb: Tensor) -> Picture:
-        """One of `CHOICES` in a camera, with its legend.
+        """The picture of one of `CHOICES` as a camera sees it, with its legend.
 
         Args:
-            choice: Any but "off".
+            choice: Any of `CHOICES` but "off".
             camera: One camera, shape [1].
             rgb: What it sees, in [0, 1]. [H, W, 3]
         """

@@ -1,4 +1,4 @@
-"""nerfstudio glue: several views per iteration, and the structure tensors of the training images."""
+"""nerfstudio's pipeline for this method: several views in an iteration, with the structure tensors of their images."""
 
 from __future__ import annotations
 

@@ -15,11 +15,11 @@ from sadgs_ns.method.structure_tensor import FREQUENCY_CONSTANT, NUM_LEVELS, SCA
 from sadgs_ns.plugin.color_scales import PERIOD, Picture
 
 ELLIPSES_ACROSS = 28
-"""Ellipses along an image's shorter side."""
+"""Number of ellipses along an image's shorter side."""
 
 
 def texture_period(structure_tensor: Tensor, frequency_constant: float = FREQUENCY_CONSTANT) -> Tensor:
-    """Period of the finest texture at each pixel: 2π c Λ_min.
+    """Period of the finest texture at each pixel, 2π c Λ_min.
 
     The structure tensor measures ω = c / σ, and a sine of period P answers most at σ = P / 2π.
 
@@ -28,7 +28,7 @@ def texture_period(structure_tensor: Tensor, frequency_constant: float = FREQUEN
         frequency_constant: c that S̄ was computed with, in 1/px.
 
     Returns:
-        px; NaN where S̄ is 0: no texture, or masked. [...]
+        The period in px, or NaN where S̄ is 0, that is without texture or masked. [...]
     """
     period = wavelength(structure_tensor)
     return torch.where(period < 0.999 / WAVELENGTH_EPSILON, 2 * torch.pi * frequency_constant * period, torch.nan)
@@ -39,17 +39,17 @@ class Ellipses:
     """S̄⁻¹ at some pixels (paper, figure 1): short across a texture's stripes, long along them."""
 
     centers: Tensor
-    """px. [E, 2]"""
+    """Centres in px. [E, 2]"""
     axes: Tensor
     """Wavelengths along the short and the long axis, px, at most `longest`. [E, 2]"""
     angles: Tensor
     """Direction of the short axis, from x towards y, rad. [E]"""
     periods: Tensor
-    """px. [E]"""
+    """Periods of the texture in px. [E]"""
     longest: float
     """Wavelength of the coarsest level, at which axes are cut: stripes have an infinite one along them."""
     spacing: float
-    """Between the centres, px."""
+    """Distance between neighbouring centres in px."""
 
 
 def structure_ellipses(
@@ -60,7 +60,7 @@ def structure_ellipses(
     Args:
         structure_tensor: S̄ as (xx, xy, yy) in 1/px². [H, W, 3]
         frequency_constant: c that S̄ was computed with, in 1/px.
-        spacing: Of the grid in px, ≥ 1; None puts `ELLIPSES_ACROSS` along the shorter side.
+        spacing: Spacing of the grid in px, ≥ 1; None puts `ELLIPSES_ACROSS` along the shorter side.
     """
     height, width = structure_tensor.shape[:2]
     spacing = max(min(height, width) / ELLIPSES_ACROSS, 1.0) if spacing is None else spacing
@@ -94,7 +94,7 @@ def draw_ellipses(
     """S̄⁻¹ as ellipses over an image, which is made dark grey. A circle as wide as the grid is the coarsest wavelength.
 
     Args:
-        image: [H, W, 3]
+        image: The picture to draw on. [H, W, 3]
         structure_tensor: S̄ of the image. [H, W, 3]
         frequency_constant: c that S̄ was computed with, in 1/px.
         size: Height and width of the picture in px; None keeps those of the image.
