@@ -176,10 +176,9 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
         with torch.no_grad():
             model.get_outputs(camera)
         pipeline.train()
-    # Looked up on the class: on the instance hasattr would already compute it.
-    if hasattr(type(pipeline), "structure_tensors"):
+    if hasattr(pipeline, "structure_maps"):  # splatfacto's pipeline has none
         with timed("structure_tensor"), compiling:
-            _ = pipeline.structure_tensors
+            _ = pipeline.structure_maps.codes
 
     timer, curve = LoopTimer(), None
     if job.row.curve_every is not None:

@@ -27,11 +27,12 @@ from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow
 from sadgs_ns.method.codes import decode
 from sadgs_ns.method.split import grid_split, num_children
 from sadgs_ns.method.strategy import SMALL_SCALE
-from sadgs_ns.plugin import checkpoints, visualization
+from sadgs_ns.plugin import checkpoints, color_scales, gaussian_maps, texture
+from sadgs_ns.plugin.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
 from sadgs_ns.plugin.model import SadgsModel
 from sadgs_ns.plugin.pipeline import SadgsPipeline
+from sadgs_ns.plugin.structure_maps import observe_training_views
 from sadgs_ns.plugin.trainer import SadgsTrainerConfig
-from sadgs_ns.plugin.visualization import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 SEED = 0
@@ -60,7 +61,7 @@ class View:
 
     @property
     def camera(self) -> tuple[Tensor, Tensor, int, int]:
-        """viewmat, K, width and height, as `visualization.blend` takes them."""
+        """viewmat, K, width and height, as `gaussian_maps.blend` takes them."""
         height, width = self.photo.shape[:2]
         return self.viewmat, self.K, width, height
 
@@ -131,8 +132,8 @@ def get_view(pipeline: SadgsPipeline, index: int, split: Literal["train", "eval"
     camera = dataset.cameras[index : index + 1]
     return View(
         name=dataset.image_filenames[index].name,
-        photo=pipeline.photo(data),
-        structure_tensor=decode(pipeline.structure_tensors_of([data])[0]),
+        photo=pipeline.structure_maps.photo(data),
+        structure_tensor=decode(pipeline.structure_maps.codes_of([data])[0]),
         viewmat=(
             pipeline.views.viewmat(index)
             if split == "train"
@@ -226,27 +227,27 @@ def view_panels(pipeline: SadgsPipeline, view: View, statistics: dict[str, Tenso
     return {
         "ellipses": Panel(
             f"{view.name}: the structure tensor, its inverse as ellipses",
-            visualization.draw_ellipses(photo, view.structure_tensor, constant, size),
+            texture.draw_ellipses(photo, view.structure_tensor, constant, size),
             PERIOD,
         ),
         "wavelength": Panel(
             f"{view.name}: local wavelength",
-            PERIOD(visualization.texture_period(view.structure_tensor, constant)),
+            PERIOD(texture.texture_period(view.structure_tensor, constant)),
             PERIOD,
         ),
         "eta": Panel(
             f"{view.name}: η of the Gaussians, largest of their observations; over 1 violates",
-            ETA(visualization.eta_map(params, statistics, *view.camera, **options)),
+            ETA(gaussian_maps.eta_map(params, statistics, *view.camera, **options)),
             ETA,
         ),
         "children": Panel(
             f"{view.name}: {split:,} of {model.num_points:,} Gaussians would split, {added:,} more",
-            CHILDREN(visualization.children_map(params, counts, *view.camera, **options)),
+            CHILDREN(gaussian_maps.children_map(params, counts, *view.camera, **options)),
             CHILDREN,
         ),
         "low": Panel(
             f"{view.name}: {int(is_low.sum()):,} of {model.num_points:,} Gaussians are consistently low (η < 0.1)",
-            LOW(visualization.share_map(params, is_low, *view.camera, **options)),
+            LOW(gaussian_maps.share_map(params, is_low, *view.camera, **options)),
             LOW,
         ),
     }
@@ -255,21 +256,21 @@ def view_panels(pipeline: SadgsPipeline, view: View, statistics: dict[str, Tenso
 def step_panels(model: SadgsModel, view: View, conventional: Step, structure: Step) -> list[Panel]:
     """The photo, and the Gaussians in random colours before and after one step of each kind (paper, figure 3)."""
     generator = torch.Generator().manual_seed(SEED)
-    colors = visualization.random_colors(model.num_points, generator).to(model.device)
+    colors = gaussian_maps.random_colors(model.num_points, generator).to(model.device)
 
     viewmat, K, width, height = view.camera
     enlarge = max(math.ceil(MIN_RENDER_SIDE / max(height, width)), 1)
     camera = (viewmat, K * K.new_tensor([[enlarge], [enlarge], [1.0]]), enlarge * width, enlarge * height)
 
     def panel(title: str, params: Any, its_colors: Tensor) -> Panel:
-        render, _ = visualization.blend(params, its_colors, *camera, rasterize_mode=model.config.rasterize_mode)
+        render, _ = gaussian_maps.blend(params, its_colors, *camera, rasterize_mode=model.config.rasterize_mode)
         return Panel(f"{title}: {len(params['means']):,} Gaussians", to_picture(render))
 
     return [
         Panel(f"photo {view.name}", to_picture(view.photo).repeat(enlarge, axis=0).repeat(enlarge, axis=1)),
         panel("before", model.gauss_params, colors),
         *(
-            panel(title, step.params, visualization.recolor(colors, step.origins, generator))
+            panel(title, step.params, gaussian_maps.recolor(colors, step.origins, generator))
             for title, step in (("one conventional step", conventional), ("one structure-aware step", structure))
         ),
     ]
@@ -309,13 +310,13 @@ def inspect_run(
 
     pipeline, iterations = load_run(path, load_step, data)
     view = get_view(pipeline, index, split)
-    statistics = pipeline.observe_training_views(progress("η in all training views"))
+    statistics = observe_training_views(pipeline.structure_maps, progress("η in all training views"))
     gradients = screen_gradients(pipeline, progress("gradients of all training views"))
     model = pipeline.model
     seen = statistics["n_total"] > 0
     violating = (statistics["eta_max"] > 1).any(dim=1)
     console.print(
-        f"{path}: {model.num_points} Gaussians after {iterations} iterations. In {len(pipeline.structure_tensors)} "
+        f"{path}: {model.num_points} Gaussians after {iterations} iterations. In {len(pipeline.views)} "
         f"training views {int(seen.sum())} were observed, {int(violating.sum())} with η over 1 in one of them.",
         soft_wrap=True,
         highlight=False,
@@ -325,10 +326,10 @@ def inspect_run(
     written = []
     for name, panel in view_panels(pipeline, view, statistics).items():
         written.append(folder / f"{prefix}-{name}.png")
-        visualization.draw(written[-1], [panel])
+        color_scales.draw(written[-1], [panel])
     steps = conventional_step(model, gradients), structure_step(model, statistics)
     written.append(folder / f"{prefix}-step.png")
-    visualization.draw(written[-1], step_panels(model, view, *steps), columns=2)
+    color_scales.draw(written[-1], step_panels(model, view, *steps), columns=2)
     return written
 
 

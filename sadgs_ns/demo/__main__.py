@@ -32,11 +32,11 @@ from sadgs_ns.cli.export import write_ply
 from sadgs_ns.cli.inspect import get_view
 from sadgs_ns.demo.scene import EVAL_INTERVAL, SPARSE_FOLDER, SceneDescription, expected_wavelength_map, write_scene
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.plugin import presets, visualization
+from sadgs_ns.plugin import color_scales, gaussian_maps, presets, texture
+from sadgs_ns.plugin.color_scales import ETA, PERIOD, Panel
 from sadgs_ns.plugin.model import SadgsModel
 from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
-from sadgs_ns.plugin.visualization import ETA, PERIOD, Panel
 
 PRESET = "sadgs"
 ABSGS_THRESHOLD_FACTOR = 20.0
@@ -221,16 +221,16 @@ def draw_wavelength_and_eta(path: Path, scene: SceneDescription, run: Run, index
     pipeline, before = run.pipeline, run.before_split
     view = get_view(pipeline, index)
     truth = expected_wavelength_map(scene.surfaces, next(v for v in scene.views if v.name == view.name))
-    estimate = visualization.texture_period(view.structure_tensor, pipeline.config.frequency_constant)
+    estimate = texture.texture_period(view.structure_tensor, pipeline.config.frequency_constant)
     panels = [
-        Panel(f"training view {view.name}", visualization.to_picture(view.photo)),
+        Panel(f"training view {view.name}", color_scales.to_picture(view.photo)),
         Panel("wavelength, estimated", PERIOD(estimate), PERIOD),
         Panel("wavelength, true", PERIOD(torch.from_numpy(truth)), PERIOD),
     ]
     if before.params:
-        eta = visualization.eta_map(before.params, before.statistics, *view.camera)
+        eta = gaussian_maps.eta_map(before.params, before.statistics, *view.camera)
         panels.append(Panel("η before the first split", ETA(eta), ETA))
-    visualization.draw(path, panels)
+    color_scales.draw(path, panels)
 
 
 def verdict(absgs: Run, sadgs: Run, max_gaussians: int) -> str:

@@ -69,7 +69,7 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
         return means.new_zeros((n, *model.gauss_params[name].shape[1:]))
 
     def structure() -> None:
-        encode(pipeline.structure_tensors_of_images(image))
+        encode(pipeline.structure_maps.of_images(image))
 
     def loss() -> None:
         predicted = image.repeat(views, 1, 1, 1).requires_grad_()

@@ -1,4 +1,4 @@
-"""nerfstudio glue: what the viewer shows of the method, and the settings that can be changed while it trains.
+"""The viewer's panel: what it shows of the method, and the settings that can be changed while a run trains.
 
 The viewer finds the elements by walking the pipeline, and shows them in alphabetical order of their attributes.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import time
-import weakref
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -31,15 +30,14 @@ from torch import Tensor
 from sadgs_ns.errors import reason
 from sadgs_ns.method.codes import decode
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.plugin import visualization
-from sadgs_ns.plugin.model import in_viewer
-from sadgs_ns.plugin.visualization import CHILDREN, ETA, LOW, PERIOD, Picture, to_picture
+from sadgs_ns.plugin import color_scales, gaussian_maps, texture
+from sadgs_ns.plugin.color_scales import CHILDREN, ETA, LOW, PERIOD, Picture, to_picture
+from sadgs_ns.plugin.model import SadgsModel, in_viewer
+from sadgs_ns.plugin.structure_maps import StructureMaps, observe_training_views
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 if TYPE_CHECKING:
     from viser import ViserServer
-
-    from sadgs_ns.plugin.pipeline import SadgsPipeline
 
 OUTPUT = "structure"
 """Name of the panel's picture among the viewer's output types."""
@@ -52,13 +50,18 @@ OF_PHOTOS = (PERIOD_NEAR, ELLIPSES_NEAR)
 OF_STATISTICS = (ETA_OF, CHILDREN_OF, LOW_OF)
 """Choices that need observations of the training views."""
 RANGES = {"tau_split": (0.0, 1.0), "max_gaussians": (1, 100_000_000)}
-"""Fields of the strategy that may be changed while it trains, and between which values."""
+"""Fields of the strategy that may be changed while a run trains, each with its smallest and largest value."""
 ROWS = 8
-"""Structure steps in the table, the last ones."""
+"""Number of structure steps in the table, which shows the last ones."""
 
 
 def change(strategy: StructureAwareStrategy, name: str, value: float) -> None:
     """Set one of `RANGES`' fields; the next densification acts on it.
+
+    Args:
+        strategy: The strategy that is changed.
+        name: Name of the field.
+        value: Its new value.
 
     Raises:
         ValueError: If the value is no number in the field's range; the field is then as before.
@@ -70,7 +73,13 @@ def change(strategy: StructureAwareStrategy, name: str, value: float) -> None:
 
 
 def describe(strategy: StructureAwareStrategy, num_points: int, state: dict[str, Any]) -> str:
-    """Number of Gaussians, and those of the last structure steps, as Markdown."""
+    """The number of Gaussians now, and a table of those in the last structure steps, as Markdown.
+
+    Args:
+        strategy: The strategy, whose cap is told.
+        num_points: Number of Gaussians.
+        state: The strategy's state, which lists the structure steps.
+    """
     lines = [f"**{num_points:,} Gaussians** (cap {strategy.max_gaussians:,})", ""]
     steps = state.get("structure_steps", [])[-ROWS:]
     if not steps:
@@ -84,12 +93,12 @@ def describe(strategy: StructureAwareStrategy, num_points: int, state: dict[str,
 
 
 def nearest_view(cameras: Tensor, camera: Tensor, extent: float) -> int:
-    """The training view that looks most alike: near, and in the same direction.
+    """Index of the training view that looks most like a camera's: it is near, and looks in the same direction.
 
     Args:
-        cameras: Camera to world. [C, 3, 4]
-        camera: The same of the view. [3, 4]
-        extent: Of the cameras in world units, the distance that counts as much as 1 rad.
+        cameras: Camera-to-world poses of the training views. [C, 3, 4]
+        camera: Camera-to-world pose of the camera. [3, 4]
+        extent: Extent of the training cameras in world units: the distance that counts as much as 1 rad.
     """
     distance = (cameras[:, :, 3] - camera[:, 3]).norm(dim=-1) / max(extent, 1e-12)
     angle = (cameras[:, :, 2] @ camera[:, 2]).clamp(-1, 1).acos()
@@ -97,11 +106,11 @@ def nearest_view(cameras: Tensor, camera: Tensor, extent: float) -> int:
 
 
 class ViewerMarkdown(ViewerElement[str]):
-    """A text in the viewer; unlike a parameter's, its changes call nobody.
+    """A text in the viewer; unlike a parameter, it calls nobody when it changes.
 
     Args:
-        name: Of the element.
-        text: Makes the text, when it is installed and at every `refresh`.
+        name: Name of the element.
+        text: Makes the text, when the element is installed and at every `refresh`.
     """
 
     def __init__(self, name: str, text: Callable[[], str]) -> None:
@@ -117,7 +126,7 @@ class ViewerMarkdown(ViewerElement[str]):
         self._create_gui_handle(viser_server)
 
     def refresh(self) -> None:
-        """Send the text if it is another than before and there is a viewer."""
+        """Send the text to the viewer, if there is one and the text has changed."""
         if self.gui_handle is not None and (text := self.text()) != self._shown:
             self._shown = self.gui_handle.content = text
 
@@ -125,19 +134,19 @@ class ViewerMarkdown(ViewerElement[str]):
 class StructurePanel(torch.nn.Module):
     """Elements of the viewer, and the picture that they choose.
 
-    A module because the viewer looks for elements in modules only; it has neither parameters nor state.
+    It is a module because the viewer looks for elements in modules only; it has neither parameters nor state.
 
     Args:
-        pipeline: Whose model is shown and whose strategy is changed.
+        maps: The run's structure tensors, whose views have the model that is shown and the strategy that is changed.
     """
 
-    def __init__(self, pipeline: SadgsPipeline) -> None:
+    def __init__(self, maps: StructureMaps) -> None:
         super().__init__()
-        self._reference = weakref.ref(pipeline)  # as a submodule the pipeline would contain itself
+        self._maps = maps
         self._observed: dict[str, Tensor] = {}
         self._refreshed = 0.0
         self._shown = OFF
-        strategy = pipeline.model.strategy
+        strategy = self._model.strategy
         self.choice = ViewerDropdown(
             "Show",
             OFF,
@@ -159,11 +168,11 @@ class StructurePanel(torch.nn.Module):
         self.viewer = ViewerControl()
 
     def _slider(self, name: str, hint: str) -> ViewerSlider[float]:
-        value, (low, high) = float(getattr(self._pipeline.model.strategy, name)), RANGES[name]
+        value, (low, high) = float(getattr(self._model.strategy, name)), RANGES[name]
         return ViewerSlider(
             name,
             value,
-            min(low, value),  # the run's own options may go beyond
+            min(low, value),  # the run's own options may lie beyond the range
             max(high, value),
             0.05,
             cb_hook=lambda element: self._change(name, element),
@@ -171,18 +180,16 @@ class StructurePanel(torch.nn.Module):
         )
 
     @property
-    def _pipeline(self) -> SadgsPipeline:
-        """The pipeline that the panel belongs to; private, lest the viewer walk from here into it again."""
-        pipeline = self._reference()
-        assert pipeline is not None
-        return pipeline
+    def _model(self) -> SadgsModel:
+        """The model; the name is private, lest the viewer walk from here into it again."""
+        return self._maps.views.model
 
     def _describe(self) -> str:
-        model = self._pipeline.model
+        model = self._model
         return describe(model.strategy, model.num_points, model.strategy_state)
 
     def _change(self, name: str, element: ViewerParameter) -> None:
-        strategy = self._pipeline.model.strategy
+        strategy = self._model.strategy
         try:
             if element.value != getattr(strategy, name):
                 change(strategy, name, element.value)
@@ -193,22 +200,22 @@ class StructurePanel(torch.nn.Module):
 
     @staticmethod
     def _told(act: Callable[[], None]) -> None:
-        """Do it, and say on the console what went wrong: the viewer's threads keep their errors to themselves."""
+        """Call `act`, and say on the console what went wrong: the viewer's threads keep their errors to themselves."""
         try:
             act()
         except (RuntimeError, ValueError) as error:  # memory that is full, or data that went away
             CONSOLE.print(f"[yellow]The viewer's panel stays as it was: {escape(reason(error))}[/]")
 
     def refresh(self) -> None:
-        """Show the present numbers, at most once a second; without a viewer this costs nothing."""
+        """Show the present numbers in the table, at most once a second; without a viewer this costs nothing."""
         now = time.monotonic()
         if self.table.gui_handle is not None and now - self._refreshed > 1.0:
             self._refreshed = now
             self.table.refresh()
 
     def statistics(self) -> dict[str, Tensor] | None:
-        """The run's own observations since its last structure step; if there are none, those of `observe_now`."""
-        model = self._pipeline.model
+        """The run's own observations since its last structure step, or those of `observe_now` if there are none."""
+        model = self._model
         live, n = model.strategy_state, model.num_points
         if "n_total" in live and len(live["n_total"]) == n and bool((live["n_total"] > 0).any()):
             return live
@@ -216,19 +223,19 @@ class StructurePanel(torch.nn.Module):
 
     def observe_now(self) -> None:
         """Observe all training views with the present Gaussians."""
-        self._observed = self._pipeline.observe_training_views()
+        self._observed = observe_training_views(self._maps)
 
     def choose(self) -> None:
-        """After a choice: make what it needs, and have the viewer show it.
+        """Make what the present choice needs, and have the viewer show it.
 
-        Here and not when it is drawn, since the viewer breaks off drawing at any line when its camera moves: photos
-        that are undistorted a second time would be wrong.
+        This happens here and not when the picture is drawn, since the viewer breaks off drawing at any line when its
+        camera moves: photos that are undistorted a second time would be wrong.
         """
         chosen = self.choice.value
         if chosen in OF_STATISTICS and self.statistics() is None:
             self.observe_now()
         elif chosen in OF_PHOTOS:
-            _ = self._pipeline.structure_tensors
+            _ = self._maps.codes
         self._shown = chosen
         viewer = getattr(self.viewer, "viewer", None)  # set when the viewer was made
         if viewer is not None:
@@ -238,9 +245,9 @@ class StructurePanel(torch.nn.Module):
                 output.value = name
 
     def outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
-        """What the viewer may show besides; nothing where evaluation or `ns-render` ask.
+        """What the viewer may show besides the model's own outputs; evaluation and `ns-render` get nothing.
 
-        The output is there whatever is chosen: the viewer's thread fails where one goes missing.
+        The output exists whatever is chosen, because the viewer's thread fails where one goes missing.
 
         Args:
             camera: One camera, shape [1].
@@ -258,67 +265,67 @@ class StructurePanel(torch.nn.Module):
 
     @torch.no_grad()
     def picture(self, choice: str, camera: Cameras, rgb: Tensor) -> Picture:
-        """One of `CHOICES` in a camera, with its legend.
+        """The picture of one of `CHOICES` as a camera sees it, with its legend.
 
         Args:
-            choice: Any but "off".
+            choice: Any of `CHOICES` but "off".
             camera: One camera, shape [1].
             rgb: What it sees, in [0, 1]. [H, W, 3]
         """
-        pipeline, (height, width) = self._pipeline, rgb.shape[:2]
-        constant = pipeline.config.frequency_constant
+        maps, datamanager, (height, width) = self._maps, self._maps.views.datamanager, rgb.shape[:2]
+        constant = maps.frequency_constant
         if choice in OF_STATISTICS:
             return self._of_gaussians(choice, camera, width, height)
         if choice in (PERIOD_HERE, ELLIPSES_HERE):
-            photo, tensor, name = to_picture(rgb), pipeline.structure_tensors_of_images(rgb[None])[0], "this rendering"
+            photo, tensor, name = to_picture(rgb), maps.of_images(rgb[None])[0], "this rendering"
         else:
-            cameras = pipeline.datamanager.train_dataset.cameras.camera_to_worlds
-            extent = float(pipeline.model.strategy_state["scene_scale"])
+            cameras = datamanager.train_dataset.cameras.camera_to_worlds
+            extent = float(self._model.strategy_state["scene_scale"])
             index = nearest_view(cameras, camera.camera_to_worlds[0].to(cameras), extent)
-            photo = to_picture(pipeline.photo(pipeline.datamanager.cached_train[index]))
-            tensor = decode(pipeline.structure_tensors[index])
-            name = f"the nearest training view, {pipeline.datamanager.train_dataset.image_filenames[index].name}"
+            photo = to_picture(maps.photo(datamanager.cached_train[index]))
+            tensor = decode(maps.codes[index])
+            name = f"the nearest training view, {datamanager.train_dataset.image_filenames[index].name}"
         scale = min(height / photo.shape[0], width / photo.shape[1])
         size = max(round(scale * photo.shape[0]), 1), max(round(scale * photo.shape[1]), 1)
         if choice in (ELLIPSES_HERE, ELLIPSES_NEAR):
             drawn, what = (
-                visualization.draw_ellipses(photo, tensor, constant, size),
+                texture.draw_ellipses(photo, tensor, constant, size),
                 "S̄⁻¹ as ellipses, coloured by period,",
             )
         else:
-            drawn = cv2.resize(PERIOD(visualization.texture_period(tensor, constant)), size[::-1])
+            drawn = cv2.resize(PERIOD(texture.texture_period(tensor, constant)), size[::-1])
             what = "Period of the texture, px,"
         top, left = (height - size[0]) // 2, (width - size[1]) // 2
         whole = np.zeros((height, width, 3), np.uint8)
         whole[top : top + size[0], left : left + size[1]] = drawn
-        return visualization.annotate(whole, f"{what} of {name}", PERIOD)
+        return color_scales.annotate(whole, f"{what} of {name}", PERIOD)
 
     def _of_gaussians(self, choice: str, camera: Cameras, width: int, height: int) -> Picture:
-        model, statistics = self._pipeline.model, self.statistics()
+        model, statistics = self._model, self.statistics()
         if statistics is None:
             text = "No observations yet: press “Observe all training views”, or wait for some iterations."
-            return visualization.annotate(np.zeros((height, width, 3), np.uint8), text)
+            return color_scales.annotate(np.zeros((height, width, 3), np.uint8), text)
         strategy = model.strategy
         kept = {name: statistics[name] for name in ("eta_max", "n_total")}
         kept |= {
-            "children": strategy.children_now(self.pipeline.model.gauss_params, statistics),
+            "children": strategy.children_now(model.gauss_params, statistics),
             "low": strategy.consistently_low(statistics),
         }
         rows = model.cropped({**model.gauss_params, **kept})
         if len(rows["means"]) == 0:
-            return visualization.annotate(np.zeros((height, width, 3), np.uint8), "No Gaussians in the crop box.")
+            return color_scales.annotate(np.zeros((height, width, 3), np.uint8), "No Gaussians in the crop box.")
         viewmat = viewmats_from_camera_to_world(camera.camera_to_worlds)[0].to(model.device)
         view = viewmat, camera.get_intrinsics_matrices()[0].to(model.device), width, height
         options = {"rasterize_mode": model.config.rasterize_mode}
         seen = f"{int((statistics['n_total'] > 0).sum()):,} of {model.num_points:,} Gaussians observed"
         if choice == ETA_OF:
-            drawn, scale = visualization.eta_map(rows, rows, *view, **options), ETA
+            drawn, scale = gaussian_maps.eta_map(rows, rows, *view, **options), ETA
             text = f"largest η: over 1 violates, under 0.1 is low ({seen})"
         elif choice == CHILDREN_OF:
-            drawn, scale = visualization.children_map(rows, rows["children"], *view, **options), CHILDREN
+            drawn, scale = gaussian_maps.children_map(rows, rows["children"], *view, **options), CHILDREN
             split = int((kept["children"] > 1).any(dim=1).sum())
             text = f"children at a structure step now: {split:,} Gaussians would split ({seen})"
         else:
-            drawn, scale = visualization.share_map(rows, rows["low"], *view, **options), LOW
+            drawn, scale = gaussian_maps.share_map(rows, rows["low"], *view, **options), LOW
             text = f"share of consistently low Gaussians, {int(kept['low'].sum()):,} in all ({seen})"
-        return visualization.annotate(scale(drawn), text, scale)
+        return color_scales.annotate(scale(drawn), text, scale)

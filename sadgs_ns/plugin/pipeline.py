@@ -1,11 +1,9 @@
-"""nerfstudio glue: several views per iteration, and the structure tensors of the training images."""
+"""nerfstudio's pipeline for this method: several views in an iteration, with the structure tensors of their images."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
-from functools import cached_property
 from typing import Any
 
 import torch
@@ -21,12 +19,10 @@ from sadgs_ns import kernels
 from sadgs_ns.data.cameras import refuse_unsupported_cameras
 from sadgs_ns.data.validation.parsers import findings_of
 from sadgs_ns.errors import InputError
-from sadgs_ns.method.codes import HIGHEST_FREQUENCY, encode
-from sadgs_ns.method.statistics import empty_statistics, observe
+from sadgs_ns.method.codes import HIGHEST_FREQUENCY
 from sadgs_ns.method.structure_tensor import (
     ENERGY_BLUR,
     FREQUENCY_CONSTANT,
-    multiscale_structure_tensor,
 )
 from sadgs_ns.plugin import nonfinite
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
@@ -35,10 +31,9 @@ from sadgs_ns.plugin.model import SadgsModel, SadgsModelConfig
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
 from sadgs_ns.plugin.optimizers import FusedAdam
 from sadgs_ns.plugin.panel import StructurePanel
+from sadgs_ns.plugin.structure_maps import StructureMaps
 from sadgs_ns.plugin.views import TrainingViews
 
-_PIXELS_PER_BATCH = 4_000_000
-"""Structure tensors are computed for as many images at once as fit this; each pixel takes at most about 300 bytes."""
 _NAMED_STEPS = 5
 """Iterations of which a report of what was not finite names the images."""
 
@@ -111,10 +106,11 @@ class SadgsPipeline(VanillaPipeline):
         positions = self.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]  # [C, 3]
         self.model.set_cameras(positions)
         self.views = TrainingViews(self.datamanager, self.model)
+        self.structure_maps = StructureMaps(self.views, config.frequency_constant, energy_blur=config.energy_blur)
         self.log = NonFiniteLog(self.device)
         self._checkpoint_cap: int | None = None
         self.stuck = ""  # says why, where nothing is learned any more
-        self.structure = StructurePanel(self)
+        self.structure = StructurePanel(self.structure_maps)
         self.model.viewer_outputs = self.structure.outputs
 
     @property
@@ -126,82 +122,6 @@ class SadgsPipeline(VanillaPipeline):
     def views_per_iteration(self) -> int:
         """As configured, but no more than there are: a view that is rendered twice in a step would count twice."""
         return min(self.config.views_per_iteration, len(self.datamanager.train_dataset))
-
-    @cached_property
-    def structure_tensors(self) -> list[Tensor]:
-        """Codes (`codes.encode`) of S̄ of every training image, uint8 [H, W, 3], where the images are cached."""
-        by_size = defaultdict(list)
-        for index, data in enumerate(self.datamanager.cached_train):
-            by_size[data["image"].shape[:2]].append(index)
-        tensors: list[Tensor] = [torch.empty(0)] * len(self.datamanager.cached_train)
-        for (height, width), indices in by_size.items():
-            batch_size = max(_PIXELS_PER_BATCH // (height * width), 1)
-            for start in range(0, len(indices), batch_size):
-                batch = indices[start : start + batch_size]
-                data = [self.datamanager.cached_train[index] for index in batch]
-                for index, tensor in zip(batch, self.structure_tensors_of(data), strict=True):
-                    tensor = tensor.to(self.datamanager.cached_train[index]["image"].device)
-                    # As nerfstudio pins images that it leaves on the host: a step's copy then stops nobody.
-                    on_host = self.device.type == "cuda" and tensor.device.type == "cpu"
-                    tensors[index] = tensor.pin_memory() if on_host else tensor
-        return tensors
-
-    def photo(self, data: dict[str, Any]) -> Tensor:
-        """An image of the datamanager as the loss sees it: on the training device and on the background. [H, W, 3]"""
-        background = self.model.photo_background.to(self.device)
-        return self.model.composite_with_background(self.model.get_gt_img(data["image"]), background).to(self.device)
-
-    def structure_tensors_of(self, data: list[dict[str, Any]]) -> Tensor:
-        """Codes of S̄ of the datamanager's images of one size, on the training device. uint8 [B, H, W, 3]"""
-        images = torch.stack([self.photo(d) for d in data])
-        masks = None
-        if any("mask" in d for d in data):
-            masks = torch.stack(
-                [d["mask"][..., 0].to(self.device) if "mask" in d else torch.ones_like(image[..., 0], dtype=torch.bool)
-                 for d, image in zip(data, images, strict=True)]
-            )  # fmt: skip
-        return encode(self.structure_tensors_of_images(images, masks), self.config.model.fused)
-
-    def structure_tensors_of_images(self, images: Tensor, masks: Tensor | None = None) -> Tensor:
-        """S̄ with this run's settings. [B, H, W, 3] in [0, 1], bool [B, H, W] or None → [B, H, W, 3]"""
-        return multiscale_structure_tensor(
-            images,
-            masks,
-            frequency_constant=self.config.frequency_constant,
-            energy_blur=self.config.energy_blur,
-            fused=self.config.model.fused,
-        )
-
-    @torch.no_grad()
-    def observe_training_views(self, progress: Callable[[range], Iterable[int]] = iter) -> dict[str, Tensor]:
-        """η's statistics of the Gaussians as they are, in one look at each training view.
-
-        Draws from a generator of its own: a run that is watched goes on as if it were not.
-
-        Args:
-            progress: Wraps the numbers of the views, to show how far it is.
-
-        Returns:
-            As `statistics.empty_statistics`.
-        """
-        self.model.set_crop(None)  # the viewer's, which sets it anew whenever it renders
-        strategy, params = self.model.strategy, self.model.gauss_params
-        generator = torch.Generator(self.device).manual_seed(0)
-        statistics = empty_statistics(self.model.num_points, self.device)
-        for index in progress(range(len(self.structure_tensors))):
-            tensor, (viewmats, Ks) = (
-                self.structure_tensors[index].to(self.device)[None],
-                self.views.stacked_cameras([index]),
-            )
-            _, _, info = self.model.render(viewmats, Ks, tensor.shape[2], tensor.shape[1], "RGB")
-            observe(
-                statistics,
-                params,
-                info | {"viewmats": viewmats, "Ks": Ks, "structure_tensors": tensor},
-                generator=generator,
-                fused=strategy.fused,
-            )
-        return statistics
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
@@ -302,9 +222,8 @@ class SadgsPipeline(VanillaPipeline):
                 )
             tensors = None
             if observes:
-                tensors = _stack(
-                    [self.structure_tensors[index].to(self.device, non_blocking=True) for index in indices]
-                )
+                codes = self.structure_maps.codes
+                tensors = _stack([codes[index].to(self.device, non_blocking=True) for index in indices])
             viewmats, Ks = self.views.stacked_cameras(indices)
             outputs = self.model.get_training_outputs(viewmats, Ks, width, height, indices, tensors)
             group_losses = self.model.get_loss_dict(outputs, batch)

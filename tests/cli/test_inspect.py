@@ -26,12 +26,14 @@ from PIL import Image
 from sadgs_ns.cli import inspect
 from sadgs_ns.demo.scene import write_scene
 from sadgs_ns.errors import InputError
-from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.plugin import visualization
 from sadgs_ns.method.codes import MASKED
+from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.plugin import color_scales, gaussian_maps, texture
+from sadgs_ns.plugin import panel as panel_module
 from sadgs_ns.plugin.model import _say_once
 from sadgs_ns.plugin.panel import CHOICES, OFF, OUTPUT, StructurePanel, change, describe, nearest_view
 from sadgs_ns.plugin.pipeline import SadgsPipeline
+from sadgs_ns.plugin.structure_maps import observe_training_views
 from sadgs_ns.render import rasterization
 
 WIDTH, HEIGHT, TRAIN_VIEWS, EVAL_VIEWS = 48, 36, 8, 2
@@ -72,7 +74,7 @@ def panel(run: Path) -> StructurePanel:
 
 
 def pipeline_of(panel: StructurePanel) -> SadgsPipeline:
-    return panel._pipeline
+    return panel.keeps[0]  # type: ignore[index,return-value]
 
 
 # --- the command line ---
@@ -184,13 +186,13 @@ def test_a_gpu_that_is_full_is_one_sentence(
 def test_observing_all_views_finds_what_training_finds(run: Path):
     """Training's own code, shown every view once and nothing learned in between."""
     pipeline, _ = inspect.load_run(run, load_step=8)
-    observed, model = pipeline.observe_training_views(), pipeline.model
+    observed, model = observe_training_views(pipeline.structure_maps), pipeline.model
     model.train()
     model.optimizers = {}
     model.strategy_state = model.strategy.initialize_state()
     model.step = 0
     for index in range(TRAIN_VIEWS):
-        tensors, Ks = pipeline.structure_tensors[index][None], pipeline.views.cameras[1][index][None]
+        tensors, Ks = pipeline.structure_maps.codes[index][None], pipeline.views.cameras[1][index][None]
         viewmats = pipeline.views.viewmat(index)[None]
         model.get_training_outputs(viewmats, Ks, WIDTH, HEIGHT, [index], tensors)
     trained = model.strategy_state
@@ -204,8 +206,8 @@ def test_observing_all_views_finds_what_training_finds(run: Path):
 
 def test_observing_leaves_the_run_as_it_was(early: SadgsPipeline):
     before, random = early.state_dict()["_model.gauss_params.means"].clone(), torch.get_rng_state()
-    first = early.observe_training_views()
-    torch.testing.assert_close(early.observe_training_views(), first)
+    first = observe_training_views(early.structure_maps)
+    torch.testing.assert_close(observe_training_views(early.structure_maps), first)
     inspect.screen_gradients(early, iter)
     assert torch.equal(torch.get_rng_state(), random)
     assert torch.equal(early.model.means, before)
@@ -213,7 +215,7 @@ def test_observing_leaves_the_run_as_it_was(early: SadgsPipeline):
 
 
 def test_the_structure_step_makes_the_children_of_the_plan(early: SadgsPipeline):
-    model, statistics = early.model, early.observe_training_views()
+    model, statistics = early.model, observe_training_views(early.structure_maps)
     counts, fits = model.strategy.split_plan(
         model.gauss_params, statistics, model.strategy.max_gaussians - model.num_points
     )
@@ -312,7 +314,7 @@ def test_drawing_which_the_viewer_may_break_off_loads_no_photo(choice: str, pane
     assert torch.equal(outputs[OUTPUT], outputs["rgb"])
     assert "cached_train" not in vars(pipeline.datamanager)
     panel.choose()
-    assert "cached_train" in vars(pipeline.datamanager) and "structure_tensors" in vars(pipeline)
+    assert "cached_train" in vars(pipeline.datamanager) and "codes" in vars(pipeline.structure_maps)
     outputs = in_the_viewer(lambda: pipeline.model.get_outputs_for_camera(a_camera(pipeline)))
     assert not torch.equal(outputs[OUTPUT], outputs["rgb"])
 
@@ -325,7 +327,7 @@ def test_the_pictures_survive_tiny_windows_and_crop_boxes(panel: StructurePanel,
         rendered.append(len(means))
         return rasterization.rasterize(means, *args, **options)
 
-    monkeypatch.setattr(visualization, "rasterize", rasterize)
+    monkeypatch.setattr(gaussian_maps, "rasterize", rasterize)
     pipeline = pipeline_of(panel)
     camera = a_camera(pipeline)
     camera.rescale_output_resolution(0.2)
@@ -374,7 +376,7 @@ def test_a_finished_run_is_observed_when_eta_is_asked_for(panel: StructurePanel)
 
 def test_where_every_pixel_is_masked_the_panel_says_that_none_was_observed(panel: StructurePanel):
     pipeline = pipeline_of(panel)
-    for codes in pipeline.structure_tensors:
+    for codes in pipeline.structure_maps.codes:
         codes[..., 1] = MASKED
     panel.choice.value = "η"
     panel.choose()
@@ -387,10 +389,10 @@ def test_where_every_pixel_is_masked_the_panel_says_that_none_was_observed(panel
 def test_what_fails_in_a_viewer_s_thread_is_told(
     panel: StructurePanel, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    def full() -> None:
+    def full(maps: Any) -> None:
         raise RuntimeError("CUDA out of memory.\nOf no interest.")
 
-    monkeypatch.setattr(pipeline_of(panel), "observe_training_views", full)
+    monkeypatch.setattr(panel_module, "observe_training_views", full)
     panel.observe.cb_hook(panel.observe)
     told = " ".join(capsys.readouterr().out.split())
     assert told == "The viewer's panel stays as it was: CUDA out of memory"
@@ -398,7 +400,7 @@ def test_what_fails_in_a_viewer_s_thread_is_told(
 
 def test_sliders_reach_the_strategy_and_the_plan(panel: StructurePanel):
     pipeline = pipeline_of(panel)
-    strategy, statistics = pipeline.model.strategy, pipeline.observe_training_views()
+    strategy, statistics = pipeline.model.strategy, observe_training_views(pipeline.structure_maps)
     split = []
     for tau in (1.0, 0.5, 0.0):
         panel.set_tau_split.value = tau
@@ -482,4 +484,4 @@ def test_what_the_panel_draws_of_a_training_view_is_what_the_command_draws(panel
     expected = inspect.view_panels(pipeline, view, statistics)["eta"].picture
     assert (np.abs(drawn.astype(int) - expected) <= 2).mean() > 0.99
     near = panel.picture("wavelength of the nearest photo", a_camera(pipeline, 2), rgb)
-    assert np.array_equal(near, visualization.PERIOD(visualization.texture_period(view.structure_tensor)))
+    assert np.array_equal(near, color_scales.PERIOD(texture.texture_period(view.structure_tensor)))

@@ -282,11 +282,14 @@ def test_opacities_of_exactly_zero_and_one():
     torch.testing.assert_close(opacities, expected, atol=0.01, rtol=0)
 
     params["opacities"].data = logits.clone()
-    numbers = train(short(absgs_every=0, min_opacity=0.005, reset_every=11), params, 11)
+    numbers = train(short(absgs_every=0, tau_split=1.0, min_opacity=0.005, reset_every=11), params, 11)
     assert numbers[-1] == 6, "those of opacity 0 are pruned"
     assert params["opacities"].isfinite().all()
     torch.testing.assert_close(
-        torch.sigmoid(params["opacities"].detach()), torch.full((6,), 0.1 * strategy_module.CLAMP_OPACITY), atol=0.01, rtol=0
+        torch.sigmoid(params["opacities"].detach()),
+        torch.full((6,), 0.1 * strategy_module.CLAMP_OPACITY),
+        atol=0.01,
+        rtol=0,
     )
 
 
@@ -459,7 +462,7 @@ def test_an_image_that_makes_nan_is_named_and_does_not_poison_the_model(
     config.pipeline.views_per_iteration = views
     trainer = set_up(config)
     pipeline, bad = trainer.pipeline, 5
-    assert len(pipeline.structure_tensors) == 8  # computed before the image breaks
+    assert len(pipeline.structure_maps.codes) == 8  # computed before the image breaks
     name = pipeline.datamanager.train_dataset.image_filenames[bad].name
     render_views, hit = pipeline.model.get_training_outputs, []
 

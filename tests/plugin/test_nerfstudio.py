@@ -446,7 +446,7 @@ def test_views_of_two_sizes_train_together(tmp_path: Path):
     pipeline.get_train_loss_dict, pipeline.model.get_training_outputs = count_sizes, note_size  # type: ignore
     trainer.train()
     assert set(numbers_of_sizes) == {1, 2}
-    assert {tuple(tensor.shape[:2]) for tensor in pipeline.structure_tensors} == {(HEIGHT, WIDTH), (30, 40)}
+    assert {tuple(tensor.shape[:2]) for tensor in pipeline.structure_maps.codes} == {(HEIGHT, WIDTH), (30, 40)}
     assert is_finite(pipeline.model)
 
 
@@ -483,7 +483,7 @@ def test_masked_pixels_have_no_structure_tensor_and_no_part_in_the_loss(tmp_path
     config.pipeline.views_per_iteration = 2
     trainer = train(config)
     pipeline = trainer.pipeline
-    for tensor in pipeline.structure_tensors:
+    for tensor in pipeline.structure_maps.codes:
         assert decode(tensor[:, : WIDTH // 2]).isnan().all()
         assert decode(tensor[:, WIDTH // 2 :]).amax() > 0
     data = pipeline.datamanager.cached_train[0]
@@ -510,7 +510,7 @@ def test_transparent_images_train_in_front_of_the_background(tmp_path: Path):
     target = trainer.pipeline.model.composite_with_background(data["image"] / 255, torch.ones(3))
     assert (target[:, : WIDTH // 2] == 1).all() and target[:, WIDTH // 2 :].amin() < 1
     trainer.pipeline.model.set_background(torch.zeros(3))  # as the viewer does whenever it draws
-    torch.testing.assert_close(trainer.pipeline.photo(data), target)
+    torch.testing.assert_close(trainer.pipeline.structure_maps.photo(data), target)
     trainer.train()
     assert is_finite(trainer.pipeline.model)
 

@@ -1,6 +1,6 @@
 """The viewer's panel in a real browser: what is chosen there is drawn, what is set there reaches the run.
 
-Needs Chromium and takes a minute: `pytest -m slow tests/test_viewer_in_browser.py`.
+Needs Chromium and takes a minute: `pytest -m slow tests/plugin/test_viewer_in_browser.py`.
 """
 
 from __future__ import annotations

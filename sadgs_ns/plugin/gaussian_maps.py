@@ -1,0 +1,129 @@
+"""Maps of what the Gaussians in each pixel of a view have: their η, their children, the share of chosen ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import torch
+from matplotlib.colors import hsv_to_rgb
+from torch import Tensor
+
+from sadgs_ns.method.split import num_children
+from sadgs_ns.render.rasterization import rasterize
+
+MIN_COVER = 0.05
+"""Share of a pixel that Gaussians with a value must make up; otherwise the pixel counts as empty."""
+
+
+@torch.no_grad()
+def blend(
+    params: Mapping[str, Tensor],
+    values: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    rasterize_mode: Literal["classic", "antialiased"] = "classic",
+) -> tuple[Tensor, Tensor]:
+    """Blend values of Gaussians as their colours are blended, front to back.
+
+    Args:
+        params: `means` [N, 3], `quats` [N, 4], log `scales` [N, 3], logit `opacities` [N] or [N, 1].
+        values: D values for each Gaussian. [N, D]
+        viewmat: World-to-camera matrix. [4, 4]
+        K: Intrinsics in px. [3, 3]
+        width: Width of the image in px.
+        height: Height of the image in px.
+        rasterize_mode: As for `rasterize`.
+
+    Returns:
+        The blended values [H, W, D], and how much of each pixel is covered, in [0, 1] [H, W, 1].
+    """
+    render, alpha, _ = rasterize(
+        params["means"],
+        params["quats"],
+        params["scales"].exp(),
+        torch.sigmoid(params["opacities"].flatten()),
+        values,
+        viewmat[None],
+        K[None],
+        width,
+        height,
+        rasterize_mode=rasterize_mode,
+    )
+    return render[0], alpha[0]
+
+
+def eta_map(params: Mapping[str, Tensor], statistics: Mapping[str, Tensor], *view, **options) -> Tensor:
+    """Largest η of the Gaussians that make up each pixel: a mean of log η by what each adds to the pixel.
+
+    Args:
+        params: As for `blend`.
+        statistics: `eta_max` [N, 3] and `n_total` [N]; Gaussians that were never observed count for nothing.
+        view: The positional arguments of `blend` after its first two.
+        options: The keyword arguments of `blend`.
+
+    Returns:
+        η, or NaN where hardly anything observed is drawn. [H, W]
+    """
+    largest = statistics["eta_max"].amax(dim=1)
+    known = ((statistics["n_total"] > 0) & (largest > 0)).float()
+    values = torch.stack([torch.where(known > 0, largest, 1.0).log(), known], dim=-1)
+    total, cover = blend(params, values, *view, **options)[0].unbind(-1)
+    return torch.where(cover > MIN_COVER, (total / cover).exp(), torch.nan)
+
+
+def children_map(params: Mapping[str, Tensor], counts: Tensor, *view, **options) -> Tensor:
+    """Number of children of the Gaussians that make up each pixel, as a geometric mean.
+
+    Args:
+        params: As for `blend`.
+        counts: Number of children along each axis, ≥ 1. [N, 3]
+        view: The positional arguments of `blend` after its first two.
+        options: The keyword arguments of `blend`.
+
+    Returns:
+        A number ≥ 1, or NaN where hardly anything is drawn. [H, W]
+    """
+    total, cover = blend(params, num_children(counts)[:, None].float().log(), *view, **options)
+    return torch.where(cover > MIN_COVER, (total / cover).exp(), torch.nan)[..., 0]
+
+
+def share_map(params: Mapping[str, Tensor], chosen: Tensor, *view, **options) -> Tensor:
+    """Share of what is drawn at each pixel that the chosen Gaussians make up.
+
+    Args:
+        params: As for `blend`.
+        chosen: Which Gaussians are chosen. bool [N]
+        view: The positional arguments of `blend` after its first two.
+        options: The keyword arguments of `blend`.
+
+    Returns:
+        A share in [0, 1], or NaN where hardly anything is drawn. [H, W]
+    """
+    total, cover = blend(params, chosen[:, None].float(), *view, **options)
+    return torch.where(cover > MIN_COVER, total / cover, torch.nan)[..., 0]
+
+
+def random_colors(number: int, generator: torch.Generator) -> Tensor:
+    """Bright colours that tell neighbouring Gaussians apart. [N, 3]"""
+    hue, saturation, value = torch.rand((3, number), generator=generator)
+    return torch.from_numpy(
+        hsv_to_rgb(torch.stack([hue, 0.35 + 0.65 * saturation, 0.5 + 0.5 * value], -1).numpy())
+    ).float()
+
+
+def recolor(colors: Tensor, origins: Tensor, generator: torch.Generator) -> Tensor:
+    """Colours after a densification step: Gaussians that stayed whole keep theirs, children get new ones.
+
+    Args:
+        colors: Colours before the step. [N, 3]
+        origins: Index, before the step, of the Gaussian that each one was or came from. int64 [M]
+        generator: A generator on the CPU.
+
+    Returns:
+        [M, 3]
+    """
+    is_child = torch.bincount(origins, minlength=len(colors))[origins] > 1  # [M]
+    return torch.where(is_child[:, None], random_colors(len(origins), generator).to(colors), colors[origins])
