@@ -22,7 +22,7 @@ from sadgs_ns.data.validation import names
 
 @dataclass
 class SadgsDatamanagerConfig(FullImageDatamanagerConfig):
-    """nerfstudio's options."""
+    """nerfstudio's."""
 
     _target: type = field(default_factory=lambda: SadgsDatamanager)
 
