@@ -48,7 +48,7 @@ def print_uncaught_errors_as_sentences() -> None:
     sys.excepthook = show_sentence
 
 
-def reason(error: Exception) -> str:
+def reason(error: BaseException) -> str:
     """Shorten a library's error to a few words: its first line without the full stop."""
     text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     lines = text.strip().splitlines()
