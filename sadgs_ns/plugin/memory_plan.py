@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -136,7 +136,7 @@ def fit_to_memory(
         return None, None
     state = empty_statistics(0, device) | empty_gradients(0, device)
     each = memory.kept_bytes(params, state) + memory.widest_bytes(params)
-    fixed = size.image_bytes + max(memory.step_bytes(0, _with_pairs(size.step, 0), size.fused).values())
+    fixed = size.image_bytes + max(memory.step_bytes(0, replace(size.step, pairs=0), size.fused).values())
 
     def need(num_gaussians: int, step: StepSize) -> float:
         working = max(memory.step_bytes(num_gaussians, step, size.fused).values())
@@ -148,7 +148,7 @@ def fit_to_memory(
         budget = PLANNED_SHARE * free if given is None else min(1e9 * given, free)
         none = {name: value[:0] for name, value in params.items()}
         left = budget - size.image_bytes
-        affordable = memory.affordable_growth(none, state, left, _with_pairs(size.step, 0), size.fused)  # type: ignore[arg-type]
+        affordable = memory.affordable_growth(none, state, left, replace(size.step, pairs=0), size.fused)  # type: ignore[arg-type]
         if given is not None and affordable < 1:
             raise ValueError(
                 f"strategy.memory_budget_gb is {given:g} and leaves no room for Gaussians: images and rendering "
@@ -161,19 +161,16 @@ def fit_to_memory(
             if strategy.max_gaussians < n:
                 why += f", which holds no more than the {n:,} at the start: none will be added"
     most = max(strategy.max_gaussians, n)
-    at_most = need(most, _with_pairs(size.step, memory.PAIRS_PER_GAUSSIAN * size.step.views * most))
+    at_most = need(most, replace(size.step, pairs=memory.PAIRS_PER_GAUSSIAN * size.step.views * most))
     line = (
         f"At most {strategy.max_gaussians:,} Gaussians: {at_most / 1e9:.1f} GB of the card's {total / 1e9:.1f} GB{why}."
     )
     first = need(n, size.step)
     if first <= free:
         return line, None
+    fewer_views = "lower --pipeline.views-per-iteration, or " if size.step.views > 1 else ""
     return line, (
         f"The first step will probably not fit the GPU's memory: {n:,} Gaussians, which reach "
         f"{size.step.pairs / 1e6:,.0f} million tiles of {size.step.views} views, take {first / 1e9:.1f} GB with the "
-        f"images, and {free / 1e9:.1f} GB are free; lower --pipeline.views-per-iteration, or take smaller images."
+        f"images, and {free / 1e9:.1f} GB are free; {fewer_views}take smaller images."
     )
-
-
-def _with_pairs(step: StepSize, pairs: float) -> StepSize:
-    return StepSize(step.views, step.pixels, pairs)
