@@ -31,6 +31,7 @@ from scenes import ITERATIONS
 
 from sadgs_ns.demo.scene import SPARSE_FOLDER
 from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.plugin import pipeline
 from sadgs_ns.plugin.checkpoints import checkpoint_paths
 from sadgs_ns.plugin.interrupts import SIGNALS
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
@@ -419,11 +420,12 @@ def plan(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """Lets the memory plan of the next runs allow so many Gaussians, unless they ask for another cap themselves."""
 
     def allow(cap: int) -> None:
-        def fit(strategy: StructureAwareStrategy, *_: Any) -> None:
+        def fit(strategy: StructureAwareStrategy, *_: Any) -> tuple[None, None]:
             if strategy.max_gaussians == 2000:  # of these tests' runs
                 strategy.max_gaussians = min(cap, strategy.max_gaussians)
+            return None, None
 
-        monkeypatch.setattr(StructureAwareStrategy, "fit_to_memory", fit)
+        monkeypatch.setattr(pipeline, "fit_to_memory", fit)
 
     return allow
 
