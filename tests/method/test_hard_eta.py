@@ -37,6 +37,7 @@ photometric = pytest.importorskip("sadgs_ns.kernels.losses", reason="Triton is n
 tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not installed")
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+fused_photometric_loss = partial(photometric.photometric_loss, window=losses.WINDOW)
 WIDTH, HEIGHT = 64, 48
 NEAR = 0.01
 """The splatter's and gsplat's near plane."""
@@ -389,7 +390,7 @@ def test_the_loss_of_an_overexposed_rendering_equals_the_float64_reference(scale
     target, start = (torch.rand((1, 16, 20, 3), generator=generator) for _ in range(2))
     start[:, :, :10] = 0.777
     results = []
-    for function, dtype in ((photometric.photometric_loss, torch.float32), (losses.photometric_loss, torch.float64)):
+    for function, dtype in ((fused_photometric_loss, torch.float32), (losses.photometric_loss, torch.float64)):
         x = (scale * start).to(DEVICE, dtype).requires_grad_()
         loss, _ = function(x, target.to(DEVICE, dtype), ssim_lambda=0.2, l2_lambda=2.0)
         loss.backward()
@@ -405,7 +406,7 @@ def test_a_broken_pixel_shows_in_the_loss(value: float):
     x = torch.rand((1, 16, 16, 3), device=DEVICE)
     x[0, 3, 4, 1] = value
     with np.errstate(all="ignore"):  # Triton's interpreter computes with numpy
-        loss, _ = photometric.photometric_loss(x, torch.zeros_like(x), ssim_lambda=0.2, l2_lambda=2.0)
+        loss, _ = fused_photometric_loss(x, torch.zeros_like(x), ssim_lambda=0.2, l2_lambda=2.0)
     assert not loss.isfinite()
 
 
