@@ -1,9 +1,10 @@
-"""The Triton kernels against the torch code beside them: on the GPU, or in Triton's interpreter without one."""
+"""The Triton kernels against torch code that does the same: on the GPU, or in Triton's interpreter without one."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,14 +33,11 @@ screen_gradients = pytest.importorskip("sadgs_ns.kernels.absgs", reason="Triton 
 tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not installed")
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-
-
-def fused_photometric_loss(predicted: Tensor, target: Tensor, **weights: float) -> tuple[Tensor, Tensor]:
-    return photometric.photometric_loss(predicted, target, losses.WINDOW, **weights)
+fused_photometric_loss = partial(photometric.photometric_loss, window=losses.WINDOW)
 
 
 def recorded(monkeypatch: pytest.MonkeyPatch, module: Any, *names: str) -> list[str]:
-    """Names of those functions of a module that are called from now on: no reference may be compared with itself."""
+    """A list of the functions of a module that are called from now on: no reference may be compared with itself."""
     calls: list[str] = []
     for name in names:
         run = getattr(module, name)
@@ -93,7 +91,7 @@ def test_psnr_of_extreme_errors_is_torchs(value):
 
 
 def test_partial_sums_are_added_as_accurately_as_torch_adds_them():
-    """As many as two views of 1920×1080 leave, and no multiple of what is added at once."""
+    """There are as many as two views of 1920×1080 px leave, which is no multiple of what is added at once."""
     generator = torch.Generator().manual_seed(0)
     differences, similarities = torch.rand((2, 12150), generator=generator), torch.rand(12240, generator=generator)
     loss, psnr = torch.zeros((), device=DEVICE), torch.zeros((), device=DEVICE)
@@ -324,7 +322,7 @@ LRS = (0.1, 0.01, 0.3, 0.003, 0.02)
 
 
 def with_moments(start: list[Tensor]) -> tuple[tuple[Tensor, ...], ...]:
-    """Copies of parameters, and their moments."""
+    """Copies of parameters, and their first and second moments of zeros."""
     zeros = [tuple(torch.zeros_like(p, device=DEVICE) for p in start) for _ in range(2)]
     return tuple(p.to(DEVICE).clone() for p in start), *zeros
 
@@ -417,7 +415,7 @@ def test_optimizer_keeps_torchs_state_while_it_runs_the_kernel(monkeypatch):
 
 
 def projected_gaussians(num_views: int, n: int, width: int, height: int) -> dict[str, Tensor]:
-    """Ellipses of all sizes, some long and thin, some faint, some culled, some off the image."""
+    """Projected Gaussians of all sizes, of which some are long and thin, faint, culled or off the image."""
     generator = torch.Generator().manual_seed(0)
 
     def random(*shape: int) -> Tensor:

@@ -334,15 +334,16 @@ def extreme_ellipses(n: int = 192) -> dict[str, Tensor]:
     lengths, angles = 10 ** (10 * random(2) - 1.5), math.pi * random()
     angles[:, ::3] = (4 * random()[:, ::3]).round() * math.pi / 4
     rotation = torch.stack([angles.cos(), -angles.sin(), angles.sin(), angles.cos()], -1).reshape(1, n, 2, 2)
-    covariances = rotation @ torch.diag_embed(lengths**2) @ rotation.mT + SCREEN_BLUR * torch.eye(2)
-    inverses = torch.linalg.inv(covariances).float()
+    variances = lengths**2 + SCREEN_BLUR
+    # Made of its eigenvalues, the inverse exists on every processor; that of the rounded covariance may not.
+    inverses = (rotation @ torch.diag_embed(1 / variances) @ rotation.mT).float()
     means2d = (1.4 * random(2) - 0.2) * torch.tensor([WIDTH, HEIGHT])
     means2d[:, 1::4] += ((random(2) - 0.5) * 10 ** (9 * random(1)))[:, 1::4]
     conics = torch.stack([inverses[..., 0, 0], inverses[..., 0, 1], inverses[..., 1, 1]], -1)
     opacities = random()
     means2d[:, 5], means2d[:, 6, 0], means2d[:, 7], means2d[:, 8] = math.nan, math.nan, math.inf, -math.inf
     conics[:, 10], conics[:, 11], conics[:, 12], opacities[:, 13] = 0.0, math.nan, math.inf, math.nan
-    radii = (3 * torch.linalg.eigvalsh(covariances)[..., -1].sqrt()).ceil().clamp_max(2**31 - 200).int()
+    radii = (3 * variances.amax(-1).sqrt()).ceil().clamp_max(2**31 - 200).int()
     values = {"means2d": means2d, "depths": random(), "conics": conics, "opacities": opacities}
     return {**{name: value.float() for name, value in values.items()}, "radii": radii}
 
