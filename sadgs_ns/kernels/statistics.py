@@ -38,15 +38,10 @@ def _screen_axis(viewmat, x, y, z, scale, jxx, jxz, jyy, jyz):
 
 
 @triton.jit
-def _eta(u, v, xx, xy, yy, EPSILON: tl.constexpr, DIRECTIONAL: tl.constexpr):
+def _eta(u, v, xx, xy, yy, EPSILON: tl.constexpr):
     """η of one axis (u, v), as in `method.eta.eta`."""
-    length = _hypot(u, v)
-    if DIRECTIONAL:
-        u, v = u / length, v / length  # lengths² overflow
-        return length * tl.sqrt(tl.maximum(xx * u * u + 2 * xy * u * v + yy * v * v, 0.0))
-    else:
-        largest = 0.5 * (xx + yy) + _hypot(0.5 * (xx - yy), xy)
-        return length * (tl.sqrt(tl.maximum(largest, 0.0)) + EPSILON)
+    largest = 0.5 * (xx + yy) + _hypot(0.5 * (xx - yy), xy)
+    return _hypot(u, v) * (tl.sqrt(tl.maximum(largest, 0.0)) + EPSILON)
 
 
 @triton.jit
@@ -70,14 +65,14 @@ def _add_axis(n_high, n_low, eta_max, at, high, low, most, changed):
     do_not_specialize_on_alignment=["structure_tensors", "Ks"],
 )
 def _observe(
-    means, quats, scales, opacities, drawn, means2d, conics, jitter, structure_tensors, viewmats, Ks,
-    n_high, n_low, eta_max, n_total, n, num_views, width, height, min_logit,
+    means, quats, scales, drawn, means2d, conics, jitter, structure_tensors, viewmats, Ks,
+    n_high, n_low, eta_max, n_total, n, num_views, width, height,
     HIGH: tl.constexpr, LOW: tl.constexpr, BLUR: tl.constexpr, MARGIN: tl.constexpr, EPSILON: tl.constexpr,
-    HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, MASKED: tl.constexpr, DIRECTIONAL: tl.constexpr, LANES: tl.constexpr,
+    HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, MASKED: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
     """Observe LANES Gaussians in all views."""
     g = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
-    candidate = (g < n) & (tl.load(opacities + g, g < n, float("-inf")) >= min_logit)
+    candidate = g < n
     x = tl.load(means + 3 * g, candidate, 0.0)
     y = tl.load(means + 3 * g + 1, candidate, 0.0)
     z = tl.load(means + 3 * g + 2, candidate, 1.0)
@@ -150,9 +145,9 @@ def _observe(
             viewmat, 2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy),
             scale2, jxx, jxz, jyy, jyz,
         )  # fmt: skip
-        eta0 = _eta(u0, v0, s_xx, s_xy, s_yy, EPSILON, DIRECTIONAL)
-        eta1 = _eta(u1, v1, s_xx, s_xy, s_yy, EPSILON, DIRECTIONAL)
-        eta2 = _eta(u2, v2, s_xx, s_xy, s_yy, EPSILON, DIRECTIONAL)
+        eta0 = _eta(u0, v0, s_xx, s_xy, s_yy, EPSILON)
+        eta1 = _eta(u1, v1, s_xx, s_xy, s_yy, EPSILON)
+        eta2 = _eta(u2, v2, s_xx, s_xy, s_yy, EPSILON)
         observed = observed & (eta0 < float("inf")) & (eta1 < float("inf")) & (eta2 < float("inf"))
         eta0, eta1, eta2 = tl.where(observed, eta0, 0.0), tl.where(observed, eta1, 0.0), tl.where(observed, eta2, 0.0)
         high0, high1, high2 = high0 + (eta0 > HIGH), high1 + (eta1 > HIGH), high2 + (eta2 > HIGH)
@@ -170,7 +165,7 @@ def _observe(
 
 def observe_views(
     statistics: tuple[Tensor, Tensor, Tensor, Tensor],
-    params: tuple[Tensor, Tensor, Tensor, Tensor],
+    params: tuple[Tensor, Tensor, Tensor],
     drawn: Tensor,
     means2d: Tensor,
     conics: Tensor,
@@ -179,8 +174,6 @@ def observe_views(
     viewmats: Tensor,
     Ks: Tensor,
     *,
-    min_logit: float,
-    directional: bool,
     thresholds: tuple[float, float],
     constants: tuple[float, float, float],
     code_range: tuple[float, float, int],
@@ -189,7 +182,7 @@ def observe_views(
 
     Args:
         statistics: n_high, n_low, eta_max [N, 3] and n_total [N], float32, updated in place.
-        params: means [N, 3], quats [N, 4], log scales [N, 3] and logit opacities [N] or [N, 1], float32.
+        params: means [N, 3], quats [N, 4] and log scales [N, 3], float32.
         drawn: Which Gaussians the forward pass drew. bool [C, N]
         means2d: px. [C, N, 2]
         conics: 1/px². [C, N, 3]
@@ -197,8 +190,6 @@ def observe_views(
         structure_tensors: S̄ in 1/px², or its codes of `codes.encode`. [C, H, W, 3]
         viewmats: World to camera. [C, 4, 4]
         Ks: Intrinsics in px. [C, 3, 3]
-        min_logit: Logit of the opacity from which on a Gaussian is observed.
-        directional: Use η^(proj).
         thresholds: η above the first is high, and below the second it is low.
         constants: gsplat's blur in px², its margin of the frustum, and ε of the wavelength in 1/px.
         code_range: HIGHEST_FREQUENCY, OCTAVES and MASKED of `method.codes`.
@@ -207,6 +198,6 @@ def observe_views(
     num_views, n = drawn.shape
     height, width = structure_tensors.shape[1:3]
     _observe[triton.cdiv(n, _LANES),](
-        *(value.contiguous() for value in inputs), *statistics, n, num_views, width, height, min_logit,
-        *thresholds, *constants, *code_range, directional, _LANES,
+        *(value.contiguous() for value in inputs), *statistics, n, num_views, width, height,
+        *thresholds, *constants, *code_range, _LANES,
     )  # fmt: skip

@@ -137,20 +137,32 @@ def sample_map(structure_tensors: Tensor, camera_ids: Tensor, points: Tensor) ->
     return torch.where(known[:, None], values, 0.0), known
 
 
-def eta(axes: Tensor, structure_tensor: Tensor, directional: bool = False) -> Tensor:
-    """Frequency violation of each axis: η_k = ‖v_k‖ / Λ_min (paper, eq. 6), or η^(proj) (eq. 7).
+def eta(axes: Tensor, structure_tensor: Tensor) -> Tensor:
+    """Frequency violation of each axis: η_k = ‖v_k‖ / Λ_min (paper, eq. 6).
 
     Args:
         axes: v_k in px. [M, 3, 2]
         structure_tensor: S̄ at the footprint's sample, (xx, xy, yy) in 1/px². [M, 3]
-        directional: Measure each axis along its own direction, η_k^(proj) = √(v_kᵀ S̄ v_k).
 
     Returns:
         η ≥ 0; above 1 the axis is longer than the local wavelength. [M, 3]
     """
+    return torch.hypot(axes[..., 0], axes[..., 1]) / wavelength(structure_tensor)[:, None]
+
+
+def projected_eta(axes: Tensor, structure_tensor: Tensor) -> Tensor:
+    """Frequency violation of each axis along its own direction: η_k^(proj) = √(v_kᵀ S̄ v_k) (paper, eq. 7).
+
+    The paper found it to give worse views than `eta`, and training does not use it.
+
+    Args:
+        axes: v_k in px. [M, 3, 2]
+        structure_tensor: S̄ at the footprint's sample, (xx, xy, yy) in 1/px². [M, 3]
+
+    Returns:
+        η^(proj) ≥ 0, at most η. [M, 3]
+    """
     length = torch.hypot(axes[..., 0], axes[..., 1])  # [M, 3]
-    if directional:
-        xx, xy, yy = structure_tensor[:, None].unbind(-1)  # [M, 1] each
-        u, v = (axes / length.clamp_min(torch.finfo(length.dtype).tiny)[..., None]).unbind(-1)  # lengths² overflow
-        return length * (xx * u**2 + 2 * xy * u * v + yy * v**2).clamp_min(0).sqrt()
-    return length / wavelength(structure_tensor)[:, None]
+    xx, xy, yy = structure_tensor[:, None].unbind(-1)  # [M, 1] each
+    u, v = (axes / length.clamp_min(torch.finfo(length.dtype).tiny)[..., None]).unbind(-1)  # lengths² overflow
+    return length * (xx * u**2 + 2 * xy * u * v + yy * v**2).clamp_min(0).sqrt()

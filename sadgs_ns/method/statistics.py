@@ -49,8 +49,6 @@ def observe(
     params: Params,
     info: Mapping[str, Any],
     *,
-    directional: bool = False,
-    min_opacity: float = 0.0,
     generator: torch.Generator | None = None,
     fused: bool = True,
 ) -> None:
@@ -61,11 +59,9 @@ def observe(
 
     Args:
         statistics: As made by `empty_statistics`.
-        params: `means` [N, 3], `quats` [N, 4], log `scales` [N, 3], logit `opacities` [N] or [N, 1].
+        params: `means` [N, 3], `quats` [N, 4] and log `scales` [N, 3].
         info: gsplat's meta, unpacked, of C views of one size, plus `structure_tensors` (S̄, or its codes of
             `codes.encode`) [C, H, W, 3], `viewmats` [C, 4, 4] and `Ks` [C, 3, 3].
-        directional: Use η^(proj) (paper, eq. 7).
-        min_opacity: Only Gaussians at least this opaque are observed.
         generator: Source of the jitter.
         fused: Use the Triton kernel where it runs: CUDA, float32.
     """
@@ -76,7 +72,7 @@ def observe(
 
         observe_views(
             (statistics["n_high"], statistics["n_low"], statistics["eta_max"], statistics["n_total"]),
-            (params["means"], params["quats"], params["scales"], params["opacities"]),
+            (params["means"], params["quats"], params["scales"]),
             seen,
             info["means2d"],
             info["conics"],
@@ -84,15 +80,11 @@ def observe(
             info["structure_tensors"],
             info["viewmats"],
             info["Ks"],
-            min_logit=float(torch.logit(torch.tensor(min_opacity, dtype=torch.float64).clamp(0, 1))),
-            directional=directional,
             thresholds=(HIGH_ETA, LOW_ETA),
             constants=(SCREEN_BLUR, FRUSTUM_MARGIN, WAVELENGTH_EPSILON),
             code_range=(HIGHEST_FREQUENCY, OCTAVES, MASKED),
         )
         return
-    if min_opacity > 0:
-        seen = seen & (torch.sigmoid(params["opacities"].flatten()) >= min_opacity)
     num_cameras, num_gaussians = seen.shape
     scales = torch.exp(params["scales"])
     # Every Gaussian is measured and the unseen are masked out: selecting them first would make the host wait.
@@ -115,7 +107,7 @@ def observe(
         conics = torch.stack([a, b, c], -1)
         points = sample_footprint(means2d, conics, jitter[camera])
         sampled, inside = sample_map(info["structure_tensors"], camera_ids, points)
-        violation = eta(axes, sampled, directional)  # [N, 3]
+        violation = eta(axes, sampled)  # [N, 3]
         observed = (seen[camera] & inside & violation.isfinite().all(dim=1))[:, None]  # [N, 1]
         violation = torch.where(observed, violation, 0.0)
         statistics["n_high"] += violation > HIGH_ETA

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, MutableMapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -91,8 +91,10 @@ class StructureAwareStrategy(Strategy):
     """Opacity under which every densification step prunes; AbsGS's own is 0.005."""
     reset_every: int = 1200
     """Iterations between opacity resets inside the densification window; 0 turns them off."""
-    fused: bool = field(default=True, init=False)
-    """Whether η is measured, and AbsGS's gradients are added up, in one Triton kernel each where these run (CUDA)."""
+
+    def __post_init__(self) -> None:
+        self.fused = True
+        """Whether η is measured, and AbsGS's gradients are added up, in a Triton kernel each where these run (CUDA)."""
 
     def check(self) -> None:
         """See whether densification can work with these options.

@@ -104,7 +104,7 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
             colors_from_harmonics(config.sh_degree, centres, *coefficients, viewmats, info["radii"]).sum().backward()
 
     def observation() -> None:
-        params = {"means": means, "quats": quats, "scales": scales.log(), "opacities": opacities[:, None].logit()}
+        params = {"means": means, "quats": quats, "scales": scales.log()}
         observe(
             empty_statistics(n, device),
             params,  # type: ignore[arg-type]

@@ -56,12 +56,15 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     """c of ω_l = c / σ_l in 1/px, at most 4: the larger, the shorter every wavelength and the more is split."""
     energy_blur: float = ENERGY_BLUR
     """Window, in multiples of σ_l, over which the energy of a scale is averaged; 0 measures it per pixel (eq. 4)."""
+    epsilon: float | None = None
+    """ε of the structure tensor (eq. 3 and 5), for images in [0, 1]; None makes it relative to an image's contrast, so
+    that the exposure of a photo does not decide what is split."""
 
     def check(self) -> None:
         """See whether training can work with these options.
 
         Raises:
-            InputError: If views_per_iteration or frequency_constant is out of range; as `SadgsModelConfig.check`.
+            InputError: If an option is out of its range; as `SadgsModelConfig.check`.
         """
         if self.views_per_iteration < 1:
             raise InputError(f"pipeline.views_per_iteration must be at least 1, got {self.views_per_iteration}.")
@@ -69,6 +72,10 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
             raise InputError(
                 f"pipeline.frequency_constant must be in (0, {HIGHEST_FREQUENCY:g}], got {self.frequency_constant}."
             )
+        if not self.energy_blur >= 0:
+            raise InputError(f"pipeline.energy_blur must not be negative, got {self.energy_blur:g}.")
+        if self.epsilon is not None and not self.epsilon > 0:
+            raise InputError(f"pipeline.epsilon must be positive, got {self.epsilon:g}.")
         self.model.check()
 
 
@@ -106,7 +113,9 @@ class SadgsPipeline(VanillaPipeline):
         positions = self.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]  # [C, 3]
         self.model.set_cameras(positions)
         self.views = TrainingViews(self.datamanager, self.model)
-        self.structure_maps = StructureMaps(self.views, config.frequency_constant, energy_blur=config.energy_blur)
+        self.structure_maps = StructureMaps(
+            self.views, config.frequency_constant, energy_blur=config.energy_blur, epsilon=config.epsilon
+        )
         self.log = NonFiniteLog(self.device)
         self._checkpoint_cap: int | None = None
         self.stuck = ""  # says why, where nothing is learned any more

@@ -29,7 +29,7 @@ class StructureMaps:
         options: What else `multiscale_structure_tensor` is called with.
     """
 
-    def __init__(self, views: TrainingViews, frequency_constant: float, **options: float) -> None:
+    def __init__(self, views: TrainingViews, frequency_constant: float, **options: float | None) -> None:
         self.views = views
         self.frequency_constant = frequency_constant
         self.options = options

@@ -109,7 +109,7 @@ def reference(scene: dict[str, Any]) -> tuple[dict[str, Tensor], Tensor, Tensor]
 
 
 def gradients_of(scene: dict[str, Any], alphas: Tensor, last_ids: Tensor, absgrad: bool = True) -> dict[str, Any]:
-    """Those of the kernel, in float64 on the CPU."""
+    """Gradients by the kernel, converted to float64 on the CPU."""
     results = compositing.composite_backward(
         *(scene[name] for name in NAMES[:4]),
         scene["starts"],
@@ -246,7 +246,7 @@ def test_autograd_gets_what_the_kernel_returns(monkeypatch, through):
 )
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatch, mode):
-    """All that surrounds gsplat's two kernels, for two views; torch code stands in for these."""
+    """Everything around gsplat's two kernels, for two views; torch code stands in for these kernels."""
     width, height, depths = 32, 24, []
 
     def project(means, _, quats, scales, viewmats, Ks, width, height, calc_compensations):
@@ -297,7 +297,7 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat's kernels need CUDA")
 @pytest.mark.parametrize("kind", TOLERANCES)
 def test_gradients_are_as_close_to_float64_as_gsplats(kind):
-    """As norms: rounding moves a few pairs over a cut-off, in either's passes, and single values with them.
+    """Norms are compared: rounding moves a few pairs over a cut-off in either's passes, and single values with them.
 
     Where ours may err more than gsplat's, it is by what the module states.
     """

@@ -17,13 +17,13 @@ import sadgs_ns.kernels as package
 CONSTANTS = {
     "GAUSSIAN": (0.25, 0.5, 0.25), "STRIP": 256, "RUN": 8, "ROWS": 16, "COLUMNS": 128, "TILE": 8, "LANES": 32,
     "VIEWS": 2, "BLOCK": 1024, "HIGH": 1.0, "LOW": 0.1, "BLUR": 0.3, "MARGIN": 0.3, "EPSILON": 1e-5,
-    "DIRECTIONAL": False, "VERTICAL": False, "MAX": 1e18, "PIXELS": 1024, "TINY": 1e-38, "HIGHEST": 4.0,
+    "VERTICAL": False, "MAX": 1e18, "PIXELS": 1024, "TINY": 1e-38, "HIGHEST": 4.0,
     "OCTAVES": 12.0, "MASKED": 255, "WIDTHS": (3, 45, 1), "PER_GAUSSIAN": 2, "GAUSSIANS": 16, "STRIDE": 12,
     "ALPHAS": True, "ABSGRAD": True, "PRECISION": "tf32x3",
 }
 INTEGERS = "n row height width taps num_gaussians num_views tile_width tile_height used stride start".split()
 INTEGERS += "channels weight_stride num_pairs rows view absolute_view absolute_row num_strips num_tiles".split()
-FLOATS = "exponent frequency beta1 beta2 eps min_logit l1_weight ssim_weight l2_weight".split()
+FLOATS = "exponent frequency beta1 beta2 eps l1_weight ssim_weight l2_weight".split()
 FLOATS += "scale_x scale_y ssim_lambda".split()
 POINTERS = {
     "radii": "*i32", "counts": "*i64", "order": "*i64", "ends": "*i64", "tiles": "*i16", "ids": "*i32", "drawn": "*i1",

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from sadgs_ns.data.cameras import refuse_failed_undistortion, refuse_unsupported_cameras
 from sadgs_ns.method import losses, statistics
-from sadgs_ns.method.eta import SCREEN_BLUR, eta, projected_axes, sample_footprint
+from sadgs_ns.method.eta import SCREEN_BLUR, eta, projected_axes, projected_eta, sample_footprint
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.plugin.model import SadgsModel
 from sadgs_ns.plugin.pipeline import SadgsPipeline, SadgsPipelineConfig
@@ -141,8 +141,7 @@ def test_a_gaussian_that_contains_the_camera_is_seen_only_when_its_centre_is_bef
 
 
 @pytest.mark.parametrize("focal", [50.0, 1000.0, 50_000.0])
-@pytest.mark.parametrize("directional", [False, True])
-def test_log_scales_from_minus_30_to_30(directional: bool, focal: float):
+def test_log_scales_from_minus_30_to_30(focal: float):
     """Everything is finite: statistics, image and gradients. What has no float32 covariance is culled."""
     scales = [(-30, -30, -30), (30, 30, 30), (-30, 0, 30), (30, -30, -30), (20, 20, 20), (0, 0, -30), (-3, -16.8, -3)]
     quats = [IDENTITY, (0.5, 0.1, 0.7, -0.3)]
@@ -150,7 +149,7 @@ def test_log_scales_from_minus_30_to_30(directional: bool, focal: float):
     params = parameters([(place, scale, quat) for place in places for scale in scales for quat in quats])
     info = forward(params, focal)
     assert info["conics"][visible(info)].isfinite().all()
-    state = observed(params, info, directional=directional)
+    state = observed(params, info)
     assert state["n_total"].sum() > 10
     viewmats, Ks = scenes.camera(WIDTH, HEIGHT, focal=focal)
     renders, alphas, _ = scenes.splat(params, viewmats, Ks, WIDTH, HEIGHT)
@@ -165,7 +164,7 @@ def test_eta_spans_the_whole_range_of_scales():
     tensor = torch.tensor([0.04, 0.0, 0.04]).expand(len(axes), 3)  # Λ = 5 px in every direction
     expected = (10.0 ** exponents.double())[:, None] * torch.tensor([1.0, 0.2, 0.2])
     torch.testing.assert_close(eta(axes, tensor).double(), expected, rtol=1e-4, atol=0)
-    torch.testing.assert_close(eta(axes, tensor, directional=True).double(), expected, rtol=1e-4, atol=0)
+    torch.testing.assert_close(projected_eta(axes, tensor).double(), expected, rtol=1e-4, atol=0)
 
 
 def test_axes_at_depths_whose_square_underflows():
@@ -270,8 +269,7 @@ def test_quaternions_without_direction_are_the_identity(quat: tuple[float, float
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("where", ["means2d", "conics", "structure_tensors", "means", "scales", "quats"])
-@pytest.mark.parametrize("directional", [False, True])
-def test_what_is_not_finite_is_no_observation(where: str, bad: float, directional: bool):
+def test_what_is_not_finite_is_no_observation(where: str, bad: float):
     """Of two drawn Gaussians the one with a broken number has no statistics, and the other has all of them."""
     params = parameters([((-0.2, 0, 1), (-5, -5, -5), IDENTITY), ((0.2, 0, 1), (-5, -5, -5), IDENTITY)])
     info = forward(params, 50.0)
@@ -284,7 +282,7 @@ def test_what_is_not_finite_is_no_observation(where: str, bad: float, directiona
     else:
         info[where] = info[where].detach().clone()
         info[where][0, 0] = bad
-    state = observed(params, info, directional=directional)
+    state = observed(params, info)
     is_number = where == "scales" and bad == -math.inf  # the logarithm of a scale of 0
     assert state["n_total"].tolist() == [3.0 * is_number, 3.0] and (state["eta_max"][1, :2] > 0).all()
 
@@ -297,12 +295,6 @@ def test_what_is_culled_may_be_anything():
     info["means2d"][0, 0], info["conics"][0, 0] = math.nan, math.inf
     state = observed(params, info)
     assert state["n_total"].tolist() == [0.0, 3.0]
-
-
-@pytest.mark.parametrize(("min_opacity", "counts"), [(0.0, True), (0.5, True), (1.0, False)])
-def test_the_opacity_gate_at_its_ends(min_opacity: float, counts: bool):
-    params = parameters([((0, 0, 1), SMALL, IDENTITY)])
-    assert observed(params, forward(params, 50.0), min_opacity=min_opacity)["n_total"].tolist() == [3.0 * counts]
 
 
 component = st.floats(-1e6, 1e6, width=32)
@@ -320,14 +312,13 @@ component = st.floats(-1e6, 1e6, width=32)
         max_size=8,
     ),
     focal=st.floats(50, 50_000),
-    directional=st.booleans(),
 )
-def test_any_gaussian_before_any_camera(gaussians: list[Gaussian], focal: float, directional: bool):
+def test_any_gaussian_before_any_camera(gaussians: list[Gaussian], focal: float):
     """Torch code and kernel agree and stay finite. Half the Gaussians are moved into the picture."""
     params = parameters(gaussians)
     params["means"].data[::2] *= torch.tensor([1e-6 / focal, 1e-6 / focal, 1.0])
     params["means"].data[::2, 2].abs_().add_(NEAR)
-    observed(params, forward(params, focal), rounds=1, directional=directional)
+    observed(params, forward(params, focal), rounds=1)
 
 
 # --- the other kernels ---
@@ -343,15 +334,16 @@ def extreme_ellipses(n: int = 192) -> dict[str, Tensor]:
     lengths, angles = 10 ** (10 * random(2) - 1.5), math.pi * random()
     angles[:, ::3] = (4 * random()[:, ::3]).round() * math.pi / 4
     rotation = torch.stack([angles.cos(), -angles.sin(), angles.sin(), angles.cos()], -1).reshape(1, n, 2, 2)
-    covariances = rotation @ torch.diag_embed(lengths**2) @ rotation.mT + SCREEN_BLUR * torch.eye(2)
-    inverses = torch.linalg.inv(covariances).float()
+    variances = lengths**2 + SCREEN_BLUR
+    # Made of its eigenvalues, the inverse exists on every processor; that of the rounded covariance may not.
+    inverses = (rotation @ torch.diag_embed(1 / variances) @ rotation.mT).float()
     means2d = (1.4 * random(2) - 0.2) * torch.tensor([WIDTH, HEIGHT])
     means2d[:, 1::4] += ((random(2) - 0.5) * 10 ** (9 * random(1)))[:, 1::4]
     conics = torch.stack([inverses[..., 0, 0], inverses[..., 0, 1], inverses[..., 1, 1]], -1)
     opacities = random()
     means2d[:, 5], means2d[:, 6, 0], means2d[:, 7], means2d[:, 8] = math.nan, math.nan, math.inf, -math.inf
     conics[:, 10], conics[:, 11], conics[:, 12], opacities[:, 13] = 0.0, math.nan, math.inf, math.nan
-    radii = (3 * torch.linalg.eigvalsh(covariances)[..., -1].sqrt()).ceil().clamp_max(2**31 - 200).int()
+    radii = (3 * variances.amax(-1).sqrt()).ceil().clamp_max(2**31 - 200).int()
     values = {"means2d": means2d, "depths": random(), "conics": conics, "opacities": opacities}
     return {**{name: value.float() for name, value in values.items()}, "radii": radii}
 

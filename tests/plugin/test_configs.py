@@ -373,6 +373,9 @@ def test_the_papers_presets_are_sadgs_without_what_we_added():
     model.strategy.clone_grad2d, model.strategy.split_absgrad2d = 2e-4, 4e-4
     model.strategy.min_opacity, model.strategy.refine_stop_iter = 0.005, 1900
     model.strategy.absgs_long_axis = False
+    model.strategy.eta_every = model.strategy.min_observations = 1
+    model.strategy.split_min_opacity = config.pipeline.energy_blur = 0.0
+    config.pipeline.epsilon = 1e-6
     config.optimizers["scales"]["optimizer"].lr = 0.01
     config.method_name = "sadgs-paper"
     assert yaml.dump(config) == yaml.dump(paper)

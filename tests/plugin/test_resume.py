@@ -272,7 +272,7 @@ def test_a_terminal_that_is_gone_costs_nothing_that_was_trained(scene: Path, tmp
     ours, theirs = os.openpty()
     script = "import sys; from pathlib import Path; from kill_and_resume import configure, set_up\n"
     script += f"config = configure(Path({str(scene)!r}), Path({str(tmp_path)!r}), 5000, save_every=0)\n"
-    script += "config.logging.local_writer.enable, config.pipeline.model.densify = True, False\n"
+    script += "config.logging.local_writer.enable, config.pipeline.model.strategy.refine_stop_iter = True, 0\n"
     script += "trainer = set_up(config); trainer.train()\n"
     process = subprocess.Popen(
         [sys.executable, "-W", "ignore", "-c", TERMINAL + script],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is 
 photometric = pytest.importorskip("sadgs_ns.kernels.losses", reason="Triton is not installed")
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+fused_photometric_loss = partial(photometric.photometric_loss, window=losses.WINDOW)
 HEIGHT, WIDTH = 13, 12
 
 
@@ -82,7 +84,7 @@ def test_the_kernels_loss_and_gradient_equal_the_float64_reference(name: str):
     # Both from the same float32 numbers, so that equal pixels stay equal.
     predicted, target = predicted.float().to(DEVICE), target.float().to(DEVICE)
     results = []
-    for function, dtype in ((photometric.photometric_loss, torch.float32), (losses.photometric_loss, torch.float64)):
+    for function, dtype in ((fused_photometric_loss, torch.float32), (losses.photometric_loss, torch.float64)):
         x = predicted.to(dtype).requires_grad_()
         loss, psnr = function(x, target.to(dtype), ssim_lambda=0.2, l2_lambda=2.0)
         (gradient,) = torch.autograd.grad(loss, x)
@@ -109,7 +111,7 @@ def test_views_smaller_than_ssims_window_take_the_torch_code(shape: tuple[int, .
 
 def test_no_gradient_flows_from_no_upstream():
     x = torch.rand((1, 16, 16, 3), device=DEVICE, requires_grad=True)
-    loss, _ = photometric.photometric_loss(x, torch.ones_like(x), ssim_lambda=0.2, l2_lambda=2.0)
+    loss, _ = fused_photometric_loss(x, torch.ones_like(x), ssim_lambda=0.2, l2_lambda=2.0)
     (gradient,) = torch.autograd.grad(0 * loss, x)
     assert not gradient.any()
 
@@ -209,7 +211,7 @@ def test_loss_and_splatter_together_by_finite_differences():
 
 
 def test_opacities_of_zero_and_one_have_finite_gradients():
-    """Through the sigmoid, as in training: logits that float32 rounds to 0 and 1, and infinite ones."""
+    """Opacities come through the sigmoid, as in training: of logits that float32 rounds to 0 or 1, or infinite."""
     gaussians = {name: value.float() for name, value in hard_scene().items()}
     logits = torch.tensor([200.0, -200.0, math.inf, -math.inf], requires_grad=True)
     means = gaussians["means"].requires_grad_()
@@ -278,7 +280,7 @@ def test_harmonics_that_no_view_draws():
 
 
 def test_harmonics_of_a_gaussian_where_the_camera_is_have_finite_gradients():
-    """It has no direction; gsplat culls it, being nearer than the near plane, but the numbers stay finite anyway."""
+    """Such a Gaussian has no direction. gsplat culls it before the near plane, but the numbers stay finite anyway."""
     values = [torch.zeros(2, 3), torch.ones(2, 3), torch.ones(2, 15, 3)]
     fast = [value.to(DEVICE).requires_grad_() for value in values]
     drawn = torch.tensor([[True, False]], device=DEVICE)
@@ -292,7 +294,7 @@ def test_harmonics_of_a_gaussian_where_the_camera_is_have_finite_gradients():
 # --- determinism ---
 
 ITERATIONS = 16
-"""Past two structure steps and three of AbsGS, whose splits draw random numbers."""
+"""Iterations that pass two structure steps and three of AbsGS, whose splits draw random numbers."""
 
 
 def run(folder: Path, parser: ColmapDataParserConfig, seed: int) -> dict[str, Any]:
