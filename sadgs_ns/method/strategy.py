@@ -57,9 +57,6 @@ class StructureAwareStrategy(Strategy):
     max_gaussians: int = 4_000_000
     """Hard cap on the number of Gaussians, never exceeded; the largest violations are split first.
     On CUDA fewer are added, with a warning, where the device's memory would not hold them."""
-    memory_budget_gb: float | None = None
-    """Memory of the GPU, in 10⁹ bytes, that training may take; `ns-train` lowers `max_gaussians` to it at the start.
-    None is 80 % of what is free, unless `max_gaussians` was changed, which then stays."""
     structure_every: int = 500
     """Iterations between structure-aware split and prune steps; 0 turns them off."""
     absgs_every: int = 100
@@ -67,15 +64,15 @@ class StructureAwareStrategy(Strategy):
     refine_start_iter: int = 100
     """First iteration at which densification may run."""
     refine_stop_iter: int = 1600
-    """Last iteration at which densification may run; Gaussians less than 0.1 opaque are pruned there. 0 leaves the
-    number of Gaussians as it is."""
+    """Last iteration at which densification may run; Gaussians less than 0.1 opaque are pruned there.
+    0 adds and removes none at all."""
     eta_every: int = 10
     """Iterations between η observations; the paper observes at every one, which costs time and brings nothing."""
     tau_split: float = 0.8
     """Fraction of a Gaussian's observations that must violate (η > 1) before an axis is split."""
     min_observations: int = 3
-    """Observations of η that a Gaussian needs before a structure step splits it, or prunes it for low η; the paper asks
-    for none, and then one of one is enough."""
+    """Observations of η that a Gaussian needs before a structure step splits it, or prunes it for low η.
+    With 1, as in the paper, one violation of one observation is enough."""
     split_min_opacity: float = 0.3
     """Opacity in [0, 1] that a Gaussian needs to be split by a structure step; 0, as in the paper, splits all."""
     child_scale: float = 1.5
@@ -91,17 +88,15 @@ class StructureAwareStrategy(Strategy):
     """Opacity under which every densification step prunes; AbsGS's own is 0.005."""
     reset_every: int = 1200
     """Iterations between opacity resets inside the densification window; 0 turns them off."""
-
-    def __post_init__(self) -> None:
-        self.fused = True
-        """Whether η is measured, and AbsGS's gradients are added up, in a Triton kernel each where these run (CUDA)."""
+    fused: bool = True
+    """Measure η, and add up AbsGS's gradients, in one Triton kernel each where these run (CUDA)."""
 
     def check(self) -> None:
         """See whether densification can work with these options.
 
         Raises:
-            ValueError: If `max_gaussians`, `eta_every`, `min_observations` or `memory_budget_gb` is not positive, a
-                fraction or an opacity not in [0, 1], or `child_scale` not in [1, 2).
+            ValueError: If `max_gaussians`, `eta_every` or `min_observations` is not positive, a fraction or an opacity
+                not in [0, 1], or `child_scale` not in [1, 2).
         """
         for name in ("max_gaussians", "eta_every", "min_observations"):
             if getattr(self, name) < 1:
@@ -111,8 +106,6 @@ class StructureAwareStrategy(Strategy):
         for name in ("tau_split", "split_min_opacity", "min_opacity"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"strategy.{name} must be in [0, 1], got {getattr(self, name):g}.")
-        if self.memory_budget_gb is not None and not self.memory_budget_gb > 0:
-            raise ValueError(f"strategy.memory_budget_gb must be positive, got {self.memory_budget_gb:g}.")
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
         """State to pass to the other methods; its tensors are made at the first step.

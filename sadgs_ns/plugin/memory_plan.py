@@ -111,7 +111,7 @@ def _count_pairs(
 
 
 def fit_to_memory(
-    strategy: StructureAwareStrategy, params: Params, size: TrainingSize
+    strategy: StructureAwareStrategy, params: Params, size: TrainingSize, budget_gb: float | None = None
 ) -> tuple[str | None, str | None]:
     """Lower `max_gaussians` to what the budget, or the device's free memory, holds; call before the first step.
 
@@ -119,16 +119,17 @@ def fit_to_memory(
     is not the default stays as it is.
 
     Args:
-        strategy: Its `max_gaussians` is lowered; its `memory_budget_gb` is the budget.
+        strategy: Its `max_gaussians` is lowered.
         params: The initial Gaussians, on the device of training.
         size: What the run keeps and renders besides.
+        budget_gb: Memory that the run may take, in 10⁹ bytes; None is `PLANNED_SHARE` of what is free.
 
     Returns:
         A line for the user, and a warning if the first step will probably not fit; both None without CUDA, where
         nothing is changed.
 
     Raises:
-        ValueError: If `memory_budget_gb` leaves no room for Gaussians.
+        ValueError: If the budget leaves no room for Gaussians.
     """
     device, n = params["means"].device, len(params["means"])
     free, total = memory.available_bytes(device)
@@ -143,21 +144,20 @@ def fit_to_memory(
         return size.image_bytes + each * num_gaussians + working
 
     why = ""
-    given = strategy.memory_budget_gb
-    if given is not None or strategy.max_gaussians == StructureAwareStrategy.max_gaussians:
-        budget = PLANNED_SHARE * free if given is None else min(1e9 * given, free)
+    if budget_gb is not None or strategy.max_gaussians == StructureAwareStrategy.max_gaussians:
+        budget = PLANNED_SHARE * free if budget_gb is None else min(1e9 * budget_gb, free)
         none = {name: value[:0] for name, value in params.items()}
         left = budget - size.image_bytes
         affordable = memory.affordable_growth(none, state, left, replace(size.step, pairs=0), size.fused)  # type: ignore[arg-type]
-        if given is not None and affordable < 1:
+        if budget_gb is not None and affordable < 1:
             raise ValueError(
-                f"strategy.memory_budget_gb is {given:g} and leaves no room for Gaussians: images and rendering "
+                f"memory_budget_gb is {budget_gb:g} and leaves no room for Gaussians: images and rendering "
                 f"take {fixed / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; raise it, take fewer or "
                 "smaller images, or lower pipeline.views-per-iteration."
             )
         if affordable < strategy.max_gaussians:
             strategy.max_gaussians = max(int(affordable), 1)
-            why = f"; {free / 1e9:.1f} GB are free" if given is None else f"; memory_budget_gb is {given:g}"
+            why = f"; {free / 1e9:.1f} GB are free" if budget_gb is None else f"; memory_budget_gb is {budget_gb:g}"
             if strategy.max_gaussians < n:
                 why += f", which holds no more than the {n:,} at the start: none will be added"
     most = max(strategy.max_gaussians, n)

@@ -50,6 +50,7 @@ CONSTANTS: dict[str, Any] = {
     "reset_factor": 0.1,
     "final_prune_opacity": 0.1,
     "eta_min_opacity": 0.3,
+    "memory_budget_gb": None,
     "verbose": False,
 }
 """Removed options at the values that the method has kept: a run with these lacks nothing."""

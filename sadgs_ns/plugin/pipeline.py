@@ -52,13 +52,16 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     views_per_iteration: int = 1
     """Training views rendered for one optimizer step, at most as many as there are; the loss is their mean.
     The paper uses 1 outdoors, 2 indoors. A preset's learning rates and AbsGS thresholds fit its own number."""
+    memory_budget_gb: float | None = None
+    """Memory of the GPU, in 10⁹ bytes, that training may take; the cap of Gaussians is lowered to it at the start.
+    None is 80 % of what is free, unless `max_gaussians` was changed, which then stays."""
     frequency_constant: float = FREQUENCY_CONSTANT
     """c of ω_l = c / σ_l in 1/px, at most 4: the larger, the shorter every wavelength and the more is split."""
     energy_blur: float = ENERGY_BLUR
     """Window, in multiples of σ_l, over which the energy of a scale is averaged; 0 measures it per pixel (eq. 4)."""
     epsilon: float | None = None
-    """ε of the structure tensor (eq. 3 and 5), for images in [0, 1]; None makes it relative to an image's contrast, so
-    that the exposure of a photo does not decide what is split."""
+    """ε of the structure tensor (eq. 3 and 5), for images in [0, 1].
+    None makes it relative to an image's contrast, so that the exposure of a photo does not decide what is split."""
 
     def check(self) -> None:
         """See whether training can work with these options.
@@ -74,8 +77,9 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
             )
         if not self.energy_blur >= 0:
             raise InputError(f"pipeline.energy_blur must not be negative, got {self.energy_blur:g}.")
-        if self.epsilon is not None and not self.epsilon > 0:
-            raise InputError(f"pipeline.epsilon must be positive, got {self.epsilon:g}.")
+        for name in ("epsilon", "memory_budget_gb"):
+            if (value := getattr(self, name)) is not None and not value > 0:
+                raise InputError(f"pipeline.{name} must be positive, got {value:g}.")
         self.model.check()
 
 
@@ -144,9 +148,9 @@ class SadgsPipeline(VanillaPipeline):
             model, fused = self.model, self.config.model.fused and kernels.available(self.device)
             size = training_size(self.datamanager, model.gauss_params, self.views_per_iteration, fused)  # type: ignore[arg-type]
             try:
-                line, warning = fit_to_memory(model.strategy, model.gauss_params, size)  # type: ignore[arg-type]
+                line, warning = fit_to_memory(model.strategy, model.gauss_params, size, self.config.memory_budget_gb)  # type: ignore[arg-type]
             except ValueError as error:
-                raise InputError(f"pipeline.model.{error}") from error
+                raise InputError(f"pipeline.{error}") from error
             if line is None:
                 cap = self.model.strategy.max_gaussians
                 line = f"At most {cap:,} Gaussians: this device's memory is not planned with, so this is max_gaussians."
@@ -269,8 +273,9 @@ class SadgsPipeline(VanillaPipeline):
     def _settings(self) -> dict[str, Any]:
         """What decides how training goes on from a checkpoint, by the names of the options."""
         strategy = asdict(self.config.model.strategy)
-        settings = {f"model.strategy.{name}": strategy[name] for name in strategy if name not in ("fused", "verbose")}
-        return {"views_per_iteration": self.config.views_per_iteration, **settings}
+        settings = {f"model.strategy.{name}": strategy[name] for name in strategy if name != "fused"}
+        own = {name: getattr(self.config, name) for name in ("views_per_iteration", "memory_budget_gb")}
+        return {**own, **settings}
 
     def get_extra_state(self) -> dict[str, Any]:
         """Random states and the order of the views, so that a resumed run goes on as if never stopped.

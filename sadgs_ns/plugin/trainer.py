@@ -131,7 +131,7 @@ class SadgsTrainerConfig(TrainerConfig):
     save_only_latest_checkpoint: bool = True
     """Keep the latest checkpoint only, instead of all."""
     load_dir: Path | None = None
-    """Folder of checkpoints (nerfstudio_models) from which the run goes on."""
+    """Folder of a run, or of its checkpoints, from which the run goes on."""
     load_step: int | None = None
     """Step of the checkpoint in `load_dir`; None takes the latest."""
     load_checkpoint: Path | None = None

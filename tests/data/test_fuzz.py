@@ -1,7 +1,7 @@
 """Fuzz: damaged COLMAP models end in success or an error, never in a hang, a crash or gigabytes.
 
 The examples are drawn anew in each run; hypothesis prints the one that fails, and how to repeat it. More of them:
-`pytest tests/test_fuzz.py --hypothesis-profile=long`.
+`pytest tests/data/test_fuzz.py --hypothesis-profile=long`.
 """
 
 from __future__ import annotations

@@ -55,11 +55,19 @@ def card(monkeypatch: pytest.MonkeyPatch):
     return set_memory
 
 
-def fit(other: float = 0.0, n: int = 10, views: int = 1, pixels: int = 0, pairs: float = 0, **changes: Any):
+def fit(
+    other: float = 0.0,
+    n: int = 10,
+    views: int = 1,
+    pixels: int = 0,
+    pairs: float = 0,
+    budget_gb: float | None = None,
+    **changes: Any,
+):
     """The cap, and what the user is told."""
     strategy = StructureAwareStrategy(**changes)
     size = TrainingSize(other, StepSize(views, pixels, pairs))
-    line, warning = fit_to_memory(strategy, params(n), size)  # type: ignore[arg-type]
+    line, warning = fit_to_memory(strategy, params(n), size, budget_gb)  # type: ignore[arg-type]
     assert line is not None
     return strategy.max_gaussians, line, warning
 
@@ -126,15 +134,15 @@ def test_a_small_card_gets_a_cap_that_takes_four_fifths_of_what_is_free(card: An
 
 def test_a_budget_bounds_it_and_never_raises_max_gaussians(card: Any):
     card(139, 140)
-    cap, line, _ = fit(other=1e9, memory_budget_gb=4.0)
+    cap, line, _ = fit(other=1e9, budget_gb=4.0)
     assert cap == int(3e9 // each())
     assert line == f"At most {cap:,} Gaussians: 4.0 GB of the card's 140.0 GB; memory_budget_gb is 4."
-    assert fit(memory_budget_gb=100.0)[0] == DEFAULT
-    assert fit(memory_budget_gb=100.0, max_gaussians=1000)[0] == 1000
-    assert fit(memory_budget_gb=4.0, max_gaussians=1000)[0] == 1000
-    assert fit(memory_budget_gb=4.0, max_gaussians=3_000_000)[0] == int(4e9 // each())
+    assert fit(budget_gb=100.0)[0] == DEFAULT
+    assert fit(budget_gb=100.0, max_gaussians=1000)[0] == 1000
+    assert fit(budget_gb=4.0, max_gaussians=1000)[0] == 1000
+    assert fit(budget_gb=4.0, max_gaussians=3_000_000)[0] == int(4e9 // each())
     card(2, 8)  # more than is free is not there to be taken
-    assert fit(memory_budget_gb=4.0)[0] == int(2e9 // each())
+    assert fit(budget_gb=4.0)[0] == int(2e9 // each())
 
 
 def test_a_cap_that_the_user_chose_stays_without_a_budget(card: Any):
@@ -148,17 +156,17 @@ def test_a_full_card_still_starts_and_a_budget_for_nothing_is_refused(card: Any)
     cap, line, _ = fit(other=1e9)
     assert cap == 1 and line.endswith("which holds no more than the 10 at the start: none will be added.")
     with pytest.raises(ValueError) as error:
-        fit(other=1e9, memory_budget_gb=0.5)
+        fit(other=1e9, budget_gb=0.5)
     assert str(error.value) == (
-        "strategy.memory_budget_gb is 0.5 and leaves no room for Gaussians: images and rendering take 1.0 GB, and 0.5 "
+        "memory_budget_gb is 0.5 and leaves no room for Gaussians: images and rendering take 1.0 GB, and 0.5 "
         "GB are free; raise it, take fewer or smaller images, or lower pipeline.views-per-iteration."
     )
 
 
 def test_without_cuda_nothing_changes():
-    strategy = StructureAwareStrategy(memory_budget_gb=0.1)
+    strategy = StructureAwareStrategy()
     size = TrainingSize(1e9, StepSize(1, 10**6, 10**6))
-    assert fit_to_memory(strategy, params(), size) == (None, None)  # type: ignore[arg-type]
+    assert fit_to_memory(strategy, params(), size, 0.1) == (None, None)  # type: ignore[arg-type]
     assert strategy.max_gaussians == DEFAULT
 
 
@@ -283,7 +291,7 @@ def test_ns_train_says_the_cap_at_the_start_and_keeps_it(
 def test_a_budget_for_nothing_ends_ns_train_with_one_sentence(card: Any, tmp_path: Path):
     write_scene(tmp_path / "scene", WIDTH, HEIGHT, VIEWS, points=100)
     config = configure(tmp_path / "scene", tmp_path, iterations=24, save_every=0)
-    config.pipeline.model.strategy.memory_budget_gb = 1e-6
+    config.pipeline.memory_budget_gb = 1e-6
     card(8, 8)
-    with pytest.raises(InputError, match=r"^pipeline\.model\.strategy\.memory_budget_gb is 1e-06 and leaves no room"):
+    with pytest.raises(InputError, match=r"^pipeline\.memory_budget_gb is 1e-06 and leaves no room"):
         set_up(config)
