@@ -45,7 +45,7 @@ def recorded(monkeypatch: pytest.MonkeyPatch, module: Any, *names: str) -> list[
     return calls
 
 
-@pytest.mark.parametrize("shape", [(2, 37, 51, 3), (1, 11, 11, 3), (1, 20, 90, 3)], ids=str)
+@pytest.mark.parametrize("shape", [(2, 21, 47, 3), (1, 11, 11, 3), (1, 20, 60, 3)], ids=str)
 def test_loss_and_gradient_equal_the_float64_reference(shape):
     generator = torch.Generator().manual_seed(0)
     target = torch.rand(shape, generator=generator)
@@ -75,7 +75,7 @@ def test_flat_images_have_a_finite_gradient():
 
 @pytest.mark.parametrize("function", [fused_photometric_loss, losses.photometric_loss])
 def test_psnr_carries_no_gradient(function):
-    x = torch.rand((1, 12, 12, 3), device=DEVICE, requires_grad=True)
+    x = torch.rand((1, 12, 12, 3), generator=torch.Generator().manual_seed(0)).to(DEVICE).requires_grad_()
     _, psnr = function(x, torch.zeros_like(x), ssim_lambda=0.2, l2_lambda=2.0)
     assert psnr > 0 and not psnr.requires_grad
 
@@ -181,6 +181,9 @@ def test_structure_tensors_are_the_same_with_the_kernels(monkeypatch, masked, en
         if masked == "transposed":  # the same in memory of another order
             masks = masks.mT.contiguous().mT
     monkeypatch.setattr("sadgs_ns.method.structure_tensor.NUM_LEVELS", 2)
+    if DEVICE.type == "cpu":  # the interpreter also computes what a block has beyond the image
+        monkeypatch.setattr(structure, "_TILES", {2: (16, 16), 3: (16, 16)})
+        monkeypatch.setattr(structure, "_PIXELS", 64)
     options = {"energy_blur": energy_blur, "epsilon": epsilon, "truncation": 1.5}
     expected = multiscale_structure_tensor(images.double(), masks, **options)
     monkeypatch.setattr(kernels, "available", lambda device: True)
@@ -208,9 +211,9 @@ def test_codes_are_the_references_or_their_neighbours(monkeypatch):
 @pytest.mark.parametrize(("degree", "num_others"), [(0, 15), (1, 15), (2, 15), (3, 15), (3, 24)])
 def test_colours_and_gradients_equal_gsplats_float64_harmonics(monkeypatch, degree, num_others, per_axis_radii):
     generator = torch.Generator().manual_seed(degree)
-    shapes = (90, 3), (90, 3), (90, num_others, 3), (3, 3), (3, 90, 3)
+    shapes = (40, 3), (40, 3), (40, num_others, 3), (3, 3), (3, 40, 3)
     *values, centres, weights = (torch.randn(shape, generator=generator) for shape in shapes)
-    viewmats, radii = scenes.cameras_at(centres), torch.randint(-1, 9, (3, 90, 2), generator=generator)
+    viewmats, radii = scenes.cameras_at(centres), torch.randint(-1, 9, (3, 40, 2), generator=generator)
     radii = radii if per_axis_radii else radii[..., 0].contiguous()
     drawn = (radii > 0).all(dim=-1) if per_axis_radii else radii > 0
     fast = [value.to(DEVICE, copy=True).requires_grad_() for value in values]
@@ -337,7 +340,7 @@ def test_adam_in_one_launch_equals_torchs_and_one_launch_for_each_parameter(rows
     optimizer = torch.optim.Adam(groups, **ADAM)
     together, separate = with_moments(start), with_moments(start)
     noted = torch.zeros(1, device=DEVICE)
-    for step in range(1, 6):
+    for step in range(1, 4):
         gradients = tuple(torch.randn(p.shape, generator=generator) for p in start)
         for parameter, gradient in zip(expected, gradients, strict=True):
             parameter.grad = gradient.to(dtype)

@@ -8,7 +8,7 @@ from triton_compiler import run_with_the_compiler
 pytest.importorskip("triton", reason="Triton is not installed")
 
 COMPILE = """
-import importlib, pkgutil, sys
+import importlib, pkgutil
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
@@ -55,15 +55,15 @@ for module in pkgutil.iter_modules(package.__path__):
                 signature[parameter.name] = POINTERS.get(parameter.name, "*fp32")
         signatures = [signature] if name != "_list" else [signature, signature | {"tiles": "*i32"}]
         for signature in signatures:
-            triton.compile(ASTSource(kernel, signature, constants), target=GPUTarget("cuda", int(sys.argv[1]), 32))
+            for capability in (80, 90):  # A100, H200
+                triton.compile(ASTSource(kernel, signature, constants), target=GPUTarget("cuda", capability, 32))
         compiled.append(name)
 print(" ".join(compiled))
 """
 
 
-@pytest.mark.parametrize("capability", [80, 90], ids=["A100", "H200"])
-def test_every_kernel_compiles(capability, tmp_path):
-    run = run_with_the_compiler(tmp_path, COMPILE, str(capability))
+def test_every_kernel_compiles_for_an_a100_and_an_h200(tmp_path):
+    run = run_with_the_compiler(tmp_path, COMPILE)
     assert run.returncode == 0, run.stderr[-3000:]
     expected = {"_blur_along_rows", "_similarity", "_spread_along_rows", "_gradient", "_count", "_list", "_observe"}
     expected |= {"_forward", "_backward", "_update", "_correlate", "_differentiate", "_aggregate", "_write_one"}

@@ -52,7 +52,7 @@ def test_camera_extent_is_that_of_3dgs():
 
 
 def test_points_come_first_and_the_faces_faint_grey_and_a_cell_large_after_them():
-    points, colors = torch.rand(20, 3), torch.rand(20, 3)
+    points, colors = torch.rand((2, 20, 3), generator=torch.Generator().manual_seed(0))
     alone = starting_points(points, colors, faces=False)
     assert alone[0] is points and alone[1] is colors and (alone[3] == 0.1).all()
     torch.testing.assert_close(alone[2], neighbour_scales(points))

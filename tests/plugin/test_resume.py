@@ -73,7 +73,7 @@ def kill_and_resume(*arguments: object) -> str:
 
 
 def test_a_run_killed_in_four_places_ends_bitwise_equal_to_one_that_nothing_disturbed(tmp_path: Path):
-    sizes = ("--kills", 4, "--iterations", 36, "--save-every", 6, "--width", 48, "--views", 10)
+    sizes = ("--kills", 4, "--iterations", 24, "--save-every", 4, "--width", 48, "--views", 10)
     printed = kill_and_resume(tmp_path, *sizes)
     assert re.findall(r"kill \d: .*, (.*), iteration .*: exit -9", printed) == [
         "within a step",
@@ -174,7 +174,7 @@ def test_ctrl_c_on_ns_train_prints_the_command_that_resumes_it(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     program = str(Path(sys.executable).with_name("ns-train"))
-    iterations = 150
+    iterations = 60
     command = [program, "sadgs", "--output-dir", str(tmp_path), "--experiment-name", "a run", "--timestamp", "first"]
     command += ["--max-num-iterations", str(iterations), "--steps-per-save", "5", "--vis", "tensorboard"]
     command += ["--pipeline.model.strategy.refine-stop-iter", "0", "--machine.device-type", "cpu"]

@@ -187,7 +187,7 @@ def test_spherical_harmonics_and_background() -> None:
 
 
 def test_render_modes() -> None:
-    scene: dict[str, Any] = small_scene() | {"backgrounds": torch.rand(1, 3, dtype=torch.float64)}
+    scene: dict[str, Any] = small_scene() | {"backgrounds": torch.tensor([[0.2, 0.9, 0.4]], dtype=torch.float64)}
     both, alphas, _ = render(scene, render_mode="RGB+D")
     for mode, expected in {
         "RGB": both[..., :3],
@@ -207,7 +207,8 @@ def test_gradients_agree_with_finite_differences(mode: splatter.RasterizeMode) -
     scene["scales"] = 0.15 + 0.5 * scene["scales"]
     scene["opacities"] = torch.linspace(0.3, 0.9, 6, dtype=torch.float64)
     scene["colors"] = torch.randn(6, 4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
-    scene |= {"width": 6, "height": 5, "Ks": scene["Ks"] / 6.0, "backgrounds": torch.rand(1, 3, dtype=torch.float64)}
+    background = torch.tensor([[0.2, 0.9, 0.4]], dtype=torch.float64)
+    scene |= {"width": 6, "height": 5, "Ks": scene["Ks"] / 6.0, "backgrounds": background}
     scene["Ks"][0, 2, 2] = 1.0
     names = ["means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds"]
 
@@ -320,7 +321,7 @@ def test_culled_gaussians_get_zero_gradients() -> None:
     # Behind the camera, in the camera plane, off the screen, and beyond the far plane.
     means = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 0.0], [50.0, 0.0, 1.0], [0.0, 0.0, 200.0]]).requires_grad_()
     scales = torch.full((4, 3), 0.1).requires_grad_()
-    quats, opacities, colors = torch.eye(4), torch.full((4,), 0.8), torch.rand(4, 16, 3)
+    quats, opacities, colors = torch.eye(4), torch.full((4,), 0.8), torch.ones(4, 16, 3)
     viewmats, Ks = torch.eye(4)[None], torch.tensor([[[20.0, 0, 10], [0, 20.0, 10], [0, 0, 1]]])
     image, alphas, info = splatter.rasterization(
         means, quats, scales, opacities, colors, viewmats, Ks, 20, 20, far_plane=100.0, sh_degree=3, absgrad=True
@@ -349,7 +350,8 @@ def test_no_gaussians() -> None:
 def test_two_cameras_equal_two_calls() -> None:
     scene = small_scene()
     views: list[dict[str, Any]] = [
-        {"viewmats": look_from(angle, 2.5), "colors": torch.rand(1, 24, 3).double()} for angle in (0.2, -0.6)
+        {"viewmats": look_from(angle, 2.5), "colors": small_scene(seed=seed)["colors"][None]}
+        for seed, angle in enumerate((0.2, -0.6))
     ]
     both: dict[str, Any] = {name: torch.cat([view[name] for view in views]) for name in ("viewmats", "colors")}
     colors, alphas, info = render(scene | both, Ks=scene["Ks"].expand(2, 3, 3))
