@@ -77,6 +77,29 @@ def test_structure_step_splits_in_one_step_and_forgets_the_parents():
     assert float(state["n_total"].max()) <= 2, "two steps since the split"
 
 
+def test_over_a_run_no_gaussian_has_more_observations_than_iterations_of_life():
+    """Ages are kept beside Adam's moments, which gsplat's operations and ours begin anew for every new Gaussian."""
+    strategy = short(max_gaussians=3000, clone_grad2d=1e-5, split_absgrad2d=1e-5, tau_split=0.3, min_observations=3)
+    params = random_params(60)
+    params["scales"].data += 1.0
+    optimizers, state = adam(params), strategy.initialize_state(scene_scale=1.0)
+    optimizers["means"].state[params["means"]]["age"] = torch.zeros(60)
+    images, (viewmats, Ks) = checker_images(1), camera(WIDTH, HEIGHT)
+    tensors = multiscale_structure_tensor(images)
+    newborn = observed = 0
+    for step in range(strategy.refine_stop_iter - 1):
+        optimizers["means"].state[params["means"]]["age"] += 1
+        training_step(strategy, params, optimizers, state, step, images, tensors, viewmats, Ks)
+        age = optimizers["means"].state[params["means"]]["age"]
+        assert len(age) == len(state["n_total"]) == len(params["means"])
+        assert (state["n_total"] <= age).all(), f"iteration {step + 1}"
+        for name in ("n_high", "n_low"):
+            assert (state[name] <= state["n_total"][:, None]).all()
+        assert not state["eta_max"][state["n_total"] == 0].any()
+        newborn, observed = newborn + int((age == 0).sum()), observed + int((state["n_total"] > 0).sum())
+    assert newborn > 100 and observed > 1000
+
+
 @pytest.mark.parametrize("cap", [60, 61, 150, 400])
 def test_the_hard_cap_holds_at_every_step(cap: int):
     _, _, counts = train(short(max_gaussians=cap), 26)
