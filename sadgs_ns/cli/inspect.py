@@ -181,10 +181,13 @@ def _try(
     model: SadgsModel, state: dict[str, Any], densify: Callable[[dict[str, Any], Any, dict[str, Any]], Any]
 ) -> Step:
     params = {name: torch.nn.Parameter(value.detach().clone()) for name, value in model.gauss_params.items()}
+    # A parameter, since children take theirs from their parents; rows of the state begin anew. float64 counts exactly.
+    numbers = torch.arange(model.num_points, device=params["means"].device, dtype=torch.float64)
+    params["origins"] = torch.nn.Parameter(numbers)
     optimizers = {name: torch.optim.SGD([parameter], lr=0.0) for name, parameter in params.items()}
-    state = {**state, "origins": torch.arange(model.num_points, device=params["means"].device)}
     densify(params, optimizers, state)
-    return Step({name: value.detach() for name, value in params.items()}, state["origins"])
+    origins = params.pop("origins").detach().long()
+    return Step({name: value.detach() for name, value in params.items()}, origins)
 
 
 def structure_step(model: SadgsModel, statistics: dict[str, Tensor]) -> Step:

@@ -201,7 +201,7 @@ def test_many_samples_become_the_exact_average():
 
 def test_errors_decrease_with_samples():
     tensors = multiscale_structure_tensor(texture())
-    rows = list(footprint_rows(tensors, random_footprints(400, tensors), repeats=1))
+    rows = list(footprint_rows(tensors, random_footprints(4000, tensors), repeats=1))
     assert len(rows) == 1 + len(SAMPLES)
     assert [rows[0][name] for name in ("median", "p95", "max", "flips")] == [0.0] * 4
     for name in ("median", "p95", "flips"):

@@ -94,11 +94,11 @@ def test_ellipses_are_drawn_where_and_as_they_lie():
     """Of vertical stripes each ellipse is a tall one: coloured pixels reach further up and down than to the sides."""
     tensor = torch.zeros(40, 40, 3)
     tensor[20, 20] = torch.tensor([0.4**2, 0.0, 0.4**2 / 25])  # axes of 2.5 and 12.5 px
-    ellipses = texture.structure_ellipses(tensor, spacing=40.0)
+    ellipses = texture.structure_ellipses(tensor, 0.4, spacing=40.0)
     assert ellipses.centers.tolist() == [[20.0, 20.0]]
     torch.testing.assert_close(ellipses.axes, torch.tensor([[2.5, 12.5]], dtype=torch.float64), rtol=1e-3, atol=0)
     tensor[:] = tensor[20, 20]
-    drawn = texture.draw_ellipses(np.zeros((40, 40, 3), np.uint8), tensor, size=(1120, 1120))
+    drawn = texture.draw_ellipses(np.zeros((40, 40, 3), np.uint8), tensor, 0.4, size=(1120, 1120))
     cell = drawn[520:560, 520:560]  # 28 ellipses across: cells of 40 px
     rows, columns = np.nonzero(cell.sum(axis=-1))
     assert np.ptp(rows) == 39, "as long as the cell"

@@ -82,7 +82,11 @@ def test_a_resumed_run_goes_on_with_the_views_of_the_run_that_was_never_stopped(
     for _ in range(6):
         drawn += steps_of(views_of(datamanager), number, steps=10)
         pipeline: Any = SimpleNamespace(
-            datamanager=datamanager, device=torch.device("cpu"), _settings=dict, views_per_iteration=number
+            datamanager=datamanager,
+            model=SimpleNamespace(strategy=SimpleNamespace(max_gaussians=1000)),
+            device=torch.device("cpu"),
+            _settings=dict,
+            views_per_iteration=number,
         )
         state = SadgsPipeline.get_extra_state(pipeline)
         datamanager = pipeline.datamanager = Datamanager(total)
