@@ -15,9 +15,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from nerfstudio.data.utils.colmap_parsing_utils import read_cameras_binary, read_images_binary
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from PIL import Image
 
+from sadgs_ns.bench.datasets import image_names
+
+SPARSE = Path("sparse/0")
+"""Folder of a COLMAP scene's model."""
 INTERVAL, TEST, VALIDATION = 8, 0, 4
 """Every 8th view from 0 is a test view, every 8th from 4 a validation view."""
 MASKED_SHARE = 0.25
@@ -25,7 +29,7 @@ MASKED_SHARE = 0.25
 
 
 def write_colmap(scene: Path, out: Path, masked: bool = False) -> tuple[int, int]:
-    """Write one COLMAP scene, whose `sparse/0` is binary, with the lists that nerfstudio's parser reads.
+    """Write one COLMAP scene with the lists that nerfstudio's parser reads.
 
     Args:
         scene: Folder with `images` and `sparse/0`.
@@ -34,32 +38,30 @@ def write_colmap(scene: Path, out: Path, masked: bool = False) -> tuple[int, int
 
     Returns:
         Numbers of training and of held-out views.
+
+    Raises:
+        FileNotFoundError: The model or an image is missing; names the path.
     """
+    names = image_names(ColmapDataParserConfig(colmap_path=SPARSE, downscale_factor=1), scene)
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
     for name in ("images", "sparse"):
         (out / name).symlink_to((scene / name).resolve())
-    images = [
-        image for _, image in sorted(read_images_binary(scene / "sparse/0/images.bin").items())
-    ]  # the parser's order
-    names = {offset: [image.name for image in images[offset::INTERVAL]] for offset in range(INTERVAL)}
-    held_out = names[VALIDATION]
-    train = [image.name for i, image in enumerate(images) if i % INTERVAL not in (TEST, VALIDATION)]
+    held_out = names[VALIDATION::INTERVAL]
+    train = [name for i, name in enumerate(names) if i % INTERVAL not in (TEST, VALIDATION)]
     for split, chosen in {"train": train, "test": held_out, "val": held_out}.items():
         (out / f"{split}_list.txt").write_text("\n".join(chosen))
-    if masked:
-        cameras = read_cameras_binary(scene / "sparse/0/cameras.bin")
-        for i, image in enumerate(images):
-            camera = cameras[image.camera_id]
-            mask = np.full((camera.height, camera.width), 255, np.uint8)
-            if image.name in train:
-                generator = np.random.default_rng(i)
-                height, width = (int(side * MASKED_SHARE**0.5) for side in mask.shape)
-                row, column = generator.integers(mask.shape[0] - height), generator.integers(mask.shape[1] - width)
-                mask[row : row + height, column : column + width] = 0
-            path = (out / "masks" / image.name).with_suffix(".png")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            Image.fromarray(mask).save(path)
+    for i, name in enumerate(names if masked else ()):
+        with Image.open(scene / "images" / name) as image:
+            mask = np.full(image.size[::-1], 255, np.uint8)
+        if name in train:
+            generator = np.random.default_rng(i)
+            height, width = (int(side * MASKED_SHARE**0.5) for side in mask.shape)
+            row, column = generator.integers(mask.shape[0] - height), generator.integers(mask.shape[1] - width)
+            mask[row : row + height, column : column + width] = 0
+        path = (out / "masks" / name).with_suffix(".png")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(mask).save(path)
     return len(train), len(held_out)
 
 
@@ -86,7 +88,7 @@ def write_transforms(scene: Path, out: Path) -> tuple[int, int]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Write the scenes and print how many views each has."""
+    """Write the scenes and print how many views each has; returns the exit code, 2 where there is no scene."""
     parser = argparse.ArgumentParser(
         prog="sadgs-bench validation", description="Hold out validation views, and leave test views out."
     )
@@ -94,14 +96,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("out", type=Path, help="folder for the copies")
     parser.add_argument("--masked", nargs="*", default=[], metavar="SCENE", help="also write NAME-masked of these")
     arguments = parser.parse_args(argv)
-    for scene in sorted(path for path in arguments.root.iterdir() if path.is_dir()):
-        if (scene / "sparse/0/images.bin").exists():
+    folders = sorted(path for path in arguments.root.iterdir() if path.is_dir()) if arguments.root.is_dir() else []
+    scenes = [path for path in folders if (path / SPARSE).is_dir() or (path / "transforms.json").exists()]
+    if not scenes:
+        print(f"{arguments.root} holds no folder with {SPARSE} or transforms.json: give the folder of the scenes.")
+        return 2
+    for scene in scenes:
+        if (scene / SPARSE).is_dir():
             train, held_out = write_colmap(scene, arguments.out / scene.name)
             if scene.name in arguments.masked:
                 write_colmap(scene, arguments.out / f"{scene.name}-masked", masked=True)
-        elif (scene / "transforms.json").exists():
-            train, held_out = write_transforms(scene, arguments.out / scene.name)
         else:
-            continue
+            train, held_out = write_transforms(scene, arguments.out / scene.name)
         print(f"{scene.name}: {train} training views, {held_out} validation views")
     return 0
