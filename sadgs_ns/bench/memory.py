@@ -17,6 +17,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
+from sadgs_ns.bench.step import rasterize_parameters
 from sadgs_ns.method import memory
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients
 from sadgs_ns.method.losses import photometric_loss
@@ -25,7 +26,6 @@ from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.plugin.memory_plan import estimate_pairs
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
 from sadgs_ns.plugin.optimizers import FusedAdam, step_together
-from sadgs_ns.render.rasterization import rasterize
 
 ASPECT = 4 / 3
 """Width of the images divided by their height."""
@@ -90,19 +90,7 @@ class Training:
         p = self.params
         for parameter in p.values():
             parameter.grad = None
-        renders, alphas, info = rasterize(
-            p["means"],
-            p["quats"],
-            torch.exp(p["scales"]),
-            torch.sigmoid(p["opacities"]).squeeze(-1),
-            (p["features_dc"], p["features_rest"]),
-            self.viewmats,
-            self.Ks,
-            self.width,
-            self.height,
-            sh_degree=3,
-            absgrad=True,
-        )
+        renders, alphas, info = rasterize_parameters(p, self.viewmats, self.Ks, self.width, self.height, absgrad=True)
         self.size = StepSize.of([info])
         info["means2d"].retain_grad()
         tensors = torch.stack(self.codes)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gsplat
@@ -41,6 +41,35 @@ def milliseconds(function: Callable[[], object]) -> float:
         torch.cuda.synchronize()
         times.append((time.perf_counter() - start) / REPEATS * 1e3)
     return statistics.median(times[1:])
+
+
+def rasterize_parameters(
+    params: Mapping[str, Tensor], viewmats: Tensor, Ks: Tensor, width: int, height: int, **options: bool
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Call `rasterize` with parameters as they are trained, of degree 3.
+
+    Args:
+        params: `means` [N, 3], log `scales` [N, 3], `quats` [N, 4], logit `opacities` [N, 1], `features_dc` [N, 3] and
+            `features_rest` [N, 15, 3].
+        viewmats: World to camera. [C, 4, 4]
+        Ks: Intrinsics in px. [C, 3, 3]
+        width: px.
+        height: px.
+        options: `rasterize`'s switches, such as `absgrad`.
+    """
+    return rasterize(
+        params["means"],
+        params["quats"],
+        torch.exp(params["scales"]),
+        torch.sigmoid(params["opacities"]).squeeze(-1),
+        (params["features_dc"], params["features_rest"]),
+        viewmats,
+        Ks,
+        width,
+        height,
+        sh_degree=3,
+        **options,  # type: ignore[arg-type]
+    )
 
 
 class Step:
@@ -94,19 +123,8 @@ class Step:
 
     def forward(self) -> tuple[Tensor, dict[str, Any]]:
         """Colours [1, H, W, 3] and gsplat's info."""
-        p = self.params
-        colors, _, info = rasterize(
-            p["means"],
-            p["quats"],
-            torch.exp(p["scales"]),
-            torch.sigmoid(p["opacities"]).squeeze(-1),
-            (p["features_dc"], p["features_rest"]),
-            self.viewmats,
-            self.Ks,
-            self.width,
-            self.height,
-            sh_degree=3,
-            fused=self.fused,
+        colors, _, info = rasterize_parameters(
+            self.params, self.viewmats, self.Ks, self.width, self.height, fused=self.fused
         )
         self.info = info | {"viewmats": self.viewmats, "Ks": self.Ks, "structure_tensors": self.structure_tensors}
         return colors, info
