@@ -3,7 +3,7 @@
 
 PYTHON ?= python3
 VENV ?= .venv
-# Test processes of one thread each. Two took 5 minutes on two cores.
+# Test processes of one thread each. Two took 7 minutes on two cores.
 JOBS ?= 2
 
 BIN := $(VENV)/bin
