@@ -242,7 +242,7 @@ def test_autograd_gets_what_the_kernel_returns(monkeypatch, through):
 
 
 @pytest.mark.skipif(
-    torch.cuda.is_available(), reason="with CUDA, tests/test_rasterization.py takes gsplat's own kernels"
+    torch.cuda.is_available(), reason="with CUDA, tests/render/test_rasterization.py takes gsplat's own kernels"
 )
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatch, mode):
