@@ -86,10 +86,11 @@ def render(model: Any, view: View) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def quality(model: Any, views: Iterable[View], networks: Networks) -> dict[str, float | None]:
+def quality(model: Any, views: Iterable[View], networks: Networks) -> dict[str, Any]:
     """Means over views of `psnr` in dB, `ssim`, `ssim_padded`, and the LPIPS of each network (None without one).
 
-    The networks are on the model's device during the call only, so that they take no memory from training.
+    `view_psnr` lists the PSNR of each view in their order: a mean over few views can be the work of one. The
+    networks are on the model's device during the call only, so that they take no memory from training.
     """
     from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
@@ -115,7 +116,8 @@ def quality(model: Any, views: Iterable[View], networks: Networks) -> dict[str, 
     for network in networks.values():
         if network is not None:
             network.cpu()
-    return {name: statistics.fmean(of_views) if of_views else None for name, of_views in values.items()}
+    means = {name: statistics.fmean(of_views) if of_views else None for name, of_views in values.items()}
+    return means | {"view_psnr": [round(psnr, 2) for psnr in values["psnr"]]}
 
 
 def ssim_padded(image: Tensor, truth: Tensor) -> Tensor:

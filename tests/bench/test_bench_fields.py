@@ -357,6 +357,8 @@ def test_a_record_holds_all_fields(written: tuple[dict[str, Any], Path]):
     assert record["status"] == "ok", record["error"]
     assert record["lpips_vgg"] is None and "curve" not in record
     assert record["ssim"] != record["ssim_padded"]
+    assert len(record["view_psnr"]) == record["eval_views"]
+    assert sum(record["view_psnr"]) / record["eval_views"] == pytest.approx(record["psnr"], abs=0.005)
 
 
 def test_the_times_add_up(written: tuple[dict[str, Any], Path]):
