@@ -7,6 +7,7 @@ import ctypes.util
 import importlib
 import os
 import platform
+import shlex
 import shutil
 import sys
 import warnings
@@ -136,12 +137,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     findings = [Finding("note", f"Free disk space here: {free_space(Path())}."), *check_machine()]
     if given.data is not None:
         of_data = check_data(given.data)
-        if not of_data:
-            of_data = [Finding("note", f"{given.data}: nothing to complain about.")]
         findings += of_data
+        if not any(finding.severity != "note" for finding in of_data):
+            findings.append(Finding("note", f"{given.data}: nothing to complain about."))
     for finding in findings:
         print(f"{finding.severity}: {finding.sentence}")
-    return int(any(finding.severity == "error" for finding in findings))
+    failed = any(finding.severity == "error" for finding in findings)
+    if given.data is not None and not failed:
+        print(f"Next: ns-train sadgs --data {shlex.quote(str(given.data))}")
+    return int(failed)
 
 
 if __name__ == "__main__":

@@ -135,7 +135,7 @@ def _read_binary_points(path: Path) -> Points:
 def _read_text(path: Path, minimum: int) -> Iterator[tuple[list[str], Iterator[str]]]:
     """Fields of each line that is neither empty nor a comment, and the lines after it."""
     try:
-        with path.open(encoding="utf8") as file:
+        with path.open(encoding="utf-8-sig") as file:  # Editors of Windows write a byte order mark before the text.
             for line in file:
                 if line.strip() and not line.lstrip().startswith("#"):
                     fields = line.split()
@@ -165,6 +165,11 @@ def _read_text_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
 def _read_text_poses(path: Path) -> Iterator[Pose]:
     """Name, camera and pose (wxyz quaternion, translation) [7] of each image."""
     for fields, following in _read_text(path, 10):
+        if len(fields) > 10:
+            raise InputError(
+                f"{path}: image {' '.join(fields[9:])!r} has a space in its name, where nerfstudio takes the name to "
+                "end: write the model in binary (`colmap model_converter --output_type BIN`), or rename the image."
+            )
         try:
             next(following, None)  # the image's keypoints, on a line of their own that may be empty
             yield fields[9], int(fields[8]), np.array(fields[1:8], dtype=np.float64)

@@ -10,7 +10,7 @@ from typing import Literal, ParamSpec
 
 import numpy as np
 
-from sadgs_ns.errors import InputError
+from sadgs_ns.errors import InputError, reason
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ _Arguments = ParamSpec("_Arguments")
 
 
 def collect_findings(check: Callable[_Arguments, Iterator[Finding]]) -> Callable[_Arguments, list[Finding]]:
-    """Make a list of a check's findings; where the check gives up with an InputError, that is the only finding."""
+    """Make a list of a check's findings; where the check gives up with an error, that is the only finding."""
 
     @functools.wraps(check)
     def findings(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> list[Finding]:
@@ -36,6 +36,8 @@ def collect_findings(check: Callable[_Arguments, Iterator[Finding]]) -> Callable
                 return list(check(*args, **kwargs))
         except InputError as error:
             return [Finding("error", str(error))]
+        except OSError as error:  # A folder may not be entered, or a name is too long to be one.
+            return [Finding("error", f"{error.filename} cannot be read ({reason(error)}): correct its name or rights.")]
 
     return findings
 

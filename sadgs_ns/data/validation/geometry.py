@@ -22,6 +22,11 @@ _FEWEST_STEPS = 1_000
 """Steps of float32 within the cameras' spread under which their positions are too coarse to train with."""
 _FARTHEST_CENTER = 10
 """Image sizes; a principal point this far from the middle of its image is a mistake, and no crop's."""
+UNDISTORTED_FISHEYE = (
+    "is a fisheye with all distortion coefficients 0, and nerfstudio undistorts no such image: undistort the images "
+    "yourself, or give one coefficient a tiny value (k1 = 1e-9)."
+)
+"""The rest of a sentence about such a camera."""
 _STRONGEST_DISTORTION = 2.0
 """Quotient of a pixel's distorted and undistorted radius from which on OpenCV's undistortion does not converge."""
 
@@ -181,11 +186,7 @@ def _check_camera(camera: Camera, where: str) -> Iterator[Finding]:
         yield Finding("error", f"{where} has p1, p2 = {coefficients}, which no lens has: calibrate the camera again.")
     if not any(camera.radial):
         if camera.fisheye and camera.radial:
-            yield Finding(
-                "error",
-                f"{where} is a fisheye with all distortion coefficients 0, and nerfstudio undistorts no such image: "
-                "undistort the images yourself, or give one coefficient a tiny value (k1 = 1e-9).",
-            )
+            yield Finding("error", f"{where} {UNDISTORTED_FISHEYE}")
         return
     coefficients = ", ".join(f"{value:g}" for value in camera.radial)
     told = f"{where} has the radial distortion {coefficients}, which cannot be undone"
@@ -220,20 +221,23 @@ def check_ply(path: Path, views: Sequence[View], remedy: str) -> Iterator[Findin
         problem = "is empty" if len(positions) == 0 else None
         if not np.isfinite(positions).all():
             problem = "has NaN or infinity in a point"
-        elif problem is None and views:
+        elif problem is None:
             yield from check_points(positions, views, path)
     if problem is not None:
         yield Finding("error", f"{path} should hold the SfM points but {problem}: {remedy}.")
 
 
 def check_points(positions: NDArray[np.floating], views: Sequence[View], path: Path) -> Iterator[Finding]:
-    """Check SfM points against the views that should show them.
+    """Count SfM points, and check them against the views that should show them.
 
     Args:
         positions: Finite, in the world of the views. [P, 3]
-        views: All of them.
+        views: All of them, or none if they are not to be relied on.
         path: The points' file.
     """
+    yield Finding("note", f"{path} has {len(positions):,} points.")
+    if not views or len(positions) == 0:
+        return
     positions = positions.astype(np.float64)
     far = far_outliers(positions, POINT_SHARE)
     if far.any():

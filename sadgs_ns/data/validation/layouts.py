@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from sadgs_ns.data.validation.images import images_in
 
@@ -19,8 +20,26 @@ def find_reconstruction(data: Path) -> Path | None:
     return None
 
 
+def layout_of(data: Path) -> Literal["nerfstudio", "blender", "colmap"] | None:
+    """How a capture is laid out; None if nothing that is known lies there.
+
+    Args:
+        data: The folder, or a file in the layout of `transforms.json`.
+    """
+    if data.is_file() or (data / "transforms.json").is_file():
+        return "nerfstudio"
+    if (data / "transforms_train.json").is_file():
+        return "blender"
+    return None if find_reconstruction(data) is None else "colmap"
+
+
 def no_layout(data: Path) -> str:
     """The sentence for a folder without poses."""
+    models = [data / folder for folder in COLMAP_FOLDERS]
+    files = [folder / f"cameras.{kind}" for folder in models for kind in ("txt", "bin")]
+    for path in (data, data / "transforms.json", data / "transforms_train.json", *models, *files):
+        if path.is_symlink() and not path.exists():
+            return f"{path} is a link that leads nowhere: put there what it should lead to."
     if not data.exists():
         return f"{data} does not exist: give --data the folder of a capture."
     images = images_in(data) or images_in(data / "images")

@@ -9,11 +9,31 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sadgs_ns.data import colmap
 from sadgs_ns.data.validation.findings import Finding, collect_findings
-from sadgs_ns.data.validation.geometry import Camera, View, check_ply, check_positive, check_views, finite
-from sadgs_ns.data.validation.images import MAX_AUTO_RESOLUTION, Frame, check_images, image_size, scaled_size
+from sadgs_ns.data.validation.geometry import (
+    UNDISTORTED_FISHEYE,
+    Camera,
+    View,
+    check_ply,
+    check_points,
+    check_positive,
+    check_views,
+    finite,
+)
+from sadgs_ns.data.validation.images import (
+    Frame,
+    check_factor,
+    check_images,
+    existing_factor,
+    image_size,
+    no_copies,
+    scaled_size,
+)
 from sadgs_ns.data.validation.layouts import COLMAP_FOLDERS, GIVE_POSES, find_reconstruction, no_layout
+from sadgs_ns.data.validation.splits import SPLITS, check_splits
 from sadgs_ns.errors import InputError, reason
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -43,8 +63,8 @@ def check_nerfstudio(
     if not path.is_file():
         if (found := find_reconstruction(data)) is not None:
             raise InputError(
-                f"{path} does not exist, but {data / found} holds a COLMAP reconstruction: end the command with "
-                f"`colmap --colmap-path {found}`."
+                f"{path} does not exist, but {data / found} holds a COLMAP reconstruction: leave `nerfstudio-data` out "
+                "of the command."
             )
         raise InputError(no_layout(data) if data.suffix != ".json" else f"{path} does not exist: {GIVE_POSES}.")
     meta = read_json(path)
@@ -53,9 +73,13 @@ def check_nerfstudio(
     perspective = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FISHEYE624")
     if model not in perspective:
         raise InputError(f"{path} has the camera model {model!r}: give one of {', '.join(perspective)}.")
+    _check_transform(meta, path)
+    check_factor(downscale_factor)
     factor = downscale_factor
     if factor is None:
         factor = _smaller_copies(folder, Path(described[0]["file_path"])) if open_images else 1
+    if factor > 1 and not (folder / f"images_{factor}").is_dir():
+        raise InputError(": ".join(no_copies(folder / f"images_{factor}", factor)) + ".")
     frames, views = [], []
     for frame in described:
         image, values, where = Path(frame["file_path"]), {**frame, **meta}, f"{path}: frame {frame['file_path']}"
@@ -71,11 +95,20 @@ def check_nerfstudio(
                 None if mask is None else folder / (f"masks_{factor}/{Path(mask).name}" if factor > 1 else mask),
             )
         )
-    masked = sum(frame.mask is not None for frame in frames)
-    if 0 < masked < len(frames):
-        raise InputError(f"{path} names masks for {masked} of {len(frames)} frames: give all of them one, or none.")
-    split = meta.get("train_filenames")
-    count = len(split) if isinstance(split, list) else training_images and training_images(len(frames))
+    for name, what in (("mask_path", "masks"), ("depth_file_path", "depths")):
+        if 0 < (having := sum(name in frame for frame in described)) < len(frames):
+            raise InputError(
+                f"{path} names {what} for {having} of {len(frames)} frames: give all of them one, or none."
+            )
+    count = training_images and training_images(len(frames))
+    if lists := {split: meta[f"{split}_filenames"] for split in SPLITS if f"{split}_filenames" in meta}:
+
+        def locate(name: str) -> Path:
+            return folder / (Path(name).name if factor > 1 else name)  # nerfstudio keeps smaller copies in one folder
+
+        places = {locate(frame["file_path"]) for frame in described}
+        yield from check_splits(lists, lambda split: f"{path}: {split}_filenames", locate, places)
+        count = len(set(map(locate, lists["train"])))
     yield from (of_views := list(check_views(views, count, path)))
     if open_images:
         yield from check_images(frames, path, look_for_unused=factor == 1)
@@ -84,11 +117,43 @@ def check_nerfstudio(
         yield from _check_ply(meta, path, [] if wrong else views)
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def _check_transform(meta: dict[str, Any], path: Path) -> None:
+    """See whether what nerfstudio does to all poses makes sense.
+
+    Raises:
+        InputError: If it does not.
+    """
     try:
-        meta = json.loads(path.read_text(encoding="utf8"))
+        applied = applied_transform(meta)
+    except (TypeError, ValueError, OverflowError):
+        applied = np.empty(0)
+    if applied.shape != (3, 4) or not np.isfinite(applied).all():
+        raise InputError(f"{path} has an applied_transform that is not 3 × 4 finite numbers: correct or remove it.")
+    if finite(meta.get("applied_scale", 1), "applied_scale", str(path)) <= 0:
+        raise InputError(f"{path} has applied_scale = {meta['applied_scale']}, which must be positive: correct it.")
+    methods = ("pca", "up", "vertical", "none")
+    if (method := meta.get("orientation_override", "none")) not in methods:
+        raise InputError(f"{path} has orientation_override = {method!r}: give one of {', '.join(methods)}.")
+
+
+def applied_transform(meta: dict[str, Any]) -> NDArray[np.float64]:
+    """From the world of COLMAP's points to that of the poses; by default what ns-process-data did before it said so."""
+    default = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
+    return np.array(meta.get("applied_transform", default), dtype=np.float64)  # [3, 4]
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The object that a file holds in UTF-8, after a byte order mark or without one.
+
+    Raises:
+        InputError: If the file cannot be read, is not UTF-8 or JSON, or holds something else.
+    """
+    try:
+        meta = json.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise InputError(f"{path} does not exist: restore it, or {GIVE_POSES}.") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path} is not text in UTF-8: save it in that encoding.") from None
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path} is not readable JSON ({reason(error)}): restore it, or {GIVE_POSES}.") from error
     if not isinstance(meta, dict):
@@ -144,6 +209,8 @@ def _camera(values: dict[str, Any], distortion: dict[str, Any], model: str, wher
     pinhole = (*size, values["fl_x"], values["fl_y"], values["cx"], values["cy"])
     k1, k2, k3, k4, p1, p2 = (finite(distortion.get(name, 0.0), name, where) for name in _DISTORTION)
     if model == "FISHEYE624":
+        if not any(distortion.values()):
+            raise InputError(f"{where} {UNDISTORTED_FISHEYE}")
         return Camera(*pinhole, fisheye=True)  # its coefficients have a meaning of their own
     if model == "OPENCV_FISHEYE":
         return Camera(*pinhole, radial=(k1, k2, k3, k4), fisheye=True)
@@ -154,20 +221,17 @@ def _camera(values: dict[str, Any], distortion: dict[str, Any], model: str, wher
 
 def _check_ply(meta: dict[str, Any], path: Path, views: Sequence[View]) -> Iterator[Finding]:
     """Check the SfM points and, if there are views, how the points lie to them."""
-    name = meta.get("ply_file_path")
-    if name is None:
-        if (path.parent / COLMAP_FOLDERS[0]).exists():
-            yield Finding("warning", f"{path} has no ply_file_path: nerfstudio will ask whether to make one; say yes.")
-        else:
-            yield Finding("note", f"{path} has no ply_file_path: training will start from random points.")
-        return
-    remedy = f"restore it, or remove ply_file_path from {path} to start from random points"
-    yield from check_ply(path.parent / str(name), views, remedy)
+    if "ply_file_path" in meta:
+        remedy = f"restore it, or remove ply_file_path from {path} to start from random points"
+        yield from check_ply(path.parent / str(meta["ply_file_path"]), views, remedy)
+    elif (source := colmap.points_file(path.parent / COLMAP_FOLDERS[0])) is not None:
+        positions, transform = colmap.read_points(source)[0], applied_transform(meta)
+        positions = positions[np.isfinite(positions).all(axis=1)]
+        yield from check_points(positions @ transform[:, :3].T + transform[:, 3], views, source)
+    else:
+        yield Finding("note", f"{path} has no ply_file_path: training will start from random points.")
 
 
 def _smaller_copies(folder: Path, image: Path) -> int:
     """The factor that nerfstudio's own parser chooses: it takes smaller copies only where they exist."""
-    factor, size = 1, image_size(folder / image)
-    while max(size) / factor > MAX_AUTO_RESOLUTION and (folder / f"images_{2 * factor}" / image.name).exists():
-        factor *= 2
-    return factor
+    return existing_factor(image_size(folder / image), lambda factor: folder / f"images_{factor}" / image.name)
