@@ -15,6 +15,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.data.utils import dataparsers_utils as splits
 
 from sadgs_ns.data import validation
+from sadgs_ns.data.automatic import choose_parser
 
 _checked: list[tuple[FullImageDatamanagerConfig, list[validation.Finding]]] = []
 """At most one: settings whose data were just found good, and the findings that do not stop training."""
@@ -27,7 +28,8 @@ def check_ahead(config: FullImageDatamanagerConfig) -> None:
         InputError: As `refuse_bad_data`.
     """
     _checked.clear()
-    _checked.append((copy.deepcopy(config), refuse_bad_data(config)))
+    findings = refuse_bad_data(config)
+    _checked.append((copy.deepcopy(config), findings))
 
 
 def findings_of(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[validation.Finding]:
@@ -40,7 +42,13 @@ def findings_of(config: FullImageDatamanagerConfig, open_images: bool = True) ->
 
 
 def refuse_bad_data(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[validation.Finding]:
-    """Check the data before nerfstudio parses them; parsers other than its three common ones are not checked.
+    """Choose the parser where none was named, and check the data before nerfstudio parses them.
+
+    Parsers other than nerfstudio's three common ones are not checked.
+
+    Args:
+        config: Its parser is replaced where it is the automatic one.
+        open_images: Whether to look into the images, too.
 
     Returns:
         Findings that do not stop training.
@@ -48,6 +56,7 @@ def refuse_bad_data(config: FullImageDatamanagerConfig, open_images: bool = True
     Raises:
         InputError: With the first finding that does.
     """
+    choose_parser(config)
     parser = config.dataparser
     data = Path(config.data or parser.data)
     if isinstance(parser, ColmapDataParserConfig):
