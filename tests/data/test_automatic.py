@@ -72,6 +72,26 @@ def test_the_parser_is_chosen_by_what_the_folder_holds(layout: str, scene: Path,
     assert config.dataparser == expected(data)
 
 
+def test_a_folder_above_or_below_a_capture_is_told_where_that_is(scene: Path, tmp_path: Path):
+    data = tmp_path / "above" / "capture"
+    shutil.copytree(scene, data)
+    (data / "photo.png").write_bytes((data / "images/000.png").read_bytes())
+    (data / "other").mkdir()
+    for folder, sentence in (
+        (data / "images", f"{data}/images is a part of the capture {data}: give --data that folder."),
+        (data / SPARSE_FOLDER, f"{data}/sparse/0 is a part of the capture {data}: give --data that folder."),
+        (data.parent, f"{data.parent} is no capture, but {data} in it is one: give --data that folder."),
+        (data / "photo.png", f"{data}/photo.png is a file: give --data the folder of a capture."),
+    ):
+        (finding,) = check_data(folder)
+        assert finding.sentence == sentence
+        with pytest.raises(InputError) as refused:
+            refuse_bad_data(SadgsDatamanagerConfig(data=folder))
+        assert str(refused.value) == sentence
+    (finding,) = check_data(data / "other")
+    assert "other holds neither transforms.json nor a COLMAP reconstruction" in finding.sentence
+
+
 def parsed(*words: str) -> SadgsDatamanagerConfig:
     """The settings of `ns-train sadgs …`."""
     return tyro.cli(AnnotatedBaseConfigUnion, args=["sadgs", *words]).pipeline.datamanager
@@ -105,7 +125,7 @@ def test_a_run_s_config_names_the_parser_and_serves_other_commands_and_more_trai
     assert saved.pipeline.datamanager.dataparser == LAYOUTS["sparse/0"][1](scene)
     trainer = train(config)
     _, pipeline, _, step = eval_setup(path)
-    assert step == 1 and len(pipeline.datamanager.eval_dataset) == 2
+    assert step == 1 and pipeline.datamanager.eval_dataset is not None and len(pipeline.datamanager.eval_dataset) == 2
     again = configure(tmp_path, AutomaticDataParserConfig(), iterations=3)
     again.pipeline.datamanager.data = scene
     again.load_dir = trainer.checkpoint_dir

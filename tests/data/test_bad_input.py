@@ -234,7 +234,7 @@ def one_moved_by(distance: float) -> Callable[[np.ndarray], np.ndarray]:
     return lambda positions: positions + distance * (np.arange(len(positions)) == 3)[:, None] * [1, 0, 0]
 
 
-def repaint(mode: str, color: Any) -> Callable[[Path], None]:
+def repaint(mode: str, color: Any) -> Callable[[Path], Any]:
     """Give all images one colour."""
     return lambda data: [picture(f"images/{path.name}", mode=mode, color=color)(data) for path in images(data)]
 
@@ -292,6 +292,10 @@ COLMAP = {
         r"\S+/images\.bin has 10 images that show a single colour and nothing else, such as \S+/000\.png: export .*\.",
     ),
     "images-loop": (link_to_itself("images"), r"\S+ has poses of 10 images, but there is no folder \S+/images: .*"),
+    "image-line": (
+        lambda data: picture(FIRST, (1, 36))(data),
+        r"\S+/000\.png has 1 × 36 px: leave it out of the reconstruction\.",
+    ),
     # lists of images
     "list-unknown": (
         lambda data: [
@@ -560,6 +564,30 @@ NERFSTUDIO = {
         meta(lambda m: m["frames"][6].update(distortion_params=[float("nan"), 0, 0, 0, 0, 0])),
         r"\S+: frame images/006\.png has k1 = nan, which is no finite number: correct it\.",
     ),
+    "json-focal-wide": (
+        meta(lambda m: [frame.update(fl_x=0.4, fl_y=0.4) for frame in m["frames"]]),
+        r"\S+: frame images/000\.png has the focal length 0\.4 px, with which 48 × 36 px span an angle .*",
+    ),
+    "json-focal-narrow": (
+        meta(lambda m: [frame.update(fl_x=1e9, fl_y=1e9) for frame in m["frames"]]),
+        r"\S+: frame images/000\.png has the focal length 1e\+09 px, with which 48 × 36 px span an angle of .*°: .*",
+    ),
+    "json-few-coefficients": (
+        meta(lambda m: m.update(distortion_params=[0.1])),
+        r"\S+ has distortion_params that are no list of 6 numbers \(k1, k2, k3, k4, p1, p2\): correct or remove them\.",
+    ),
+    "json-last-row": (
+        meta(set_pose(5, 3, 3, 2)),
+        r"\S+: frame images/005\.png has a last row in its pose that is not 0 0 0 1: transpose it, or correct it\.",
+    ),
+    "json-crop": (
+        meta(lambda m: m.update(fisheye_crop_radius="wide")),
+        r"\S+ has fisheye_crop_radius = 'wide', which is no finite number: correct it\.",
+    ),
+    "json-zero-byte": (
+        meta(lambda m: m["frames"][1].update(mask_path="a\0b")),
+        r"\S+: frame 1 has a mask_path that no file can have: correct or remove it\.",
+    ),
     "json-k4": (
         meta(lambda m: m.update(k4=0.1)),
         r"\S+: frame images/000\.png has k4 = 0\.1, which nerfstudio cannot undo: undistort the images yourself\.",
@@ -708,6 +736,11 @@ UNLIKELY = {
         "warning",
         r"\S+: camera 1 has its principal point at \(60, 18\) px, outside its image of 48 × 36 px: correct .*\.",
     ),
+    "camera-stretched": (
+        set_camera("PINHOLE", 40, 100, 24, 18),
+        "warning",
+        r"\S+: camera 1 has the focal lengths 40 and 100 px, which differ as no lens's do: correct them, in pixels\.",
+    ),
     "camera-corners": (
         set_camera("SIMPLE_RADIAL", 40, 24, 18, -0.4),
         "warning",
@@ -743,6 +776,17 @@ def test_unlikely_data_are_told_of_in_one_sentence(case: str, copied: Callable[[
     spoil(data)
     (finding,) = remarks(data)
     assert finding.severity == severity and re.fullmatch(sentence, finding.sentence), finding
+
+
+def test_a_lens_of_a_telescope_is_a_warning(copied: Callable[[str], Path]):
+    data = copied("nerfstudio")
+    meta(lambda m: [frame.update(fl_x=1e4, fl_y=1e4) for frame in m["frames"]])(data)
+    (finding,) = [finding for finding in validation.check_data(data) if finding.severity != "note"]
+    assert finding.severity == "warning"
+    text = (
+        r"\S+: frame images/000\.png has the focal length 10000 px, with which 48 × 36 px span an angle of 0\.28°: .*\."
+    )
+    assert re.fullmatch(text, finding.sentence)
 
 
 def test_points_behind_some_cameras_are_a_warning(copied: Callable[[str], Path]):

@@ -20,6 +20,8 @@ _FLOAT32_STEP = 2.0**-23
 """Distance of a float32 to the next one, relative to its size; nerfstudio centres poses in float32."""
 _FEWEST_STEPS = 1_000
 """Steps of float32 within the cameras' spread under which their positions are too coarse to train with."""
+_WIDEST, _NARROW, _NARROWEST = 170.0, 0.5, 0.01
+"""Angles of view in degrees: lenses without fisheye stay below the first; under the last no pixel shows any depth."""
 _FARTHEST_CENTER = 10
 """Image sizes; a principal point this far from the middle of its image is a mistake, and no crop's."""
 UNDISTORTED_FISHEYE = (
@@ -181,6 +183,15 @@ def _check_camera(camera: Camera, where: str) -> Iterator[Finding]:
         yield Finding(
             "error" if off > _FARTHEST_CENTER else "warning", f"{where} has {center}: correct cx and cy, in pixels."
         )
+    half_width, half_height = width / 2 / camera.fx, height / 2 / camera.fy
+    angle = 2 * math.degrees(math.atan(max(half_width, half_height)))
+    if not camera.fisheye and not _NARROW <= angle <= _WIDEST:
+        focal = f"the focal length {camera.fx:g} px, with which {width} × {height} px span an angle of {angle:.2g}°"
+        likely = _NARROWEST <= angle <= _WIDEST
+        yield Finding("warning" if likely else "error", f"{where} has {focal}: correct it, in pixels.")
+    if not 0.5 <= camera.fx / camera.fy <= 2:
+        focals = f"the focal lengths {camera.fx:g} and {camera.fy:g} px, which differ as no lens's do"
+        yield Finding("warning", f"{where} has {focals}: correct them, in pixels.")
     if any(abs(value) > 0.5 for value in camera.tangential):
         coefficients = ", ".join(f"{value:g}" for value in camera.tangential)
         yield Finding("error", f"{where} has p1, p2 = {coefficients}, which no lens has: calibrate the camera again.")
@@ -190,7 +201,6 @@ def _check_camera(camera: Camera, where: str) -> Iterator[Finding]:
         return
     coefficients = ", ".join(f"{value:g}" for value in camera.radial)
     told = f"{where} has the radial distortion {coefficients}, which cannot be undone"
-    half_width, half_height = width / 2 / camera.fx, height / 2 / camera.fy
     if not _can_be_undone(camera, min(half_width, half_height)):
         yield Finding("error", f"{told}: calibrate the camera again, or undistort the images yourself.")
     elif not camera.fisheye and not _can_be_undone(camera, math.hypot(half_width, half_height)):

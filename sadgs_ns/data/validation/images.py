@@ -150,6 +150,8 @@ def _problem(frame: Frame, image: _Image, mask: _Image | None, source: Path) -> 
         return image.problem.split(" (")[0], frame.image, image.problem
     if image.mode not in ("RGB", "RGBA", "L"):
         return "mode", frame.image, f"has pixels of Pillow's mode {image.mode}: convert it to 8-bit RGB"
+    if min(image.size) < 2:
+        return "small", frame.image, "has {} × {} px: leave it out of the reconstruction".format(*image.size)
     if frame.size not in (None, image.size):
         sizes = "{} × {} px, but its camera in {} {} × {}".format(*image.size, source, *frame.size)
         return "size", frame.image, f"has {sizes}: use the images that the poses were computed from"
@@ -169,7 +171,7 @@ def _describe(source: Path, images: Sequence[_Image], masks: Sequence[_Image | N
     sizes = Counter(image.size for image in images)
     kinds = Counter(f"{image.format} {image.mode}" for image in images)
     (width, height), _ = sizes.most_common(1)[0]
-    of_size = f"{width} × {height} px" + (f" and {len(sizes) - 1} other sizes" if len(sizes) > 1 else "")
+    of_size = f"{width} × {height} px" + (" and other sizes" if len(sizes) > 1 else "")
     of_kind = ", ".join(f"{kind} ({count})" if len(kinds) > 1 else kind for kind, count in kinds.most_common())
     masked = sum(mask is not None for mask in masks)
     with_masks = f", with {masked} masks" if masked else ", without masks"

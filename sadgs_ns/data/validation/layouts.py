@@ -42,9 +42,19 @@ def no_layout(data: Path) -> str:
             return f"{path} is a link that leads nowhere: put there what it should lead to."
     if not data.exists():
         return f"{data} does not exist: give --data the folder of a capture."
+    if data.is_file():
+        return f"{data} is a file: give --data the folder of a capture."
+    around = data.absolute()
+    for other in around.parents[:3]:
+        inside = around.relative_to(other).parts[0]
+        if (inside.startswith("images") or inside in ("masks", "sparse", "colmap")) and layout_of(other) is not None:
+            return f"{data} is a part of the capture {other}: give --data that folder."
     images = images_in(data) or images_in(data / "images")
     if images:
         return f"{data} holds {len(images)} images but no camera poses: {GIVE_POSES}."
+    for other in sorted(data.iterdir())[:100]:
+        if other.is_dir() and layout_of(other) is not None:
+            return f"{data} is no capture, but {other} in it is one: give --data that folder."
     return (
         f"{data.absolute()} holds neither transforms.json nor a COLMAP reconstruction ({', '.join(COLMAP_FOLDERS)}): "
         f"give --data another folder, or {GIVE_POSES}."

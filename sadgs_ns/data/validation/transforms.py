@@ -80,13 +80,12 @@ def check_nerfstudio(
         factor = _smaller_copies(folder, Path(described[0]["file_path"])) if open_images else 1
     if factor > 1 and not (folder / f"images_{factor}").is_dir():
         raise InputError(": ".join(no_copies(folder / f"images_{factor}", factor)) + ".")
+    shared = _distortion_of(meta, path)
     frames, views = [], []
     for frame in described:
         image, values, where = Path(frame["file_path"]), {**frame, **meta}, f"{path}: frame {frame['file_path']}"
         check_positive(values, where, ("fl_x", "fl_y", "cx", "cy", "w", "h"))
-        views.append(
-            view_of(frame, where, _camera(values, _distortion_of(meta) or _distortion_of(frame), model, where))
-        )
+        views.append(view_of(frame, where, _camera(values, shared or _distortion_of(frame, where), model, where)))
         mask = frame.get("mask_path")
         frames.append(
             Frame(
@@ -131,6 +130,8 @@ def _check_transform(meta: dict[str, Any], path: Path) -> None:
         raise InputError(f"{path} has an applied_transform that is not 3 × 4 finite numbers: correct or remove it.")
     if finite(meta.get("applied_scale", 1), "applied_scale", str(path)) <= 0:
         raise InputError(f"{path} has applied_scale = {meta['applied_scale']}, which must be positive: correct it.")
+    if meta.get("fisheye_crop_radius") is not None:
+        finite(meta["fisheye_crop_radius"], "fisheye_crop_radius", str(path))
     methods = ("pca", "up", "vertical", "none")
     if (method := meta.get("orientation_override", "none")) not in methods:
         raise InputError(f"{path} has orientation_override = {method!r}: give one of {', '.join(methods)}.")
@@ -178,10 +179,13 @@ def frames_of(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
             raise InputError(f"{where} has no pose of 4 × 4 numbers: give it a transform_matrix, or remove the frame.")
         if not np.isfinite(pose).all():
             raise InputError(f"{where} has NaN or infinity in its pose: remove the frame, or compute the poses again.")
-        if np.abs(pose[3, :3]).max() > 1e-6:
+        if np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
             raise InputError(f"{where} has a last row in its pose that is not 0 0 0 1: transpose it, or correct it.")
-        if not isinstance(frame.get("mask_path", ""), str):
-            raise InputError(f"{where} has a mask_path that is no string: correct or remove it.")
+        for name in ("file_path", "mask_path"):
+            if not isinstance(value := frame.get(name, ""), str) or "\0" in value:
+                raise InputError(
+                    f"{path}: frame {number} has a {name} that is no name of a file: correct or remove it."
+                )
     return frames
 
 
@@ -191,12 +195,21 @@ def view_of(frame: dict[str, Any], where: str, camera: Camera) -> View:
     return View(where, where, (pose[:3, :3] * [1, -1, -1]).T, pose[:3, 3], camera)  # OpenGL's camera axes to OpenCV's
 
 
-def _distortion_of(values: dict[str, Any]) -> dict[str, Any]:
-    """The coefficients that a frame, or all of them, have by name; nerfstudio takes all from one of the two."""
-    listed = values.get("distortion_params")
-    if isinstance(listed, list):
-        return dict(zip(_DISTORTION, listed, strict=False))
-    return {name: values[name] for name in _DISTORTION if name in values}
+def _distortion_of(values: dict[str, Any], where: Path | str) -> dict[str, Any]:
+    """The coefficients that a frame, or all of them, have by name; nerfstudio takes all from one of the two.
+
+    Raises:
+        InputError: If they are listed, but not as nerfstudio reads them.
+    """
+    if "distortion_params" not in values:
+        return {name: values[name] for name in _DISTORTION if name in values}
+    listed = values["distortion_params"]
+    if not isinstance(listed, list) or len(listed) not in (6, 12):  # 12 are FISHEYE624's
+        names = ", ".join(_DISTORTION)
+        raise InputError(
+            f"{where} has distortion_params that are no list of 6 numbers ({names}): correct or remove them."
+        )
+    return dict(zip(_DISTORTION, listed, strict=False))
 
 
 def _camera(values: dict[str, Any], distortion: dict[str, Any], model: str, where: str) -> Camera:
