@@ -183,3 +183,17 @@ def test_a_factor_without_copies_and_one_that_makes_nothing_smaller_are_named(sc
         parser.downscale_factor = 0
         with pytest.raises(InputError, match=r"^downscale-factor must be at least 1, got 0\.$"):
             refuse_bad_data(SadgsDatamanagerConfig(dataparser=parser))
+
+
+def test_images_that_are_to_be_divided_by_their_names_need_such_names(tmp_path: Path):
+    parser = nerfstudio_data(tmp_path)
+    parser.eval_mode = "filename"
+    with pytest.raises(InputError, match=r"^images/000\.png has neither train nor eval in its name, by which `--eval-"):
+        refuse_bad_data(SadgsDatamanagerConfig(dataparser=parser))
+    path, names = tmp_path / "transforms.json", {"000": "eval0", "001": "eval1"}
+    for image in (tmp_path / "images").iterdir():
+        name = names.get(image.stem, f"train{image.stem}")
+        image.rename(image.with_stem(name))
+        path.write_text(path.read_text().replace(f"images/{image.stem}.", f"images/{name}."))
+    findings = refuse_bad_data(SadgsDatamanagerConfig(dataparser=parser))
+    assert [finding for finding in findings if finding.severity != "note"] == []

@@ -515,7 +515,7 @@ NERFSTUDIO = {
         lists(train=[1], val=[], test=[]),
         r"\S+: train_filenames is no list of images' names: correct it, or remove all such lists\.",
     ),
-    "json-no-training": (lists(train=[], val=[], test=[]), r"\S+ leaves no view for training: name some in .*\."),
+    "json-no-training": (lists(train=[], val=[], test=[]), r"\S+ leaves no view for training: hold out fewer images\."),
     "json-applied-transform": (
         meta(lambda m: m.update(applied_transform=[[1, 0], [0, 1]])),
         r"\S+ has an applied_transform that is not 3 × 4 finite numbers: correct or remove it\.",

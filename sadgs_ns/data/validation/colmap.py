@@ -44,7 +44,7 @@ def check_colmap(
     downscale_factor: int | None = None,
     rounding: Rounding = "floor",
     load_points: bool = True,
-    training_images: Callable[[int], int] | None = lambda count: count - math.ceil(count / 8),
+    training_images: Callable[[Sequence[str]], int] = lambda names: len(names) - math.ceil(len(names) / 8),
     open_images: bool = True,
 ) -> Iterator[Finding]:
     """Check a COLMAP reconstruction, binary or text.
@@ -90,13 +90,14 @@ def check_colmap(
             f"{poses_path} has poses of {len(poses)} images, but there is no folder {images_folder}: put them there, "
             f"or end the command with `colmap --colmap-path {colmap_path} --images-path FOLDER`."
         )
-    training = training_images and training_images(len(poses))
     if lists := {split: _read_list(path) for split in SPLITS if (path := data / f"{split}_list.txt").is_file()}:
         places = {images_folder / name for name, _, _ in poses}
         yield from check_splits(
             lists, lambda split: f"{data / split}_list.txt", lambda name: images_folder / name, places
         )
         training = len(set(lists["train"]))
+    else:
+        training = training_images([name for name, _, _ in poses])
     views = _views(poses, used, poses_path, cameras_path)
     yield from (of_views := list(check_views(views, training, poses_path)))
     if load_points:

@@ -105,12 +105,12 @@ def finite(value: Any, name: str, where: str) -> float:
     raise InputError(f"{where} has {name} = {value!r}, which is no finite number: correct it.")
 
 
-def check_views(views: Sequence[View], training: int | None, source: Path) -> Iterator[Finding]:
+def check_views(views: Sequence[View], training: int, source: Path) -> Iterator[Finding]:
     """Check number, cameras, rotations and positions of the views.
 
     Args:
         views: All of them.
-        training: How many are trained on, where that is known.
+        training: How many are trained on.
         source: The file that they are from.
     """
     yield from _check_number(len(views), training, source)
@@ -120,12 +120,12 @@ def check_views(views: Sequence[View], training: int | None, source: Path) -> It
         yield from _check_camera(camera, where)
 
 
-def _check_number(views: int, training: int | None, source: Path) -> Iterator[Finding]:
+def _check_number(views: int, training: int, source: Path) -> Iterator[Finding]:
     if views < 2:
         yield Finding("error", f"{source} has 1 view, which shows no depth: take at least 2 images, better 20 or more.")
     elif training == 0:
-        yield Finding("error", f"{source} leaves no view for training: name some in its list of training images.")
-    elif training is not None and training < 3:
+        yield Finding("error", f"{source} leaves no view for training: hold out fewer images.")
+    elif training < 3:
         yield Finding(
             "warning",
             f"{source} leaves {training} training view{'s' * (training > 1)}: so few fix no shape; take 20 or more.",

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Sequence
+from pathlib import Path, PurePosixPath
 
-import numpy as np
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
@@ -16,6 +14,7 @@ from nerfstudio.data.utils import dataparsers_utils as splits
 
 from sadgs_ns.data import validation
 from sadgs_ns.data.automatic import choose_parser
+from sadgs_ns.errors import InputError
 
 _checked: list[tuple[FullImageDatamanagerConfig, list[validation.Finding]]] = []
 """At most one: settings whose data were just found good, and the findings that do not stop training."""
@@ -87,19 +86,24 @@ def refuse_bad_data(config: FullImageDatamanagerConfig, open_images: bool = True
     return findings
 
 
-def _training_images(parser: ColmapDataParserConfig | NerfstudioDataParserConfig) -> Callable[[int], int] | None:
-    """A function that says how many of so many views the parser trains on; None if that depends on their names."""
-    if parser.eval_mode == "filename":
-        return None
+def _training_images(parser: ColmapDataParserConfig | NerfstudioDataParserConfig) -> Callable[[Sequence[str]], int]:
+    """A function of all images' names that says how many of them the parser trains on."""
 
-    def count(views: int) -> int:
-        names: list[Any] = [None] * views
+    def count(names: Sequence[str]) -> int:
         if parser.eval_mode == "fraction":
-            chosen, _ = splits.get_train_eval_split_fraction(names, parser.train_split_fraction)
+            chosen, _ = splits.get_train_eval_split_fraction(list(names), parser.train_split_fraction)
         elif parser.eval_mode == "interval":
-            chosen, _ = splits.get_train_eval_split_interval(names, parser.eval_interval)
+            chosen, _ = splits.get_train_eval_split_interval(list(names), parser.eval_interval)
+        elif parser.eval_mode == "filename":
+            for name in names:
+                if not any(word in PurePosixPath(name).name for word in ("train", "eval")):
+                    raise InputError(
+                        f"{name} has neither train nor eval in its name, by which `--eval-mode filename` divides the "
+                        "images: rename them, or leave that option out."
+                    )
+            chosen, _ = splits.get_train_eval_split_filename(list(names))
         else:
-            chosen = np.arange(views)
+            return len(names)
         return len(chosen)
 
     return count

@@ -46,7 +46,7 @@ def check_nerfstudio(
     *,
     downscale_factor: int | None = None,
     load_points: bool = True,
-    training_images: Callable[[int], int] | None = lambda count: math.ceil(0.9 * count),
+    training_images: Callable[[Sequence[str]], int] = lambda names: math.ceil(0.9 * len(names)),
     open_images: bool = True,
 ) -> Iterator[Finding]:
     """Check a `transforms.json`, as `ns-process-data` writes it.
@@ -55,7 +55,7 @@ def check_nerfstudio(
         data: The folder, or the file itself.
         downscale_factor: As of nerfstudio's parser: None chooses by size.
         load_points: Whether the SfM points will be read.
-        training_images: How many of so many views are trained on; None if that depends on names.
+        training_images: Says of the names of all images how many of them are trained on.
         open_images: Whether to look into the images, too.
     """
     path = data if data.suffix == ".json" else data / "transforms.json"
@@ -99,7 +99,6 @@ def check_nerfstudio(
             raise InputError(
                 f"{path} names {what} for {having} of {len(frames)} frames: give all of them one, or none."
             )
-    count = training_images and training_images(len(frames))
     if lists := {split: meta[f"{split}_filenames"] for split in SPLITS if f"{split}_filenames" in meta}:
 
         def locate(name: str) -> Path:
@@ -107,8 +106,10 @@ def check_nerfstudio(
 
         places = {locate(frame["file_path"]) for frame in described}
         yield from check_splits(lists, lambda split: f"{path}: {split}_filenames", locate, places)
-        count = len(set(map(locate, lists["train"])))
-    yield from (of_views := list(check_views(views, count, path)))
+        training = len(set(map(locate, lists["train"])))
+    else:
+        training = training_images([frame["file_path"] for frame in described])
+    yield from (of_views := list(check_views(views, training, path)))
     if open_images:
         yield from check_images(frames, path, look_for_unused=factor == 1)
     if load_points:
