@@ -15,7 +15,9 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
 from sadgs_ns.data.validation.colmap import chosen_factor
+from sadgs_ns.data.validation.findings import unreadable
 from sadgs_ns.data.validation.layouts import find_reconstruction, layout_of
+from sadgs_ns.errors import InputError
 
 
 @dataclass
@@ -46,12 +48,15 @@ def choose_parser(config: FullImageDatamanagerConfig) -> None:
         config: Changed in place, unless a parser was named.
 
     Raises:
-        InputError: As `chosen_factor`.
+        InputError: If the folder cannot be read; as `chosen_factor`.
     """
     if not isinstance(config.dataparser, AutomaticDataParserConfig):
         return
     data = Path(config.data or config.dataparser.data)
-    layout, folder = layout_of(data), find_reconstruction(data)
+    try:
+        layout, folder = layout_of(data), find_reconstruction(data)
+    except OSError as error:
+        raise InputError(unreadable(error)) from error
     if layout == "blender":
         config.dataparser = BlenderDataParserConfig(data=data)
     elif layout == "colmap" and folder is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 import shutil
 import sys
 from collections.abc import Callable
@@ -90,6 +91,15 @@ def test_a_folder_above_or_below_a_capture_is_told_where_that_is(scene: Path, tm
         assert str(refused.value) == sentence
     (finding,) = check_data(data / "other")
     assert "other holds neither transforms.json nor a COLMAP reconstruction" in finding.sentence
+
+
+def test_a_folder_that_cannot_be_read_is_named(tmp_path: Path):
+    data = tmp_path / ("a" * 300)
+    sentence = f"{data} cannot be read (File name too long): correct its name or rights."
+    assert [finding.sentence for finding in check_data(data)] == [sentence]
+    with pytest.raises(InputError) as refused:
+        refuse_bad_data(SadgsDatamanagerConfig(data=data))
+    assert str(refused.value) == sentence
 
 
 def parsed(*words: str) -> SadgsDatamanagerConfig:
@@ -197,3 +207,28 @@ def test_images_that_are_to_be_divided_by_their_names_need_such_names(tmp_path: 
         path.write_text(path.read_text().replace(f"images/{image.stem}.", f"images/{name}."))
     findings = refuse_bad_data(SadgsDatamanagerConfig(dataparser=parser))
     assert [finding for finding in findings if finding.severity != "note"] == []
+
+
+def test_lists_without_test_images_and_with_training_images_among_them_are_warned_of(tmp_path: Path):
+    nerfstudio_data(tmp_path)
+    path = tmp_path / "transforms.json"
+    content = json.loads(path.read_text())
+    names = [frame["file_path"] for frame in content["frames"]]
+    content |= {"train_filenames": names[2:], "val_filenames": names[:2]}
+
+    def warning() -> str:
+        path.write_text(json.dumps(content))
+        (finding,) = [finding for finding in check_data(tmp_path) if finding.severity != "note"]
+        assert finding.severity == "warning"
+        return finding.sentence.removeprefix(f"{path}: test_filenames ")
+
+    assert warning() == "is missing: `ns-eval` will have nothing to measure; name some images."
+    content["test_filenames"] = []
+    assert warning() == "is empty: `ns-eval` will have nothing to measure; name some images."
+    content["test_filenames"] = [f"./{names[0]}", names[2], names[3]]
+    assert warning() == (
+        "names 2 of the 8 training images: what `ns-eval` measures of them shows nothing about new views."
+    )
+    content["test_filenames"] = names[:2]
+    path.write_text(json.dumps(content))
+    assert [finding for finding in check_data(tmp_path) if finding.severity != "note"] == []

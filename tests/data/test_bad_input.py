@@ -325,7 +325,10 @@ COLMAP = {
         link_to_itself(f"{SPARSE}/images.bin"),
         r"\S+/images\.bin cannot be read \(Too many levels of symbolic links\): copy the whole reconstruction\.",
     ),
-    "no-poses": (remove("sparse"), r"\S+ holds 10 images but no camera poses: .*ns-process-data.*\."),
+    "no-poses": (
+        remove("sparse"),
+        r"\S+ holds 10 images but no camera poses: compute them with `sadgs-process \S+/images FOLDER`\.",
+    ),
     "no-images": (
         model(lambda cameras, images, points: images.clear()),
         r"\S+/images\.bin holds no pose, so there is no image to train on: run COLMAP's mapper again\.",
@@ -736,6 +739,11 @@ UNLIKELY = {
         "warning",
         r"\S+: camera 1 has its principal point at \(60, 18\) px, outside its image of 48 × 36 px: correct .*\.",
     ),
+    "masks-unused": (
+        lambda data: ((data / "masks").mkdir(), picture("masks/000.png", mode="L")(data)),
+        "warning",
+        r"\S+/masks holds masks that are not used: end the command with `colmap --colmap-path sparse/0 --masks-path .*",
+    ),
     "camera-stretched": (
         set_camera("PINHOLE", 40, 100, 24, 18),
         "warning",
@@ -892,6 +900,24 @@ def test_cameras_of_several_models_and_sizes_train_together(copied: Callable[[st
     sizes = {tuple(data["image"].shape[:2]) for data in trainer.pipeline.datamanager.cached_train}
     assert len(sizes) >= 2  # undistortion crops the second camera's
     assert is_finite(trainer.pipeline.model)
+
+
+def test_images_and_masks_of_several_kinds_and_few_points_train(copied: Callable[[str], Path], tmp_path: Path):
+    data = copied("nerfstudio")
+    for name, mode in (("001", "RGBA"), ("002", "L")):
+        with Image.open(data / f"images/{name}.png") as image:
+            image.convert(mode).save(data / f"images/{name}.png")
+    for index, mode in enumerate(("L", "1", "I;16", "L", "L")):
+        picture(f"mask{index}.png", mode=mode, color=int(index < 4))(data)  # the last one is black
+    with Image.open(data / "mask4.png") as image:
+        image.putpixel((20, 20), 255)
+        image.save(data / "mask3.png")  # of a single pixel
+    meta(lambda m: [frame.update(mask_path=f"mask{k % 5}.png") for k, frame in enumerate(m["frames"])])(data)
+    with_points([[0, 0, 0]] * 3)(data)
+    assert [finding for finding in validation.check_data(data) if finding.severity != "note"] == []
+    config = configure(tmp_path / "out", parser_of(data), iterations=8)
+    config.pipeline.views_per_iteration = 2
+    assert is_finite(train(config).pipeline.model)
 
 
 @pytest.mark.parametrize(("layout", "views", "training"), [("nerfstudio", 2, 2), ("colmap", 2, 1)])

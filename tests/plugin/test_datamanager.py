@@ -86,9 +86,9 @@ def test_matches_of_points_are_left_to_nerfstudio(colmap: ColmapDataParserConfig
 MARK = b"\xef\xbb\xbf"
 
 
-@pytest.mark.parametrize("comments", [True, False])
+@pytest.mark.parametrize(("comments", "line_end"), [(True, b"\n"), (False, b"\r\n")])
 def test_colmap_s_text_after_a_byte_order_mark_is_read_as_without_one(
-    comments: bool, colmap: ColmapDataParserConfig, tmp_path: Path
+    comments: bool, line_end: bytes, colmap: ColmapDataParserConfig, tmp_path: Path
 ):
     data = Path(shutil.copytree(colmap.data, tmp_path / "scene"))
     folder = data / SPARSE_FOLDER
@@ -100,8 +100,8 @@ def test_colmap_s_text_after_a_byte_order_mark_is_read_as_without_one(
     parser = dataclasses.replace(colmap, data=data)
     expected = load(parser).train_dataparser_outputs
     for path in folder.iterdir():
-        lines = path.read_bytes().splitlines(keepends=True)
-        path.write_bytes(MARK + b"".join(line for line in lines if comments or not line.startswith(b"#")))
+        lines = path.read_bytes().splitlines()
+        path.write_bytes(MARK + b"".join(line + line_end for line in lines if comments or not line.startswith(b"#")))
     assert refuse_bad_data(SadgsDatamanagerConfig(dataparser=parser))
     assert_equal_outputs(load(parser).train_dataparser_outputs, expected)
 

@@ -36,10 +36,15 @@ def collect_findings(check: Callable[_Arguments, Iterator[Finding]]) -> Callable
                 return list(check(*args, **kwargs))
         except InputError as error:
             return [Finding("error", str(error))]
-        except OSError as error:  # A folder may not be entered, or a name is too long to be one.
-            return [Finding("error", f"{error.filename} cannot be read ({reason(error)}): correct its name or rights.")]
+        except OSError as error:
+            return [Finding("error", unreadable(error))]
 
     return findings
+
+
+def unreadable(error: OSError) -> str:
+    """Return the sentence for a folder that may not be entered, or a name that is too long to be one."""
+    return f"{error.filename} cannot be read ({reason(error)}): correct its name or rights."
 
 
 def refuse(findings: Sequence[Finding], data: Path) -> None:

@@ -130,8 +130,6 @@ def _check_number(views: int, training: int, source: Path) -> Iterator[Finding]:
             "warning",
             f"{source} leaves {training} training view{'s' * (training > 1)}: so few fix no shape; take 20 or more.",
         )
-    elif training == views and views < 10:
-        yield Finding("note", f"{source} has {views} views, none of them held out: `ns-eval` cannot measure any.")
 
 
 def check_rotations(views: Sequence[View]) -> Iterator[Finding]:

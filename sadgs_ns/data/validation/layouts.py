@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Literal
 
@@ -49,9 +50,10 @@ def no_layout(data: Path) -> str:
         inside = around.relative_to(other).parts[0]
         if (inside.startswith("images") or inside in ("masks", "sparse", "colmap")) and layout_of(other) is not None:
             return f"{data} is a part of the capture {other}: give --data that folder."
-    images = images_in(data) or images_in(data / "images")
-    if images:
-        return f"{data} holds {len(images)} images but no camera poses: {GIVE_POSES}."
+    for photos in (data, data / "images"):
+        if images := images_in(photos):
+            command = f"`sadgs-process {shlex.quote(str(photos))} FOLDER`"
+            return f"{data} holds {len(images)} images but no camera poses: compute them with {command}."
     for other in sorted(data.iterdir())[:100]:
         if other.is_dir() and layout_of(other) is not None:
             return f"{data} is no capture, but {other} in it is one: give --data that folder."

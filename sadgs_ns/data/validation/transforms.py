@@ -110,6 +110,8 @@ def check_nerfstudio(
     else:
         training = training_images([frame["file_path"] for frame in described])
     yield from (of_views := list(check_views(views, training, path)))
+    if 3 <= training == len(frames) < 10:  # With more frames all are trained on only where that was asked for.
+        yield Finding("note", f"{path} has {training} views, none of them held out: `ns-eval` cannot measure any.")
     if open_images:
         yield from check_images(frames, path, look_for_unused=factor == 1)
     if load_points:
