@@ -30,7 +30,7 @@ PARSERS: dict[str, DataParserConfig] = {
     **all_dataparsers,
     "nerfstudio-data": NerfstudioDataParserConfig(load_3D_points=True),
 }
-"""nerfstudio's parsers by the names that they have on the command line, and ours before them."""
+"""Parsers by the names that they have on the command line: ours, then nerfstudio's."""
 
 if TYPE_CHECKING:
     AnyParserConfig = DataParserConfig
@@ -38,7 +38,7 @@ else:
     AnyParserConfig = tyro.conf.OmitSubcommandPrefixes[
         tyro.extras.subcommand_type_from_defaults(PARSERS, prefix_names=False)
     ]
-    """The union of which tyro makes subcommands, as nerfstudio makes its own."""
+    """Union of which tyro makes subcommands, as nerfstudio does of its own parsers."""
 
 
 def choose_parser(config: FullImageDatamanagerConfig) -> None:

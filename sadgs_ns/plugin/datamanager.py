@@ -1,4 +1,4 @@
-"""nerfstudio's loader of whole images, behind checks of the images' names, and with a faster reader of SfM points."""
+"""A data manager: nerfstudio's loader of whole images, with checks of their names and a faster reader of points."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ from sadgs_ns.data.validation.transforms import read_json
 
 @dataclass
 class SadgsDatamanagerConfig(FullImageDatamanagerConfig):
-    """nerfstudio's; what its loader of whole images does not read is no option of the command line."""
+    """nerfstudio's options, without those on the command line that its loader of whole images does not read."""
 
     _target: type = field(default_factory=lambda: SadgsDatamanager)
     data: Suppress[Path | None] = None
     """Folder of the data; `--data` sets it."""
     dataparser: AnyParserConfig = field(default_factory=AutomaticDataParserConfig)
-    """How the folder is read; by default as what it holds asks for."""
+    """How the folder is read: by default with the parser that fits what it holds."""
     masks_on_gpu: Suppress[bool] = False
     """Not read where whole images are cached."""
     images_on_gpu: Suppress[bool] = False
@@ -67,7 +67,7 @@ class SadgsDatamanagerConfig(FullImageDatamanagerConfig):
 
 
 class SadgsDatamanager(FullImageDatamanager[InputDataset]):
-    """Checks what the data's images are called, and where they lie, and reads SfM points once, faster, without open3d.
+    """A loader that checks the images' names and places, and reads SfM points once, faster and without open3d.
 
     The checks are here rather than in the pipeline, because `ns-render dataset` makes a datamanager of its own.
 
@@ -81,7 +81,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         parser = copy.copy(config.dataparser)
         self._points: Path | None = None
         """COLMAP's points, where nerfstudio does not read them itself."""
-        if isinstance(parser, ColmapDataParserConfig):  # before it offers to make smaller images
+        if isinstance(parser, ColmapDataParserConfig):  # These checks precede the making of smaller images.
             model = (config.data or parser.data) / parser.colmap_path
             kind = "txt" if (model / "cameras.txt").exists() else "bin"
             if (source := model / f"images.{kind}").is_file():
@@ -114,7 +114,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
 
 
 class _Nerfstudio(Nerfstudio):
-    """nerfstudio's parser, which would read points with open3d, and ask whether to make a file of COLMAP's points."""
+    """nerfstudio's parser of transforms.json, which alone reads points with open3d and asks whether to make a PLY."""
 
     def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
         model = self.config.data / COLMAP_FOLDERS[0]
@@ -136,7 +136,7 @@ class _Nerfstudio(Nerfstudio):
 
 
 class _Blender(Blender):
-    """nerfstudio's parser, which would stumble over a byte order mark."""
+    """nerfstudio's parser of Blender scenes, which alone would stumble over a byte order mark."""
 
     def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
         with _reading_byte_order_marks(blender_dataparser):
@@ -144,7 +144,7 @@ class _Blender(Blender):
 
 
 class _Colmap(ColmapDataParser):
-    """nerfstudio's parser, which would stumble over a byte order mark."""
+    """nerfstudio's parser of COLMAP's files, which alone would stumble over a byte order mark."""
 
     def _get_all_images_and_cameras(self, recon_dir: Path) -> dict[str, Any]:
         files = [recon_dir / "cameras.txt", recon_dir / "images.txt"]
@@ -174,15 +174,15 @@ def _reading_byte_order_marks(module: Any) -> Iterator[None]:
 def _points_in_the_run(
     positions: NDArray[np.floating], colors: NDArray[np.uint8], transform: Tensor, scale: float
 ) -> dict[str, Tensor]:
-    """Points as nerfstudio's metadata hold them.
+    """Return points as nerfstudio's metadata hold them.
 
     Args:
-        positions: In the data's frame. [P, 3]
-        colors: In 0 … 255. [P, 3]
-        transform: From the data's frame to the run's. [3, 4]
-        scale: Factor after the transform.
+        positions: Positions in the data's frame. [P, 3]
+        colors: Colours in 0 … 255. [P, 3]
+        transform: Map from the data's frame to the run's. [3, 4]
+        scale: Factor that is applied after the transform.
     """
-    with np.errstate(over="ignore"):  # numbers beyond float32 become infinite, and the model leaves them out
+    with np.errstate(over="ignore"):  # What is beyond float32 becomes infinite, and is left out later.
         positions = positions.astype(np.float32)
     homogeneous = torch.from_numpy(np.pad(positions, ((0, 0), (0, 1)), constant_values=1))
     return {"points3D_xyz": homogeneous @ transform.T * scale, "points3D_rgb": torch.from_numpy(colors)}

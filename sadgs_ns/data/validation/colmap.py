@@ -31,7 +31,7 @@ from sadgs_ns.data.validation.splits import SPLITS, check_splits
 from sadgs_ns.errors import InputError, reason
 
 UNSUPPORTED_CAMERAS = {"FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}
-"""Those of COLMAP's camera models that nerfstudio cannot read."""
+"""COLMAP's camera models that nerfstudio cannot read."""
 
 
 @collect_findings
@@ -78,7 +78,7 @@ def check_colmap(
         if camera_id not in cameras:
             raise InputError(f"{where} has camera {camera_id}, which {cameras_path} lacks: take both of one model.")
     used = {camera_id: cameras[camera_id] for _, camera_id, _ in poses}
-    for camera_id, camera in cameras.items():  # nerfstudio reads all of them, used or not
+    for camera_id, camera in cameras.items():  # nerfstudio reads unused ones, too.
         _check_camera(camera, f"{cameras_path}: camera {camera_id}")
     if len({"FISHEYE" in camera.model for camera in used.values()}) > 1:
         raise InputError(
@@ -141,7 +141,7 @@ def check_colmap(
 
 
 def chosen_factor(data: Path, colmap_path: Path) -> int:
-    """The factor by which images are scaled down where no parser is named.
+    """Return the factor by which images are scaled down where no parser is named.
 
     nerfstudio's parser of COLMAP's files asks a question at the terminal where copies that it wants do not exist. So
     that it never has to, the images are taken at full resolution then, as they are beside a `transforms.json`.
@@ -163,7 +163,7 @@ def chosen_factor(data: Path, colmap_path: Path) -> int:
 
 
 def _read_list(path: Path) -> list[str]:
-    """The names in a list of images.
+    """Return the names in a list of images.
 
     Raises:
         InputError: If the file cannot be read, is not UTF-8 or starts with a byte order mark.
@@ -201,7 +201,7 @@ def _check_camera(camera: colmap.Camera, where: str) -> None:
 def _views(
     poses: Sequence[colmap.Pose], cameras: Mapping[int, colmap.Camera], poses_path: Path, cameras_path: Path
 ) -> list[View]:
-    """The poses and their cameras, as the checks of geometry take them."""
+    """Return the poses and their cameras, as the checks of geometry take them."""
     described = {camera_id: _describe(camera) for camera_id, camera in cameras.items()}
     quats = np.array([pose[[1, 2, 3, 0]] for _, _, pose in poses])  # xyzw [V, 4]
     rotations = Rotation.from_quat(quats).as_matrix()  # [V, 3, 3]
@@ -218,7 +218,7 @@ def _views(
 
 
 def _describe(camera: colmap.Camera) -> Camera:
-    """What COLMAP's parameters of a model that nerfstudio reads stand for."""
+    """Return what COLMAP's parameters of a model that nerfstudio reads stand for."""
     focals = _number_of_focals(camera.model)
     fx, fy, (cx, cy, *rest) = camera.params[0], camera.params[focals - 1], camera.params[focals:]
     tangential = rest[2:] if camera.model == "OPENCV" else ()
@@ -228,6 +228,7 @@ def _describe(camera: colmap.Camera) -> Camera:
 
 
 def _number_of_focals(model: str) -> int:
+    """Return how many focal lengths a camera model has, 1 or 2."""
     return 1 if model.startswith("SIMPLE") or "RADIAL" in model else 2
 
 

@@ -20,7 +20,7 @@ class Finding:
     severity: Literal["error", "warning", "note"]
     """Whether training is refused, may disappoint, or just behaves in a way worth knowing."""
     sentence: str
-    """Names the file and the remedy."""
+    """A sentence that names the file and the remedy."""
 
 
 _Arguments = ParamSpec("_Arguments")
@@ -32,7 +32,7 @@ def collect_findings(check: Callable[_Arguments, Iterator[Finding]]) -> Callable
     @functools.wraps(check)
     def findings(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> list[Finding]:
         try:
-            with np.errstate(over="ignore", invalid="ignore"):  # numbers that are nearly infinite
+            with np.errstate(over="ignore", invalid="ignore"):  # Some numbers are nearly infinite.
                 return list(check(*args, **kwargs))
         except InputError as error:
             return [Finding("error", str(error))]

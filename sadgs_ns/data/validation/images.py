@@ -19,9 +19,9 @@ from sadgs_ns.errors import InputError, reason
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"}
 MAX_AUTO_RESOLUTION = 1600
-"""Longest side in px; nerfstudio looks for smaller copies of images that are larger."""
+"""Longest side in px up to which nerfstudio looks for no smaller copies of images."""
 MASK_MODES = ("L", "1", "I;16", "I")
-"""Pillow's modes of one channel of numbers; nerfstudio takes every pixel that is not 0 for one to train on."""
+"""Pillow's modes that masks may have; nerfstudio trains on every pixel that is not 0."""
 Rounding = Literal["floor", "round", "ceil"]
 Size = tuple[int, int]
 """Width and height in px."""
@@ -32,9 +32,11 @@ class Frame:
     """An image with what its camera says."""
 
     image: Path
+    """File of the image."""
     size: Size | None
-    """What the camera says, or None where nothing but the image tells."""
+    """Size that the camera has, or None where nothing but the image tells."""
     mask: Path | None = None
+    """File of the mask, if there is one."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class _Image:
     """What is known of an image file."""
 
     size: Size = (0, 0)
-    """Zeros where it is unknown."""
+    """Width and height in px, zeros where they are unknown."""
     mode: str = ""
     """Pillow's name for the kind of pixels."""
     format: str = ""
@@ -52,24 +54,24 @@ class _Image:
 
 
 def image_size(path: Path) -> Size:
-    """Width and height in px, zeros where they cannot be read."""
+    """Return width and height in px, zeros where they cannot be read."""
     return _inspect(path).size
 
 
 def scaled_size(size: Size, factor: int, rounding: Rounding) -> Size:
-    """A camera's width and height after nerfstudio scaled them down, in its float32."""
+    """Return a camera's width and height after nerfstudio scaled them down, in its float32."""
     width, height = (float(np.float32(side) * np.float32(1.0 / factor)) for side in size)
     to_int = {"floor": math.floor, "round": lambda value: math.floor(value + 0.5), "ceil": math.ceil}[rounding]
     return to_int(width), to_int(height)
 
 
 def smaller_folder(folder: Path, factor: int) -> Path:
-    """The folder in which nerfstudio keeps copies of a folder's images that are smaller by a factor."""
+    """Return the folder in which nerfstudio keeps copies of a folder's images that are smaller by a factor."""
     return folder.with_name(f"{folder.name}_{factor}") if factor > 1 else folder
 
 
 def check_factor(downscale_factor: int | None) -> None:
-    """See whether a factor can make images smaller.
+    """Check whether a factor can make images smaller.
 
     Raises:
         InputError: If it is less than 1.
@@ -79,7 +81,7 @@ def check_factor(downscale_factor: int | None) -> None:
 
 
 def no_copies(folder: Path, factor: int) -> tuple[str, str]:
-    """What is wrong and what helps where `--downscale-factor` asks for a folder of smaller copies that is not there."""
+    """Return what is wrong and what helps where `--downscale-factor` asks for smaller copies that are not there."""
     return (
         f"{folder} does not exist, which should hold the images scaled down by `--downscale-factor {factor}`",
         f"leave that option out, and put `--pipeline.datamanager.camera-res-scale-factor {1 / factor:.4g}` before the "
@@ -88,7 +90,7 @@ def no_copies(folder: Path, factor: int) -> tuple[str, str]:
 
 
 def existing_factor(size: Size, copy_of: Callable[[int], Path]) -> int:
-    """The factor by which images are scaled down where the user names none.
+    """Return the factor by which images are scaled down where the user names none.
 
     nerfstudio's parser of `transforms.json` chooses it in the same way.
 
@@ -145,7 +147,7 @@ def check_images(frames: Sequence[Frame], source: Path, look_for_unused: bool = 
 
 
 def _problem(frame: Frame, image: _Image, mask: _Image | None, source: Path) -> tuple[str, Path, str] | None:
-    """What is wrong with a frame's files: its kind, the file and the rest of the sentence; None if nothing is."""
+    """Return what is wrong with a frame's files, if anything is: its kind, the file and the rest of the sentence."""
     if image.problem:
         return image.problem.split(" (")[0], frame.image, image.problem
     if image.mode not in ("RGB", "RGBA", "L"):
@@ -167,7 +169,7 @@ def _problem(frame: Frame, image: _Image, mask: _Image | None, source: Path) -> 
 
 
 def _describe(source: Path, images: Sequence[_Image], masks: Sequence[_Image | None]) -> str:
-    """The sentence on number, size and kind of good images, and on the number of masks."""
+    """Return a sentence on number, size and kind of good images, and on the number of masks."""
     sizes = Counter(image.size for image in images)
     kinds = Counter(f"{image.format} {image.mode}" for image in images)
     (width, height), _ = sizes.most_common(1)[0]
@@ -185,8 +187,8 @@ def _describe(source: Path, images: Sequence[_Image], masks: Sequence[_Image | N
 
 
 def unused_images(frames: Sequence[Frame], source: Path) -> str | None:
-    """A sentence on images beside the frames' that have no pose in the source; None if there are none."""
-    # realpath, unlike Path.resolve, does not raise where links form a loop.
+    """Return a sentence on images beside the frames' that have no pose in the source; None if there are none."""
+    # Unlike Path.resolve, realpath does not raise where links form a loop.
     used = {os.path.realpath(path) for frame in frames for path in (frame.image, frame.mask) if path is not None}
     folders = sorted({frame.image.parent for frame in frames})
     unused = [path for folder in folders for path in images_in(folder) if os.path.realpath(path) not in used]
@@ -198,14 +200,14 @@ def unused_images(frames: Sequence[Frame], source: Path) -> str | None:
 
 
 def images_in(folder: Path) -> list[Path]:
-    """The images right in a folder, sorted; none where there is no folder."""
+    """Return the images right in a folder, sorted; none where there is no folder."""
     if not folder.is_dir():
         return []
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
 
 
 def _and_more(path: Path, count: int) -> str:
-    """The first of some paths, and how many others there are."""
+    """Return the start of a sentence on some paths: the first of them, and how many others there are."""
     return f"{path} (and {count - 1} more)" if count > 1 else f"{path}"
 
 
@@ -225,32 +227,35 @@ def _inspect(path: Path) -> _Image:
         return _Image(problem="does not exist: put it there, or leave it out of the reconstruction")
     except UnidentifiedImageError:
         return _Image(problem=f"is no image that Pillow knows: {again}")
-    except Exception as error:  # decoders raise whatever they stumble over: OSError, SyntaxError, struct.error, …
+    except Exception as error:  # Decoders raise OSError, SyntaxError, struct.error, …
         return _Image(problem=f"cannot be read as an image ({reason(error)}): {again}")
     return _Image(size, mode, kind)
 
 
 def _ends_well(path: Path, image: Image.Image) -> bool:
-    """Whether an image that opened is surely whole, found without decoding it; if not, decoding it tells."""
+    """Return whether an image that opened is surely whole, without decoding it; if not, decoding it tells."""
     if image.format == "JPEG":
         with path.open("rb") as file:
             file.seek(-2, 2)
             return file.read() == b"\xff\xd9"
     if image.format == "PNG":
         try:
-            image.verify()  # its checksums
-        except Exception:  # as above; a file without its last bytes fails here and decodes well
+            image.verify()  # This reads its checksums.
+        except Exception:  # It raises anything, also for a file that lacks its last bytes alone, which decodes well.
             return False
         return True
     return False
 
 
 def _is_of_one_colour(path: Path) -> bool:
-    """Whether all pixels of an image that can be seen have one colour; it is decoded for that, JPEG at an eighth."""
+    """Return whether all pixels of an image that can be seen have one colour.
+
+    The image is decoded for that, a JPEG at an eighth of its size.
+    """
     try:
         with Image.open(path) as image:
             image.draft(None, (image.width // 8, image.height // 8))
-            seen = image.convert("RGBa") if image.mode == "RGBA" else image  # what is transparent becomes black
+            seen = image.convert("RGBa") if image.mode == "RGBA" else image  # What is transparent becomes black.
             extrema: Any = seen.getextrema()
     except Exception:  # What a decoder stumbles over is no single colour; nerfstudio's reader may yet read it.
         return False
@@ -258,9 +263,9 @@ def _is_of_one_colour(path: Path) -> bool:
 
 
 def _is_black(path: Path) -> bool:
-    """Whether a mask, which is decoded for that, is 0 everywhere."""
+    """Return whether a mask, which is decoded for that, is 0 everywhere."""
     try:
         with Image.open(path) as image:
             return image.getextrema() == (0, 0)
-    except Exception:  # as above
+    except Exception:  # As for an image.
         return False

@@ -1,4 +1,4 @@
-"""How a capture's folder is laid out, and what to say where there is no layout that is known."""
+"""Layouts of a capture's folder, and what to say where there is none that is known."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from sadgs_ns.data.validation.images import images_in
 COLMAP_FOLDERS = ("colmap/sparse/0", "sparse/0", "sparse", "colmap")
 """Folders in which a reconstruction is looked for; nerfstudio's default is the first."""
 GIVE_POSES = "compute poses with `sadgs-process PHOTOS FOLDER` or `ns-process-data`"
+"""Remedy where poses are missing, as the end of a sentence."""
 
 
 def find_reconstruction(data: Path) -> Path | None:
-    """The folder of a COLMAP reconstruction, relative to the data, or None."""
+    """Return the folder of a COLMAP reconstruction, relative to the data, or None."""
     for folder in COLMAP_FOLDERS:
         if any((data / folder / f"cameras.{kind}").is_file() for kind in ("txt", "bin")):
             return Path(folder)
@@ -22,7 +23,7 @@ def find_reconstruction(data: Path) -> Path | None:
 
 
 def layout_of(data: Path) -> Literal["nerfstudio", "blender", "colmap"] | None:
-    """How a capture is laid out; None if nothing that is known lies there.
+    """Return how a capture is laid out; None if nothing that is known lies there.
 
     Args:
         data: The folder, or a file in the layout of `transforms.json`.
@@ -35,7 +36,7 @@ def layout_of(data: Path) -> Literal["nerfstudio", "blender", "colmap"] | None:
 
 
 def no_layout(data: Path) -> str:
-    """The sentence for a folder without poses."""
+    """Return the sentence for a folder without poses."""
     models = [data / folder for folder in COLMAP_FOLDERS]
     files = [folder / f"cameras.{kind}" for folder in models for kind in ("txt", "bin")]
     for path in (data, data / "transforms.json", data / "transforms_train.json", *models, *files):

@@ -17,7 +17,7 @@ from sadgs_ns.data.automatic import choose_parser
 from sadgs_ns.errors import InputError
 
 _checked: list[tuple[FullImageDatamanagerConfig, list[validation.Finding]]] = []
-"""At most one: settings whose data were just found good, and the findings that do not stop training."""
+"""Settings whose data were just found good, at most one, with the findings that do not stop training."""
 
 
 def check_ahead(config: FullImageDatamanagerConfig) -> None:
@@ -32,7 +32,11 @@ def check_ahead(config: FullImageDatamanagerConfig) -> None:
 
 
 def findings_of(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[validation.Finding]:
-    """The findings of `check_ahead`, once, if it checked these settings, or else those of a check now."""
+    """Return the findings of `check_ahead`, once, if it checked these settings, or else those of a check now.
+
+    Raises:
+        InputError: As `refuse_bad_data`.
+    """
     while _checked:
         settings, findings = _checked.pop()
         if settings == config:
@@ -87,7 +91,7 @@ def refuse_bad_data(config: FullImageDatamanagerConfig, open_images: bool = True
 
 
 def _training_images(parser: ColmapDataParserConfig | NerfstudioDataParserConfig) -> Callable[[Sequence[str]], int]:
-    """A function of all images' names that says how many of them the parser trains on."""
+    """Return a function of all images' names that says how many of them the parser trains on."""
 
     def count(names: Sequence[str]) -> int:
         if parser.eval_mode == "fraction":

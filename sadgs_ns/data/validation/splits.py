@@ -10,7 +10,7 @@ from sadgs_ns.data.validation.findings import Finding
 from sadgs_ns.errors import InputError
 
 SPLITS = ("train", "val", "test")
-"""nerfstudio trains on the first, `ns-train` measures the second on the way, and `ns-eval` the third."""
+"""Parts of the images: nerfstudio trains on the first, `ns-train` measures the second, and `ns-eval` the third."""
 
 
 def check_splits(

@@ -37,7 +37,7 @@ from sadgs_ns.data.validation.splits import SPLITS, check_splits
 from sadgs_ns.errors import InputError, reason
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-"""nerfstudio's coefficients, in the order of its distortion_params."""
+"""Names of nerfstudio's coefficients, in the order of its distortion_params."""
 
 
 @collect_findings
@@ -102,7 +102,7 @@ def check_nerfstudio(
     if lists := {split: meta[f"{split}_filenames"] for split in SPLITS if f"{split}_filenames" in meta}:
 
         def locate(name: str) -> Path:
-            return folder / (Path(name).name if factor > 1 else name)  # nerfstudio keeps smaller copies in one folder
+            return folder / (Path(name).name if factor > 1 else name)  # Smaller copies lie in one folder.
 
         places = {locate(frame["file_path"]) for frame in described}
         yield from check_splits(lists, lambda split: f"{path}: {split}_filenames", locate, places)
@@ -120,7 +120,7 @@ def check_nerfstudio(
 
 
 def _check_transform(meta: dict[str, Any], path: Path) -> None:
-    """See whether what nerfstudio does to all poses makes sense.
+    """Check whether what nerfstudio does to all poses makes sense.
 
     Raises:
         InputError: If it does not.
@@ -141,13 +141,16 @@ def _check_transform(meta: dict[str, Any], path: Path) -> None:
 
 
 def applied_transform(meta: dict[str, Any]) -> NDArray[np.float64]:
-    """From the world of COLMAP's points to that of the poses; by default what ns-process-data did before it said so."""
+    """Return the map [3, 4] from the world of COLMAP's points to that of the poses.
+
+    Where the file says nothing, it is what ns-process-data did before it wrote so.
+    """
     default = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
-    return np.array(meta.get("applied_transform", default), dtype=np.float64)  # [3, 4]
+    return np.array(meta.get("applied_transform", default), dtype=np.float64)
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The object that a file holds in UTF-8, after a byte order mark or without one.
+    """Return the object that a file holds in UTF-8, after a byte order mark or without one.
 
     Raises:
         InputError: If the file cannot be read, is not UTF-8 or JSON, or holds something else.
@@ -166,7 +169,11 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def frames_of(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
-    """The frames, each with a file path and a pose that can be used."""
+    """Return the frames, each with a file path and a pose that can be used.
+
+    Raises:
+        InputError: If there are none, or one of them has no such path or pose.
+    """
     frames = meta.get("frames")
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{path} lists no frames, so there is no image to train on: {GIVE_POSES}.")
@@ -191,13 +198,13 @@ def frames_of(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
 
 
 def view_of(frame: dict[str, Any], where: str, camera: Camera) -> View:
-    """A frame that `frames_of` found good, with its camera."""
+    """Return a frame that `frames_of` found good, with its camera, as the checks of geometry take it."""
     pose = np.array(frame["transform_matrix"], dtype=np.float64)
-    return View(where, where, (pose[:3, :3] * [1, -1, -1]).T, pose[:3, 3], camera)  # OpenGL's camera axes to OpenCV's
+    return View(where, where, (pose[:3, :3] * [1, -1, -1]).T, pose[:3, 3], camera)  # The axes become OpenCV's.
 
 
 def _distortion_of(values: dict[str, Any], where: Path | str) -> dict[str, Any]:
-    """The coefficients that a frame, or all of them, have by name; nerfstudio takes all from one of the two.
+    """Return the coefficients that a frame, or all of them, have by name; nerfstudio takes all from one of the two.
 
     Raises:
         InputError: If they are listed, but not as nerfstudio reads them.
@@ -205,7 +212,7 @@ def _distortion_of(values: dict[str, Any], where: Path | str) -> dict[str, Any]:
     if "distortion_params" not in values:
         return {name: values[name] for name in _DISTORTION if name in values}
     listed = values["distortion_params"]
-    if not isinstance(listed, list) or len(listed) not in (6, 12):  # 12 are FISHEYE624's
+    if not isinstance(listed, list) or len(listed) not in (6, 12):  # FISHEYE624 has 12.
         names = ", ".join(_DISTORTION)
         raise InputError(
             f"{where} has distortion_params that are no list of 6 numbers ({names}): correct or remove them."
@@ -214,7 +221,7 @@ def _distortion_of(values: dict[str, Any], where: Path | str) -> dict[str, Any]:
 
 
 def _camera(values: dict[str, Any], distortion: dict[str, Any], model: str, where: str) -> Camera:
-    """The camera that good values stand for.
+    """Return the camera that good values stand for.
 
     Raises:
         InputError: If a distortion coefficient is no number, or one that nerfstudio does not support.
@@ -225,7 +232,7 @@ def _camera(values: dict[str, Any], distortion: dict[str, Any], model: str, wher
     if model == "FISHEYE624":
         if not any(distortion.values()):
             raise InputError(f"{where} {UNDISTORTED_FISHEYE}")
-        return Camera(*pinhole, fisheye=True)  # its coefficients have a meaning of their own
+        return Camera(*pinhole, fisheye=True)  # Its coefficients mean something else.
     if model == "OPENCV_FISHEYE":
         return Camera(*pinhole, radial=(k1, k2, k3, k4), fisheye=True)
     if k4 != 0:
@@ -247,5 +254,5 @@ def _check_ply(meta: dict[str, Any], path: Path, views: Sequence[View]) -> Itera
 
 
 def _smaller_copies(folder: Path, image: Path) -> int:
-    """The factor that nerfstudio's own parser chooses: it takes smaller copies only where they exist."""
+    """Return the factor that nerfstudio's own parser chooses: it takes smaller copies only where they exist."""
     return existing_factor(image_size(folder / image), lambda factor: folder / f"images_{factor}" / image.name)
