@@ -48,6 +48,7 @@ def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> T
     from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
     from nerfstudio.engine.trainer import TrainerConfig
 
+    from sadgs_ns.data.automatic import PARSERS
     from sadgs_ns.plugin.trainer import SadgsTrainerConfig
 
     config = copy.deepcopy(all_methods.get(row.method))
@@ -64,6 +65,8 @@ def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> T
         raise ValueError(f"scene {scene.name!r}: {root / scene.data} does not exist; check --scenes.")
     # As `ns-train METHOD PARSER` does: the method's own settings of its default parser, which may read SfM points.
     own, registered = datamanager.dataparser, all_dataparsers[name]
+    if isinstance(config, SadgsTrainerConfig):
+        registered = PARSERS[name]
     dataparser = copy.deepcopy(own if type(own) is type(registered) else registered)
     for path, value in scene.options.items():
         set_dotted(dataparser, path, value)

@@ -1,4 +1,4 @@
-"""`sadgs-doctor [DATA]`: what this machine offers to training, and what is wrong with a data folder."""
+"""`sadgs-doctor [DATA]`, which says what this machine offers to training, and what a data folder holds."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import ctypes.util
 import importlib
 import os
 import platform
+import shlex
 import shutil
 import sys
 import warnings
@@ -18,11 +19,13 @@ from sadgs_ns.data.validation import Finding, check_data
 from sadgs_ns.errors import free_space, reason
 
 PACKAGES = ("sadgs_ns", "torch", "torchvision", "gsplat", "nerfstudio", "triton", "pycolmap", "open3d")
+"""Packages whose versions are printed."""
 _LPIPS_NETWORKS = {"AlexNet": "AlexNet_Weights", "VGG": "VGG16_Weights"}
+"""Networks of LPIPS, and what torchvision calls their weights."""
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that matter; "missing" for those that are not installed."""
+    """Return the versions of Python and of the packages that matter; "missing" for those that are not installed."""
     found = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -35,12 +38,13 @@ def versions() -> dict[str, str]:
 def check_machine() -> Iterator[Finding]:
     """Check torch, its device, the kernels, LPIPS's weights and what nerfstudio's commands need.
 
-    Notes say what is well. Nothing is downloaded; on CUDA a small kernel is compiled, and gsplat's, if they never were.
+    Notes say what is in order. Nothing is downloaded; on CUDA a small kernel is compiled, and gsplat's, if they never
+    were.
     """
     try:
         import torch
         import torchvision  # noqa: F401
-    except Exception as error:  # a broken installation raises anything; versions that do not fit, an OSError
+    except Exception as error:  # A broken installation raises anything.
         yield Finding("error", f"torch cannot be used ({reason(error)}): install the versions of constraints.txt.")
         return
     if torch.cuda.is_available():
@@ -65,6 +69,7 @@ def check_machine() -> Iterator[Finding]:
 
 
 def _check_cuda() -> Iterator[Finding]:
+    """Check the GPU, Triton and gsplat."""
     import torch
 
     from sadgs_ns import kernels
@@ -92,7 +97,7 @@ def _check_cuda() -> Iterator[Finding]:
     try:
         backend = importlib.import_module("gsplat.cuda._backend")
         problem = None if backend._C is not None else "neither prebuilt nor compiled"
-    except Exception as error:  # its compilation fails in many ways
+    except Exception as error:  # Its compilation fails in many ways.
         problem = reason(error)
     if problem is None:
         yield Finding("note", "gsplat has its CUDA kernels.")
@@ -104,6 +109,7 @@ def _check_cuda() -> Iterator[Finding]:
 
 
 def _check_lpips() -> Iterator[Finding]:
+    """Check whether the weights of LPIPS are on the disk."""
     import torch
     import torchvision
 
@@ -122,10 +128,10 @@ def _check_lpips() -> Iterator[Finding]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns 1 if there is an error, else 0."""
+    """Run the command line; return 1 if there is an error, else 0."""
     parser = argparse.ArgumentParser(
         prog="sadgs-doctor",
-        description="Print what this machine offers to training, and check a data folder before a long run. The exit "
+        description="Print what this machine offers to training and what a data folder holds, and check both. The exit "
         "code is 1 if something would stop training.",
     )
     parser.add_argument(
@@ -136,12 +142,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     findings = [Finding("note", f"Free disk space here: {free_space(Path())}."), *check_machine()]
     if given.data is not None:
         of_data = check_data(given.data)
-        if not of_data:
-            of_data = [Finding("note", f"{given.data}: nothing to complain about.")]
         findings += of_data
+        if not any(finding.severity != "note" for finding in of_data):
+            findings.append(Finding("note", f"{given.data}: nothing to complain about."))
     for finding in findings:
         print(f"{finding.severity}: {finding.sentence}")
-    return int(any(finding.severity == "error" for finding in findings))
+    failed = any(finding.severity == "error" for finding in findings)
+    if given.data is not None and not failed:
+        print(f"Next: ns-train sadgs --data {shlex.quote(str(given.data))}")
+    return int(failed)
 
 
 if __name__ == "__main__":

@@ -1,1 +1,1 @@
-"""Reading and checking captures: COLMAP, PLY, cameras and images."""
+"""Readers and checks of captures: COLMAP, PLY, cameras and images."""

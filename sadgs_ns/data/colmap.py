@@ -1,4 +1,4 @@
-"""COLMAP's reconstructions, text and binary, read as far as checks and training need them.
+"""Readers of COLMAP's reconstructions, text and binary, as far as checks and training need them.
 
 The libraries' readers trust the files: a corrupt length makes nerfstudio's and pycolmap's ask for terabytes. To find
 the lengths means to walk through the file as the functions here do, which take a tenth of the time of nerfstudio's
@@ -32,7 +32,7 @@ CAMERA_PARAMETERS = {
     "RADIAL_FISHEYE": 5,
     "THIN_PRISM_FISHEYE": 12,
 }
-"""COLMAP's camera models in the order of their numbers, and how many parameters each has."""
+"""Number of parameters of each of COLMAP's camera models, in the order of the models' numbers."""
 
 
 Points = tuple[NDArray[np.float64], NDArray[np.uint8]]
@@ -43,16 +43,20 @@ Pose = tuple[str, int, NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics, as COLMAP stores them."""
+    """Intrinsics of a camera, as COLMAP stores them."""
 
     model: str
+    """Name of the camera model."""
     width: int
+    """Width of the images in px."""
     height: int
+    """Height of the images in px."""
     params: tuple[float, ...]
+    """Parameters in the order of the model; the first are focal lengths in px."""
 
 
 class _Binary:
-    """A COLMAP binary file, read item by item; its end comes as an InputError."""
+    """A COLMAP binary file that is read item by item; where it ends too early, reading raises an InputError."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.offset = path, 0
@@ -65,10 +69,11 @@ class _Binary:
             raise InputError(f"{path} cannot be read ({reason(error)}): copy the whole reconstruction.") from error
 
     def corrupt(self, detail: str) -> InputError:
+        """Return the error to raise where the content makes no sense."""
         return InputError(f"{self.path} is cut off or corrupt ({detail}): copy it again, or run COLMAP's mapper again.")
 
     def take(self, layout: struct.Struct) -> tuple[Any, ...]:
-        """The next values."""
+        """Return the next values."""
         self.skip(layout.size)
         return layout.unpack_from(self.content, self.offset - layout.size)
 
@@ -79,7 +84,7 @@ class _Binary:
         self.offset += size
 
     def text(self) -> str:
-        """The next string, which ends with a zero byte."""
+        """Return the next string, which ends with a zero byte."""
         end = self.content.find(b"\0", self.offset, self.offset + 4096)
         if end < 0:
             raise self.corrupt(f"at byte {self.offset} there is no image's name")
@@ -108,12 +113,12 @@ def _read_binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
 
 
 def _read_binary_poses(path: Path) -> Iterator[Pose]:
-    """Name, camera and pose (wxyz quaternion, translation) [7] of each image."""
+    """Yield name, camera and pose (wxyz quaternion, translation) [7] of each image."""
     file = _Binary(path)
     for _ in range(file.take(_COUNT)[0]):
         _, *pose, camera_id = file.take(_POSE)
         name = file.text()
-        file.skip(24 * file.take(_COUNT)[0])  # keypoints
+        file.skip(24 * file.take(_COUNT)[0])  # The keypoints are not needed.
         yield name, camera_id, np.array(pose)
 
 
@@ -121,10 +126,10 @@ def _read_binary_points(path: Path) -> Points:
     file = _Binary(path)
     records = []
     (count,), content, start = file.take(_COUNT), file.content, file.offset
-    for _ in range(count):  # of up to millions: no calls in here
+    for _ in range(count):  # There may be millions, so nothing is called in here.
         record = content[start : start + _POINT.itemsize]
         records.append(record)
-        start += _POINT.itemsize + 8 * int.from_bytes(record[-8:], "little")  # its track follows it
+        start += _POINT.itemsize + 8 * int.from_bytes(record[-8:], "little")  # Its track follows it.
         if start > len(content):
             break
     file.skip(start - file.offset)
@@ -133,9 +138,9 @@ def _read_binary_points(path: Path) -> Points:
 
 
 def _read_text(path: Path, minimum: int) -> Iterator[tuple[list[str], Iterator[str]]]:
-    """Fields of each line that is neither empty nor a comment, and the lines after it."""
+    """Yield the fields of each line that is neither empty nor a comment, and the lines after it."""
     try:
-        with path.open(encoding="utf8") as file:
+        with path.open(encoding="utf-8-sig") as file:  # Editors of Windows write a byte order mark before the text.
             for line in file:
                 if line.strip() and not line.lstrip().startswith("#"):
                     fields = line.split()
@@ -163,10 +168,15 @@ def _read_text_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
 
 
 def _read_text_poses(path: Path) -> Iterator[Pose]:
-    """Name, camera and pose (wxyz quaternion, translation) [7] of each image."""
+    """Yield name, camera and pose (wxyz quaternion, translation) [7] of each image."""
     for fields, following in _read_text(path, 10):
+        if len(fields) > 10:
+            raise InputError(
+                f"{path}: image {' '.join(fields[9:])!r} has a space in its name, where nerfstudio takes the name to "
+                "end: write the model in binary (`colmap model_converter --output_type BIN`), or rename the image."
+            )
         try:
-            next(following, None)  # the image's keypoints, on a line of their own that may be empty
+            next(following, None)  # The keypoints are on a line of their own, which may be empty.
             yield fields[9], int(fields[8]), np.array(fields[1:8], dtype=np.float64)
         except ValueError as error:
             raise _not_colmap(path, error) from error
@@ -185,24 +195,37 @@ def _read_text_points(path: Path) -> Points:
 
 
 def read_cameras(path: Path) -> dict[int, Camera]:
-    """Cameras of a `cameras.bin` or `cameras.txt` by their ids.
+    """Return the cameras of a `cameras.bin` or `cameras.txt` by their ids.
 
     Raises:
-        InputError: If the file cannot be read, is cut off or corrupt; so do the functions below.
+        InputError: If the file cannot be read, is cut off or corrupt.
     """
     return dict((_read_binary_cameras if path.suffix == ".bin" else _read_text_cameras)(path))
 
 
 def read_poses(path: Path) -> list[Pose]:
-    """Name, camera id and pose (wxyz quaternion and translation, world to camera) [7] of the images of `images.*`."""
+    """Return name, camera id and pose [7] of the images of an `images.bin` or `images.txt`.
+
+    A pose is a wxyz quaternion and a translation, from world to camera.
+
+    Raises:
+        InputError: As `read_cameras`.
+    """
     return list((_read_binary_poses if path.suffix == ".bin" else _read_text_poses)(path))
 
 
 def points_file(model: Path) -> Path | None:
-    """The points of a folder with a reconstruction; the binary file, as nerfstudio prefers it; None if it has none."""
+    """Return a reconstruction's file of points, or None; of two the binary one, which nerfstudio prefers."""
     return next((path for kind in ("bin", "txt") if (path := model / f"points3D.{kind}").is_file()), None)
 
 
 def read_points(path: Path) -> Points:
-    """Positions [P, 3] in the reconstruction's world, and colours in 0 … 255 [P, 3], of the points of `points3D.*`."""
+    """Return the points of a `points3D.bin` or `points3D.txt`.
+
+    Returns:
+        Positions [P, 3] in the reconstruction's world, and colours [P, 3] in 0 … 255.
+
+    Raises:
+        InputError: As `read_cameras`.
+    """
     return (_read_binary_points if path.suffix == ".bin" else _read_text_points)(path)

@@ -1,4 +1,4 @@
-"""Gaussians in another world frame: what a similarity does to positions, shapes and spherical harmonics."""
+"""Similarities between world frames, and what they do to positions, shapes and spherical harmonics."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from sadgs_ns.errors import InputError, reason
 Array = NDArray[np.float64]
 
 TRANSFORMS_NAME = "dataparser_transforms.json"
-"""File beside `config.yml` in which nerfstudio's trainer writes how it moved the data's cameras and points."""
+"""Name of the file in which nerfstudio's trainer writes, beside `config.yml`, how it moved cameras and points."""
 _TOLERANCE = 1e-4
-"""How far a transform, written in float32, may be from a similarity, relative to its scale."""
+"""Largest deviation from a similarity of a transform that was written in float32, relative to its scale."""
 
 
 @dataclass(frozen=True)
@@ -26,15 +26,15 @@ class Similarity:
     """A map x ↦ scale · orthogonal · x + translation from one world frame to another."""
 
     scale: float
-    """> 0."""
+    """Factor by which lengths grow; it is positive."""
     orthogonal: Array
     """A rotation, or a rotation times −1, which is a reflection. [3, 3]"""
     translation: Array
-    """In units of the frame that results. [3]"""
+    """Translation in units of the frame that results. [3]"""
 
     @staticmethod
     def of(transform: Array) -> Similarity:
-        """The similarity that a matrix is, up to rounding.
+        """Return the similarity that a matrix is, up to rounding.
 
         Args:
             transform: Linear part and translation. [3, 4]
@@ -45,26 +45,28 @@ class Similarity:
         linear = np.asarray(transform[:, :3], dtype=np.float64)
         if np.isfinite(transform).all() and (scale := abs(np.linalg.det(linear)) ** (1 / 3)) > 0:
             left, _, right = np.linalg.svd(linear)
-            orthogonal = np.asarray(left @ right, dtype=np.float64)  # the nearest one; keeps the determinant's sign
+            orthogonal = np.asarray(
+                left @ right, dtype=np.float64
+            )  # It is the nearest one, and keeps the determinant's sign.
             if np.abs(linear - scale * orthogonal).max() < _TOLERANCE * scale:
                 return Similarity(scale, orthogonal, np.asarray(transform[:, 3], dtype=np.float64))
         raise ValueError("it is no rotation, scale and translation")
 
     def inverse(self) -> Similarity:
-        """The map back."""
+        """Return the map back."""
         back = self.orthogonal.T
         return Similarity(1 / self.scale, back, -back @ self.translation / self.scale)
 
     def positions(self, means: Array) -> Array:
-        """Positions in the new frame. [N, 3] → [N, 3]"""
+        """Return positions in the new frame. [N, 3] → [N, 3]"""
         return self.scale * (means @ self.orthogonal.T) + self.translation
 
     def log_scales(self, scales: Array) -> Array:
-        """Logarithms of standard deviations in the new frame. [N, 3] → [N, 3]"""
+        """Return logarithms of standard deviations in the new frame. [N, 3] → [N, 3]"""
         return scales + math.log(self.scale)
 
     def rotations(self, quats: Array) -> Array:
-        """Rotations of Gaussians in the new frame; a Gaussian is its own point reflection.
+        """Return rotations of Gaussians in the new frame; a Gaussian is its own point reflection.
 
         Args:
             quats: wxyz, of any length. [N, 4]
@@ -74,18 +76,18 @@ class Similarity:
         """
         turn = Rotation.from_matrix(self.orthogonal * np.sign(np.linalg.det(self.orthogonal)))
         lengths, turned = np.linalg.norm(quats, axis=1), quats.copy()
-        sound = (lengths > 0) & np.isfinite(lengths)  # scipy refuses the others
+        sound = (lengths > 0) & np.isfinite(lengths)  # Scipy refuses the others.
         turned[sound] = (turn * Rotation.from_quat(quats[sound][:, [1, 2, 3, 0]])).as_quat()[:, [3, 0, 1, 2]]
         return turned
 
     def harmonics(self, degree: int) -> Array:
-        """D with c' = D c: coefficients, as seen in the new frame, of colours c that depend on the direction.
+        """Return the matrix D that takes coefficients c of colours to those in the new frame, c' = D c.
 
         By definition D = ∫ Y(d)ᵀ Y(Qᵀ d) over the unit sphere, Q being the orthogonal part; the quadrature, 4
         Gauss–Legendre nodes in z times 8 in azimuth, is exact for the polynomials of degree 2 · 3 in it.
 
         Args:
-            degree: 0 … 3.
+            degree: Degree of the harmonics, 0 … 3.
 
         Returns:
             [(degree + 1)², (degree + 1)²]
@@ -102,14 +104,14 @@ class Similarity:
 
 
 def spherical_harmonics(directions: Array, degree: int) -> Array:
-    """The real spherical harmonics, in the order and with the signs of 3D Gaussian splatting.
+    """Return the real spherical harmonics, in the order and with the signs of 3D Gaussian splatting.
 
     Args:
         directions: Unit vectors. [..., 3]
-        degree: 0 … 3.
+        degree: Degree of the harmonics, 0 … 3.
 
     Returns:
-        Orthonormal on the unit sphere. [..., (degree + 1)²]
+        Values of functions that are orthonormal on the unit sphere. [..., (degree + 1)²]
 
     Raises:
         ValueError: If the degree is another.
@@ -143,7 +145,7 @@ def spherical_harmonics(directions: Array, degree: int) -> Array:
 
 
 def from_data(path: Path) -> Similarity:
-    """How nerfstudio moved the data's world (COLMAP's, or that of `transforms.json`) into its own.
+    """Return how nerfstudio moved the data's world (COLMAP's, or that of `transforms.json`) into its own.
 
     Args:
         path: A run's `dataparser_transforms.json`.

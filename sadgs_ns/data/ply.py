@@ -1,4 +1,4 @@
-"""SfM points of a PLY file, without open3d, which needs a system library and most of a second to import."""
+"""Reader of SfM points of a PLY file, without open3d, which needs a system library and most of a second to import."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from sadgs_ns.errors import InputError, reason
 
 GREY = 127
-"""The colour of points without one, in 0 … 255."""
+"""Colour that is given to points without one, in 0 … 255."""
 
 
 def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Positions and colours of the vertices.
+    """Return positions and colours of the vertices.
 
     Args:
         path: A PLY file, text or binary; colours are numbers of 0 … 255, or floating-point ones of 0 … 1.
@@ -30,13 +30,13 @@ def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """
     try:
         vertices = _read_vertices(path)
-        with np.errstate(over="ignore"):  # numbers beyond float32 become infinite
+        with np.errstate(over="ignore"):  # Numbers beyond float32 become infinite.
             positions = np.stack([vertices[axis] for axis in "xyz"], axis=-1).astype(np.float32)
     except InputError:
         raise
     except OSError as error:
         raise InputError(f"{path} cannot be read ({reason(error)}): restore it.") from error
-    except Exception as error:  # plyfile's parser is strict, but what a damaged header leads it to is open
+    except Exception as error:  # What a damaged header leads plyfile's parser to is open.
         raise InputError(f"{path} is not a PLY file of points ({reason(error)}): restore it.") from error
     if not {"red", "green", "blue"} <= set(vertices.dtype.names or ()):
         return positions, np.full(positions.shape, GREY, np.uint8)
@@ -47,7 +47,7 @@ def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
 
 
 def _read_vertices(path: Path) -> NDArray[Any]:
-    """The vertices as a structured array [P].
+    """Return the vertices as a structured array [P].
 
     plyfile reads the header and binary vertices; numpy reads text, where plyfile takes 30 µs a point.
     """
@@ -68,7 +68,7 @@ def _read_vertices(path: Path) -> NDArray[Any]:
         dtype = np.dtype(empty["vertex"].dtype())
         if count == 0:
             return np.empty(0, dtype)
-        if empty.text and empty.elements[0].name == "vertex" and not dtype.hasobject:  # lists are objects
+        if empty.text and empty.elements[0].name == "vertex" and not dtype.hasobject:  # Lists are objects.
             start = file.tell()
             if sum(1 for _ in file) < count:
                 raise _cut_off(path, count)
@@ -83,4 +83,5 @@ def _read_vertices(path: Path) -> NDArray[Any]:
 
 
 def _cut_off(path: Path, count: int) -> InputError:
+    """Return the error for a file that ends before the points that its header promises."""
     return InputError(f"{path} is cut off: its header promises {count} points: restore it.")

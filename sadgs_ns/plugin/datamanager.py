@@ -1,8 +1,12 @@
-"""nerfstudio's loader of whole images, behind checks of the images' names, and with a faster reader of SfM points."""
+"""A data manager: nerfstudio's loader of whole images, with checks of their names and a faster reader of points."""
 
 from __future__ import annotations
 
+import codecs
+import contextlib
 import copy
+import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -10,6 +14,9 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
+from nerfstudio.data.dataparsers import blender_dataparser, nerfstudio_dataparser
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.blender_dataparser import Blender
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 from nerfstudio.data.datasets.base_dataset import InputDataset
@@ -18,16 +25,21 @@ from torch import Tensor
 from tyro.conf import Suppress
 
 from sadgs_ns.data import colmap, ply
+from sadgs_ns.data.automatic import AnyParserConfig, AutomaticDataParserConfig, choose_parser
 from sadgs_ns.data.validation import names
+from sadgs_ns.data.validation.layouts import COLMAP_FOLDERS
+from sadgs_ns.data.validation.transforms import read_json
 
 
 @dataclass
 class SadgsDatamanagerConfig(FullImageDatamanagerConfig):
-    """nerfstudio's; what its loader of whole images does not read is no option of the command line."""
+    """nerfstudio's options, without those on the command line that its loader of whole images does not read."""
 
     _target: type = field(default_factory=lambda: SadgsDatamanager)
     data: Suppress[Path | None] = None
     """Folder of the data; `--data` sets it."""
+    dataparser: AnyParserConfig = field(default_factory=AutomaticDataParserConfig)
+    """How the folder is read: by default with the parser that fits what it holds."""
     masks_on_gpu: Suppress[bool] = False
     """Not read where whole images are cached."""
     images_on_gpu: Suppress[bool] = False
@@ -55,7 +67,7 @@ class SadgsDatamanagerConfig(FullImageDatamanagerConfig):
 
 
 class SadgsDatamanager(FullImageDatamanager[InputDataset]):
-    """Checks what the data's images are called, and where they lie, and reads SfM points once, faster, without open3d.
+    """A loader that checks the images' names and places, and reads SfM points once, faster and without open3d.
 
     The checks are here rather than in the pipeline, because `ns-render dataset` makes a datamanager of its own.
 
@@ -64,10 +76,12 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
     """
 
     def __init__(self, config: FullImageDatamanagerConfig, *args: Any, **kwargs: Any) -> None:
-        parser = copy.copy(config.dataparser)  # changed below; the one that was given belongs to the run's config.yml
+        config = copy.copy(config)  # It is changed below, and the one that was given belongs to the run's config.yml.
+        choose_parser(config)
+        parser = copy.copy(config.dataparser)
         self._points: Path | None = None
         """COLMAP's points, where nerfstudio does not read them itself."""
-        if isinstance(parser, ColmapDataParserConfig):  # before it offers to make smaller images
+        if isinstance(parser, ColmapDataParserConfig):  # These checks precede the making of smaller images.
             model = (config.data or parser.data) / parser.colmap_path
             kind = "txt" if (model / "cameras.txt").exists() else "bin"
             if (source := model / f"images.{kind}").is_file():
@@ -76,9 +90,8 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
             if plain and parser.load_3D_points:
                 self._points = colmap.points_file(model)
                 parser.load_3D_points = self._points is None
-        if parser._target is Nerfstudio:
-            parser._target = _Nerfstudio
-        config = copy.copy(config)
+        own = {Nerfstudio: _Nerfstudio, Blender: _Blender, ColmapDataParser: _Colmap}
+        parser._target = own.get(parser._target, parser._target)
         config.dataparser = parser
         super().__init__(config, *args, **kwargs)  # type: ignore[arg-type]
         for dataset in (self.train_dataset, self.eval_dataset):
@@ -101,7 +114,19 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
 
 
 class _Nerfstudio(Nerfstudio):
-    """nerfstudio's parser, which would read points with open3d."""
+    """nerfstudio's parser of transforms.json, which alone reads points with open3d and asks whether to make a PLY."""
+
+    def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
+        model = self.config.data / COLMAP_FOLDERS[0]
+        if model.exists():
+            self.prompted_user, self.create_pc = True, False  # The answer no; the points are read below.
+        with _reading_byte_order_marks(nerfstudio_dataparser):
+            outputs = super()._generate_dataparser_outputs(split)
+        source = colmap.points_file(model)
+        if self.config.load_3D_points and "points3D_xyz" not in outputs.metadata and source is not None:
+            points = colmap.read_points(source)
+            outputs.metadata |= _points_in_the_run(*points, outputs.dataparser_transform, outputs.dataparser_scale)
+        return outputs
 
     def _load_3D_points(
         self, ply_file_path: Path, transform_matrix: Tensor, scale_factor: float
@@ -110,18 +135,54 @@ class _Nerfstudio(Nerfstudio):
         return _points_in_the_run(positions, colors, transform_matrix, scale_factor) if len(positions) else None
 
 
+class _Blender(Blender):
+    """nerfstudio's parser of Blender scenes, which alone would stumble over a byte order mark."""
+
+    def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
+        with _reading_byte_order_marks(blender_dataparser):
+            return super()._generate_dataparser_outputs(split)
+
+
+class _Colmap(ColmapDataParser):
+    """nerfstudio's parser of COLMAP's files, which alone would stumble over a byte order mark."""
+
+    def _get_all_images_and_cameras(self, recon_dir: Path) -> dict[str, Any]:
+        files = [recon_dir / "cameras.txt", recon_dir / "images.txt"]
+        if not files[0].exists() or not any(_has_byte_order_mark(file) for file in files):
+            return super()._get_all_images_and_cameras(recon_dir)
+        with tempfile.TemporaryDirectory() as folder:
+            for file in files:
+                Path(folder, file.name).write_bytes(file.read_bytes().removeprefix(codecs.BOM_UTF8))
+            return super()._get_all_images_and_cameras(Path(folder))
+
+
+def _has_byte_order_mark(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(3) == codecs.BOM_UTF8
+
+
+@contextlib.contextmanager
+def _reading_byte_order_marks(module: Any) -> Iterator[None]:
+    """Give a module of nerfstudio's a reader of JSON that takes a byte order mark, which editors of Windows write."""
+    before, module.load_from_json = module.load_from_json, read_json
+    try:
+        yield
+    finally:
+        module.load_from_json = before
+
+
 def _points_in_the_run(
     positions: NDArray[np.floating], colors: NDArray[np.uint8], transform: Tensor, scale: float
 ) -> dict[str, Tensor]:
-    """Points as nerfstudio's metadata hold them.
+    """Return points as nerfstudio's metadata hold them.
 
     Args:
-        positions: In the data's frame. [P, 3]
-        colors: In 0 … 255. [P, 3]
-        transform: From the data's frame to the run's. [3, 4]
-        scale: Factor after the transform.
+        positions: Positions in the data's frame. [P, 3]
+        colors: Colours in 0 … 255. [P, 3]
+        transform: Map from the data's frame to the run's. [3, 4]
+        scale: Factor that is applied after the transform.
     """
-    with np.errstate(over="ignore"):  # numbers beyond float32 become infinite, and the model leaves them out
+    with np.errstate(over="ignore"):  # What is beyond float32 becomes infinite, and is left out later.
         positions = positions.astype(np.float32)
     homogeneous = torch.from_numpy(np.pad(positions, ((0, 0), (0, 1)), constant_values=1))
     return {"points3D_xyz": homogeneous @ transform.T * scale, "points3D_rgb": torch.from_numpy(colors)}

@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -43,9 +42,7 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     """Full images, several of them per iteration, and their structure tensors."""
 
     _target: type = field(default_factory=lambda: SadgsPipeline)
-    datamanager: FullImageDatamanagerConfig = field(
-        default_factory=lambda: SadgsDatamanagerConfig(dataparser=NerfstudioDataParserConfig(load_3D_points=True))
-    )
+    datamanager: FullImageDatamanagerConfig = field(default_factory=SadgsDatamanagerConfig)
     """How images are loaded and drawn."""
     model: SadgsModelConfig = field(default_factory=SadgsModelConfig)
     """The Gaussians and their densification."""

@@ -208,17 +208,20 @@ def test_build_config_of_splatfacto(tmp_path: Path):
 
 
 @pytest.mark.usefixtures("nerfstudio")
-def test_a_methods_own_settings_of_its_parser_stay(tmp_path: Path):
+@pytest.mark.parametrize("method", ["splatfacto", "sadgs"])
+def test_a_methods_own_settings_of_its_parser_stay(method: str, tmp_path: Path):
     (tmp_path / "lego").mkdir()
     scene = Scene("lego", "lego", "nerfstudio-data", {"downscale_factor": 1})
-    config: Any = build_config(scene, Row("ours", "splatfacto"), 0, tmp_path, tmp_path)
+    config: Any = build_config(scene, Row("ours", method), 0, tmp_path, tmp_path)
     parser = config.pipeline.datamanager.dataparser
     assert parser.load_3D_points and parser.downscale_factor == 1  # nerfstudio's default reads no points
 
     from nerfstudio.configs.method_configs import all_methods
 
-    method: Any = all_methods["splatfacto"]
-    assert method.pipeline.datamanager.dataparser.downscale_factor is None, "the registry must not change"
+    registered: Any = all_methods[method]
+    again: Any = build_config(dataclasses.replace(scene, options={}), Row("ours", method), 0, tmp_path, tmp_path)
+    assert again.pipeline.datamanager.dataparser.downscale_factor is None, "the registry must not change"
+    assert registered.pipeline.datamanager.data is None
 
 
 @pytest.mark.usefixtures("nerfstudio")

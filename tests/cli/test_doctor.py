@@ -67,8 +67,14 @@ def test_it_runs_as_a_module_prints_versions_and_finds_nothing_wrong_with_a_good
     assert lines[0].startswith(f"python {sys.version.split()[0]}, sadgs_ns ")
     for package in ("torch", "gsplat", "nerfstudio"):
         assert f"{package} {version(package)}" in lines[0].split(", ")
-    assert lines[-1] == f"note: {tmp_path / 'scene'}: nothing to complain about."
-    assert all(re.fullmatch(r"(note|warning|error): .+\.", line) for line in lines[1:])
+    scene = tmp_path / "scene"
+    assert lines[-4:] == [
+        f"note: {scene}/sparse/0/points3D.bin has 20 points.",
+        f"note: {scene}/sparse/0/images.bin has 9 images of 32 × 24 px, PNG RGB, without masks.",
+        f"note: {scene}: nothing to complain about.",
+        f"Next: ns-train sadgs --data {scene}",
+    ]
+    assert all(re.fullmatch(r"(note|warning|error): .+\.", line) for line in lines[1:-1])
     assert result.returncode == int(any(line.startswith("error") for line in lines)), result.stdout + result.stderr
 
 

@@ -13,14 +13,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.dataparsers import blender_dataparser, nerfstudio_dataparser
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 from nerfstudio.data.utils import colmap_parsing_utils
+from nerfstudio.process_data.colmap_utils import create_ply_from_colmap
+from nerfstudio.utils.io import load_from_json
 from plyfile import PlyData, PlyElement
-from runs import nerfstudio_data
+from runs import blender_data, nerfstudio_data
 
 from sadgs_ns.data import ply
+from sadgs_ns.data.validation.parsers import refuse_bad_data
 from sadgs_ns.demo.scene import SPARSE_FOLDER
 from sadgs_ns.errors import InputError
 from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig
@@ -77,6 +81,73 @@ def test_colmap_s_points_are_nerfstudio_s_to_the_bit(
 def test_matches_of_points_are_left_to_nerfstudio(colmap: ColmapDataParserConfig, reads: list[Path]):
     datamanager = load(dataclasses.replace(colmap, max_2D_matches_per_3D_point=-1))
     assert len(reads) == 1 and "points3D_points2D_xy" in datamanager.train_dataset.metadata
+
+
+MARK = b"\xef\xbb\xbf"
+
+
+@pytest.mark.parametrize(("comments", "line_end"), [(True, b"\n"), (False, b"\r\n")])
+def test_colmap_s_text_after_a_byte_order_mark_is_read_as_without_one(
+    comments: bool, line_end: bytes, colmap: ColmapDataParserConfig, tmp_path: Path
+):
+    data = Path(shutil.copytree(colmap.data, tmp_path / "scene"))
+    folder = data / SPARSE_FOLDER
+    model = colmap_parsing_utils.read_model(str(folder), ".bin")
+    assert model is not None
+    for path in folder.iterdir():
+        path.unlink()
+    colmap_parsing_utils.write_model(*model, str(folder), ".txt")
+    parser = dataclasses.replace(colmap, data=data)
+    expected = load(parser).train_dataparser_outputs
+    for path in folder.iterdir():
+        lines = path.read_bytes().splitlines()
+        path.write_bytes(MARK + b"".join(line + line_end for line in lines if comments or not line.startswith(b"#")))
+    assert refuse_bad_data(SadgsDatamanagerConfig(dataparser=parser))
+    assert_equal_outputs(load(parser).train_dataparser_outputs, expected)
+
+
+@pytest.mark.parametrize("write", [nerfstudio_data, lambda folder: blender_data(folder, "white")])
+def test_json_after_a_byte_order_mark_is_read_as_without_one(
+    write: Callable[[Path], DataParserConfig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    parser = write(tmp_path)
+    expected = load(parser).train_dataparser_outputs
+    for path in tmp_path.glob("*.json"):
+        path.write_bytes(MARK + path.read_bytes())
+    assert refuse_bad_data(SadgsDatamanagerConfig(dataparser=parser))
+    datamanager = load(parser)
+    assert_equal_outputs(datamanager.train_dataparser_outputs, expected)
+    assert datamanager.dataparser.get_dataparser_outputs("val").image_filenames  # as `ns-render dataset` asks for it
+    for module in (nerfstudio_dataparser, blender_dataparser):
+        assert vars(module)["load_from_json"] is load_from_json  # for others' parsers
+
+
+def assert_equal_outputs(outputs: DataparserOutputs, expected: DataparserOutputs) -> None:
+    assert outputs.image_filenames == expected.image_filenames
+    assert torch.equal(outputs.cameras.camera_to_worlds, expected.cameras.camera_to_worlds)
+    assert torch.equal(outputs.cameras.fx, expected.cameras.fx)
+    for name in READ:
+        assert (name in outputs.metadata) == (name in expected.metadata)
+        assert name not in expected.metadata or torch.equal(outputs.metadata[name], expected.metadata[name])
+
+
+@pytest.mark.parametrize("transform", [None, [[1, 0, 0, 2], [0, 0, -1, 0], [0, 1, 0, 0.5]]])
+def test_colmap_s_points_of_an_old_ns_process_data_are_read_without_a_question(
+    transform: list | None, colmap: ColmapDataParserConfig, tmp_path: Path, reads: list[Path]
+):
+    parser = nerfstudio_data(tmp_path)
+    path = tmp_path / "transforms.json"
+    shutil.copytree(colmap.data / SPARSE_FOLDER, tmp_path / "colmap/sparse/0")
+    before = {**json.loads(path.read_text()), **({} if transform is None else {"applied_transform": transform})}
+    path.write_text(json.dumps(before))
+    metadata = load(parser).train_dataset.metadata  # a question would raise: pytest gives it no terminal
+    assert json.loads(path.read_text()) == before and reads == []
+    applied = torch.tensor(transform or [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]], dtype=torch.float32)
+    create_ply_from_colmap("p.ply", tmp_path / "colmap/sparse/0", tmp_path, applied)  # what it would do after a yes
+    path.write_text(json.dumps({**before, "applied_transform": applied.tolist(), "ply_file_path": "p.ply"}))
+    expected = load(parser).train_dataset.metadata
+    torch.testing.assert_close(metadata["points3D_xyz"], expected["points3D_xyz"], atol=3e-6, rtol=0)  # 6 digits
+    assert torch.equal(metadata["points3D_rgb"], expected["points3D_rgb"])
 
 
 POSITIONS = np.array([[0.0, 0.0, 1.0], [1.0, 0.5, 1.0], [-2.0, 0.25, 3.0]])

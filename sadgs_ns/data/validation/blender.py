@@ -37,8 +37,8 @@ def check_blender(data: Path, *, ply_path: Path | None = None, open_images: bool
             angle = f"camera_angle_x = {meta['camera_angle_x']:g}"
             raise InputError(f"{path} has {angle}, which is no angle of view in radians: correct it.")
         images = [data / (frame["file_path"].replace("./", "") + ".png") for frame in described]
-        size = image_size(images[0])  # that of all cameras
-        width, height = size if open_images and any(size) else (1, 1)  # for the rest any will do
+        size = image_size(images[0])  # The cameras have no size of their own.
+        width, height = size if open_images and any(size) else (1, 1)  # The other checks need none.
         focal = 0.5 * width / math.tan(0.5 * meta["camera_angle_x"])
         camera = Camera(width, height, focal, focal, width / 2, height / 2)
         views = [view_of(frame, f"{path}: frame {frame['file_path']}", camera) for frame in described]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -16,16 +17,21 @@ from sadgs_ns.data.validation.images import (
     MAX_AUTO_RESOLUTION,
     Frame,
     Rounding,
+    check_factor,
     check_images,
+    existing_factor,
     image_size,
+    images_in,
+    no_copies,
     scaled_size,
     smaller_folder,
 )
 from sadgs_ns.data.validation.layouts import COLMAP_FOLDERS, find_reconstruction, no_layout
-from sadgs_ns.errors import InputError
+from sadgs_ns.data.validation.splits import SPLITS, check_splits
+from sadgs_ns.errors import InputError, reason
 
 UNSUPPORTED_CAMERAS = {"FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}
-"""Those of COLMAP's camera models that nerfstudio cannot read."""
+"""COLMAP's camera models that nerfstudio cannot read."""
 
 
 @collect_findings
@@ -38,7 +44,7 @@ def check_colmap(
     downscale_factor: int | None = None,
     rounding: Rounding = "floor",
     load_points: bool = True,
-    training_images: Callable[[int], int] | None = lambda count: count - math.ceil(count / 8),
+    training_images: Callable[[Sequence[str]], int] = lambda names: len(names) - math.ceil(len(names) / 8),
     open_images: bool = True,
 ) -> Iterator[Finding]:
     """Check a COLMAP reconstruction, binary or text.
@@ -48,6 +54,7 @@ def check_colmap(
         images_path, colmap_path, masks_path, downscale_factor, rounding: As of nerfstudio's parser.
         load_points, training_images, open_images: As for `check_nerfstudio`.
     """
+    check_factor(downscale_factor)
     images_folder, model_folder = data / images_path, data / colmap_path
     kind = next((kind for kind in ("txt", "bin") if (model_folder / f"cameras.{kind}").is_file()), None)
     if kind is None:
@@ -71,7 +78,7 @@ def check_colmap(
         if camera_id not in cameras:
             raise InputError(f"{where} has camera {camera_id}, which {cameras_path} lacks: take both of one model.")
     used = {camera_id: cameras[camera_id] for _, camera_id, _ in poses}
-    for camera_id, camera in cameras.items():  # nerfstudio reads all of them, used or not
+    for camera_id, camera in cameras.items():  # nerfstudio reads unused ones, too.
         _check_camera(camera, f"{cameras_path}: camera {camera_id}")
     if len({"FISHEYE" in camera.model for camera in used.values()}) > 1:
         raise InputError(
@@ -81,16 +88,28 @@ def check_colmap(
     if not images_folder.is_dir():
         raise InputError(
             f"{poses_path} has poses of {len(poses)} images, but there is no folder {images_folder}: put them there, "
-            "or add `--images-path FOLDER` after `colmap`."
+            f"or end the command with `colmap --colmap-path {colmap_path} --images-path FOLDER`."
         )
-    training = training_images and training_images(len(poses))
-    if (listed := data / "train_list.txt").is_file():
-        training = len(listed.read_text(encoding="utf8").splitlines())
+    if lists := {split: _read_list(path) for split in SPLITS if (path := data / f"{split}_list.txt").is_file()}:
+        places = {images_folder / name for name, _, _ in poses}
+        yield from check_splits(
+            lists, lambda split: f"{data / split}_list.txt", lambda name: images_folder / name, places
+        )
+        training = len(set(lists["train"]))
+    else:
+        training = training_images([name for name, _, _ in poses])
     views = _views(poses, used, poses_path, cameras_path)
     yield from (of_views := list(check_views(views, training, poses_path)))
     if load_points:
         wrong = any(finding.severity == "error" for finding in of_views)
-        yield from _check_points(model_folder, [] if wrong else views)
+        random = f"end the command with `colmap --colmap-path {colmap_path} --load-3D-points False`"
+        yield from _check_points(model_folder, [] if wrong else views, f"{random} to start from random points")
+    if masks_path is None and images_in(data / "masks"):
+        yield Finding(
+            "warning",
+            f"{data / 'masks'} holds masks that are not used: end the command with "
+            f"`colmap --colmap-path {colmap_path} --masks-path masks` to leave out what is black in them.",
+        )
     if not open_images:
         return
     factor = downscale_factor
@@ -100,10 +119,15 @@ def check_colmap(
             factor *= 2
     smaller = smaller_folder(images_folder, factor)
     if not all((smaller / name).parent.exists() for name, _, _ in poses):
+        if downscale_factor is not None:
+            problem, remedy = no_copies(smaller, factor)
+        else:
+            problem = f"{images_folder} holds images of more than {MAX_AUTO_RESOLUTION} px and there is no {smaller}"
+            remedy = "add `--downscale-factor 1` after `colmap` to take them as they are"
+        if sys.stdin is None or not sys.stdin.isatty():
+            raise InputError(f"{problem}: {remedy}.")
         yield Finding(
-            "warning",
-            f"{images_folder} holds images of more than {MAX_AUTO_RESOLUTION} px and there is no {smaller}: nerfstudio "
-            f"will ask whether to make it with ffmpeg; say yes, or add `--downscale-factor 1` after `colmap`.",
+            "warning", f"{problem}: nerfstudio will ask whether to make it with ffmpeg; say yes, or {remedy}."
         )
         factor, smaller = 1, images_folder
     frames = []
@@ -114,6 +138,46 @@ def check_colmap(
             mask = (smaller_folder(data / masks_path, factor) / name).with_suffix(".png")
         frames.append(Frame(smaller / name, size, mask))
     yield from check_images(frames, poses_path, look_for_unused=factor == 1)
+
+
+def chosen_factor(data: Path, colmap_path: Path) -> int:
+    """Return the factor by which images are scaled down where no parser is named.
+
+    nerfstudio's parser of COLMAP's files asks a question at the terminal where copies that it wants do not exist. So
+    that it never has to, the images are taken at full resolution then, as they are beside a `transforms.json`.
+
+    Args:
+        data: The folder that holds the images.
+        colmap_path: Folder of the reconstruction, relative to it.
+
+    Raises:
+        InputError: As `colmap.read_poses`.
+    """
+    folder = data / colmap_path
+    kind = "txt" if (folder / "cameras.txt").is_file() else "bin"
+    names = [name for name, _, _ in colmap.read_poses(folder / f"images.{kind}")]
+    images = data / "images"
+    if not names:
+        return 1
+    return existing_factor(image_size(images / names[0]), lambda factor: smaller_folder(images, factor) / names[0])
+
+
+def _read_list(path: Path) -> list[str]:
+    """Return the names in a list of images.
+
+    Raises:
+        InputError: If the file cannot be read, is not UTF-8 or starts with a byte order mark.
+    """
+    try:
+        text = path.read_text("utf8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read as text in UTF-8 ({reason(error)}): correct or remove it.") from error
+    if text.startswith("\ufeff"):
+        raise InputError(
+            f"{path} starts with a byte order mark, which nerfstudio takes for a part of the first name: save it as "
+            "UTF-8 without one."
+        )
+    return text.splitlines()
 
 
 def _check_camera(camera: colmap.Camera, where: str) -> None:
@@ -137,7 +201,7 @@ def _check_camera(camera: colmap.Camera, where: str) -> None:
 def _views(
     poses: Sequence[colmap.Pose], cameras: Mapping[int, colmap.Camera], poses_path: Path, cameras_path: Path
 ) -> list[View]:
-    """The poses and their cameras, as the checks of geometry take them."""
+    """Return the poses and their cameras, as the checks of geometry take them."""
     described = {camera_id: _describe(camera) for camera_id, camera in cameras.items()}
     quats = np.array([pose[[1, 2, 3, 0]] for _, _, pose in poses])  # xyzw [V, 4]
     rotations = Rotation.from_quat(quats).as_matrix()  # [V, 3, 3]
@@ -154,7 +218,7 @@ def _views(
 
 
 def _describe(camera: colmap.Camera) -> Camera:
-    """What COLMAP's parameters of a model that nerfstudio reads stand for."""
+    """Return what COLMAP's parameters of a model that nerfstudio reads stand for."""
     focals = _number_of_focals(camera.model)
     fx, fy, (cx, cy, *rest) = camera.params[0], camera.params[focals - 1], camera.params[focals:]
     tangential = rest[2:] if camera.model == "OPENCV" else ()
@@ -164,13 +228,17 @@ def _describe(camera: colmap.Camera) -> Camera:
 
 
 def _number_of_focals(model: str) -> int:
+    """Return how many focal lengths a camera model has, 1 or 2."""
     return 1 if model.startswith("SIMPLE") or "RADIAL" in model else 2
 
 
-def _check_points(model_folder: Path, views: Sequence[View]) -> Iterator[Finding]:
-    """Check the SfM points and, if there are views, how the points lie to them."""
+def _check_points(model_folder: Path, views: Sequence[View], random: str) -> Iterator[Finding]:
+    """Check the SfM points and, if there are views, how the points lie to them.
+
+    Args:
+        random: How to do without these points, as the end of a sentence.
+    """
     path = colmap.points_file(model_folder)
-    random = "add `--load-3D-points False` after `colmap` to start from random points"
     if path is None:
         yield Finding(
             "error", f"{model_folder} has no points3D.bin or .txt: copy the whole reconstruction, or {random}."
@@ -181,5 +249,5 @@ def _check_points(model_folder: Path, views: Sequence[View]) -> Iterator[Finding
         yield Finding("error", f"{path} has NaN or infinity in a point: run COLMAP's mapper again, or {random}.")
     if len(positions) == 0:
         yield Finding("error", f"{path} holds no SfM point: run COLMAP's mapper again, or {random}.")
-    elif views and np.isfinite(positions).all():
+    elif np.isfinite(positions).all():
         yield from check_points(positions, views, path)

@@ -10,7 +10,7 @@ from typing import Literal, ParamSpec
 
 import numpy as np
 
-from sadgs_ns.errors import InputError
+from sadgs_ns.errors import InputError, reason
 
 
 @dataclass(frozen=True)
@@ -20,24 +20,31 @@ class Finding:
     severity: Literal["error", "warning", "note"]
     """Whether training is refused, may disappoint, or just behaves in a way worth knowing."""
     sentence: str
-    """Names the file and the remedy."""
+    """A sentence that names the file and the remedy."""
 
 
 _Arguments = ParamSpec("_Arguments")
 
 
 def collect_findings(check: Callable[_Arguments, Iterator[Finding]]) -> Callable[_Arguments, list[Finding]]:
-    """Make a list of a check's findings; where the check gives up with an InputError, that is the only finding."""
+    """Make a list of a check's findings; where the check gives up with an error, that is the only finding."""
 
     @functools.wraps(check)
     def findings(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> list[Finding]:
         try:
-            with np.errstate(over="ignore", invalid="ignore"):  # numbers that are nearly infinite
+            with np.errstate(over="ignore", invalid="ignore"):  # Some numbers are nearly infinite.
                 return list(check(*args, **kwargs))
         except InputError as error:
             return [Finding("error", str(error))]
+        except OSError as error:
+            return [Finding("error", unreadable(error))]
 
     return findings
+
+
+def unreadable(error: OSError) -> str:
+    """Return the sentence for a folder that may not be entered, or a name that is too long to be one."""
+    return f"{error.filename} cannot be read ({reason(error)}): correct its name or rights."
 
 
 def refuse(findings: Sequence[Finding], data: Path) -> None:

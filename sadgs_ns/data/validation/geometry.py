@@ -1,4 +1,4 @@
-"""Checks of numbers that all layouts share: cameras, poses and points, with medians and quantiles rather than means."""
+"""Checks of cameras, poses and points, which all layouts share, with medians and quantiles rather than means."""
 
 from __future__ import annotations
 
@@ -19,52 +19,61 @@ from sadgs_ns.outliers import CAMERA_SHARE, POINT_SHARE, REACH, far_outliers
 _FLOAT32_STEP = 2.0**-23
 """Distance of a float32 to the next one, relative to its size; nerfstudio centres poses in float32."""
 _FEWEST_STEPS = 1_000
-"""Steps of float32 within the cameras' spread under which their positions are too coarse to train with."""
+"""Least number of steps of float32 within the cameras' spread; with fewer, their positions are too coarse."""
+_WIDEST, _NARROW, _NARROWEST = 170.0, 0.5, 0.01
+"""Angles of view in degrees: lenses without fisheye stay below the first; under the last no pixel shows any depth."""
 _FARTHEST_CENTER = 10
-"""Image sizes; a principal point this far from the middle of its image is a mistake, and no crop's."""
+"""Distance in image sizes at which a principal point is a mistake, and not due to a crop."""
+UNDISTORTED_FISHEYE = (
+    "is a fisheye with all distortion coefficients 0, and nerfstudio undistorts no such image: undistort the images "
+    "yourself, or give one coefficient a tiny value (k1 = 1e-9)."
+)
+"""The rest of a sentence about such a camera."""
 _STRONGEST_DISTORTION = 2.0
 """Quotient of a pixel's distorted and undistorted radius from which on OpenCV's undistortion does not converge."""
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics, as all layouts give them."""
+    """Intrinsics of a camera, as all layouts give them."""
 
     width: int
-    """px."""
+    """Width of the image in px."""
     height: int
-    """px."""
+    """Height of the image in px."""
     fx: float
-    """px."""
+    """Horizontal focal length in px."""
     fy: float
-    """px."""
+    """Vertical focal length in px."""
     cx: float
-    """px from the left edge."""
+    """Distance of the principal point from the left edge in px."""
     cy: float
-    """px from the upper edge."""
+    """Distance of the principal point from the upper edge in px."""
     radial: tuple[float, ...] = ()
-    """k1, k2, …; OpenCV's polynomial of the radius, or of the angle for a fisheye."""
+    """Coefficients k1, k2, … of OpenCV's polynomial of the radius, or of the angle for a fisheye."""
     tangential: tuple[float, ...] = ()
-    """p1, p2 as OpenCV defines them."""
+    """Coefficients p1, p2 as OpenCV defines them."""
     fisheye: bool = False
+    """Whether the lens is a fisheye."""
 
 
 class View(NamedTuple):
-    """A camera somewhere."""
+    """A camera at its place."""
 
     where: str
     """The start of a sentence about its pose: file and image."""
     where_camera: str
     """The start of a sentence about its camera."""
     rotation: NDArray[np.float64]
-    """World to camera, in OpenCV's axes. [3, 3]"""
+    """Rotation from world to camera, in OpenCV's axes. [3, 3]"""
     centre: NDArray[np.float64]
-    """World units. [3]"""
+    """Position of the camera in world units. [3]"""
     camera: Camera
+    """Intrinsics of the camera."""
 
 
 def check_positive(values: Mapping[str, Any], where: str, names: Sequence[str]) -> None:
-    """See whether values are there and finite, widths and heights whole, and all but the principal point positive.
+    """Check that values are there and finite, widths and heights whole, and all but the principal point positive.
 
     Args:
         values: Any JSON values.
@@ -85,7 +94,7 @@ def check_positive(values: Mapping[str, Any], where: str, names: Sequence[str]) 
 
 
 def finite(value: Any, name: str, where: str) -> float:
-    """A JSON value that is a finite number.
+    """Return a JSON value that is a finite number.
 
     Raises:
         InputError: If it is not.
@@ -93,38 +102,37 @@ def finite(value: Any, name: str, where: str) -> float:
     try:
         if not isinstance(value, bool) and isinstance(value, int | float) and math.isfinite(value):
             return value
-    except OverflowError:  # an integer beyond float64
+    except OverflowError:  # It is an integer beyond float64.
         value = "a number beyond all bounds"
     raise InputError(f"{where} has {name} = {value!r}, which is no finite number: correct it.")
 
 
-def check_views(views: Sequence[View], training: int | None, source: Path) -> Iterator[Finding]:
+def check_views(views: Sequence[View], training: int, source: Path) -> Iterator[Finding]:
     """Check number, cameras, rotations and positions of the views.
 
     Args:
         views: All of them.
-        training: How many are trained on, where that is known.
+        training: How many are trained on.
         source: The file that they are from.
     """
     yield from _check_number(len(views), training, source)
     yield from check_rotations(views)
     yield from _check_centres(views, source)
-    for camera, where in {view.camera: view.where_camera for view in reversed(views)}.items():  # the first view of each
+    first = {view.camera: view.where_camera for view in reversed(views)}  # Of views with one camera the first is named.
+    for camera, where in first.items():
         yield from _check_camera(camera, where)
 
 
-def _check_number(views: int, training: int | None, source: Path) -> Iterator[Finding]:
+def _check_number(views: int, training: int, source: Path) -> Iterator[Finding]:
     if views < 2:
         yield Finding("error", f"{source} has 1 view, which shows no depth: take at least 2 images, better 20 or more.")
     elif training == 0:
-        yield Finding("error", f"{source} leaves no view for training: name some in its list of training images.")
-    elif training is not None and training < 3:
+        yield Finding("error", f"{source} leaves no view for training: hold out fewer images.")
+    elif training < 3:
         yield Finding(
             "warning",
             f"{source} leaves {training} training view{'s' * (training > 1)}: so few fix no shape; take 20 or more.",
         )
-    elif training == views and views < 10:
-        yield Finding("note", f"{source} has {views} views, none of them held out: `ns-eval` cannot measure any.")
 
 
 def check_rotations(views: Sequence[View]) -> Iterator[Finding]:
@@ -170,26 +178,30 @@ def _check_centres(views: Sequence[View], source: Path) -> Iterator[Finding]:
 
 def _check_camera(camera: Camera, where: str) -> Iterator[Finding]:
     width, height = camera.width, camera.height
-    off = max(abs(camera.cx / width - 0.5), abs(camera.cy / height - 0.5))  # image sizes from its middle
+    off = max(abs(camera.cx / width - 0.5), abs(camera.cy / height - 0.5))  # In image sizes from the middle.
     if off > 0.5:
         center = f"its principal point at ({camera.cx:g}, {camera.cy:g}) px, outside its image of {width} × {height} px"
         yield Finding(
             "error" if off > _FARTHEST_CENTER else "warning", f"{where} has {center}: correct cx and cy, in pixels."
         )
+    half_width, half_height = width / 2 / camera.fx, height / 2 / camera.fy
+    angle = 2 * math.degrees(math.atan(max(half_width, half_height)))
+    if not camera.fisheye and not _NARROW <= angle <= _WIDEST:
+        focal = f"the focal length {camera.fx:g} px, with which {width} × {height} px span an angle of {angle:.2g}°"
+        likely = _NARROWEST <= angle <= _WIDEST
+        yield Finding("warning" if likely else "error", f"{where} has {focal}: correct it, in pixels.")
+    if not 0.5 <= camera.fx / camera.fy <= 2:
+        focals = f"the focal lengths {camera.fx:g} and {camera.fy:g} px, which differ as no lens's do"
+        yield Finding("warning", f"{where} has {focals}: correct them, in pixels.")
     if any(abs(value) > 0.5 for value in camera.tangential):
         coefficients = ", ".join(f"{value:g}" for value in camera.tangential)
         yield Finding("error", f"{where} has p1, p2 = {coefficients}, which no lens has: calibrate the camera again.")
     if not any(camera.radial):
         if camera.fisheye and camera.radial:
-            yield Finding(
-                "error",
-                f"{where} is a fisheye with all distortion coefficients 0, and nerfstudio undistorts no such image: "
-                "undistort the images yourself, or give one coefficient a tiny value (k1 = 1e-9).",
-            )
+            yield Finding("error", f"{where} {UNDISTORTED_FISHEYE}")
         return
     coefficients = ", ".join(f"{value:g}" for value in camera.radial)
     told = f"{where} has the radial distortion {coefficients}, which cannot be undone"
-    half_width, half_height = width / 2 / camera.fx, height / 2 / camera.fy
     if not _can_be_undone(camera, min(half_width, half_height)):
         yield Finding("error", f"{told}: calibrate the camera again, or undistort the images yourself.")
     elif not camera.fisheye and not _can_be_undone(camera, math.hypot(half_width, half_height)):
@@ -197,13 +209,15 @@ def _check_camera(camera: Camera, where: str) -> Iterator[Finding]:
 
 
 def _can_be_undone(camera: Camera, radius: float) -> bool:
-    """Whether pixels up to a distorted radius, in focal lengths from the middle, each have one place that they show."""
-    undistorted = np.linspace(0, np.pi if camera.fisheye else 4 * radius, 2049)  # radii, or angles of a fisheye
-    with np.errstate(all="ignore"):  # large coefficients overflow
+    """Return whether pixels up to a distorted radius, in focal lengths from the middle, each show one place alone."""
+    undistorted = np.linspace(
+        0, np.pi if camera.fisheye else 4 * radius, 2049
+    )  # These are radii, or angles of a fisheye.
+    with np.errstate(all="ignore"):  # Large coefficients overflow.
         factor = np.polyval([*reversed(camera.radial), 1.0], undistorted**2)
         distorted = undistorted * factor
         falls = ~(np.diff(distorted) > 0)
-    end = int(falls.argmax()) if falls.any() else len(falls)  # so far it rises
+    end = int(falls.argmax()) if falls.any() else len(falls)  # Up to here it rises.
     if not distorted[end] >= radius:
         return False
     strength = factor[: end + 1][distorted[: end + 1] >= radius][0]
@@ -220,20 +234,23 @@ def check_ply(path: Path, views: Sequence[View], remedy: str) -> Iterator[Findin
         problem = "is empty" if len(positions) == 0 else None
         if not np.isfinite(positions).all():
             problem = "has NaN or infinity in a point"
-        elif problem is None and views:
+        elif problem is None:
             yield from check_points(positions, views, path)
     if problem is not None:
         yield Finding("error", f"{path} should hold the SfM points but {problem}: {remedy}.")
 
 
 def check_points(positions: NDArray[np.floating], views: Sequence[View], path: Path) -> Iterator[Finding]:
-    """Check SfM points against the views that should show them.
+    """Count SfM points, and check them against the views that should show them.
 
     Args:
         positions: Finite, in the world of the views. [P, 3]
-        views: All of them.
+        views: All of them, or none if they are not to be relied on.
         path: The points' file.
     """
+    yield Finding("note", f"{path} has {len(positions):,} points.")
+    if not views or len(positions) == 0:
+        return
     positions = positions.astype(np.float64)
     far = far_outliers(positions, POINT_SHARE)
     if far.any():
@@ -263,9 +280,9 @@ def check_points(positions: NDArray[np.floating], views: Sequence[View], path: P
 
 
 def _share_of_views_with_points(positions: NDArray[np.float64], views: Sequence[View]) -> float:
-    """Which part of the views has any of the points before it, on its image or not far beside it, in [0, 1].
+    """Return which part of the views, in [0, 1], has any of the points [P, 3] on its image or not far beside it.
 
-    Looks at a part of many views and of many points, evenly through them.
+    Of many views and of many points a part is looked at, evenly through them.
     """
     positions = positions[:: len(positions) // 10_000 + 1]  # [P, 3]
     views = views[:: len(views) // 50 + 1]
@@ -274,7 +291,7 @@ def _share_of_views_with_points(positions: NDArray[np.float64], views: Sequence[
         x, y, z = view.rotation @ (positions - view.centre).T  # [P] each
         visible = z > 0
         if not view.camera.fisheye:
-            camera = view.camera  # lenses and principal points move what is seen by less than half an image
+            camera = view.camera  # A lens or a principal point moves what is seen by less than half an image.
             visible &= np.abs(x * camera.fx + (camera.cx - camera.width / 2) * z) < camera.width * z
             visible &= np.abs(y * camera.fy + (camera.cy - camera.height / 2) * z) < camera.height * z
         seeing += bool(visible.any())
@@ -282,15 +299,15 @@ def _share_of_views_with_points(positions: NDArray[np.float64], views: Sequence[
 
 
 def _distances(centres: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances of centres [V, 3] from their median. [V]"""
+    """Return the distances of centres [V, 3] from their median. [V]"""
     return np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
 
 
 def _spread(centres: NDArray[np.float64]) -> float:
-    """How far from their median most of the centres [V, 3] lie; one of them, at least, does not count."""
+    """Return how far from their median most of the centres [V, 3] lie; one of them, at least, does not count."""
     return float(np.quantile(_distances(centres), CAMERA_SHARE, method="lower"))
 
 
 def _and_more(where: str, which: NDArray[np.bool_]) -> str:
-    """The first of the views that something is so of, and how many others there are."""
+    """Return the start of a sentence on the views that are marked: the first of them, and how many others there are."""
     return f"{where} (and {which.sum() - 1} more)" if which.sum() > 1 else where

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from collections.abc import Iterator, Sequence
+import os
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from sadgs_ns.data.validation.findings import Finding
-from sadgs_ns.errors import reason
+from sadgs_ns.errors import InputError, reason
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"}
 MAX_AUTO_RESOLUTION = 1600
-"""Longest side in px; nerfstudio looks for smaller copies of images that are larger."""
+"""Longest side in px up to which nerfstudio looks for no smaller copies of images."""
+MASK_MODES = ("L", "1", "I;16", "I")
+"""Pillow's modes that masks may have; nerfstudio trains on every pixel that is not 0."""
 Rounding = Literal["floor", "round", "ceil"]
 Size = tuple[int, int]
 """Width and height in px."""
@@ -29,9 +32,11 @@ class Frame:
     """An image with what its camera says."""
 
     image: Path
+    """File of the image."""
     size: Size | None
-    """What the camera says, or None where nothing but the image tells."""
+    """Size that the camera has, or None where nothing but the image tells."""
     mask: Path | None = None
+    """File of the mask, if there is one."""
 
 
 @dataclass(frozen=True)
@@ -39,84 +44,154 @@ class _Image:
     """What is known of an image file."""
 
     size: Size = (0, 0)
-    """Zeros where it is unknown."""
+    """Width and height in px, zeros where they are unknown."""
     mode: str = ""
     """Pillow's name for the kind of pixels."""
+    format: str = ""
+    """Pillow's name for the format of the file."""
     problem: str = ""
     """The rest of a sentence that starts with the file; empty for a good image."""
 
 
 def image_size(path: Path) -> Size:
-    """Width and height in px, zeros where they cannot be read."""
+    """Return width and height in px, zeros where they cannot be read."""
     return _inspect(path).size
 
 
 def scaled_size(size: Size, factor: int, rounding: Rounding) -> Size:
-    """A camera's width and height after nerfstudio scaled them down, in its float32."""
+    """Return a camera's width and height after nerfstudio scaled them down, in its float32."""
     width, height = (float(np.float32(side) * np.float32(1.0 / factor)) for side in size)
     to_int = {"floor": math.floor, "round": lambda value: math.floor(value + 0.5), "ceil": math.ceil}[rounding]
     return to_int(width), to_int(height)
 
 
 def smaller_folder(folder: Path, factor: int) -> Path:
-    """The folder in which nerfstudio keeps copies of a folder's images that are smaller by a factor."""
+    """Return the folder in which nerfstudio keeps copies of a folder's images that are smaller by a factor."""
     return folder.with_name(f"{folder.name}_{factor}") if factor > 1 else folder
 
 
+def check_factor(downscale_factor: int | None) -> None:
+    """Check whether a factor can make images smaller.
+
+    Raises:
+        InputError: If it is less than 1.
+    """
+    if downscale_factor is not None and downscale_factor < 1:
+        raise InputError(f"downscale-factor must be at least 1, got {downscale_factor}.")
+
+
+def no_copies(folder: Path, factor: int) -> tuple[str, str]:
+    """Return what is wrong and what helps where `--downscale-factor` asks for smaller copies that are not there."""
+    return (
+        f"{folder} does not exist, which should hold the images scaled down by `--downscale-factor {factor}`",
+        f"leave that option out, and put `--pipeline.datamanager.camera-res-scale-factor {1 / factor:.4g}` before the "
+        "parser's name",
+    )
+
+
+def existing_factor(size: Size, copy_of: Callable[[int], Path]) -> int:
+    """Return the factor by which images are scaled down where the user names none.
+
+    nerfstudio's parser of `transforms.json` chooses it in the same way.
+
+    Args:
+        size: That of an image at full resolution.
+        copy_of: Where that image's copy would lie that is smaller by a factor.
+
+    Returns:
+        The smallest power of 2 that makes the image's sides 1600 px or less, or a smaller one if copies by that factor
+        do not exist; 1 if there are no copies.
+    """
+    factor = 1
+    while max(size) / factor > MAX_AUTO_RESOLUTION and copy_of(2 * factor).exists():
+        factor *= 2
+    return factor
+
+
 def check_images(frames: Sequence[Frame], source: Path, look_for_unused: bool = False) -> Iterator[Finding]:
-    """Check the frames' images and masks.
+    """Check the frames' images and masks, and say in a note what they are.
+
+    Images are decoded until one shows something, and masks until one leaves a pixel to train on.
 
     Args:
         frames: All frames.
         source: The file that the frames' sizes are from.
         look_for_unused: Whether to warn of images beside the frames' that no frame uses.
     """
-    for sentence in image_problems(frames, source):
-        yield Finding("error", sentence)
-    if look_for_unused and (unused := unused_images(frames, source)) is not None:
-        yield Finding("warning", unused)
-
-
-def image_problems(frames: Sequence[Frame], source: Path) -> Iterator[str]:
-    """A sentence for each kind of problem with images and masks, naming the first that has it.
-
-    Args:
-        source: The file that the frames' sizes are from.
-    """
-
-    def problem(frame: Frame) -> tuple[str, Path, str] | None:
-        """Kind, file and the rest of the sentence."""
-        image = _inspect(frame.image)
-        if image.problem:
-            return image.problem.split(" (")[0], frame.image, image.problem
-        if image.mode not in ("RGB", "RGBA", "L"):
-            return "mode", frame.image, f"has pixels of Pillow's mode {image.mode}: convert it to 8-bit RGB"
-        if frame.size not in (None, image.size):
-            sizes = "{} × {} px, but its camera in {} {} × {}".format(*image.size, source, *frame.size)
-            return "size", frame.image, f"has {sizes}: use the images that the poses were computed from"
-        if frame.mask is not None:
-            mask = _inspect(frame.mask)
-            if mask.problem:
-                return mask.problem.split(" (")[0], frame.mask, mask.problem
-            if mask.size != image.size:
-                return "mask", frame.mask, f"is a mask of another size than {frame.image}: resize it"
-        return None
-
-    problems: dict[str, list[tuple[Path, str]]] = defaultdict(list)
     with ThreadPoolExecutor() as pool:
-        for found in pool.map(problem, frames):
-            if found is not None:
-                problems[found[0]].append(found[1:])
+        images = list(pool.map(_inspect, (frame.image for frame in frames)))
+        masks = list(pool.map(lambda frame: frame.mask and _inspect(frame.mask), frames))
+    problems: dict[str, list[tuple[Path, str]]] = defaultdict(list)
+    for found in map(_problem, frames, images, masks, [source] * len(frames)):
+        if found is not None:
+            problems[found[0]].append(found[1:])
     for same in problems.values():
         path, text = same[0]
-        yield f"{_and_more(path, len(same))} {text}."
+        yield Finding("error", f"{_and_more(path, len(same))} {text}.")
+    if not problems and all(_is_of_one_colour(frame.image) for frame in frames):
+        yield Finding(
+            "error",
+            f"{source} has {len(frames)} images that show a single colour and nothing else, such as {frames[0].image}: "
+            "export them again.",
+        )
+    if not problems and all(frame.mask is not None and _is_black(frame.mask) for frame in frames):
+        yield Finding(
+            "error",
+            f"{source} has {len(frames)} masks that are all black, such as {frames[0].mask}, which leaves no pixel to "
+            "train on: make white what is to be trained on.",
+        )
+    if look_for_unused and (unused := unused_images(frames, source)) is not None:
+        yield Finding("warning", unused)
+    if not problems:
+        yield Finding("note", _describe(source, images, masks))
+
+
+def _problem(frame: Frame, image: _Image, mask: _Image | None, source: Path) -> tuple[str, Path, str] | None:
+    """Return what is wrong with a frame's files, if anything is: its kind, the file and the rest of the sentence."""
+    if image.problem:
+        return image.problem.split(" (")[0], frame.image, image.problem
+    if image.mode not in ("RGB", "RGBA", "L"):
+        return "mode", frame.image, f"has pixels of Pillow's mode {image.mode}: convert it to 8-bit RGB"
+    if min(image.size) < 2:
+        return "small", frame.image, "has {} × {} px: leave it out of the reconstruction".format(*image.size)
+    if frame.size not in (None, image.size):
+        sizes = "{} × {} px, but its camera in {} {} × {}".format(*image.size, source, *frame.size)
+        return "size", frame.image, f"has {sizes}: use the images that the poses were computed from"
+    if frame.mask is None or mask is None:
+        return None
+    if mask.problem:
+        return mask.problem.split(" (")[0], frame.mask, mask.problem
+    if mask.mode not in MASK_MODES:
+        return "mask mode", frame.mask, f"is a mask of Pillow's mode {mask.mode}: convert it to 8-bit grey"
+    if mask.size != image.size:
+        return "mask", frame.mask, f"is a mask of another size than {frame.image}: resize it"
+    return None
+
+
+def _describe(source: Path, images: Sequence[_Image], masks: Sequence[_Image | None]) -> str:
+    """Return a sentence on number, size and kind of good images, and on the number of masks."""
+    sizes = Counter(image.size for image in images)
+    kinds = Counter(f"{image.format} {image.mode}" for image in images)
+    (width, height), _ = sizes.most_common(1)[0]
+    of_size = f"{width} × {height} px" + (" and other sizes" if len(sizes) > 1 else "")
+    of_kind = ", ".join(f"{kind} ({count})" if len(kinds) > 1 else kind for kind, count in kinds.most_common())
+    masked = sum(mask is not None for mask in masks)
+    with_masks = f", with {masked} masks" if masked else ", without masks"
+    text = f"{source} has {len(images)} images of {of_size}, {of_kind}{with_masks}."
+    if max(max(size) for size in sizes) > MAX_AUTO_RESOLUTION:
+        text += (
+            f" Images of more than {MAX_AUTO_RESOLUTION} px take long: "
+            "`--pipeline.datamanager.camera-res-scale-factor 0.5` trains at half their resolution."
+        )
+    return text
 
 
 def unused_images(frames: Sequence[Frame], source: Path) -> str | None:
-    """A sentence on images beside the frames' that have no pose in the source; None if there are none."""
-    used = {path.resolve() for frame in frames for path in (frame.image, frame.mask) if path is not None}
+    """Return a sentence on images beside the frames' that have no pose in the source; None if there are none."""
+    # Unlike Path.resolve, realpath does not raise where links form a loop.
+    used = {os.path.realpath(path) for frame in frames for path in (frame.image, frame.mask) if path is not None}
     folders = sorted({frame.image.parent for frame in frames})
-    unused = [path for folder in folders for path in images_in(folder) if path.resolve() not in used]
+    unused = [path for folder in folders for path in images_in(folder) if os.path.realpath(path) not in used]
     if not unused:
         return None
     return (
@@ -125,14 +200,14 @@ def unused_images(frames: Sequence[Frame], source: Path) -> str | None:
 
 
 def images_in(folder: Path) -> list[Path]:
-    """The images right in a folder, sorted; none where there is no folder."""
+    """Return the images right in a folder, sorted; none where there is no folder."""
     if not folder.is_dir():
         return []
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
 
 
 def _and_more(path: Path, count: int) -> str:
-    """The first of some paths, and how many others there are."""
+    """Return the start of a sentence on some paths: the first of them, and how many others there are."""
     return f"{path} (and {count - 1} more)" if count > 1 else f"{path}"
 
 
@@ -143,7 +218,7 @@ def _inspect(path: Path) -> _Image:
         if path.stat().st_size == 0:
             return _Image(problem=f"has 0 bytes: {again}")
         with Image.open(path) as image:
-            size, mode = image.size, image.mode
+            size, mode, kind = image.size, image.mode, image.format or ""
             whole = _ends_well(path, image)
         if not whole:
             with Image.open(path) as image:
@@ -152,21 +227,45 @@ def _inspect(path: Path) -> _Image:
         return _Image(problem="does not exist: put it there, or leave it out of the reconstruction")
     except UnidentifiedImageError:
         return _Image(problem=f"is no image that Pillow knows: {again}")
-    except Exception as error:  # decoders raise whatever they stumble over: OSError, SyntaxError, struct.error, …
+    except Exception as error:  # Decoders raise OSError, SyntaxError, struct.error, …
         return _Image(problem=f"cannot be read as an image ({reason(error)}): {again}")
-    return _Image(size, mode)
+    return _Image(size, mode, kind)
 
 
 def _ends_well(path: Path, image: Image.Image) -> bool:
-    """Whether an image that opened is surely whole, found without decoding it; if not, decoding it tells."""
+    """Return whether an image that opened is surely whole, without decoding it; if not, decoding it tells."""
     if image.format == "JPEG":
         with path.open("rb") as file:
             file.seek(-2, 2)
             return file.read() == b"\xff\xd9"
     if image.format == "PNG":
         try:
-            image.verify()  # its checksums
-        except Exception:  # as above; a file without its last bytes fails here and decodes well
+            image.verify()  # This reads its checksums.
+        except Exception:  # It raises anything, also for a file that lacks its last bytes alone, which decodes well.
             return False
         return True
     return False
+
+
+def _is_of_one_colour(path: Path) -> bool:
+    """Return whether all pixels of an image that can be seen have one colour.
+
+    The image is decoded for that, a JPEG at an eighth of its size.
+    """
+    try:
+        with Image.open(path) as image:
+            image.draft(None, (image.width // 8, image.height // 8))
+            seen = image.convert("RGBa") if image.mode == "RGBA" else image  # What is transparent becomes black.
+            extrema: Any = seen.getextrema()
+    except Exception:  # What a decoder stumbles over is no single colour; nerfstudio's reader may yet read it.
+        return False
+    return all(low == high for low, high in (extrema if isinstance(extrema[0], tuple) else [extrema]))
+
+
+def _is_black(path: Path) -> bool:
+    """Return whether a mask, which is decoded for that, is 0 everywhere."""
+    try:
+        with Image.open(path) as image:
+            return image.getextrema() == (0, 0)
+    except Exception:  # As for an image.
+        return False

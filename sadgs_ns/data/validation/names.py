@@ -40,7 +40,7 @@ def check_paths(paths: Sequence[Path]) -> None:
         InputError: Names the first such path.
     """
     if not paths or len({path.is_absolute() for path in paths}) > 1:
-        return  # absolute and relative paths have no folder in common
+        return  # Absolute and relative paths have no folder in common.
     shared = commonpath(paths)
     for path in paths:
         if ".." in path.relative_to(shared).parts:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Sequence
+from pathlib import Path, PurePosixPath
 
-import numpy as np
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
@@ -15,9 +13,11 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.data.utils import dataparsers_utils as splits
 
 from sadgs_ns.data import validation
+from sadgs_ns.data.automatic import choose_parser
+from sadgs_ns.errors import InputError
 
 _checked: list[tuple[FullImageDatamanagerConfig, list[validation.Finding]]] = []
-"""At most one: settings whose data were just found good, and the findings that do not stop training."""
+"""Settings whose data were just found good, at most one, with the findings that do not stop training."""
 
 
 def check_ahead(config: FullImageDatamanagerConfig) -> None:
@@ -27,11 +27,16 @@ def check_ahead(config: FullImageDatamanagerConfig) -> None:
         InputError: As `refuse_bad_data`.
     """
     _checked.clear()
-    _checked.append((copy.deepcopy(config), refuse_bad_data(config)))
+    findings = refuse_bad_data(config)
+    _checked.append((copy.deepcopy(config), findings))
 
 
 def findings_of(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[validation.Finding]:
-    """The findings of `check_ahead`, once, if it checked these settings, or else those of a check now."""
+    """Return the findings of `check_ahead`, once, if it checked these settings, or else those of a check now.
+
+    Raises:
+        InputError: As `refuse_bad_data`.
+    """
     while _checked:
         settings, findings = _checked.pop()
         if settings == config:
@@ -40,7 +45,13 @@ def findings_of(config: FullImageDatamanagerConfig, open_images: bool = True) ->
 
 
 def refuse_bad_data(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[validation.Finding]:
-    """Check the data before nerfstudio parses them; parsers other than its three common ones are not checked.
+    """Choose the parser where none was named, and check the data before nerfstudio parses them.
+
+    Parsers other than nerfstudio's three common ones are not checked.
+
+    Args:
+        config: Its parser is replaced where it is the automatic one.
+        open_images: Whether to look into the images, too.
 
     Returns:
         Findings that do not stop training.
@@ -48,6 +59,7 @@ def refuse_bad_data(config: FullImageDatamanagerConfig, open_images: bool = True
     Raises:
         InputError: With the first finding that does.
     """
+    choose_parser(config)
     parser = config.dataparser
     data = Path(config.data or parser.data)
     if isinstance(parser, ColmapDataParserConfig):
@@ -78,19 +90,24 @@ def refuse_bad_data(config: FullImageDatamanagerConfig, open_images: bool = True
     return findings
 
 
-def _training_images(parser: ColmapDataParserConfig | NerfstudioDataParserConfig) -> Callable[[int], int] | None:
-    """A function that says how many of so many views the parser trains on; None if that depends on their names."""
-    if parser.eval_mode == "filename":
-        return None
+def _training_images(parser: ColmapDataParserConfig | NerfstudioDataParserConfig) -> Callable[[Sequence[str]], int]:
+    """Return a function of all images' names that says how many of them the parser trains on."""
 
-    def count(views: int) -> int:
-        names: list[Any] = [None] * views
+    def count(names: Sequence[str]) -> int:
         if parser.eval_mode == "fraction":
-            chosen, _ = splits.get_train_eval_split_fraction(names, parser.train_split_fraction)
+            chosen, _ = splits.get_train_eval_split_fraction(list(names), parser.train_split_fraction)
         elif parser.eval_mode == "interval":
-            chosen, _ = splits.get_train_eval_split_interval(names, parser.eval_interval)
+            chosen, _ = splits.get_train_eval_split_interval(list(names), parser.eval_interval)
+        elif parser.eval_mode == "filename":
+            for name in names:
+                if not any(word in PurePosixPath(name).name for word in ("train", "eval")):
+                    raise InputError(
+                        f"{name} has neither train nor eval in its name, by which `--eval-mode filename` divides the "
+                        "images: rename them, or leave that option out."
+                    )
+            chosen, _ = splits.get_train_eval_split_filename(list(names))
         else:
-            chosen = np.arange(views)
+            return len(names)
         return len(chosen)
 
     return count

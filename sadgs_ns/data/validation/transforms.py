@@ -9,15 +9,35 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sadgs_ns.data import colmap
 from sadgs_ns.data.validation.findings import Finding, collect_findings
-from sadgs_ns.data.validation.geometry import Camera, View, check_ply, check_positive, check_views, finite
-from sadgs_ns.data.validation.images import MAX_AUTO_RESOLUTION, Frame, check_images, image_size, scaled_size
+from sadgs_ns.data.validation.geometry import (
+    UNDISTORTED_FISHEYE,
+    Camera,
+    View,
+    check_ply,
+    check_points,
+    check_positive,
+    check_views,
+    finite,
+)
+from sadgs_ns.data.validation.images import (
+    Frame,
+    check_factor,
+    check_images,
+    existing_factor,
+    image_size,
+    no_copies,
+    scaled_size,
+)
 from sadgs_ns.data.validation.layouts import COLMAP_FOLDERS, GIVE_POSES, find_reconstruction, no_layout
+from sadgs_ns.data.validation.splits import SPLITS, check_splits
 from sadgs_ns.errors import InputError, reason
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-"""nerfstudio's coefficients, in the order of its distortion_params."""
+"""Names of nerfstudio's coefficients, in the order of its distortion_params."""
 
 
 @collect_findings
@@ -26,7 +46,7 @@ def check_nerfstudio(
     *,
     downscale_factor: int | None = None,
     load_points: bool = True,
-    training_images: Callable[[int], int] | None = lambda count: math.ceil(0.9 * count),
+    training_images: Callable[[Sequence[str]], int] = lambda names: math.ceil(0.9 * len(names)),
     open_images: bool = True,
 ) -> Iterator[Finding]:
     """Check a `transforms.json`, as `ns-process-data` writes it.
@@ -35,7 +55,7 @@ def check_nerfstudio(
         data: The folder, or the file itself.
         downscale_factor: As of nerfstudio's parser: None chooses by size.
         load_points: Whether the SfM points will be read.
-        training_images: How many of so many views are trained on; None if that depends on names.
+        training_images: Says of the names of all images how many of them are trained on.
         open_images: Whether to look into the images, too.
     """
     path = data if data.suffix == ".json" else data / "transforms.json"
@@ -43,8 +63,8 @@ def check_nerfstudio(
     if not path.is_file():
         if (found := find_reconstruction(data)) is not None:
             raise InputError(
-                f"{path} does not exist, but {data / found} holds a COLMAP reconstruction: end the command with "
-                f"`colmap --colmap-path {found}`."
+                f"{path} does not exist, but {data / found} holds a COLMAP reconstruction: leave `nerfstudio-data` out "
+                "of the command."
             )
         raise InputError(no_layout(data) if data.suffix != ".json" else f"{path} does not exist: {GIVE_POSES}.")
     meta = read_json(path)
@@ -53,16 +73,19 @@ def check_nerfstudio(
     perspective = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FISHEYE624")
     if model not in perspective:
         raise InputError(f"{path} has the camera model {model!r}: give one of {', '.join(perspective)}.")
+    _check_transform(meta, path)
+    check_factor(downscale_factor)
     factor = downscale_factor
     if factor is None:
         factor = _smaller_copies(folder, Path(described[0]["file_path"])) if open_images else 1
+    if factor > 1 and not (folder / f"images_{factor}").is_dir():
+        raise InputError(": ".join(no_copies(folder / f"images_{factor}", factor)) + ".")
+    shared = _distortion_of(meta, path)
     frames, views = [], []
     for frame in described:
         image, values, where = Path(frame["file_path"]), {**frame, **meta}, f"{path}: frame {frame['file_path']}"
         check_positive(values, where, ("fl_x", "fl_y", "cx", "cy", "w", "h"))
-        views.append(
-            view_of(frame, where, _camera(values, _distortion_of(meta) or _distortion_of(frame), model, where))
-        )
+        views.append(view_of(frame, where, _camera(values, shared or _distortion_of(frame, where), model, where)))
         mask = frame.get("mask_path")
         frames.append(
             Frame(
@@ -71,12 +94,24 @@ def check_nerfstudio(
                 None if mask is None else folder / (f"masks_{factor}/{Path(mask).name}" if factor > 1 else mask),
             )
         )
-    masked = sum(frame.mask is not None for frame in frames)
-    if 0 < masked < len(frames):
-        raise InputError(f"{path} names masks for {masked} of {len(frames)} frames: give all of them one, or none.")
-    split = meta.get("train_filenames")
-    count = len(split) if isinstance(split, list) else training_images and training_images(len(frames))
-    yield from (of_views := list(check_views(views, count, path)))
+    for name, what in (("mask_path", "masks"), ("depth_file_path", "depths")):
+        if 0 < (having := sum(name in frame for frame in described)) < len(frames):
+            raise InputError(
+                f"{path} names {what} for {having} of {len(frames)} frames: give all of them one, or none."
+            )
+    if lists := {split: meta[f"{split}_filenames"] for split in SPLITS if f"{split}_filenames" in meta}:
+
+        def locate(name: str) -> Path:
+            return folder / (Path(name).name if factor > 1 else name)  # Smaller copies lie in one folder.
+
+        places = {locate(frame["file_path"]) for frame in described}
+        yield from check_splits(lists, lambda split: f"{path}: {split}_filenames", locate, places)
+        training = len(set(map(locate, lists["train"])))
+    else:
+        training = training_images([frame["file_path"] for frame in described])
+    yield from (of_views := list(check_views(views, training, path)))
+    if 3 <= training == len(frames) < 10:  # With more frames all are trained on only where that was asked for.
+        yield Finding("note", f"{path} has {training} views, none of them held out: `ns-eval` cannot measure any.")
     if open_images:
         yield from check_images(frames, path, look_for_unused=factor == 1)
     if load_points:
@@ -84,11 +119,48 @@ def check_nerfstudio(
         yield from _check_ply(meta, path, [] if wrong else views)
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def _check_transform(meta: dict[str, Any], path: Path) -> None:
+    """Check whether what nerfstudio does to all poses makes sense.
+
+    Raises:
+        InputError: If it does not.
+    """
     try:
-        meta = json.loads(path.read_text(encoding="utf8"))
+        applied = applied_transform(meta)
+    except (TypeError, ValueError, OverflowError):
+        applied = np.empty(0)
+    if applied.shape != (3, 4) or not np.isfinite(applied).all():
+        raise InputError(f"{path} has an applied_transform that is not 3 × 4 finite numbers: correct or remove it.")
+    if finite(meta.get("applied_scale", 1), "applied_scale", str(path)) <= 0:
+        raise InputError(f"{path} has applied_scale = {meta['applied_scale']}, which must be positive: correct it.")
+    if meta.get("fisheye_crop_radius") is not None:
+        finite(meta["fisheye_crop_radius"], "fisheye_crop_radius", str(path))
+    methods = ("pca", "up", "vertical", "none")
+    if (method := meta.get("orientation_override", "none")) not in methods:
+        raise InputError(f"{path} has orientation_override = {method!r}: give one of {', '.join(methods)}.")
+
+
+def applied_transform(meta: dict[str, Any]) -> NDArray[np.float64]:
+    """Return the map [3, 4] from the world of COLMAP's points to that of the poses.
+
+    Where the file says nothing, it is what ns-process-data did before it wrote so.
+    """
+    default = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
+    return np.array(meta.get("applied_transform", default), dtype=np.float64)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the object that a file holds in UTF-8, after a byte order mark or without one.
+
+    Raises:
+        InputError: If the file cannot be read, is not UTF-8 or JSON, or holds something else.
+    """
+    try:
+        meta = json.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise InputError(f"{path} does not exist: restore it, or {GIVE_POSES}.") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path} is not text in UTF-8: save it in that encoding.") from None
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path} is not readable JSON ({reason(error)}): restore it, or {GIVE_POSES}.") from error
     if not isinstance(meta, dict):
@@ -97,7 +169,11 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def frames_of(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
-    """The frames, each with a file path and a pose that can be used."""
+    """Return the frames, each with a file path and a pose that can be used.
+
+    Raises:
+        InputError: If there are none, or one of them has no such path or pose.
+    """
     frames = meta.get("frames")
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{path} lists no frames, so there is no image to train on: {GIVE_POSES}.")
@@ -113,29 +189,39 @@ def frames_of(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
             raise InputError(f"{where} has no pose of 4 × 4 numbers: give it a transform_matrix, or remove the frame.")
         if not np.isfinite(pose).all():
             raise InputError(f"{where} has NaN or infinity in its pose: remove the frame, or compute the poses again.")
-        if np.abs(pose[3, :3]).max() > 1e-6:
+        if np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
             raise InputError(f"{where} has a last row in its pose that is not 0 0 0 1: transpose it, or correct it.")
-        if not isinstance(frame.get("mask_path", ""), str):
-            raise InputError(f"{where} has a mask_path that is no string: correct or remove it.")
+        for name in ("file_path", "mask_path"):
+            if not isinstance(value := frame.get(name, ""), str) or "\0" in value:
+                raise InputError(f"{path}: frame {number} has a {name} that no file can have: correct or remove it.")
     return frames
 
 
 def view_of(frame: dict[str, Any], where: str, camera: Camera) -> View:
-    """A frame that `frames_of` found good, with its camera."""
+    """Return a frame that `frames_of` found good, with its camera, as the checks of geometry take it."""
     pose = np.array(frame["transform_matrix"], dtype=np.float64)
-    return View(where, where, (pose[:3, :3] * [1, -1, -1]).T, pose[:3, 3], camera)  # OpenGL's camera axes to OpenCV's
+    return View(where, where, (pose[:3, :3] * [1, -1, -1]).T, pose[:3, 3], camera)  # The axes become OpenCV's.
 
 
-def _distortion_of(values: dict[str, Any]) -> dict[str, Any]:
-    """The coefficients that a frame, or all of them, have by name; nerfstudio takes all from one of the two."""
-    listed = values.get("distortion_params")
-    if isinstance(listed, list):
-        return dict(zip(_DISTORTION, listed, strict=False))
-    return {name: values[name] for name in _DISTORTION if name in values}
+def _distortion_of(values: dict[str, Any], where: Path | str) -> dict[str, Any]:
+    """Return the coefficients that a frame, or all of them, have by name; nerfstudio takes all from one of the two.
+
+    Raises:
+        InputError: If they are listed, but not as nerfstudio reads them.
+    """
+    if "distortion_params" not in values:
+        return {name: values[name] for name in _DISTORTION if name in values}
+    listed = values["distortion_params"]
+    if not isinstance(listed, list) or len(listed) not in (6, 12):  # FISHEYE624 has 12.
+        names = ", ".join(_DISTORTION)
+        raise InputError(
+            f"{where} has distortion_params that are no list of 6 numbers ({names}): correct or remove them."
+        )
+    return dict(zip(_DISTORTION, listed, strict=False))
 
 
 def _camera(values: dict[str, Any], distortion: dict[str, Any], model: str, where: str) -> Camera:
-    """The camera that good values stand for.
+    """Return the camera that good values stand for.
 
     Raises:
         InputError: If a distortion coefficient is no number, or one that nerfstudio does not support.
@@ -144,7 +230,9 @@ def _camera(values: dict[str, Any], distortion: dict[str, Any], model: str, wher
     pinhole = (*size, values["fl_x"], values["fl_y"], values["cx"], values["cy"])
     k1, k2, k3, k4, p1, p2 = (finite(distortion.get(name, 0.0), name, where) for name in _DISTORTION)
     if model == "FISHEYE624":
-        return Camera(*pinhole, fisheye=True)  # its coefficients have a meaning of their own
+        if not any(distortion.values()):
+            raise InputError(f"{where} {UNDISTORTED_FISHEYE}")
+        return Camera(*pinhole, fisheye=True)  # Its coefficients mean something else.
     if model == "OPENCV_FISHEYE":
         return Camera(*pinhole, radial=(k1, k2, k3, k4), fisheye=True)
     if k4 != 0:
@@ -154,20 +242,17 @@ def _camera(values: dict[str, Any], distortion: dict[str, Any], model: str, wher
 
 def _check_ply(meta: dict[str, Any], path: Path, views: Sequence[View]) -> Iterator[Finding]:
     """Check the SfM points and, if there are views, how the points lie to them."""
-    name = meta.get("ply_file_path")
-    if name is None:
-        if (path.parent / COLMAP_FOLDERS[0]).exists():
-            yield Finding("warning", f"{path} has no ply_file_path: nerfstudio will ask whether to make one; say yes.")
-        else:
-            yield Finding("note", f"{path} has no ply_file_path: training will start from random points.")
-        return
-    remedy = f"restore it, or remove ply_file_path from {path} to start from random points"
-    yield from check_ply(path.parent / str(name), views, remedy)
+    if "ply_file_path" in meta:
+        remedy = f"restore it, or remove ply_file_path from {path} to start from random points"
+        yield from check_ply(path.parent / str(meta["ply_file_path"]), views, remedy)
+    elif (source := colmap.points_file(path.parent / COLMAP_FOLDERS[0])) is not None:
+        positions, transform = colmap.read_points(source)[0], applied_transform(meta)
+        positions = positions[np.isfinite(positions).all(axis=1)]
+        yield from check_points(positions @ transform[:, :3].T + transform[:, 3], views, source)
+    else:
+        yield Finding("note", f"{path} has no ply_file_path: training will start from random points.")
 
 
 def _smaller_copies(folder: Path, image: Path) -> int:
-    """The factor that nerfstudio's own parser chooses: it takes smaller copies only where they exist."""
-    factor, size = 1, image_size(folder / image)
-    while max(size) / factor > MAX_AUTO_RESOLUTION and (folder / f"images_{2 * factor}" / image.name).exists():
-        factor *= 2
-    return factor
+    """Return the factor that nerfstudio's own parser chooses: it takes smaller copies only where they exist."""
+    return existing_factor(image_size(folder / image), lambda factor: folder / f"images_{factor}" / image.name)

@@ -1,0 +1,234 @@
+"""The parser that is chosen where none is named: by what the folder holds, and for good in the run's config.yml."""
+
+from __future__ import annotations
+
+import copy
+import json
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tyro
+import yaml
+from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.utils.eval_utils import eval_setup
+from PIL import Image
+from runs import blender_data, configure, nerfstudio_data, train
+
+from sadgs_ns.data.automatic import AutomaticDataParserConfig, choose_parser
+from sadgs_ns.data.validation import check_data
+from sadgs_ns.data.validation.parsers import refuse_bad_data
+from sadgs_ns.demo.scene import SPARSE_FOLDER
+from sadgs_ns.errors import InputError
+from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
+
+
+def colmap_in(folder: str) -> Callable[[Path, Path], None]:
+    """Lay a drawn scene out with its reconstruction in a folder."""
+
+    def lay_out(scene: Path, data: Path) -> None:
+        shutil.copytree(scene / "images", data / "images")
+        shutil.copytree(scene / SPARSE_FOLDER, data / folder)
+
+    return lay_out
+
+
+def beside_a_reconstruction(scene: Path, data: Path) -> None:
+    nerfstudio_data(data)
+    shutil.copytree(scene / SPARSE_FOLDER, data / "colmap/sparse/0")
+
+
+LAYOUTS: dict[str, tuple[Callable[[Path, Path], Any], Callable[[Path], DataParserConfig]]] = {
+    **{
+        folder: (
+            colmap_in(folder),
+            lambda data, folder=folder: ColmapDataParserConfig(data=data, colmap_path=Path(folder), downscale_factor=1),
+        )
+        for folder in ("sparse/0", "colmap/sparse/0", "sparse")
+    },
+    "transforms.json": (
+        lambda scene, data: nerfstudio_data(data),
+        lambda data: NerfstudioDataParserConfig(data=data, load_3D_points=True),
+    ),
+    "both": (beside_a_reconstruction, lambda data: NerfstudioDataParserConfig(data=data, load_3D_points=True)),
+    "blender": (lambda scene, data: blender_data(data, "white"), lambda data: BlenderDataParserConfig(data=data)),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_the_parser_is_chosen_by_what_the_folder_holds(layout: str, scene: Path, tmp_path: Path):
+    data = tmp_path / "capture"
+    lay_out, expected = LAYOUTS[layout]
+    lay_out(scene, data)
+    config = SadgsDatamanagerConfig(data=data)
+    assert [finding for finding in check_data(data) if finding.severity != "note"] == []
+    assert [finding for finding in refuse_bad_data(config) if finding.severity != "note"] == []
+    assert config.dataparser == expected(data)
+
+
+def test_a_folder_above_or_below_a_capture_is_told_where_that_is(scene: Path, tmp_path: Path):
+    data = tmp_path / "above" / "capture"
+    shutil.copytree(scene, data)
+    (data / "photo.png").write_bytes((data / "images/000.png").read_bytes())
+    (data / "other").mkdir()
+    for folder, sentence in (
+        (data / "images", f"{data}/images is a part of the capture {data}: give --data that folder."),
+        (data / SPARSE_FOLDER, f"{data}/sparse/0 is a part of the capture {data}: give --data that folder."),
+        (data.parent, f"{data.parent} is no capture, but {data} in it is one: give --data that folder."),
+        (data / "photo.png", f"{data}/photo.png is a file: give --data the folder of a capture."),
+    ):
+        (finding,) = check_data(folder)
+        assert finding.sentence == sentence
+        with pytest.raises(InputError) as refused:
+            refuse_bad_data(SadgsDatamanagerConfig(data=folder))
+        assert str(refused.value) == sentence
+    (finding,) = check_data(data / "other")
+    assert "other holds neither transforms.json nor a COLMAP reconstruction" in finding.sentence
+
+
+def test_a_folder_that_cannot_be_read_is_named(tmp_path: Path):
+    data = tmp_path / ("a" * 300)
+    sentence = f"{data} cannot be read (File name too long): correct its name or rights."
+    assert [finding.sentence for finding in check_data(data)] == [sentence]
+    with pytest.raises(InputError) as refused:
+        refuse_bad_data(SadgsDatamanagerConfig(data=data))
+    assert str(refused.value) == sentence
+
+
+def parsed(*words: str) -> SadgsDatamanagerConfig:
+    """The settings of `ns-train sadgs …`."""
+    return tyro.cli(AnnotatedBaseConfigUnion, args=["sadgs", *words]).pipeline.datamanager
+
+
+def test_the_command_line_tells_a_parser_that_was_named_from_none(scene: Path, capsys: pytest.CaptureFixture[str]):
+    config = parsed()
+    assert config.dataparser == AutomaticDataParserConfig()
+    for words, expected in (
+        (["nerfstudio-data"], NerfstudioDataParserConfig(load_3D_points=True)),
+        (["nerfstudio-data", "--eval-mode", "all"], NerfstudioDataParserConfig(load_3D_points=True, eval_mode="all")),
+        (["colmap"], ColmapDataParserConfig()),
+    ):
+        config = parsed(*words)
+        config.data = scene
+        before = copy.deepcopy(config)
+        choose_parser(config)
+        assert config == before and config.dataparser == expected, words
+        with pytest.raises(
+            InputError, match=r"leave `nerfstudio-data` out|add `--colmap-path sparse/0` after `colmap`"
+        ):
+            refuse_bad_data(config)
+
+
+def test_a_run_s_config_names_the_parser_and_serves_other_commands_and_more_training(scene: Path, tmp_path: Path):
+    config = configure(tmp_path, AutomaticDataParserConfig(), iterations=2)
+    config.data = config.pipeline.datamanager.data = scene  # as ns-train sets both
+    config.save_config()
+    path = config.get_base_dir() / "config.yml"
+    saved = yaml.load(path.read_text(), Loader=yaml.Loader)
+    assert saved.pipeline.datamanager.dataparser == LAYOUTS["sparse/0"][1](scene)
+    trainer = train(config)
+    _, pipeline, _, step = eval_setup(path)
+    assert step == 1 and pipeline.datamanager.eval_dataset is not None and len(pipeline.datamanager.eval_dataset) == 2
+    again = configure(tmp_path, AutomaticDataParserConfig(), iterations=3)
+    again.pipeline.datamanager.data = scene
+    again.load_dir = trainer.checkpoint_dir
+    assert train(again)._start_step == 2
+
+
+@pytest.fixture
+def large(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A capture whose images are larger than nerfstudio takes without a question."""
+    monkeypatch.setattr("sadgs_ns.data.validation.images.MAX_AUTO_RESOLUTION", 20)
+    monkeypatch.setattr("sadgs_ns.data.validation.colmap.MAX_AUTO_RESOLUTION", 20)
+    return Path(shutil.copytree(scene, tmp_path / "large"))
+
+
+def test_large_images_are_taken_as_they_are_and_smaller_copies_where_they_exist(large: Path):
+    for factor, copies in ((1, 4), (2, 2), (4, 4)):  # of factor 4 alone none is taken, for nerfstudio asks for each
+        smaller = large / f"images_{copies}"
+        smaller.mkdir(exist_ok=True)
+        for path in (large / "images").iterdir():
+            with Image.open(path) as image:
+                image.resize((image.width // copies, image.height // copies)).save(smaller / path.name)
+        config = SadgsDatamanagerConfig(data=large)
+        refuse_bad_data(config)
+        assert isinstance(config.dataparser, ColmapDataParserConfig) and config.dataparser.downscale_factor == factor
+        (note,) = [finding.sentence for finding in check_data(large) if " images of " in finding.sentence]
+        assert note.endswith("PNG RGB, without masks.") == (factor == 4)
+        if factor == 1:
+            shutil.rmtree(smaller)
+
+
+def test_a_question_that_a_named_parser_would_ask_nobody_is_an_error(large: Path, monkeypatch: pytest.MonkeyPatch):
+    config = SadgsDatamanagerConfig(dataparser=ColmapDataParserConfig(data=large, colmap_path=SPARSE_FOLDER))
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: False)
+    with pytest.raises(InputError, match=r"more than 20 px and there is no \S+/images_4: add `--downscale-factor 1` "):
+        refuse_bad_data(config)
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
+    (warning,) = [finding for finding in refuse_bad_data(config) if finding.severity == "warning"]
+    assert "nerfstudio will ask whether to make it with ffmpeg; say yes, or add `--down" in warning.sentence
+
+
+def test_a_factor_without_copies_and_one_that_makes_nothing_smaller_are_named(scene: Path, tmp_path: Path):
+    named: list[Any] = [
+        ColmapDataParserConfig(data=scene, colmap_path=SPARSE_FOLDER),
+        nerfstudio_data(tmp_path / "data"),
+    ]
+    for parser in named:
+        parser.downscale_factor = 8
+        with pytest.raises(InputError) as refused:
+            refuse_bad_data(SadgsDatamanagerConfig(dataparser=parser))
+        folder = parser.data / "images_8"
+        assert str(refused.value) == (
+            f"{folder} does not exist, which should hold the images scaled down by `--downscale-factor 8`: leave that "
+            "option out, and put `--pipeline.datamanager.camera-res-scale-factor 0.125` before the parser's name."
+        )
+        parser.downscale_factor = 0
+        with pytest.raises(InputError, match=r"^downscale-factor must be at least 1, got 0\.$"):
+            refuse_bad_data(SadgsDatamanagerConfig(dataparser=parser))
+
+
+def test_images_that_are_to_be_divided_by_their_names_need_such_names(tmp_path: Path):
+    parser = nerfstudio_data(tmp_path)
+    parser.eval_mode = "filename"
+    with pytest.raises(InputError, match=r"^images/000\.png has neither train nor eval in its name, by which `--eval-"):
+        refuse_bad_data(SadgsDatamanagerConfig(dataparser=parser))
+    path, names = tmp_path / "transforms.json", {"000": "eval0", "001": "eval1"}
+    for image in (tmp_path / "images").iterdir():
+        name = names.get(image.stem, f"train{image.stem}")
+        image.rename(image.with_stem(name))
+        path.write_text(path.read_text().replace(f"images/{image.stem}.", f"images/{name}."))
+    findings = refuse_bad_data(SadgsDatamanagerConfig(dataparser=parser))
+    assert [finding for finding in findings if finding.severity != "note"] == []
+
+
+def test_lists_without_test_images_and_with_training_images_among_them_are_warned_of(tmp_path: Path):
+    nerfstudio_data(tmp_path)
+    path = tmp_path / "transforms.json"
+    content = json.loads(path.read_text())
+    names = [frame["file_path"] for frame in content["frames"]]
+    content |= {"train_filenames": names[2:], "val_filenames": names[:2]}
+
+    def warning() -> str:
+        path.write_text(json.dumps(content))
+        (finding,) = [finding for finding in check_data(tmp_path) if finding.severity != "note"]
+        assert finding.severity == "warning"
+        return finding.sentence.removeprefix(f"{path}: test_filenames ")
+
+    assert warning() == "is missing: `ns-eval` will have nothing to measure; name some images."
+    content["test_filenames"] = []
+    assert warning() == "is empty: `ns-eval` will have nothing to measure; name some images."
+    content["test_filenames"] = [f"./{names[0]}", names[2], names[3]]
+    assert warning() == (
+        "names 2 of the 8 training images: what `ns-eval` measures of them shows nothing about new views."
+    )
+    content["test_filenames"] = names[:2]
+    path.write_text(json.dumps(content))
+    assert [finding for finding in check_data(tmp_path) if finding.severity != "note"] == []
