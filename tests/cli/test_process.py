@@ -27,7 +27,7 @@ from sadgs_ns.cli.process import command as program
 from sadgs_ns.cli.process.apart import run_apart
 from sadgs_ns.cli.process.command import main, process
 from sadgs_ns.cli.process.photos import Photo, find_photos, photos_by_camera, read_photos
-from sadgs_ns.cli.process.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching
+from sadgs_ns.cli.process.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching, expected_work
 from sadgs_ns.cli.process.stages import match, sequential_pairs
 from sadgs_ns.cli.process.video import sharpest_frames
 from sadgs_ns.errors import InputError, RunError
@@ -395,7 +395,13 @@ def numbered(count: int, has_position: bool = False, name: str = "IMG_{}.jpg") -
             "sequential",
             "each is matched with those that follow it (--matching sequential)",
         ),
-        ("auto", [*numbered(300), *numbered(1, name="x{}.jpg")], False, "exhaustive", "which are 45,150 pairs and may"),
+        (
+            "auto",
+            [*numbered(300), *numbered(1, name="x{}.jpg")],
+            False,
+            "exhaustive",
+            "which takes long; --matching sequential",
+        ),
         ("exhaustive", numbered(300), False, "exhaustive", ""),
         ("spatial", numbered(3, has_position=True), False, "spatial", ""),
     ],
@@ -407,6 +413,18 @@ def test_without_a_vocabulary_photos_are_matched_in_another_way(
     assert matching == chosen and told in notice and bool(told) == bool(notice)
     if notice:
         assert choose_matching(asked, photos, is_video, lambda: None) == ("vocabulary", "")
+
+
+def test_the_time_that_it_takes_is_told_roughly(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    told = {
+        (10, "exhaustive"): "10 photos, up to 45 pairs to match: roughly a minute on 2 processor cores.",
+        (300, "sequential"): "300 photos, up to 4,800 pairs to match: roughly 1.1 hours on 2 processor cores.",
+        (300, "exhaustive"): "300 photos, up to 44,850 pairs to match: roughly 4.8 hours on 2 processor cores.",
+    }
+    for (count, matching), sentence in told.items():
+        photos = [dataclasses.replace(photo, size=(4000, 3000)) for photo in numbered(count)]
+        assert expected_work(photos, matching) == sentence
 
 
 def test_a_way_of_matching_that_cannot_work_is_told_before_any_work(photos: Path, tmp_path: Path, monkeypatch, capsys):
@@ -490,6 +508,19 @@ def test_photos_that_colmap_could_not_write_are_told(tmp_path: Path, monkeypatch
     (folder / "images" / "b.png").write_bytes((folder / "images" / "b.png").read_bytes()[:30])
     with pytest.raises(OSError, match=r"images could not be written \(the disk is full; .* free there"):
         program._publish(folder, tmp_path)
+
+
+def test_two_runs_do_not_disturb_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+    command = [str(black(tmp_path / "photos", "a.png", "b.png", "c.png")), str(tmp_path / "out")]
+
+    def run_another(function: str, *arguments: object, folder: Path, **others: object) -> None:
+        (folder / "models").mkdir()
+        assert main(command) == 2 and (folder / "models").is_dir()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(program, "run_apart", run_another)
+    assert main(command) == 130 and not (tmp_path / "out" / "work" / "models").exists()
+    assert f"another sadgs-process works on {tmp_path / 'out'}; wait for it, or stop it." in capsys.readouterr().err
 
 
 def test_damaged_settings_are_told_in_a_sentence(tmp_path: Path, capsys):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import fcntl
 import io
 import json
 import os
@@ -17,7 +18,7 @@ import shutil
 import signal
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
@@ -34,7 +35,7 @@ from sadgs_ns.cli.process.photos import (
     restore_alpha,
     write_alpha,
 )
-from sadgs_ns.cli.process.plan import Matching, Summary, choose_matching
+from sadgs_ns.cli.process.plan import Matching, Summary, choose_matching, expected_work
 from sadgs_ns.cli.process.video import video_frames, write_frames
 from sadgs_ns.errors import InputError, RunError, WriteError, free_space, reason
 from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
@@ -131,37 +132,38 @@ def process(
         tell(f"{out} is finished; delete it to make it again.")
         return Summary(**finished)
     columns = (TextColumn("{task.description:>24}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    try:
-        with Progress(*columns) as progress:
-            report = _reporter(progress)
-            if is_video:
-                folder = work / "frames"
-                if not folder.exists():
-                    chosen = video_frames(source, frames)
-                    _note(settings, noted)  # before anything else lies in the folder: an interrupted run goes on by it
-                    partial = empty_folder(work / "frames.partial")
-                    write_frames(chosen, partial, lambda done: report("frames", done, frames))
-                    partial.rename(folder)
-                names = sorted(photo.name for photo in folder.glob("*.jpg"))
-            else:
-                folder, names = source, settings["photos"]
-            photos = read_photos(folder, names, report)
+    with Progress(*columns) as progress, contextlib.ExitStack() as alone:
+        report = _reporter(progress)
+        if is_video:
+            folder = work / "frames"
+            chosen = [] if folder.exists() else video_frames(source, frames)
+            _note(settings, noted)  # before anything else lies in the folder: an interrupted run goes on by it
+            alone.enter_context(_alone(work))
+            if not folder.exists():
+                partial = empty_folder(work / "frames.partial")
+                write_frames(chosen, partial, lambda done: report("frames", done, frames))
+                partial.rename(folder)
+            names = sorted(photo.name for photo in folder.glob("*.jpg"))
+        else:
+            folder, names = source, settings["photos"]
+        photos = read_photos(folder, names, report)
 
-            def fetch_vocabulary() -> None:
-                with tempfile.TemporaryDirectory() as scratch:
-                    run_apart(f"{_STAGES}:fetch_vocabulary", Path(scratch), folder=Path(scratch), report=report)
+        def fetch_vocabulary() -> None:
+            with tempfile.TemporaryDirectory() as scratch:
+                run_apart(f"{_STAGES}:fetch_vocabulary", Path(scratch), folder=Path(scratch), report=report)
 
-            chosen_matching, notice = choose_matching(matching, photos, is_video, fetch_vocabulary)
-            _note(settings, noted)  # for a folder only now, when its photos are known to be readable
-            if notice:
-                tell(notice)
-            folder, photos = convert_photos(folder, photos, work / "photos")
-            if transparent := write_alpha(folder, photos, work / "alpha"):
-                tell(f"{transparent} photos are partly transparent; their images in the scene are, too.")
-            groups = [[photo.name] for photo in photos] if camera_per_photo else photos_by_camera(photos)
-            arguments = (folder, groups, chosen_matching, max_size, work / "alpha", work)
-            summary = run_apart(f"{_STAGES}:make_model", *arguments, folder=work, report=report)
-            _publish(work / "undistorted", out)
+        chosen_matching, notice = choose_matching(matching, photos, is_video, fetch_vocabulary)
+        if not is_video:
+            _note(settings, noted)  # only now, when the photos are known to be readable
+            alone.enter_context(_alone(work))
+        tell(f"{notice} {expected_work(photos, chosen_matching)}".lstrip())
+        folder, photos = convert_photos(folder, photos, work / "photos")
+        if transparent := write_alpha(folder, photos, work / "alpha"):
+            tell(f"{transparent} photos are partly transparent; their images in the scene are, too.")
+        groups = [[photo.name] for photo in photos] if camera_per_photo else photos_by_camera(photos)
+        arguments = (folder, groups, chosen_matching, max_size, work / "alpha", work)
+        summary = run_apart(f"{_STAGES}:make_model", *arguments, folder=work, report=report)
+        _publish(work / "undistorted", out)
         if summary.is_poor:  # the features serve another way of matching
             shutil.rmtree(work / "model")
         else:
@@ -169,12 +171,30 @@ def process(
                 ending = {"max_size": max_size, "finished": dataclasses.asdict(summary)}
                 partial.write_text(json.dumps(settings | ending))
             _remove_intermediate_files(work)
-        return summary
+    return summary
+
+
+@contextlib.contextmanager
+def _alone(work: Path) -> Iterator[None]:
+    """Keep other runs away from a work folder, and leave nothing half-written there.
+
+    Raises:
+        InputError: If another run works there.
+    """
+    lock = os.open(work, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError(f"another sadgs-process works on {work.parent}; wait for it, or stop it.") from error
+        try:
+            yield
+        finally:
+            for name in _UNFINISHED:
+                shutil.rmtree(work / name, ignore_errors=True)
+            (work / "pairs.txt").unlink(missing_ok=True)
     finally:
-        for name in _UNFINISHED:
-            shutil.rmtree(work / name, ignore_errors=True)
-        with contextlib.suppress(OSError):
-            (work / "pairs.txt").unlink()
+        os.close(lock)
 
 
 def _remove_intermediate_files(work: Path) -> None:
