@@ -28,7 +28,7 @@ from sadgs_ns.cli.process.apart import run_apart
 from sadgs_ns.cli.process.command import main, process
 from sadgs_ns.cli.process.photos import Photo, find_photos, photos_by_camera, read_photos
 from sadgs_ns.cli.process.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching, expected_work
-from sadgs_ns.cli.process.stages import match, sequential_pairs
+from sadgs_ns.cli.process.stages import check_written, match, sequential_pairs
 from sadgs_ns.cli.process.video import sharpest_frames
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
@@ -521,6 +521,23 @@ def test_two_runs_do_not_disturb_each_other(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(program, "run_apart", run_another)
     assert main(command) == 130 and not (tmp_path / "out" / "work" / "models").exists()
     assert f"another sadgs-process works on {tmp_path / 'out'}; wait for it, or stop it." in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["points3D.bin", "images.bin"])
+def test_a_model_that_colmap_could_not_write_is_told(run: Run, tmp_path: Path, name: str):
+    """COLMAP says nothing here either."""
+    model = pycolmap.Reconstruction(run.out / "sparse" / "0")
+    model.write(tmp_path)
+    check_written(tmp_path, model)
+    (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:500])
+    with pytest.raises((OSError, IndexError, ValueError)):
+        check_written(tmp_path, model)
+
+
+def test_a_folder_in_which_no_settings_could_be_noted_can_be_used(tmp_path: Path, taken: list[list[str]]):
+    (tmp_path / "out" / "work").mkdir(parents=True)
+    photos = black(tmp_path / "photos", "a.png", "b.png", "c.png")
+    assert main([str(photos), str(tmp_path / "out")]) == 130 and len(taken) == 1
 
 
 def test_damaged_settings_are_told_in_a_sentence(tmp_path: Path, capsys):

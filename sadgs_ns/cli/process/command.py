@@ -115,7 +115,7 @@ def process(
     """
     work = out / "work"
     noted = work / "settings.json"
-    if out.is_file() or (out.exists() and any(out.iterdir()) and not noted.exists()):
+    if out.is_file() or (not noted.exists() and any(not path.is_dir() for path in out.rglob("*"))):
         raise InputError(f"{out} exists and is not a scene that sadgs-process began; give another folder.")
     is_video = source.is_file()
     settings = {"source": os.path.realpath(source), "camera_per_photo": camera_per_photo}

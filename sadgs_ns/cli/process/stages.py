@@ -202,8 +202,20 @@ def reconstruct(photos: Path, count: int, database: Path, attempts: Path, model:
     best = max(models.values(), key=lambda candidate: candidate.num_reg_images())
     partial = empty_folder(model.with_name("model.partial"))
     best.write(partial)
+    check_written(partial, best)
     partial.rename(model)
     report("cameras", count, count)
+
+
+def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
+    """Read a written model again, because COLMAP does not say when the disk is full.
+
+    Raises:
+        OSError: If the folder holds less than the model.
+    """
+    sizes = [(len(one.images), one.num_points3D()) for one in (pycolmap.Reconstruction(folder), model)]
+    if sizes[0] != sizes[1]:
+        raise OSError(f"{folder} was not written completely: the disk is full")
 
 
 def undistort(photos: Path, alphas: Path, model: Path, folder: Path, max_size: int, report: Report) -> None:
@@ -234,6 +246,7 @@ def undistort(photos: Path, alphas: Path, model: Path, folder: Path, max_size: i
     (sparse / "0").mkdir()
     for file in sparse.glob("*.bin"):
         file.rename(sparse / "0" / file.name)
+    check_written(sparse / "0", reconstruction)
     report("undistorted photos", len(registered), len(registered))
 
 
