@@ -1,34 +1,57 @@
 """`sadgs-process PHOTOS_OR_VIDEO OUT`: from photos to a scene that `ns-train sadgs --data OUT` reads, with pycolmap.
 
 OUT holds `images/`, `transforms.json`, `sparse_pc.ply` and COLMAP's model in `sparse/0`. What an interrupted run needs
-to go on lies in `OUT/work`.
+to go on lies in `OUT/work`; of a finished scene only `settings.json` stays there, by which the command knows it again.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import dataclasses
+import fcntl
+import io
 import json
+import os
+import shlex
+import shutil
+import signal
 import sys
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-import pycolmap
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from sadgs_ns.atomic import atomic_path
-from sadgs_ns.cli.process.photos import find_photos, photos_by_camera, photos_not_read
-from sadgs_ns.cli.process.stages import (
-    Matching,
-    Summary,
+from sadgs_ns.cli.process.apart import Report, run_apart
+from sadgs_ns.cli.process.photos import (
+    convert_photos,
     empty_folder,
-    extract,
-    match,
-    reconstruct,
-    summarize,
-    undistort,
+    find_photos,
+    photos_by_camera,
+    photos_not_read,
+    read_photos,
+    restore_alpha,
+    write_alpha,
 )
+from sadgs_ns.cli.process.plan import Matching, Summary, choose_matching, expected_work
 from sadgs_ns.cli.process.video import video_frames, write_frames
-from sadgs_ns.errors import WriteError, free_space, reason
+from sadgs_ns.errors import InputError, RunError, WriteError, free_space, reason
+from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
+
+MIN_SIZE = 64
+"""Smallest longest side of the result in px; no structure is left in smaller images."""
+_STAGES = "sadgs_ns.cli.process.stages"
+_UNFINISHED = (
+    "frames.partial",
+    "photos.partial",
+    "alpha.partial",
+    "model.partial",
+    "models",
+    "undistorted",
+)
+"""Folders in `work` that are made anew by each run that needs them."""
 
 
 def _note(settings: dict, noted: Path) -> None:
@@ -65,65 +88,175 @@ def process(
     frames: int = 200,
     max_size: int = 1600,
     camera_per_photo: bool = False,
+    tell: Callable[[str], None] = print,
 ) -> Summary:
     """Make a scene of photos or a video.
 
     Args:
         source: A folder of photos, searched with its subfolders, or a video.
-        out: Folder for the scene; made if it does not exist, continued if an earlier run was interrupted.
+        out: Folder for the scene; made if it does not exist, continued if an earlier run was interrupted. A finished
+            scene is left as it is.
         matching: Which pairs are matched; "auto" is sequential for videos, exhaustive for at most
-            `stages.EXHAUSTIVE_LIMIT` photos, and by GPS positions or a vocabulary for more.
+            `plan.EXHAUSTIVE_LIMIT` photos, and by GPS positions or a vocabulary for more. Where there is no vocabulary,
+            it is sequential for numbered photos and exhaustive for others.
         frames: How many frames of a video are taken.
         max_size: Longest side of the undistorted photos in px; 0 keeps them as they are.
         camera_per_photo: Whether every photo has a focal length of its own. Otherwise photos of one size share a
             camera, unless EXIF tells of several cameras or focal lengths.
+        tell: Called with sentences that the user should read, as the work goes on.
 
     Returns:
         What was registered and what was not.
 
     Raises:
-        ValueError: One sentence that names the input and the remedy.
+        InputError: One sentence that names the input and the remedy.
+        OSError: If a file cannot be written.
+        RunError: If COLMAP fails.
     """
     work = out / "work"
     noted = work / "settings.json"
-    if out.is_file() or (out.exists() and any(out.iterdir()) and not noted.exists()):
-        raise ValueError(f"{out} exists and is not a scene that sadgs-process began; give another folder.")
+    if out.is_file() or (not noted.exists() and any(not path.is_dir() for path in out.rglob("*"))):
+        raise InputError(f"{out} exists and is not a scene that sadgs-process began; give another folder.")
     is_video = source.is_file()
-    settings = {"source": str(source.resolve()), "camera_per_photo": camera_per_photo}
+    settings = {"source": os.path.realpath(source), "camera_per_photo": camera_per_photo}
     settings |= {"frames": frames} if is_video else {"photos": find_photos(source, out)}
-    if noted.exists() and (changes := _changes(json.loads(noted.read_text()), settings)):
-        raise ValueError(
+    begun = _read_settings(noted) if noted.exists() else {}
+    finished = begun.get("finished") if (out / "transforms.json").exists() else None
+    asked = settings | ({"max_size": max_size} if finished else {})
+    if begun and (changes := _changes(begun, asked)):
+        raise InputError(
             f"{out} was begun with other photos or settings ({changes}); give another folder or delete it."
         )
-    if is_video:
-        photos = work / "frames"
-        if not photos.exists():
-            chosen = video_frames(source, frames)
-            _note(settings, noted)  # before anything else lies in the folder: an interrupted run goes on by it
-            partial = empty_folder(work / "frames.partial")
-            write_frames(chosen, partial)
-            partial.rename(photos)
-        names = sorted(photo.name for photo in photos.glob("*.jpg"))
-    else:
-        photos, names = source, settings["photos"]
-    groups = [[name] for name in names] if camera_per_photo else photos_by_camera(photos, names)
-    _note(settings, noted)  # for a folder only now, when its photos are known to be readable
-    database = work / "database.db"
+    if finished:
+        _remove_intermediate_files(work)
+        tell(f"{out} is finished; delete it to make it again.")
+        return Summary(**finished)
     columns = (TextColumn("{task.description:>24}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, int(pycolmap.logging.ERROR)
+    with Progress(*columns) as progress, contextlib.ExitStack() as alone:
+        report = _reporter(progress)
+        if is_video:
+            folder = work / "frames"
+            chosen = [] if folder.exists() else video_frames(source, frames)
+            _note(settings, noted)  # before anything else lies in the folder: an interrupted run goes on by it
+            alone.enter_context(_alone(work))
+            if not folder.exists():
+                partial = empty_folder(work / "frames.partial")
+                write_frames(chosen, partial, lambda done: report("frames", done, frames))
+                partial.rename(folder)
+            names = sorted(photo.name for photo in folder.glob("*.jpg"))
+        else:
+            folder, names = source, settings["photos"]
+        photos = read_photos(folder, names, report)
+
+        def fetch_vocabulary() -> None:
+            with tempfile.TemporaryDirectory() as scratch:
+                run_apart(f"{_STAGES}:fetch_vocabulary", Path(scratch), folder=Path(scratch), report=report)
+
+        chosen_matching, notice = choose_matching(matching, photos, is_video, fetch_vocabulary)
+        if not is_video:
+            _note(settings, noted)  # only now, when the photos are known to be readable
+            alone.enter_context(_alone(work))
+        tell(f"{notice} {expected_work(photos, chosen_matching)}".lstrip())
+        folder, photos = convert_photos(folder, photos, work / "photos")
+        if transparent := write_alpha(folder, photos, work / "alpha"):
+            tell(f"{transparent} photos are partly transparent; their images in the scene are, too.")
+        groups = [[photo.name] for photo in photos] if camera_per_photo else photos_by_camera(photos)
+        arguments = (folder, groups, chosen_matching, max_size, work / "alpha", work)
+        summary = run_apart(f"{_STAGES}:make_model", *arguments, folder=work, report=report)
+        _publish(work / "undistorted", out)
+        if summary.is_poor:  # the features serve another way of matching
+            shutil.rmtree(work / "model")
+        else:
+            with atomic_path(noted) as partial:
+                ending = {"max_size": max_size, "finished": dataclasses.asdict(summary)}
+                partial.write_text(json.dumps(settings | ending))
+            _remove_intermediate_files(work)
+    return summary
+
+
+@contextlib.contextmanager
+def _alone(work: Path) -> Iterator[None]:
+    """Keep other runs away from a work folder, and leave nothing half-written there.
+
+    Raises:
+        InputError: If another run works there.
+    """
+    lock = os.open(work, os.O_RDONLY)
     try:
-        with Progress(*columns) as progress:
-            extract(photos, groups, database, progress)
-            match(names, database, work, matching, is_video, progress)
-            model = reconstruct(photos, names, database, work, progress)
-            undistort(photos, model, out, work, max_size or -1, progress)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError(f"another sadgs-process works on {work.parent}; wait for it, or stop it.") from error
+        try:
+            yield
+        finally:
+            for name in _UNFINISHED:
+                shutil.rmtree(work / name, ignore_errors=True)
+            (work / "pairs.txt").unlink(missing_ok=True)
     finally:
-        pycolmap.logging.minloglevel = level
-    return summarize(names, model, database)
+        os.close(lock)
+
+
+def _remove_intermediate_files(work: Path) -> None:
+    """Remove what a finished scene does not need from its work folder."""
+    for path in work.iterdir():
+        if path.is_dir():
+            shutil.rmtree(path)
+        elif path.name != "settings.json":
+            path.unlink()
+
+
+def _read_settings(noted: Path) -> dict:
+    try:
+        return dict(json.loads(noted.read_text()))
+    except ValueError as error:
+        raise InputError(
+            f"{noted} is damaged ({reason(error)}): delete {noted.parent.parent} and begin again."
+        ) from error
+
+
+def _reporter(progress: Progress) -> Report:
+    """A function that shows each stage as a bar of its own."""
+    tasks: dict[str, TaskID] = {}
+
+    def report(stage: str, done: int, total: int) -> None:
+        if stage not in tasks:
+            tasks[stage] = progress.add_task(stage, total=total)
+        progress.update(tasks[stage], completed=done)
+
+    return report
+
+
+def _publish(undistorted: Path, out: Path) -> None:
+    """Add what nerfstudio reads to undistorted photos and their model, and move all to the scene's folder.
+
+    Raises:
+        OSError: If a file cannot be written, or COLMAP could not write one.
+    """
+    from nerfstudio.process_data.colmap_utils import colmap_to_json
+
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints all cameras where there are several
+        colmap_to_json(undistorted / "sparse" / "0", undistorted)
+    images = undistorted / "images"
+    written = [frame["file_path"] for frame in json.loads((undistorted / "transforms.json").read_text())["frames"]]
+    try:
+        read_photos(undistorted, written, lambda *step: None)
+    except InputError as error:  # COLMAP does not say when a disk is full
+        raise WriteError(images, OSError("the disk is full")) from error
+    restore_alpha(images, undistorted / "alpha")
+    (out / "transforms.json").unlink(missing_ok=True)  # whose presence says that all is there
+    for name in ("images", "sparse"):
+        shutil.rmtree(out / name, ignore_errors=True)
+    for name in ("images", "sparse", "sparse_pc.ply", "transforms.json"):
+        (undistorted / name).rename(out / name)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Make a scene; returns the exit code: 1 on a full disk, 2 if the input is wrong, 130 after an interrupt."""
+    """Make a scene and return the exit code.
+
+    It is 0 for a scene of at least half of the photos, 1 for one of fewer, a full disk or a failure of COLMAP, 2 if the
+    input is wrong, and 130, 143 or 129 after SIGINT, SIGTERM or SIGHUP.
+    """
     parser = argparse.ArgumentParser(prog="sadgs-process", description="From photos or a video to a scene for sadgs.")
     parser.add_argument("source", type=Path, help="folder of photos, or a video")
     parser.add_argument("out", type=Path, help="folder for the scene; an interrupted run goes on in it")
@@ -135,7 +268,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--frames", type=int, default=200, help="frames to take of a video (default %(default)s)")
     parser.add_argument(
-        "--max-size", type=int, default=1600, metavar="PX", help="longest side of the result, 0 for all (%(default)s)"
+        "--max-size",
+        type=int,
+        default=1600,
+        metavar="PX",
+        help=f"longest side of the result, at least {MIN_SIZE}, 0 to keep it (default %(default)s)",
     )
     parser.add_argument(
         "--camera-per-photo", action="store_true", help="every photo has its own zoom, and EXIF does not tell"
@@ -143,26 +280,45 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parser.parse_args(argv)
     if options.frames < 3:
         parser.error("--frames must be at least 3")
-    if options.max_size < 0:
-        parser.error("--max-size must not be negative")
+    if options.max_size != 0 and options.max_size < MIN_SIZE:
+        parser.error(f"--max-size must be at least {MIN_SIZE} px, or 0 to keep the photos' size")
     try:
-        summary = process(**vars(options))
-    except ValueError as error:
+        if not (options.source.is_absolute() and options.out.is_absolute()):
+            try:
+                os.getcwd()
+            except FileNotFoundError:
+                raise InputError(
+                    "the working directory was deleted; change to another one, or give full paths."
+                ) from None
+        with Interrupts(waiting=lambda: True):
+            summary = process(**vars(options))
+    except InputError as error:
         print(f"sadgs-process: {error}", file=sys.stderr)
         return 2
-    except OSError as error:
-        told = f"{reason(error)} ({free_space(options.out)} free there); the same command goes on."
-        print(f"sadgs-process: {error if isinstance(error, WriteError) else told}", file=sys.stderr)
+    except (OSError, RunError) as error:
+        told = str(error)
+        if isinstance(error, OSError) and error.errno is not None:
+            where = error.filename or options.out
+            told = f"{where}: {reason(error)} ({free_space(options.out)} free there); the same command goes on."
+        print(f"sadgs-process: {told}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stopped:
         print("sadgs-process: stopped; the same command goes on.", file=sys.stderr)
-        return 130
+        return 128 + (stopped.number if isinstance(stopped, Interrupted) else signal.SIGINT)
     print(summary)
     if options.source.is_dir() and (not_read := photos_not_read(options.source)):
         print(not_read)
-    if summary.registered < 0.5 * summary.photos:
-        print("Fewer than half of the photos registered: more overlap between them would help.")
-    print(f"\nns-train sadgs --data {options.out}")
+    out = shlex.quote(str(options.out))
+    if summary.is_poor:
+        print(
+            f"warning: {options.out} shows only what {summary.registered} of {summary.photos} photos saw. Take more "
+            "photos between those that did not register, with two thirds of overlap, and give another folder; or try "
+            "the same command with --matching exhaustive, which uses the features found so far. This trains on what is "
+            f"there: ns-train sadgs --data {out}",
+            file=sys.stderr,
+        )
+        return 1
+    print(f"\nCheck machine and data before a long run:  sadgs-doctor {out}\nTrain:  ns-train sadgs --data {out}")
     return 0
 
 

@@ -1,21 +1,48 @@
-"""The photos of a folder, and which of them one camera took."""
+"""The photos of a folder: which there are, whether they are whole, and what their headers tell."""
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import os
+import re
+import shutil
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, UnidentifiedImageError
 
 from sadgs_ns.data.validation.images import IMAGE_SUFFIXES
+from sadgs_ns.errors import InputError, reason
 
 _UNREAD_SUFFIXES = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"}
-"""Suffixes of formats that phones and cameras write and COLMAP does not read."""
+"""Suffixes of formats that phones and cameras write and that neither COLMAP nor Pillow surely reads."""
+_CONVERTED_SUFFIXES = {".webp"}
+"""Suffixes of formats that training and Pillow read, but COLMAP does not."""
+_NAMED = 20
+"""How many unreadable photos a message names."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Photo:
+    """What a photo's header tells."""
+
+    name: str
+    """Relative to the folder of the photos."""
+    size: tuple[int, int]
+    """Width and height in px, as the pixels are stored."""
+    camera: tuple
+    """Equal for photos that one camera at one focal length took, as far as size, orientation and EXIF tell."""
+    has_position: bool
+    """Whether EXIF holds GPS coordinates."""
+    has_alpha: bool
+    """Whether some pixels may be transparent."""
 
 
 def photos_not_read(folder: Path) -> str:
-    """A sentence on the photos in formats that are not read; empty if there are none."""
+    """Return a sentence on the photos in formats that are not read; it is empty if there are none."""
     others = [path.suffix for path in folder.rglob("*") if path.suffix.lower() in _UNREAD_SUFFIXES]
     if not others:
         return ""
@@ -24,36 +51,208 @@ def photos_not_read(folder: Path) -> str:
 
 
 def find_photos(source: Path, out: Path) -> list[str]:
-    """The names of a folder's photos, relative to it, without those of a scene that is made in the same folder.
+    """Return the sorted names of a folder's photos, relative to it.
+
+    The photos of a scene that is made in the same folder are left out, and so are hidden files, as macOS writes them.
 
     Raises:
-        ValueError: If there are fewer than three photos.
+        InputError: If there are fewer than three photos, or one has a name that is no Unicode.
     """
     if not source.is_dir():
-        raise ValueError(f"{source} does not exist; give a folder of photos or a video.")
-    folder, scene = source.resolve(), out.resolve()
-    found = [path for path in folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES]
-    if folder in scene.parents:
-        found = [path for path in found if scene not in path.parents]
-    if len(found) < 3:
-        told = f"{source} holds {len(found)} photos; a reconstruction needs at least 3, better 30 or more."
-        raise ValueError(f"{told} {photos_not_read(folder)}".rstrip())
-    return sorted(path.relative_to(folder).as_posix() for path in found)
+        raise InputError(f"{source} does not exist; give a folder of photos or a video.")
+    folder, scene = Path(os.path.realpath(source)), Path(os.path.realpath(out))
+    found = [
+        path.relative_to(folder)
+        for path in folder.rglob("*")
+        if path.suffix.lower() in IMAGE_SUFFIXES and scene not in path.parents and not path.is_dir()
+    ]
+    names = sorted(path.as_posix() for path in found if not any(part.startswith(".") for part in path.parts))
+    if len(names) < 3:
+        told = f"{source} holds {len(names)} photos; a reconstruction needs at least 3, better 30 or more."
+        raise InputError(f"{told} {photos_not_read(folder)}".rstrip())
+    for name in names:
+        if not name.isprintable():
+            raise InputError(f"{source} holds a photo with unprintable characters in its name, {name!a}: rename it.")
+    return names
 
 
-def photos_by_camera(photos: Path, names: Sequence[str]) -> list[list[str]]:
-    """Photos that one camera at one focal length took, as far as their size and EXIF tell.
+def read_photos(folder: Path, names: Sequence[str], report: Callable[[str, int, int], None]) -> list[Photo]:
+    """Read and decode photos, because COLMAP takes the missing end of a file for black pixels.
+
+    Args:
+        folder: The folder of the photos.
+        names: The photos, relative to it.
+        report: Called with a stage's name, how many photos are read, and how many there are.
 
     Raises:
-        ValueError: If a photo cannot be read.
+        InputError: If some cannot be read or decoded; the message names them.
     """
-    groups: dict[tuple, list[str]] = defaultdict(list)
-    for name in names:
+    photos: list[Photo] = []
+    broken: dict[str, str] = {}
+
+    def read(name: str) -> Photo | str:
         try:
-            with Image.open(photos / name) as image:
-                exif = image.getexif()
-                lens = exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLength)
-                groups[image.size, exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model), lens].append(name)
-        except OSError as error:
-            raise ValueError(f"{photos / name} cannot be read as an image ({error}); remove or replace it.") from error
+            return _read_photo(folder, name)
+        except UnidentifiedImageError:
+            return "no image that Pillow knows" if (folder / name).stat().st_size else "0 bytes"
+        except Exception as error:  # decoders raise whatever they stumble over: OSError, SyntaxError, struct.error, …
+            return reason(error)
+
+    with _threads() as pool:
+        for name, found in zip(names, pool.map(read, names), strict=True):
+            if isinstance(found, Photo):
+                photos.append(found)
+            else:
+                broken[name] = found
+            report("photos", len(photos) + len(broken), len(names))
+    if broken:
+        named = [f"{name} ({why})" for name, why in list(broken.items())[:_NAMED]]
+        more = [f"{len(broken) - _NAMED} more"] if len(broken) > _NAMED else []
+        them = "it" if len(broken) == 1 else "them"
+        raise InputError(
+            f"{len(broken)} of the {len(names)} photos in {folder} cannot be read as a whole image: "
+            f"{', '.join(named + more)}; copy {them} again or remove {them}."
+        )
+    return photos
+
+
+@contextlib.contextmanager
+def _threads() -> Iterator[ThreadPoolExecutor]:
+    """Threads that take no more work when the block raises, as at an interrupt."""
+    pool = ThreadPoolExecutor()
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _read_photo(folder: Path, name: str) -> Photo:
+    with Image.open(folder / name) as image:
+        exif = image.getexif()
+        lens = exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLength)
+        position = exif.get_ifd(ExifTags.IFD.GPSInfo)
+        photo = Photo(
+            name,
+            image.size,
+            (image.size, *(exif.get(tag) for tag in (ExifTags.Base.Make, ExifTags.Base.Model)), lens),
+            ExifTags.GPS.GPSLatitude in position and ExifTags.GPS.GPSLongitude in position,
+            image.has_transparency_data,
+        )
+        image.draft(
+            "RGB", (image.width // 8, image.height // 8)
+        )  # an eighth of a JPEG's size tells whether it is whole
+        image.load()
+    return photo
+
+
+def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tuple[Path, list[Photo]]:
+    """Convert photos in formats that COLMAP does not read, if there are any.
+
+    Args:
+        folder: The folder of the photos.
+        photos: The photos.
+        converted: The folder to make of conversions and of links to the other photos. It appears when it is complete,
+            and is left as it is if it exists.
+
+    Returns:
+        The folder of photos that COLMAP reads, and the photos in it.
+    """
+    new = [dataclasses.replace(photo, name=_converted_name(photo)) for photo in photos]
+    if new == list(photos):
+        return folder, new
+    if converted.exists():
+        return converted, new
+    partial = empty_folder(converted.with_name(f"{converted.name}.partial"))
+
+    def convert(photo: Photo, name: str) -> None:
+        source, target = Path(os.path.realpath(folder / photo.name)), partial / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if name != photo.name:
+            with Image.open(source) as image:
+                pixels = image.convert("RGBA" if photo.has_alpha else "RGB")
+                pixels.save(target, exif=image.getexif(), quality=97, subsampling=0)  # the latter two for JPEG alone
+            return
+        try:
+            target.symlink_to(source)
+        except OSError:  # Windows lets only administrators make links
+            shutil.copyfile(source, target)
+
+    with _threads() as pool:
+        list(pool.map(convert, photos, [photo.name for photo in new]))
+    partial.rename(converted)
+    return converted, new
+
+
+def _converted_name(photo: Photo) -> str:
+    if Path(photo.name).suffix.lower() not in _CONVERTED_SUFFIXES:
+        return photo.name
+    return photo.name + (".png" if photo.has_alpha else ".jpg")
+
+
+def write_alpha(folder: Path, photos: Sequence[Photo], alphas: Path) -> int:
+    """Write the opacity of photos that are partly transparent, which COLMAP leaves out, as grey images.
+
+    Args:
+        folder: The folder of the photos.
+        photos: The photos.
+        alphas: The folder to make; the opacity of `NAME` is in `NAME.png` there. It appears when it is complete, and is
+            left as it is if it exists.
+
+    Returns:
+        How many photos are partly transparent.
+    """
+    if not alphas.exists():
+        partial = empty_folder(alphas.with_name(f"{alphas.name}.partial"))
+        for photo in photos:
+            if photo.has_alpha:
+                with Image.open(folder / photo.name) as image:
+                    alpha = image.convert("RGBA").getchannel("A")
+                if alpha.getextrema() != (255, 255):
+                    target = partial / f"{photo.name}.png"
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    alpha.save(target)
+        partial.rename(alphas)
+    return sum(1 for _ in alphas.rglob("*.png"))
+
+
+def restore_alpha(images: Path, alphas: Path) -> None:
+    """Give images the opacity that `write_alpha` wrote beside them; both are of one size.
+
+    Args:
+        images: The folder of the images, which are changed.
+        alphas: The folder of the opacities, some of whose images may be missing.
+    """
+    for path in alphas.rglob("*.png"):
+        target = images / path.relative_to(alphas).with_suffix("")
+        if target.exists():
+            with Image.open(target) as image, Image.open(path) as alpha:
+                pixels = image.convert("RGB")
+                pixels.putalpha(alpha.convert("L"))
+            pixels.save(target)
+
+
+def empty_folder(folder: Path) -> Path:
+    """Make a folder, and remove what an interrupted run left in it."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    return folder
+
+
+def photos_by_camera(photos: Sequence[Photo]) -> list[list[str]]:
+    """Group the names of photos that one camera at one focal length took, as far as their size and EXIF tell."""
+    groups: dict[tuple, list[str]] = defaultdict(list)
+    for photo in photos:
+        groups[photo.camera].append(photo.name)
     return list(groups.values())
+
+
+def are_in_order(names: Sequence[str]) -> bool:
+    """Whether photos are named by their numbers alone, as cameras number them in the order of their taking."""
+    return len({re.sub(r"\d+", "0", name) for name in names}) == 1
+
+
+def in_order(names: Sequence[str]) -> list[str]:
+    """Sort names so that photo 10 comes after photo 9."""
+    return sorted(
+        names, key=lambda name: [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
+    )

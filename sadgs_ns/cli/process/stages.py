@@ -1,53 +1,90 @@
-"""The four stages from photos to a scene, each with pycolmap: features, matches, cameras and points, undistortion.
+"""The stages from photos to a scene, each with pycolmap: features, matches, cameras and points, undistortion.
 
-Each stage goes on where an interrupted run left it.
+Each stage goes on where an interrupted run left it. They run in a process of their own (`apart.py`), so no other
+module may import this one.
 """
 
 from __future__ import annotations
 
 import contextlib
-import io
 import itertools
 import shutil
 import sqlite3
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
+import numpy as np
 import pycolmap
-from rich.progress import Progress
 
-from sadgs_ns.errors import reason
+from sadgs_ns.cli.process.apart import Report
+from sadgs_ns.cli.process.photos import empty_folder, in_order
+from sadgs_ns.cli.process.plan import Matching, Summary
+from sadgs_ns.errors import InputError
 
 _SEED = 0
 """Seed of COLMAP's random samples, so that equal photos give nearly equal cameras; COLMAP's own seed is the clock."""
-EXHAUSTIVE_LIMIT = 200
-"""Photos up to which every pair is matched; twice the photos take four times as long."""
 FEW_FEATURES = 500
 """Keypoints under which a photo counts as blurred or empty."""
-Matching = Literal["auto", "exhaustive", "sequential", "spatial", "vocabulary"]
 
 
-@dataclass(frozen=True)
-class Summary:
-    """What became of the photos."""
+def make_model(
+    photos: Path,
+    groups: Sequence[Sequence[str]],
+    matching: Matching,
+    max_size: int,
+    alphas: Path,
+    work: Path,
+    report: Report,
+) -> Summary:
+    """Make a model of photos, and `work/undistorted` of it.
 
-    photos: int
-    registered: int
-    points: int
-    reprojection_error: float
-    """Mean over all observations, px."""
-    left_out: dict[str, str]
-    """Photos that were not registered, and why."""
+    Args:
+        photos: The folder of the photos.
+        groups: The photos' names, those of one camera together.
+        matching: Any but "auto".
+        max_size: Longest side of the undistorted photos in px; 0 keeps them as they are.
+        alphas: Folder of the photos' opacities as `write_alpha` writes it; they are undistorted into
+            `work/undistorted/alpha`.
+        work: Folder for all files; what an interrupted run left there is used.
+        report: Called as the work goes on.
 
-    def __str__(self) -> str:
-        lines = [
-            f"{self.registered} of {self.photos} photos registered, {self.points:,} points, "
-            f"mean reprojection error {self.reprojection_error:.2f} px."
-        ]
-        return "\n".join(lines + [f"  {name}: {why}" for name, why in sorted(self.left_out.items())])
+    Raises:
+        InputError: If no two photos could be related.
+    """
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+    names = sorted(itertools.chain(*groups))
+    database, model = work / "database.db", work / "model"
+    if not model.exists():
+        extract(photos, groups, database, report)
+        match(names, database, work / "pairs.txt", matching, report)
+        reconstruct(photos, len(names), database, work / "models", model, report)
+    undistort(photos, alphas, model, work / "undistorted", max_size, report)
+    return summarize(names, model, database)
+
+
+def fetch_vocabulary(folder: Path, report: Report) -> None:
+    """Have COLMAP load its vocabulary tree, which it downloads if it must; the process aborts if it cannot.
+
+    Args:
+        folder: An empty folder for a database of two made-up photos.
+        report: Called at the start, because nothing tells how the download goes on.
+    """
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+    report("vocabulary tree", 0, 1)
+    database = folder / "database.db"
+    random = np.random.default_rng(0)
+    with pycolmap.Database.open(database) as opened:
+        camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=100, height=100, params=[100, 50, 50])
+        camera_id = opened.write_camera(camera)
+        for name in "ab":
+            image_id = opened.write_image(pycolmap.Image(name=name, camera_id=camera_id))
+            opened.write_keypoints(image_id, random.uniform(0, 100, (50, 2)).astype(np.float32))
+            kind = pycolmap.FeatureExtractorType.SIFT
+            descriptors = random.integers(0, 256, (50, 128), dtype=np.uint8)
+            opened.write_descriptors(image_id, pycolmap.FeatureDescriptors(type=kind, data=descriptors))
+    pycolmap.match_vocabtree(database)
+    report("vocabulary tree", 1, 1)
 
 
 def sequential_pairs(names: Sequence[str], overlap: int = 10) -> list[tuple[str, str]]:
@@ -61,16 +98,10 @@ def sequential_pairs(names: Sequence[str], overlap: int = 10) -> list[tuple[str,
     return [(names[i], names[i + step]) for i in range(len(names)) for step in steps if i + step < len(names)]
 
 
-def empty_folder(folder: Path) -> Path:
-    """Make a folder, and remove what an interrupted run left in it."""
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    return folder
-
-
-def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, progress: Progress) -> None:
+def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, report: Report) -> None:
     """Find SIFT features in the photos that have none yet; each group of photos shares a camera."""
-    task = progress.add_task("features", total=sum(map(len, groups)))
+    total = sum(map(len, groups))
+    report("features", 0, total)
     with ThreadPoolExecutor(1) as pool:
         for group in groups:
             reader = pycolmap.ImageReaderOptions(camera_model="OPENCV")
@@ -84,9 +115,9 @@ def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, progr
             while not extraction.done():
                 wait([extraction], timeout=0.5)
                 with contextlib.suppress(sqlite3.Error), contextlib.closing(_reading(database)) as connection:
-                    progress.update(task, completed=connection.execute("SELECT COUNT(*) FROM keypoints").fetchone()[0])
+                    report("features", connection.execute("SELECT COUNT(*) FROM keypoints").fetchone()[0], total)
             extraction.result()
-    progress.update(task, completed=sum(map(len, groups)))
+    report("features", total, total)
 
 
 def _reading(database: Path) -> sqlite3.Connection:
@@ -94,117 +125,129 @@ def _reading(database: Path) -> sqlite3.Connection:
     return sqlite3.connect(f"{database.resolve().as_uri()}?immutable=1", uri=True)
 
 
-def match(
-    names: Sequence[str], database: Path, work: Path, matching: Matching, is_video: bool, progress: Progress
-) -> None:
+def match(names: Sequence[str], database: Path, pair_list: Path, matching: Matching, report: Report) -> None:
     """Match features between photos; pairs that an earlier run matched are skipped.
 
-    Raises:
-        ValueError: If a way of matching cannot work on these photos.
+    Args:
+        names: All photos.
+        database: COLMAP's database, which holds their features.
+        pair_list: A file to write lists of pairs to.
+        matching: Any but "auto".
+        report: Called as the work goes on.
     """
-    if matching == "auto":
-        if is_video:
-            matching = "sequential"
-        elif len(names) <= EXHAUSTIVE_LIMIT:
-            matching = "exhaustive"
-        else:
-            matching = "spatial" if _all_have_positions(database, len(names)) else "vocabulary"
+    stage = f"matches ({matching})"
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = _SEED
     # COLMAP separates the names in a list of pairs by spaces.
     listable = not any(character.isspace() for name in names for character in name)
     if matching in ("spatial", "vocabulary") or not listable:  # COLMAP's own functions tell nothing of their progress
-        task = progress.add_task(f"matches ({matching})", total=1)
-        if matching == "spatial":
-            if not _all_have_positions(database, len(names)):
-                raise ValueError(
-                    "--matching spatial needs a GPS position in every photo; use vocabulary or exhaustive."
-                )
-            pycolmap.match_spatial(database, verification_options=verification)
-        elif matching == "sequential":
-            pycolmap.match_sequential(database, verification_options=verification)
-        elif matching == "exhaustive":
-            pycolmap.match_exhaustive(database, verification_options=verification)
-        else:
-            try:
-                pycolmap.match_vocabtree(database, verification_options=verification)
-            except Exception as error:  # it downloads a vocabulary at its first use
-                raise ValueError(f"--matching vocabulary failed ({reason(error)}); use exhaustive.") from error
-        progress.advance(task)
+        report(stage, 0, 1)
+        functions = {
+            "spatial": pycolmap.match_spatial,
+            "vocabulary": pycolmap.match_vocabtree,
+            "sequential": pycolmap.match_sequential,
+            "exhaustive": pycolmap.match_exhaustive,
+        }
+        functions[matching](database, verification_options=verification)
+        report(stage, 1, 1)
         return
-    pairs = sequential_pairs(names) if matching == "sequential" else list(itertools.combinations(names, 2))
-    task = progress.add_task(f"matches ({matching})", total=len(pairs))
+    pairs = sequential_pairs(in_order(names)) if matching == "sequential" else list(itertools.combinations(names, 2))
+    report(stage, 0, len(pairs))
     for start in range(0, len(pairs), 50):
         chunk = pairs[start : start + 50]
-        listed = work / "pairs.txt"
-        listed.write_text("".join(f"{a} {b}\n" for a, b in chunk))
-        pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
+        pair_list.write_text("".join(f"{a} {b}\n" for a, b in chunk), "utf8")
+        pairing = pycolmap.ImportedPairingOptions(match_list_path=pair_list)
         pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
-        progress.advance(task, len(chunk))
+        report(stage, start + len(chunk), len(pairs))
 
 
-def _all_have_positions(database: Path, photos: int) -> bool:
-    with pycolmap.Database.open(database) as opened:
-        return opened.num_pose_priors() == photos
-
-
-def reconstruct(photos: Path, names: Sequence[str], database: Path, work: Path, progress: Progress) -> Path:
+def reconstruct(photos: Path, count: int, database: Path, attempts: Path, model: Path, report: Report) -> None:
     """Estimate cameras and points; of several disconnected models the one with the most photos is kept.
 
-    Returns:
-        The model's folder.
+    Args:
+        photos: The folder of the photos.
+        count: How many photos there are.
+        database: COLMAP's database, which holds features and matches.
+        attempts: A folder for all models.
+        model: The folder to make of the best one; it appears when it is complete.
+        report: Called as the work goes on.
 
     Raises:
-        ValueError: If no two photos could be related.
+        InputError: If no two photos could be related.
     """
-    model = work / "model"
-    task = progress.add_task("cameras", total=len(names))
-    if (model / "images.bin").exists():
-        progress.advance(task, len(names))
-        return model
-    attempts = empty_folder(work / "models")
-    options = pycolmap.IncrementalPipelineOptions(min_model_size=3, random_seed=_SEED)
+    registered = 0
+
+    def advance(more: int) -> None:
+        nonlocal registered
+        registered = min(registered + more, count)  # it counts further where it begins another model
+        report("cameras", registered, count)
+
+    advance(0)
     models = pycolmap.incremental_mapping(
         database,
         photos,
-        attempts,
-        options,
-        initial_image_pair_callback=lambda: progress.advance(task, 2),
-        next_image_callback=lambda: progress.advance(task),
+        empty_folder(attempts),
+        pycolmap.IncrementalPipelineOptions(min_model_size=3, random_seed=_SEED),
+        initial_image_pair_callback=lambda: advance(2),
+        next_image_callback=lambda: advance(1),
     )
     if not models:
-        raise ValueError(
-            "no two photos could be related to each other; take more of them, with at least two thirds of overlap, "
-            "sharp, and of a scene with texture."
+        with pycolmap.Database.open(database) as opened:
+            images = opened.read_all_images()
+            poor = sum(opened.num_keypoints_for_image(image.image_id) < FEW_FEATURES for image in images)
+        raise InputError(
+            f"no two photos could be related to each other ({poor} of {count} have fewer than {FEW_FEATURES} "
+            "features); take more of them, with at least two thirds of overlap, sharp, and of a scene with texture."
         )
     best = max(models.values(), key=lambda candidate: candidate.num_reg_images())
-    partial = empty_folder(work / "model.partial")
+    partial = empty_folder(model.with_name("model.partial"))
     best.write(partial)
+    check_written(partial, best)
     partial.rename(model)
-    progress.update(task, completed=len(names))
-    return model
+    report("cameras", count, count)
 
 
-def undistort(photos: Path, model: Path, out: Path, work: Path, max_size: int, progress: Progress) -> None:
-    """Write undistorted photos, the model that fits them, and what nerfstudio reads."""
-    from nerfstudio.process_data.colmap_utils import colmap_to_json
+def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
+    """Read a written model again, because COLMAP does not say when the disk is full.
 
-    task = progress.add_task("undistorted photos", total=1)
-    partial = work / "undistorted"
-    shutil.rmtree(partial, ignore_errors=True)
-    options = pycolmap.UndistortCameraOptions(max_image_size=max_size)
-    pycolmap.undistort_images(partial, model, photos, undistort_options=options, jpeg_quality=95)
-    sparse = partial / "sparse"
+    Raises:
+        OSError: If the folder holds less than the model.
+    """
+    sizes = [(len(one.images), one.num_points3D()) for one in (pycolmap.Reconstruction(folder), model)]
+    if sizes[0] != sizes[1]:
+        raise OSError(f"{folder} was not written completely: the disk is full")
+
+
+def undistort(photos: Path, alphas: Path, model: Path, folder: Path, max_size: int, report: Report) -> None:
+    """Write undistorted photos, their opacity and the model that fits them, which goes to `sparse/0` of a folder."""
+    reconstruction = pycolmap.Reconstruction(model)
+    registered = [image for image in reconstruction.images.values() if image.has_pose]
+    report("undistorted photos", 0, len(registered))
+    shutil.rmtree(folder, ignore_errors=True)
+    options = pycolmap.UndistortCameraOptions(max_image_size=max_size or -1)
+    with ThreadPoolExecutor(1) as pool:
+        undistortion = pool.submit(
+            pycolmap.undistort_images, folder, model, photos, undistort_options=options, jpeg_quality=95
+        )
+        while not undistortion.done():
+            wait([undistortion], timeout=0.5)
+            written = sum(path.is_file() for path in (folder / "images").rglob("*"))
+            report("undistorted photos", written, len(registered))
+        undistortion.result()
+    for image in registered:
+        alpha = alphas / f"{image.name}.png"
+        if alpha.exists():
+            target = folder / "alpha" / f"{image.name}.png"
+            target.parent.mkdir(parents=True, exist_ok=True)
+            opacity = pycolmap.Bitmap.read(alpha, as_rgb=False)
+            assert opacity is not None  # nobody but `write_alpha` wrote it
+            pycolmap.undistort_image(options, opacity, image.camera)[0].write(target)
+    sparse = folder / "sparse"
     (sparse / "0").mkdir()
     for file in sparse.glob("*.bin"):
         file.rename(sparse / "0" / file.name)
-    with contextlib.redirect_stdout(io.StringIO()):  # it prints all cameras where there are several
-        colmap_to_json(sparse / "0", partial)
-    for name in ("images", "sparse"):
-        shutil.rmtree(out / name, ignore_errors=True)
-    for name in ("images", "sparse", "sparse_pc.ply", "transforms.json"):  # the last one says that all are there
-        (partial / name).rename(out / name)
-    progress.advance(task)
+    check_written(sparse / "0", reconstruction)
+    report("undistorted photos", len(registered), len(registered))
 
 
 def summarize(names: Sequence[str], model: Path, database: Path) -> Summary:

@@ -1,0 +1,116 @@
+"""Which photos are compared with each other, decided before any work, and what came of it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from sadgs_ns.cli.process.photos import Photo, are_in_order
+from sadgs_ns.errors import InputError, RunError
+
+EXHAUSTIVE_LIMIT = 200
+"""Photos up to which every pair is matched; twice the photos take four times as long."""
+_FEATURES_PER_MEGAPIXEL = 2.2
+"""Processor time in s to find features in a million pixels, as measured on fox, south and bonsai."""
+_PAIR_PER_MEGAPIXEL, _LONGEST_PAIR = 0.3, 0.65
+"""Processor time in s to match two photos of a million pixels, and of so many that COLMAP's limit of features holds."""
+_MAX_SIDE = 3200
+"""Longest side in px to which COLMAP scales photos down to find features."""
+_PAIRS_PER_PHOTO = {"sequential": 16, "spatial": 50, "vocabulary": 100}
+"""Other photos that each photo is matched with, at most."""
+Matching = Literal["auto", "exhaustive", "sequential", "spatial", "vocabulary"]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What became of the photos."""
+
+    photos: int
+    registered: int
+    points: int
+    reprojection_error: float
+    """Mean over all observations, px."""
+    left_out: dict[str, str]
+    """Photos that were not registered, and why."""
+
+    def __str__(self) -> str:
+        lines = [
+            f"{self.registered} of {self.photos} photos registered, {self.points:,} points, "
+            f"mean reprojection error {self.reprojection_error:.2f} px."
+        ]
+        return "\n".join(lines + [f"  {name}: {why}" for name, why in sorted(self.left_out.items())])
+
+    @property
+    def is_poor(self) -> bool:
+        """Whether fewer than half of the photos registered."""
+        return self.registered < 0.5 * self.photos
+
+
+def choose_matching(
+    asked: Matching, photos: Sequence[Photo], is_video: bool, fetch_vocabulary: Callable[[], None]
+) -> tuple[Matching, str]:
+    """Decide which pairs of photos are matched.
+
+    Args:
+        asked: What the user asked for.
+        photos: The photos, or the frames of a video.
+        is_video: Whether they are frames of a video.
+        fetch_vocabulary: Makes sure that COLMAP's vocabulary tree is on this machine; raises RunError if it cannot.
+
+    Returns:
+        Any way of matching but "auto", and what the user should know about the choice; empty if there is nothing.
+
+    Raises:
+        InputError: If what was asked for cannot work on these photos or this machine.
+    """
+    nowhere = [photo.name for photo in photos if not photo.has_position]
+    if asked == "spatial" and nowhere:
+        raise InputError(
+            f"--matching spatial needs a GPS position in the EXIF data of every photo, and {len(nowhere)} of the "
+            f"{len(photos)} have none, such as {nowhere[0]}; use sequential, exhaustive or auto."
+        )
+    if asked not in ("auto", "vocabulary"):
+        return asked, ""
+    if asked == "auto" and is_video:
+        return "sequential", ""
+    if asked == "auto" and len(photos) <= EXHAUSTIVE_LIMIT:
+        return "exhaustive", ""
+    if asked == "auto" and not nowhere:
+        return "spatial", ""
+    try:
+        fetch_vocabulary()
+    except RunError as error:
+        why = str(error).partition(";")[0]
+        lacking = f"There is no vocabulary tree, which pycolmap downloads at its first use: {why}."
+        if asked == "vocabulary":
+            raise InputError(
+                f"{lacking} Use --matching sequential for photos in the order of their taking, or exhaustive."
+            ) from error
+        if are_in_order([photo.name for photo in photos]):
+            return "sequential", (
+                f"{lacking} The photos are numbered, so each is matched with those that follow it "
+                "(--matching sequential); if many do not register, use --matching exhaustive."
+            )
+        return "exhaustive", (
+            f"{lacking} Each photo is matched with all others (--matching exhaustive), which takes long; --matching "
+            "sequential is quicker for photos in the order of their taking."
+        )
+    return "vocabulary", ""
+
+
+def expected_work(photos: Sequence[Photo], matching: str) -> str:
+    """Return a sentence on how much there is to do, and roughly how long it takes on this machine."""
+    megapixels = 0.0
+    for photo in photos:
+        width, height = photo.size
+        megapixels += width * height / 1e6 * min(1.0, _MAX_SIDE / max(width, height)) ** 2
+    pairs = min(len(photos) * _PAIRS_PER_PHOTO.get(matching, len(photos)), len(photos) * (len(photos) - 1) // 2)
+    per_pair = min(_PAIR_PER_MEGAPIXEL * megapixels / len(photos), _LONGEST_PAIR)
+    cores = os.cpu_count() or 1
+    minutes = (megapixels * _FEATURES_PER_MEGAPIXEL + pairs * per_pair) / cores / 60
+    duration = (
+        f"{minutes / 60:.1f} hours" if minutes >= 60 else f"{minutes:.0f} minutes" if minutes >= 2 else "a minute"
+    )
+    return f"{len(photos)} photos, up to {pairs:,} pairs to match: roughly {duration} on {cores} processor cores."
