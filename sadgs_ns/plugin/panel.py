@@ -1,4 +1,4 @@
-"""The viewer's panel: what it shows of the method, and the settings that can be changed while a run trains.
+"""The viewer's panel, which shows what the method does and changes some of its settings while a run trains.
 
 The viewer finds the elements by walking the pipeline, and shows them in alphabetical order of their attributes.
 """
@@ -122,7 +122,7 @@ class ViewerMarkdown(ViewerElement[str]):
 
     Args:
         name: Name of the element.
-        text: Makes the text, when the element is installed and at every `refresh`.
+        text: Called for the text when the element is installed, and at every `refresh`.
     """
 
     def __init__(self, name: str, text: Callable[[], str]) -> None:
@@ -185,7 +185,7 @@ class StructurePanel(torch.nn.Module):
         return ViewerSlider(
             name,
             value,
-            min(low, value),  # the run's own options may lie beyond the range
+            min(low, value),  # The run's own options may lie beyond the range.
             max(high, value),
             0.05,
             cb_hook=lambda element: self._change(name, element),
@@ -235,7 +235,11 @@ class StructurePanel(torch.nn.Module):
             self.table.refresh()
 
     def statistics(self) -> dict[str, Tensor] | None:
-        """The run's own observations since its last structure step, or those of `observe_now` if there are none."""
+        """Return the run's own observations since its last structure step, or else those of `observe_now`.
+
+        Returns:
+            As `empty_statistics`, or None where neither is of the present Gaussians.
+        """
         model = self._model
         live, n = model.strategy_state, model.num_points
         if "n_total" in live and len(live["n_total"]) == n and bool((live["n_total"] > 0).any()):
@@ -280,8 +284,8 @@ class StructurePanel(torch.nn.Module):
     def choose(self) -> None:
         """Make what the present choice needs, and have the viewer show it.
 
-        This happens here and not when the picture is drawn, since the viewer breaks off drawing at any line when its
-        camera moves: photos that are undistorted a second time would be wrong.
+        This does not happen when the picture is drawn, because the viewer breaks off drawing at any line when its
+        camera moves, and photos that were then undistorted a second time would be wrong.
         """
         chosen = self.choice.value
         if chosen in OF_STATISTICS and self.statistics() is None:
@@ -290,15 +294,15 @@ class StructurePanel(torch.nn.Module):
             self._read_photos()
             self._say("")
         self._shown = chosen
-        viewer = getattr(self.viewer, "viewer", None)  # set when the viewer was made
+        viewer = getattr(self.viewer, "viewer", None)  # It is set when the viewer is made.
         if viewer is not None:
-            output = viewer.control_panel._output_render  # nerfstudio 1.1 has no public way
+            output = viewer.control_panel._output_render  # nerfstudio 1.1 has no public way.
             name = "rgb" if chosen == OFF else OUTPUT
             if name in output.options:
                 output.value = name
 
     def outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
-        """What the viewer may show besides the model's own outputs; evaluation and `ns-render` get nothing.
+        """Return what the viewer may show besides the model's own outputs; evaluation and `ns-render` get nothing.
 
         The output exists whatever is chosen, because the viewer's thread fails where one goes missing.
 
@@ -318,12 +322,15 @@ class StructurePanel(torch.nn.Module):
 
     @torch.no_grad()
     def picture(self, choice: str, camera: Cameras, rgb: Tensor) -> Picture:
-        """The picture of one of `CHOICES` as a camera sees it, with its legend.
+        """Draw one of `CHOICES` as a camera sees it, with its legend.
 
         Args:
             choice: Any of `CHOICES` but "off".
             camera: One camera, shape [1].
             rgb: What it sees, in [0, 1]. [H, W, 3]
+
+        Returns:
+            The picture. [H, W, 3]
         """
         maps, datamanager, (height, width) = self._maps, self._maps.views.datamanager, rgb.shape[:2]
         constant = maps.frequency_constant

@@ -86,7 +86,8 @@ def test_observing_all_training_views_tells_how_far_it_is_and_what_was_seen(
     assert told(panel) == [
         "Reading the training photos and their texture …",
         *(f"Observing training view {view + 1} of {views} …" for view in range(views)),
-        f"Observed {views} training views, which see {seen:,} Gaussians: “η”, “children” and “low” show what was found.",
+        f"Observed {views} training views, which see {seen:,} Gaussians: “η”, “children” and “low” show what was "
+        "found.",
     ]
     assert was_disabled(panel) == [True, False], "the button cannot be pressed meanwhile"
     panel.choice.value = "wavelength of the nearest photo"
