@@ -90,7 +90,7 @@ class ProgressTable(LocalWriter):
         self._rows: deque[str] = deque(maxlen=config.max_log_size or None)
         self._times: deque[tuple[int, float]] = deque(maxlen=10)
         self._estimated = False
-        in_place = config.max_log_size > 0 and CONSOLE.is_terminal and not CONSOLE.is_dumb_terminal
+        in_place = config.max_log_size > 0 and CONSOLE.is_interactive
         self._live = Live(console=CONSOLE, auto_refresh=False) if in_place else None
 
     def write_stats_log(self, step: int) -> None:
