@@ -57,7 +57,8 @@ def configure(output: Path, parser: DataParserConfig, iterations: int = 6, **str
 
 def as_saved_before_the_folders(config: str) -> str:
     """What a config.yml said when all files of the package lay in one folder."""
-    text = config.replace("sadgs_ns.plugin.", "sadgs_ns.").replace("sadgs_ns.method.", "sadgs_ns.")
+    text = config.replace("sadgs_ns.plugin.progress.ProgressTable", "nerfstudio.utils.writer.LocalWriter")
+    text = text.replace("sadgs_ns.plugin.", "sadgs_ns.").replace("sadgs_ns.method.", "sadgs_ns.")
     for name in ("MachineConfig", "ViewerConfig"):
         text = text.replace(f"sadgs_ns.trainer.Sadgs{name}", f"nerfstudio.configs.base_config.{name}")
     assert "sadgs_ns.model.SadgsModelConfig" in text and "sadgs_ns.strategy.StructureAwareStrategy" in text

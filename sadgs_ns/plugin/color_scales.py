@@ -32,7 +32,7 @@ viridis."""
 
 @dataclass(frozen=True)
 class Scale:
-    """A colour scale: which colour a value has, and what a legend says of it."""
+    """A colour scale, which says what colour a value has, and what a legend says of it."""
 
     label: str
     colors: str
@@ -45,16 +45,23 @@ class Scale:
 
     @property
     def norm(self) -> Normalize:
-        """Maps values to [0, 1]; those beyond the ends get the colours of the ends."""
+        """What maps values to [0, 1]; values beyond the ends get the colours of the ends."""
         return (LogNorm if self.log else Normalize)(self.low, self.high, clip=True)
 
     @property
     def colormap(self) -> Colormap:
-        """Maps [0, 1] to colours."""
+        """What maps [0, 1] to colours."""
         return matplotlib.colormaps[self.colors].with_extremes(bad=NOTHING)
 
     def __call__(self, values: Tensor) -> Picture:
-        """Colour a map of values [H, W]; NaN becomes black. [H, W, 3]"""
+        """Colour a map of values.
+
+        Args:
+            values: Values in the scale's unit; NaN becomes black. [H, W]
+
+        Returns:
+            The coloured map. [H, W, 3]
+        """
         shown = self.norm(np.ma.masked_invalid(values.detach().float().cpu().numpy()))
         return self.colormap(shown, bytes=True)[..., :3]  # type: ignore[return-value]
 
@@ -67,7 +74,7 @@ LOW = Scale("share of consistently low Gaussians", "cividis", 0, 1, (0, 0.25, 0.
 
 
 def to_picture(image: Tensor) -> Picture:
-    """An image in [0, 1] as a picture. [H, W, 3]"""
+    """Return an image in [0, 1], [H, W, 3], as a picture; values beyond are cut."""
     return (255 * image.detach().float().clamp(0, 1)).round().byte().cpu().numpy()
 
 
@@ -85,21 +92,24 @@ def _bar(scale: Scale, width: int, height: int) -> Image.Image:
 
 
 def annotate(picture: Picture, text: str, scale: Scale | None = None) -> Picture:
-    """A picture with a line of text, and the scale's colours and numbers, at its upper edge.
+    """Return a picture with a line of text, and the scale's colours and numbers, at its upper edge.
 
-    This is for the viewer, whose pictures have no margin, and whose axes lie at the lower edge. Tiny pictures stay as
-    they are.
+    The viewer's pictures have no margin, and its axes lie at the lower edge. Pictures under 160×120 px stay as they
+    are.
 
     Args:
-        picture: [H, W, 3]
+        picture: The picture, which is not changed. [H, W, 3]
         text: One line.
         scale: The scale to show, or None for the text alone.
+
+    Returns:
+        A picture of the same size. [H, W, 3]
     """
     height, width = picture.shape[:2]
     if height < 120 or width < 160:
         return picture
     size = max(min(height // 30, width // 40), 9)
-    size = max(min(size, int(size * (width - 2 * size) / _font(size).getlength(text))), 6)  # the whole text is seen
+    size = max(min(size, int(size * (width - 2 * size) / _font(size).getlength(text))), 6)  # The whole text fits.
     strip = 4 * size if scale is not None else 2 * size
     image = Image.fromarray(picture)
     image.paste((20, 20, 20), (0, 0, width, strip))

@@ -1,4 +1,4 @@
-"""Maps of what the Gaussians in each pixel of a view have: their η, their children, the share of chosen ones."""
+"""Maps of what the Gaussians of each pixel have: their η, their children, or the share of chosen ones."""
 
 from __future__ import annotations
 
@@ -56,7 +56,9 @@ def blend(
 
 
 def eta_map(params: Mapping[str, Tensor], statistics: Mapping[str, Tensor], *view, **options) -> Tensor:
-    """Largest η of the Gaussians that make up each pixel: a mean of log η by what each adds to the pixel.
+    """Return the largest η of the Gaussians that make up each pixel, as a geometric mean.
+
+    Each Gaussian's η weighs as much as the Gaussian adds to the pixel.
 
     Args:
         params: As for `blend`.
@@ -75,7 +77,7 @@ def eta_map(params: Mapping[str, Tensor], statistics: Mapping[str, Tensor], *vie
 
 
 def children_map(params: Mapping[str, Tensor], counts: Tensor, *view, **options) -> Tensor:
-    """Number of children of the Gaussians that make up each pixel, as a geometric mean.
+    """Return the number of children of the Gaussians that make up each pixel, as a geometric mean.
 
     Args:
         params: As for `blend`.
@@ -91,7 +93,7 @@ def children_map(params: Mapping[str, Tensor], counts: Tensor, *view, **options)
 
 
 def share_map(params: Mapping[str, Tensor], chosen: Tensor, *view, **options) -> Tensor:
-    """Share of what is drawn at each pixel that the chosen Gaussians make up.
+    """Return the share of what is drawn at each pixel that the chosen Gaussians make up.
 
     Args:
         params: As for `blend`.
@@ -107,7 +109,15 @@ def share_map(params: Mapping[str, Tensor], chosen: Tensor, *view, **options) ->
 
 
 def random_colors(number: int, generator: torch.Generator) -> Tensor:
-    """Bright colours that tell neighbouring Gaussians apart. [N, 3]"""
+    """Return bright colours that tell neighbouring Gaussians apart.
+
+    Args:
+        number: Number of colours, N.
+        generator: A generator on the CPU.
+
+    Returns:
+        In [0, 1]. [N, 3]
+    """
     hue, saturation, value = torch.rand((3, number), generator=generator)
     return torch.from_numpy(
         hsv_to_rgb(torch.stack([hue, 0.35 + 0.65 * saturation, 0.5 + 0.5 * value], -1).numpy())
@@ -115,15 +125,15 @@ def random_colors(number: int, generator: torch.Generator) -> Tensor:
 
 
 def recolor(colors: Tensor, origins: Tensor, generator: torch.Generator) -> Tensor:
-    """Colours after a densification step: Gaussians that stayed whole keep theirs, children get new ones.
+    """Return colours after a densification step: Gaussians that stayed whole keep theirs, children get new ones.
 
     Args:
-        colors: Colours before the step. [N, 3]
+        colors: Colours before the step, in [0, 1]. [N, 3]
         origins: Index, before the step, of the Gaussian that each one was or came from. int64 [M]
         generator: A generator on the CPU.
 
     Returns:
-        [M, 3]
+        In [0, 1]. [M, 3]
     """
     is_child = torch.bincount(origins, minlength=len(colors))[origins] > 1  # [M]
     return torch.where(is_child[:, None], random_colors(len(origins), generator).to(colors), colors[origins])

@@ -1,4 +1,4 @@
-"""The viewer's panel: what it shows of the method, and the settings that can be changed while a run trains.
+"""The viewer's panel, which shows what the method does and changes some of its settings while a run trains.
 
 The viewer finds the elements by walking the pipeline, and shows them in alphabetical order of their attributes.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -73,7 +73,10 @@ def change(strategy: StructureAwareStrategy, name: str, value: float) -> None:
 
 
 def describe(strategy: StructureAwareStrategy, num_points: int, state: dict[str, Any]) -> str:
-    """The number of Gaussians now, and a table of those in the last structure steps, as Markdown.
+    """Return the number of Gaussians now, and a table of how the last structure steps changed it, as Markdown.
+
+    What AbsGS and pruning changed between the structure steps has rows of its own, so that each row begins where the
+    one above ends, and the last one ends with the number of now.
 
     Args:
         strategy: The strategy, whose cap is told.
@@ -84,16 +87,25 @@ def describe(strategy: StructureAwareStrategy, num_points: int, state: dict[str,
     steps = state.get("structure_steps", [])[-ROWS:]
     if not steps:
         return "\n".join([*lines, "No structure step yet."])
-    lines += ["| iteration | violate | low | Gaussians |", "| --- | --- | --- | --- |"]
-    lines += [
-        f"| {step['iteration']} | {step['violating']:,} | {step['low']:,} | {step['before']:,} → {step['after']:,} |"
-        for step in steps
-    ]
+    lines += ["| iteration | step | violate | low | Gaussians |", "| --- | --- | --- | --- | --- |"]
+    number, last = steps[0]["before"], ""
+    for step in steps:
+        if step["before"] != number:
+            lines.append(_between(f"to {step['iteration']}", number, step["before"]))
+        change = f"{step['before']:,} → {step['after']:,}"
+        lines.append(f"| {step['iteration']} | structure | {step['violating']:,} | {step['low']:,} | {change} |")
+        number, last = step["after"], f"since {step['iteration']}"
+    if number != num_points:
+        lines.append(_between(last, number, num_points))
     return "\n".join(lines)
 
 
+def _between(when: str, before: int, after: int) -> str:
+    return f"| {when} | AbsGS, pruning | | | {before:,} → {after:,} |"
+
+
 def nearest_view(cameras: Tensor, camera: Tensor, extent: float) -> int:
-    """Index of the training view that looks most like a camera's: it is near, and looks in the same direction.
+    """Return the index of the training view that is most like a camera's: near it, and looking in the same direction.
 
     Args:
         cameras: Camera-to-world poses of the training views. [C, 3, 4]
@@ -110,7 +122,7 @@ class ViewerMarkdown(ViewerElement[str]):
 
     Args:
         name: Name of the element.
-        text: Makes the text, when the element is installed and at every `refresh`.
+        text: Called for the text when the element is installed, and at every `refresh`.
     """
 
     def __init__(self, name: str, text: Callable[[], str]) -> None:
@@ -145,6 +157,7 @@ class StructurePanel(torch.nn.Module):
         self._maps = maps
         self._observed: dict[str, Tensor] = {}
         self._refreshed = 0.0
+        self._status = ""
         self._shown = OFF
         strategy = self._model.strategy
         self.choice = ViewerDropdown(
@@ -172,7 +185,7 @@ class StructurePanel(torch.nn.Module):
         return ViewerSlider(
             name,
             value,
-            min(low, value),  # the run's own options may lie beyond the range
+            min(low, value),  # The run's own options may lie beyond the range.
             max(high, value),
             0.05,
             cb_hook=lambda element: self._change(name, element),
@@ -186,7 +199,13 @@ class StructurePanel(torch.nn.Module):
 
     def _describe(self) -> str:
         model = self._model
-        return describe(model.strategy, model.num_points, model.strategy_state)
+        text = describe(model.strategy, model.num_points, model.strategy_state)
+        return f"{self._status}\n\n{text}" if self._status else text
+
+    def _say(self, status: str) -> None:
+        """Show above the table what the panel is doing or has done."""
+        self._status = status
+        self.table.refresh()
 
     def _change(self, name: str, element: ViewerParameter) -> None:
         strategy = self._model.strategy
@@ -198,13 +217,15 @@ class StructurePanel(torch.nn.Module):
             element.value = getattr(strategy, name)
         self.table.refresh()
 
-    @staticmethod
-    def _told(act: Callable[[], None]) -> None:
-        """Call `act`, and say on the console what went wrong: the viewer's threads keep their errors to themselves."""
+    def _told(self, act: Callable[[], None]) -> None:
+        """Call `act`, and say what went wrong: the viewer's threads keep their errors to themselves."""
+        self._say("")
         try:
             act()
-        except (RuntimeError, ValueError) as error:  # memory that is full, or data that went away
-            CONSOLE.print(f"[yellow]The viewer's panel stays as it was: {escape(reason(error))}[/]")
+        except (RuntimeError, ValueError) as error:  # Memory is full, or data went away.
+            text = f"The viewer's panel stays as it was: {reason(error)}"
+            CONSOLE.print(f"[yellow]{escape(text)}[/]")
+            self._say(text)
 
     def refresh(self) -> None:
         """Show the present numbers in the table, at most once a second; without a viewer this costs nothing."""
@@ -214,7 +235,11 @@ class StructurePanel(torch.nn.Module):
             self.table.refresh()
 
     def statistics(self) -> dict[str, Tensor] | None:
-        """The run's own observations since its last structure step, or those of `observe_now` if there are none."""
+        """Return the run's own observations since its last structure step, or else those of `observe_now`.
+
+        Returns:
+            As `empty_statistics`, or None where neither is of the present Gaussians.
+        """
         model = self._model
         live, n = model.strategy_state, model.num_points
         if "n_total" in live and len(live["n_total"]) == n and bool((live["n_total"] > 0).any()):
@@ -222,30 +247,62 @@ class StructurePanel(torch.nn.Module):
         return self._observed if len(self._observed.get("n_total", ())) == n else None
 
     def observe_now(self) -> None:
-        """Observe all training views with the present Gaussians."""
-        self._observed = observe_training_views(self._maps)
+        """Observe all training views with the present Gaussians, and say above the table how far that is."""
+        number = len(self._maps.views)
+        self._set_busy(True)
+        try:
+            self._read_photos()
+            self._observed = observe_training_views(self._maps, self._told_of)
+        finally:
+            self._set_busy(False)
+        seen = int((self._observed["n_total"] > 0).sum())
+        self._say(
+            f"Observed {number:,} training views, which see {seen:,} Gaussians: “{ETA_OF}”, “{CHILDREN_OF}” and "
+            f"“{LOW_OF}” show what was found."
+        )
+
+    def _told_of(self, views: range) -> Iterator[int]:
+        """Yield the views, and say at most twice a second which of them is looked at."""
+        due = 0.0
+        for view in views:
+            if time.monotonic() >= due:
+                self._say(f"Observing training view {view + 1:,} of {len(views):,} …")
+                due = time.monotonic() + 0.5
+            yield view
+
+    def _read_photos(self) -> None:
+        """Compute the structure tensors of the training photos, which are then kept."""
+        if "codes" not in vars(self._maps):
+            self._say("Reading the training photos and their texture …")
+            _ = self._maps.codes
+
+    def _set_busy(self, busy: bool) -> None:
+        """Let the button be pressed only while nothing is observed."""
+        if self.observe.gui_handle is not None:
+            self.observe.set_disabled(busy)
 
     def choose(self) -> None:
         """Make what the present choice needs, and have the viewer show it.
 
-        This happens here and not when the picture is drawn, since the viewer breaks off drawing at any line when its
-        camera moves: photos that are undistorted a second time would be wrong.
+        This does not happen when the picture is drawn, because the viewer breaks off drawing at any line when its
+        camera moves, and photos that were then undistorted a second time would be wrong.
         """
         chosen = self.choice.value
         if chosen in OF_STATISTICS and self.statistics() is None:
             self.observe_now()
         elif chosen in OF_PHOTOS:
-            _ = self._maps.codes
+            self._read_photos()
+            self._say("")
         self._shown = chosen
-        viewer = getattr(self.viewer, "viewer", None)  # set when the viewer was made
+        viewer = getattr(self.viewer, "viewer", None)  # It is set when the viewer is made.
         if viewer is not None:
-            output = viewer.control_panel._output_render  # nerfstudio 1.1 has no public way
+            output = viewer.control_panel._output_render  # nerfstudio 1.1 has no public way.
             name = "rgb" if chosen == OFF else OUTPUT
             if name in output.options:
                 output.value = name
 
     def outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
-        """What the viewer may show besides the model's own outputs; evaluation and `ns-render` get nothing.
+        """Return what the viewer may show besides the model's own outputs; evaluation and `ns-render` get nothing.
 
         The output exists whatever is chosen, because the viewer's thread fails where one goes missing.
 
@@ -265,12 +322,15 @@ class StructurePanel(torch.nn.Module):
 
     @torch.no_grad()
     def picture(self, choice: str, camera: Cameras, rgb: Tensor) -> Picture:
-        """The picture of one of `CHOICES` as a camera sees it, with its legend.
+        """Draw one of `CHOICES` as a camera sees it, with its legend.
 
         Args:
             choice: Any of `CHOICES` but "off".
             camera: One camera, shape [1].
             rgb: What it sees, in [0, 1]. [H, W, 3]
+
+        Returns:
+            The picture. [H, W, 3]
         """
         maps, datamanager, (height, width) = self._maps, self._maps.views.datamanager, rgb.shape[:2]
         constant = maps.frequency_constant

@@ -1,4 +1,4 @@
-"""S̄ for the eye: the period of the texture at each pixel, and S̄⁻¹ as ellipses over an image (paper, figure 1)."""
+"""Pictures of S̄: the period of the texture at each pixel, and S̄⁻¹ as ellipses over an image (paper, figure 1)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ELLIPSES_ACROSS = 28
 
 
 def texture_period(structure_tensor: Tensor, frequency_constant: float = FREQUENCY_CONSTANT) -> Tensor:
-    """Period of the finest texture at each pixel, 2π c Λ_min.
+    """Return the period of the finest texture at each pixel, 2π c Λ_min.
 
     The structure tensor measures ω = c / σ, and a sine of period P answers most at σ = P / 2π.
 
@@ -36,7 +36,7 @@ def texture_period(structure_tensor: Tensor, frequency_constant: float = FREQUEN
 
 @dataclass(frozen=True)
 class Ellipses:
-    """S̄⁻¹ at some pixels (paper, figure 1): short across a texture's stripes, long along them."""
+    """S̄⁻¹ at some pixels (paper, figure 1); it is short across a texture's stripes and long along them."""
 
     centers: Tensor
     """Centres in px. [E, 2]"""
@@ -55,7 +55,7 @@ class Ellipses:
 def structure_ellipses(
     structure_tensor: Tensor, frequency_constant: float = FREQUENCY_CONSTANT, spacing: float | None = None
 ) -> Ellipses:
-    """S̄⁻¹ on a regular grid of pixels, without those where there is no texture.
+    """Return S̄⁻¹ on a regular grid of pixels, without those where there is no texture.
 
     Args:
         structure_tensor: S̄ as (xx, xy, yy) in 1/px². [H, W, 3]
@@ -74,7 +74,7 @@ def structure_ellipses(
     longest = SCALE_STEP ** (NUM_LEVELS - 1) / frequency_constant
     lengths = 1.0 / (values.clamp_min(0).sqrt() + WAVELENGTH_EPSILON)
     textured = lengths[:, 1] < 2 * longest
-    short = vectors[textured, :, 1]  # of the larger eigenvalue
+    short = vectors[textured, :, 1]  # The larger eigenvalue is the higher frequency.
     return Ellipses(
         centers=points[textured],
         axes=lengths[textured].flip(-1).clamp_max(longest),
@@ -91,31 +91,36 @@ def draw_ellipses(
     frequency_constant: float = FREQUENCY_CONSTANT,
     size: tuple[int, int] | None = None,
 ) -> Picture:
-    """S̄⁻¹ as ellipses over an image, which is made dark grey. A circle as wide as the grid is the coarsest wavelength.
+    """Draw S̄⁻¹ as ellipses over an image, which is made dark grey.
+
+    A circle as wide as the grid's spacing has the coarsest wavelength on both axes.
 
     Args:
         image: The picture to draw on. [H, W, 3]
         structure_tensor: S̄ of the image. [H, W, 3]
         frequency_constant: c that S̄ was computed with, in 1/px.
         size: Height and width of the picture in px; None keeps those of the image.
+
+    Returns:
+        The drawing. [H, W, 3]
     """
     ellipses = structure_ellipses(structure_tensor, frequency_constant)
     height, width = image.shape[:2] if size is None else size
     enlarge_x, enlarge_y = width / image.shape[1], height / image.shape[0]
     picture = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if enlarge_x < 1 else cv2.INTER_LINEAR)
-    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)  # colour is the ellipses'
+    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)  # Colour is left to the ellipses.
     picture = np.repeat((0.5 * grey).astype(np.uint8)[..., None], 3, axis=-1)
     if len(ellipses.centers) == 0:
         return picture
     colors = PERIOD(ellipses.periods[None])[0]
     # The grid's own size, not the wavelengths', decides how large they are drawn: none vanish or overlap.
     radius = 0.5 * ellipses.spacing * min(enlarge_x, enlarge_y) / ellipses.longest
-    fixed = 16  # OpenCV's fixed point: 4 bits
+    fixed = 16  # OpenCV takes numbers with 4 bits after the point.
     thickness = max(round(min(height, width) / 350), 1)
     for center, axes, angle, color in zip(
         ellipses.centers.tolist(), ellipses.axes.tolist(), ellipses.angles.tolist(), colors.tolist(), strict=True
     ):
-        # OpenCV's pixel centres are integers.
+        # OpenCV numbers pixels by their centres, we by their edges.
         at = (round((center[0] * enlarge_x - 0.5) * fixed), round((center[1] * enlarge_y - 0.5) * fixed))
         half = (max(round(axes[0] * radius * fixed), 1), max(round(axes[1] * radius * fixed), 1))
         cv2.ellipse(picture, at, half, math.degrees(angle), 0, 360, color, thickness, cv2.LINE_AA, shift=4)

@@ -13,7 +13,8 @@ from typing import Any, Literal
 
 import torch
 import yaml
-from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
+from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -27,6 +28,7 @@ from sadgs_ns.plugin.compilation import compile_kernels
 from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
 from sadgs_ns.plugin.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig, SadgsOptimizers
 from sadgs_ns.plugin.pipeline import SadgsPipeline, SadgsPipelineConfig
+from sadgs_ns.plugin.progress import ProgressTable, about_cpu, remove_tables, what_next
 
 _LESS_MEMORY = (
     "lower --pipeline.model.strategy.max-gaussians or --pipeline.views-per-iteration, or take smaller images "
@@ -148,8 +150,12 @@ class SadgsTrainerConfig(TrainerConfig):
     """Folder of the checkpoints inside the run's."""
     load_scheduler: Suppress[bool] = True
     """Whether schedules go on where the checkpoint left them."""
-    logging: Suppress[LoggingConfig] = field(default_factory=LoggingConfig)
-    """What nerfstudio prints, and how often."""
+    logging: Suppress[LoggingConfig] = field(
+        default_factory=lambda: LoggingConfig(
+            local_writer=LocalWriterConfig(_target=ProgressTable, enable=True), profiler="none"
+        )
+    )
+    """What is printed during training, and how often."""
     mixed_precision: Suppress[bool] = False
     """Refused: this method trains in float32."""
     use_grad_scaler: Suppress[bool] = False
@@ -278,6 +284,8 @@ class SadgsTrainer(Trainer):
         try:
             super().setup(*args, **kwargs)
             self._say_what_was_chosen()
+            last = [TrainingCallbackLocation.AFTER_TRAIN]
+            self.callbacks.append(TrainingCallback(last, lambda step: self._say_what_is_next()))
             compile_kernels(self.pipeline, self.optimizers.optimizers)
         except torch.cuda.OutOfMemoryError as error:
             raise RunError(f"The GPU's memory is too small to start ({_memory(error)}): {_LESS_MEMORY}.") from error
@@ -305,7 +313,15 @@ class SadgsTrainer(Trainer):
                 "outdoors, on images of 1.9, it took twice as long as sadgs and was worse. Consider sadgs, or smaller "
                 "images.[/]"
             )
+        if self.device == "cpu":
+            lines.append(f"[yellow]{about_cpu(torch.get_num_threads())}[/]")
         CONSOLE.print("\n".join(lines), highlight=False, soft_wrap=True)
+
+    def _say_what_is_next(self) -> None:
+        """Print the commands for a run that is done, below nerfstudio's box; not where the run ends with an error."""
+        if not self.pipeline.stuck:
+            text = what_next(self.base_dir / "config.yml", self.pipeline.model.num_points)
+            CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
 
     def _load_checkpoint(self) -> None:
         """Resume as nerfstudio does, but with the safe loader, and from an earlier checkpoint if the latest is damaged.
@@ -388,6 +404,7 @@ class SadgsTrainer(Trainer):
             raise WriteError(Path(error.filename or self.base_dir), error) from error
         finally:
             self.config.max_num_iterations = total
+            remove_tables()
         if out_of_memory:
             raise RunError(self._rescue(out_of_memory))
 

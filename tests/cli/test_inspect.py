@@ -29,7 +29,6 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.method.codes import MASKED
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin import color_scales, gaussian_maps, texture
-from sadgs_ns.plugin import panel as panel_module
 from sadgs_ns.plugin.model import _say_once
 from sadgs_ns.plugin.panel import CHOICES, OFF, OUTPUT, StructurePanel, change, describe, nearest_view
 from sadgs_ns.plugin.pipeline import SadgsPipeline
@@ -386,18 +385,6 @@ def test_where_every_pixel_is_masked_the_panel_says_that_none_was_observed(panel
     assert (picture == 0).all(), "black"
 
 
-def test_what_fails_in_a_viewer_s_thread_is_told(
-    panel: StructurePanel, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    def full(maps: Any) -> None:
-        raise RuntimeError("CUDA out of memory.\nOf no interest.")
-
-    monkeypatch.setattr(panel_module, "observe_training_views", full)
-    panel.observe.cb_hook(panel.observe)
-    told = " ".join(capsys.readouterr().out.split())
-    assert told == "The viewer's panel stays as it was: CUDA out of memory"
-
-
 def test_sliders_reach_the_strategy_and_the_plan(panel: StructurePanel):
     pipeline = pipeline_of(panel)
     strategy, statistics = pipeline.model.strategy, observe_training_views(pipeline.structure_maps)
@@ -442,7 +429,7 @@ def test_counts_of_the_structure_steps_are_kept_in_checkpoints_and_told(run: Pat
         assert step["after"] >= step["before"] - step["pruned"] + step["split"]
     assert sum(step["split"] for step in steps) > 0
     for step in steps:
-        assert f"| {step['iteration']} | {step['violating']:,} | {step['low']:,} |" in panel.table.text()
+        assert f"| {step['iteration']} | structure | {step['violating']:,} | {step['low']:,} |" in panel.table.text()
     assert "No structure step yet" in describe(StructureAwareStrategy(), 5, {})
 
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import copy
 import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+import processes
 import pytest
 import torch
 from kill_and_resume import differences, set_up
@@ -17,6 +16,7 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.scripts.eval import ComputePSNR
+from nerfstudio.scripts.train import entrypoint
 from nerfstudio.utils.eval_utils import eval_setup
 from plyfile import PlyData
 from runs import (
@@ -41,7 +41,7 @@ from sadgs_ns.plugin.trainer import SadgsTrainer
 
 @pytest.fixture(scope="module")
 def finished(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of a run that `ns-train sadgs` made."""
+    """Folder of a run that `ns-train sadgs` made, here in this process, which has imported everything."""
     output = tmp_path_factory.mktemp("cli")
     options = {
         "output-dir": output,
@@ -59,12 +59,13 @@ def finished(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         "eval-mode": "interval",
         "eval-interval": 8,
     }
-    command = [str(Path(sys.executable).with_name("ns-train")), "sadgs"]
+    command = ["ns-train", "sadgs"]
     command += [word for name, value in options.items() for word in (f"--{name}", str(value))] + ["colmap"]
     command += [word for name, value in parser.items() for word in (f"--{name}", str(value))]
-    environment = {name: value for name, value in os.environ.items() if name != "TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD"}
-    result = subprocess.run(command, capture_output=True, text=True, timeout=100, env=environment)
-    assert result.returncode == 0, result.stdout + result.stderr
+    with pytest.MonkeyPatch.context() as patched:
+        patched.delenv("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", raising=False)
+        patched.setattr(sys, "argv", command)
+        entrypoint()
     return output / "room" / "sadgs" / "run"
 
 
@@ -411,7 +412,7 @@ trainer = Space(checkpoint_dir=Path({str(trainer.checkpoint_dir)!r}), pipeline=p
                 optimizers=Space(optimizers={{}}, schedulers={{}}))
 SadgsTrainer.save_checkpoint(trainer, 2)
 """
-    assert subprocess.run([sys.executable, "-W", "ignore", "-c", code], timeout=60).returncode == -9
+    assert processes.python(code).returncode == -9
     assert len(list(tmp_path.rglob("*.partial"))) == 1
     config.load_dir = trainer.checkpoint_dir
     resumed = set_up(config)

@@ -17,6 +17,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import processes
 import pytest
 import torch
 import tyro
@@ -35,10 +36,6 @@ from sadgs_ns.plugin import pipeline
 from sadgs_ns.plugin.checkpoints import checkpoint_paths
 from sadgs_ns.plugin.interrupts import SIGNALS
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
-
-SCRIPT = Path(__file__).parents[1] / "kill_and_resume.py"
-TERMINAL = "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0)\n"
-"""Makes the standard input the terminal that controls the process, so that it is sent SIGHUP when that is gone."""
 
 
 def after(trainer: SadgsTrainer, at: int, act: Callable[[], None]) -> None:
@@ -63,10 +60,18 @@ def one_line(text: str, start: str) -> str:
 
 def kill_and_resume(*arguments: object) -> str:
     """Run the script and return its output."""
-    command = [sys.executable, str(SCRIPT), *map(str, arguments)]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=1800)
+    script = f"import sys, kill_and_resume; sys.exit(kill_and_resume.main({[str(word) for word in arguments]}))"
+    result = processes.python(script, timeout=1800)
     assert result.returncode == 0, result.stdout + result.stderr
     return result.stdout
+
+
+@pytest.fixture(scope="module")
+def finished(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run that is finished, and that nothing disturbed."""
+    trainer = set_up(configure(scene, tmp_path_factory.mktemp("finished"), ITERATIONS, save_every=0))
+    trainer.train()
+    return trainer.base_dir
 
 
 # --- killed ---
@@ -118,7 +123,7 @@ class Clock:
 
 
 def test_the_clock_makes_checkpoints_that_change_nothing_and_resume_to_the_same_model(
-    scene: Path, config: SadgsTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scene: Path, finished: Path, config: SadgsTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     assert (config.steps_per_save, config.seconds_per_save) == (0, 60)
     config.save_only_latest_checkpoint = False
@@ -130,16 +135,14 @@ def test_the_clock_makes_checkpoints_that_change_nothing_and_resume_to_the_same_
     assert clock.saved == [2, 10, ITERATIONS - 1]
     assert checkpoints(trainer) == [f"step-{step:09d}.ckpt" for step in clock.saved]
 
-    without = set_up(configure(scene, tmp_path / "without", ITERATIONS, save_every=0))
-    without.train()
     resumed_config = configure(scene, tmp_path / "resumed", ITERATIONS, save_every=0)
     resumed_config.load_dir, resumed_config.load_step = trainer.checkpoint_dir, 2
     resumed = set_up(resumed_config)
     resumed.train()
-    assert checkpoints(without) == checkpoints(resumed) == [f"step-{ITERATIONS - 1:09d}.ckpt"]
-    ends = [
-        torch.load(t.checkpoint_dir / checkpoints(without)[0], weights_only=True) for t in (trainer, without, resumed)
-    ]
+    (last,) = (finished / "nerfstudio_models").iterdir()
+    assert [last.name] == checkpoints(resumed) == [f"step-{ITERATIONS - 1:09d}.ckpt"]
+    folders = (trainer.checkpoint_dir, last.parent, resumed.checkpoint_dir)
+    ends = [torch.load(folder / last.name, weights_only=True) for folder in folders]
     assert differences(ends[0], ends[1]) == differences(ends[0], ends[2]) == []
 
 
@@ -214,11 +217,8 @@ def hang_up_by_default() -> Iterator[None]:
 @pytest.mark.usefixtures("hang_up_by_default")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_an_interrupt_within_a_step_waits_for_its_end_and_resumes_to_the_same_model(
-    number: signal.Signals, scene: Path, config: SadgsTrainerConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    number: signal.Signals, finished: Path, config: SadgsTrainerConfig, capsys: pytest.CaptureFixture[str]
 ):
-    whole = set_up(configure(scene, tmp_path / "whole", ITERATIONS, save_every=0))
-    whole.train()
-
     trainer = set_up(config)
     get_loss = trainer.pipeline.get_train_loss_dict
 
@@ -242,8 +242,9 @@ def test_an_interrupt_within_a_step_waits_for_its_end_and_resumes_to_the_same_mo
 
     resumed = set_up(yaml.load((trainer.base_dir / "config.yml").read_text(), Loader=yaml.Loader))
     resumed.train()
-    name = f"step-{ITERATIONS - 1:09d}.ckpt"
-    ends = [torch.load(t.checkpoint_dir / name, weights_only=True) for t in (whole, resumed)]
+    (last,) = (finished / "nerfstudio_models").iterdir()
+    assert checkpoints(resumed) == [last.name]
+    ends = [torch.load(path / last.name, weights_only=True) for path in (last.parent, resumed.checkpoint_dir)]
     assert differences(*ends) == []
 
 
@@ -274,25 +275,15 @@ def test_a_terminal_that_is_gone_costs_nothing_that_was_trained(scene: Path, tmp
     script += f"config = configure(Path({str(scene)!r}), Path({str(tmp_path)!r}), 5000, save_every=0)\n"
     script += "config.logging.local_writer.enable, config.pipeline.model.strategy.refine_stop_iter = True, 0\n"
     script += "trainer = set_up(config); trainer.train()\n"
-    process = subprocess.Popen(
-        [sys.executable, "-W", "ignore", "-c", TERMINAL + script],
-        stdin=theirs,
-        stdout=theirs,
-        stderr=theirs,
-        start_new_session=True,
-        cwd=SCRIPT.parent,
-        env={
-            **os.environ,
-            "PYTHONPATH": os.pathsep.join([*map(str, SCRIPT.parents), os.environ.get("PYTHONPATH", "")]),
-        },
-    )
+    process = processes.start(processes.in_terminal, os.ttyname(theirs), script, dict(os.environ))
     try:
-        os.close(theirs)
         printed = b""
         while b"10 (0.20%)" not in printed:  # a line of the table of progress
             printed += os.read(ours, 4096)
+        os.close(theirs)
         os.close(ours)
-        assert process.wait(60) == 128 + signal.SIGHUP, printed.decode()
+        process.join(60)
+        assert process.exitcode == 128 + signal.SIGHUP, printed.decode()
     finally:
         process.kill()
     (path,) = tmp_path.rglob("*.ckpt")
@@ -358,14 +349,6 @@ def test_a_handler_that_the_program_has_for_sigterm_stays(config: SadgsTrainerCo
 
 
 # --- finished runs ---
-
-
-@pytest.fixture(scope="module")
-def finished(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a run that is finished."""
-    trainer = set_up(configure(scene, tmp_path_factory.mktemp("finished"), ITERATIONS, save_every=0))
-    trainer.train()
-    return trainer.base_dir
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of viser and websockets

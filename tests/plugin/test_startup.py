@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import processes
 import pytest
 from kill_and_resume import set_up
 from scenes import HEIGHT, ITERATIONS, WIDTH
@@ -17,11 +16,11 @@ LATER = ("sadgs_ns.cli.export", "pycolmap", "torchmetrics", "matplotlib.figure",
 
 
 def test_the_methods_import_nothing_that_training_does_not_need():
-    start = "import sys, torch, sadgs_ns.plugin.presets, sadgs_ns.plugin.model"
+    start = f"import sys, torch, {', '.join(processes.IMPORTED)}"
     start += "; from sadgs_ns.method.initialization import neighbour_scales; neighbour_scales(torch.rand(9, 3))"
     code = f"{start}; print([name for name in {LATER} if name in sys.modules])"
-    run = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
-    assert run.stdout.strip() == "[]"
+    run = processes.python(code)
+    assert (run.returncode, run.stdout.strip()) == (0, "[]"), run.stderr
 
 
 @pytest.fixture
