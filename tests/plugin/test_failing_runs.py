@@ -282,6 +282,22 @@ def test_a_step_or_file_without_a_checkpoint_is_named(saved: Path, tmp_path: Pat
     assert checkpoints.checkpoint_paths(None, None, None) == []
 
 
+def test_what_is_given_to_the_wrong_option_is_told_where_it_belongs(saved: Path, tmp_path: Path):
+    run = saved.parents[1]
+    for folder in (run, saved.parent):
+        with pytest.raises(InputError, match=rf"^{folder} is a folder: give it to --load-dir instead of"):
+            checkpoints.checkpoint_paths(None, None, folder)
+    with pytest.raises(InputError, match=rf"^{saved} is a file: give it to --load-checkpoint instead of --load-dir\.$"):
+        checkpoints.checkpoint_paths(saved, None, None)
+    with pytest.raises(InputError, match=r"^load_dir and load_checkpoint both name where the run goes on: give one"):
+        checkpoints.checkpoint_paths(run, None, saved)
+    for above in run.parents[:3]:  # the folders of the method, the experiment and all outputs
+        with pytest.raises(InputError, match=rf"^{above} holds no checkpoint: give .* of sadgs, such as {run}\.$"):
+            checkpoints.checkpoint_paths(above, None, None)
+    with pytest.raises(InputError, match=rf"^{tmp_path} holds no checkpoint: give --load-dir the .* run of sadgs\.$"):
+        checkpoints.checkpoint_paths(tmp_path, None, None)
+
+
 # --- runs that learn nothing ---
 
 
