@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -247,6 +248,24 @@ class SadgsPipeline(VanillaPipeline):
                     total[name] = value if len(groups) == 1 else total.get(name, 0) + weight * value
         self.log.begin_step(step, [index for views in groups.values() for index, _ in views], losses["main_loss"])
         return outputs, losses, metrics
+
+    def get_average_eval_image_metrics(
+        self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
+    ) -> dict[str, float]:
+        """Return the mean of each metric over the held-out views, and with `get_std` its standard deviation, too.
+
+        A single view has no deviation; nerfstudio would return NaN, which is no JSON.
+
+        Raises:
+            InputError: If no view is held out.
+        """
+        views = len(self.datamanager.eval_dataset)
+        if views == 0:
+            raise InputError(
+                "The run holds out no view, so that there is nothing to measure: train with one of the parser's "
+                "--eval-mode that holds out some."
+            )
+        return super().get_average_eval_image_metrics(step, output_path, get_std and views > 1)
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint's parameters and states.
