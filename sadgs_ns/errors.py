@@ -12,8 +12,8 @@ from types import TracebackType
 _NERFSTUDIOS: tuple[tuple[str, str, type[Exception], str, str], ...] = (
     (
         "nerfstudio.utils.eval_utils", "eval_setup", OSError, "",
-        "{error.filename} cannot be read ({reason}): give --load-config the config.yml of a run; paths in that file may "
-        "be relative to the folder in which the run was started.",
+        "{error.filename} cannot be read ({reason}): give --load-config the config.yml of a run; paths in that file "
+        "may be relative to the folder in which the run was started.",
     ),
     (
         "nerfstudio.utils.eval_utils", "eval_setup", AssertionError, "",
@@ -104,7 +104,7 @@ def print_uncaught_errors_as_sentences() -> None:
 
 
 def _of_nerfstudio(error: BaseException) -> str | None:
-    """Return what to tell the user of an error of nerfstudio's own; None if there is nothing better than a traceback."""
+    """Return what to tell the user of an error of nerfstudio's own; None if a traceback tells more."""
     frames = [frame for frame, _ in tracebacks.walk_tb(error.__traceback__)]
     places = [(str(frame.f_globals.get("__name__")), frame.f_code.co_name) for frame in frames]
     last = next((place for place in reversed(places) if place[0].startswith("nerfstudio.")), None)

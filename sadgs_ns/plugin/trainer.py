@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import copy
+import errno
 import math
 import os
 import shlex
+import socket
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -159,6 +161,39 @@ class SadgsTrainerConfig(TrainerConfig):
     gradient_accumulation_steps: Suppress[dict[str, int]] = field(default_factory=dict)
     """`pipeline.views_per_iteration` takes its place."""
 
+    def __post_init__(self) -> None:
+        """Check `load_config` before nerfstudio reads it, since nerfstudio then forgets all other options.
+
+        Raises:
+            InputError: If it is no config.yml, or other options were given beside it.
+        """
+        if self.load_config is None:
+            return
+        try:
+            with self.load_config.open(encoding="utf8") as file:
+                problem = None if file.readline().startswith("!!python/object:") else "it is no config.yml of a run"
+        except (OSError, UnicodeDecodeError) as error:
+            problem = reason(error)
+        if problem is not None:
+            raise InputError(f"{self.load_config} cannot be used ({problem}): give --load-config the file of a run.")
+        from nerfstudio.configs.method_configs import all_methods  # It imports this module.
+
+        preset = all_methods.get(self.method_name or "", self)
+        if lost := [
+            name for name, value in vars(preset).items() if vars(self)[name] != value and name != "load_config"
+        ]:
+            raise InputError(
+                f"With --load-config all options come from its file, and others are not read, here of "
+                f"{', '.join(lost)}: leave them out, change them in the file, or give --load-dir with the run's folder "
+                "and all options instead of --load-config."
+            )
+
+    def print_to_terminal(self) -> None:
+        """Print nothing, where nerfstudio prints 260 lines before it is known whether the run can start.
+
+        `config.yml` holds them all.
+        """
+
     def check(self) -> None:
         """Check whether training can work with these options.
 
@@ -186,10 +221,16 @@ class SadgsTrainerConfig(TrainerConfig):
             raise InputError(f"viewer.websocket_port must be in [1, 65535], got {port}.")
         if self.machine.num_devices * self.machine.num_machines != 1:
             raise InputError(_ONE_DEVICE)
-        if self.machine.device_type == "cuda" and not torch.cuda.is_available():
+        device = self.machine.device_type
+        available = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+        if not available[device]:
+            name = device.upper()
             raise InputError(
-                "machine.device_type is cuda, but torch finds no CUDA device: set it to cpu, or install torch for CUDA."
+                f"machine.device_type is {device}, but torch finds no {name} device: set it to cpu, or install torch "
+                f"for {name}."
             )
+        if not 0 <= self.machine.seed < 2**32:
+            raise InputError(f"machine.seed must be in [0, 2³²), got {self.machine.seed}.")
         self._check_rates()
         if self.mixed_precision or self.use_grad_scaler:
             raise InputError(
@@ -220,6 +261,36 @@ class SadgsTrainerConfig(TrainerConfig):
                             f"optimizers.{group}.scheduler.{name} must be positive and finite, got {factor:g}."
                         )
 
+    def _check_address(self) -> None:
+        """Check whether the viewer can listen where it is told to.
+
+        viser would take the next free port, of which nerfstudio knows nothing, or look for one for ever.
+
+        Raises:
+            InputError: If it cannot.
+        """
+        host, port = self.viewer.websocket_host, self.viewer.websocket_port
+        try:
+            places = socket.getaddrinfo(host, port or 0, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        except OSError as error:
+            raise InputError(
+                f"viewer.websocket_host {host!r} is unknown ({reason(error)}): 127.0.0.1 opens the viewer to this "
+                "machine only, 0.0.0.0 to the network."
+            ) from error
+        try:
+            for family, _, _, _, address in places:
+                socket.create_server(address, family=family).close()
+        except OSError as error:
+            what = reason(error).partition(" (while")[0]
+            if error.errno == errno.EADDRINUSE:
+                told = (
+                    f"viewer.websocket_port {port} is taken on {host} ({what}): give another, or none for a free one."
+                )
+            else:
+                told = f"The viewer cannot listen on {host}{f':{port}' if port else ''} ({what}): give another "
+                told += "viewer.websocket_host or viewer.websocket_port."
+            raise InputError(told) from error
+
     def save_config(self) -> None:
         """Write `config.yml`, the first file of a run, once options, checkpoint and data have been found good.
 
@@ -229,6 +300,8 @@ class SadgsTrainerConfig(TrainerConfig):
         """
         self.check()
         checkpoints.check_chosen(self.load_dir, self.load_step, self.load_checkpoint)
+        if self.is_viewer_enabled() or self.is_viewer_legacy_enabled():
+            self._check_address()
         check_ahead(self.pipeline.datamanager)
         CONSOLE.log(f"Saving config to: {self.write()}")
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
 import shutil
+import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,7 @@ from runs import checkpoint, configure, is_finite, set_up, train
 from sadgs_ns.cli.export import write_ply
 from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.plugin import checkpoints, nonfinite
+from sadgs_ns.plugin.presets import sadgs
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 ITERATIONS = 6
@@ -44,6 +47,9 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig
             "sadgs trains on one device; set machine.num_devices and machine.num_machines to 1",
         ),
         ("machine.device_type", "cuda", "machine.device_type is cuda, but torch finds no CUDA device: set it to cpu,"),
+        ("machine.device_type", "mps", "machine.device_type is mps, but torch finds no MPS device: set it to cpu, or "),
+        ("machine.seed", -1, "machine.seed must be in [0, 2³²), got -1."),
+        ("machine.seed", 2**32, "machine.seed must be in [0, 2³²), got 4294967296."),
         ("steps_per_save", -3, "steps_per_save must not be negative, got -3."),
         ("seconds_per_save", math.nan, "seconds_per_save must not be negative, got nan."),
         ("steps_per_eval_batch", -1, "steps_per_eval_batch must not be negative, got -1."),
@@ -65,8 +71,8 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig
 def test_options_with_which_no_run_can_work_are_refused_before_anything_is_written(
     option: str, value: Any, sentence: str, config: SadgsTrainerConfig
 ):
-    if value == "cuda" and torch.cuda.is_available():
-        pytest.skip("there is a CUDA device")
+    if (value == "cuda" and torch.cuda.is_available()) or (value == "mps" and torch.backends.mps.is_available()):
+        pytest.skip(f"there is a device of kind {value}")
     owner: Any = config
     *owners, name = option.split(".")
     for part in owners:
@@ -76,6 +82,61 @@ def test_options_with_which_no_run_can_work_are_refused_before_anything_is_writt
         config.save_config()
     assert str(refused.value).startswith(sentence) and "\n" not in str(refused.value)
     assert not config.output_dir.exists()
+
+
+def test_a_viewer_that_cannot_listen_where_it_is_told_to_is_refused(config: SadgsTrainerConfig):
+    def refused() -> str:
+        with pytest.raises(InputError) as error:
+            config.save_config()
+        assert not config.output_dir.exists()
+        return str(error.value)
+
+    config.vis = "viewer"
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        config.viewer.websocket_port = port = other.getsockname()[1]
+        told = (
+            rf"^viewer\.websocket_port {port} is taken on 127\.0\.0\.1 \(.+\): give another, or none for a free one\.$"
+        )
+        assert re.search(told, refused())
+        config.vis = "tensorboard"
+        config.save_config()
+        shutil.rmtree(config.output_dir)
+    config.vis, config.viewer.websocket_port = "viewer_legacy", None
+    config.viewer.websocket_host = "192.0.2.1"  # an address that no machine has
+    assert re.search(
+        r"^The viewer cannot listen on 192\.0\.2\.1 \(.+\): give another viewer\.websocket_host", refused()
+    )
+    config.viewer.websocket_host = "no host"
+    assert re.search(r"^viewer\.websocket_host 'no host' is unknown \(.+\): 127\.0\.0\.1 opens the viewer", refused())
+    config.viewer.websocket_host = "127.0.0.1"
+    config.save_config()
+
+
+def test_options_beside_a_config_that_nerfstudio_would_not_read_are_refused(
+    config: SadgsTrainerConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    preset, file = sadgs.config, config.write()
+    dataclasses.replace(preset, load_config=file).print_to_terminal()
+    assert capsys.readouterr().out == ""
+    with pytest.raises(InputError) as refused:
+        dataclasses.replace(preset, load_config=file, max_num_iterations=9, pipeline=config.pipeline)
+    assert str(refused.value) == (
+        "With --load-config all options come from its file, and others are not read, here of pipeline, "
+        "max_num_iterations: leave them out, change them in the file, or give --load-dir with the run's folder and all "
+        "options instead of --load-config."
+    )
+    (tmp_path / "text").write_text("hello")
+    (tmp_path / "bytes").write_bytes(b"\xff")
+    for name, problem in (
+        ("none", "No such file or directory"),
+        ("", "Is a directory"),
+        ("text", "it is no config.yml of a run"),
+        ("bytes", ".+"),
+    ):
+        with pytest.raises(
+            InputError, match=rf"^{tmp_path / name} cannot be used \({problem}\): give --load-config the"
+        ):
+            dataclasses.replace(preset, load_config=tmp_path / name)
 
 
 def test_accumulating_over_one_iteration_is_what_everybody_does(config: SadgsTrainerConfig):
