@@ -26,7 +26,7 @@ from sadgs_ns.method.structure_tensor import (
     FREQUENCY_CONSTANT,
 )
 from sadgs_ns.plugin import nonfinite
-from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
+from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig, check_options
 from sadgs_ns.plugin.memory_plan import fit_to_memory, training_size
 from sadgs_ns.plugin.model import SadgsModel, SadgsModelConfig
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
@@ -34,9 +34,15 @@ from sadgs_ns.plugin.optimizers import FusedAdam
 from sadgs_ns.plugin.panel import StructurePanel
 from sadgs_ns.plugin.structure_maps import StructureMaps
 from sadgs_ns.plugin.views import TrainingViews
+from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 _NAMED_STEPS = 5
-"""Iterations of which a report of what was not finite names the images."""
+"""Number of iterations of which a report of what was not finite names the images."""
+
+_SAMPLED = 1000
+"""About so many cameras, and Gaussians, are enough to find out whether training can see anything."""
+_PLANES = (0.01, 1e10)
+"""Distances in world units from a camera between which gsplat and our splatter draw Gaussians."""
 
 
 @dataclass
@@ -81,6 +87,7 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
         for name in ("epsilon", "memory_budget_gb"):
             if (value := getattr(self, name)) is not None and not value > 0:
                 raise InputError(f"pipeline.{name} must be positive, got {value:g}.")
+        check_options(self.datamanager)
         self.model.check()
 
 
@@ -143,8 +150,9 @@ class SadgsPipeline(VanillaPipeline):
         """Those of data and model, and at the end a last look at what was not finite.
 
         Raises:
-            InputError: If `memory_budget_gb` leaves no room for Gaussians.
+            InputError: If no camera sees a Gaussian, or `memory_budget_gb` leaves no room for them.
         """
+        self._refuse_empty_views()
         if self.config.model.strategy.refine_stop_iter > 0:
             model, fused = self.model, self.config.model.fused and kernels.available(self.device)
             size = training_size(self.datamanager, model.gauss_params, self.views_per_iteration, fused)  # type: ignore[arg-type]
@@ -171,6 +179,27 @@ class SadgsPipeline(VanillaPipeline):
         last = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self._report_nonfinite(last=True))
         # The log is read before densification makes new parameters, which have no gradients.
         return [read, *super().get_training_callbacks(training_callback_attributes), counts, last]
+
+    def _refuse_empty_views(self) -> None:
+        """Check whether training can see anything.
+
+        Raises:
+            InputError: If fewer than 1 in 100 Gaussians are within the planes of a camera between which they are drawn.
+        """
+        cameras = self.datamanager.train_dataset.cameras
+        viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds[:: -(-len(cameras) // _SAMPLED)])
+        means = self.model.means.detach()
+        means = means[:: -(-len(means) // _SAMPLED)].to(viewmats)  # [N, 3]
+        depths = means @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]  # [N, C]
+        near, far = _PLANES
+        drawn = ((depths > near) & (depths < far)).any(dim=1)
+        if drawn.float().mean() < 0.01:
+            extent = float(self.model.strategy_state["scene_scale"])
+            raise InputError(
+                f"The renderings would be empty, since a camera sees from {near} to {far:g} units and the cameras lie "
+                f"within {extent:.2g}: set the parser's scale-factor so that they lie within about 1, or leave its "
+                "auto-scale-poses on."
+            )
 
     def _keep_cap(self) -> None:
         """Go on with the cap that the checkpoint's run had in effect; say so if memory now allows more, or less."""

@@ -17,8 +17,10 @@ from kill_and_resume import differences, parser_of
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer
-from runs import checkpoint, configure, is_finite, set_up, train
+from runs import checkpoint, configure, is_finite, nerfstudio_data, set_up, train
+from scenes import HEIGHT, WIDTH
 
+from sadgs_ns import errors
 from sadgs_ns.cli.export import write_ply
 from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.plugin import checkpoints, nonfinite
@@ -50,6 +52,36 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig
         ("machine.device_type", "mps", "machine.device_type is mps, but torch finds no MPS device: set it to cpu, or "),
         ("machine.seed", -1, "machine.seed must be in [0, 2³²), got -1."),
         ("machine.seed", 2**32, "machine.seed must be in [0, 2³²), got 4294967296."),
+        (
+            "pipeline.datamanager.dataparser.scale_factor",
+            0.0,
+            "scale_factor, an option of the data's parser, must be positive and finite, got 0.",
+        ),
+        (
+            "pipeline.datamanager.dataparser.scale_factor",
+            math.nan,
+            "scale_factor, an option of the data's parser, must be positive and finite, got nan.",
+        ),
+        (
+            "pipeline.datamanager.dataparser.train_split_fraction",
+            2.0,
+            "train_split_fraction, an option of the data's parser, must be in (0, 1], got 2.",
+        ),
+        (
+            "pipeline.datamanager.dataparser.eval_interval",
+            1,
+            "eval_interval, an option of the data's parser, must be at least 2, got 1.",
+        ),
+        (
+            "pipeline.datamanager.camera_res_scale_factor",
+            100.0,
+            "pipeline.datamanager.camera_res_scale_factor must be in (0, 1], got 100.",
+        ),
+        (
+            "pipeline.datamanager.camera_res_scale_factor",
+            math.nan,
+            "pipeline.datamanager.camera_res_scale_factor must be in (0, 1], got nan.",
+        ),
         ("steps_per_save", -3, "steps_per_save must not be negative, got -3."),
         ("seconds_per_save", math.nan, "seconds_per_save must not be negative, got nan."),
         ("steps_per_eval_batch", -1, "steps_per_eval_batch must not be negative, got -1."),
@@ -82,6 +114,46 @@ def test_options_with_which_no_run_can_work_are_refused_before_anything_is_writt
         config.save_config()
     assert str(refused.value).startswith(sentence) and "\n" not in str(refused.value)
     assert not config.output_dir.exists()
+
+
+@pytest.mark.filterwarnings("ignore:Skipping Gaussian Smoothing:UserWarning")  # of images smaller than SSIM's window
+def test_images_that_are_too_small_after_scaling_are_named(config: SadgsTrainerConfig):
+    config.pipeline.datamanager.camera_res_scale_factor = 1.5 / HEIGHT
+    sentence = (
+        rf"/images/\S+ would be trained on with {int(1.5 * WIDTH / HEIGHT)} × 1 px, and at least 2 × 2 are needed: "
+    )
+    with pytest.raises(InputError, match=sentence):
+        set_up(config)
+    config.pipeline.datamanager.camera_res_scale_factor = 2.5 / HEIGHT
+    assert is_finite(train(config).pipeline.model)
+
+
+def test_names_that_hold_out_all_images_or_say_nothing_are_refused(tmp_path: Path):
+    parser = dataclasses.replace(nerfstudio_data(tmp_path / "data"), eval_mode="filename")
+    with pytest.raises(ValueError) as failed:
+        set_up(configure(tmp_path / "out", parser))
+    assert errors._of_nerfstudio(failed.value) == (
+        "With --eval-mode filename each image must have train or eval in its name: rename the images, or choose "
+        "another --eval-mode."
+    )
+    described = tmp_path / "data" / "transforms.json"
+    described.write_text(described.read_text().replace('"images/', '"images/eval'))
+    for path in (tmp_path / "data" / "images").iterdir():
+        path.rename(path.with_name(f"eval{path.name}"))
+    with pytest.raises(
+        InputError, match=r"^All images are held out, so that there is none to train on: choose another"
+    ):
+        set_up(configure(tmp_path / "out", parser))
+
+
+@pytest.mark.parametrize("factor", [1e-4, 1e12])
+def test_cameras_that_see_nothing_are_refused(factor: float, config: SadgsTrainerConfig):
+    parser: Any = config.pipeline.datamanager.dataparser
+    config.pipeline.datamanager.dataparser = dataclasses.replace(parser, scale_factor=factor)
+    with pytest.raises(
+        InputError, match=r"^The renderings would be empty, since a camera sees from 0\.01 to 1e\+10 units"
+    ):
+        set_up(config)
 
 
 def test_a_viewer_that_cannot_listen_where_it_is_told_to_is_refused(config: SadgsTrainerConfig):
