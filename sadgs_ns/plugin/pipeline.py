@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from sadgs_ns import kernels
@@ -21,6 +23,7 @@ from sadgs_ns.data.cameras import refuse_unsupported_cameras
 from sadgs_ns.data.validation.parsers import findings_of
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.codes import HIGHEST_FREQUENCY
+from sadgs_ns.method.initialization import camera_extent
 from sadgs_ns.method.structure_tensor import (
     ENERGY_BLUR,
     FREQUENCY_CONSTANT,
@@ -43,6 +46,9 @@ _SAMPLED = 1000
 """About so many cameras, and Gaussians, are enough to find out whether training can see anything."""
 _PLANES = (0.01, 1e10)
 """Distances in world units from a camera between which gsplat and our splatter draw Gaussians."""
+
+_SAME_PLACE = 1e-3
+"""Share of the cameras' extent up to which two cameras are taken for one."""
 
 
 @dataclass
@@ -122,14 +128,14 @@ class SadgsPipeline(VanillaPipeline):
             CONSOLE.print(
                 "[yellow]Triton does not run here: without its kernels training takes about twice as long.[/]"
             )
-        positions = self.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]  # [C, 3]
-        self.model.set_cameras(positions)
+        self.model.set_cameras(_positions(self.datamanager.train_dataset.cameras))
         self.views = TrainingViews(self.datamanager, self.model)
         self.structure_maps = StructureMaps(
             self.views, config.frequency_constant, energy_blur=config.energy_blur, epsilon=config.epsilon
         )
         self.log = NonFiniteLog(self.device)
         self._checkpoint_cap: int | None = None
+        self._checkpoint_views: tuple[list[str], Tensor] | None = None  # names of images, and positions of cameras
         self.stuck = ""  # says why, where nothing is learned any more
         self.structure = StructurePanel(self.structure_maps)
         self.model.viewer_outputs = self.structure.outputs
@@ -318,6 +324,35 @@ class SadgsPipeline(VanillaPipeline):
             raise InputError("The checkpoint lacks the state of structure-aware densification, so splatfacto made it.")
         super().load_pipeline(loaded_state, step)
 
+    def refuse_other_capture(self) -> None:
+        """Check whether the loaded checkpoint is of the data that training is about to go on with.
+
+        Images may have been added or taken away since, if the others' poses stayed where they were. A warning is
+        printed where the cameras are the same and no image has its old name.
+
+        Raises:
+            InputError: If more than half of the cameras of either are where the other has none.
+        """
+        if self._checkpoint_views is None:
+            return
+        (before, positions_before), dataset = self._checkpoint_views, self.datamanager.train_dataset
+        now, positions = [path.name for path in dataset.image_filenames], _positions(dataset.cameras)
+        distances, _ = KDTree(positions).query(positions_before)  # [C]
+        same = int((distances < _SAME_PLACE * camera_extent(positions)).sum())
+        if 2 * same < min(len(before), len(now)):
+            raise InputError(
+                "It was trained on other data, or with other options of the parser: of its "
+                f"{len(before)} cameras ({before[0]}, …) {same or 'none'} stand where one of these {len(now)} "
+                f"({now[0]}, …) does."
+            )
+        if not {Path(name).stem for name in before} & {Path(name).stem for name in now}:
+            CONSOLE.print(
+                "[yellow]The checkpoint's run had the same cameras, but none of its images had the name of one of "
+                f"these ({escape(before[0])} and {escape(now[0])} are the first): the Gaussians fit only if the images "
+                "were renamed.[/]",
+                soft_wrap=True,
+            )
+
     def _settings(self) -> dict[str, Any]:
         """What decides how training goes on from a checkpoint, by the names of the options."""
         strategy = asdict(self.config.model.strategy)
@@ -335,6 +370,8 @@ class SadgsPipeline(VanillaPipeline):
             "view_order": list(self.datamanager.train_unseen_cameras),
             "settings": self._settings(),
             "max_gaussians": self.model.strategy.max_gaussians,  # which may be lower than the setting
+            "images": [path.name for path in self.datamanager.train_dataset.image_filenames],
+            "camera_positions": _positions(self.datamanager.train_dataset.cameras),
         }
         if hasattr(self.datamanager, "random_generator"):
             state["view_shuffle"] = self.datamanager.random_generator.getstate()
@@ -357,6 +394,8 @@ class SadgsPipeline(VanillaPipeline):
             )
         if not any(name.endswith(("max_gaussians", "memory_budget_gb")) for name in changed):
             self._checkpoint_cap = state.get("max_gaussians")
+        if "images" in state:  # Earlier versions did not save it.
+            self._checkpoint_views = state["images"], state["camera_positions"]
         torch.set_rng_state(state["torch"].cpu())
         if max(state["view_order"], default=0) < len(self.datamanager.train_dataset):
             self.datamanager.train_unseen_cameras = list(state["view_order"])
@@ -364,6 +403,11 @@ class SadgsPipeline(VanillaPipeline):
                 self.datamanager.random_generator.setstate(state["view_shuffle"])
         if "cuda" in state and self.device.type == "cuda":
             torch.cuda.set_rng_state(state["cuda"].cpu(), self.device)
+
+
+def _positions(cameras: Cameras) -> Tensor:
+    """Return the centres of cameras in world units. [C, 3]"""
+    return cameras.camera_to_worlds[:, :3, 3].cpu()
 
 
 def _stack(tensors: list[Tensor]) -> Tensor:

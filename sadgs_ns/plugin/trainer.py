@@ -7,6 +7,7 @@ import errno
 import math
 import os
 import shlex
+import signal
 import socket
 import time
 from dataclasses import dataclass, field
@@ -34,6 +35,7 @@ _LESS_MEMORY = (
     "lower --pipeline.model.strategy.max-gaussians or --pipeline.views-per-iteration, or take smaller images "
     "(`--downscale-factor 2` after `nerfstudio-data` or `colmap`)"
 )
+_NOTHING_DONE = "stopped before an iteration was done; the same command starts again."
 _ONE_DEVICE = "sadgs trains on one device; set machine.num_devices and machine.num_machines to 1."
 _MEASURED_MEGAPIXELS = 1.0
 """Above this size of images a run with several views an iteration prints a warning; .7 and 1.9 have been measured."""
@@ -347,6 +349,7 @@ class SadgsTrainer(Trainer):
         Raises:
             InputError: If one of them cannot be used.
             RunError: If they do not fit the GPU's memory.
+            SystemExit: If SIGINT came; nerfstudio would print a traceback.
         """
         try:
             super().setup(*args, **kwargs)
@@ -354,6 +357,9 @@ class SadgsTrainer(Trainer):
             compile_kernels(self.pipeline, self.optimizers.optimizers)
         except torch.cuda.OutOfMemoryError as error:
             raise RunError(f"The GPU's memory is too small to start ({_memory(error)}): {_LESS_MEMORY}.") from error
+        except KeyboardInterrupt:
+            CONSOLE.print(f"SIGINT: {_NOTHING_DONE}", soft_wrap=True)
+            raise SystemExit(128 + signal.SIGINT) from None
 
     def _say_what_was_chosen(self) -> None:
         """Print the run's size in one line, after the memory plan's, and warn of what does not suit the data."""
@@ -394,6 +400,7 @@ class SadgsTrainer(Trainer):
         try:
             self._start_step = state["step"] + 1
             self.pipeline.load_pipeline(state["pipeline"], state["step"])
+            self.pipeline.refuse_other_capture()
             self.optimizers.load_optimizers(state["optimizers"])
             if "schedulers" in state and config.load_scheduler:
                 self.optimizers.load_schedulers(state["schedulers"])
@@ -528,7 +535,7 @@ class SadgsTrainer(Trainer):
         if done >= total:
             return
         if done == self._start_step:
-            text = f"{interrupted}: stopped before an iteration was done; the same command starts again."
+            text = f"{interrupted}: {_NOTHING_DONE}"
         else:
             # With --load-config nerfstudio takes all options from the file, so the file must name the checkpoints, too.
             config = copy.copy(self.config)
