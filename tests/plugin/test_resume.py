@@ -432,8 +432,8 @@ def test_a_checkpoint_of_another_capture_is_refused(finished: Path, tmp_path: Pa
         set_up(other)
     assert re.fullmatch(
         rf"{finished}/\S+\.ckpt cannot be continued: It was trained on other data, or with other options of the "
-        r"parser: of its 8 cameras \(001\.png, …\) none stand where one of these 9 \(\d+\.png, …\) does; give --load-dir the "
-        r"folder of a run of sadgs, or train from scratch\.",
+        r"parser: of its 8 cameras \(001\.png, …\) none stand where one of these 9 \(\d+\.png, …\) does; give "
+        r"--load-dir the folder of a run of sadgs, or train from scratch\.",
         str(refused.value),
     )
 
