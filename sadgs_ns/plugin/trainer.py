@@ -263,6 +263,21 @@ class SadgsTrainerConfig(TrainerConfig):
                             f"optimizers.{group}.scheduler.{name} must be positive and finite, got {factor:g}."
                         )
 
+    def _check_folder(self) -> None:
+        """Check whether the run would delete checkpoints of an earlier run in the same folder.
+
+        Raises:
+            InputError: If it would: the folder holds some, and the run does not go on from them.
+        """
+        folder = self.get_checkpoint_dir()
+        there = sorted(folder.glob("step-*.ckpt"))
+        start = self.load_dir if self.load_checkpoint is None else self.load_checkpoint.parent
+        if there and (start is None or start.resolve() not in (folder.resolve(), folder.parent.resolve())):
+            raise InputError(
+                f"{folder} holds {there[-1].name} of an earlier run, which this run would delete: go on from it with "
+                f"--load-dir {folder.parent} (load_dir in a config.yml), give another --timestamp, or remove it."
+            )
+
     def _check_address(self) -> None:
         """Check whether the viewer can listen where it is told to.
 
@@ -302,6 +317,7 @@ class SadgsTrainerConfig(TrainerConfig):
         """
         self.check()
         checkpoints.check_chosen(self.load_dir, self.load_step, self.load_checkpoint)
+        self._check_folder()
         if self.is_viewer_enabled() or self.is_viewer_legacy_enabled():
             self._check_address()
         check_ahead(self.pipeline.datamanager)

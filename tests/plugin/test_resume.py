@@ -6,6 +6,7 @@ import dataclasses
 import os
 import re
 import shlex
+import shutil
 import signal
 import socket
 import subprocess
@@ -420,6 +421,25 @@ def test_a_run_s_folder_does_as_well_as_its_folder_of_checkpoints(finished: Path
     config.load_dir = finished
     config.save_config()
     assert set_up(config)._start_step == ITERATIONS
+
+
+def test_checkpoints_of_an_earlier_run_are_not_deleted(finished: Path, config: SadgsTrainerConfig, tmp_path: Path):
+    """As where --timestamp names a finished run, or --load-config a run that was killed and so names no checkpoint."""
+    (saved,) = (finished / "nerfstudio_models").iterdir()
+    config.output_dir, elsewhere = finished.parents[2], tmp_path / "elsewhere"
+    assert config.get_base_dir() == finished
+    elsewhere.mkdir()
+    shutil.copy(saved, elsewhere)
+    for config.load_dir in (None, elsewhere):
+        with pytest.raises(InputError) as refused:
+            config.save_config()
+        assert str(refused.value) == (
+            f"{saved.parent} holds {saved.name} of an earlier run, which this run would delete: go on from it with "
+            f"--load-dir {finished} (load_dir in a config.yml), give another --timestamp, or remove it."
+        )
+    for config.load_dir, config.load_checkpoint in ((finished, None), (saved.parent, None), (None, saved)):
+        config.save_config()
+    (finished / "config.yml").unlink()
 
 
 # --- other data than the checkpoint's ---
