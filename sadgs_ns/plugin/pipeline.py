@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -41,19 +42,19 @@ from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 _NAMED_STEPS = 5
 """Number of iterations of which a report of what was not finite names the images."""
-
+_WIDEST_BLUR = 100
+"""Largest window of `energy_blur`, which makes kernels of thousands of pixels."""
 _SAMPLED = 1000
 """About so many cameras, and Gaussians, are enough to find out whether training can see anything."""
 _PLANES = (0.01, 1e10)
 """Distances in world units from a camera between which gsplat and our splatter draw Gaussians."""
-
 _SAME_PLACE = 1e-3
 """Share of the cameras' extent up to which two cameras are taken for one."""
 
 
 @dataclass
 class SadgsPipelineConfig(VanillaPipelineConfig):
-    """Full images, several of them per iteration, and their structure tensors."""
+    """Options of the data, the model and the structure tensors of the images."""
 
     _target: type = field(default_factory=lambda: SadgsPipeline)
     datamanager: FullImageDatamanagerConfig = field(
@@ -77,7 +78,7 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     None makes it relative to an image's contrast, so that the exposure of a photo does not decide what is split."""
 
     def check(self) -> None:
-        """See whether training can work with these options.
+        """Check whether training can work with these options.
 
         Raises:
             InputError: If an option is out of its range; as `SadgsModelConfig.check`.
@@ -88,11 +89,11 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
             raise InputError(
                 f"pipeline.frequency_constant must be in (0, {HIGHEST_FREQUENCY:g}], got {self.frequency_constant}."
             )
-        if not self.energy_blur >= 0:
-            raise InputError(f"pipeline.energy_blur must not be negative, got {self.energy_blur:g}.")
+        if not 0 <= self.energy_blur <= _WIDEST_BLUR:
+            raise InputError(f"pipeline.energy_blur must be in [0, {_WIDEST_BLUR}], got {self.energy_blur:g}.")
         for name in ("epsilon", "memory_budget_gb"):
-            if (value := getattr(self, name)) is not None and not value > 0:
-                raise InputError(f"pipeline.{name} must be positive, got {value:g}.")
+            if (value := getattr(self, name)) is not None and not 0 < value < math.inf:
+                raise InputError(f"pipeline.{name} must be positive and finite, got {value:g}.")
         check_options(self.datamanager)
         self.model.check()
 
@@ -117,7 +118,9 @@ class SadgsPipeline(VanillaPipeline):
         for dataset in (self.datamanager.train_dataset, self.datamanager.eval_dataset):
             refuse_unsupported_cameras(dataset.cameras)
         if self.device.type == "cpu":
-            self.datamanager.config.cache_images = "gpu"  # means the training device; "cpu" would pin memory for CUDA
+            self.datamanager.config.cache_images = (
+                "gpu"  # This is the training device; "cpu" would pin memory for CUDA.
+            )
         parsed_on = getattr(self.datamanager.dataparser.config, "alpha_color", None)
         if parsed_on is not None and parsed_on != config.model.background_color:
             CONSOLE.print(
@@ -135,25 +138,25 @@ class SadgsPipeline(VanillaPipeline):
         )
         self.log = NonFiniteLog(self.device)
         self._checkpoint_cap: int | None = None
-        self._checkpoint_views: tuple[list[str], Tensor] | None = None  # names of images, and positions of cameras
-        self.stuck = ""  # says why, where nothing is learned any more
+        self._checkpoint_views: tuple[list[str], Tensor] | None = None  # These are names and positions [C, 3].
+        self.stuck = ""  # It says why, where nothing is learned any more.
         self.structure = StructurePanel(self.structure_maps)
         self.model.viewer_outputs = self.structure.outputs
 
     @property
     def model(self) -> SadgsModel:
-        """The unwrapped model."""
+        """The model, which is never wrapped for several devices."""
         return self._model  # type: ignore[return-value]
 
     @property
     def views_per_iteration(self) -> int:
-        """As configured, but no more than there are: a view that is rendered twice in a step would count twice."""
+        """Number of views in a step, at most as many as there are: a view that is rendered twice would count twice."""
         return min(self.config.views_per_iteration, len(self.datamanager.train_dataset))
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Those of data and model, and at the end a last look at what was not finite.
+        """Return the callbacks of data and model, and two that read what was not finite; plan the memory.
 
         Raises:
             InputError: If no camera sees a Gaussian, or `memory_budget_gb` leaves no room for them.
@@ -354,14 +357,16 @@ class SadgsPipeline(VanillaPipeline):
             )
 
     def _settings(self) -> dict[str, Any]:
-        """What decides how training goes on from a checkpoint, by the names of the options."""
+        """Return the options that decide how training goes on from a checkpoint, by their names."""
         strategy = asdict(self.config.model.strategy)
         settings = {f"model.strategy.{name}": strategy[name] for name in strategy if name != "fused"}
         own = {name: getattr(self.config, name) for name in ("views_per_iteration", "memory_budget_gb")}
         return {**own, **settings}
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Random states and the order of the views, so that a resumed run goes on as if never stopped.
+        """Return what lets a resumed run go on as if it had never been stopped, and tells of which data it is.
+
+        This is random states, the order of the views, the settings, and the names and cameras of the images.
 
         With nerfstudio's farthest-point sampling of views, the order after the present round is drawn anew.
         """
@@ -369,7 +374,7 @@ class SadgsPipeline(VanillaPipeline):
             "torch": torch.get_rng_state(),
             "view_order": list(self.datamanager.train_unseen_cameras),
             "settings": self._settings(),
-            "max_gaussians": self.model.strategy.max_gaussians,  # which may be lower than the setting
+            "max_gaussians": self.model.strategy.max_gaussians,  # It may be lower than the setting.
             "images": [path.name for path in self.datamanager.train_dataset.image_filenames],
             "camera_positions": _positions(self.datamanager.train_dataset.cameras),
         }
@@ -380,9 +385,9 @@ class SadgsPipeline(VanillaPipeline):
         return state
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what `get_extra_state` saved; the view order only where the data still has that many views.
+        """Restore what `get_extra_state` saved; the order of the views only where the data still has that many.
 
-        Says where densification goes on with other settings than the checkpoint's run had.
+        A line says where densification goes on with other settings than the checkpoint's run had.
         """
         now, before = self._settings(), state.get("settings", {})
         changed = [name for name in before if name in now and now[name] != before[name]]
@@ -411,5 +416,5 @@ def _positions(cameras: Cameras) -> Tensor:
 
 
 def _stack(tensors: list[Tensor]) -> Tensor:
-    """`torch.stack`, but a single tensor is not copied."""
+    """Stack tensors as `torch.stack` does, but do not copy a single one."""
     return tensors[0][None] if len(tensors) == 1 else torch.stack(tensors)

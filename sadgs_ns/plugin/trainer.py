@@ -1,4 +1,4 @@
-"""nerfstudio glue: a trainer whose schedules follow the run's length and whose checkpoints resume."""
+"""The trainer of `ns-train sadgs`: it checks its options, its schedules follow the run's length, and it resumes."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _LESS_MEMORY = (
 _NOTHING_DONE = "stopped before an iteration was done; the same command starts again."
 _ONE_DEVICE = "sadgs trains on one device; set machine.num_devices and machine.num_machines to 1."
 _MEASURED_MEGAPIXELS = 1.0
-"""Above this size of images a run with several views an iteration prints a warning; .7 and 1.9 have been measured."""
+"""Above this size of images a run with several views an iteration prints a warning; 0.7 and 1.9 were measured."""
 _SAVING_SHARE = 0.01
 """Largest share of the time between two checkpoints by the clock that saving may take."""
 
@@ -50,7 +50,7 @@ def _memory(error: torch.cuda.OutOfMemoryError) -> str:
 
 @dataclass
 class SadgsMachineConfig(MachineConfig):
-    """nerfstudio's, for one machine."""
+    """nerfstudio's options of the machine; those of several machines are not shown."""
 
     seed: int = 42
     """Seed of everything that is drawn at random."""
@@ -70,7 +70,7 @@ class SadgsMachineConfig(MachineConfig):
 
 @dataclass
 class SadgsViewerConfig(ViewerConfig):
-    """nerfstudio's, but listening on this machine only."""
+    """nerfstudio's options of the viewer, which here listens on this machine only."""
 
     websocket_host: str = "127.0.0.1"
     """Address at which the viewer listens: this machine only; 0.0.0.0 opens it to the network."""
@@ -499,7 +499,7 @@ class SadgsTrainer(Trainer):
         for name, parameter in model.gauss_params.items():
             states = self.optimizers.optimizers[name].state
             if not states and parameter.numel() > 0:
-                lengths.add(-1)  # gsplat was rewriting the state, which it takes out meanwhile
+                lengths.add(-1)  # gsplat takes the state out while it rewrites it.
             for state in states.values():
                 lengths |= {len(value) for value in state.values() if isinstance(value, torch.Tensor) and value.dim()}
         lengths |= {len(v) for v in model.strategy_state.values() if isinstance(v, torch.Tensor) and v.dim()}
@@ -601,7 +601,7 @@ class SadgsTrainer(Trainer):
         with atomic_path(path, beside=self.checkpoint_dir) as partial:
             try:
                 torch.save(state, partial)
-            except RuntimeError as error:  # torch's writer reports a full disk so
+            except RuntimeError as error:  # torch's writer reports a full disk in this way.
                 raise OSError(reason(error)) from error
             if others:  # These are about to be deleted, so the new one must survive a power cut first.
                 with partial.open("rb+") as file:
