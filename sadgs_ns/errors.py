@@ -128,5 +128,5 @@ def reason(error: BaseException) -> str:
 
 def free_space(path: Path) -> str:
     """Return the room on the disk of a file or folder, which need not exist, such as "12.3 GB"."""
-    existing = next((p for p in (path, *path.parents) if p.exists()), Path())
+    existing = next((p for p in (path, *path.parents) if os.path.exists(p)), Path())  # Path.exists may raise.
     return f"{shutil.disk_usage(existing).free / 1e9:.1f} GB"

@@ -75,7 +75,7 @@ class SadgsViewerConfig(ViewerConfig):
     websocket_host: str = "127.0.0.1"
     """Address at which the viewer listens: this machine only; 0.0.0.0 opens it to the network."""
     websocket_port: int | None = None
-    """Port at which the viewer listens; None is 7007, or the next free one."""
+    """Port at which the viewer listens; None is 7007, or a free one where that is taken."""
     quit_on_train_completion: bool = False
     """End the command when training is done, instead of keeping the viewer open."""
     max_num_display_images: int = 512
@@ -250,7 +250,7 @@ class SadgsTrainerConfig(TrainerConfig):
         """Check whether the learning rates can train anything.
 
         Raises:
-            InputError: If one is not in [0, 1], or a schedule's factor is not positive and finite.
+            InputError: If one is not in [0, 1], now or where a schedule ends, or a factor is not positive and finite.
         """
         for group, configs in self.optimizers.items():
             rate, scheduler = configs["optimizer"].lr, configs.get("scheduler")
@@ -262,6 +262,11 @@ class SadgsTrainerConfig(TrainerConfig):
                         raise InputError(
                             f"optimizers.{group}.scheduler.{name} must be positive and finite, got {factor:g}."
                         )
+                    if rate * factor > 1:
+                        raise InputError(
+                            f"optimizers.{group}.scheduler.{name} must leave the rate in [0, 1], got {factor:g}, which "
+                            f"makes {rate * factor:g} of {rate:g}."
+                        )
 
     def _check_folder(self) -> None:
         """Check whether the run would delete checkpoints of an earlier run in the same folder.
@@ -270,7 +275,7 @@ class SadgsTrainerConfig(TrainerConfig):
             InputError: If it would: the folder holds some, and the run does not go on from them.
         """
         folder = self.get_checkpoint_dir()
-        there = sorted(folder.glob("step-*.ckpt"))
+        there = sorted(folder.glob("step-*.ckpt")) if os.path.isdir(folder) else []
         start = self.load_dir if self.load_checkpoint is None else self.load_checkpoint.parent
         if there and (start is None or start.resolve() not in (folder.resolve(), folder.parent.resolve())):
             raise InputError(

@@ -94,6 +94,11 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig
         ("optimizers.quats.optimizer.lr", 1e9, "optimizers.quats.optimizer.lr must be in [0, 1], got 1e+09."),
         ("optimizers.scales.optimizer.lr", -1.0, "optimizers.scales.optimizer.lr must be in [0, 1], got -1."),
         (
+            "optimizers.means.scheduler.initial_factor",
+            1e9,
+            "optimizers.means.scheduler.initial_factor must leave the rate in [0, 1], got 1e+09, which makes 160000 ",
+        ),
+        (
             "optimizers.means.scheduler.final_factor",
             0.0,
             "optimizers.means.scheduler.final_factor must be positive and finite, got 0.",
@@ -234,6 +239,14 @@ def test_an_output_folder_that_cannot_be_made_is_named_before_anything_is_writte
     with pytest.raises(WriteError, match=r"/file/out/\S+/config\.yml could not be written \(Not a directory; .*name "):
         config.save_config()
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_an_output_folder_whose_name_is_too_long_is_named(config: SadgsTrainerConfig):
+    config.timestamp = "x" * 300
+    with pytest.raises(
+        WriteError, match=r"/x+/config\.yml could not be written \(File name too long; .* free there"
+    ):
+        config.save_config()
 
 
 def test_a_read_only_output_folder_is_named(config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch):
