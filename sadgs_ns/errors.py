@@ -2,10 +2,53 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
+import traceback as tracebacks
 from pathlib import Path
 from types import TracebackType
+
+_NERFSTUDIOS: tuple[tuple[str, str, type[Exception], str, str], ...] = (
+    (
+        "nerfstudio.utils.eval_utils", "eval_setup", OSError, "",
+        "{error.filename} cannot be read ({reason}): give --load-config the config.yml of a run; paths in that file "
+        "may be relative to the folder in which the run was started.",
+    ),
+    (
+        "nerfstudio.utils.eval_utils", "eval_setup", AssertionError, "",
+        "The file that --load-config names is no config.yml of a run: give it one.",
+    ),
+    (
+        "nerfstudio.cameras.camera_utils", "get_interpolated_poses_many", ValueError, "at least one array",
+        "A path between views needs two of them, and the run holds out fewer: add --pose-source train, which takes the "
+        "training views.",
+    ),
+    (
+        "nerfstudio.data.utils.dataparsers_utils", "get_train_eval_split_filename", ValueError, "",
+        "With --eval-mode filename each image must have train or eval in its name: rename the images, or choose "
+        "another --eval-mode.",
+    ),
+    (
+        "nerfstudio.scripts.render", "main", ValueError, "empty sequence",
+        "The run holds out no view that could be rendered: add --split train, which takes the training views.",
+    ),
+    (
+        "nerfstudio.scripts.render", "main", AssertionError, "",
+        "`ns-render spiral` does not work with methods that train on whole images, as this one and splatfacto do: use "
+        "`ns-render interpolate`, or `ns-render camera-path` with a path that was drawn in the viewer.",
+    ),
+    (
+        "nerfstudio.scripts.eval", "main", AssertionError, "",
+        "--output-path must end with .json: give the file of results another name.",
+    ),
+    (
+        "nerfstudio.utils.writer", "__init__", Exception, "",
+        "The logger that --vis names could not start ({reason}): log in to its service, or choose another --vis.",
+    ),
+)  # fmt: skip
+"""Errors of nerfstudio's commands that users meet: the innermost function of nerfstudio in the traceback, with its
+module; the kind of error, and a part of its text; what to say instead. None of our code runs around these functions."""
 
 
 class InputError(ValueError):
@@ -31,21 +74,49 @@ class WriteError(OSError):
         )
 
 
+def refuse_deleted_working_directory() -> None:
+    """Raise an error where the folder in which the process works was deleted.
+
+    There MKL, a library of torch's, ends the process as soon as torch is imported, and it does not say why.
+
+    Raises:
+        InputError: If the folder was deleted.
+    """
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        print_uncaught_errors_as_sentences()
+        raise InputError("The working directory was deleted: change to a folder that exists with `cd`.") from None
+
+
 def print_uncaught_errors_as_sentences() -> None:
     """Have Python print our errors, where nobody catches them, as their sentence alone instead of a traceback.
 
     nerfstudio's commands run none of our code around what they do, but all of them import the package's `plugin`
-    folder, which calls this. Python's exit code stays 1, and other errors are shown as before.
+    folder, which calls this. Some errors of nerfstudio's own become a sentence, too. Python's exit code stays 1, and
+    other errors are shown as before.
     """
     show = sys.excepthook
 
     def show_sentence(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
-        if isinstance(error, InputError | RunError | WriteError):
-            print(f"error: {error}", file=sys.stderr)
-        else:
+        sentence = str(error) if isinstance(error, InputError | RunError | WriteError) else _of_nerfstudio(error)
+        if sentence is None:
             show(kind, error, traceback)
+        else:
+            print(f"error: {sentence}", file=sys.stderr)
 
     sys.excepthook = show_sentence
+
+
+def _of_nerfstudio(error: BaseException) -> str | None:
+    """Return what to tell the user of an error of nerfstudio's own; None if a traceback tells more."""
+    frames = [frame for frame, _ in tracebacks.walk_tb(error.__traceback__)]
+    places = [(str(frame.f_globals.get("__name__")), frame.f_code.co_name) for frame in frames]
+    last = next((place for place in reversed(places) if place[0].startswith("nerfstudio.")), None)
+    for module, function, kind, part, sentence in _NERFSTUDIOS:
+        if (module, function) == last and isinstance(error, kind) and part in str(error):
+            return sentence.format(error=error, reason=reason(error))
+    return None
 
 
 def reason(error: BaseException) -> str:
@@ -57,5 +128,5 @@ def reason(error: BaseException) -> str:
 
 def free_space(path: Path) -> str:
     """Return the room on the disk of a file or folder, which need not exist, such as "12.3 GB"."""
-    existing = next((p for p in (path, *path.absolute().parents) if p.exists()), Path("/"))
+    existing = next((p for p in (path, *path.parents) if os.path.exists(p)), Path())  # Path.exists may raise.
     return f"{shutil.disk_usage(existing).free / 1e9:.1f} GB"

@@ -95,12 +95,17 @@ class StructureAwareStrategy(Strategy):
         """See whether densification can work with these options.
 
         Raises:
-            ValueError: If `max_gaussians`, `eta_every` or `min_observations` is not positive, a fraction or an opacity
-                not in [0, 1], or `child_scale` not in [1, 2).
+            ValueError: If `max_gaussians`, `eta_every` or `min_observations` is not positive, another number of
+                iterations or a threshold of gradients is negative, a fraction or an opacity not in [0, 1], or
+                `child_scale` not in [1, 2).
         """
         for name in ("max_gaussians", "eta_every", "min_observations"):
             if getattr(self, name) < 1:
                 raise ValueError(f"strategy.{name} must be at least 1, got {getattr(self, name)}.")
+        iterations = ("structure_every", "absgs_every", "refine_start_iter", "refine_stop_iter", "reset_every")
+        for name in (*iterations, "clone_grad2d", "split_absgrad2d"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"strategy.{name} must not be negative, got {getattr(self, name):g}.")
         if not 1 <= self.child_scale < 2:
             raise ValueError(f"strategy.child_scale must be at least 1 and less than 2, got {self.child_scale:g}.")
         for name in ("tau_split", "split_min_opacity", "min_opacity"):

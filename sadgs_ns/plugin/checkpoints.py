@@ -53,32 +53,45 @@ def checkpoint_paths(load_dir: Path | None, load_step: int | None, load_checkpoi
     """Return the checkpoints that nerfstudio's options for resuming name, in the order in which they are to be tried.
 
     Args:
-        load_dir: A folder of checkpoints, or the folder of a run, which holds one. It takes precedence.
+        load_dir: A folder of checkpoints, or the folder of a run, which holds one; None if `load_checkpoint` is given.
         load_step: Step of the only checkpoint of `load_dir` to take; None takes all, the latest first.
-        load_checkpoint: A file.
+        load_checkpoint: A file; None if `load_dir` is given.
 
     Returns:
         Their paths; none if no option names any.
 
     Raises:
-        InputError: If what is named does not exist or holds no checkpoint, or the folder holds something else, too.
+        InputError: If both are given, if what is named does not exist or holds no checkpoint, or if the folder holds
+            something else, too.
     """
     if load_dir is None:
         if load_checkpoint is None:
             return []
+        if load_checkpoint.is_dir():
+            raise InputError(f"{load_checkpoint} is a folder: give it to --load-dir instead of --load-checkpoint.")
         if not load_checkpoint.is_file():
             raise InputError(f"{load_checkpoint} does not exist: give --load-checkpoint a file step-*.ckpt of a run.")
         return [load_checkpoint]
+    if load_checkpoint is not None:
+        raise InputError("load_dir and load_checkpoint both name where the run goes on: give one of them.")
+    if load_dir.is_file():
+        raise InputError(f"{load_dir} is a file: give it to --load-checkpoint instead of --load-dir.")
     if (load_dir / _FOLDER).is_dir():
         load_dir = load_dir / _FOLDER
-    steps = {}
+    steps, others = {}, []
     for path in sorted(load_dir.iterdir()) if load_dir.is_dir() else []:
         match = re.fullmatch(r"step-(\d+)\.ckpt", path.name)
         if match is None:
-            raise InputError(f"{path} lies among the checkpoints and is none: move it elsewhere.")
-        steps[int(match[1])] = path
+            others.append(path)
+        else:
+            steps[int(match[1])] = path
     if not steps:
-        raise InputError(f"{load_dir} holds no checkpoint: give --load-dir the folder of a run of sadgs.")
+        below = [path.parent for depth in ("*", "*/*", "*/*/*") for path in load_dir.glob(f"{depth}/{_FOLDER}")]
+        latest = max(below, key=lambda run: (run / _FOLDER).stat().st_mtime, default=None)
+        example = "" if latest is None else f", such as {latest}"
+        raise InputError(f"{load_dir} holds no checkpoint: give --load-dir the folder of a run of sadgs{example}.")
+    if others:
+        raise InputError(f"{others[0]} lies among the checkpoints and is none: move it elsewhere.")
     if load_step is None:
         return [steps[step] for step in sorted(steps, reverse=True)]
     if load_step not in steps:

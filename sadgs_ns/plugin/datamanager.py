@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import contextlib
 import copy
+import math
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -29,6 +30,7 @@ from sadgs_ns.data.automatic import AnyParserConfig, AutomaticDataParserConfig, 
 from sadgs_ns.data.validation import names
 from sadgs_ns.data.validation.layouts import COLMAP_FOLDERS
 from sadgs_ns.data.validation.transforms import read_json
+from sadgs_ns.errors import InputError
 
 
 @dataclass
@@ -66,13 +68,35 @@ class SadgsDatamanagerConfig(FullImageDatamanagerConfig):
     """Views after which "fps" starts again; it draws no more than there are."""
 
 
+def check_options(config: FullImageDatamanagerConfig) -> None:
+    """Check whether the options of a datamanager and of its parser of data make sense.
+
+    Raises:
+        InputError: If one is out of its range.
+    """
+    parser: Any = config.dataparser
+    ranges = {
+        "scale_factor": (lambda value: 0 < value < math.inf, "positive and finite"),
+        "train_split_fraction": (lambda value: 0 < value <= 1, "in (0, 1]"),
+        "eval_interval": (lambda value: value >= 2, "at least 2"),
+    }
+    for name, (fits, allowed) in ranges.items():
+        if hasattr(parser, name) and not fits(value := getattr(parser, name)):
+            raise InputError(f"{name}, an option of the data's parser, must be {allowed}, got {value:g}.")
+    if not 0 < config.camera_res_scale_factor <= 1:
+        raise InputError(
+            f"pipeline.datamanager.camera_res_scale_factor must be in (0, 1], got {config.camera_res_scale_factor:g}."
+        )
+
+
 class SadgsDatamanager(FullImageDatamanager[InputDataset]):
     """A loader that checks the images' names and places, and reads SfM points once, faster and without open3d.
 
     The checks are here rather than in the pipeline, because `ns-render dataset` makes a datamanager of its own.
 
     Raises:
-        InputError: As `colmap.read_poses`, `ply.read_points`, `names.check_names` and `names.check_paths`.
+        InputError: If there is no image to train on, or one is too small; as `colmap.read_poses`, `ply.read_points`,
+            `names.check_names` and `names.check_paths`.
     """
 
     def __init__(self, config: FullImageDatamanagerConfig, *args: Any, **kwargs: Any) -> None:
@@ -96,6 +120,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         super().__init__(config, *args, **kwargs)  # type: ignore[arg-type]
         for dataset in (self.train_dataset, self.eval_dataset):
             names.check_paths(dataset.image_filenames)
+            _check_sizes(dataset)
 
     def create_train_dataset(self) -> InputDataset:
         """Add COLMAP's points to what nerfstudio makes; it would read the same ones in ten times the time."""
@@ -103,7 +128,10 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
             outputs = self.train_dataparser_outputs
             points = colmap.read_points(self._points)
             outputs.metadata |= _points_in_the_run(*points, outputs.dataparser_transform, outputs.dataparser_scale)
-        return super().create_train_dataset()
+        dataset = super().create_train_dataset()
+        if len(dataset) == 0:
+            raise InputError("All images are held out, so that there is none to train on: choose another --eval-mode.")
+        return dataset
 
     def create_eval_dataset(self) -> InputDataset:
         """Make the dataset without reading the points a second time: nothing looks for them here."""
@@ -111,6 +139,22 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         if hasattr(parser, "load_3D_points"):
             parser.load_3D_points = False
         return super().create_eval_dataset()
+
+
+def _check_sizes(dataset: InputDataset) -> None:
+    """Check whether images are large enough for the loss.
+
+    Raises:
+        InputError: If one is less than 2 px high or wide.
+    """
+    sizes = torch.cat([dataset.cameras.width, dataset.cameras.height], dim=-1)  # [C, 2] px
+    for index in (sizes < 2).any(dim=-1).nonzero().flatten().tolist():
+        width, height = sizes[index].tolist()
+        raise InputError(
+            f"{dataset.image_filenames[index]} would be trained on with {width} × {height} px, and at least 2 × 2 are "
+            "needed: take a larger image, or scale it down less with pipeline.datamanager.camera-res-scale-factor or "
+            "the parser's downscale-factor."
+        )
 
 
 class _Nerfstudio(Nerfstudio):

@@ -1,4 +1,4 @@
-"""Handling of SIGINT, SIGTERM and SIGHUP, which stop a run only when a training step is whole."""
+"""SIGINT, SIGTERM and SIGHUP stop a run, but only when a training step is whole."""
 
 from __future__ import annotations
 

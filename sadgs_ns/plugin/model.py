@@ -1,4 +1,4 @@
-"""The model that nerfstudio trains: splatfacto's, with the structure-aware strategy and this package's rasterizer."""
+"""The model that nerfstudio trains: splatfacto's with the structure-aware strategy and this package's rasterizer."""
 
 from __future__ import annotations
 
@@ -44,6 +44,8 @@ on the scene `south` dropping them brought 1.7 dB, elsewhere nothing (docs/measu
 BILATERAL_GRID_SHAPE = (16, 16, 8)
 """Cells of a view's bilateral grid in x, y and guidance, as in splatfacto and in "Bilateral Guided Radiance Field
 Processing"."""
+_MOST_RANDOM = 10_000_000
+"""Largest number of random points to start from; they take the host's memory before the cap thins them out."""
 MAX_SCALE_RATIO = 10.0
 """Ratio of the longest to the shortest scale from which scale regularization acts, as in splatfacto."""
 
@@ -95,7 +97,7 @@ class SadgsModelConfig(InstantiateConfig):
     Without, torch and gsplat compute the same, more slowly."""
 
     def check(self) -> None:
-        """See whether training can work with these options.
+        """Check whether training can work with these options.
 
         Raises:
             InputError: If one is out of its range.
@@ -104,14 +106,19 @@ class SadgsModelConfig(InstantiateConfig):
             raise InputError(f"pipeline.model.ssim_lambda must be in [0, 1], got {self.ssim_lambda:g}.")
         if not 0 < self.initial_opacity < 1:
             raise InputError(f"pipeline.model.initial_opacity must be in (0, 1), got {self.initial_opacity:g}.")
-        if not self.opacity_reg >= 0:
-            raise InputError(f"pipeline.model.opacity_reg must not be negative, got {self.opacity_reg:g}.")
+        if not 0 <= self.opacity_reg <= 1:
+            raise InputError(f"pipeline.model.opacity_reg must be in [0, 1], got {self.opacity_reg:g}.")
         if not 0 <= self.sh_degree <= 4:
             raise InputError(f"pipeline.model.sh_degree must be in [0, 4], got {self.sh_degree}.")
-        if self.num_random < 1:
-            raise InputError(f"pipeline.model.num_random must be at least 1, got {self.num_random}.")
+        if not 1 <= self.num_random <= _MOST_RANDOM:
+            raise InputError(f"pipeline.model.num_random must be in [1, {_MOST_RANDOM:,}], got {self.num_random:,}.")
         if not 0 < self.random_scale < math.inf:
             raise InputError(f"pipeline.model.random_scale must be positive and finite, got {self.random_scale:g}.")
+        for name in ("trans_l2_penalty", "rot_l2_penalty"):
+            if not 0 <= (penalty := getattr(self.camera_optimizer, name)) < math.inf:
+                raise InputError(
+                    f"pipeline.model.camera_optimizer.{name} must be finite and not negative, got {penalty:g}."
+                )
         try:
             self.strategy.check()
         except ValueError as error:
@@ -150,7 +157,7 @@ class SadgsModel(SplatfactoModel):
         )
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
-        self._lpips: list[torch.nn.Module | None] = []  # a list, so that its weights stay out of the checkpoint
+        self._lpips: list[torch.nn.Module | None] = []  # In a list its weights stay out of the checkpoint.
         self.step = 0
         self.infos: list[dict[str, Any]] = []
         self.crop_box: OrientedBox | None = None
@@ -161,13 +168,17 @@ class SadgsModel(SplatfactoModel):
             if config.background_color == "random"
             else get_color(config.background_color)
         )
-        self.photo_background = self.background_color  # for the run; the viewer exchanges the other while it draws
+        self.photo_background = self.background_color  # The viewer exchanges the other one while it draws.
         if config.use_bilateral_grid:
             x, y, w = BILATERAL_GRID_SHAPE
             self.bil_grids = BilateralGrid(num=self.num_train_data, grid_X=x, grid_Y=y, grid_W=w)
 
     def _initial_gaussians(self) -> dict[str, Tensor]:
-        """Initial parameters, each with leading dimension N: log scales, logit opacities [N, 1], SH coefficients."""
+        """Return the initial parameters by name.
+
+        They are means [N, 3], log scales [N, 3], quats [N, 4], logit opacities [N, 1] and coefficients of harmonics,
+        features_dc [N, 3] and features_rest [N, K, 3].
+        """
         config = self.config
         if self.seed_points is None or config.random_init:
             if not config.random_init:
@@ -529,7 +540,7 @@ def _load_lpips(device: torch.device) -> torch.nn.Module | None:
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
     try:
-        with torch.random.fork_rng(devices=[]):  # weights are drawn before they are loaded: training must not notice
+        with torch.random.fork_rng(devices=[]):  # Drawing weights must not change training's random state.
             return LearnedPerceptualImagePatchSimilarity(normalize=True).to(device)
     except Exception as error:
         CONSOLE.print(f"[yellow]LPIPS is not reported: its AlexNet weights could not be loaded ({error}).[/]")

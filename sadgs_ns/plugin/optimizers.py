@@ -125,7 +125,7 @@ class SadgsOptimizers(Optimizers):
             plain = self.config[name]["optimizer"].max_norm is None and not grad_scaler.is_enabled()
             if plain and isinstance(optimizer, FusedAdam) and optimizer.triton:
                 together[name] = optimizer
-                optimizer._opt_called = True  # type: ignore[attr-defined] # as `step` notes for torch's schedulers
+                optimizer._opt_called = True  # type: ignore[attr-defined] # torch's schedulers look for it.
         step_together(together.values())
         super().optimizer_scaler_step_some(grad_scaler, [name for name in param_groups if name not in together])
 

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from sadgs_ns import kernels
@@ -19,12 +23,13 @@ from sadgs_ns.data.cameras import refuse_unsupported_cameras
 from sadgs_ns.data.validation.parsers import findings_of
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.codes import HIGHEST_FREQUENCY
+from sadgs_ns.method.initialization import camera_extent
 from sadgs_ns.method.structure_tensor import (
     ENERGY_BLUR,
     FREQUENCY_CONSTANT,
 )
 from sadgs_ns.plugin import nonfinite
-from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
+from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig, check_options
 from sadgs_ns.plugin.memory_plan import fit_to_memory, training_size
 from sadgs_ns.plugin.model import SadgsModel, SadgsModelConfig
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
@@ -32,14 +37,23 @@ from sadgs_ns.plugin.optimizers import FusedAdam
 from sadgs_ns.plugin.panel import StructurePanel
 from sadgs_ns.plugin.structure_maps import StructureMaps
 from sadgs_ns.plugin.views import TrainingViews
+from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 _NAMED_STEPS = 5
-"""Iterations of which a report of what was not finite names the images."""
+"""Number of iterations of which a report of what was not finite names the images."""
+_WIDEST_BLUR = 100
+"""Largest window of `energy_blur`, which makes kernels of thousands of pixels."""
+_SAMPLED = 1000
+"""About so many cameras, and Gaussians, are enough to find out whether training can see anything."""
+_PLANES = (0.01, 1e10)
+"""Distances in world units from a camera between which gsplat and our splatter draw Gaussians."""
+_SAME_PLACE = 1e-3
+"""Share of the cameras' extent up to which two cameras are taken for one."""
 
 
 @dataclass
 class SadgsPipelineConfig(VanillaPipelineConfig):
-    """Full images, several of them per iteration, and their structure tensors."""
+    """Options of the data, the model and the structure tensors of the images."""
 
     _target: type = field(default_factory=lambda: SadgsPipeline)
     datamanager: FullImageDatamanagerConfig = field(default_factory=SadgsDatamanagerConfig)
@@ -61,7 +75,7 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     None makes it relative to an image's contrast, so that the exposure of a photo does not decide what is split."""
 
     def check(self) -> None:
-        """See whether training can work with these options.
+        """Check whether training can work with these options.
 
         Raises:
             InputError: If an option is out of its range; as `SadgsModelConfig.check`.
@@ -72,11 +86,12 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
             raise InputError(
                 f"pipeline.frequency_constant must be in (0, {HIGHEST_FREQUENCY:g}], got {self.frequency_constant}."
             )
-        if not self.energy_blur >= 0:
-            raise InputError(f"pipeline.energy_blur must not be negative, got {self.energy_blur:g}.")
+        if not 0 <= self.energy_blur <= _WIDEST_BLUR:
+            raise InputError(f"pipeline.energy_blur must be in [0, {_WIDEST_BLUR}], got {self.energy_blur:g}.")
         for name in ("epsilon", "memory_budget_gb"):
-            if (value := getattr(self, name)) is not None and not value > 0:
-                raise InputError(f"pipeline.{name} must be positive, got {value:g}.")
+            if (value := getattr(self, name)) is not None and not 0 < value < math.inf:
+                raise InputError(f"pipeline.{name} must be positive and finite, got {value:g}.")
+        check_options(self.datamanager)
         self.model.check()
 
 
@@ -100,7 +115,9 @@ class SadgsPipeline(VanillaPipeline):
         for dataset in (self.datamanager.train_dataset, self.datamanager.eval_dataset):
             refuse_unsupported_cameras(dataset.cameras)
         if self.device.type == "cpu":
-            self.datamanager.config.cache_images = "gpu"  # means the training device; "cpu" would pin memory for CUDA
+            self.datamanager.config.cache_images = (
+                "gpu"  # This is the training device; "cpu" would pin memory for CUDA.
+            )
         parsed_on = getattr(self.datamanager.dataparser.config, "alpha_color", None)
         if parsed_on is not None and parsed_on != config.model.background_color:
             CONSOLE.print(
@@ -111,36 +128,37 @@ class SadgsPipeline(VanillaPipeline):
             CONSOLE.print(
                 "[yellow]Triton does not run here: without its kernels training takes about twice as long.[/]"
             )
-        positions = self.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]  # [C, 3]
-        self.model.set_cameras(positions)
+        self.model.set_cameras(_positions(self.datamanager.train_dataset.cameras))
         self.views = TrainingViews(self.datamanager, self.model)
         self.structure_maps = StructureMaps(
             self.views, config.frequency_constant, energy_blur=config.energy_blur, epsilon=config.epsilon
         )
         self.log = NonFiniteLog(self.device)
         self._checkpoint_cap: int | None = None
-        self.stuck = ""  # says why, where nothing is learned any more
+        self._checkpoint_views: tuple[list[str], Tensor] | None = None  # These are names and positions [C, 3].
+        self.stuck = ""  # It says why, where nothing is learned any more.
         self.structure = StructurePanel(self.structure_maps)
         self.model.viewer_outputs = self.structure.outputs
 
     @property
     def model(self) -> SadgsModel:
-        """The unwrapped model."""
+        """The model, which is never wrapped for several devices."""
         return self._model  # type: ignore[return-value]
 
     @property
     def views_per_iteration(self) -> int:
-        """As configured, but no more than there are: a view that is rendered twice in a step would count twice."""
+        """Number of views in a step, at most as many as there are: a view that is rendered twice would count twice."""
         return min(self.config.views_per_iteration, len(self.datamanager.train_dataset))
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Those of data and model, and at the end a last look at what was not finite.
+        """Return the callbacks of data and model, and two that read what was not finite; plan the memory.
 
         Raises:
-            InputError: If `memory_budget_gb` leaves no room for Gaussians.
+            InputError: If no camera sees a Gaussian, or `memory_budget_gb` leaves no room for them.
         """
+        self._refuse_empty_views()
         if self.config.model.strategy.refine_stop_iter > 0:
             model, fused = self.model, self.config.model.fused and kernels.available(self.device)
             size = training_size(self.datamanager, model.gauss_params, self.views_per_iteration, fused)  # type: ignore[arg-type]
@@ -167,6 +185,27 @@ class SadgsPipeline(VanillaPipeline):
         last = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self._report_nonfinite(last=True))
         # The log is read before densification makes new parameters, which have no gradients.
         return [read, *super().get_training_callbacks(training_callback_attributes), counts, last]
+
+    def _refuse_empty_views(self) -> None:
+        """Check whether training can see anything.
+
+        Raises:
+            InputError: If fewer than 1 in 100 Gaussians are within the planes of a camera between which they are drawn.
+        """
+        cameras = self.datamanager.train_dataset.cameras
+        viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds[:: -(-len(cameras) // _SAMPLED)])
+        means = self.model.means.detach()
+        means = means[:: -(-len(means) // _SAMPLED)].to(viewmats)  # [N, 3]
+        depths = means @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]  # [N, C]
+        near, far = _PLANES
+        drawn = ((depths > near) & (depths < far)).any(dim=1)
+        if drawn.float().mean() < 0.01:
+            extent = float(self.model.strategy_state["scene_scale"])
+            raise InputError(
+                f"The renderings would be empty, since a camera sees from {near} to {far:g} units and the cameras lie "
+                f"within {extent:.2g}: set the parser's scale-factor so that they lie within about 1, or leave its "
+                "auto-scale-poses on."
+            )
 
     def _keep_cap(self) -> None:
         """Go on with the cap that the checkpoint's run had in effect; say so if memory now allows more, or less."""
@@ -245,6 +284,24 @@ class SadgsPipeline(VanillaPipeline):
         self.log.begin_step(step, [index for views in groups.values() for index, _ in views], losses["main_loss"])
         return outputs, losses, metrics
 
+    def get_average_eval_image_metrics(
+        self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
+    ) -> dict[str, float]:
+        """Return the mean of each metric over the held-out views, and with `get_std` its standard deviation, too.
+
+        A single view has no deviation; nerfstudio would return NaN, which is no JSON.
+
+        Raises:
+            InputError: If no view is held out.
+        """
+        views = len(self.datamanager.eval_dataset)
+        if views == 0:
+            raise InputError(
+                "The run holds out no view, so that there is nothing to measure: train with one of the parser's "
+                "--eval-mode that holds out some."
+            )
+        return super().get_average_eval_image_metrics(step, output_path, get_std and views > 1)
+
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint's parameters and states.
 
@@ -267,15 +324,46 @@ class SadgsPipeline(VanillaPipeline):
             raise InputError("The checkpoint lacks the state of structure-aware densification, so splatfacto made it.")
         super().load_pipeline(loaded_state, step)
 
+    def refuse_other_capture(self) -> None:
+        """Check whether the loaded checkpoint is of the data that training is about to go on with.
+
+        Images may have been added or taken away since, if the others' poses stayed where they were. A warning is
+        printed where the cameras are the same and no image has its old name.
+
+        Raises:
+            InputError: If more than half of the cameras of either are where the other has none.
+        """
+        if self._checkpoint_views is None:
+            return
+        (before, positions_before), dataset = self._checkpoint_views, self.datamanager.train_dataset
+        now, positions = [path.name for path in dataset.image_filenames], _positions(dataset.cameras)
+        distances, _ = KDTree(positions).query(positions_before)  # [C]
+        same = int((distances < _SAME_PLACE * camera_extent(positions)).sum())
+        if 2 * same < min(len(before), len(now)):
+            raise InputError(
+                "It was trained on other data, or with other options of the parser: of its "
+                f"{len(before)} cameras ({before[0]}, …) {same or 'none'} stand where one of these {len(now)} "
+                f"({now[0]}, …) does."
+            )
+        if not {Path(name).stem for name in before} & {Path(name).stem for name in now}:
+            CONSOLE.print(
+                "[yellow]The checkpoint's run had the same cameras, but none of its images had the name of one of "
+                f"these ({escape(before[0])} and {escape(now[0])} are the first): the Gaussians fit only if the images "
+                "were renamed.[/]",
+                soft_wrap=True,
+            )
+
     def _settings(self) -> dict[str, Any]:
-        """What decides how training goes on from a checkpoint, by the names of the options."""
+        """Return the options that decide how training goes on from a checkpoint, by their names."""
         strategy = asdict(self.config.model.strategy)
         settings = {f"model.strategy.{name}": strategy[name] for name in strategy if name != "fused"}
         own = {name: getattr(self.config, name) for name in ("views_per_iteration", "memory_budget_gb")}
         return {**own, **settings}
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Random states and the order of the views, so that a resumed run goes on as if never stopped.
+        """Return what lets a resumed run go on as if it had never been stopped, and tells of which data it is.
+
+        This is random states, the order of the views, the settings, and the names and cameras of the images.
 
         With nerfstudio's farthest-point sampling of views, the order after the present round is drawn anew.
         """
@@ -283,7 +371,9 @@ class SadgsPipeline(VanillaPipeline):
             "torch": torch.get_rng_state(),
             "view_order": list(self.datamanager.train_unseen_cameras),
             "settings": self._settings(),
-            "max_gaussians": self.model.strategy.max_gaussians,  # which may be lower than the setting
+            "max_gaussians": self.model.strategy.max_gaussians,  # It may be lower than the setting.
+            "images": [path.name for path in self.datamanager.train_dataset.image_filenames],
+            "camera_positions": _positions(self.datamanager.train_dataset.cameras),
         }
         if hasattr(self.datamanager, "random_generator"):
             state["view_shuffle"] = self.datamanager.random_generator.getstate()
@@ -292,9 +382,9 @@ class SadgsPipeline(VanillaPipeline):
         return state
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what `get_extra_state` saved; the view order only where the data still has that many views.
+        """Restore what `get_extra_state` saved; the order of the views only where the data still has that many.
 
-        Says where densification goes on with other settings than the checkpoint's run had.
+        A line says where densification goes on with other settings than the checkpoint's run had.
         """
         now, before = self._settings(), state.get("settings", {})
         changed = [name for name in before if name in now and now[name] != before[name]]
@@ -306,6 +396,8 @@ class SadgsPipeline(VanillaPipeline):
             )
         if not any(name.endswith(("max_gaussians", "memory_budget_gb")) for name in changed):
             self._checkpoint_cap = state.get("max_gaussians")
+        if "images" in state:  # Earlier versions did not save it.
+            self._checkpoint_views = state["images"], state["camera_positions"]
         torch.set_rng_state(state["torch"].cpu())
         if max(state["view_order"], default=0) < len(self.datamanager.train_dataset):
             self.datamanager.train_unseen_cameras = list(state["view_order"])
@@ -315,6 +407,11 @@ class SadgsPipeline(VanillaPipeline):
             torch.cuda.set_rng_state(state["cuda"].cpu(), self.device)
 
 
+def _positions(cameras: Cameras) -> Tensor:
+    """Return the centres of cameras in world units. [C, 3]"""
+    return cameras.camera_to_worlds[:, :3, 3].cpu()
+
+
 def _stack(tensors: list[Tensor]) -> Tensor:
-    """`torch.stack`, but a single tensor is not copied."""
+    """Stack tensors as `torch.stack` does, but do not copy a single one."""
     return tensors[0][None] if len(tensors) == 1 else torch.stack(tensors)

@@ -1,11 +1,14 @@
-"""nerfstudio glue: a trainer whose schedules follow the run's length and whose checkpoints resume."""
+"""The trainer of `ns-train sadgs`: it checks its options, its schedules follow the run's length, and it resumes."""
 
 from __future__ import annotations
 
 import copy
+import errno
 import math
 import os
 import shlex
+import signal
+import socket
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -34,9 +37,10 @@ _LESS_MEMORY = (
     "lower --pipeline.model.strategy.max-gaussians or --pipeline.views-per-iteration, or take smaller images "
     "(`--downscale-factor 2` after `nerfstudio-data` or `colmap`)"
 )
+_NOTHING_DONE = "stopped before an iteration was done; the same command starts again."
 _ONE_DEVICE = "sadgs trains on one device; set machine.num_devices and machine.num_machines to 1."
 _MEASURED_MEGAPIXELS = 1.0
-"""Above this size of images a run with several views an iteration prints a warning; .7 and 1.9 have been measured."""
+"""Above this size of images a run with several views an iteration prints a warning; 0.7 and 1.9 were measured."""
 _SAVING_SHARE = 0.01
 """Largest share of the time between two checkpoints by the clock that saving may take."""
 
@@ -48,7 +52,7 @@ def _memory(error: torch.cuda.OutOfMemoryError) -> str:
 
 @dataclass
 class SadgsMachineConfig(MachineConfig):
-    """nerfstudio's, for one machine."""
+    """nerfstudio's options of the machine; those of several machines are not shown."""
 
     seed: int = 42
     """Seed of everything that is drawn at random."""
@@ -68,12 +72,12 @@ class SadgsMachineConfig(MachineConfig):
 
 @dataclass
 class SadgsViewerConfig(ViewerConfig):
-    """nerfstudio's, but listening on this machine only."""
+    """nerfstudio's options of the viewer, which here listens on this machine only."""
 
     websocket_host: str = "127.0.0.1"
     """Address at which the viewer listens: this machine only; 0.0.0.0 opens it to the network."""
     websocket_port: int | None = None
-    """Port at which the viewer listens; None is 7007, or the next free one."""
+    """Port at which the viewer listens; None is 7007, or a free one where that is taken."""
     quit_on_train_completion: bool = False
     """End the command when training is done, instead of keeping the viewer open."""
     max_num_display_images: int = 512
@@ -165,6 +169,39 @@ class SadgsTrainerConfig(TrainerConfig):
     gradient_accumulation_steps: Suppress[dict[str, int]] = field(default_factory=dict)
     """`pipeline.views_per_iteration` takes its place."""
 
+    def __post_init__(self) -> None:
+        """Check `load_config` before nerfstudio reads it, since nerfstudio then forgets all other options.
+
+        Raises:
+            InputError: If it is no config.yml, or other options were given beside it.
+        """
+        if self.load_config is None:
+            return
+        try:
+            with self.load_config.open(encoding="utf8") as file:
+                problem = None if file.readline().startswith("!!python/object:") else "it is no config.yml of a run"
+        except (OSError, UnicodeDecodeError) as error:
+            problem = reason(error)
+        if problem is not None:
+            raise InputError(f"{self.load_config} cannot be used ({problem}): give --load-config the file of a run.")
+        from nerfstudio.configs.method_configs import all_methods  # It imports this module.
+
+        preset = all_methods.get(self.method_name or "", self)
+        if lost := [
+            name for name, value in vars(preset).items() if vars(self)[name] != value and name != "load_config"
+        ]:
+            raise InputError(
+                f"With --load-config all options come from its file, and others are not read, here of "
+                f"{', '.join(lost)}: leave them out, change them in the file, or give --load-dir with the run's folder "
+                "and all options instead of --load-config."
+            )
+
+    def print_to_terminal(self) -> None:
+        """Print nothing, where nerfstudio prints 260 lines before it is known whether the run can start.
+
+        `config.yml` holds them all.
+        """
+
     def check(self) -> None:
         """Check whether training can work with these options.
 
@@ -192,10 +229,16 @@ class SadgsTrainerConfig(TrainerConfig):
             raise InputError(f"viewer.websocket_port must be in [1, 65535], got {port}.")
         if self.machine.num_devices * self.machine.num_machines != 1:
             raise InputError(_ONE_DEVICE)
-        if self.machine.device_type == "cuda" and not torch.cuda.is_available():
+        device = self.machine.device_type
+        available = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+        if not available[device]:
+            name = device.upper()
             raise InputError(
-                "machine.device_type is cuda, but torch finds no CUDA device: set it to cpu, or install torch for CUDA."
+                f"machine.device_type is {device}, but torch finds no {name} device: set it to cpu, or install torch "
+                f"for {name}."
             )
+        if not 0 <= self.machine.seed < 2**32:
+            raise InputError(f"machine.seed must be in [0, 2³²), got {self.machine.seed}.")
         self._check_rates()
         if self.mixed_precision or self.use_grad_scaler:
             raise InputError(
@@ -213,7 +256,7 @@ class SadgsTrainerConfig(TrainerConfig):
         """Check whether the learning rates can train anything.
 
         Raises:
-            InputError: If one is not in [0, 1], or a schedule's factor is not positive and finite.
+            InputError: If one is not in [0, 1], now or where a schedule ends, or a factor is not positive and finite.
         """
         for group, configs in self.optimizers.items():
             rate, scheduler = configs["optimizer"].lr, configs.get("scheduler")
@@ -225,6 +268,56 @@ class SadgsTrainerConfig(TrainerConfig):
                         raise InputError(
                             f"optimizers.{group}.scheduler.{name} must be positive and finite, got {factor:g}."
                         )
+                    if rate * factor > 1:
+                        raise InputError(
+                            f"optimizers.{group}.scheduler.{name} must leave the rate in [0, 1], got {factor:g}, which "
+                            f"makes {rate * factor:g} of {rate:g}."
+                        )
+
+    def _check_folder(self) -> None:
+        """Check whether the run would delete checkpoints of an earlier run in the same folder.
+
+        Raises:
+            InputError: If it would: the folder holds some, and the run does not go on from them.
+        """
+        folder = self.get_checkpoint_dir()
+        there = sorted(folder.glob("step-*.ckpt")) if os.path.isdir(folder) else []
+        start = self.load_dir if self.load_checkpoint is None else self.load_checkpoint.parent
+        if there and (start is None or start.resolve() not in (folder.resolve(), folder.parent.resolve())):
+            raise InputError(
+                f"{folder} holds {there[-1].name} of an earlier run, which this run would delete: go on from it with "
+                f"--load-dir {folder.parent} (load_dir in a config.yml), give another --timestamp, or remove it."
+            )
+
+    def _check_address(self) -> None:
+        """Check whether the viewer can listen where it is told to.
+
+        viser would take the next free port, of which nerfstudio knows nothing, or look for one for ever.
+
+        Raises:
+            InputError: If it cannot.
+        """
+        host, port = self.viewer.websocket_host, self.viewer.websocket_port
+        try:
+            places = socket.getaddrinfo(host, port or 0, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        except OSError as error:
+            raise InputError(
+                f"viewer.websocket_host {host!r} is unknown ({reason(error)}): 127.0.0.1 opens the viewer to this "
+                "machine only, 0.0.0.0 to the network."
+            ) from error
+        try:
+            for family, _, _, _, address in places:
+                socket.create_server(address, family=family).close()
+        except OSError as error:
+            what = reason(error).partition(" (while")[0]
+            if error.errno == errno.EADDRINUSE:
+                told = (
+                    f"viewer.websocket_port {port} is taken on {host} ({what}): give another, or none for a free one."
+                )
+            else:
+                told = f"The viewer cannot listen on {host}{f':{port}' if port else ''} ({what}): give another "
+                told += "viewer.websocket_host or viewer.websocket_port."
+            raise InputError(told) from error
 
     def save_config(self) -> None:
         """Write `config.yml`, the first file of a run, once options, checkpoint and data have been found good.
@@ -235,6 +328,9 @@ class SadgsTrainerConfig(TrainerConfig):
         """
         self.check()
         checkpoints.check_chosen(self.load_dir, self.load_step, self.load_checkpoint)
+        self._check_folder()
+        if self.is_viewer_enabled() or self.is_viewer_legacy_enabled():
+            self._check_address()
         check_ahead(self.pipeline.datamanager)
         CONSOLE.log(f"Saving config to: {self.write()}")
 
@@ -280,6 +376,7 @@ class SadgsTrainer(Trainer):
         Raises:
             InputError: If one of them cannot be used.
             RunError: If they do not fit the GPU's memory.
+            SystemExit: If SIGINT came; nerfstudio would print a traceback.
         """
         try:
             super().setup(*args, **kwargs)
@@ -289,6 +386,9 @@ class SadgsTrainer(Trainer):
             compile_kernels(self.pipeline, self.optimizers.optimizers)
         except torch.cuda.OutOfMemoryError as error:
             raise RunError(f"The GPU's memory is too small to start ({_memory(error)}): {_LESS_MEMORY}.") from error
+        except KeyboardInterrupt:
+            CONSOLE.print(f"SIGINT: {_NOTHING_DONE}", soft_wrap=True)
+            raise SystemExit(128 + signal.SIGINT) from None
 
     def _say_what_was_chosen(self) -> None:
         """Print the run's size in one line, after the memory plan's, and warn of what does not suit the data."""
@@ -337,6 +437,7 @@ class SadgsTrainer(Trainer):
         try:
             self._start_step = state["step"] + 1
             self.pipeline.load_pipeline(state["pipeline"], state["step"])
+            self.pipeline.refuse_other_capture()
             self.optimizers.load_optimizers(state["optimizers"])
             if "schedulers" in state and config.load_scheduler:
                 self.optimizers.load_schedulers(state["schedulers"])
@@ -420,7 +521,7 @@ class SadgsTrainer(Trainer):
         for name, parameter in model.gauss_params.items():
             states = self.optimizers.optimizers[name].state
             if not states and parameter.numel() > 0:
-                lengths.add(-1)  # gsplat was rewriting the state, which it takes out meanwhile
+                lengths.add(-1)  # gsplat takes the state out while it rewrites it.
             for state in states.values():
                 lengths |= {len(value) for value in state.values() if isinstance(value, torch.Tensor) and value.dim()}
         lengths |= {len(v) for v in model.strategy_state.values() if isinstance(v, torch.Tensor) and v.dim()}
@@ -472,7 +573,7 @@ class SadgsTrainer(Trainer):
         if done >= total:
             return
         if done == self._start_step:
-            text = f"{interrupted}: stopped before an iteration was done; the same command starts again."
+            text = f"{interrupted}: {_NOTHING_DONE}"
         else:
             # With --load-config nerfstudio takes all options from the file, so the file must name the checkpoints, too.
             config = copy.copy(self.config)
@@ -522,7 +623,7 @@ class SadgsTrainer(Trainer):
         with atomic_path(path, beside=self.checkpoint_dir) as partial:
             try:
                 torch.save(state, partial)
-            except RuntimeError as error:  # torch's writer reports a full disk so
+            except RuntimeError as error:  # torch's writer reports a full disk in this way.
                 raise OSError(reason(error)) from error
             if others:  # These are about to be deleted, so the new one must survive a power cut first.
                 with partial.open("rb+") as file:

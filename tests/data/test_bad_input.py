@@ -1049,7 +1049,7 @@ def test_uncaught_errors_print_one_sentence_and_exit_with_1():
         ("pipeline.frequency_constant", -1.0, "pipeline.frequency_constant must be in (0, 4], got -1.0."),
         ("pipeline.model.ssim_lambda", 7.0, "pipeline.model.ssim_lambda must be in [0, 1], got 7."),
         ("pipeline.model.initial_opacity", 1.0, "pipeline.model.initial_opacity must be in (0, 1), got 1."),
-        ("pipeline.model.opacity_reg", -1.0, "pipeline.model.opacity_reg must not be negative, got -1."),
+        ("pipeline.model.opacity_reg", -1.0, "pipeline.model.opacity_reg must be in [0, 1], got -1."),
         ("pipeline.model.strategy.tau_split", 1.5, "pipeline.model.strategy.tau_split must be in [0, 1], got 1.5."),
         (
             "pipeline.model.strategy.max_gaussians",
@@ -1081,4 +1081,5 @@ def test_ns_train_on_bad_data_ends_with_the_sentence_alone(copied: Callable[[str
     assert result.returncode == 1
     assert "Traceback" not in result.stdout + result.stderr
     assert result.stderr.splitlines()[-1].startswith(f"error: {data / FIRST} has 0 bytes: copy it again, or leave it")
+    assert "Config" not in result.stdout and len(result.stdout.splitlines()) < 5  # nerfstudio repeats --data
     assert not (tmp_path / "out").exists()

@@ -148,6 +148,9 @@ def test_an_interval_of_zero_is_refused_at_the_start():
         StructureAwareStrategy(eta_every=0).initialize_state()
     with pytest.raises(ValueError, match=r"strategy\.min_observations must be at least 1, got 0\."):
         StructureAwareStrategy(min_observations=0).initialize_state()
+    for option, value in (("structure_every", -1), ("reset_every", -100), ("split_absgrad2d", math.nan)):
+        with pytest.raises(ValueError, match=rf"strategy\.{option} must not be negative, got {value}\."):
+            dataclasses.replace(StructureAwareStrategy(), **{option: value}).initialize_state()
 
 
 @pytest.mark.parametrize(

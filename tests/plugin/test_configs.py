@@ -18,6 +18,7 @@ import pytest
 import torch
 import tyro
 import yaml
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
@@ -218,17 +219,44 @@ def test_help_texts_break_their_lines_between_sentences_as_tyro_does_not_join_th
     [
         ("sh_degree", 5, "pipeline.model.sh_degree must be in [0, 4], got 5."),
         ("sh_degree", -1, "pipeline.model.sh_degree must be in [0, 4], got -1."),
-        ("num_random", 0, "pipeline.model.num_random must be at least 1, got 0."),
+        ("num_random", 0, "pipeline.model.num_random must be in [1, 10,000,000], got 0."),
+        ("num_random", 10**9, "pipeline.model.num_random must be in [1, 10,000,000], got 1,000,000,000."),
         ("random_scale", 0.0, "pipeline.model.random_scale must be positive and finite, got 0."),
         ("random_scale", float("nan"), "pipeline.model.random_scale must be positive and finite, got nan."),
         ("ssim_lambda", 1.5, "pipeline.model.ssim_lambda must be in [0, 1], got 1.5."),
         ("initial_opacity", 1.0, "pipeline.model.initial_opacity must be in (0, 1), got 1."),
-        ("opacity_reg", -1.0, "pipeline.model.opacity_reg must not be negative, got -1."),
+        ("opacity_reg", -1.0, "pipeline.model.opacity_reg must be in [0, 1], got -1."),
+        ("opacity_reg", float("inf"), "pipeline.model.opacity_reg must be in [0, 1], got inf."),
+        (
+            "camera_optimizer",
+            CameraOptimizerConfig(trans_l2_penalty=float("nan")),
+            "pipeline.model.camera_optimizer.trans_l2_penalty must be finite and not negative, got nan.",
+        ),
+        (
+            "camera_optimizer",
+            CameraOptimizerConfig(rot_l2_penalty=-1.0),
+            "pipeline.model.camera_optimizer.rot_l2_penalty must be finite and not negative, got -1.",
+        ),
     ],
 )
 def test_options_of_the_model_that_are_out_of_range_are_refused(option: str, value: Any, sentence: str):
     with pytest.raises(InputError) as refused:
         dataclasses.replace(SadgsModelConfig(), **{option: value}).check()
+    assert str(refused.value) == sentence
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "sentence"),
+    [
+        ("energy_blur", float("inf"), "pipeline.energy_blur must be in [0, 100], got inf."),
+        ("energy_blur", -1.0, "pipeline.energy_blur must be in [0, 100], got -1."),
+        ("epsilon", float("inf"), "pipeline.epsilon must be positive and finite, got inf."),
+        ("memory_budget_gb", 0.0, "pipeline.memory_budget_gb must be positive and finite, got 0."),
+    ],
+)
+def test_options_of_the_pipeline_that_are_out_of_range_are_refused(option: str, value: float, sentence: str):
+    with pytest.raises(InputError) as refused:
+        dataclasses.replace(SadgsPipelineConfig(), **{option: value}).check()
     assert str(refused.value) == sentence
 
 

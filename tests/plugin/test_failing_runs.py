@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
 import shutil
+import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,11 +17,14 @@ from kill_and_resume import differences, parser_of
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer
-from runs import checkpoint, configure, is_finite, set_up, train
+from runs import checkpoint, configure, is_finite, nerfstudio_data, set_up, train
+from scenes import HEIGHT, WIDTH
 
+from sadgs_ns import errors
 from sadgs_ns.cli.export import write_ply
 from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.plugin import checkpoints, nonfinite
+from sadgs_ns.plugin.presets import sadgs
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 ITERATIONS = 6
@@ -44,6 +49,39 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig
             "sadgs trains on one device; set machine.num_devices and machine.num_machines to 1",
         ),
         ("machine.device_type", "cuda", "machine.device_type is cuda, but torch finds no CUDA device: set it to cpu,"),
+        ("machine.device_type", "mps", "machine.device_type is mps, but torch finds no MPS device: set it to cpu, or "),
+        ("machine.seed", -1, "machine.seed must be in [0, 2³²), got -1."),
+        ("machine.seed", 2**32, "machine.seed must be in [0, 2³²), got 4294967296."),
+        (
+            "pipeline.datamanager.dataparser.scale_factor",
+            0.0,
+            "scale_factor, an option of the data's parser, must be positive and finite, got 0.",
+        ),
+        (
+            "pipeline.datamanager.dataparser.scale_factor",
+            math.nan,
+            "scale_factor, an option of the data's parser, must be positive and finite, got nan.",
+        ),
+        (
+            "pipeline.datamanager.dataparser.train_split_fraction",
+            2.0,
+            "train_split_fraction, an option of the data's parser, must be in (0, 1], got 2.",
+        ),
+        (
+            "pipeline.datamanager.dataparser.eval_interval",
+            1,
+            "eval_interval, an option of the data's parser, must be at least 2, got 1.",
+        ),
+        (
+            "pipeline.datamanager.camera_res_scale_factor",
+            100.0,
+            "pipeline.datamanager.camera_res_scale_factor must be in (0, 1], got 100.",
+        ),
+        (
+            "pipeline.datamanager.camera_res_scale_factor",
+            math.nan,
+            "pipeline.datamanager.camera_res_scale_factor must be in (0, 1], got nan.",
+        ),
         ("steps_per_save", -3, "steps_per_save must not be negative, got -3."),
         ("seconds_per_save", math.nan, "seconds_per_save must not be negative, got nan."),
         ("steps_per_eval_batch", -1, "steps_per_eval_batch must not be negative, got -1."),
@@ -56,6 +94,11 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig
         ("optimizers.quats.optimizer.lr", 1e9, "optimizers.quats.optimizer.lr must be in [0, 1], got 1e+09."),
         ("optimizers.scales.optimizer.lr", -1.0, "optimizers.scales.optimizer.lr must be in [0, 1], got -1."),
         (
+            "optimizers.means.scheduler.initial_factor",
+            1e9,
+            "optimizers.means.scheduler.initial_factor must leave the rate in [0, 1], got 1e+09, which makes 160000 ",
+        ),
+        (
             "optimizers.means.scheduler.final_factor",
             0.0,
             "optimizers.means.scheduler.final_factor must be positive and finite, got 0.",
@@ -65,8 +108,8 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig
 def test_options_with_which_no_run_can_work_are_refused_before_anything_is_written(
     option: str, value: Any, sentence: str, config: SadgsTrainerConfig
 ):
-    if value == "cuda" and torch.cuda.is_available():
-        pytest.skip("there is a CUDA device")
+    if (value == "cuda" and torch.cuda.is_available()) or (value == "mps" and torch.backends.mps.is_available()):
+        pytest.skip(f"there is a device of kind {value}")
     owner: Any = config
     *owners, name = option.split(".")
     for part in owners:
@@ -76,6 +119,101 @@ def test_options_with_which_no_run_can_work_are_refused_before_anything_is_writt
         config.save_config()
     assert str(refused.value).startswith(sentence) and "\n" not in str(refused.value)
     assert not config.output_dir.exists()
+
+
+@pytest.mark.filterwarnings("ignore:Skipping Gaussian Smoothing:UserWarning")  # of images smaller than SSIM's window
+def test_images_that_are_too_small_after_scaling_are_named(config: SadgsTrainerConfig):
+    config.pipeline.datamanager.camera_res_scale_factor = 1.5 / HEIGHT
+    sentence = (
+        rf"/images/\S+ would be trained on with {int(1.5 * WIDTH / HEIGHT)} × 1 px, and at least 2 × 2 are needed: "
+    )
+    with pytest.raises(InputError, match=sentence):
+        set_up(config)
+    config.pipeline.datamanager.camera_res_scale_factor = 2.5 / HEIGHT
+    assert is_finite(train(config).pipeline.model)
+
+
+def test_names_that_hold_out_all_images_or_say_nothing_are_refused(tmp_path: Path):
+    parser = dataclasses.replace(nerfstudio_data(tmp_path / "data"), eval_mode="filename")
+    with pytest.raises(ValueError) as failed:
+        set_up(configure(tmp_path / "out", parser))
+    assert errors._of_nerfstudio(failed.value) == (
+        "With --eval-mode filename each image must have train or eval in its name: rename the images, or choose "
+        "another --eval-mode."
+    )
+    described = tmp_path / "data" / "transforms.json"
+    described.write_text(described.read_text().replace('"images/', '"images/eval'))
+    for path in (tmp_path / "data" / "images").iterdir():
+        path.rename(path.with_name(f"eval{path.name}"))
+    with pytest.raises(
+        InputError, match=r"^All images are held out, so that there is none to train on: choose another"
+    ):
+        set_up(configure(tmp_path / "out", parser))
+
+
+@pytest.mark.parametrize("factor", [1e-4, 1e12])
+def test_cameras_that_see_nothing_are_refused(factor: float, config: SadgsTrainerConfig):
+    parser: Any = config.pipeline.datamanager.dataparser
+    config.pipeline.datamanager.dataparser = dataclasses.replace(parser, scale_factor=factor)
+    with pytest.raises(
+        InputError, match=r"^The renderings would be empty, since a camera sees from 0\.01 to 1e\+10 units"
+    ):
+        set_up(config)
+
+
+def test_a_viewer_that_cannot_listen_where_it_is_told_to_is_refused(config: SadgsTrainerConfig):
+    def refused() -> str:
+        with pytest.raises(InputError) as error:
+            config.save_config()
+        assert not config.output_dir.exists()
+        return str(error.value)
+
+    config.vis = "viewer"
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        config.viewer.websocket_port = port = other.getsockname()[1]
+        told = (
+            rf"^viewer\.websocket_port {port} is taken on 127\.0\.0\.1 \(.+\): give another, or none for a free one\.$"
+        )
+        assert re.search(told, refused())
+        config.vis = "tensorboard"
+        config.save_config()
+        shutil.rmtree(config.output_dir)
+    config.vis, config.viewer.websocket_port = "viewer_legacy", None
+    config.viewer.websocket_host = "192.0.2.1"  # an address that no machine has
+    assert re.search(
+        r"^The viewer cannot listen on 192\.0\.2\.1 \(.+\): give another viewer\.websocket_host", refused()
+    )
+    config.viewer.websocket_host = "no host"
+    assert re.search(r"^viewer\.websocket_host 'no host' is unknown \(.+\): 127\.0\.0\.1 opens the viewer", refused())
+    config.viewer.websocket_host = "127.0.0.1"
+    config.save_config()
+
+
+def test_options_beside_a_config_that_nerfstudio_would_not_read_are_refused(
+    config: SadgsTrainerConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    preset, file = sadgs.config, config.write()
+    dataclasses.replace(preset, load_config=file).print_to_terminal()
+    assert capsys.readouterr().out == ""
+    with pytest.raises(InputError) as refused:
+        dataclasses.replace(preset, load_config=file, max_num_iterations=9, pipeline=config.pipeline)
+    assert str(refused.value) == (
+        "With --load-config all options come from its file, and others are not read, here of pipeline, "
+        "max_num_iterations: leave them out, change them in the file, or give --load-dir with the run's folder and all "
+        "options instead of --load-config."
+    )
+    (tmp_path / "text").write_text("hello")
+    (tmp_path / "bytes").write_bytes(b"\xff")
+    for name, problem in (
+        ("none", "No such file or directory"),
+        ("", "Is a directory"),
+        ("text", "it is no config.yml of a run"),
+        ("bytes", ".+"),
+    ):
+        with pytest.raises(
+            InputError, match=rf"^{tmp_path / name} cannot be used \({problem}\): give --load-config the"
+        ):
+            dataclasses.replace(preset, load_config=tmp_path / name)
 
 
 def test_accumulating_over_one_iteration_is_what_everybody_does(config: SadgsTrainerConfig):
@@ -101,6 +239,12 @@ def test_an_output_folder_that_cannot_be_made_is_named_before_anything_is_writte
     with pytest.raises(WriteError, match=r"/file/out/\S+/config\.yml could not be written \(Not a directory; .*name "):
         config.save_config()
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_an_output_folder_whose_name_is_too_long_is_named(config: SadgsTrainerConfig):
+    config.timestamp = "x" * 300
+    with pytest.raises(WriteError, match=r"/x+/config\.yml could not be written \(File name too long; .* free there"):
+        config.save_config()
 
 
 def test_a_read_only_output_folder_is_named(config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch):
@@ -280,6 +424,22 @@ def test_a_step_or_file_without_a_checkpoint_is_named(saved: Path, tmp_path: Pat
     for step in (None, 5):
         assert checkpoints.checkpoint_paths(saved.parent, step, None) == [saved]
     assert checkpoints.checkpoint_paths(None, None, None) == []
+
+
+def test_what_is_given_to_the_wrong_option_is_told_where_it_belongs(saved: Path, tmp_path: Path):
+    run = saved.parents[1]
+    for folder in (run, saved.parent):
+        with pytest.raises(InputError, match=rf"^{folder} is a folder: give it to --load-dir instead of"):
+            checkpoints.checkpoint_paths(None, None, folder)
+    with pytest.raises(InputError, match=rf"^{saved} is a file: give it to --load-checkpoint instead of --load-dir\.$"):
+        checkpoints.checkpoint_paths(saved, None, None)
+    with pytest.raises(InputError, match=r"^load_dir and load_checkpoint both name where the run goes on: give one"):
+        checkpoints.checkpoint_paths(run, None, saved)
+    for above in run.parents[:3]:  # the folders of the method, the experiment and all outputs
+        with pytest.raises(InputError, match=rf"^{above} holds no checkpoint: give .* of sadgs, such as {run}\.$"):
+            checkpoints.checkpoint_paths(above, None, None)
+    with pytest.raises(InputError, match=rf"^{tmp_path} holds no checkpoint: give --load-dir the .* run of sadgs\.$"):
+        checkpoints.checkpoint_paths(tmp_path, None, None)
 
 
 # --- runs that learn nothing ---

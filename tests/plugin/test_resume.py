@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import re
 import shlex
+import shutil
 import signal
 import socket
 import subprocess
@@ -19,6 +21,7 @@ from typing import Any
 
 import processes
 import pytest
+import runs
 import torch
 import tyro
 import yaml
@@ -31,6 +34,7 @@ from nerfstudio.utils import writer
 from scenes import ITERATIONS
 
 from sadgs_ns.demo.scene import SPARSE_FOLDER
+from sadgs_ns.errors import InputError
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin import pipeline
 from sadgs_ns.plugin.checkpoints import checkpoint_paths
@@ -290,6 +294,17 @@ def test_a_terminal_that_is_gone_costs_nothing_that_was_trained(scene: Path, tmp
     assert torch.load(path, weights_only=True)["step"] > 0
 
 
+def test_ctrl_c_while_the_data_are_loaded_ends_without_a_traceback(
+    config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(SadgsTrainer, "setup_optimizers", lambda _: send(signal.SIGINT))
+    with pytest.raises(SystemExit) as stopped:
+        set_up(config)
+    assert stopped.value.code == 130
+    line = one_line(capsys.readouterr().out, "SIGINT")
+    assert line == "SIGINT: stopped before an iteration was done; the same command starts again."
+
+
 def test_an_interrupt_while_paused_before_the_first_iteration_leaves_nothing(
     config: SadgsTrainerConfig, capsys: pytest.CaptureFixture[str]
 ):
@@ -352,8 +367,7 @@ def test_a_handler_that_the_program_has_for_sigterm_stays(config: SadgsTrainerCo
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of viser and websockets
-@pytest.mark.parametrize("vis", ["tensorboard", "viewer"])
-@pytest.mark.parametrize("option", ["load_dir", "load_checkpoint"])
+@pytest.mark.parametrize(("option", "vis"), [("load_dir", "tensorboard"), ("load_checkpoint", "viewer")])
 def test_opening_a_finished_run_says_how_to_train_on_and_ends_well(
     option: str,
     vis: str,
@@ -392,6 +406,93 @@ def test_a_run_s_folder_does_as_well_as_its_folder_of_checkpoints(finished: Path
             assert checkpoint_paths(folder, step, None) == [saved]
     config.load_dir = finished
     config.save_config()
+    assert set_up(config)._start_step == ITERATIONS
+
+
+def test_checkpoints_of_an_earlier_run_are_not_deleted(finished: Path, config: SadgsTrainerConfig, tmp_path: Path):
+    """As where --timestamp names a finished run, or --load-config a run that was killed and so names no checkpoint."""
+    (saved,) = (finished / "nerfstudio_models").iterdir()
+    config.output_dir, elsewhere = finished.parents[2], tmp_path / "elsewhere"
+    assert config.get_base_dir() == finished
+    elsewhere.mkdir()
+    shutil.copy(saved, elsewhere)
+    for config.load_dir in (None, elsewhere):
+        with pytest.raises(InputError) as refused:
+            config.save_config()
+        assert str(refused.value) == (
+            f"{saved.parent} holds {saved.name} of an earlier run, which this run would delete: go on from it with "
+            f"--load-dir {finished} (load_dir in a config.yml), give another --timestamp, or remove it."
+        )
+    for config.load_dir, config.load_checkpoint in ((finished, None), (saved.parent, None), (None, saved)):
+        config.save_config()
+    (finished / "config.yml").unlink()
+
+
+# --- other data than the checkpoint's ---
+
+
+def test_a_checkpoint_of_another_capture_is_refused(finished: Path, tmp_path: Path):
+    other = runs.configure(tmp_path, runs.nerfstudio_data(tmp_path / "data"))
+    other.load_dir = finished
+    with pytest.raises(InputError) as refused:
+        set_up(other)
+    assert re.fullmatch(
+        rf"{finished}/\S+\.ckpt cannot be continued: It was trained on other data, or with other options of the "
+        r"parser: of its 8 cameras \(001\.png, …\) none stand where one of these 9 \(\d+\.png, …\) does; give "
+        r"--load-dir the folder of a run of sadgs, or train from scratch\.",
+        str(refused.value),
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "goes_on"),
+    [
+        ({"scale_factor": 2.0}, False),
+        ({"orientation_method": "none"}, False),
+        ({"eval_mode": "all"}, True),
+        ({"eval_mode": "fraction", "train_split_fraction": 0.5}, True),
+    ],
+)
+def test_a_checkpoint_goes_on_with_more_or_fewer_views_of_its_world_alone(
+    options: dict[str, Any], goes_on: bool, finished: Path, config: SadgsTrainerConfig
+):
+    parser: Any = config.pipeline.datamanager.dataparser
+    config.pipeline.datamanager.dataparser = dataclasses.replace(parser, **options)
+    config.load_dir = finished
+    if goes_on:
+        assert set_up(config)._start_step == ITERATIONS
+    else:
+        with pytest.raises(InputError, match=r"of its 8 cameras \(001\.png, …\) none stand where one of these 8 \("):
+            set_up(config)
+
+
+def test_images_with_other_names_at_the_same_cameras_are_told_of(
+    finished: Path, config: SadgsTrainerConfig, capsys: pytest.CaptureFixture[str]
+):
+    config.load_dir = finished
+    trainer = set_up(config)
+    assert "same cameras" not in capsys.readouterr().out
+    files: Any = trainer.pipeline.datamanager.train_dataset.image_filenames
+    files[:] = [path.with_name(f"of_another_{path.name}") for path in files]
+    trainer.pipeline.refuse_other_capture()
+    line = one_line(capsys.readouterr().out, "The checkpoint's run")
+    assert line.endswith(
+        "(001.png and of_another_001.png are the first): the Gaussians fit only if the images were renamed."
+    )
+    files[:] = [path.with_name(path.name.removeprefix("of_another_")).with_suffix(".jpg") for path in files]
+    trainer.pipeline.refuse_other_capture()
+    assert "same cameras" not in capsys.readouterr().out
+
+
+def test_a_checkpoint_of_an_earlier_version_does_not_say_its_cameras(
+    finished: Path, config: SadgsTrainerConfig, tmp_path: Path
+):
+    (saved,) = (finished / "nerfstudio_models").iterdir()
+    state = torch.load(saved, weights_only=True)
+    for name in ("images", "camera_positions"):
+        del state["pipeline"]["_extra_state"][name]
+    torch.save(state, tmp_path / saved.name)
+    config.load_checkpoint = tmp_path / saved.name
     assert set_up(config)._start_step == ITERATIONS
 
 

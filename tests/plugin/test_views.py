@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,7 +24,10 @@ class Datamanager:
         self.config = FullImageDatamanagerConfig(**options)
         cameras = SimpleNamespace(camera_to_worlds=torch.rand((total, 3, 4), generator=torch.manual_seed(0)))
         self.cached_train = [{"image": torch.zeros(1, 1, 3)} for _ in range(total)]
-        self.train_dataset: Any = type("Dataset", (), {"cameras": cameras, "__len__": lambda _: total})()
+        files = [Path(f"{index}.png") for index in range(total)]
+        self.train_dataset: Any = type(
+            "Dataset", (), {"cameras": cameras, "image_filenames": files, "__len__": lambda _: total}
+        )()
         self.train_unseen_cameras = self.sample_train_cameras()
 
     sample_train_cameras = FullImageDatamanager.sample_train_cameras
