@@ -45,9 +45,8 @@ class Similarity:
         linear = np.asarray(transform[:, :3], dtype=np.float64)
         if np.isfinite(transform).all() and (scale := abs(np.linalg.det(linear)) ** (1 / 3)) > 0:
             left, _, right = np.linalg.svd(linear)
-            orthogonal = np.asarray(
-                left @ right, dtype=np.float64
-            )  # It is the nearest one, and keeps the determinant's sign.
+            # This orthogonal matrix is the nearest one, and keeps the determinant's sign.
+            orthogonal = np.asarray(left @ right, dtype=np.float64)
             if np.abs(linear - scale * orthogonal).max() < _TOLERANCE * scale:
                 return Similarity(scale, orthogonal, np.asarray(transform[:, 3], dtype=np.float64))
         raise ValueError("it is no rotation, scale and translation")

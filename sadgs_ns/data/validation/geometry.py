@@ -210,9 +210,8 @@ def _check_camera(camera: Camera, where: str) -> Iterator[Finding]:
 
 def _can_be_undone(camera: Camera, radius: float) -> bool:
     """Return whether pixels up to a distorted radius, in focal lengths from the middle, each show one place alone."""
-    undistorted = np.linspace(
-        0, np.pi if camera.fisheye else 4 * radius, 2049
-    )  # These are radii, or angles of a fisheye.
+    # Without distortion these are radii, or angles of a fisheye.
+    undistorted = np.linspace(0, np.pi if camera.fisheye else 4 * radius, 2049)
     with np.errstate(all="ignore"):  # Large coefficients overflow.
         factor = np.polyval([*reversed(camera.radial), 1.0], undistorted**2)
         distorted = undistorted * factor
