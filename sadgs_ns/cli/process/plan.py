@@ -1,4 +1,4 @@
-"""Which photos are compared with each other, decided before any work, and what came of it."""
+"""What is decided before any work, which is the pairs of photos to match, and the summary after it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Matching = Literal["auto", "exhaustive", "sequential", "spatial", "vocabulary"]
 
 @dataclass(frozen=True)
 class Summary:
-    """What became of the photos."""
+    """How many photos registered, and why others did not."""
 
     photos: int
     registered: int
