@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import functools
 import itertools
 import json
 import multiprocessing
@@ -28,7 +29,7 @@ from sadgs_ns.cli.process.apart import run_apart
 from sadgs_ns.cli.process.command import main, process
 from sadgs_ns.cli.process.photos import PHOTO_SUFFIXES, Photo, find_photos, photos_by_camera, read_photos
 from sadgs_ns.cli.process.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching, expected_work
-from sadgs_ns.cli.process.stages import check_written, match, sequential_pairs
+from sadgs_ns.cli.process.stages import check_written, fetch_vocabulary, match, sequential_pairs
 from sadgs_ns.cli.process.video import sharpest_frames
 from sadgs_ns.data.validation.images import IMAGE_SUFFIXES
 from sadgs_ns.errors import InputError, RunError
@@ -377,6 +378,23 @@ def test_numbered_photos_are_neighbours_in_the_order_of_their_numbers(tmp_path: 
 
 def no_vocabulary() -> None:
     raise RunError("COLMAP failed.")
+
+
+def test_a_vocabulary_tree_that_is_there_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The tree is a small one of random descriptors, because COLMAP's own has to be downloaded."""
+    random, kind = np.random.default_rng(0), pycolmap.FeatureExtractorType.SIFT
+    tree = pycolmap.VisualIndex.create(128, 64)
+    descriptors = pycolmap.FeatureDescriptorsFloat(type=kind, data=random.random((2600, 128), np.float32))
+    options = pycolmap.VisualIndex.BuildOptions()
+    options.num_visual_words = 64
+    tree.build(options, descriptors)
+    tree.write(tmp_path / "tree")
+    pairing = pycolmap.VocabTreePairingOptions(vocab_tree_path=tmp_path / "tree")
+    matching = functools.partial(pycolmap.match_vocabtree, pairing_options=pairing)
+    monkeypatch.setattr(pycolmap, "match_vocabtree", matching)
+    steps: list[tuple] = []
+    fetch_vocabulary(tmp_path, lambda *step: steps.append(step))
+    assert steps == [("vocabulary tree", 0, 1), ("vocabulary tree", 1, 1)]
 
 
 def numbered(count: int, has_position: bool = False, name: str = "IMG_{}.jpg") -> list[Photo]:
