@@ -15,6 +15,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -466,7 +467,7 @@ def test_the_formats_are_those_that_training_reads():
 def test_photos_with_gps_positions_are_known(tmp_path: Path):
     for i in range(3):
         exif = Image.Exif()
-        exif[0x8825] = {1: "N", 2: (48.0, 5.0, float(i)), 3: "E", 4: (11.0, 0.0, 0.0)} if i < 2 else {1: "N"}
+        exif[0x8825] = {1: "N", 2: (48.0, 5.0, float(i)), 3: "E", 4: (11.0, 0.0, 0.0)} | ({6: 500.0} if i < 2 else {})
         Image.new("RGB", (8, 8)).save(tmp_path / f"{i}.jpg", exif=exif)
     read = read_photos(tmp_path, [f"{i}.jpg" for i in range(3)], lambda *step: None)
     assert [photo.has_position for photo in read] == [True, True, False]
@@ -498,10 +499,10 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """Has COLMAP register so many of 12 photos at once, instead of running it."""
 
     def register(count: int) -> None:
-        def stand_in(function: str, *arguments: object, folder: Path, report: object) -> Summary:
+        def stand_in(function: str, *arguments: Any, folder: Path, report: object) -> Summary:
             (folder / "model").mkdir()
             (folder / "database.db").write_bytes(b"features")
-            return Summary(12, count, 100, 0.5, {})
+            return Summary(12, count, 100, 0.5, {}, arguments[2])
 
         monkeypatch.setattr(program, "run_apart", stand_in)
         monkeypatch.setattr(program, "_publish", lambda undistorted, out: None)
@@ -512,12 +513,15 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
 def test_a_scene_of_few_of_the_photos_is_warned_of(tmp_path: Path, registered: Callable[[int], None], capsys):
     photos = black(tmp_path / "photos", "a.png", "b.png", "c.png")
     registered(3)
-    assert main([str(photos), str(tmp_path / "out")]) == 1
+    assert main([str(photos), str(tmp_path / "out"), "--matching", "sequential"]) == 1
     printed = capsys.readouterr()
     assert "ns-train" not in printed.out and "3 of 12 photos registered" in printed.out
-    assert "warning: " in printed.err and "shows only what 3 of 12 photos saw. Take more photos between" in printed.err
-    assert "--matching exhaustive" in printed.err and f"ns-train sadgs --data {tmp_path / 'out'}" in printed.err
+    told = "out shows only what 3 of 12 photos saw. Try the same command with --matching exhaustive, which uses the "
+    assert printed.err.startswith("warning: ") and told in printed.err
+    assert f"trains on what is there: ns-train sadgs --data {tmp_path / 'out'}\n" in printed.err
     assert {path.name for path in (tmp_path / "out" / "work").iterdir()} == {"settings.json", "database.db", "alpha"}
+    assert main([str(photos), str(tmp_path / "out"), "--matching", "exhaustive"]) == 1
+    assert "photos saw. Try another folder with more photos between" in capsys.readouterr().err
     registered(6)
     assert main([str(photos), str(tmp_path / "out"), "--matching", "exhaustive"]) == 0
     assert f"Train:  ns-train sadgs --data {tmp_path / 'out'}\n" in capsys.readouterr().out

@@ -310,11 +310,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(not_read)
     out = shlex.quote(str(options.out))
     if summary.is_poor:
+        again = "the same command with --matching exhaustive, which uses the features found so far; or "
         print(
-            f"warning: {options.out} shows only what {summary.registered} of {summary.photos} photos saw. Take more "
-            "photos between those that did not register, with two thirds of overlap, and give another folder; or try "
-            "the same command with --matching exhaustive, which uses the features found so far. This trains on what is "
-            f"there: ns-train sadgs --data {out}",
+            f"warning: {options.out} shows only what {summary.registered} of {summary.photos} photos saw. Try "
+            f"{'' if summary.matching == 'exhaustive' else again}another folder with more photos between those that "
+            f"did not register, with two thirds of overlap. This trains on what is there: ns-train sadgs --data {out}",
             file=sys.stderr,
         )
         return 1

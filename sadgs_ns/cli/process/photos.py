@@ -37,7 +37,7 @@ class Photo:
     camera: tuple
     """Equal for photos that one camera at one focal length took, as far as size and EXIF tell."""
     has_position: bool
-    """Whether EXIF holds GPS coordinates."""
+    """Whether EXIF holds GPS coordinates with an altitude; COLMAP uses none without it."""
     has_alpha: bool
     """Whether some pixels may be transparent."""
 
@@ -136,7 +136,7 @@ def _read_photo(folder: Path, name: str) -> Photo:
             name,
             image.size,
             (image.size, *(exif.get(tag) for tag in (ExifTags.Base.Make, ExifTags.Base.Model)), lens),
-            ExifTags.GPS.GPSLatitude in position and ExifTags.GPS.GPSLongitude in position,
+            position.keys() >= {ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLongitude, ExifTags.GPS.GPSAltitude},
             image.has_transparency_data,
         )
         image.draft(

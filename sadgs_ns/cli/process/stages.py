@@ -7,6 +7,7 @@ module of the package may import this one.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import itertools
 import shutil
 import sqlite3
@@ -60,7 +61,7 @@ def make_model(
         match(names, database, work / "pairs.txt", matching, report)
         reconstruct(photos, len(names), database, work / "models", model, report)
     undistort(photos, alphas, model, work / "undistorted", max_size, report)
-    return summarize(names, model, database)
+    return dataclasses.replace(summarize(names, model, database), matching=matching)
 
 
 def fetch_vocabulary(folder: Path, report: Report) -> None:
