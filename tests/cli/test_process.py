@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import functools
 import itertools
 import json
 import multiprocessing
@@ -14,6 +15,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,10 +28,11 @@ from rich.progress import Progress
 from sadgs_ns.cli.process import command as program
 from sadgs_ns.cli.process.apart import run_apart
 from sadgs_ns.cli.process.command import main, process
-from sadgs_ns.cli.process.photos import Photo, find_photos, photos_by_camera, read_photos
+from sadgs_ns.cli.process.photos import PHOTO_SUFFIXES, Photo, find_photos, photos_by_camera, read_photos
 from sadgs_ns.cli.process.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching, expected_work
-from sadgs_ns.cli.process.stages import check_written, match, sequential_pairs
+from sadgs_ns.cli.process.stages import check_written, fetch_vocabulary, match, sequential_pairs
 from sadgs_ns.cli.process.video import sharpest_frames
+from sadgs_ns.data.validation.images import IMAGE_SUFFIXES
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
 
@@ -338,7 +341,7 @@ def test_a_size_without_structure_is_refused(tmp_path: Path, size: str, capsys):
 def test_names_with_spaces_and_webp_and_transparent_photos(tmp_path: Path, capsys):
     """COLMAP reads no WebP and leaves out alpha, both without a word."""
     (tmp_path / "photos").mkdir()
-    for i, photo in enumerate(draw_photos()):
+    for i, photo in enumerate(itertools.islice(draw_photos(), 6)):
         alpha = Image.new("L", photo.size, 255)
         alpha.paste(0, (0, 0, WIDTH // 4, HEIGHT))
         if i in (1, 2):
@@ -346,9 +349,9 @@ def test_names_with_spaces_and_webp_and_transparent_photos(tmp_path: Path, capsy
         photo.save(tmp_path / "photos" / f"my photo {i}.{'png' if i == 1 else 'webp'}", lossless=True)
     summary = process(tmp_path / "photos", tmp_path / "out", max_size=80)
     assert "2 photos are partly transparent" in capsys.readouterr().out
-    assert summary.registered == VIEWS and not summary.left_out
+    assert summary.registered == 6 and not summary.left_out
     frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
-    assert len(frames) == VIEWS
+    assert len(frames) == 6
     transparent = []
     for frame in frames:
         with Image.open(tmp_path / "out" / frame["file_path"]) as image:
@@ -376,6 +379,23 @@ def test_numbered_photos_are_neighbours_in_the_order_of_their_numbers(tmp_path: 
 
 def no_vocabulary() -> None:
     raise RunError("COLMAP failed.")
+
+
+def test_a_vocabulary_tree_that_is_there_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The tree is a small one of random descriptors, because COLMAP's own has to be downloaded."""
+    random, kind = np.random.default_rng(0), pycolmap.FeatureExtractorType.SIFT
+    tree = pycolmap.VisualIndex.create(128, 64)
+    descriptors = pycolmap.FeatureDescriptorsFloat(type=kind, data=random.random((2600, 128), np.float32))
+    options = pycolmap.VisualIndex.BuildOptions()
+    options.num_visual_words = 64
+    tree.build(options, descriptors)
+    tree.write(tmp_path / "tree")
+    pairing = pycolmap.VocabTreePairingOptions(vocab_tree_path=tmp_path / "tree")
+    matching = functools.partial(pycolmap.match_vocabtree, pairing_options=pairing)
+    monkeypatch.setattr(pycolmap, "match_vocabtree", matching)
+    steps: list[tuple] = []
+    fetch_vocabulary(tmp_path, lambda *step: steps.append(step))
+    assert steps == [("vocabulary tree", 0, 1), ("vocabulary tree", 1, 1)]
 
 
 def numbered(count: int, has_position: bool = False, name: str = "IMG_{}.jpg") -> list[Photo]:
@@ -440,10 +460,14 @@ def test_a_way_of_matching_that_cannot_work_is_told_before_any_work(photos: Path
     assert not (tmp_path / "out").exists()
 
 
+def test_the_formats_are_those_that_training_reads():
+    assert PHOTO_SUFFIXES == IMAGE_SUFFIXES
+
+
 def test_photos_with_gps_positions_are_known(tmp_path: Path):
     for i in range(3):
         exif = Image.Exif()
-        exif[0x8825] = {1: "N", 2: (48.0, 5.0, float(i)), 3: "E", 4: (11.0, 0.0, 0.0)} if i < 2 else {1: "N"}
+        exif[0x8825] = {1: "N", 2: (48.0, 5.0, float(i)), 3: "E", 4: (11.0, 0.0, 0.0)} | ({6: 500.0} if i < 2 else {})
         Image.new("RGB", (8, 8)).save(tmp_path / f"{i}.jpg", exif=exif)
     read = read_photos(tmp_path, [f"{i}.jpg" for i in range(3)], lambda *step: None)
     assert [photo.has_position for photo in read] == [True, True, False]
@@ -475,10 +499,10 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """Has COLMAP register so many of 12 photos at once, instead of running it."""
 
     def register(count: int) -> None:
-        def stand_in(function: str, *arguments: object, folder: Path, report: object) -> Summary:
+        def stand_in(function: str, *arguments: Any, folder: Path, report: object) -> Summary:
             (folder / "model").mkdir()
             (folder / "database.db").write_bytes(b"features")
-            return Summary(12, count, 100, 0.5, {})
+            return Summary(12, count, 100, 0.5, {}, arguments[2])
 
         monkeypatch.setattr(program, "run_apart", stand_in)
         monkeypatch.setattr(program, "_publish", lambda undistorted, out: None)
@@ -489,12 +513,15 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
 def test_a_scene_of_few_of_the_photos_is_warned_of(tmp_path: Path, registered: Callable[[int], None], capsys):
     photos = black(tmp_path / "photos", "a.png", "b.png", "c.png")
     registered(3)
-    assert main([str(photos), str(tmp_path / "out")]) == 1
+    assert main([str(photos), str(tmp_path / "out"), "--matching", "sequential"]) == 1
     printed = capsys.readouterr()
     assert "ns-train" not in printed.out and "3 of 12 photos registered" in printed.out
-    assert "warning: " in printed.err and "shows only what 3 of 12 photos saw. Take more photos between" in printed.err
-    assert "--matching exhaustive" in printed.err and f"ns-train sadgs --data {tmp_path / 'out'}" in printed.err
+    told = "out shows only what 3 of 12 photos saw. Try the same command with --matching exhaustive, which uses the "
+    assert printed.err.startswith("warning: ") and told in printed.err
+    assert f"trains on what is there: ns-train sadgs --data {tmp_path / 'out'}\n" in printed.err
     assert {path.name for path in (tmp_path / "out" / "work").iterdir()} == {"settings.json", "database.db", "alpha"}
+    assert main([str(photos), str(tmp_path / "out"), "--matching", "exhaustive"]) == 1
+    assert "photos saw. Try another folder with more photos between" in capsys.readouterr().err
     registered(6)
     assert main([str(photos), str(tmp_path / "out"), "--matching", "exhaustive"]) == 0
     assert f"Train:  ns-train sadgs --data {tmp_path / 'out'}\n" in capsys.readouterr().out
@@ -548,9 +575,10 @@ def test_damaged_settings_are_told_in_a_sentence(tmp_path: Path, capsys):
     assert "settings.json is damaged (" in (printed := capsys.readouterr().err) and printed.count("\n") == 1
 
 
-def test_pillow_is_safe_from_pycolmap():
+def test_the_command_starts_without_slow_or_harmful_imports():
     """pycolmap replaces Pillow's zlib, which crashes Pillow where it is loaded later and writes a PNG."""
-    code = "from sadgs_ns.cli.process import command; import sys; assert 'pycolmap' not in sys.modules"
+    imports = "import sys; from sadgs_ns.cli.process import command"
+    code = f"{imports}; assert not {{'pycolmap', 'scipy', 'torch'}} & {{*sys.modules}}"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

@@ -1,4 +1,4 @@
-"""Running COLMAP in a process of its own.
+"""COLMAP runs in a process of its own.
 
 COLMAP aborts the whole process where it meets an error in one of its threads, such as a full disk or a failed
 download, and does not listen to signals while it works. In a process of its own it can be ended at any time, and its
@@ -52,17 +52,17 @@ def run_apart(function: str, *arguments: Any, folder: Path, report: Report) -> A
     receiving, sending = context.Pipe(duplex=False)
     log, written = context.Pipe(duplex=False)
     process = context.Process(target=_serve, args=(sending, written, function, arguments), daemon=True)
-    # Signals that the terminal sends to both processes are blocked in the child, which inherits the mask.
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGHUP})
-    try:
-        process.start()
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-    sending.close()
-    written.close()
     stage, lines = "its start", b""
     sources: list[Any] = [receiving, log]
     try:
+        # The terminal sends its signals to both processes. They are blocked in the child, which inherits this mask.
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGHUP})
+        try:
+            process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        sending.close()
+        written.close()
         while sources:
             for ready in wait(sources):
                 if ready is log:
@@ -85,15 +85,16 @@ def run_apart(function: str, *arguments: Any, folder: Path, report: Report) -> A
                     raise content
         process.join()
     finally:
-        process.kill()
-        process.join()
+        if process.pid is not None:
+            process.kill()
+            process.join()
         receiving.close()
         log.close()
     raise _error_of(process.exitcode, lines.decode(errors="replace"), stage, folder)
 
 
 def _error_of(exitcode: int | None, log: str, stage: str, folder: Path) -> Exception:
-    """What to tell of a process that ended before its work."""
+    """Return the error that says why a process ended before its work was done."""
     told = [_LOG_PREFIX.sub("", line).strip() for line in log.splitlines() if _ERROR_LINE.search(line)]
     existing = next((path for path in (folder, *folder.absolute().parents) if path.exists()), Path("/"))
     if _FULL_DISK.search(log) or shutil.disk_usage(existing).free < _FULL_BELOW:
@@ -111,7 +112,7 @@ def _error_of(exitcode: int | None, log: str, stage: str, folder: Path) -> Excep
 
 
 def _serve(sending: Connection, written: Connection, function: str, arguments: tuple) -> None:
-    """Call the function and send what it reports and returns; in the other process."""
+    """Call the function and send what it reports and returns; this runs in the other process."""
     os.dup2(written.fileno(), 2)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 

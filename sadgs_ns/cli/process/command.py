@@ -55,14 +55,14 @@ _UNFINISHED = (
 
 
 def _note(settings: dict, noted: Path) -> None:
-    """Write the settings that a scene is begun with; a scene that goes on keeps its own."""
+    """Write the settings that a scene is begun with, unless it was begun before."""
     if not noted.exists():
         with atomic_path(noted) as partial:
             partial.write_text(json.dumps(settings))
 
 
 def _changes(begun: dict, asked: dict) -> str:
-    """What differs between the settings that a scene was begun with and those asked for now; empty if nothing does."""
+    """Say what differs between the settings that a scene was begun with and those asked for now, if anything does."""
     changed = [name for name in asked if begun.get(name) != asked[name]]
     if "source" in changed:  # the rest follows from it
         changed = ["source"]
@@ -94,7 +94,7 @@ def process(
 
     Args:
         source: A folder of photos, searched with its subfolders, or a video.
-        out: Folder for the scene; made if it does not exist, continued if an earlier run was interrupted. A finished
+        out: Folder for the scene. It is made if it does not exist, and an interrupted run in it goes on. A finished
             scene is left as it is.
         matching: Which pairs are matched; "auto" is sequential for videos, exhaustive for at most
             `plan.EXHAUSTIVE_LIMIT` photos, and by GPS positions or a vocabulary for more. Where there is no vocabulary,
@@ -109,7 +109,7 @@ def process(
         What was registered and what was not.
 
     Raises:
-        InputError: One sentence that names the input and the remedy.
+        InputError: If the photos, the folder or the settings cannot be used.
         OSError: If a file cannot be written.
         RunError: If COLMAP fails.
     """
@@ -216,7 +216,7 @@ def _read_settings(noted: Path) -> dict:
 
 
 def _reporter(progress: Progress) -> Report:
-    """A function that shows each stage as a bar of its own."""
+    """Return a function that shows each stage as a bar of its own."""
     tasks: dict[str, TaskID] = {}
 
     def report(stage: str, done: int, total: int) -> None:
@@ -228,14 +228,14 @@ def _reporter(progress: Progress) -> Report:
 
 
 def _publish(undistorted: Path, out: Path) -> None:
-    """Add what nerfstudio reads to undistorted photos and their model, and move all to the scene's folder.
+    """Add what nerfstudio reads to undistorted photos and their model, and move everything to the scene's folder.
 
     Raises:
         OSError: If a file cannot be written, or COLMAP could not write one.
     """
     from nerfstudio.process_data.colmap_utils import colmap_to_json
 
-    with contextlib.redirect_stdout(io.StringIO()):  # it prints all cameras where there are several
+    with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio prints all cameras where there are several
         colmap_to_json(undistorted / "sparse" / "0", undistorted)
     images = undistorted / "images"
     written = [frame["file_path"] for frame in json.loads((undistorted / "transforms.json").read_text())["frames"]]
@@ -244,7 +244,7 @@ def _publish(undistorted: Path, out: Path) -> None:
     except InputError as error:  # COLMAP does not say when a disk is full
         raise WriteError(images, OSError("the disk is full")) from error
     restore_alpha(images, undistorted / "alpha")
-    (out / "transforms.json").unlink(missing_ok=True)  # whose presence says that all is there
+    (out / "transforms.json").unlink(missing_ok=True)  # its presence says that all the others are there
     for name in ("images", "sparse"):
         shutil.rmtree(out / name, ignore_errors=True)
     for name in ("images", "sparse", "sparse_pc.ply", "transforms.json"):
@@ -310,11 +310,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(not_read)
     out = shlex.quote(str(options.out))
     if summary.is_poor:
+        again = "the same command with --matching exhaustive, which uses the features found so far; or "
         print(
-            f"warning: {options.out} shows only what {summary.registered} of {summary.photos} photos saw. Take more "
-            "photos between those that did not register, with two thirds of overlap, and give another folder; or try "
-            "the same command with --matching exhaustive, which uses the features found so far. This trains on what is "
-            f"there: ns-train sadgs --data {out}",
+            f"warning: {options.out} shows only what {summary.registered} of {summary.photos} photos saw. Try "
+            f"{'' if summary.matching == 'exhaustive' else again}another folder with more photos between those that "
+            f"did not register, with two thirds of overlap. This trains on what is there: ns-train sadgs --data {out}",
             file=sys.stderr,
         )
         return 1

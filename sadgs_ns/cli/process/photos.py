@@ -1,4 +1,4 @@
-"""The photos of a folder: which there are, whether they are whole, and what their headers tell."""
+"""Finds the photos of a folder, checks that they are whole, and converts what COLMAP does not read."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from pathlib import Path
 
 from PIL import ExifTags, Image, UnidentifiedImageError
 
-from sadgs_ns.data.validation.images import IMAGE_SUFFIXES
 from sadgs_ns.errors import InputError, reason
 
+PHOTO_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"}
+"""Suffixes of the formats that training reads; the checks of data have the same set, but are slow to import."""
 _UNREAD_SUFFIXES = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"}
 """Suffixes of formats that phones and cameras write and that neither COLMAP nor Pillow surely reads."""
 _CONVERTED_SUFFIXES = {".webp"}
@@ -34,9 +35,9 @@ class Photo:
     size: tuple[int, int]
     """Width and height in px, as the pixels are stored."""
     camera: tuple
-    """Equal for photos that one camera at one focal length took, as far as size, orientation and EXIF tell."""
+    """Equal for photos that one camera at one focal length took, as far as size and EXIF tell."""
     has_position: bool
-    """Whether EXIF holds GPS coordinates."""
+    """Whether EXIF holds GPS coordinates with an altitude; COLMAP uses none without it."""
     has_alpha: bool
     """Whether some pixels may be transparent."""
 
@@ -46,7 +47,7 @@ def photos_not_read(folder: Path) -> str:
     others = [path.suffix for path in folder.rglob("*") if path.suffix.lower() in _UNREAD_SUFFIXES]
     if not others:
         return ""
-    kinds = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
+    kinds = ", ".join(sorted(suffix[1:] for suffix in PHOTO_SUFFIXES))
     return f"Its {len(others)} {' and '.join(sorted(set(others)))} files are not read: convert them to one of {kinds}."
 
 
@@ -64,7 +65,7 @@ def find_photos(source: Path, out: Path) -> list[str]:
     found = [
         path.relative_to(folder)
         for path in folder.rglob("*")
-        if path.suffix.lower() in IMAGE_SUFFIXES and scene not in path.parents and not path.is_dir()
+        if path.suffix.lower() in PHOTO_SUFFIXES and scene not in path.parents and not path.is_dir()
     ]
     names = sorted(path.as_posix() for path in found if not any(part.startswith(".") for part in path.parts))
     if len(names) < 3:
@@ -95,7 +96,7 @@ def read_photos(folder: Path, names: Sequence[str], report: Callable[[str, int, 
             return _read_photo(folder, name)
         except UnidentifiedImageError:
             return "no image that Pillow knows" if (folder / name).stat().st_size else "0 bytes"
-        except Exception as error:  # decoders raise whatever they stumble over: OSError, SyntaxError, struct.error, …
+        except Exception as error:  # Decoders raise whatever they stumble over.
             return reason(error)
 
     with _threads() as pool:
@@ -118,7 +119,7 @@ def read_photos(folder: Path, names: Sequence[str], report: Callable[[str, int, 
 
 @contextlib.contextmanager
 def _threads() -> Iterator[ThreadPoolExecutor]:
-    """Threads that take no more work when the block raises, as at an interrupt."""
+    """Make threads that take no more work when the block raises, as at an interrupt."""
     pool = ThreadPoolExecutor()
     try:
         yield pool
@@ -135,7 +136,7 @@ def _read_photo(folder: Path, name: str) -> Photo:
             name,
             image.size,
             (image.size, *(exif.get(tag) for tag in (ExifTags.Base.Make, ExifTags.Base.Model)), lens),
-            ExifTags.GPS.GPSLatitude in position and ExifTags.GPS.GPSLongitude in position,
+            position.keys() >= {ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLongitude, ExifTags.GPS.GPSAltitude},
             image.has_transparency_data,
         )
         image.draft(
@@ -174,7 +175,7 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
             return
         try:
             target.symlink_to(source)
-        except OSError:  # Windows lets only administrators make links
+        except OSError:  # Some file systems hold no links.
             shutil.copyfile(source, target)
 
     with _threads() as pool:

@@ -1,4 +1,4 @@
-"""Which photos are compared with each other, decided before any work, and what came of it."""
+"""What is decided before any work, which is the pairs of photos to match, and the summary after it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Matching = Literal["auto", "exhaustive", "sequential", "spatial", "vocabulary"]
 
 @dataclass(frozen=True)
 class Summary:
-    """What became of the photos."""
+    """How many photos registered, and why others did not."""
 
     photos: int
     registered: int
@@ -34,6 +34,8 @@ class Summary:
     """Mean over all observations, px."""
     left_out: dict[str, str]
     """Photos that were not registered, and why."""
+    matching: Matching = "exhaustive"
+    """Which pairs were matched."""
 
     def __str__(self) -> str:
         lines = [
@@ -68,8 +70,8 @@ def choose_matching(
     nowhere = [photo.name for photo in photos if not photo.has_position]
     if asked == "spatial" and nowhere:
         raise InputError(
-            f"--matching spatial needs a GPS position in the EXIF data of every photo, and {len(nowhere)} of the "
-            f"{len(photos)} have none, such as {nowhere[0]}; use sequential, exhaustive or auto."
+            f"--matching spatial needs a GPS position with altitude in the EXIF data of every photo, and {len(nowhere)} "
+            f"of the {len(photos)} have none, such as {nowhere[0]}; use sequential, exhaustive or auto."
         )
     if asked not in ("auto", "vocabulary"):
         return asked, ""

@@ -1,12 +1,13 @@
-"""The stages from photos to a scene, each with pycolmap: features, matches, cameras and points, undistortion.
+"""The stages from photos to a scene are features, matches, cameras with points, and undistortion, all by pycolmap.
 
 Each stage goes on where an interrupted run left it. They run in a process of their own (`apart.py`), so no other
-module may import this one.
+module of the package may import this one.
 """
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import itertools
 import shutil
 import sqlite3
@@ -37,16 +38,16 @@ def make_model(
     work: Path,
     report: Report,
 ) -> Summary:
-    """Make a model of photos, and `work/undistorted` of it.
+    """Make a model of photos, and from it the undistorted scene in `work/undistorted`.
 
     Args:
         photos: The folder of the photos.
         groups: The photos' names, those of one camera together.
-        matching: Any but "auto".
+        matching: Which pairs are matched; any but "auto".
         max_size: Longest side of the undistorted photos in px; 0 keeps them as they are.
         alphas: Folder of the photos' opacities as `write_alpha` writes it; they are undistorted into
             `work/undistorted/alpha`.
-        work: Folder for all files; what an interrupted run left there is used.
+        work: Folder for all files; what an interrupted run left there is used again.
         report: Called as the work goes on.
 
     Raises:
@@ -60,7 +61,7 @@ def make_model(
         match(names, database, work / "pairs.txt", matching, report)
         reconstruct(photos, len(names), database, work / "models", model, report)
     undistort(photos, alphas, model, work / "undistorted", max_size, report)
-    return summarize(names, model, database)
+    return dataclasses.replace(summarize(names, model, database), matching=matching)
 
 
 def fetch_vocabulary(folder: Path, report: Report) -> None:
@@ -88,7 +89,7 @@ def fetch_vocabulary(folder: Path, report: Report) -> None:
 
 
 def sequential_pairs(names: Sequence[str], overlap: int = 10) -> list[tuple[str, str]]:
-    """Pairs of each frame with the next ones and with ever fewer of those farther on, which close loops.
+    """Return the pairs of each frame with the next ones and with ever fewer of those farther on, which close loops.
 
     Args:
         names: In the order of the video.
@@ -106,7 +107,7 @@ def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, repor
         for group in groups:
             reader = pycolmap.ImageReaderOptions(camera_model="OPENCV")
             if database.exists():
-                with pycolmap.Database.open(database) as opened:  # an interrupted run has made the camera
+                with pycolmap.Database.open(database) as opened:  # An interrupted run has made the camera.
                     known = {image.name: image.camera_id for image in opened.read_all_images()}
                 reader.existing_camera_id = next((known[name] for name in group if name in known), -1)
             extraction = pool.submit(
@@ -121,7 +122,7 @@ def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, repor
 
 
 def _reading(database: Path) -> sqlite3.Connection:
-    """A connection that takes no lock, because COLMAP aborts where it meets one; what it reads may be half-written."""
+    """Open a connection that takes no lock, because COLMAP aborts where it meets one; it may read half-written rows."""
     return sqlite3.connect(f"{database.resolve().as_uri()}?immutable=1", uri=True)
 
 
@@ -132,7 +133,7 @@ def match(names: Sequence[str], database: Path, pair_list: Path, matching: Match
         names: All photos.
         database: COLMAP's database, which holds their features.
         pair_list: A file to write lists of pairs to.
-        matching: Any but "auto".
+        matching: Which pairs are matched; any but "auto".
         report: Called as the work goes on.
     """
     stage = f"matches ({matching})"
@@ -140,7 +141,7 @@ def match(names: Sequence[str], database: Path, pair_list: Path, matching: Match
     verification.ransac.random_seed = _SEED
     # COLMAP separates the names in a list of pairs by spaces.
     listable = not any(character.isspace() for name in names for character in name)
-    if matching in ("spatial", "vocabulary") or not listable:  # COLMAP's own functions tell nothing of their progress
+    if matching in ("spatial", "vocabulary") or not listable:  # these functions tell nothing of their progress
         report(stage, 0, 1)
         functions = {
             "spatial": pycolmap.match_spatial,
@@ -162,7 +163,7 @@ def match(names: Sequence[str], database: Path, pair_list: Path, matching: Match
 
 
 def reconstruct(photos: Path, count: int, database: Path, attempts: Path, model: Path, report: Report) -> None:
-    """Estimate cameras and points; of several disconnected models the one with the most photos is kept.
+    """Estimate cameras and points, and keep the model with the most photos if there are several.
 
     Args:
         photos: The folder of the photos.
@@ -179,7 +180,7 @@ def reconstruct(photos: Path, count: int, database: Path, attempts: Path, model:
 
     def advance(more: int) -> None:
         nonlocal registered
-        registered = min(registered + more, count)  # it counts further where it begins another model
+        registered = min(registered + more, count)  # COLMAP counts on where it begins another model.
         report("cameras", registered, count)
 
     advance(0)
@@ -219,7 +220,19 @@ def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
 
 
 def undistort(photos: Path, alphas: Path, model: Path, folder: Path, max_size: int, report: Report) -> None:
-    """Write undistorted photos, their opacity and the model that fits them, which goes to `sparse/0` of a folder."""
+    """Write undistorted photos, their opacity and the model that fits them.
+
+    Args:
+        photos: The folder of the photos.
+        alphas: The folder of their opacities.
+        model: The folder of their model.
+        folder: The folder to write `images`, `alpha` and `sparse/0` to; what is in it is removed before.
+        max_size: Longest side of the undistorted photos in px; 0 keeps them as they are.
+        report: Called as the work goes on.
+
+    Raises:
+        OSError: If the model could not be written.
+    """
     reconstruction = pycolmap.Reconstruction(model)
     registered = [image for image in reconstruction.images.values() if image.has_pose]
     report("undistorted photos", 0, len(registered))
@@ -240,7 +253,7 @@ def undistort(photos: Path, alphas: Path, model: Path, folder: Path, max_size: i
             target = folder / "alpha" / f"{image.name}.png"
             target.parent.mkdir(parents=True, exist_ok=True)
             opacity = pycolmap.Bitmap.read(alpha, as_rgb=False)
-            assert opacity is not None  # nobody but `write_alpha` wrote it
+            assert opacity is not None  # `write_alpha` wrote it
             pycolmap.undistort_image(options, opacity, image.camera)[0].write(target)
     sparse = folder / "sparse"
     (sparse / "0").mkdir()
