@@ -38,14 +38,6 @@ from sadgs_ns.plugin.interrupts import SIGNALS
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 
-@pytest.fixture(scope="module")
-def finished(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a run that is finished, and that nothing disturbed."""
-    trainer = set_up(configure(scene, tmp_path_factory.mktemp("finished"), ITERATIONS, save_every=0))
-    trainer.train()
-    return trainer.base_dir
-
-
 def after(trainer: SadgsTrainer, at: int, act: Callable[[], None]) -> None:
     """Call `act` at the end of an iteration, after densification."""
     location = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
@@ -348,6 +340,14 @@ def test_a_handler_that_the_program_has_for_sigterm_stays(config: SadgsTrainerCo
 
 
 # --- finished runs ---
+
+
+@pytest.fixture(scope="module")
+def finished(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run that is finished."""
+    trainer = set_up(configure(scene, tmp_path_factory.mktemp("finished"), ITERATIONS, save_every=0))
+    trainer.train()
+    return trainer.base_dir
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of viser and websockets
