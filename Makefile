@@ -3,7 +3,8 @@
 
 PYTHON ?= python3
 VENV ?= .venv
-# Test processes of one thread each. Two took 7 minutes on two cores.
+# Test processes of one thread each. `worksteal` leaves the tests of a file together, so that a run which they share is
+# trained once.
 JOBS ?= 2
 
 BIN := $(VENV)/bin
@@ -15,7 +16,7 @@ demo: $(STAMP)
 	$(BIN)/python -m sadgs_ns.demo
 
 test: $(STAMP)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
 # ATEN_CPU_CAPABILITY=default keeps torch from its AVX2 and AVX-512 kernels, which round differently. A test that
 # fails in only one of `test` and `test-portable` depends on the processor.

@@ -6,7 +6,6 @@ import ctypes.util
 import importlib
 import re
 import shutil
-import subprocess
 import sys
 import warnings
 from importlib.metadata import version
@@ -14,6 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import processes
 import pytest
 import torch
 
@@ -61,8 +61,9 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
 
 def test_it_runs_as_a_module_prints_versions_and_finds_nothing_wrong_with_a_good_scene(tmp_path: Path):
     write_scene(tmp_path / "scene", 32, 24, 9, 20)
-    command = [sys.executable, "-W", "ignore", "-m", "sadgs_ns.cli.doctor", str(tmp_path / "scene")]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    argv = ["sadgs_ns.cli.doctor", str(tmp_path / "scene")]
+    code = f"import runpy, sys; sys.argv = {argv}; runpy.run_module(sys.argv[0], run_name='__main__')"
+    result = processes.python(code)
     lines = result.stdout.splitlines()
     assert lines[0].startswith(f"python {sys.version.split()[0]}, sadgs_ns ")
     for package in ("torch", "gsplat", "nerfstudio"):

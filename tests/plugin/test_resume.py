@@ -70,14 +70,6 @@ def kill_and_resume(*arguments: object) -> str:
     return result.stdout
 
 
-@pytest.fixture(scope="module")
-def finished(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a run that is finished, and that nothing disturbed."""
-    trainer = set_up(configure(scene, tmp_path_factory.mktemp("finished"), ITERATIONS, save_every=0))
-    trainer.train()
-    return trainer.base_dir
-
-
 # --- killed ---
 
 
@@ -246,9 +238,8 @@ def test_an_interrupt_within_a_step_waits_for_its_end_and_resumes_to_the_same_mo
 
     resumed = set_up(yaml.load((trainer.base_dir / "config.yml").read_text(), Loader=yaml.Loader))
     resumed.train()
-    (last,) = (finished / "nerfstudio_models").iterdir()
-    assert checkpoints(resumed) == [last.name]
-    ends = [torch.load(path / last.name, weights_only=True) for path in (last.parent, resumed.checkpoint_dir)]
+    (whole,) = (finished / "nerfstudio_models").iterdir()
+    ends = [torch.load(path, weights_only=True) for path in (whole, resumed.checkpoint_dir / whole.name)]
     assert differences(*ends) == []
 
 
@@ -364,6 +355,14 @@ def test_a_handler_that_the_program_has_for_sigterm_stays(config: SadgsTrainerCo
 
 
 # --- finished runs ---
+
+
+@pytest.fixture(scope="module")
+def finished(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run that is finished."""
+    trainer = set_up(configure(scene, tmp_path_factory.mktemp("finished"), ITERATIONS, save_every=0))
+    trainer.train()
+    return trainer.base_dir
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of viser and websockets
