@@ -485,8 +485,10 @@ class SadgsTrainer(Trainer):
         except OSError as error:
             if error.errno is None:  # It is a WriteError, or it does not come from the disk.
                 raise
-            # A logger, such as tensorboard's, could not write.
-            raise WriteError(Path(error.filename or self.base_dir), error) from error
+            # A logger, such as tensorboard's, could not write; its file may be on another disk, or its folder is gone.
+            if not self._stepping and self._completed_step > self._saved_step:
+                self.save_checkpoint(self._completed_step)
+            raise WriteError(Path(os.fsdecode(error.filename or self.base_dir)), error) from error
         finally:
             self.config.max_num_iterations = total
         if out_of_memory:
