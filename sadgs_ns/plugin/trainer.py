@@ -422,6 +422,11 @@ class SadgsTrainer(Trainer):
             self._start_step = state["step"] + 1
             self.pipeline.load_pipeline(state["pipeline"], state["step"])
             self.pipeline.refuse_other_capture()
+            if more := sorted(state["optimizers"].keys() - self.optimizers.optimizers.keys()):
+                raise InputError(
+                    f"It optimized {' and '.join(more)}, too: set pipeline.model.use-bilateral-grid and "
+                    "pipeline.model.camera-optimizer.mode as they were."
+                )
             self.optimizers.load_optimizers(state["optimizers"])
             if "schedulers" in state and config.load_scheduler:
                 self.optimizers.load_schedulers(state["schedulers"])
