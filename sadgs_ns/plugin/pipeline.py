@@ -322,6 +322,13 @@ class SadgsPipeline(VanillaPipeline):
                 )
         if not {"_extra_state", "_model._extra_state"} <= loaded.keys():
             raise InputError("The checkpoint lacks the state of structure-aware densification, so splatfacto made it.")
+        for name, parameter in self.named_parameters():
+            value = loaded.get(name)
+            if ".gauss_params." not in name and value is not None and value.shape != parameter.shape:
+                raise InputError(
+                    f"The checkpoint's {name} is for {len(value)} training views, and there are {len(parameter)}: set "
+                    "the parser's options that choose them as they were."
+                )
         super().load_pipeline(loaded_state, step)
 
     def refuse_other_capture(self) -> None:

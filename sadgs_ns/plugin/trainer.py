@@ -438,6 +438,11 @@ class SadgsTrainer(Trainer):
             self._start_step = state["step"] + 1
             self.pipeline.load_pipeline(state["pipeline"], state["step"])
             self.pipeline.refuse_other_capture()
+            if more := sorted(state["optimizers"].keys() - self.optimizers.optimizers.keys()):
+                raise InputError(
+                    f"It optimized {' and '.join(more)}, too: set pipeline.model.use-bilateral-grid and "
+                    "pipeline.model.camera-optimizer.mode as they were."
+                )
             self.optimizers.load_optimizers(state["optimizers"])
             if "schedulers" in state and config.load_scheduler:
                 self.optimizers.load_schedulers(state["schedulers"])
@@ -501,8 +506,10 @@ class SadgsTrainer(Trainer):
         except OSError as error:
             if error.errno is None:  # It is a WriteError, or it does not come from the disk.
                 raise
-            # A logger, such as tensorboard's, could not write.
-            raise WriteError(Path(error.filename or self.base_dir), error) from error
+            # A logger, such as tensorboard's, could not write; its file may be on another disk, or its folder is gone.
+            if not self._stepping and self._completed_step > self._saved_step:
+                self.save_checkpoint(self._completed_step)
+            raise WriteError(Path(os.fsdecode(error.filename or self.base_dir)), error) from error
         finally:
             self.config.max_num_iterations = total
             remove_tables()

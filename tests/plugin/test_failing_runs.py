@@ -17,6 +17,7 @@ from kill_and_resume import differences, parser_of
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils import writer
 from runs import checkpoint, configure, is_finite, nerfstudio_data, set_up, train
 from scenes import HEIGHT, WIDTH
 
@@ -290,6 +291,22 @@ def test_a_logger_s_full_disk_is_one_sentence_and_other_errors_of_reading_are_th
         failing(OSError(28, "No space left on device", "/x/events")).train()
     with pytest.raises(OSError, match=r"^broken data stream$"):
         failing(OSError("broken data stream")).train()
+
+
+def test_what_was_trained_is_saved_where_a_logger_fails_after_a_step(
+    config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch
+):
+    trainer = set_up(config)
+
+    def write() -> None:  # as tensorboard's writer where the run's folder was deleted
+        if trainer.step == 3:
+            raise FileNotFoundError(2, "No such file or directory", b"/x/events")
+
+    monkeypatch.setattr(writer, "write_out_storage", write)
+    shutil.rmtree(trainer.base_dir)
+    with pytest.raises(WriteError, match=r"^/x/events could not be written \(No such file or directory; "):
+        trainer.train()
+    assert [path.name for path in trainer.checkpoint_dir.iterdir()] == ["step-000000003.ckpt"]
 
 
 def test_a_full_disk_leaves_the_previous_export(tmp_path: Path):

@@ -465,6 +465,24 @@ def test_a_checkpoint_goes_on_with_more_or_fewer_views_of_its_world_alone(
             set_up(config)
 
 
+def test_what_is_learned_of_each_view_goes_on_with_the_same_views_and_options_alone(
+    config: SadgsTrainerConfig, tmp_path: Path
+):
+    config.pipeline.model.use_bilateral_grid = True
+    trainer = set_up(config)
+    trainer.save_checkpoint(1)
+    config.load_dir, config.output_dir = trainer.checkpoint_dir, tmp_path / "resumed"
+    assert set_up(config)._start_step == 2
+    config.pipeline.model.use_bilateral_grid = False
+    with pytest.raises(InputError, match=r"continued: It optimized bilateral_grid, too: set pipeline\.model\."):
+        set_up(config)
+    config.pipeline.model.use_bilateral_grid = True
+    parser: Any = config.pipeline.datamanager.dataparser
+    config.pipeline.datamanager.dataparser = dataclasses.replace(parser, eval_mode="all")
+    with pytest.raises(InputError, match=r"\S+grids is for 8 training views, and there are 10: set the parser"):
+        set_up(config)
+
+
 def test_images_with_other_names_at_the_same_cameras_are_told_of(
     finished: Path, config: SadgsTrainerConfig, capsys: pytest.CaptureFixture[str]
 ):
