@@ -70,8 +70,8 @@ def choose_matching(
     nowhere = [photo.name for photo in photos if not photo.has_position]
     if asked == "spatial" and nowhere:
         raise InputError(
-            f"--matching spatial needs a GPS position with altitude in the EXIF data of every photo, and {len(nowhere)} "
-            f"of the {len(photos)} have none, such as {nowhere[0]}; use sequential, exhaustive or auto."
+            f"--matching spatial needs a GPS position with altitude in the EXIF data of every photo, and "
+            f"{len(nowhere)} of the {len(photos)} have none, such as {nowhere[0]}; use sequential, exhaustive or auto."
         )
     if asked not in ("auto", "vocabulary"):
         return asked, ""
