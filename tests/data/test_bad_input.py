@@ -857,5 +857,4 @@ def test_ns_train_on_bad_data_ends_with_the_sentence_alone(copied: Callable[[str
     assert result.returncode == 1
     assert "Traceback" not in result.stdout + result.stderr
     assert result.stderr.splitlines()[-1].startswith(f"error: {data / FIRST} has 0 bytes: copy it again, or leave it")
-    assert "Config" not in result.stdout and len(result.stdout.splitlines()) < 5  # nerfstudio repeats --data
     assert not (tmp_path / "out").exists()
