@@ -25,11 +25,6 @@ _NERFSTUDIOS: tuple[tuple[str, str, type[Exception], str, str], ...] = (
         "training views.",
     ),
     (
-        "nerfstudio.data.utils.dataparsers_utils", "get_train_eval_split_filename", ValueError, "",
-        "With --eval-mode filename each image must have train or eval in its name: rename the images, or choose "
-        "another --eval-mode.",
-    ),
-    (
         "nerfstudio.scripts.render", "main", ValueError, "empty sequence",
         "The run holds out no view that could be rendered: add --split train, which takes the training views.",
     ),

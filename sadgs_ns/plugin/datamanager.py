@@ -95,8 +95,8 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
     The checks are here rather than in the pipeline, because `ns-render dataset` makes a datamanager of its own.
 
     Raises:
-        InputError: If there is no image to train on, or one is too small; as `colmap.read_poses`, `ply.read_points`,
-            `names.check_names` and `names.check_paths`.
+        InputError: If an image is too small; as `colmap.read_poses`, `ply.read_points`, `names.check_names` and
+            `names.check_paths`.
     """
 
     def __init__(self, config: FullImageDatamanagerConfig, *args: Any, **kwargs: Any) -> None:
@@ -128,10 +128,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
             outputs = self.train_dataparser_outputs
             points = colmap.read_points(self._points)
             outputs.metadata |= _points_in_the_run(*points, outputs.dataparser_transform, outputs.dataparser_scale)
-        dataset = super().create_train_dataset()
-        if len(dataset) == 0:
-            raise InputError("All images are held out, so that there is none to train on: choose another --eval-mode.")
-        return dataset
+        return super().create_train_dataset()
 
     def create_eval_dataset(self) -> InputDataset:
         """Make the dataset without reading the points a second time: nothing looks for them here."""

@@ -18,10 +18,9 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
-from runs import checkpoint, configure, is_finite, nerfstudio_data, set_up, train
+from runs import checkpoint, configure, is_finite, set_up, train
 from scenes import HEIGHT, WIDTH
 
-from sadgs_ns import errors
 from sadgs_ns.cli.export import write_ply
 from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.plugin import checkpoints, nonfinite
@@ -132,24 +131,6 @@ def test_images_that_are_too_small_after_scaling_are_named(config: SadgsTrainerC
         set_up(config)
     config.pipeline.datamanager.camera_res_scale_factor = 2.5 / HEIGHT
     assert is_finite(train(config).pipeline.model)
-
-
-def test_names_that_hold_out_all_images_or_say_nothing_are_refused(tmp_path: Path):
-    parser = dataclasses.replace(nerfstudio_data(tmp_path / "data"), eval_mode="filename")
-    with pytest.raises(ValueError) as failed:
-        set_up(configure(tmp_path / "out", parser))
-    assert errors._of_nerfstudio(failed.value) == (
-        "With --eval-mode filename each image must have train or eval in its name: rename the images, or choose "
-        "another --eval-mode."
-    )
-    described = tmp_path / "data" / "transforms.json"
-    described.write_text(described.read_text().replace('"images/', '"images/eval'))
-    for path in (tmp_path / "data" / "images").iterdir():
-        path.rename(path.with_name(f"eval{path.name}"))
-    with pytest.raises(
-        InputError, match=r"^All images are held out, so that there is none to train on: choose another"
-    ):
-        set_up(configure(tmp_path / "out", parser))
 
 
 @pytest.mark.parametrize("factor", [1e-4, 1e12])
