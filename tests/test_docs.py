@@ -31,7 +31,7 @@ def rows_of_hard_cases(document: str) -> list[tuple[str, str]]:
         modules = re.findall(r"tests/(?:\w+/)?test_\w+\.py", section)
         table = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("| ")]
         table = [cells for cells in table if not cells[0].startswith("**")][2:]  # without groups and header
-        assert {len(cells) for cells in table} == {3}
+        assert {len(cells) for cells in table} in ({3}, {4})  # one section also says what was before
         rows += [(modules[0], cells[-1]) for cells in table]
     return rows
 
@@ -42,7 +42,7 @@ def test_every_hard_case_names_a_test_that_there_is(document: str, at_least: int
     assert len(rows) >= at_least
     for module, cell in rows:
         names = re.findall(r"`([^`]+)`", cell)
-        assert names or cell == "the same", cell
+        assert names or cell in ("the same", "tried by hand", "–"), cell
         for name in names:
             found = re.fullmatch(r"(?:(tests/(?:\w+/)?test_\w+\.py)::)?(test_\w+)?(?:\[(.+)\])?", name)
             assert found, name
