@@ -106,8 +106,8 @@ class SadgsModelConfig(InstantiateConfig):
             raise InputError(f"pipeline.model.ssim_lambda must be in [0, 1], got {self.ssim_lambda:g}.")
         if not 0 < self.initial_opacity < 1:
             raise InputError(f"pipeline.model.initial_opacity must be in (0, 1), got {self.initial_opacity:g}.")
-        if not 0 <= self.opacity_reg <= 1:
-            raise InputError(f"pipeline.model.opacity_reg must be in [0, 1], got {self.opacity_reg:g}.")
+        if not 0 <= self.opacity_reg <= 100:
+            raise InputError(f"pipeline.model.opacity_reg must be in [0, 100], got {self.opacity_reg:g}.")
         if not 0 <= self.sh_degree <= 4:
             raise InputError(f"pipeline.model.sh_degree must be in [0, 4], got {self.sh_degree}.")
         if not 1 <= self.num_random <= _MOST_RANDOM:

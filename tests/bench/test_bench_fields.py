@@ -148,6 +148,8 @@ def runs(request: pytest.FixtureRequest, root: Path, tmp_path_factory: pytest.Te
 def test_the_curve_changes_nothing_in_the_training(runs: Runs):
     (_, measured), (_, plain) = runs["with"], runs["without"]
     assert len(plain["pipeline"]["_model.gauss_params.means"]) != 200, "densification took part"
+    for states in (measured, plain):
+        states["pipeline"].get("_extra_state", {}).pop("images", None)  # which are names, and no numbers
     torch.testing.assert_close(measured, plain, rtol=0, atol=0)
 
 

@@ -84,7 +84,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SadgsTraine
     params["features_rest"].data = 0.3 * torch.randn(params["features_rest"].shape, generator=generator)
     params["opacities"].data = torch.randn(params["opacities"].shape, generator=generator)
     trainer.save_checkpoint(11)
-    trainer.config.save_config()
+    trainer.config.write()
     return folder / "scene", trainer
 
 

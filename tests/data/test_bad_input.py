@@ -1050,7 +1050,7 @@ def test_uncaught_errors_print_one_sentence_and_exit_with_1():
         ("pipeline.frequency_constant", -1.0, "pipeline.frequency_constant must be in (0, 4], got -1.0."),
         ("pipeline.model.ssim_lambda", 7.0, "pipeline.model.ssim_lambda must be in [0, 1], got 7."),
         ("pipeline.model.initial_opacity", 1.0, "pipeline.model.initial_opacity must be in (0, 1), got 1."),
-        ("pipeline.model.opacity_reg", -1.0, "pipeline.model.opacity_reg must be in [0, 1], got -1."),
+        ("pipeline.model.opacity_reg", -1.0, "pipeline.model.opacity_reg must be in [0, 100], got -1."),
         ("pipeline.model.strategy.tau_split", 1.5, "pipeline.model.strategy.tau_split must be in [0, 1], got 1.5."),
         (
             "pipeline.model.strategy.max_gaussians",

@@ -225,8 +225,8 @@ def test_help_texts_break_their_lines_between_sentences_as_tyro_does_not_join_th
         ("random_scale", float("nan"), "pipeline.model.random_scale must be positive and finite, got nan."),
         ("ssim_lambda", 1.5, "pipeline.model.ssim_lambda must be in [0, 1], got 1.5."),
         ("initial_opacity", 1.0, "pipeline.model.initial_opacity must be in (0, 1), got 1."),
-        ("opacity_reg", -1.0, "pipeline.model.opacity_reg must be in [0, 1], got -1."),
-        ("opacity_reg", float("inf"), "pipeline.model.opacity_reg must be in [0, 1], got inf."),
+        ("opacity_reg", -1.0, "pipeline.model.opacity_reg must be in [0, 100], got -1."),
+        ("opacity_reg", float("inf"), "pipeline.model.opacity_reg must be in [0, 100], got inf."),
         (
             "camera_optimizer",
             CameraOptimizerConfig(trans_l2_penalty=float("nan")),
