@@ -4,6 +4,8 @@ so that ours still fail a test.
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import os
 import signal
 from pathlib import Path
@@ -17,6 +19,13 @@ settings.register_profile("long", max_examples=5000)  # pytest --hypothesis-prof
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel is defined: they then run on the CPU, slowly
+    with contextlib.suppress(ImportError, AttributeError, TypeError):
+        # Of every sum and product of integers the interpreter computes whether it overflows, half of its time, only to
+        # throw the answer away: it does not assert anything unless it is debugged.
+        from triton.runtime.interpreter import interpreter_builder
+
+        if not interpreter_builder.options.debug:
+            interpreter_builder.options = dataclasses.replace(interpreter_builder.options, sanitize_overflow=False)
 
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     # Where a shell lets its children ignore Ctrl-C (nohup, in the background), so would the runs that tests interrupt.
