@@ -17,6 +17,12 @@ from hypothesis import settings
 
 settings.register_profile("long", max_examples=5000)  # pytest --hypothesis-profile=long
 
+if "PYTEST_XDIST_WORKER" in os.environ and "OMP_NUM_THREADS" not in os.environ:
+    # Where each worker's torch has a thread for every core, they wait for each other's: training takes four times as
+    # long. The environment is for the processes that tests start.
+    os.environ["OMP_NUM_THREADS"] = "1"
+    torch.set_num_threads(1)
+
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel is defined: they then run on the CPU, slowly
     with contextlib.suppress(ImportError, AttributeError, TypeError):
