@@ -4,6 +4,8 @@ so that ours still fail a test.
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import os
 import signal
 from pathlib import Path
@@ -15,8 +17,21 @@ from hypothesis import settings
 
 settings.register_profile("long", max_examples=5000)  # pytest --hypothesis-profile=long
 
+if "PYTEST_XDIST_WORKER" in os.environ and "OMP_NUM_THREADS" not in os.environ:
+    # Where each worker's torch has a thread for every core, they wait for each other's: training takes four times as
+    # long. The environment is for the processes that tests start.
+    os.environ["OMP_NUM_THREADS"] = "1"
+    torch.set_num_threads(1)
+
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel is defined: they then run on the CPU, slowly
+    with contextlib.suppress(ImportError, AttributeError, TypeError):
+        # Of every sum and product of integers the interpreter computes whether it overflows, half of its time, only to
+        # throw the answer away: it does not assert anything unless it is debugged.
+        from triton.runtime.interpreter import interpreter_builder
+
+        if not interpreter_builder.options.debug:
+            interpreter_builder.options = dataclasses.replace(interpreter_builder.options, sanitize_overflow=False)
 
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     # Where a shell lets its children ignore Ctrl-C (nohup, in the background), so would the runs that tests interrupt.

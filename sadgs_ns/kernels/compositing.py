@@ -39,16 +39,13 @@ _STRIDE = 12
 
 
 @triton.jit
-def _add(one, other):
-    return one + other
+def _row(values, ROW: tl.constexpr):
+    """One row of a block. Adding −0.0 changes nothing, so that the compiler removes the sum."""
+    rows = tl.arange(0, values.shape[0])[:, None]
+    return tl.sum(tl.where(rows == ROW, values, -0.0), axis=0)
 
 
-@triton.jit
-def _multiply(one, other):
-    return one * other
-
-
-if isinstance(_add, triton.JITFunction):
+if isinstance(_row, triton.JITFunction):
 
     @triton.jit
     def _reciprocal(value):
@@ -61,13 +58,6 @@ else:  # Triton's interpreter, which knows no PTX
     @triton.jit
     def _reciprocal(value):
         return 1 / value
-
-
-@triton.jit
-def _row(values, ROW: tl.constexpr):
-    """One row of a block. Adding −0.0 changes nothing, so that the compiler removes the sum."""
-    rows = tl.arange(0, values.shape[0])[:, None]
-    return tl.sum(tl.where(rows == ROW, values, -0.0), axis=0)
 
 
 @triton.jit
@@ -202,12 +192,12 @@ def _composite_backward(
         alpha = tl.where(seen, tl.minimum(alpha, 0.999), 0.0)
 
         ratio = _reciprocal(1 - alpha)
-        front = tl.associative_scan(tl.where(first_row, ratio * transmittance[None, :], ratio), 0, _multiply)
+        front = tl.cumprod(tl.where(first_row, ratio * transmittance[None, :], ratio), 0)
         transmittance = _row(front, GAUSSIANS - 1)
         weight = alpha * front
         color = r[:, None] * red[None, :] + g_[:, None] * green[None, :] + b_[:, None] * blue[None, :]
         share = weight * color
-        share = tl.associative_scan(tl.where(first_row, share + behind[None, :], share), 0, _add)
+        share = tl.cumsum(tl.where(first_row, share + behind[None, :], share), 0)
         behind = _row(share, GAUSSIANS - 1)
         by_color = tl.dot(weight, v_rgb, input_precision=PRECISION)
         # This is front · color − behind / (1 − alpha), where `share` includes the Gaussian's own share in `behind`.
