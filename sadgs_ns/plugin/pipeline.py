@@ -115,9 +115,8 @@ class SadgsPipeline(VanillaPipeline):
         for dataset in (self.datamanager.train_dataset, self.datamanager.eval_dataset):
             refuse_unsupported_cameras(dataset.cameras)
         if self.device.type == "cpu":
-            self.datamanager.config.cache_images = (
-                "gpu"  # This is the training device; "cpu" would pin memory for CUDA.
-            )
+            # "gpu" is the training device; "cpu" would pin memory for CUDA.
+            self.datamanager.config.cache_images = "gpu"
         parsed_on = getattr(self.datamanager.dataparser.config, "alpha_color", None)
         if parsed_on is not None and parsed_on != config.model.background_color:
             CONSOLE.print(
