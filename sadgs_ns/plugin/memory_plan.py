@@ -26,8 +26,10 @@ SAMPLED_CAMERAS = 8
 """Training cameras in which the pairs of the initial Gaussians are counted."""
 TILE_SIZE = 8
 """Size of a tile in px, as `kernels.compositing.TILE_SIZE`, which cannot be imported without Triton."""
-_NEAR, _BLUR, _REACH = 0.01, 0.3, 3.0
-"""gsplat's near plane in world units, its screen-space blur in px², and the standard deviations that it draws."""
+NEAR_PLANE = 0.01
+"""Depth in world units from which gsplat and our splatter draw Gaussians."""
+_BLUR, _REACH = 0.3, 3.0
+"""gsplat's screen-space blur in px², and the standard deviations that it draws."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ def _count_pairs(
     first = ((means2d - radii) / TILE_SIZE).floor().clamp_min(0).minimum(tiles)
     last = ((means2d + radii) / TILE_SIZE).ceil().clamp_min(0).minimum(tiles)
     counts = (last - first).prod(dim=-1)  # [N]
-    drawn = (depths[:, 0] > _NEAR) & (reach > 0) & counts.isfinite()
+    drawn = (depths[:, 0] > NEAR_PLANE) & (reach > 0) & counts.isfinite()
     return int(torch.where(drawn, counts, 0.0).double().sum())
 
 

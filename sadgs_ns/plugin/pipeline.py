@@ -30,7 +30,7 @@ from sadgs_ns.method.structure_tensor import (
 )
 from sadgs_ns.plugin import nonfinite
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig, check_options
-from sadgs_ns.plugin.memory_plan import fit_to_memory, training_size
+from sadgs_ns.plugin.memory_plan import NEAR_PLANE, fit_to_memory, training_size
 from sadgs_ns.plugin.model import SadgsModel, SadgsModelConfig
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
 from sadgs_ns.plugin.optimizers import FusedAdam
@@ -45,8 +45,8 @@ _WIDEST_BLUR = 100
 """Largest window of `energy_blur`, which makes kernels of thousands of pixels."""
 _SAMPLED = 1000
 """About so many cameras, and Gaussians, are enough to find out whether training can see anything."""
-_PLANES = (0.01, 1e10)
-"""Distances in world units from a camera between which gsplat and our splatter draw Gaussians."""
+_FAR_PLANE = 1e10
+"""Depth in world units up to which gsplat and our splatter draw Gaussians."""
 _SAME_PLACE = 1e-3
 """Share of the cameras' extent up to which two cameras are taken for one."""
 
@@ -196,14 +196,13 @@ class SadgsPipeline(VanillaPipeline):
         means = self.model.means.detach()
         means = means[:: -(-len(means) // _SAMPLED)].to(viewmats)  # [N, 3]
         depths = means @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]  # [N, C]
-        near, far = _PLANES
-        drawn = ((depths > near) & (depths < far)).any(dim=1)
+        drawn = ((depths > NEAR_PLANE) & (depths < _FAR_PLANE)).any(dim=1)
         if drawn.float().mean() < 0.01:
             extent = float(self.model.strategy_state["scene_scale"])
             raise InputError(
-                f"The renderings would be empty, since a camera sees from {near} to {far:g} units and the cameras lie "
-                f"within {extent:.2g}: set the parser's scale-factor so that they lie within about 1, or leave its "
-                "auto-scale-poses on."
+                f"The renderings would be empty, since a camera sees from {NEAR_PLANE} to {_FAR_PLANE:g} units and the "
+                f"cameras lie within {extent:.2g}: set the parser's scale-factor so that they lie within about 1, or "
+                "leave its auto-scale-poses on."
             )
 
     def _keep_cap(self) -> None:
