@@ -31,7 +31,7 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from sadgs_ns.demo.__main__ import fit_schedule
+from sadgs_ns.demo.__main__ import fit_densification
 from sadgs_ns.demo.scene import EVAL_INTERVAL, SPARSE_FOLDER, write_scene
 from sadgs_ns.plugin.presets import sadgs
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
@@ -72,7 +72,7 @@ def configure(scene: Path, output: Path, iterations: int, save_every: int, seed:
     config.logging.local_writer.enable, config.logging.profiler = False, "none"
     config.pipeline.datamanager.dataparser = parser_of(scene)
     config.pipeline.model.strategy = dataclasses.replace(config.pipeline.model.strategy)
-    fit_schedule(config.pipeline.model.strategy, iterations, max_gaussians=2000)
+    fit_densification(config.pipeline.model.strategy, max_gaussians=2000)
     return config
 
 
@@ -218,7 +218,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     undisturbed, disturbed = configured("undisturbed"), configured("disturbed")
     for config in (undisturbed, configured("other seed", 43)):
         assert run(config) == 0
-    structure_every = disturbed.pipeline.model.strategy.structure_every
+    structure_every = disturbed.pipeline.model.strategy.windows.structure_every
     draw = plan(given.kills, given.iterations, structure_every, given.save_every, given.seed)
     folder = disturbed.get_checkpoint_dir()
     for number in range(given.kills):

@@ -60,7 +60,7 @@ def as_saved_before_the_folders(config: str) -> str:
     text = config.replace("sadgs_ns.plugin.progress.ProgressTable", "nerfstudio.utils.writer.LocalWriter")
     text = text.replace("sadgs_ns.plugin.", "sadgs_ns.").replace("sadgs_ns.method.", "sadgs_ns.")
     for name in ("MachineConfig", "ViewerConfig"):
-        text = text.replace(f"sadgs_ns.trainer.Sadgs{name}", f"nerfstudio.configs.base_config.{name}")
+        text = text.replace(f"sadgs_ns.config.Sadgs{name}", f"nerfstudio.configs.base_config.{name}")
     assert "sadgs_ns.model.SadgsModelConfig" in text and "sadgs_ns.strategy.StructureAwareStrategy" in text
     return text
 

@@ -125,7 +125,7 @@ class Workload:
     """Of the demo scene."""
     analysed_views: int = 2
     """So many of the demo's images stand in for a photo."""
-    iterations: int = StructureAwareStrategy().structure_every
+    iterations: int = StructureAwareStrategy().windows.structure_every
     """Between two structure steps."""
 
 

@@ -11,6 +11,7 @@ import functools
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -25,7 +26,10 @@ WARMUP = 3
 """Steps before them."""
 
 _SCHEDULE = ("refine_every", "reset_every", "structure_every", "absgs_every", "refine_stop_iter")
-"""Fields of a strategy, gsplat's or ours, that say when it densifies."""
+"""Fields of a strategy, gsplat's or ours, that say when it densifies; ours derives those that are None."""
+_FAR = {"refine_stop_iter": sys.maxsize // 2, "absgs_every": sys.maxsize // 8}
+"""Where they are put, if not to a quarter of the largest integer: the end lies behind all that is due, and the next
+AbsGS step before the next structure step, which would forget its gradients, so that they would not be computed."""
 
 
 @contextlib.contextmanager
@@ -152,15 +156,20 @@ def within_densification(strategy: Any) -> Iterator[None]:
 
     Its window is opened and the next clone, split, prune and reset is put out of reach; what is off (0) stays off.
     """
-    schedule = {name: getattr(strategy, name) for name in _SCHEDULE if getattr(strategy, name, 0) > 0}
+    if strategy is None:
+        yield
+        return
+    derived = getattr(strategy, "windows", None)
+    before = vars(strategy).copy()
+    now = before if derived is None else before | asdict(derived) | {"run_length": sys.maxsize}
     try:
-        for name in schedule:
-            # Before the next structure step, which would forget AbsGS's gradients, so that they are not even computed.
-            setattr(strategy, name, sys.maxsize // 2 if name == "absgs_every" else sys.maxsize)
+        vars(strategy).update(now)
+        for name in _SCHEDULE:
+            if now.get(name, 0) > 0:
+                setattr(strategy, name, _FAR.get(name, sys.maxsize // 4))
         yield
     finally:
-        for name, value in schedule.items():
-            setattr(strategy, name, value)
+        vars(strategy).update(before)
 
 
 def measure(trainer: Any, steps: int = STEPS) -> dict[str, float]:
@@ -187,7 +196,8 @@ def measure(trainer: Any, steps: int = STEPS) -> dict[str, float]:
     """
     model = trainer.pipeline.model
     strategy = getattr(model, "strategy", None)
-    every = getattr(strategy, "eta_every", 1)
+    windows = getattr(strategy, "windows", None)
+    every = 1 if windows is None else windows.eta_every
     steps = -(-steps // every) * every
     first = trainer.config.max_num_iterations
     watch = Stopwatch(torch.device(model.device))

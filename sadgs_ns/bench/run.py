@@ -207,7 +207,8 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
         train_psnr = evaluate.quality(model, train_views, {})["psnr"]
         fps = evaluate.frames_per_second(model, [camera for camera, _ in views])
     record = {
-        "iterations": config.max_num_iterations,
+        "iterations": trainer.config.max_num_iterations,
+        "views_per_iteration": getattr(pipeline, "views_per_iteration", 1),
         "loop_seconds": timer.seconds,
         **seconds,
         "wall_seconds": wall,
@@ -223,7 +224,7 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
     }
     if curve is not None:
-        end = point(config.max_num_iterations, timer.seconds, held_out, int(model.num_points))
+        end = point(trainer.config.max_num_iterations, timer.seconds, held_out, int(model.num_points))
         record["curve"] = [*curve.points, end]
     if images is not None:
         names = [Path(path).stem for path in datamanager.eval_dataset.image_filenames]

@@ -113,7 +113,8 @@ def load_run(path: Path, load_step: int | None = None, data: Path | None = None)
         raise InputError(f"{checkpoint} does not fit its run: {str(error).rstrip('.')}; {_REMEDY}.") from error
     except (KeyError, RuntimeError) as error:  # what lacks, or has another size
         raise InputError(f"{checkpoint} is not of this version of sadgs ({reason(error)}): {_REMEDY}.") from error
-    pipeline.model.strategy.fit_to_run(config.max_num_iterations)
+    saved = state["pipeline"]["_extra_state"].get("schedule", {})  # Earlier versions did not derive it.
+    pipeline.model.strategy.fit_to_run(saved.get("iterations", config.max_num_iterations))
     return pipeline, state["step"] + 1
 
 

@@ -39,7 +39,7 @@ from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 PRESET = "sadgs"
-ABSGS_THRESHOLD_FACTOR = 20.0
+ABSGS_THRESHOLD_FACTOR = 12.0
 """What AbsGS's gradient thresholds are multiplied by. Gradients are normalised by the image's size and grow with a
 Gaussian's share of it; the demo's few are tens of times wider, relative to the image, than those of a photograph. At
 the preset's thresholds nearly all were split each time, and the cap was full before the first structure step."""
@@ -93,20 +93,13 @@ class Run:
         return float(ssim(first, second, data_range=1.0))
 
 
-def fit_schedule(strategy: StructureAwareStrategy, iterations: int, max_gaussians: int) -> None:
-    """Shrink the preset's schedule, made for 3,000 iterations, to the demo's few.
-
-    The proportions stay: four AbsGS steps, then a structure step, three times over. η is observed at every iteration,
-    which gives as many observations before a structure step as the preset's every tenth of 3,000.
+def fit_densification(strategy: StructureAwareStrategy, max_gaussians: int) -> None:
+    """Fit densification to the demo, whose images are small and whose run is short.
 
     Args:
         strategy: Changed in place.
-        iterations: Length of the run.
         max_gaussians: The demo's cap, which bounds the time of a step on a CPU.
     """
-    factor = iterations / 3000
-    for name in ("structure_every", "absgs_every", "refine_start_iter", "refine_stop_iter", "reset_every", "eta_every"):
-        setattr(strategy, name, max(round(getattr(strategy, name) * factor), 1))
     strategy.clone_grad2d *= ABSGS_THRESHOLD_FACTOR
     strategy.split_absgrad2d *= ABSGS_THRESHOLD_FACTOR
     strategy.max_gaussians = max_gaussians
@@ -137,7 +130,7 @@ def run_config(
         data=scene, colmap_path=SPARSE_FOLDER, downscale_factor=1, eval_mode="interval", eval_interval=EVAL_INTERVAL
     )
     strategy = config.pipeline.model.strategy
-    fit_schedule(strategy, iterations, max_gaussians)
+    fit_densification(strategy, max_gaussians)
     if not densify:
         strategy.refine_stop_iter = 0
     if not split:
@@ -159,20 +152,20 @@ def train(config: SadgsTrainerConfig, label: str, on_step: Callable[[int, int], 
     trainer: SadgsTrainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
     pipeline, snapshot = trainer.pipeline, Snapshot()
-    strategy = pipeline.model.strategy
+    windows = pipeline.model.strategy.windows
     counts: list[int] = []  # before (negative) and after each structure step
 
     def at_structure_step(step: int) -> bool:
         return (
-            strategy.structure_every > 0
-            and step < strategy.refine_stop_iter
-            and (step + 1) % strategy.structure_every == 0
+            windows.structure_every > 0
+            and step < windows.refine_stop_iter
+            and (step + 1) % windows.structure_every == 0
         )
 
     def before_densification(step: int) -> None:
         if at_structure_step(step):
             counts.append(-pipeline.model.num_points)
-        if step + 1 == strategy.structure_every and "eta_max" in pipeline.model.strategy_state:
+        if step + 1 == windows.structure_every and "eta_max" in pipeline.model.strategy_state:
             snapshot.params = {name: value.detach().clone() for name, value in pipeline.model.gauss_params.items()}
             state = pipeline.model.strategy_state
             snapshot.statistics = {name: state[name].clone() for name in ("eta_max", "n_total")}

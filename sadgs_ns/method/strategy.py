@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, MutableMapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow
 from sadgs_ns.method.memory import StepSize, affordable_growth, free_bytes
+from sadgs_ns.method.schedule import Windows, windows
 from sadgs_ns.method.split import Params, children_per_axis, grid_split, limit_growth, num_children
 from sadgs_ns.method.statistics import consistent, empty_statistics, observe
 
@@ -42,6 +43,7 @@ class StructureAwareStrategy(Strategy):
     A gsplat `Strategy`. Iterations are counted from 1: `step` s is iteration s + 1. In a training loop:
 
         strategy = StructureAwareStrategy()
+        strategy.fit_to_run(num_iterations)
         state = strategy.initialize_state(scene_scale)
         renders, alphas, info = rasterization(..., packed=False, absgrad=strategy.needs_absgrad(step))
         info |= {"structure_tensors": ..., "viewmats": ..., "Ks": ...}   # [C, H, W, 3], [C, 4, 4], [C, 3, 3]
@@ -57,17 +59,19 @@ class StructureAwareStrategy(Strategy):
     max_gaussians: int = 4_000_000
     """Hard cap on the number of Gaussians, never exceeded; the largest violations are split first.
     On CUDA fewer are added, with a warning, where the device's memory would not hold them."""
-    structure_every: int = 500
-    """Iterations between structure-aware split and prune steps; 0 turns them off."""
-    absgs_every: int = 100
-    """Iterations between AbsGS steps, skipped where a structure step falls; 0 turns them off."""
-    refine_start_iter: int = 100
-    """First iteration at which densification may run."""
-    refine_stop_iter: int = 1600
+    structure_every: int | None = None
+    """Iterations between structure-aware split and prune steps; None is a sixth of the run, 0 turns them off."""
+    absgs_every: int | None = None
+    """Iterations between AbsGS steps, skipped where a structure step falls.
+    None is a thirtieth of the run, 0 turns them off."""
+    refine_start_iter: int | None = None
+    """First iteration at which densification may run; None is a thirtieth of the run."""
+    refine_stop_iter: int | None = None
     """Last iteration at which densification may run; Gaussians less than 0.1 opaque are pruned there.
-    0 adds and removes none at all."""
-    eta_every: int = 10
-    """Iterations between η observations; the paper observes at every one, which costs time and brings nothing."""
+    None is 16/30 of the run, and 19/30 are the most; 0 adds and removes none at all."""
+    eta_every: int | None = None
+    """Iterations between η observations; None is a three-hundredth of the run.
+    The paper observes at every iteration, which costs time and brings nothing."""
     tau_split: float = 0.8
     """Fraction of a Gaussian's observations that must violate (η > 1) before an axis is split."""
     min_observations: int = 3
@@ -78,18 +82,33 @@ class StructureAwareStrategy(Strategy):
     child_scale: float = 1.5
     """k in [1, 2): children are k times the paper's s/n long on the axes that are split, which closes their gaps.
     They stand closer and are 1/k as opaque an axis, which keeps the covariance and the mass; 1 is the paper's."""
-    clone_grad2d: float = 3e-4
+    clone_grad2d: float = 5e-4
     """AbsGS: normalised mean screen gradient at which a small Gaussian is cloned; AbsGS's own is 2e-4."""
-    split_absgrad2d: float = 6e-4
+    split_absgrad2d: float = 1e-3
     """AbsGS: normalised mean absolute screen gradient at which a large Gaussian is split; AbsGS's own is 4e-4."""
     absgs_long_axis: bool = True
     """AbsGS halves a large Gaussian's longest axis in its place, instead of drawing the places of two at random."""
     min_opacity: float = 0.02
     """Opacity under which every densification step prunes; AbsGS's own is 0.005."""
-    reset_every: int = 1200
-    """Iterations between opacity resets inside the densification window; 0 turns them off."""
+    reset_every: int | None = None
+    """Iterations between opacity resets inside the densification window; None is 12/30 of the run, 0 turns them off."""
     fused: bool = True
     """Measure η, and add up AbsGS's gradients, in one Triton kernel each where these run (CUDA)."""
+    run_length: int = field(default=3000, init=False)
+    """Iterations of the run, which `fit_to_run` sets: windows that are None follow it."""
+
+    @property
+    def windows(self) -> Windows:
+        """When densification does what: what is given, and the rest from the length of the run."""
+        return windows(
+            self.run_length,
+            structure_every=self.structure_every,
+            absgs_every=self.absgs_every,
+            refine_start_iter=self.refine_start_iter,
+            refine_stop_iter=self.refine_stop_iter,
+            reset_every=self.reset_every,
+            eta_every=self.eta_every,
+        )
 
     def check(self) -> None:
         """See whether densification can work with these options.
@@ -100,11 +119,11 @@ class StructureAwareStrategy(Strategy):
                 `child_scale` not in [1, 2).
         """
         for name in ("max_gaussians", "eta_every", "min_observations"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"strategy.{name} must be at least 1, got {getattr(self, name)}.")
+            if (value := getattr(self, name)) is not None and value < 1:
+                raise ValueError(f"strategy.{name} must be at least 1, got {value}.")
         iterations = ("structure_every", "absgs_every", "refine_start_iter", "refine_stop_iter", "reset_every")
         for name in (*iterations, "clone_grad2d", "split_absgrad2d"):
-            if not getattr(self, name) >= 0:
+            if (value := getattr(self, name)) is not None and not value >= 0:
                 raise ValueError(f"strategy.{name} must not be negative, got {getattr(self, name):g}.")
         if not 1 <= self.child_scale < 2:
             raise ValueError(f"strategy.child_scale must be at least 1 and less than 2, got {self.child_scale:g}.")
@@ -127,13 +146,8 @@ class StructureAwareStrategy(Strategy):
         return {"scene_scale": scene_scale}
 
     def fit_to_run(self, num_iterations: int) -> None:
-        """Let densification end early enough in a short run: after at most 19/30 of it, as in the released code.
-
-        Where it would end before `refine_start_iter`, there is none, and nothing that prepares it.
-        """
-        self.refine_stop_iter = min(self.refine_stop_iter, num_iterations * 19 // 30)
-        if self.refine_stop_iter < self.refine_start_iter:
-            self.refine_stop_iter = 0
+        """Let the windows that are not given follow the length of a run; without this call it is 3,000 iterations."""
+        self.run_length = num_iterations
 
     def check_sanity(self, params: Params, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
         """Check names and optimizers.
@@ -149,17 +163,21 @@ class StructureAwareStrategy(Strategy):
 
     def observes(self, step: int) -> bool:
         """Whether `step_pre_backward` will measure η at this step, and so needs structure tensors."""
+        windows = self.windows
         # Beyond the last structure step nobody would read it.
-        return step % self.eta_every == 0 and _next_due(step + 1, self.structure_every) <= self.refine_stop_iter
+        return step % windows.eta_every == 0 and (
+            _next_due(step + 1, windows.structure_every) <= windows.refine_stop_iter
+        )
 
     def needs_absgrad(self, step: int) -> bool:
         """Whether the rasterizer must provide absolute screen gradients: an AbsGS step will read this step's.
 
         Those just before a structure step are not read: it forgets them.
         """
-        first = max(step + 1, self.refine_start_iter)
-        read = _next_due(first, self.absgs_every)
-        return read <= self.refine_stop_iter and read < _next_due(first, self.structure_every)
+        windows = self.windows
+        first = max(step + 1, windows.refine_start_iter)
+        read = _next_due(first, windows.absgs_every)
+        return read <= windows.refine_stop_iter and read < _next_due(first, windows.structure_every)
 
     def step_pre_backward(
         self,
@@ -170,19 +188,14 @@ class StructureAwareStrategy(Strategy):
         info: Info | Sequence[Info],
     ) -> None:
         """Keep the screen gradients and observe η, before `loss.backward()`."""
-        if step >= self.refine_stop_iter:
+        if step >= self.windows.refine_stop_iter:
             return
         self._ensure_statistics(params, state)
         for view in _views(info):
             if self.needs_absgrad(step):
                 view["means2d"].retain_grad()
             if self.observes(step):
-                observe(
-                    state,
-                    params,
-                    view,
-                    fused=self.fused,
-                )
+                observe(state, params, view, fused=self.fused)
 
     def step_post_backward(
         self,
@@ -200,26 +213,28 @@ class StructureAwareStrategy(Strategy):
         """
         if packed:
             raise ValueError("StructureAwareStrategy reads gsplat's unpacked meta: call rasterization(packed=False)")
-        iteration = step + 1
-        if iteration > self.refine_stop_iter:
+        iteration, windows = step + 1, self.windows
+        if iteration > windows.refine_stop_iter:
             return
         views = _views(info)
         if self.needs_absgrad(step):
             num_views = sum(view["n_cameras"] for view in views)
             for view in views:
                 accumulate_gradients(state, view, num_views, fused=self.fused)
-        if iteration >= self.refine_start_iter:
-            if _due(iteration, self.structure_every):
+        if iteration >= windows.refine_start_iter:
+            if _due(iteration, windows.structure_every):
                 self._structure_step(params, optimizers, state, iteration, views)
-            elif _due(iteration, self.absgs_every):
+            elif _due(iteration, windows.absgs_every):
                 self._absgs_step(params, optimizers, state, iteration, views)
-            if iteration == self.refine_stop_iter:
-                if not _due(iteration, self.structure_every):  # whose step has done so
+            if iteration == windows.refine_stop_iter:
+                if not _due(iteration, windows.structure_every):  # whose step has done so
                     self._prune(params, optimizers, state, self._opacities(params) < FINAL_PRUNE_OPACITY)
                 for key in self._empty_state(0, torch.device("cpu")):
                     state.pop(key, None)  # nobody reads them any more: neither memory nor checkpoints should hold them
-            elif _due(iteration, self.reset_every) and iteration <= self.refine_stop_iter - self.reset_every // 4:
-                # A reset just before the final prune would leave nothing that had time to recover.
+            # A reset just before the final prune would leave nothing that had time to recover.
+            elif _due(iteration, windows.reset_every) and (
+                iteration <= windows.refine_stop_iter - windows.reset_every // 4
+            ):
                 self._map_opacities(params, optimizers, lambda opacities: opacities * RESET_FACTOR)
 
     def consistently_low(self, statistics: Mapping[str, Tensor]) -> Tensor:
@@ -257,7 +272,7 @@ class StructureAwareStrategy(Strategy):
         is_low = self.consistently_low(state)
         n_before, n_low = len(is_low), int(is_low.sum())
         # The final prune, before children are made: those are fainter, and would go with what they replace.
-        faint = max(self.min_opacity, FINAL_PRUNE_OPACITY if iteration == self.refine_stop_iter else 0.0)
+        faint = max(self.min_opacity, FINAL_PRUNE_OPACITY if iteration == self.windows.refine_stop_iter else 0.0)
         n_pruned = self._prune(params, optimizers, state, (opacities < faint) | (is_low & (opacities < PRUNE_OPACITY)))
         self._map_opacities(params, optimizers, lambda alpha: alpha.clamp_max(CLAMP_OPACITY))
         under_cap, in_memory = self._room(params, state, views)

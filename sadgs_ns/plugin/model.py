@@ -233,15 +233,15 @@ class SadgsModel(SplatfactoModel):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Fit the schedule to the length of the run and return splatfacto's two callbacks."""
+        """Fit densification to the length of the run and return splatfacto's two callbacks."""
         if training_callback_attributes.trainer is not None:
             iterations = training_callback_attributes.trainer.config.max_num_iterations
             self.strategy.fit_to_run(iterations)
-            too_short = self.strategy.refine_stop_iter < self.strategy.structure_every
-            if too_short and self.config.strategy.refine_stop_iter > 0:
+            windows = self.strategy.windows
+            if windows.refine_stop_iter < windows.structure_every and self.strategy.refine_stop_iter != 0:
                 CONSOLE.print(
                     f"[yellow]{iterations} iterations are too few for a structure-aware split: densification ends at "
-                    f"{self.strategy.refine_stop_iter}, the first split would come at {self.strategy.structure_every}. "
+                    f"{windows.refine_stop_iter}, the first split would come at {windows.structure_every}. "
                     "Train longer or lower pipeline.model.strategy.structure-every.[/]"
                 )
         return super().get_training_callbacks(training_callback_attributes)
@@ -339,7 +339,7 @@ class SadgsModel(SplatfactoModel):
         """
         absgrad = self.strategy.needs_absgrad(self.step)
         render, alpha, info = self.render(viewmats, Ks, width, height, "RGB", absgrad)
-        if self.step < self.strategy.refine_stop_iter:
+        if self.step < self.strategy.windows.refine_stop_iter:
             info |= {"viewmats": viewmats.detach(), "Ks": Ks, "structure_tensors": structure_tensors}
             self.strategy.step_pre_backward(self.gauss_params, self.optimizers, self.strategy_state, self.step, info)
             self.infos.append(info)
@@ -466,7 +466,7 @@ class SadgsModel(SplatfactoModel):
                 scales = self.scales.exp()
                 ratio = scales.amax(dim=-1) / scales.amin(dim=-1)
                 losses["scale_reg"] = 0.1 * (ratio - MAX_SCALE_RATIO).clamp_min(0).mean()
-            if self.config.opacity_reg > 0 and self.step < self.strategy.refine_stop_iter:
+            if self.config.opacity_reg > 0 and self.step < self.strategy.windows.refine_stop_iter:
                 losses["opacity_reg"] = self.config.opacity_reg * torch.sigmoid(self.opacities).mean()
             self.camera_optimizer.get_loss_dict(losses)
             if self.config.use_bilateral_grid:

@@ -18,6 +18,8 @@ from rich.markup import escape
 
 MOVED = {
     "sadgs_ns.trainer.SadgsTrainer": "sadgs_ns.plugin.trainer.SadgsTrainer",
+    "sadgs_ns.plugin.trainer.SadgsMachineConfig": "sadgs_ns.plugin.config.SadgsMachineConfig",
+    "sadgs_ns.plugin.trainer.SadgsViewerConfig": "sadgs_ns.plugin.config.SadgsViewerConfig",
     "sadgs_ns.pipeline.SadgsPipeline": "sadgs_ns.plugin.pipeline.SadgsPipeline",
     "sadgs_ns.pipeline.SadgsPipelineConfig": "sadgs_ns.plugin.pipeline.SadgsPipelineConfig",
     "sadgs_ns.datamanager.SadgsDatamanager": "sadgs_ns.plugin.datamanager.SadgsDatamanager",
@@ -54,6 +56,10 @@ CONSTANTS: dict[str, Any] = {
     "verbose": False,
 }
 """Removed options at the values that the method has kept: a run with these lacks nothing."""
+
+
+BEFORE: dict[str, Any] = {"rate_power": 0.0}
+"""New options whose default changes a run, at the value that runs of earlier versions had."""
 
 
 def read_with(trainer_config: type[TrainerConfig]) -> None:
@@ -107,9 +113,10 @@ def _bring_up_to_date(config: Any, path: str) -> list[str]:
         return []
     options = {option.name: option for option in dataclasses.fields(config)}
     for name, option in options.items():
-        if name not in vars(config):
+        if option.init and name not in vars(config):
             made = option.default_factory is not dataclasses.MISSING
-            setattr(config, name, option.default_factory() if made else option.default)  # type: ignore[misc]
+            default = option.default_factory() if made else option.default  # type: ignore[misc]
+            setattr(config, name, BEFORE.get(name, default))
     harmless = {**vars(SplatfactoModelConfig()), **CONSTANTS}  # options of splatfacto's densification had no effect
     left_out: list[str] = []
     for name, value in sorted(vars(config).items()):

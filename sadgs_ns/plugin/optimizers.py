@@ -152,7 +152,7 @@ class RunLengthDecaySchedulerConfig(SchedulerConfig):
     """Exponential decay over the length of the run, whatever `--max-num-iterations` is."""
 
     _target: type = field(default_factory=lambda: RunLengthDecayScheduler)
-    initial_factor: float = 1.0
+    initial_factor: Suppress[float] = 1.0
     """Learning rate at the first iteration, relative to the optimizer's."""
     final_factor: float = 1.0
     """Learning rate at the last iteration, relative to the optimizer's."""

@@ -24,10 +24,8 @@ from sadgs_ns.data.validation.parsers import findings_of
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.codes import HIGHEST_FREQUENCY
 from sadgs_ns.method.initialization import camera_extent
-from sadgs_ns.method.structure_tensor import (
-    ENERGY_BLUR,
-    FREQUENCY_CONSTANT,
-)
+from sadgs_ns.method.schedule import schedule
+from sadgs_ns.method.structure_tensor import ENERGY_BLUR, FREQUENCY_CONSTANT
 from sadgs_ns.plugin import nonfinite
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig, check_options
 from sadgs_ns.plugin.memory_plan import NEAR_PLANE, fit_to_memory, training_size
@@ -39,6 +37,8 @@ from sadgs_ns.plugin.structure_maps import StructureMaps
 from sadgs_ns.plugin.views import TrainingViews
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
+_MOST_EFFORT = 100
+"""Largest `effort`, which is a million iterations of a capture of 7,000 views."""
 _NAMED_STEPS = 5
 """Number of iterations of which a report of what was not finite names the images."""
 _WIDEST_BLUR = 100
@@ -60,9 +60,12 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     """How images are loaded and drawn."""
     model: SadgsModelConfig = field(default_factory=SadgsModelConfig)
     """The Gaussians and their densification."""
-    views_per_iteration: int = 1
+    effort: float = 1.0
+    """How much training the capture is given, relative to what its number of views asks for.
+    0.5 is a draft of half as many renderings; 2 and 4 resolve more where views are many, but overfit few."""
+    views_per_iteration: int | None = None
     """Training views rendered for one optimizer step, at most as many as there are; the loss is their mean.
-    The paper uses 1 outdoors, 2 indoors. A preset's learning rates and AbsGS thresholds fit its own number."""
+    None takes one more for every 2,000 renderings of the run, up to 4. The paper uses 1 outdoors, 2 indoors."""
     memory_budget_gb: float | None = None
     """Memory of the GPU, in 10⁹ bytes, that training may take; the cap of Gaussians is lowered to it at the start.
     None is 80 % of what is free, unless `max_gaussians` was changed, which then stays."""
@@ -80,7 +83,9 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
         Raises:
             InputError: If an option is out of its range; as `SadgsModelConfig.check`.
         """
-        if self.views_per_iteration < 1:
+        if not 0 < self.effort <= _MOST_EFFORT:
+            raise InputError(f"pipeline.effort must be in (0, {_MOST_EFFORT}], got {self.effort:g}.")
+        if self.views_per_iteration is not None and self.views_per_iteration < 1:
             raise InputError(f"pipeline.views_per_iteration must be at least 1, got {self.views_per_iteration}.")
         if not 0 < self.frequency_constant <= HIGHEST_FREQUENCY:
             raise InputError(
@@ -132,6 +137,9 @@ class SadgsPipeline(VanillaPipeline):
         self.structure_maps = StructureMaps(
             self.views, config.frequency_constant, energy_blur=config.energy_blur, epsilon=config.epsilon
         )
+        number, asked = max(len(self.datamanager.train_dataset), 1), config.views_per_iteration
+        self.schedule = schedule(number, effort=config.effort, views_per_iteration=asked)
+        """Length of the run and views of a step; the trainer, which knows more, puts its own here."""
         self.log = NonFiniteLog(self.device)
         self._checkpoint_cap: int | None = None
         self._checkpoint_views: tuple[list[str], Tensor] | None = None  # These are names and positions [C, 3].
@@ -147,7 +155,7 @@ class SadgsPipeline(VanillaPipeline):
     @property
     def views_per_iteration(self) -> int:
         """Number of views in a step, at most as many as there are: a view that is rendered twice would count twice."""
-        return min(self.config.views_per_iteration, len(self.datamanager.train_dataset))
+        return self.schedule.views_per_iteration
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
@@ -158,7 +166,7 @@ class SadgsPipeline(VanillaPipeline):
             InputError: If no camera sees a Gaussian, or `memory_budget_gb` leaves no room for them.
         """
         self._refuse_empty_views()
-        if self.config.model.strategy.refine_stop_iter > 0:
+        if self.config.model.strategy.refine_stop_iter != 0:
             model, fused = self.model, self.config.model.fused and kernels.available(self.device)
             size = training_size(self.datamanager, model.gauss_params, self.views_per_iteration, fused)  # type: ignore[arg-type]
             try:
@@ -361,7 +369,8 @@ class SadgsPipeline(VanillaPipeline):
     def _settings(self) -> dict[str, Any]:
         """Return the options that decide how training goes on from a checkpoint, by their names."""
         strategy = asdict(self.config.model.strategy)
-        settings = {f"model.strategy.{name}": strategy[name] for name in strategy if name != "fused"}
+        hidden = ("fused", "run_length")
+        settings = {f"model.strategy.{name}": strategy[name] for name in strategy if name not in hidden}
         own = {name: getattr(self.config, name) for name in ("views_per_iteration", "memory_budget_gb")}
         return {**own, **settings}
 
@@ -376,6 +385,7 @@ class SadgsPipeline(VanillaPipeline):
             "torch": torch.get_rng_state(),
             "view_order": list(self.datamanager.train_unseen_cameras),
             "settings": self._settings(),
+            "schedule": {**asdict(self.schedule), "effort": self.config.effort},
             "max_gaussians": self.model.strategy.max_gaussians,  # It may be lower than the setting.
             "images": [path.name for path in self.datamanager.train_dataset.image_filenames],
             "camera_positions": _positions(self.datamanager.train_dataset.cameras),

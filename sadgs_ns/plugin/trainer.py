@@ -1,46 +1,41 @@
-"""The trainer of `ns-train sadgs`: it checks its options, its schedules follow the run's length, and it resumes."""
+"""The trainer of `ns-train sadgs`: it derives the schedule, saves, resumes, and ends a run in one sentence."""
 
 from __future__ import annotations
 
 import copy
-import errno
 import math
 import os
 import shlex
 import signal
-import socket
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
-import yaml
-from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
-from tyro.conf import Suppress
 
 from sadgs_ns.atomic import atomic_path
-from sadgs_ns.data.validation.parsers import check_ahead
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
+from sadgs_ns.method.schedule import rate_factor, schedule
 from sadgs_ns.plugin import checkpoints, older_runs
 from sadgs_ns.plugin.compilation import compile_kernels
+from sadgs_ns.plugin.config import ONE_DEVICE, CheckedTrainerConfig
 from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
 from sadgs_ns.plugin.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig, SadgsOptimizers
-from sadgs_ns.plugin.pipeline import SadgsPipeline, SadgsPipelineConfig
-from sadgs_ns.plugin.progress import ProgressTable, about_cpu, remove_tables, what_next
+from sadgs_ns.plugin.pipeline import SadgsPipeline
+from sadgs_ns.plugin.progress import about_cpu, remove_tables, what_next
 
 _LESS_MEMORY = (
     "lower --pipeline.model.strategy.max-gaussians or --pipeline.views-per-iteration, or take smaller images "
     "(`--downscale-factor 2` after `nerfstudio-data` or `colmap`)"
 )
 _NOTHING_DONE = "stopped before an iteration was done; the same command starts again."
-_ONE_DEVICE = "sadgs trains on one device; set machine.num_devices and machine.num_machines to 1."
-_MEASURED_MEGAPIXELS = 1.0
-"""Above this size of images a run with several views an iteration prints a warning; 0.7 and 1.9 were measured."""
+RATES_OF_VIEWS = ("means", "opacities", "scales", "quats")
+"""Parameters whose learning rates follow the number of views in a step; colours learn well at the same rate."""
 _SAVING_SHARE = 0.01
 """Largest share of the time between two checkpoints by the clock that saving may take."""
 
@@ -51,299 +46,10 @@ def _memory(error: torch.cuda.OutOfMemoryError) -> str:
 
 
 @dataclass
-class SadgsMachineConfig(MachineConfig):
-    """nerfstudio's options of the machine; those of several machines are not shown."""
-
-    seed: int = 42
-    """Seed of everything that is drawn at random."""
-    num_devices: int = 1
-    """Number of devices to train on; this method trains on one."""
-    device_type: Literal["cpu", "cuda", "mps"] = field(
-        default_factory=lambda: "cuda" if torch.cuda.is_available() else "cpu"
-    )
-    """Kind of device to train on; CUDA where there is one."""
-    num_machines: Suppress[int] = 1
-    """Number of machines; this method trains on one."""
-    machine_rank: Suppress[int] = 0
-    """Rank of this machine among several."""
-    dist_url: Suppress[str] = "auto"
-    """Where several devices meet."""
-
-
-@dataclass
-class SadgsViewerConfig(ViewerConfig):
-    """nerfstudio's options of the viewer, which here listens on this machine only."""
-
-    websocket_host: str = "127.0.0.1"
-    """Address at which the viewer listens: this machine only; 0.0.0.0 opens it to the network."""
-    websocket_port: int | None = None
-    """Port at which the viewer listens; None is 7007, or a free one where that is taken."""
-    quit_on_train_completion: bool = False
-    """End the command when training is done, instead of keeping the viewer open."""
-    max_num_display_images: int = 512
-    """Number of training images shown as cameras in the viewer, -1 for all; training takes all images anyway."""
-    make_share_url: bool = False
-    """Print an address at which others can open the viewer, through a server of viser's makers."""
-    websocket_port_default: Suppress[int] = 7007
-    """Port that is tried first where `websocket_port` is None."""
-    relative_log_filename: Suppress[str] = "viewer_log_filename.txt"
-    """Name of the viewer's log."""
-    num_rays_per_chunk: Suppress[int] = 32768
-    """Gaussians are not drawn in rays."""
-    camera_frustum_scale: Suppress[float] = 0.1
-    """Size of the cameras at the start; a slider in the viewer sets it, too."""
-    default_composite_depth: Suppress[bool] = True
-    """Whether cameras behind the splat are hidden at the start; a box in the viewer sets it, too."""
-
-
-@dataclass
-class SadgsTrainerConfig(TrainerConfig):
-    """nerfstudio's trainer with this method's defaults."""
+class SadgsTrainerConfig(CheckedTrainerConfig):
+    """Options of `ns-train sadgs`."""
 
     _target: type = field(default_factory=lambda: SadgsTrainer)
-    output_dir: Path = Path("outputs")
-    """Folder in which each run gets a folder of its own."""
-    experiment_name: str | None = None
-    """Name of the run's folder; None takes that of the data."""
-    timestamp: str = "{timestamp}"
-    """Name of the folder inside the experiment's and the method's; by default it is the time of the start."""
-    machine: SadgsMachineConfig = field(default_factory=SadgsMachineConfig)
-    """Device and seed."""
-    pipeline: SadgsPipelineConfig = field(default_factory=SadgsPipelineConfig)
-    """Data and model."""
-    viewer: SadgsViewerConfig = field(default_factory=SadgsViewerConfig)
-    """The viewer in the browser."""
-    max_num_iterations: int = 3000
-    """Length of the run in optimizer steps; schedules stretch to it."""
-    steps_per_save: int = 0
-    """Steps between checkpoints; 0 leaves them to the clock. One is always made at the end."""
-    seconds_per_save: float = 60.0
-    """Seconds from one checkpoint to the next where steps_per_save is 0; 0 makes none before the end.
-    If 100 times what the last one took is longer, that is waited."""
-    steps_per_eval_batch: int = 0
-    """Steps between losses on a held-out view; 0 is never."""
-    steps_per_eval_image: int = 500
-    """Steps between metrics of one held-out view, where a logger such as tensorboard is on."""
-    steps_per_eval_all_images: int = 0
-    """Steps between metrics of all held-out views; 0 is never. `ns-eval` measures them after training."""
-    data: Path | None = None
-    """Folder of the data."""
-    project_name: str | None = "nerfstudio-project"
-    """Name of the project in wandb and comet."""
-    vis: Literal[
-        "viewer", "wandb", "tensorboard", "comet", "viewer+wandb", "viewer+tensorboard", "viewer+comet", "viewer_legacy"
-    ] = "viewer"
-    """Where the run can be watched. With a viewer the command waits at the end, until Ctrl+C."""
-    save_only_latest_checkpoint: bool = True
-    """Keep the latest checkpoint only, instead of all."""
-    load_dir: Path | None = None
-    """Folder of a run, or of its checkpoints, from which the run goes on."""
-    load_step: int | None = None
-    """Step of the checkpoint in `load_dir`; None takes the latest."""
-    load_checkpoint: Path | None = None
-    """Checkpoint from which the run goes on."""
-    load_config: Path | None = None
-    """The config.yml of a run whose options are taken, instead of all others; nerfstudio executes what it says."""
-    start_paused: bool = False
-    """Wait for a click in the viewer before training starts."""
-    method_name: Suppress[str | None] = None
-    """The preset's name."""
-    prompt: Suppress[str | None] = None
-    """Read by methods that make scenes from text."""
-    relative_model_dir: Suppress[Path] = Path("nerfstudio_models")
-    """Folder of the checkpoints inside the run's."""
-    load_scheduler: Suppress[bool] = True
-    """Whether schedules go on where the checkpoint left them."""
-    logging: Suppress[LoggingConfig] = field(
-        default_factory=lambda: LoggingConfig(
-            local_writer=LocalWriterConfig(_target=ProgressTable, enable=True), profiler="none"
-        )
-    )
-    """What is printed during training, and how often."""
-    mixed_precision: Suppress[bool] = False
-    """Refused: this method trains in float32."""
-    use_grad_scaler: Suppress[bool] = False
-    """Refused: densification reads gradients as they are."""
-    log_gradients: Suppress[bool] = False
-    """Whether gradients' norms are logged at each step."""
-    gradient_accumulation_steps: Suppress[dict[str, int]] = field(default_factory=dict)
-    """`pipeline.views_per_iteration` takes its place."""
-
-    def __post_init__(self) -> None:
-        """Check `load_config` before nerfstudio reads it, since nerfstudio then forgets all other options.
-
-        Raises:
-            InputError: If it is no config.yml, or other options were given beside it.
-        """
-        if self.load_config is None:
-            return
-        try:
-            with self.load_config.open(encoding="utf8") as file:
-                problem = None if file.readline().startswith("!!python/object:") else "it is no config.yml of a run"
-        except (OSError, UnicodeDecodeError) as error:
-            problem = reason(error)
-        if problem is not None:
-            raise InputError(f"{self.load_config} cannot be used ({problem}): give --load-config the file of a run.")
-        from nerfstudio.configs.method_configs import all_methods  # It imports this module.
-
-        preset = all_methods.get(self.method_name or "", self)
-        if lost := [
-            name for name, value in vars(preset).items() if vars(self)[name] != value and name != "load_config"
-        ]:
-            raise InputError(
-                f"With --load-config all options come from its file, and others are not read, here of "
-                f"{', '.join(lost)}: leave them out, change them in the file, or give --load-dir with the run's folder "
-                "and all options instead of --load-config."
-            )
-
-    def print_to_terminal(self) -> None:
-        """Print nothing, where nerfstudio prints 260 lines before it is known whether the run can start.
-
-        `config.yml` holds them all.
-        """
-
-    def check(self) -> None:
-        """Check whether training can work with these options.
-
-        Raises:
-            InputError: If a number is out of its range, gradients would be scaled or accumulated, or the device is not
-                there; as `SadgsPipelineConfig.check`.
-        """
-        for name, count in (
-            ("max_num_iterations", self.max_num_iterations),
-            ("logging.steps_per_log", self.logging.steps_per_log),
-        ):
-            if count < 1:
-                raise InputError(f"{name} must be at least 1, got {count}.")
-        for name in ("save", "eval_batch", "eval_image", "eval_all_images"):
-            if (steps := getattr(self, f"steps_per_{name}")) < 0:
-                raise InputError(f"steps_per_{name} must not be negative, got {steps}.")
-        if not self.seconds_per_save >= 0:
-            raise InputError(f"seconds_per_save must not be negative, got {self.seconds_per_save:g}.")
-        if self.load_step is not None and self.load_dir is None:
-            raise InputError(
-                f"load_step is {self.load_step}, but load_dir is not set: add --load-dir with the folder of a run."
-            )
-        port = self.viewer.websocket_port
-        if port is not None and not 1 <= port <= 65535:
-            raise InputError(f"viewer.websocket_port must be in [1, 65535], got {port}.")
-        if self.machine.num_devices * self.machine.num_machines != 1:
-            raise InputError(_ONE_DEVICE)
-        device = self.machine.device_type
-        available = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
-        if not available[device]:
-            name = device.upper()
-            raise InputError(
-                f"machine.device_type is {device}, but torch finds no {name} device: set it to cpu, or install torch "
-                f"for {name}."
-            )
-        if not 0 <= self.machine.seed < 2**32:
-            raise InputError(f"machine.seed must be in [0, 2³²), got {self.machine.seed}.")
-        self._check_rates()
-        if self.mixed_precision or self.use_grad_scaler:
-            raise InputError(
-                "sadgs trains in float32, and its densification reads gradients as they are: leave mixed_precision and "
-                "use_grad_scaler off."
-            )
-        if any(steps != 1 for steps in self.gradient_accumulation_steps.values()):
-            raise InputError(
-                "sadgs updates every parameter in every iteration, and densification would lose gradients that were "
-                "kept for later: leave gradient_accumulation_steps out, and set pipeline.views_per_iteration instead."
-            )
-        self.pipeline.check()
-
-    def _check_rates(self) -> None:
-        """Check whether the learning rates can train anything.
-
-        Raises:
-            InputError: If one is not in [0, 1], now or where a schedule ends, or a factor is not positive and finite.
-        """
-        for group, configs in self.optimizers.items():
-            rate, scheduler = configs["optimizer"].lr, configs.get("scheduler")
-            if not 0 <= rate <= 1:
-                raise InputError(f"optimizers.{group}.optimizer.lr must be in [0, 1], got {rate:g}.")
-            if isinstance(scheduler, RunLengthDecaySchedulerConfig):
-                for name in ("initial_factor", "final_factor"):
-                    if not 0 < (factor := getattr(scheduler, name)) < math.inf:
-                        raise InputError(
-                            f"optimizers.{group}.scheduler.{name} must be positive and finite, got {factor:g}."
-                        )
-                    if rate * factor > 1:
-                        raise InputError(
-                            f"optimizers.{group}.scheduler.{name} must leave the rate in [0, 1], got {factor:g}, which "
-                            f"makes {rate * factor:g} of {rate:g}."
-                        )
-
-    def _check_folder(self) -> None:
-        """Check whether the run would delete checkpoints of an earlier run in the same folder.
-
-        Raises:
-            InputError: If it would: the folder holds some, and the run does not go on from them.
-        """
-        folder = self.get_checkpoint_dir()
-        there = sorted(folder.glob("step-*.ckpt")) if os.path.isdir(folder) else []
-        start = self.load_dir if self.load_checkpoint is None else self.load_checkpoint.parent
-        if there and (start is None or start.resolve() not in (folder.resolve(), folder.parent.resolve())):
-            raise InputError(
-                f"{folder} holds {there[-1].name} of an earlier run, which this run would delete: go on from it with "
-                f"--load-dir {folder.parent} (load_dir in a config.yml), give another --timestamp, or remove it."
-            )
-
-    def _check_address(self) -> None:
-        """Check whether the viewer can listen where it is told to.
-
-        viser would take the next free port, of which nerfstudio knows nothing, or look for one for ever.
-
-        Raises:
-            InputError: If it cannot.
-        """
-        host, port = self.viewer.websocket_host, self.viewer.websocket_port
-        try:
-            places = socket.getaddrinfo(host, port or 0, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        except OSError as error:
-            raise InputError(
-                f"viewer.websocket_host {host!r} is unknown ({reason(error)}): 127.0.0.1 opens the viewer to this "
-                "machine only, 0.0.0.0 to the network."
-            ) from error
-        try:
-            for family, _, _, _, address in places:
-                socket.create_server(address, family=family).close()
-        except OSError as error:
-            what = reason(error).partition(" (while")[0]
-            if error.errno == errno.EADDRINUSE:
-                told = (
-                    f"viewer.websocket_port {port} is taken on {host} ({what}): give another, or none for a free one."
-                )
-            else:
-                told = f"The viewer cannot listen on {host}{f':{port}' if port else ''} ({what}): give another "
-                told += "viewer.websocket_host or viewer.websocket_port."
-            raise InputError(told) from error
-
-    def save_config(self) -> None:
-        """Write `config.yml`, the first file of a run, once options, checkpoint and data have been found good.
-
-        Raises:
-            InputError: If they are not; nothing is written then.
-            WriteError: If the folder cannot be written.
-        """
-        self.check()
-        checkpoints.check_chosen(self.load_dir, self.load_step, self.load_checkpoint)
-        self._check_folder()
-        if self.is_viewer_enabled() or self.is_viewer_legacy_enabled():
-            self._check_address()
-        check_ahead(self.pipeline.datamanager)
-        CONSOLE.log(f"Saving config to: {self.write()}")
-
-    def write(self) -> Path:
-        """Write `config.yml` and return its path.
-
-        Raises:
-            WriteError: If the disk is full or the folder cannot be written.
-        """
-        path = self.get_base_dir() / "config.yml"
-        with atomic_path(path) as partial:
-            partial.write_text(yaml.dump(self), "utf8")
-        return path
 
 
 older_runs.read_with(SadgsTrainerConfig)
@@ -361,10 +67,12 @@ class SadgsTrainer(Trainer):
 
     def __init__(self, config: SadgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         if world_size > 1:
-            raise InputError(_ONE_DEVICE)
+            raise InputError(ONE_DEVICE)
         config.check()
         super().__init__(config, local_rank, world_size)
         self._stepping = False
+        self._checkpoint: tuple[Path, dict[str, Any]] | None = None  # It is kept from its reading to its loading.
+        self._derived = config.max_num_iterations is None
         self._completed_step = self._saved_step = -1
         self._save_due = math.inf
         # A run that is paused or done polls no signal, because nerfstudio waits for the viewer's user.
@@ -391,27 +99,26 @@ class SadgsTrainer(Trainer):
             raise SystemExit(128 + signal.SIGINT) from None
 
     def _say_what_was_chosen(self) -> None:
-        """Print the run's size in one line, after the memory plan's, and warn of what does not suit the data."""
-        cameras, config = self.pipeline.datamanager.train_dataset.cameras, self.config
-        views, asked, taken = len(cameras), config.pipeline.views_per_iteration, self.pipeline.views_per_iteration
+        """Print the run's size after the memory plan's line, and what decided it."""
+        cameras, config, schedule = self.pipeline.datamanager.train_dataset.cameras, self.config, self.pipeline.schedule
+        views, asked, taken = len(cameras), config.pipeline.views_per_iteration, schedule.views_per_iteration
         megapixels = float((cameras.height * cameras.width).double().mean()) / 1e6
         done = f", of which {self._start_step:,} are done" if self._start_step else ""
-        times = round(config.max_num_iterations * taken / views)
+        times = round(schedule.iterations * taken / views)
         lines = [
             f"{config.method_name} on {views:,} training views of {megapixels:.2g} megapixels: "
-            f"{config.max_num_iterations:,} iterations of {taken} view{'s' * (taken > 1)}{done}, so that each view is "
+            f"{schedule.iterations:,} iterations of {taken} view{'s' * (taken > 1)}{done}, so that each view is "
             f"rendered about {times:,} time{'s' * (times != 1)}."
         ]
-        if asked > taken:
+        if self._derived:
+            lines.append(
+                f"The number of views and --pipeline.effort {config.pipeline.effort:g} decide this: 0.5 is a draft of "
+                "half as many renderings, 2 resolves more where views are many."
+            )
+        if asked is not None and asked > taken:
             lines.append(
                 f"[yellow]pipeline.views_per_iteration is {asked}, but there are {views} training views: all are taken "
                 "each time.[/]"
-            )
-        if taken > 1 and megapixels > _MEASURED_MEGAPIXELS:
-            lines.append(
-                "[yellow]Training with several views an iteration was measured on images of up to 0.7 megapixels; "
-                "outdoors, on images of 1.9, it took twice as long as sadgs and was worse. Consider sadgs, or smaller "
-                "images.[/]"
             )
         if self.device == "cpu":
             lines.append(f"[yellow]{about_cpu(torch.get_num_threads())}[/]")
@@ -429,11 +136,9 @@ class SadgsTrainer(Trainer):
         Raises:
             InputError: If there is none, none can be read, or it is not of this method.
         """
-        config = self.config
-        chosen = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
-        if chosen is None:
+        if self._checkpoint is None:
             return super()._load_checkpoint()
-        path, state = chosen
+        config, (path, state), self._checkpoint = self.config, self._checkpoint, None
         try:
             self._start_step = state["step"] + 1
             self.pipeline.load_pipeline(state["pipeline"], state["step"])
@@ -458,8 +163,37 @@ class SadgsTrainer(Trainer):
             ) from error
         CONSOLE.print(f"Resuming after step {state['step']} of {path}", markup=False, soft_wrap=True)
 
+    def _derive_schedule(self) -> None:
+        """Decide the length of the run and the views of a step: by hand, as in the checkpoint's run, or by rule.
+
+        The configuration of `config.yml` keeps saying what was asked for, and the trainer's what was decided.
+        """
+        config, pipeline = copy.copy(self.config), self.pipeline
+        before: dict[str, Any] = {}
+        if self._checkpoint is not None:
+            loaded = self._checkpoint[1]["pipeline"]
+            before = loaded.get("_extra_state", {}).get("schedule", {}) if isinstance(loaded, dict) else {}
+        if before.get("effort") != config.pipeline.effort:
+            before = {}  # Another effort is asked for, or an earlier version saved none.
+        asked = config.pipeline.views_per_iteration
+        pipeline.schedule = schedule(
+            len(pipeline.datamanager.train_dataset),
+            effort=config.pipeline.effort,
+            iterations=before.get("iterations") if self._derived else config.max_num_iterations,
+            views_per_iteration=before.get("views_per_iteration") if asked is None else asked,
+        )
+        config.max_num_iterations = pipeline.schedule.iterations
+        self.config = config
+
     def setup_optimizers(self) -> SadgsOptimizers:
-        """Build the optimizers with schedules as long as the run, fused where the model is."""
+        """Derive the run's length and build the optimizers with schedules as long as that, fused where the model is.
+
+        Raises:
+            InputError: As `checkpoints.read_chosen`, since a run that goes on keeps its length.
+        """
+        config = self.config
+        self._checkpoint = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
+        self._derive_schedule()
         optimizers: dict[str, Any] = copy.deepcopy(dict(self.config.optimizers))
         for group in optimizers.values():
             scheduler, optimizer = group.setdefault("scheduler", None), group["optimizer"]
@@ -469,6 +203,9 @@ class SadgsTrainer(Trainer):
                 scheduler.max_steps = self.config.max_num_iterations
         # Positions move in proportion to the cameras' extent, as in 3DGS; splatfacto does not do so.
         optimizers["means"]["optimizer"].lr *= self.pipeline.model.strategy_state["scene_scale"]
+        factor = rate_factor(self.pipeline.views_per_iteration, self.config.rate_power)
+        for name in RATES_OF_VIEWS:
+            optimizers[name]["optimizer"].lr *= factor
         return SadgsOptimizers(optimizers, self.pipeline.get_param_groups())
 
     def train(self) -> None:
@@ -480,7 +217,7 @@ class SadgsTrainer(Trainer):
             SystemExit: If SIGINT, SIGTERM or SIGHUP came. A checkpoint is saved then, a line says how to go on, and the
                 exit code is the one that shells give these signals.
         """
-        total = self.config.max_num_iterations
+        total = self.pipeline.schedule.iterations
         self.step: int = max(self._start_step - 1, 0)  # It names the checkpoint where nothing is left to do.
         self._completed_step = self._saved_step = self._start_step - 1
         self.config.max_num_iterations = max(total - self._start_step, 0)

@@ -190,7 +190,7 @@ def test_shipped_protocols_fit_the_real_configs(name: str, tmp_path: Path):
 @pytest.mark.usefixtures("nerfstudio")
 def test_build_config_of_splatfacto(tmp_path: Path):
     (tmp_path / "fox").mkdir()
-    job = next(j for j in protocol.load(CONFIGS / "ours.yaml").jobs() if j.row.label == "splatfacto-3k" and j.seed == 1)
+    job = next(j for j in protocol.load(CONFIGS / "ours.yaml").jobs() if j.row.label == "splatfacto-3k")
     config: Any = build_config(dataclasses.replace(job.scene, data="fox"), job.row, 1, tmp_path, tmp_path)
     assert config.max_num_iterations == config.optimizers["means"]["scheduler"].max_steps == 3000
     assert config.pipeline.model.num_downscales == 0

@@ -87,16 +87,19 @@ def test_every_row_of_every_protocol_fits_the_config_of_its_method(name: str, tm
 
 @pytest.mark.parametrize("name", ["mipnerf360", "deep-blending", "tanks-and-temples"])
 def test_table_1_has_the_settings_of_the_paper(name: str, tmp_path: Path):
-    ours = "sadgs" if name == "tanks-and-temples" else "sadgs-paper"
-    assert {scene for scene, label in configs(name, tmp_path) if label == ours} == set(load(name).scenes)
-    for (scene, label), config in configs(name, tmp_path).items():
+    built = configs(name, tmp_path)
+    for ours in ("sadgs", "sadgs-paper"):
+        assert {scene for scene, label in built if label == ours} == set(load(name).scenes)
+    for (scene, label), config in built.items():
         parser = config.pipeline.datamanager.dataparser
         assert (parser.eval_mode, parser.eval_interval, parser.colmap_path) == ("interval", 8, Path("sparse/0"))
         indoor = scene in {"room", "counter", "kitchen", "bonsai"}
         assert parser.downscale_factor == {"mipnerf360": 2 if indoor else 4}.get(name, 1)
-        if label == ours:
+        if label == "sadgs-paper":
             assert config.pipeline.views_per_iteration == (2 if indoor or name == "deep-blending" else 1)
             assert config.max_num_iterations == (7000 if name == "tanks-and-temples" else 3000)
+        if label == "sadgs":
+            assert (config.max_num_iterations, config.pipeline.views_per_iteration) == (None, None), "derived"
         if label.startswith("sadgs"):
             assert config.pipeline.model.strategy.tau_split == 0.8
     assert (
@@ -127,9 +130,11 @@ def test_the_cameras_of_mipnerf360_have_the_size_of_the_official_images(full: tu
 def test_each_ablation_changes_one_thing_of_the_full_method(tmp_path: Path):
     built = configs("ablations", tmp_path)
     strategy = "pipeline.model.strategy"
+    windows = {"structure_every": 500, "absgs_every": 100, "refine_start_iter": 100, "reset_every": 1200}
+    longer = {f"{strategy}.{name}": value for name, value in windows.items()}  # They would stretch with the run.
     changes = {
-        "30k iterations": {"max_num_iterations": 30000},
-        "15k iterations": {"max_num_iterations": 15000},
+        "30k iterations": {"max_num_iterations": 30000, **longer},
+        "15k iterations": {"max_num_iterations": 15000, **longer},
         "full": {},
         "30k position schedule": {"optimizers.means.scheduler.max_steps": 30000},
         "no multiview consistency": {f"{strategy}.tau_split": 0.0},
@@ -151,7 +156,7 @@ def test_the_progressive_rows_add_one_thing_each(tmp_path: Path):
         steps = [config.optimizers["means"]["scheduler"].max_steps for config in (base, schedule)]
         assert steps == [30000, 3000]
         strategies = [config.pipeline.model.strategy for config in (training, densification, full)]
-        assert [s.structure_every for s in strategies] == [0, 500, 500]
+        assert [s.windows.structure_every for s in strategies] == [0, 500, 500]
         assert [s.tau_split for s in strategies] == [0.8, 0.0, 0.8]
 
 
@@ -162,6 +167,83 @@ def test_matched_counts_are_splatfactos_when_they_were_measured(tmp_path: Path):
         (count,) = (row["gaussians"] for row in measured if (row["scene"], row["label"]) == (scene, "splatfacto"))
         assert built[scene, "sadgs-matched"].pipeline.model.strategy.max_gaussians == round(count, -3)
         assert built[scene, "splatfacto"].max_num_iterations == 30000
+
+
+def of_sadgs(name: str, root: Path) -> dict[tuple[str, str], Any]:
+    """Configs of the protocol's rows of `sadgs`."""
+    return {key: config for key, config in configs(name, root).items() if config.method_name == "sadgs"}
+
+
+@pytest.mark.parametrize("name", ["ours", "schedule"])
+def test_the_derived_schedule_is_measured_on_all_eight_scenes(name: str, tmp_path: Path):
+    built = of_sadgs(name, tmp_path)
+    efforts: dict[str, set[float]] = {}
+    for (scene, label), config in built.items():
+        assert config.pipeline.model.background_color == ("white" if scene == "lego" else "black")
+        if not label.endswith("before"):
+            assert config.max_num_iterations is None
+            assert config.rate_power == 0.5
+            efforts.setdefault(scene, set()).add(config.pipeline.effort)
+    assert set(efforts) == {"bonsai", "fox", "room", "castle", "tree", "south", "site", "lego"}
+    assert all(of_scene == {0.5, 1.0, 2.0, 4.0} for of_scene in efforts.values())
+
+
+def test_defaults_are_chosen_on_validation_views_and_the_main_table_is_of_test_views():
+    for name, options in (("schedule", {}), ("ours", {"eval_mode": "interval", "eval_interval": 8})):
+        for scene in load(name).scenes.values():
+            held_out = {key: value for key, value in scene.options.items() if key.startswith("eval")}
+            assert held_out == ({} if scene.name == "lego" else options)
+
+
+def test_the_main_table_has_three_seeds_of_ours_beside_splatfacto():
+    seeds: dict[tuple[str, str], list[int]] = {}
+    for made in load("ours").jobs():
+        seeds.setdefault((made.row.label, made.scene.name), []).append(made.seed)
+    for scene in load("ours").scenes:
+        assert seeds["sadgs", scene] == [0, 1, 2]
+        assert all(seeds[label, scene] == [0] for label in ("splatfacto", "splatfacto-3k", "effort 0.5", "effort 4"))
+
+
+@pytest.mark.parametrize(
+    ("label", "iterations", "views", "opacity", "windows", "thresholds", "rates"),
+    [
+        (
+            "sadgs before", 3000, 1, 0.1, (500, 100, 100, 1600, 1200, 10), (3e-4, 6e-4),
+            {"means": (1.6e-4, 1.6e-6), "opacities": (0.025, 0.025), "scales": (0.02, 0.02), "quats": (2e-3, 2e-3)},
+        ),
+        (
+            "sadgs-indoor before", 2000, 4, 0.5, (350, 70, 70, 1120, 840, 7), (5e-4, 1e-3),
+            {
+                "means": (4.8e-4, 4.8e-6), "opacities": (0.0375, 0.0375),
+                "scales": (0.045, 0.0075), "quats": (4.5e-3, 7.5e-4),
+            },
+        ),
+    ],
+)  # fmt: skip
+def test_the_presets_of_before_are_rows_with_all_that_they_said(
+    label: str,
+    iterations: int,
+    views: int,
+    opacity: float,
+    windows: tuple[int, ...],
+    thresholds: tuple[float, float],
+    rates: dict[str, tuple[float, float]],
+    tmp_path: Path,
+):
+    for (_, row), config in configs("schedule", tmp_path).items():
+        if row != label:
+            continue
+        strategy = config.pipeline.model.strategy
+        strategy.fit_to_run(config.max_num_iterations)
+        assert (config.max_num_iterations, config.pipeline.views_per_iteration) == (iterations, views)
+        assert (config.pipeline.model.initial_opacity, config.rate_power) == (opacity, 0.0)
+        names = ("structure_every", "absgs_every", "refine_start_iter", "refine_stop_iter", "reset_every", "eta_every")
+        assert tuple(getattr(strategy.windows, name) for name in names) == windows
+        assert (strategy.clone_grad2d, strategy.split_absgrad2d) == thresholds
+        for group, (first, last) in rates.items():
+            optimizer, scheduler = config.optimizers[group]["optimizer"], config.optimizers[group].get("scheduler")
+            factors = (1.0, 1.0) if scheduler is None else (scheduler.initial_factor, scheduler.final_factor)
+            assert tuple(optimizer.lr * factor for factor in factors) == pytest.approx((first, last))
 
 
 def content(*rows: dict[str, Any], **changes: Any) -> dict[str, Any]:

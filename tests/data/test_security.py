@@ -182,7 +182,7 @@ def test_an_image_apart_from_the_others_by_dots_is_refused(tmp_path: Path):
 
 
 def test_saved_configs_make_the_datamanager_with_the_checks():
-    for name in ("sadgs", "sadgs_indoor", "sadgs_large", "sadgs_paper", "sadgs_paper_indoor"):
+    for name in ("sadgs", "sadgs_paper", "sadgs_paper_indoor"):
         datamanager: FullImageDatamanagerConfig = getattr(presets, name).config.pipeline.datamanager
         assert datamanager._target is SadgsDatamanagerConfig()._target  # what nerfstudio puts into a loaded config
 
@@ -243,7 +243,7 @@ def test_the_viewer_answers_only_on_loopback_unless_told_otherwise(
         shut_down(trainer)
 
 
-@pytest.mark.parametrize("method", ["sadgs", "sadgs-indoor", "sadgs-large", "sadgs-paper"])
+@pytest.mark.parametrize("method", ["sadgs", "sadgs-paper"])
 def test_the_help_shows_that_the_viewer_listens_on_loopback(method: str, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit):
         cli(AnnotatedBaseConfigUnion, args=[method, "--help"])

@@ -10,6 +10,7 @@ from scenes import adam, camera, random_params, training_step
 
 from sadgs_ns.method import strategy as strategy_module
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow
+from sadgs_ns.method.schedule import Windows
 from sadgs_ns.method.statistics import empty_statistics
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
@@ -87,7 +88,7 @@ def test_over_a_run_no_gaussian_has_more_observations_than_iterations_of_life():
     images, (viewmats, Ks) = checker_images(1), camera(WIDTH, HEIGHT)
     tensors = multiscale_structure_tensor(images)
     newborn = observed = 0
-    for step in range(strategy.refine_stop_iter - 1):
+    for step in range(strategy.windows.refine_stop_iter - 1):
         optimizers["means"].state[params["means"]]["age"] += 1
         training_step(strategy, params, optimizers, state, step, images, tensors, viewmats, Ks)
         age = optimizers["means"].state[params["means"]]["age"]
@@ -117,16 +118,26 @@ def test_nothing_happens_outside_the_window():
 
 def test_window_fits_short_runs_and_keeps_long_ones():
     for length, expected in ((3000, 1600), (300, 190), (30_000, 1600)):
-        strategy = StructureAwareStrategy()
+        strategy = StructureAwareStrategy(refine_stop_iter=1600)
         strategy.fit_to_run(length)
-        assert strategy.refine_stop_iter == expected
+        assert strategy.windows.refine_stop_iter == expected
+
+
+def test_windows_follow_the_length_of_the_run_but_for_those_that_are_given():
+    strategy = StructureAwareStrategy(reset_every=0, eta_every=7)
+    strategy.fit_to_run(6000)
+    assert strategy.windows == Windows(
+        structure_every=1000, absgs_every=200, refine_start_iter=200, refine_stop_iter=3200, reset_every=0, eta_every=7
+    )
+    strategy.fit_to_run(3000)
+    assert strategy.windows.structure_every == 500 and strategy.structure_every is None
 
 
 def test_a_run_too_short_to_densify_prepares_nothing_for_it():
     strategy = StructureAwareStrategy(structure_every=50, absgs_every=10, refine_start_iter=500)
     strategy.fit_to_run(700)  # 443 would be before 500
     assert not any(strategy.observes(step) or strategy.needs_absgrad(step) for step in range(700))
-    assert strategy.refine_stop_iter == 0
+    assert strategy.windows.refine_stop_iter == 0
 
 
 def test_eta_is_observed_only_where_a_structure_step_will_read_it():
@@ -149,7 +160,7 @@ def test_gradients_are_kept_only_where_an_absgs_step_will_read_them():
 def test_keeping_all_gradients_changes_nothing():
     class Hoarder(StructureAwareStrategy):
         def needs_absgrad(self, step: int) -> bool:
-            return step < self.refine_stop_iter
+            return step < self.windows.refine_stop_iter
 
     thrifty = short(clone_grad2d=2e-5, split_absgrad2d=4e-5)
     plain, _, counts = train(thrifty, 26)

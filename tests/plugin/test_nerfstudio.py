@@ -35,7 +35,9 @@ from scenes import HEIGHT, POINTS, VIEWS, WIDTH
 
 from sadgs_ns.demo.scene import SPARSE_FOLDER
 from sadgs_ns.method.codes import decode
+from sadgs_ns.method.schedule import Schedule
 from sadgs_ns.plugin.model import SadgsModel, _load_lpips
+from sadgs_ns.plugin.presets import RATES
 from sadgs_ns.plugin.trainer import SadgsTrainer
 
 
@@ -302,7 +304,7 @@ def test_the_position_rate_ends_at_a_hundredth_whatever_the_length_of_the_run(
     config = configure(tmp_path, colmap, iterations)
     rates: list[float] = []
     trainer = set_up(config)
-    start = 1.6e-4 * trainer.pipeline.model.strategy_state["scene_scale"]
+    start = RATES["means"][0] * trainer.pipeline.model.strategy_state["scene_scale"]
     rate = trainer.optimizers.schedulers["means"].get_last_lr
     rates += rate()
     trainer.train()
@@ -343,7 +345,7 @@ def test_the_position_rate_grows_with_the_cameras_extent(colmap: ColmapDataParse
     trainer = set_up(configure(tmp_path, colmap))
     extent = trainer.pipeline.model.strategy_state["scene_scale"]
     assert extent != pytest.approx(1.0)
-    assert trainer.optimizers.schedulers["means"].get_last_lr() == pytest.approx([1.6e-4 * extent])
+    assert trainer.optimizers.schedulers["means"].get_last_lr() == pytest.approx([RATES["means"][0] * extent])
 
 
 def test_optimized_camera_poses_move(colmap: ColmapDataParserConfig, tmp_path: Path):
@@ -460,7 +462,7 @@ def test_the_loss_of_views_is_the_mean_of_their_own(tmp_path: Path, camera_optim
     pipeline = set_up(config).pipeline
 
     def loss(*indices: int) -> torch.Tensor:
-        pipeline.config.views_per_iteration = len(indices)
+        pipeline.schedule = Schedule(iterations=3, views_per_iteration=len(indices))
         pipeline.datamanager.train_unseen_cameras[:0] = indices
         _, losses, metrics = pipeline.get_train_loss_dict(0)
         assert metrics["gaussian_count"] == pytest.approx(pipeline.model.num_points)

@@ -35,6 +35,7 @@ from scenes import ITERATIONS
 
 from sadgs_ns.demo.scene import SPARSE_FOLDER
 from sadgs_ns.errors import InputError
+from sadgs_ns.method.schedule import Schedule, schedule
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin import pipeline
 from sadgs_ns.plugin.checkpoints import checkpoint_paths
@@ -463,6 +464,25 @@ def test_a_checkpoint_goes_on_with_more_or_fewer_views_of_its_world_alone(
     else:
         with pytest.raises(InputError, match=r"of its 8 cameras \(001\.png, …\) none stand where one of these 8 \("):
             set_up(config)
+
+
+def test_a_resumed_run_keeps_the_length_that_was_derived_unless_another_is_asked_for(
+    config: SadgsTrainerConfig, tmp_path: Path
+):
+    config.max_num_iterations = None
+    trainer = set_up(config)
+    trainer.save_checkpoint(0)
+    derived = trainer.pipeline.schedule
+    config.load_dir, config.output_dir = trainer.checkpoint_dir, tmp_path / "resumed"
+    parser: Any = config.pipeline.datamanager.dataparser
+    config.pipeline.datamanager.dataparser = dataclasses.replace(parser, eval_mode="all")  # It has more views.
+    assert set_up(config).pipeline.schedule == derived
+
+    config.pipeline.effort = 2.0
+    views = len(set_up(config).pipeline.datamanager.train_dataset)
+    assert set_up(config).pipeline.schedule == schedule(views, effort=2.0) != derived
+    config.pipeline.effort, config.max_num_iterations, config.pipeline.views_per_iteration = 1.0, 7, 3
+    assert set_up(config).pipeline.schedule == Schedule(iterations=7, views_per_iteration=3)
 
 
 def test_what_is_learned_of_each_view_goes_on_with_the_same_views_and_options_alone(

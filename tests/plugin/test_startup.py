@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 from kill_and_resume import set_up
 from scenes import HEIGHT, ITERATIONS, WIDTH
 
+from sadgs_ns.method.schedule import Schedule
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 LATER = ("sadgs_ns.cli.export", "pycolmap", "torchmetrics", "matplotlib.figure", "open3d", "jinja2.sandbox", "sklearn")
@@ -44,29 +46,53 @@ def test_a_run_says_in_two_lines_what_it_chose(
     times = f"so that each view is rendered about {round(ITERATIONS * 4 / views)} times."
     assert f"sadgs on {size}: {ITERATIONS} iterations of 4 views, {times}\n" in printed
     assert "At most 2,000 Gaussians: this device's memory is not planned with, so this is max_gaussians.\n" in printed
-    assert "Consider" not in printed
 
     trainer.save_checkpoint(4)
     config.load_dir, config.output_dir = trainer.checkpoint_dir, tmp_path / "resumed"
     assert f": {ITERATIONS} iterations of 4 views, of which 5 are done, so that each" in says(config)[1]
 
 
-def test_a_run_says_where_its_preset_does_not_suit_the_data(
+def test_the_number_of_views_and_the_effort_decide_what_is_not_set_by_hand(
+    config: SadgsTrainerConfig, says: Callable[[SadgsTrainerConfig], tuple[SadgsTrainer, str]]
+):
+    config.max_num_iterations, config.pipeline.effort = None, 0.5
+    trainer, printed = says(config)
+    pipeline = trainer.pipeline
+    visits = 0.5 * (2000 + 50 * len(pipeline.datamanager.train_dataset))
+    assert pipeline.schedule == Schedule(iterations=math.ceil(visits), views_per_iteration=1)
+    assert trainer.config.max_num_iterations == pipeline.schedule.iterations
+    assert pipeline.model.strategy.run_length == pipeline.schedule.iterations
+    assert f": {pipeline.schedule.iterations:,} iterations of 1 view, so that each view is rendered about" in printed
+    assert (
+        "\nThe number of views and --pipeline.effort 0.5 decide this: 0.5 is a draft of half as many renderings, 2 "
+        in printed
+    )
+    assert config.max_num_iterations is None, "config.yml says what was asked for"
+
+    config.max_num_iterations = 5
+    assert "decide this" not in says(config)[1]
+
+
+def test_rates_of_the_gaussians_shapes_follow_the_views_of_a_step(config: SadgsTrainerConfig):
+    def rates(views: int, power: float) -> dict[str, float]:
+        config.pipeline.views_per_iteration, config.rate_power = views, power
+        optimizers = set_up(config).optimizers.optimizers
+        return {name: optimizer.defaults["lr"] for name, optimizer in optimizers.items()}
+
+    one, four = rates(1, 0.5), rates(4, 0.5)
+    factors = {name: four[name] / one[name] for name in one}
+    shapes = dict.fromkeys(("means", "opacities", "scales", "quats"), 2.0)
+    assert factors == pytest.approx({**dict.fromkeys(("features_dc", "features_rest"), 1.0), **shapes})
+    assert rates(4, 0.0) == one
+
+
+def test_a_run_says_where_there_are_fewer_views_than_a_step_should_take(
     config: SadgsTrainerConfig,
     says: Callable[[SadgsTrainerConfig], tuple[SadgsTrainer, str]],
-    monkeypatch: pytest.MonkeyPatch,
 ):
-    config.method_name, config.pipeline.views_per_iteration = "sadgs-indoor", 50
+    config.pipeline.views_per_iteration = 50
     trainer, printed = says(config)
     views = len(trainer.pipeline.datamanager.train_dataset)
     assert (
         f"pipeline.views_per_iteration is 50, but there are {views} training views: all are taken each time." in printed
     )
-
-    monkeypatch.setattr("sadgs_ns.plugin.trainer._MEASURED_MEGAPIXELS", WIDTH * HEIGHT / 2e6)
-    assert (
-        "several views an iteration was measured on images of up to 0.7 megapixels; outdoors, on images of 1.9, it "
-        "took twice as long as sadgs and was worse. Consider sadgs, or smaller images.\n"
-    ) in says(config)[1]
-    config.pipeline.views_per_iteration = 1
-    assert "Consider" not in says(config)[1]

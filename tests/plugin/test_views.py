@@ -11,6 +11,7 @@ import pytest
 import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 
+from sadgs_ns.method.schedule import Schedule
 from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.plugin.views import TrainingViews
 
@@ -90,7 +91,8 @@ def test_a_resumed_run_goes_on_with_the_views_of_the_run_that_was_never_stopped(
             model=SimpleNamespace(strategy=SimpleNamespace(max_gaussians=1000)),
             device=torch.device("cpu"),
             _settings=dict,
-            views_per_iteration=number,
+            schedule=Schedule(iterations=10, views_per_iteration=number),
+            config=SimpleNamespace(effort=1.0),
         )
         state = SadgsPipeline.get_extra_state(pipeline)
         datamanager = pipeline.datamanager = Datamanager(total)

@@ -1,0 +1,133 @@
+"""How long a run is, how many views a step takes, and when densification does what; derived from the capture.
+
+A *view visit* is one rendering of one training view with its gradients. Many visits to few views overfit, and few
+visits to many underfit, so that the number of visits follows the number of views (docs/measurements.md, "The schedule
+that a capture needs").
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+BASE_VISITS = 2000
+"""View visits of a run whatever the number of views."""
+VISITS_PER_VIEW = 50
+"""View visits of a run for each training view."""
+STEPS_BEFORE_VIEWS = 2000
+"""Optimizer steps that a run should have before a step takes a view more."""
+MOST_VIEWS = 4
+"""Largest number of views in a step that is derived."""
+_PARTS = 30
+"""Windows are whole multiples of this part of the run, so that steps which are due together stay so."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """The length of a run."""
+
+    iterations: int
+    """Optimizer steps."""
+    views_per_iteration: int
+    """Views that are rendered for one of them; the loss is their mean."""
+
+
+@dataclass(frozen=True)
+class Windows:
+    """When densification does what, in iterations counted from 1."""
+
+    structure_every: int
+    """Iterations between structure-aware split and prune steps; 0 is never."""
+    absgs_every: int
+    """Iterations between AbsGS steps; 0 is never."""
+    refine_start_iter: int
+    """First iteration at which densification may run."""
+    refine_stop_iter: int
+    """Last iteration at which densification may run; 0 is never."""
+    reset_every: int
+    """Iterations between opacity resets; 0 is never."""
+    eta_every: int
+    """Iterations between observations of η."""
+
+
+def schedule(
+    num_views: int, *, effort: float = 1.0, iterations: int | None = None, views_per_iteration: int | None = None
+) -> Schedule:
+    """Derive the length of a run from the number of its training views.
+
+    The run visits views effort · (2,000 + 50 · num_views) times. A step takes one view more for every 2,000 visits, up
+    to four: more views in a step spare the GPU work and the gradients noise, but a run needs its steps.
+
+    Args:
+        num_views: Training views, at least 1.
+        effort: Factor on the visits, > 0.
+        iterations: Optimizer steps, if they are given; else they are as many as the visits take.
+        views_per_iteration: Views of a step, if they are given; never more than there are.
+    """
+    visits = effort * (BASE_VISITS + VISITS_PER_VIEW * num_views)
+    if views_per_iteration is None:
+        views_per_iteration = min(max(int(visits) // STEPS_BEFORE_VIEWS, 1), MOST_VIEWS)
+    views_per_iteration = min(views_per_iteration, num_views)
+    if iterations is None:
+        iterations = math.ceil(visits / views_per_iteration)
+    return Schedule(iterations, views_per_iteration)
+
+
+@lru_cache(maxsize=64)
+def windows(
+    iterations: int,
+    *,
+    structure_every: int | None = None,
+    absgs_every: int | None = None,
+    refine_start_iter: int | None = None,
+    refine_stop_iter: int | None = None,
+    reset_every: int | None = None,
+    eta_every: int | None = None,
+) -> Windows:
+    """Derive when densification does what from the length of the run; what is given stays.
+
+    In the proportions of the released code: of thirty parts of the run, an AbsGS step ends each from the first to the
+    sixteenth, a structure step takes the place of every fifth, and opacities are reset once after twelve. η is observed
+    ten times in a part.
+
+    Densification ends after at most 19/30 of the run (released code). Where that is before `refine_start_iter`, there
+    is none, and nothing that prepares it.
+
+    Args:
+        iterations: Length of the run.
+        structure_every: As in `Windows`, like all that follow.
+        absgs_every: ...
+        refine_start_iter: ...
+        refine_stop_iter: ...
+        reset_every: ...
+        eta_every: ...
+    """
+    part = max(round(iterations / _PARTS), 1)
+
+    def given_or(parts: float, given: int | None) -> int:
+        return max(round(parts * part), 1) if given is None else given
+
+    start = given_or(1, refine_start_iter)
+    stop = min(given_or(16, refine_stop_iter), iterations * 19 // 30)
+    return Windows(
+        structure_every=given_or(5, structure_every),
+        absgs_every=given_or(1, absgs_every),
+        refine_start_iter=start,
+        refine_stop_iter=stop if stop >= start else 0,
+        reset_every=given_or(12, reset_every),
+        eta_every=given_or(0.1, eta_every),
+    )
+
+
+def rate_factor(views_per_iteration: int, power: float) -> float:
+    """Factor on the learning rates of a step of several views.
+
+    Adam's step is as long as the rate whatever the gradient's length, and the mean over n views is √n times less noisy,
+    so that a step √n times as long is as sure of its direction.
+
+    Args:
+        views_per_iteration: At least 1.
+        power: 0.5 for that reason; 0 for rates that do not follow the number of views.
+    """
+    return float(views_per_iteration**power)
