@@ -93,9 +93,9 @@ class CheckedTrainerConfig(TrainerConfig):
     max_num_iterations: int | None = None  # type: ignore[assignment]
     """Length of the run in optimizer steps; None derives it from the number of views and `pipeline.effort`.
     Densification and the learning rates' schedules stretch to it."""
-    rate_power: float = 0.5
-    """Power of the number of views in a step that multiplies the rates of positions, opacities, scales and rotations.
-    The mean over more views is less noisy, so that they may be higher; 0 leaves them as they are set."""
+    rates_follow_views: bool = True
+    """Whether the rates of positions, opacities, scales and rotations, set for one view a step, change with more views.
+    The mean over more views is less noisy, so that they may be higher, and fall further."""
     steps_per_save: int = 0
     """Steps between checkpoints; 0 leaves them to the clock. One is always made at the end."""
     seconds_per_save: float = 60.0
@@ -220,8 +220,6 @@ class CheckedTrainerConfig(TrainerConfig):
             )
         if not 0 <= self.machine.seed < 2**32:
             raise InputError(f"machine.seed must be in [0, 2³²), got {self.machine.seed}.")
-        if not 0 <= self.rate_power <= 1:
-            raise InputError(f"rate_power must be in [0, 1], got {self.rate_power:g}.")
         self._check_rates()
         if self.mixed_precision or self.use_grad_scaler:
             raise InputError(

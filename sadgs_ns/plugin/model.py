@@ -75,7 +75,7 @@ class SadgsModelConfig(InstantiateConfig):
     """Also start from points on the faces of the SfM points' bounding box, which become sky and far background."""
     initial_opacity: float = POINT_OPACITY
     """Opacity at which SfM points start, in (0, 1); random ones start at 0.1.
-    Half opaque ones gave a better LPIPS indoors, and a worse one outdoors (docs/measurements.md)."""
+    Half opaque ones mostly have a lower LPIPS and make more Gaussians (docs/measurements.md)."""
     sh_degree: int = 3
     """Degree of the spherical harmonics that make colours depend on the direction of view, 0 to 4."""
     rasterize_mode: Literal["classic", "antialiased"] = "classic"

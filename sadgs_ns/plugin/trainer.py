@@ -20,7 +20,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from sadgs_ns.atomic import atomic_path
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
-from sadgs_ns.method.schedule import rate_factor, schedule
+from sadgs_ns.method.schedule import between_one_and_four, schedule
 from sadgs_ns.plugin import checkpoints, older_runs
 from sadgs_ns.plugin.compilation import compile_kernels
 from sadgs_ns.plugin.config import ONE_DEVICE, CheckedTrainerConfig
@@ -34,8 +34,9 @@ _LESS_MEMORY = (
     "(`--downscale-factor 2` after `nerfstudio-data` or `colmap`)"
 )
 _NOTHING_DONE = "stopped before an iteration was done; the same command starts again."
-RATES_OF_VIEWS = ("means", "opacities", "scales", "quats")
-"""Parameters whose learning rates follow the number of views in a step; colours learn well at the same rate."""
+RATES_OF_FOUR_VIEWS = {"means": (3.0, 3.0), "opacities": (1.5, 1.5), "scales": (2.25, 0.375), "quats": (2.25, 0.375)}
+"""Factors on learning rates at the first and at the last iteration in steps of four views (docs/measurements.md).
+Colours learn at the same rate in all."""
 _SAVING_SHARE = 0.01
 """Largest share of the time between two checkpoints by the clock that saving may take."""
 
@@ -195,6 +196,13 @@ class SadgsTrainer(Trainer):
         self._checkpoint = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
         self._derive_schedule()
         optimizers: dict[str, Any] = copy.deepcopy(dict(self.config.optimizers))
+        for name, at_four in RATES_OF_FOUR_VIEWS.items() if self.config.rates_follow_views else ():
+            start, end = (between_one_and_four(self.pipeline.views_per_iteration, factor) for factor in at_four)
+            optimizers[name]["optimizer"].lr *= start
+            decay = optimizers[name].get("scheduler") or RunLengthDecaySchedulerConfig()
+            if start != end and isinstance(decay, RunLengthDecaySchedulerConfig):
+                optimizers[name]["scheduler"] = decay
+                decay.final_factor *= end / start
         for group in optimizers.values():
             scheduler, optimizer = group.setdefault("scheduler", None), group["optimizer"]
             if isinstance(optimizer, FusedAdamOptimizerConfig):
@@ -203,9 +211,6 @@ class SadgsTrainer(Trainer):
                 scheduler.max_steps = self.config.max_num_iterations
         # Positions move in proportion to the cameras' extent, as in 3DGS; splatfacto does not do so.
         optimizers["means"]["optimizer"].lr *= self.pipeline.model.strategy_state["scene_scale"]
-        factor = rate_factor(self.pipeline.views_per_iteration, self.config.rate_power)
-        for name in RATES_OF_VIEWS:
-            optimizers[name]["optimizer"].lr *= factor
         return SadgsOptimizers(optimizers, self.pipeline.get_param_groups())
 
     def train(self) -> None:

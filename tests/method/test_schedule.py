@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sadgs_ns.method.schedule import MOST_VIEWS, Schedule, Windows, rate_factor, schedule, windows
+from sadgs_ns.method.schedule import MOST_VIEWS, Schedule, Windows, between_one_and_four, schedule, windows
 
 
 @pytest.mark.parametrize(
@@ -64,6 +64,6 @@ def test_windows_that_are_given_stay_but_for_an_end_too_late_to_recover_from():
     assert windows(300, refine_stop_iter=0).refine_stop_iter == 0
 
 
-def test_rates_grow_with_the_root_of_the_views_unless_they_are_told_not_to():
-    assert [rate_factor(views, 0.5) for views in (1, 4)] == [1.0, 2.0]
-    assert [rate_factor(views, 0.0) for views in (1, 4)] == [1.0, 1.0]
+def test_factors_on_rates_go_from_one_view_to_four_and_no_further():
+    assert [between_one_and_four(views, 9.0) for views in (1, 2, 4, 8)] == pytest.approx([1.0, 3.0, 9.0, 9.0])
+    assert [between_one_and_four(views, 0.25) for views in (1, 2, 4)] == pytest.approx([1.0, 0.5, 0.25])

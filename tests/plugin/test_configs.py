@@ -140,7 +140,7 @@ def test_presets_have_their_own_names_and_every_optimizer(name: str):
 def test_presets_differ_where_their_comments_say():
     assert [preset(name).pipeline.views_per_iteration for name in METHODS] == [None, 1, 2]
     assert [preset(name).max_num_iterations for name in METHODS] == [None, 3000, 3000]
-    assert [preset(name).rate_power for name in METHODS] == [0.5, 0.0, 0.0]
+    assert [preset(name).rates_follow_views for name in METHODS] == [True, False, False]
 
 
 def test_presets_share_nothing_that_one_of_them_could_change():
@@ -396,10 +396,8 @@ def test_the_papers_presets_are_sadgs_without_what_we_added():
     model.strategy.eta_every = model.strategy.min_observations = 1
     model.strategy.split_min_opacity = config.pipeline.energy_blur = 0.0
     config.pipeline.epsilon = 1e-6
-    config.max_num_iterations, config.pipeline.views_per_iteration, config.rate_power = 3000, 1, 0.0
-    for group, rate in (("means", 1.6e-4), ("opacities", 0.025), ("scales", 0.01), ("quats", 0.002)):
-        config.optimizers[group]["optimizer"].lr = rate
-    del config.optimizers["scales"]["scheduler"], config.optimizers["quats"]["scheduler"]
+    config.max_num_iterations, config.pipeline.views_per_iteration, config.rates_follow_views = 3000, 1, False
+    config.optimizers["scales"]["optimizer"].lr = 0.01
     config.method_name = "sadgs-paper"
     assert yaml.dump(config) == yaml.dump(paper)
     config.pipeline.views_per_iteration = 2

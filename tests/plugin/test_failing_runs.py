@@ -91,7 +91,6 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig
         ("viewer.websocket_port", 99999, "viewer.websocket_port must be in [1, 65535], got 99999."),
         ("pipeline.effort", 0.0, "pipeline.effort must be in (0, 100], got 0."),
         ("pipeline.effort", math.nan, "pipeline.effort must be in (0, 100], got nan."),
-        ("rate_power", 2.0, "rate_power must be in [0, 1], got 2."),
         ("load_step", 3, "load_step is 3, but load_dir is not set: add --load-dir with the folder of a run."),
         ("optimizers.means.optimizer.lr", math.nan, "optimizers.means.optimizer.lr must be in [0, 1], got nan."),
         ("optimizers.quats.optimizer.lr", 1e9, "optimizers.quats.optimizer.lr must be in [0, 1], got 1e+09."),
@@ -99,7 +98,7 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig
         (
             "optimizers.means.scheduler.initial_factor",
             1e9,
-            "optimizers.means.scheduler.initial_factor must leave the rate in [0, 1], got 1e+09, which makes 240000 ",
+            "optimizers.means.scheduler.initial_factor must leave the rate in [0, 1], got 1e+09, which makes 160000 ",
         ),
         (
             "optimizers.means.scheduler.final_factor",

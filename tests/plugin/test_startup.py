@@ -74,16 +74,21 @@ def test_the_number_of_views_and_the_effort_decide_what_is_not_set_by_hand(
 
 
 def test_rates_of_the_gaussians_shapes_follow_the_views_of_a_step(config: SadgsTrainerConfig):
-    def rates(views: int, power: float) -> dict[str, float]:
-        config.pipeline.views_per_iteration, config.rate_power = views, power
-        optimizers = set_up(config).optimizers.optimizers
-        return {name: optimizer.defaults["lr"] for name, optimizer in optimizers.items()}
+    def rates(views: int) -> tuple[dict[str, float], dict[str, float]]:
+        config.pipeline.views_per_iteration = views
+        schedulers = set_up(config).optimizers.schedulers
+        first = {name: scheduler.get_last_lr()[0] for name, scheduler in schedulers.items()}
+        factors = {name: scheduler.lr_lambdas[0](ITERATIONS) for name, scheduler in schedulers.items()}
+        return first, {name: factor * schedulers[name].base_lrs[0] for name, factor in factors.items()}
 
-    one, four = rates(1, 0.5), rates(4, 0.5)
-    factors = {name: four[name] / one[name] for name in one}
-    shapes = dict.fromkeys(("means", "opacities", "scales", "quats"), 2.0)
-    assert factors == pytest.approx({**dict.fromkeys(("features_dc", "features_rest"), 1.0), **shapes})
-    assert rates(4, 0.0) == one
+    assert rates(1)[0].keys() == {"means"}
+    first, last = rates(4)
+    extent = set_up(config).pipeline.model.strategy_state["scene_scale"]
+    assert first == pytest.approx({"means": 4.8e-4 * extent, "scales": 0.045, "quats": 0.0045})
+    assert last == pytest.approx({"means": 4.8e-6 * extent, "scales": 0.0075, "quats": 0.00075})
+    assert set_up(config).optimizers.optimizers["opacities"].param_groups[0]["lr"] == pytest.approx(0.0375)
+    config.rates_follow_views = False
+    assert rates(4) == rates(1)
 
 
 def test_a_run_says_where_there_are_fewer_views_than_a_step_should_take(
