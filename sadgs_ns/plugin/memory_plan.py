@@ -28,6 +28,8 @@ TILE_SIZE = 8
 """Size of a tile in px, as `kernels.compositing.TILE_SIZE`, which cannot be imported without Triton."""
 NEAR_PLANE = 0.01
 """Depth in world units from which gsplat and our splatter draw Gaussians."""
+IMAGE_SHARE = 0.25
+"""Share of the device's free memory up to which the images of a large capture are kept on it."""
 _BLUR, _REACH = 0.3, 3.0
 """gsplat's screen-space blur in px², and the standard deviations that it draws."""
 
@@ -53,16 +55,40 @@ def training_size(datamanager: FullImageDatamanager, params: Params, views: int,
         views: Views rendered in a step.
         fused: Whether the loss is computed by our kernels.
     """
-    config, cameras = datamanager.config, datamanager.train_dataset.cameras
-    pixels = cameras.height * cameras.width  # [C, 1]
-    image_bytes = 0.0
-    if config.cache_images == "gpu":
-        held_out = datamanager.eval_dataset.cameras
-        cached = float(pixels.sum() + (held_out.height * held_out.width).sum())
-        image_bytes = 3 * (1 if config.cache_images_type == "uint8" else 4) * cached + CODE_BYTES * float(pixels.sum())
-    return TrainingSize(
-        image_bytes, StepSize(views, views * int(pixels.max()), views * estimate_pairs(params, cameras)), fused
-    )
+    cameras = datamanager.train_dataset.cameras
+    kept = image_bytes(datamanager) if datamanager.config.cache_images == "gpu" else 0.0
+    largest = int((cameras.height * cameras.width).max())
+    return TrainingSize(kept, StepSize(views, views * largest, views * estimate_pairs(params, cameras)), fused)
+
+
+def image_bytes(datamanager: FullImageDatamanager) -> float:
+    """Bytes of all images, held-out ones too, and of the codes of S̄ of the training images."""
+    train, held_out = (
+        float((cameras.height * cameras.width).sum())
+        for cameras in (datamanager.train_dataset.cameras, datamanager.eval_dataset.cameras)
+    )  # px
+    value_bytes = 1 if datamanager.config.cache_images_type == "uint8" else 4
+    return 3 * value_bytes * (train + held_out) + CODE_BYTES * train
+
+
+def keep_images_on_device(datamanager: FullImageDatamanager, device: torch.device) -> str | None:
+    """Keep images on the device although there are more than 500, where they take a small part of its memory.
+
+    nerfstudio leaves more than 500 images on the host, whatever their size. With 525 of 640×480 px a step of four views
+    took 12 ms then, and 4.5 ms with fewer and larger images on the device (H200).
+
+    Args:
+        datamanager: Its images have not been loaded yet; its configuration is changed.
+        device: The device of training.
+
+    Returns:
+        A line for the user, or None if the images do not fit.
+    """
+    size, (free, _) = image_bytes(datamanager), memory.available_bytes(device)
+    if size > IMAGE_SHARE * free:
+        return None
+    datamanager.config.cache_images = "gpu"
+    return f"They stay on the GPU all the same: images and their structure take {size / 1e9:.2g} GB of its memory."
 
 
 @torch.no_grad()

@@ -28,7 +28,7 @@ from sadgs_ns.method.schedule import schedule
 from sadgs_ns.method.structure_tensor import ENERGY_BLUR, FREQUENCY_CONSTANT
 from sadgs_ns.plugin import nonfinite
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig, check_options
-from sadgs_ns.plugin.memory_plan import NEAR_PLANE, fit_to_memory, training_size
+from sadgs_ns.plugin.memory_plan import NEAR_PLANE, fit_to_memory, keep_images_on_device, training_size
 from sadgs_ns.plugin.model import SadgsModel, SadgsModelConfig
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
 from sadgs_ns.plugin.optimizers import FusedAdam
@@ -122,6 +122,10 @@ class SadgsPipeline(VanillaPipeline):
         if self.device.type == "cpu":
             # "gpu" is the training device; "cpu" would pin memory for CUDA.
             self.datamanager.config.cache_images = "gpu"
+        elif config.datamanager.cache_images == "gpu" and self.datamanager.config.cache_images == "cpu":
+            line = keep_images_on_device(self.datamanager, self.device)
+            if line is not None:
+                CONSOLE.print(line, highlight=False, soft_wrap=True)
         parsed_on = getattr(self.datamanager.dataparser.config, "alpha_color", None)
         if parsed_on is not None and parsed_on != config.model.background_color:
             CONSOLE.print(

@@ -20,7 +20,14 @@ from sadgs_ns.method import memory
 from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin import memory_plan
-from sadgs_ns.plugin.memory_plan import TrainingSize, estimate_pairs, fit_to_memory, training_size
+from sadgs_ns.plugin.memory_plan import (
+    TrainingSize,
+    estimate_pairs,
+    fit_to_memory,
+    image_bytes,
+    keep_images_on_device,
+    training_size,
+)
 
 DEFAULT = StructureAwareStrategy.max_gaussians
 WIDTH, HEIGHT, VIEWS = 48, 36, 10
@@ -295,3 +302,25 @@ def test_a_budget_for_nothing_ends_ns_train_with_one_sentence(card: Any, tmp_pat
     card(8, 8)
     with pytest.raises(InputError, match=r"^pipeline\.memory_budget_gb is 1e-06 and leaves no room"):
         set_up(config)
+
+
+def test_many_small_images_stay_on_the_device_and_many_large_ones_on_the_host(card: Any):
+    def datamanager(side: int) -> Any:
+        def dataset(number: int) -> Any:
+            return SimpleNamespace(
+                cameras=SimpleNamespace(height=torch.full((number, 1), side), width=torch.tensor(side))
+            )
+
+        config = SimpleNamespace(cache_images="cpu", cache_images_type="uint8")
+        return SimpleNamespace(config=config, train_dataset=dataset(600), eval_dataset=dataset(100))
+
+    small, large, device = datamanager(100), datamanager(10_000), torch.device("cuda")
+    assert image_bytes(small) == 3 * 700 * 100**2 + 3 * 600 * 100**2
+    card(0.16, 80)  # It takes 39 MB, and a quarter of 160.
+    assert keep_images_on_device(small, device) == (
+        "They stay on the GPU all the same: images and their structure take 0.039 GB of its memory."
+    )
+    assert small.config.cache_images == "gpu"
+    card(80, 80)
+    assert keep_images_on_device(large, device) is None
+    assert large.config.cache_images == "cpu"
