@@ -19,6 +19,8 @@ from sadgs_ns.bench import protocol, results
 from sadgs_ns.bench.datasets import image_names, runnable
 from sadgs_ns.bench.protocol import Job, Row, Scene
 from sadgs_ns.bench.run import build_config
+from sadgs_ns.method.schedule import between_one_and_four
+from sadgs_ns.plugin.trainer import RATES_OF_FOUR_VIEWS
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "bench"
 PROTOCOLS = sorted(path.stem for path in CONFIGS.glob("*.yaml"))
@@ -131,7 +133,7 @@ def test_each_ablation_changes_one_thing_of_the_full_method(tmp_path: Path):
     built = configs("ablations", tmp_path)
     strategy = "pipeline.model.strategy"
     windows = {"structure_every": 500, "absgs_every": 100, "refine_start_iter": 100, "reset_every": 1200}
-    longer = {f"{strategy}.{name}": value for name, value in windows.items()}  # They would stretch with the run.
+    longer = {f"{strategy}.{name}": value for name, value in windows.items()}  # as in the preset
     changes = {
         "30k iterations": {"max_num_iterations": 30000, **longer},
         "15k iterations": {"max_num_iterations": 15000, **longer},
@@ -182,7 +184,7 @@ def test_the_derived_schedule_is_measured_on_all_eight_scenes(name: str, tmp_pat
         assert config.pipeline.model.background_color == ("white" if scene == "lego" else "black")
         if not label.endswith("before"):
             assert config.max_num_iterations is None
-            assert config.rate_power == 0.5
+            assert config.rates_follow_views
             efforts.setdefault(scene, set()).add(config.pipeline.effort)
     assert set(efforts) == {"bonsai", "fox", "room", "castle", "tree", "south", "site", "lego"}
     assert all(of_scene == {0.5, 1.0, 2.0, 4.0} for of_scene in efforts.values())
@@ -236,14 +238,18 @@ def test_the_presets_of_before_are_rows_with_all_that_they_said(
         strategy = config.pipeline.model.strategy
         strategy.fit_to_run(config.max_num_iterations)
         assert (config.max_num_iterations, config.pipeline.views_per_iteration) == (iterations, views)
-        assert (config.pipeline.model.initial_opacity, config.rate_power) == (opacity, 0.0)
+        assert config.pipeline.model.initial_opacity == opacity
         names = ("structure_every", "absgs_every", "refine_start_iter", "refine_stop_iter", "reset_every", "eta_every")
         assert tuple(getattr(strategy.windows, name) for name in names) == windows
         assert (strategy.clone_grad2d, strategy.split_absgrad2d) == thresholds
         for group, (first, last) in rates.items():
             optimizer, scheduler = config.optimizers[group]["optimizer"], config.optimizers[group].get("scheduler")
             factors = (1.0, 1.0) if scheduler is None else (scheduler.initial_factor, scheduler.final_factor)
-            assert tuple(optimizer.lr * factor for factor in factors) == pytest.approx((first, last))
+            of_views = [between_one_and_four(views, at_four) for at_four in RATES_OF_FOUR_VIEWS[group]]
+            if not config.rates_follow_views:
+                of_views = [1.0, 1.0]
+            rate = [optimizer.lr * factor * more for factor, more in zip(factors, of_views, strict=True)]
+            assert rate == pytest.approx([first, last])
 
 
 def content(*rows: dict[str, Any], **changes: Any) -> dict[str, Any]:
