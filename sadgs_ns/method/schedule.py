@@ -8,7 +8,7 @@ that a capture needs").
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 BASE_VISITS = 2000
@@ -20,7 +20,16 @@ STEPS_BEFORE_VIEWS = 2000
 MOST_VIEWS = 4
 """Largest number of views in a step that is derived."""
 _PARTS = 30
-"""Windows are whole multiples of this part of the run, so that steps which are due together stay so."""
+"""A run is divided into so many parts of as many whole iterations."""
+_WINDOWS = {
+    "structure_every": 5,
+    "absgs_every": 1,
+    "refine_start_iter": 1,
+    "refine_stop_iter": 16,
+    "reset_every": 12,
+    "eta_every": 0.1,
+}
+"""`Windows` in parts of the run."""
 
 
 @dataclass(frozen=True)
@@ -75,16 +84,7 @@ def schedule(
 
 
 @lru_cache(maxsize=64)
-def windows(
-    iterations: int,
-    *,
-    structure_every: int | None = None,
-    absgs_every: int | None = None,
-    refine_start_iter: int | None = None,
-    refine_stop_iter: int | None = None,
-    reset_every: int | None = None,
-    eta_every: int | None = None,
-) -> Windows:
+def windows(iterations: int, **given: int | None) -> Windows:
     """Derive when densification does what from the length of the run; what is given stays.
 
     In the proportions of the released code: of thirty parts of the run, an AbsGS step ends each from the first to the
@@ -96,28 +96,16 @@ def windows(
 
     Args:
         iterations: Length of the run.
-        structure_every: As in `Windows`, like all that follow.
-        absgs_every: ...
-        refine_start_iter: ...
-        refine_stop_iter: ...
-        reset_every: ...
-        eta_every: ...
+        **given: Fields of `Windows`; None derives one.
+
+    Raises:
+        TypeError: If another name is given.
     """
     part = max(round(iterations / _PARTS), 1)
-
-    def given_or(parts: float, given: int | None) -> int:
-        return max(round(parts * part), 1) if given is None else given
-
-    start = given_or(1, refine_start_iter)
-    stop = min(given_or(16, refine_stop_iter), iterations * 19 // 30)
-    return Windows(
-        structure_every=given_or(5, structure_every),
-        absgs_every=given_or(1, absgs_every),
-        refine_start_iter=start,
-        refine_stop_iter=stop if stop >= start else 0,
-        reset_every=given_or(12, reset_every),
-        eta_every=given_or(0.1, eta_every),
-    )
+    derived = {name: max(round(parts * part), 1) for name, parts in _WINDOWS.items()}
+    chosen = Windows(**derived | {name: value for name, value in given.items() if value is not None})
+    stop = min(chosen.refine_stop_iter, iterations * 19 // 30)
+    return replace(chosen, refine_stop_iter=stop if stop >= chosen.refine_start_iter else 0)
 
 
 def between_one_and_four(views_per_iteration: int, at_four: float) -> float:
