@@ -38,7 +38,7 @@ from sadgs_ns.plugin.views import TrainingViews
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 _MOST_EFFORT = 100
-"""Largest `effort`, which is a million iterations of a capture of 7,000 views."""
+"""Largest `effort`, which is a million iterations of four views for a capture of 760 views."""
 _NAMED_STEPS = 5
 """Number of iterations of which a report of what was not finite names the images."""
 _WIDEST_BLUR = 100
