@@ -19,13 +19,20 @@ STEPS_BEFORE_VIEWS = 2000
 """Optimizer steps that a run should have before a step takes a view more."""
 MOST_VIEWS = 4
 """Largest number of views in a step that is derived."""
+MORE_VISITS_FROM = (50, 90)
+"""Number of training views up to which effort above 1 adds no visits, because they would overfit, and number from which
+it multiplies them."""
+GROWTH_WITH_EFFORT = (-0.74, 0.6)
+"""Power of effort that multiplies the thresholds of growth, and the least factor: effort 2 and more is 0.6."""
+DENSIFICATION_SHARE = 16 / 30
+"""Share of a run in which Gaussians are added and removed."""
 _PARTS = 30
 """A run is divided into so many parts of as many whole iterations."""
 _WINDOWS = {
     "structure_every": 5,
     "absgs_every": 1,
     "refine_start_iter": 1,
-    "refine_stop_iter": 16,
+    "refine_stop_iter": round(_PARTS * DENSIFICATION_SHARE),
     "reset_every": 12,
     "eta_every": 0.1,
 }
@@ -65,16 +72,20 @@ def schedule(
 ) -> Schedule:
     """Derive the length of a run from the number of its training views.
 
-    The run visits views effort · (2,000 + 50 · num_views) times. A step takes one view more for every 2,000 visits, up
-    to four: more views in a step spare the GPU work and the gradients noise, but a run needs its steps.
+    With effort 1 the run visits views 2,000 + 50 · num_views times. Less effort multiplies that; more effort multiplies
+    it where views are many, and adds nothing where they are few (`MORE_VISITS_FROM`). A step takes one view more for
+    every 2,000 visits, up to four: more views in a step spare the GPU work and the gradients noise, but a run needs its
+    steps.
 
     Args:
         num_views: Training views, at least 1.
-        effort: Factor on the visits, > 0.
+        effort: How much training, relative to what the number of views asks for, > 0.
         iterations: Optimizer steps, if they are given; else they are as many as the visits take.
         views_per_iteration: Views of a step, if they are given; never more than there are.
     """
-    visits = effort * (BASE_VISITS + VISITS_PER_VIEW * num_views)
+    few, many = MORE_VISITS_FROM
+    power = 1.0 if effort <= 1 else min(max((num_views - few) / (many - few), 0.0), 1.0)
+    visits = effort**power * (BASE_VISITS + VISITS_PER_VIEW * num_views)
     if views_per_iteration is None:
         views_per_iteration = min(max(int(visits) // STEPS_BEFORE_VIEWS, 1), MOST_VIEWS)
     views_per_iteration = min(views_per_iteration, num_views)
@@ -106,6 +117,19 @@ def windows(iterations: int, **given: int | None) -> Windows:
     chosen = Windows(**derived | {name: value for name, value in given.items() if value is not None})
     stop = min(chosen.refine_stop_iter, iterations * 19 // 30)
     return replace(chosen, refine_stop_iter=stop if stop >= chosen.refine_start_iter else 0)
+
+
+def growth_threshold(effort: float) -> float:
+    """Factor on the gradients at which AbsGS adds Gaussians.
+
+    Effort above 1 adds more of them, which resolves more on few views as on many; a draft has the thresholds of
+    effort 1, since its steps are fewer already.
+
+    Args:
+        effort: As in `schedule`.
+    """
+    power, least = GROWTH_WITH_EFFORT
+    return max(effort**power, least) if effort > 1 else 1.0
 
 
 def between_one_and_four(views_per_iteration: int, at_four: float) -> float:

@@ -24,7 +24,7 @@ from sadgs_ns.data.validation.parsers import findings_of
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.codes import HIGHEST_FREQUENCY
 from sadgs_ns.method.initialization import camera_extent
-from sadgs_ns.method.schedule import schedule
+from sadgs_ns.method.schedule import growth_threshold, schedule
 from sadgs_ns.method.structure_tensor import ENERGY_BLUR, FREQUENCY_CONSTANT
 from sadgs_ns.plugin import nonfinite
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig, check_options
@@ -62,7 +62,7 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     """The Gaussians and their densification."""
     effort: float = 1.0
     """How much training the capture is given, relative to what its number of views asks for.
-    0.5 is a draft of half as many renderings; 2 and 4 resolve more where views are many, but overfit few."""
+    0.5 is a draft of half as many renderings. 2 adds more Gaussians; 2 and 4 render more where views are many."""
     views_per_iteration: int | None = None
     """Training views rendered for one optimizer step, at most as many as there are; the loss is their mean.
     None takes one more for every 2,000 renderings of the run, up to 4. The paper uses 1 outdoors, 2 indoors."""
@@ -144,6 +144,8 @@ class SadgsPipeline(VanillaPipeline):
         number, asked = max(len(self.datamanager.train_dataset), 1), config.views_per_iteration
         self.schedule = schedule(number, effort=config.effort, views_per_iteration=asked)
         """Length of the run and views of a step; the trainer, which knows more, puts its own here."""
+        strategy, less = self.model.strategy, growth_threshold(config.effort)
+        strategy.clone_grad2d, strategy.split_absgrad2d = less * strategy.clone_grad2d, less * strategy.split_absgrad2d
         self.log = NonFiniteLog(self.device)
         self._checkpoint_cap: int | None = None
         self._checkpoint_views: tuple[list[str], Tensor] | None = None  # These are names and positions [C, 3].

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 import pytest
 
-from sadgs_ns.method.schedule import MOST_VIEWS, Schedule, Windows, between_one_and_four, schedule, windows
+from sadgs_ns.method.schedule import (
+    DENSIFICATION_SHARE,
+    MOST_VIEWS,
+    Schedule,
+    Windows,
+    between_one_and_four,
+    growth_threshold,
+    schedule,
+    windows,
+)
 
 
 @pytest.mark.parametrize(
@@ -24,11 +33,28 @@ def test_visits_grow_with_the_views_and_steps_take_more_views_where_they_can(num
 @pytest.mark.parametrize("effort", [0.01, 0.5, 1.0, 2.0, 4.0])
 def test_every_schedule_renders_what_the_effort_asks_for(num_views: int, effort: float):
     derived = schedule(num_views, effort=effort)
-    visits = effort * (2000 + 50 * num_views)
+    visits = (effort if effort <= 1 or num_views >= 100 else 1) * (2000 + 50 * num_views)
     assert 1 <= derived.views_per_iteration <= min(MOST_VIEWS, num_views)
     rendered = derived.iterations * derived.views_per_iteration
     assert visits <= rendered < visits + derived.views_per_iteration
     assert derived.iterations >= min(2000, visits) or num_views < derived.views_per_iteration
+
+
+@pytest.mark.parametrize(
+    ("num_views", "factors"),
+    [(20, [0.5, 1, 1]), (50, [0.5, 1, 1]), (70, [0.5, 2**0.5, 2]), (90, [0.5, 2, 4]), (500, [0.5, 2, 4])],
+)
+def test_effort_above_1_adds_visits_only_where_views_are_many(num_views: int, factors: list[float]):
+    visits = []
+    for effort in (1.0, 0.5, 2.0, 4.0):
+        derived = schedule(num_views, effort=effort)
+        visits.append(derived.iterations * derived.views_per_iteration)
+    assert [more / visits[0] for more in visits[1:]] == pytest.approx(factors, rel=2e-3)
+
+
+def test_effort_lets_more_grow_and_a_draft_as_much():
+    assert [growth_threshold(effort) for effort in (0.1, 0.5, 1.0)] == [1.0, 1.0, 1.0]
+    assert [growth_threshold(effort) for effort in (1.5, 2, 4, 100)] == pytest.approx([0.741, 0.6, 0.6, 0.6], abs=1e-3)
 
 
 def test_what_is_set_by_hand_stays():
@@ -47,6 +73,7 @@ def test_windows_are_the_released_codes_at_3000_iterations_and_in_proportion_els
         multiples = (derived.structure_every, derived.refine_start_iter, derived.refine_stop_iter, derived.reset_every)
         assert multiples == (5 * part, part, 16 * part, 12 * part)
         assert derived.eta_every == max(round(0.1 * part), 1)
+        assert derived.refine_stop_iter == pytest.approx(DENSIFICATION_SHARE * iterations, rel=0.1)
 
 
 @pytest.mark.parametrize("iterations", [1, 2, 5, 20, 29, 31])
