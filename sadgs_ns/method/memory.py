@@ -20,7 +20,8 @@ from torch import Tensor
 from sadgs_ns.method.split import Params
 
 COPIES = 4
-"""Tensors of a parameter's size: the parameter, its gradient and Adam's two moments."""
+"""Tensors of a parameter's size: the parameter, its gradient and Adam's two moments. The mean over the last iterations
+is a fifth, in the place of the statistics and of a split's copy, which are as large and gone by then."""
 ACTIVATION_BYTES = 16
 """Bytes of a Gaussian in every phase: exp(scales) 12, sigmoid(opacities) 4."""
 ACTIVATION_GRADIENT_BYTES = 28

@@ -26,6 +26,7 @@ from torch import Tensor
 
 from sadgs_ns.data.cameras import refuse_unsupported_cameras
 from sadgs_ns.errors import InputError
+from sadgs_ns.method.averaging import RunningMean
 from sadgs_ns.method.initialization import (
     POINT_OPACITY,
     camera_extent,
@@ -86,6 +87,9 @@ class SadgsModelConfig(InstantiateConfig):
     opacity_reg: float = 0.01
     """Weight of the mean opacity in the loss while densification runs: what no image needs fades until it is pruned.
     Larger leaves fewer Gaussians; 0 is off, as in the paper."""
+    averaged_share: float = 0.05
+    """Share of the run, at its end, over which the Gaussians' parameters are averaged, in [0, 0.3].
+    The finished run has the mean; 0 leaves it the last iteration's."""
     use_scale_regularization: bool = False
     """Penalize Gaussians more than ten times as long as thick (PhysGaussian), against spikes."""
     use_bilateral_grid: bool = False
@@ -108,6 +112,8 @@ class SadgsModelConfig(InstantiateConfig):
             raise InputError(f"pipeline.model.initial_opacity must be in (0, 1), got {self.initial_opacity:g}.")
         if not 0 <= self.opacity_reg <= 100:
             raise InputError(f"pipeline.model.opacity_reg must be in [0, 100], got {self.opacity_reg:g}.")
+        if not 0 <= self.averaged_share <= 0.3:
+            raise InputError(f"pipeline.model.averaged_share must be in [0, 0.3], got {self.averaged_share:g}.")
         if not 0 <= self.sh_degree <= 4:
             raise InputError(f"pipeline.model.sh_degree must be in [0, 4], got {self.sh_degree}.")
         if not 1 <= self.num_random <= _MOST_RANDOM:
@@ -159,6 +165,7 @@ class SadgsModel(SplatfactoModel):
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
         self._lpips: list[torch.nn.Module | None] = []  # In a list its weights stay out of the checkpoint.
         self.step = 0
+        self.average = RunningMean()
         self.infos: list[dict[str, Any]] = []
         self.crop_box: OrientedBox | None = None
         self.viewer_outputs: Callable[[Cameras, dict[str, Tensor]], dict[str, Tensor]] | None = None
@@ -247,12 +254,19 @@ class SadgsModel(SplatfactoModel):
         return super().get_training_callbacks(training_callback_attributes)
 
     def step_post_backward(self, step: int) -> None:
-        """Hand the step's forward passes to the strategy."""
+        """Hand the step's forward passes to the strategy, and average the parameters when the run nears its end."""
         if self.infos:
             self.strategy.step_post_backward(
                 self.gauss_params, self.optimizers, self.strategy_state, self.step, self.infos
             )
         self.infos = []
+        iterations, done = self.strategy.run_length, self.step + 1
+        if done <= iterations - round(self.config.averaged_share * iterations):
+            self.average.clear()  # A run that was to end here, and is trained on, may have begun to average.
+            return
+        self.average.add(self.gauss_params)
+        if done >= iterations:
+            self.average.move_to(self.gauss_params)
 
     def wants_structure_tensors(self, step: int) -> bool:
         """Tell whether the strategy will observe η at this step."""
@@ -499,7 +513,11 @@ class SadgsModel(SplatfactoModel):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return what a checkpoint needs besides parameters: the step and the strategy's state."""
-        return {"step": self.step, "strategy_state": dict(self.strategy_state)}
+        return {
+            "step": self.step,
+            "strategy_state": dict(self.strategy_state),
+            "average": self.average.state_dict(),
+        }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` saved."""
@@ -508,6 +526,8 @@ class SadgsModel(SplatfactoModel):
             key: value.to(self.device) if isinstance(value, Tensor) else value
             for key, value in state["strategy_state"].items()
         }
+        if "average" in state:  # Earlier versions averaged nothing.
+            self.average.load_state_dict(state["average"], self.device)
 
     def load_state_dict(self, dict: dict[str, Any], **kwargs: Any) -> Any:  # type: ignore[override]
         """Load a checkpoint of any number of Gaussians.

@@ -149,19 +149,21 @@ class FusedAdamOptimizerConfig(AdamOptimizerConfig):
 
 @dataclass
 class RunLengthDecaySchedulerConfig(SchedulerConfig):
-    """Exponential decay over the length of the run, whatever `--max-num-iterations` is."""
+    """Exponential decay over the length of the run, or over its last part, whatever `--max-num-iterations` is."""
 
     _target: type = field(default_factory=lambda: RunLengthDecayScheduler)
     initial_factor: Suppress[float] = 1.0
     """Learning rate at the first iteration, relative to the optimizer's."""
     final_factor: float = 1.0
     """Learning rate at the last iteration, relative to the optimizer's."""
+    hold_share: Suppress[float] = 0.0
+    """Share of the run in [0, 1) in which the learning rate stays as at the first iteration."""
     max_steps: Suppress[int | None] = None
     """Iterations until `final_factor`; None is the length of the run."""
 
 
 class RunLengthDecayScheduler(Scheduler):
-    """lr(t) = lr · initial^(1−t) · final^t with t the fraction of the run that has passed."""
+    """lr(t) = lr · initial^(1−t) · final^t with t the fraction that has passed of the run after `hold_share`."""
 
     config: RunLengthDecaySchedulerConfig
 
@@ -173,10 +175,10 @@ class RunLengthDecayScheduler(Scheduler):
         max_steps = self.config.max_steps
         if max_steps is None:
             raise ValueError("max_steps is unset: SadgsTrainer sets it to the length of the run.")
-        initial, final = self.config.initial_factor, self.config.final_factor
+        initial, final, hold = self.config.initial_factor, self.config.final_factor, self.config.hold_share
 
         def factor(step: int) -> float:
-            t = min(step / max(max_steps, 1), 1.0)
+            t = min(max((step / max(max_steps, 1) - hold) / (1 - hold), 0.0), 1.0)
             return float(initial ** (1 - t) * final**t)
 
         return LambdaLR(optimizer, factor)

@@ -6,6 +6,7 @@ from typing import Any
 
 from nerfstudio.plugins.types import MethodSpecification
 
+from sadgs_ns.method.schedule import DENSIFICATION_SHARE
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin.model import SadgsModelConfig
 from sadgs_ns.plugin.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
@@ -14,9 +15,9 @@ from sadgs_ns.plugin.trainer import SadgsTrainerConfig
 
 RATES: dict[str, tuple[float, float, float]] = {
     "means": (1.6e-4, 1.0, 0.01),
-    "features_dc": (2.5e-3, 1.0, 1.0),
-    "features_rest": (2.5e-4, 1.0, 1.0),
-    "opacities": (0.025, 1.0, 1.0),
+    "features_dc": (2.5e-3, 1.0, 0.1),
+    "features_rest": (2.5e-4, 1.0, 0.1),
+    "opacities": (0.025, 1.0, 0.1),
     "scales": (0.02, 1.0, 1.0),
     "quats": (0.002, 1.0, 1.0),
     "camera_opt": (1e-4, 1.0, 0.005),
@@ -24,9 +25,13 @@ RATES: dict[str, tuple[float, float, float]] = {
 }
 """Learning rate of each group of parameters, and the factors on it at the first and at the last iteration.
 
-Positions, colours and opacities are 3DGS's; the scales' rate is four times 3DGS's, the rotations' twice. They are those
-of a step of one view; `trainer.RATES_OF_FOUR_VIEWS` says how they change with more.
+The rates of positions, colours and opacities are 3DGS's at the start; the scales' is four times 3DGS's, the rotations'
+twice. They are those of a step of one view; `trainer.RATES_OF_FOUR_VIEWS` says how they change with more.
 """
+HELD = ("features_dc", "features_rest", "opacities")
+"""Groups whose rate stays as it is until densification ends, and falls then."""
+CONSTANT = {name: (RATES[name][0], 1.0, 1.0) for name in HELD}
+"""What stands for these groups in the paper's presets, whose rates do not fall."""
 
 
 def optimizers(**rates: tuple[float, float, float]) -> dict[str, dict[str, Any]]:
@@ -40,7 +45,9 @@ def optimizers(**rates: tuple[float, float, float]) -> dict[str, dict[str, Any]]
         groups[name] = {"optimizer": FusedAdamOptimizerConfig(lr=lr)}
         if (initial_factor, final_factor) != (1.0, 1.0):
             groups[name]["scheduler"] = RunLengthDecaySchedulerConfig(
-                initial_factor=initial_factor, final_factor=final_factor
+                initial_factor=initial_factor,
+                final_factor=final_factor,
+                hold_share=DENSIFICATION_SHARE if name in HELD else 0.0,
             )
     return groups
 
@@ -60,6 +67,7 @@ def paper_pipeline(views_per_iteration: int) -> SadgsPipelineConfig:
         model=SadgsModelConfig(
             ssim_lambda=0.2,
             opacity_reg=0.0,
+            averaged_share=0.0,
             strategy=StructureAwareStrategy(
                 eta_every=1,
                 min_observations=1,
@@ -94,7 +102,7 @@ sadgs_paper = MethodSpecification(
         max_num_iterations=3000,
         pipeline=paper_pipeline(views_per_iteration=1),
         rates_follow_views=False,
-        optimizers=optimizers(scales=(0.01, 1.0, 1.0)),
+        optimizers=optimizers(**CONSTANT, scales=(0.01, 1.0, 1.0)),
     ),
 )
 
@@ -109,6 +117,6 @@ sadgs_paper_indoor = MethodSpecification(
         max_num_iterations=3000,
         pipeline=paper_pipeline(views_per_iteration=2),
         rates_follow_views=False,
-        optimizers=optimizers(scales=(5e-3, 3.0, 0.5), quats=(1e-3, 3.0, 0.5)),
+        optimizers=optimizers(**CONSTANT, scales=(5e-3, 3.0, 0.5), quats=(1e-3, 3.0, 0.5)),
     ),
 )

@@ -34,9 +34,16 @@ _LESS_MEMORY = (
     "(`--downscale-factor 2` after `nerfstudio-data` or `colmap`)"
 )
 _NOTHING_DONE = "stopped before an iteration was done; the same command starts again."
-RATES_OF_FOUR_VIEWS = {"means": (3.0, 3.0), "opacities": (1.5, 1.5), "scales": (2.25, 0.375), "quats": (2.25, 0.375)}
+RATES_OF_FOUR_VIEWS = {
+    "means": (3.0, 3.0),
+    "features_dc": (1.0, 10.0),
+    "features_rest": (1.0, 10.0),
+    "opacities": (1.5, 15.0),
+    "scales": (2.25, 0.375),
+    "quats": (2.25, 0.375),
+}
 """Factors on learning rates at the first and at the last iteration in steps of four views (docs/measurements.md).
-Colours learn at the same rate in all."""
+Those of colours and opacities fall to a tenth in steps of one view, and stay as they are in steps of four."""
 _SAVING_SHARE = 0.01
 """Largest share of the time between two checkpoints by the clock that saving may take."""
 
@@ -114,7 +121,7 @@ class SadgsTrainer(Trainer):
         if self._derived:
             lines.append(
                 f"The number of views and --pipeline.effort {config.pipeline.effort:g} decide this: 0.5 is a draft of "
-                "half as many renderings, 2 resolves more where views are many."
+                "half as many renderings, 2 resolves more, with more Gaussians and, where views are many, renderings."
             )
         if asked is not None and asked > taken:
             lines.append(

@@ -19,8 +19,6 @@ from sadgs_ns.bench import protocol, results
 from sadgs_ns.bench.datasets import image_names, runnable
 from sadgs_ns.bench.protocol import Job, Row, Scene
 from sadgs_ns.bench.run import build_config
-from sadgs_ns.method.schedule import between_one_and_four
-from sadgs_ns.plugin.trainer import RATES_OF_FOUR_VIEWS
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "bench"
 PROTOCOLS = sorted(path.stem for path in CONFIGS.glob("*.yaml"))
@@ -204,52 +202,6 @@ def test_the_main_table_has_three_seeds_of_ours_beside_splatfacto():
     for scene in load("ours").scenes:
         assert seeds["sadgs", scene] == [0, 1, 2]
         assert all(seeds[label, scene] == [0] for label in ("splatfacto", "splatfacto-3k", "effort 0.5", "effort 4"))
-
-
-@pytest.mark.parametrize(
-    ("label", "iterations", "views", "opacity", "windows", "thresholds", "rates"),
-    [
-        (
-            "sadgs before", 3000, 1, 0.1, (500, 100, 100, 1600, 1200, 10), (3e-4, 6e-4),
-            {"means": (1.6e-4, 1.6e-6), "opacities": (0.025, 0.025), "scales": (0.02, 0.02), "quats": (2e-3, 2e-3)},
-        ),
-        (
-            "sadgs-indoor before", 2000, 4, 0.5, (350, 70, 70, 1120, 840, 7), (5e-4, 1e-3),
-            {
-                "means": (4.8e-4, 4.8e-6), "opacities": (0.0375, 0.0375),
-                "scales": (0.045, 0.0075), "quats": (4.5e-3, 7.5e-4),
-            },
-        ),
-    ],
-)  # fmt: skip
-def test_the_presets_of_before_are_rows_with_all_that_they_said(
-    label: str,
-    iterations: int,
-    views: int,
-    opacity: float,
-    windows: tuple[int, ...],
-    thresholds: tuple[float, float],
-    rates: dict[str, tuple[float, float]],
-    tmp_path: Path,
-):
-    for (_, row), config in configs("schedule", tmp_path).items():
-        if row != label:
-            continue
-        strategy = config.pipeline.model.strategy
-        strategy.fit_to_run(config.max_num_iterations)
-        assert (config.max_num_iterations, config.pipeline.views_per_iteration) == (iterations, views)
-        assert config.pipeline.model.initial_opacity == opacity
-        names = ("structure_every", "absgs_every", "refine_start_iter", "refine_stop_iter", "reset_every", "eta_every")
-        assert tuple(getattr(strategy.windows, name) for name in names) == windows
-        assert (strategy.clone_grad2d, strategy.split_absgrad2d) == thresholds
-        for group, (first, last) in rates.items():
-            optimizer, scheduler = config.optimizers[group]["optimizer"], config.optimizers[group].get("scheduler")
-            factors = (1.0, 1.0) if scheduler is None else (scheduler.initial_factor, scheduler.final_factor)
-            of_views = [between_one_and_four(views, at_four) for at_four in RATES_OF_FOUR_VIEWS[group]]
-            if not config.rates_follow_views:
-                of_views = [1.0, 1.0]
-            rate = [optimizer.lr * factor * more for factor, more in zip(factors, of_views, strict=True)]
-            assert rate == pytest.approx([first, last])
 
 
 def content(*rows: dict[str, Any], **changes: Any) -> dict[str, Any]:

@@ -388,7 +388,7 @@ def test_the_papers_presets_are_sadgs_without_what_we_added():
     config, paper, indoor = preset("sadgs"), preset("sadgs-paper"), preset("sadgs-paper-indoor")
     model = config.pipeline.model
     assert model.ssim_lambda > 0.2 and model.opacity_reg > 0 and model.strategy.child_scale > 1
-    model.ssim_lambda, model.opacity_reg, model.strategy.child_scale = 0.2, 0.0, 1.0
+    model.ssim_lambda, model.opacity_reg, model.strategy.child_scale, model.averaged_share = 0.2, 0.0, 1.0, 0.0
     model.strategy.clone_grad2d, model.strategy.split_absgrad2d = 2e-4, 4e-4
     model.strategy.structure_every, model.strategy.absgs_every, model.strategy.reset_every = 500, 100, 1200
     model.strategy.min_opacity, model.strategy.refine_start_iter, model.strategy.refine_stop_iter = 0.005, 100, 1900
@@ -398,6 +398,8 @@ def test_the_papers_presets_are_sadgs_without_what_we_added():
     config.pipeline.epsilon = 1e-6
     config.max_num_iterations, config.pipeline.views_per_iteration, config.rates_follow_views = 3000, 1, False
     config.optimizers["scales"]["optimizer"].lr = 0.01
+    for group in ("features_dc", "features_rest", "opacities"):
+        del config.optimizers[group]["scheduler"]
     config.method_name = "sadgs-paper"
     assert yaml.dump(config) == yaml.dump(paper)
     config.pipeline.views_per_iteration = 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,7 @@ from sadgs_ns.method.codes import decode
 from sadgs_ns.method.schedule import Schedule
 from sadgs_ns.plugin.model import SadgsModel, _load_lpips
 from sadgs_ns.plugin.presets import RATES
-from sadgs_ns.plugin.trainer import SadgsTrainer
+from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 
 @pytest.fixture(scope="module")
@@ -202,6 +203,58 @@ def test_a_resumed_run_equals_one_that_was_never_stopped(colmap: ColmapDataParse
     assert steps == list(range(middle + 1, last + 1))
     assert differences(checkpoint(resumed, last), expected) == []
     assert differences(stopped, expected) != []
+
+
+def test_a_finished_run_is_the_mean_of_its_last_iterations_also_when_it_was_stopped_among_them(
+    colmap: ColmapDataParserConfig, tmp_path: Path
+):
+    iterations, averaged, stop = 20, 6, 16  # The mean is of the iterations 15 to 20.
+
+    def configured(folder: str, share: float) -> SadgsTrainerConfig:
+        config = configure(tmp_path / folder, copy.deepcopy(colmap), iterations)
+        config.pipeline.model.averaged_share = share
+        return config
+
+    iterates: list[dict[str, torch.Tensor]] = []
+    train(
+        configured("last", 0.0),
+        lambda trainer: iterates.append(
+            {name: value.detach().clone() for name, value in trainer.pipeline.model.gauss_params.items()}
+        ),
+    )
+    config = configured("whole", averaged / iterations)
+    config.steps_per_save, config.save_only_latest_checkpoint = stop, False
+    whole = train(config)
+    for name, value in whole.pipeline.model.gauss_params.items():
+        expected = torch.stack([iterate[name] for iterate in iterates[-averaged:]]).double().mean(0)
+        torch.testing.assert_close(value.detach().double(), expected, rtol=1e-5, atol=1e-5)
+    assert not torch.equal(whole.pipeline.model.means, iterates[-1]["means"])
+
+    assert checkpoint(whole, stop)["pipeline"]["_model._extra_state"]["average"]["count"] == stop + 1 - 14
+    config = configured("resumed", averaged / iterations)
+    config.load_dir, config.load_step = whole.checkpoint_dir, stop
+    last = iterations - 1
+    assert differences(checkpoint(train(config), last), checkpoint(whole, last)) == []
+
+
+@pytest.mark.parametrize(("views", "share"), [(1, 0.1), (2, 0.1**0.5), (4, 1.0)])
+def test_rates_of_colours_and_opacities_fall_after_densification_in_steps_of_few_views(
+    views: int, share: float, colmap: ColmapDataParserConfig, tmp_path: Path
+):
+    iterations = 30
+    config = configure(tmp_path, colmap, iterations)
+    config.pipeline.views_per_iteration = views
+    optimizers = set_up(config).optimizers
+    for name, more in (
+        ("features_dc", 1.0),
+        ("features_rest", 1.0),
+        ("opacities", 1.5 ** (math.log(views) / math.log(4))),
+    ):
+        start = RATES[name][0] * more
+        factor = optimizers.schedulers[name].lr_lambdas[0] if name in optimizers.schedulers else lambda step: 1.0
+        rates = [config.optimizers[name]["optimizer"].lr * more * factor(step) for step in (0, 16, 23, iterations)]
+        assert rates == pytest.approx([start, start, start * share**0.5, start * share])
+        assert optimizers.optimizers[name].param_groups[0]["lr"] == pytest.approx(start)
 
 
 def test_resuming_with_other_settings_says_which(

@@ -1,0 +1,65 @@
+"""The mean of the Gaussians' parameters over the last iterations of a run, which is less noisy than the last ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sadgs_ns.method.split import Params
+
+
+class RunningMean:
+    """The mean of parameters over iterations (Polyak and Juditsky, "Acceleration of stochastic approximation by
+    averaging").
+
+    Each step renders few views, so that the parameters keep moving around what is best for all of them. Their mean
+    lies closer to it. Parameters are averaged as they are optimized: log scales, logits of opacities, and quaternions,
+    which move too little within a twentieth of a run to need more than that.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        """Number of iterations in the mean."""
+        self.means: dict[str, Tensor] = {}
+        """Means by the parameters' names, of the parameters' shapes."""
+
+    @torch.no_grad()
+    def add(self, params: Params) -> None:
+        """Take an iteration's parameters into the mean.
+
+        Args:
+            params: Parameters by name, of the same shapes each time. [N, …]
+        """
+        self.count += 1
+        if self.count == 1:
+            self.means = {name: parameter.detach().clone() for name, parameter in params.items()}
+            return
+        for name, mean in self.means.items():
+            mean.lerp_(params[name], 1 / self.count)
+
+    @torch.no_grad()
+    def move_to(self, params: Params) -> None:
+        """Write the mean into the parameters and forget it.
+
+        Args:
+            params: Parameters by name, as `add` saw them. [N, …]
+        """
+        for name, mean in self.means.items():
+            params[name].copy_(mean)
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget what was added."""
+        self.count, self.means = 0, {}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a checkpoint needs; its tensors are the mean's own."""
+        return {"count": self.count, "means": dict(self.means)}
+
+    def load_state_dict(self, state: Mapping[str, Any], device: torch.device) -> None:
+        """Restore what `state_dict` returned."""
+        self.count = state["count"]
+        self.means = {name: mean.to(device) for name, mean in state["means"].items()}
