@@ -1,5 +1,7 @@
 """Fixtures that several modules share, and the third-party warnings that the project's "error" filter lets pass: named,
 so that ours still fail a test.
+
+Where there is a GPU, tests train on it; those that compare runs bit by bit, or fork processes, take the CPU instead.
 """
 
 from __future__ import annotations

@@ -25,6 +25,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+if __name__ == "__main__":
+    # Importing our presets asks torch for a GPU, after which CUDA fails in forks. All runs here are on the CPU.
+    os.environ["CUDA_VISIBLE_DEVICES"] = ""
+
 import numpy as np
 import torch
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig

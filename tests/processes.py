@@ -2,6 +2,9 @@
 
 Importing nerfstudio takes ten seconds, so processes are forked from a server that has imported it and done nothing
 else. The server is started for the first of them, once for each process of pytest.
+
+The server and the processes see no GPU: our presets ask torch for one when they are imported, and CUDA does not work
+in forks of a process that has asked.
 """
 
 from __future__ import annotations
@@ -14,12 +17,14 @@ import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 IMPORTED = ["sadgs_ns.plugin.presets", "sadgs_ns.plugin.model"]
 """What nerfstudio imports for this package's methods."""
 NS_TRAIN = "import sys; from nerfstudio.scripts.train import entrypoint; sys.argv[:] = {}; entrypoint()"
 """The program `ns-train`, to be completed with its name and arguments."""
 
+_NO_GPU = {"CUDA_VISIBLE_DEVICES": ""}
 _SERVER = multiprocessing.get_context("forkserver")
 _SERVER.set_forkserver_preload(IMPORTED)
 
@@ -29,7 +34,8 @@ def python(code: str, environment: Mapping[str, str] = os.environ, timeout: floa
 
     Args:
         code: The program.
-        environment: Its environment. What libraries read when they are imported has the server's values.
+        environment: Its environment, but for the GPUs. What libraries read when they are imported has the server's
+            values.
         timeout: Seconds after which it is killed.
 
     Returns:
@@ -57,7 +63,8 @@ def start(function: Callable[..., None], *arguments: Any) -> Any:
         A `multiprocessing.Process`.
     """
     process = _SERVER.Process(target=function, args=arguments)
-    process.start()
+    with mock.patch.dict(os.environ, _NO_GPU):  # If this is the first process, it starts the server.
+        process.start()
     return process
 
 
@@ -67,7 +74,7 @@ def in_terminal(terminal: str, code: str, environment: Mapping[str, str]) -> Non
     Args:
         terminal: The terminal's device.
         code: The program.
-        environment: Its environment.
+        environment: Its environment, but for the GPUs.
     """
     os.setsid()
     descriptor = os.open(terminal, os.O_RDWR)  # It becomes the controlling one, since the process has none.
@@ -87,7 +94,7 @@ def _into_files(files: tuple[Path, Path], code: str, environment: Mapping[str, s
 def _execute(code: str, environment: Mapping[str, str]) -> None:
     """Run a program as the main one: an error ends it through `sys.excepthook`."""
     os.environ.clear()
-    os.environ.update(environment)
+    os.environ.update({**environment, **_NO_GPU})
     try:
         exec(compile(code, "<string>", "exec"), {"__name__": "__main__"})
     except Exception:

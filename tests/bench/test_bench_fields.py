@@ -102,11 +102,15 @@ def replace_lpips(patch: pytest.MonkeyPatch) -> None:
 
 
 def replace_gsplat(patch: pytest.MonkeyPatch) -> None:
-    """nerfstudio's own model without LPIPS and, where there is no GPU, with the splatter in gsplat's place."""
+    """nerfstudio's own model without LPIPS and torch.compile and, where there is no GPU, with the splatter for gsplat.
+
+    torch.compile takes a minute, and on a GPU warns that TensorFloat32 is off.
+    """
     from nerfstudio.models import splatfacto
     from torchmetrics.image import lpip
 
     patch.setattr(lpip, "LearnedPerceptualImagePatchSimilarity", lambda normalize: torch.nn.Identity())
+    patch.setattr(splatfacto, "get_viewmat", viewmats_from_camera_to_world)  # which is compiled
     if torch.cuda.is_available():
         return
 
@@ -114,7 +118,6 @@ def replace_gsplat(patch: pytest.MonkeyPatch) -> None:
         return splatter.rasterization(**options)
 
     patch.setattr(splatfacto, "rasterization", rasterization)
-    patch.setattr(splatfacto, "get_viewmat", viewmats_from_camera_to_world)  # else torch.compile takes a minute
     patch.setattr(torch.Tensor, "cuda", lambda tensor: tensor)
 
 

@@ -259,7 +259,8 @@ def test_the_conventional_step_clones_or_splits_in_two(early: SadgsPipeline):
 def test_the_photo_and_its_camera_belong_together(early: SadgsPipeline):
     """Where a view's camera puts the SfM points, its photo has their colours, more than any other photo."""
     assert early.model.seed_points is not None
-    points, colors = early.model.seed_points[0].float(), early.model.seed_points[1].float() / 255
+    points, colors = (values.to(early.device).float() for values in early.model.seed_points)
+    colors = colors / 255
     views = [inspect.get_view(early, index) for index in range(TRAIN_VIEWS)]
     for number, view in enumerate(views):
         pixels = (points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]) @ view.K.T

@@ -1,4 +1,4 @@
-"""Training, resuming, evaluating and exporting through nerfstudio, on the CPU and a tiny drawn scene."""
+"""Training, resuming, evaluating and exporting through nerfstudio, on a tiny drawn scene, on a GPU if there is one."""
 
 from __future__ import annotations
 
@@ -187,6 +187,7 @@ def test_training_makes_the_training_views_more_alike(colmap: ColmapDataParserCo
 def test_a_resumed_run_equals_one_that_was_never_stopped(colmap: ColmapDataParserConfig, tmp_path: Path):
     middle, last = 7, 15  # after the structure step of iteration 6, before AbsGS at 9, and beyond the last of them
     config = configure(tmp_path / "whole", colmap, iterations=last + 1)
+    config.machine.device_type = "cpu"  # A GPU adds up gradients in no fixed order.
     config.pipeline.views_per_iteration = 2
     config.steps_per_save, config.save_only_latest_checkpoint = middle, False
     whole = train(config)
@@ -195,6 +196,7 @@ def test_a_resumed_run_equals_one_that_was_never_stopped(colmap: ColmapDataParse
     assert POINTS < numbers[0] != numbers[1]
 
     resumed_config = configure(tmp_path / "resumed", copy.deepcopy(colmap), iterations=last + 1)
+    resumed_config.machine.device_type = "cpu"
     resumed_config.pipeline.views_per_iteration = 2
     resumed_config.load_dir, resumed_config.load_step = whole.checkpoint_dir, middle
     steps: list[int] = []
@@ -304,13 +306,13 @@ def test_the_mean_opacity_weighs_in_the_loss_while_densification_runs(colmap: Co
         reset_every=0,
     )
     config.pipeline.model.opacity_reg = 100.0  # against which the images weigh nothing
-    black = {"rgb": torch.zeros((16, 16, 3)), "background": torch.zeros(3)}
     opacities: list[float] = []
     regularized: list[bool] = []
 
     def look(trainer: SadgsTrainer) -> None:
         model = trainer.pipeline.model
-        losses = model.get_loss_dict(dict(black), {"image": torch.zeros((16, 16, 3))})
+        black = torch.zeros((16, 16, 3), device=model.device)
+        losses = model.get_loss_dict({"rgb": black, "background": black[0, 0]}, {"image": black})
         regularized.append("opacity_reg" in losses)
         opacities.append(float(torch.sigmoid(model.opacities.detach()).mean()))
         if regularized[-1]:
@@ -378,13 +380,13 @@ def test_a_training_step_updates_the_gaussians_in_one_launch(
 ):
     adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
     launch, launched = adam.adam_step, []
+    trainer = set_up(configure(tmp_path, colmap, 3))  # On a GPU this launches the kernel once to compile it.
 
     def counted(parameters: tuple[torch.Tensor, ...], *args: Any, **kwargs: Any) -> None:
         launched.append(len(parameters))
         launch(parameters, *args, **kwargs)
 
     monkeypatch.setattr(adam, "adam_step", counted)
-    trainer = set_up(configure(tmp_path, colmap, 3))
     before = {name: parameter.detach().clone() for name, parameter in trainer.pipeline.model.gauss_params.items()}
     for name in before:
         trainer.optimizers.optimizers[name].triton = True  # type: ignore[attr-defined] # in its interpreter, without CUDA
@@ -530,8 +532,9 @@ def test_the_loss_of_views_is_the_mean_of_their_own(tmp_path: Path, camera_optim
 def test_images_in_bytes_become_what_two_operations_made_of_them(tmp_path: Path, colmap: ColmapDataParserConfig):
     model = set_up(configure(tmp_path, colmap)).pipeline.model
     image = torch.arange(256, dtype=torch.uint8).view(-1, 2, 1).expand(-1, -1, 3)
-    assert torch.equal(model.get_gt_img(image), image.float() / 255.0)
-    assert torch.equal(model.get_gt_img(image.double()), image.double())
+    on_device = image.to(model.device)
+    assert torch.equal(model.get_gt_img(image), on_device.float() / 255.0)
+    assert torch.equal(model.get_gt_img(image.double()), on_device.double())
 
 
 def test_masked_pixels_have_no_structure_tensor_and_no_part_in_the_loss(tmp_path: Path):
@@ -543,12 +546,12 @@ def test_masked_pixels_have_no_structure_tensor_and_no_part_in_the_loss(tmp_path
         assert decode(tensor[:, : WIDTH // 2]).isnan().all()
         assert decode(tensor[:, WIDTH // 2 :]).amax() > 0
     data = pipeline.datamanager.cached_train[0]
-    background = torch.zeros(3)
+    background = torch.zeros(3, device=pipeline.device)
 
     def loss(rgb: torch.Tensor) -> torch.Tensor:
         return pipeline.model.get_loss_dict({"rgb": rgb, "background": background}, data)["main_loss"]
 
-    rgb = torch.rand(HEIGHT, WIDTH, 3)
+    rgb = torch.rand((HEIGHT, WIDTH, 3), device=pipeline.device)
     left, right = rgb.clone(), rgb.clone()
     left[:, : WIDTH // 2] += 0.3
     right[:, WIDTH // 2 :] += 0.3
@@ -561,14 +564,15 @@ def test_transparent_images_train_in_front_of_the_background(tmp_path: Path):
     config.pipeline.model.background_color = "white"
     config.pipeline.model.random_init = True
     trainer = set_up(config)
-    data = trainer.pipeline.datamanager.cached_train[0]
+    model, data = trainer.pipeline.model, trainer.pipeline.datamanager.cached_train[0]
     assert data["image"].shape[-1] == 4
-    target = trainer.pipeline.model.composite_with_background(data["image"] / 255, torch.ones(3))
+    white = torch.ones(3, device=model.device)
+    target = model.composite_with_background(data["image"].to(model.device) / 255, white)
     assert (target[:, : WIDTH // 2] == 1).all() and target[:, WIDTH // 2 :].amin() < 1
-    trainer.pipeline.model.set_background(torch.zeros(3))  # as the viewer does whenever it draws
+    model.set_background(torch.zeros(3))  # as the viewer does whenever it draws
     torch.testing.assert_close(trainer.pipeline.structure_maps.photo(data), target)
     trainer.train()
-    assert is_finite(trainer.pipeline.model)
+    assert is_finite(model)
 
 
 def test_blender_data_train_with_the_alpha_colour_that_its_parser_gives_them(tmp_path: Path):
@@ -634,5 +638,5 @@ def test_a_crop_box_hides_what_lies_outside(trained: SadgsTrainer):
     assert torch.equal(accumulation(1000.0, 0.0), everything)
     middle = float(model.means.median())
     assert 0 < accumulation(0.5, middle).sum() < everything.sum()
-    assert torch.equal(accumulation(0.5, 100.0), torch.zeros(HEIGHT, WIDTH, 1))
+    assert torch.equal(accumulation(0.5, 100.0), torch.zeros_like(everything))
     assert torch.equal(model.get_outputs_for_camera(camera)["accumulation"], everything)

@@ -173,14 +173,14 @@ def test_the_clock_gives_way_to_steps_and_makes_nothing_in_a_short_run(
 def test_ctrl_c_on_ns_train_prints_the_command_that_resumes_it(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    program = str(Path(sys.executable).with_name("ns-train"))
     iterations = 60
-    command = [program, "sadgs", "--output-dir", str(tmp_path), "--experiment-name", "a run", "--timestamp", "first"]
+    command = ["ns-train", "sadgs", "--output-dir", str(tmp_path), "--experiment-name", "a run", "--timestamp", "first"]
     command += ["--max-num-iterations", str(iterations), "--steps-per-save", "5", "--vis", "tensorboard"]
     command += ["--pipeline.model.strategy.refine-stop-iter", "0", "--machine.device-type", "cpu"]
     command += ["colmap", "--data", str(scene), "--colmap-path", str(SPARSE_FOLDER), "--downscale-factor", "1"]
     folder = tmp_path / "a run" / "sadgs" / "first" / "nerfstudio_models"
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    program = [sys.executable, "-c", processes.NS_TRAIN.format(command)]  # wherever pip has put the script ns-train
+    process = subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
         deadline = time.monotonic() + 100
         while not list(folder.glob("*.ckpt")) and process.poll() is None and time.monotonic() < deadline:
