@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import stat
 import threading
+import time
 from collections.abc import Callable
 from types import TracebackType
 from typing import Any
 
 HANG_UP: int | None = getattr(signal, "SIGHUP", None)
 """The signal that says that the terminal is gone, as of an ssh that was cut off; Windows has none."""
+_HANG_UP_SECONDS = 2.0
+"""Longest time from a write that fails because the terminal is gone to the signal that says so."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, *([] if HANG_UP is None else [HANG_UP]))
 """Signals that ask a run to stop."""
 
@@ -60,6 +64,17 @@ class Interrupts:
         """Raise Interrupted if a signal has come."""
         if self._received is not None:
             raise Interrupted(self._received)
+
+    def behind(self, error: OSError) -> Interrupted | None:
+        """Return the interruption that made a write fail, or None if the error has another cause.
+
+        The kernel takes a terminal away before it sends SIGHUP, so that what is printed between fails.
+        """
+        if error.errno == errno.EIO and HANG_UP in self._previous:
+            end = time.monotonic() + _HANG_UP_SECONDS
+            while self._received is None and time.monotonic() < end:
+                time.sleep(0.01)
+        return None if self._received is None or self._received != HANG_UP else Interrupted(self._received)
 
     def _handle(self, number: int, frame: object) -> None:
         if self._received is not None:

@@ -250,6 +250,11 @@ class SadgsTrainer(Trainer):
                     self._stop_if_stuck()
                 except Interrupted as interrupted:
                     self._stop(interrupted, total)
+                except OSError as error:
+                    interruption = self._interrupts.behind(error)
+                    if interruption is None or self._stepping:
+                        raise
+                    self._stop(interruption, total)
         except torch.cuda.OutOfMemoryError as error:
             out_of_memory = _memory(error)  # The RunError is raised below, when the failed step's tensors are gone.
         except OSError as error:
