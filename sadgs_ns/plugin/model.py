@@ -512,7 +512,7 @@ class SadgsModel(SplatfactoModel):
         return {name: value for name, value in metrics.items() if "lpips" not in name or value == value}, images
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Return what a checkpoint needs besides parameters: the step and the strategy's state."""
+        """Return what a checkpoint needs besides parameters: the step, the strategy's state and the mean so far."""
         return {
             "step": self.step,
             "strategy_state": dict(self.strategy_state),
