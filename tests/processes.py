@@ -48,7 +48,7 @@ def python(code: str, environment: Mapping[str, str] = os.environ, timeout: floa
         files = Path(folder, "output"), Path(folder, "errors")
         for file in files:
             file.touch()
-        process = start(_into_files, files, code, dict(environment))
+        process = start(into_files, files, code, dict(environment))
         process.join(timeout)
         if process.is_alive():
             process.kill()
@@ -84,7 +84,8 @@ def in_terminal(terminal: str, code: str, environment: Mapping[str, str]) -> Non
     _execute(code, environment)
 
 
-def _into_files(files: tuple[Path, Path], code: str, environment: Mapping[str, str]) -> None:
+def into_files(files: tuple[Path, Path], code: str, environment: Mapping[str, str]) -> None:
+    """Run a program whose standard output and error are written to two files; for `start`."""
     for standard, file in zip((1, 2), files, strict=True):
         with file.open("wb") as opened:
             os.dup2(opened.fileno(), standard)

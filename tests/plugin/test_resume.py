@@ -10,8 +10,6 @@ import shlex
 import shutil
 import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -180,18 +178,20 @@ def test_ctrl_c_on_ns_train_prints_the_command_that_resumes_it(
     command += ["--pipeline.model.strategy.refine-stop-iter", "0", "--machine.device-type", "cpu"]
     command += ["colmap", "--data", str(scene), "--colmap-path", str(SPARSE_FOLDER), "--downscale-factor", "1"]
     folder = tmp_path / "a run" / "sadgs" / "first" / "nerfstudio_models"
-    program = [sys.executable, "-c", processes.NS_TRAIN.format(command)]  # wherever pip has put the script ns-train
-    process = subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    files = tmp_path / "output", tmp_path / "errors"
+    program = processes.NS_TRAIN.format(command)  # It does not matter where pip has put the script ns-train.
+    process = processes.start(processes.into_files, files, program, dict(os.environ))
     try:
         deadline = time.monotonic() + 100
-        while not list(folder.glob("*.ckpt")) and process.poll() is None and time.monotonic() < deadline:
+        while not list(folder.glob("*.ckpt")) and process.is_alive() and time.monotonic() < deadline:
             time.sleep(0.01)
-        process.send_signal(signal.SIGINT)
-        printed, _ = process.communicate(timeout=60)
+        os.kill(process.pid, signal.SIGINT)
+        process.join(60)
+        printed, errors = (file.read_text() for file in files)
+        assert process.exitcode == 130, printed + errors
     finally:
         process.kill()
-    assert process.returncode == 130, printed
-    assert "Traceback" not in printed
+    assert "Traceback" not in printed + errors
     line = one_line(printed, "SIGINT")
     (path,) = folder.iterdir()
     done = torch.load(path, weights_only=True)["step"] + 1
