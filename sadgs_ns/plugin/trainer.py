@@ -34,16 +34,9 @@ _LESS_MEMORY = (
     "(`--downscale-factor 2` after `nerfstudio-data` or `colmap`)"
 )
 _NOTHING_DONE = "stopped before an iteration was done; the same command starts again."
-RATES_OF_FOUR_VIEWS = {
-    "means": (3.0, 3.0),
-    "features_dc": (1.0, 10.0),
-    "features_rest": (1.0, 10.0),
-    "opacities": (1.5, 15.0),
-    "scales": (2.25, 0.375),
-    "quats": (2.25, 0.375),
-}
+RATES_OF_FOUR_VIEWS = {"means": (3.0, 3.0), "opacities": (1.5, 1.5), "scales": (2.25, 0.375), "quats": (2.25, 0.375)}
 """Factors on learning rates at the first and at the last iteration in steps of four views (docs/measurements.md).
-Those of colours and opacities fall to a tenth in steps of one view, and stay as they are in steps of four."""
+Rates that fall once densification has ended fall less in steps of several views, and not at all in steps of four."""
 _SAVING_SHARE = 0.01
 """Largest share of the time between two checkpoints by the clock that saving may take."""
 
@@ -214,7 +207,12 @@ class SadgsTrainer(Trainer):
             scheduler, optimizer = group.setdefault("scheduler", None), group["optimizer"]
             if isinstance(optimizer, FusedAdamOptimizerConfig):
                 optimizer.fused &= self.config.pipeline.model.fused
-            if isinstance(scheduler, RunLengthDecaySchedulerConfig) and scheduler.max_steps is None:
+            if not isinstance(scheduler, RunLengthDecaySchedulerConfig):
+                continue
+            if self.config.rates_follow_views and scheduler.hold_share > 0:
+                constant = 1 / scheduler.final_factor
+                scheduler.final_factor *= between_one_and_four(self.pipeline.views_per_iteration, constant)
+            if scheduler.max_steps is None:
                 scheduler.max_steps = self.config.max_num_iterations
         # Positions move in proportion to the cameras' extent, as in 3DGS; splatfacto does not do so.
         optimizers["means"]["optimizer"].lr *= self.pipeline.model.strategy_state["scene_scale"]

@@ -91,6 +91,16 @@ def test_rates_follow_the_views_of_a_step(config: SadgsTrainerConfig):
     assert rates(4) == rates(1)
 
 
+def test_late_rates_that_are_constant_by_hand_stay_so_with_any_number_of_views(config: SadgsTrainerConfig):
+    config.optimizers["opacities"]["scheduler"].final_factor = 1.0
+    del config.optimizers["features_dc"]["scheduler"]  # as in the config.yml of a run before rates fell late
+    for views in (1, 2, 4):
+        config.pipeline.views_per_iteration = views
+        schedulers = set_up(config).optimizers.schedulers
+        assert schedulers["opacities"].lr_lambdas[0](ITERATIONS) == pytest.approx(1.0)
+        assert "features_dc" not in schedulers
+
+
 def test_a_run_says_where_there_are_fewer_views_than_a_step_should_take(
     config: SadgsTrainerConfig,
     says: Callable[[SadgsTrainerConfig], tuple[SadgsTrainer, str]],
