@@ -304,6 +304,15 @@ def test_options_that_are_missing_in_an_older_config_get_their_defaults():
     assert yaml.dump(yaml.load(text, Loader=yaml.Loader)) == yaml.dump(preset("sadgs"))
 
 
+def test_a_run_of_before_an_option_that_changes_training_goes_on_without_it():
+    text = yaml.dump(preset("sadgs"))
+    for line in ("    averaged_share: 0.05\n", "rates_follow_views: true\n"):
+        assert line in text
+        text = text.replace(line, "")
+    config = yaml.load(text, Loader=yaml.Loader)
+    assert (config.pipeline.model.averaged_share, config.rates_follow_views) == (0.0, False)
+
+
 def test_options_that_this_version_lacks_are_named_where_they_changed_the_run(capsys: pytest.CaptureFixture[str]):
     text = with_options(yaml.dump(preset("sadgs")), "densify: false", "l2_lambda: 2.0", "some_option: [1]")
     config = yaml.load(text, Loader=yaml.Loader)
