@@ -120,23 +120,6 @@ def starting_points(
     )
 
 
-def clear_of_cameras(means: Tensor, radii: Tensor, positions: Tensor) -> Tensor:
-    """Which points have no camera nearer than their radius.
-
-    Args:
-        means: World units. [N, 3]
-        radii: World units. [N]
-        positions: Camera centres in world units. [C, 3]
-
-    Returns:
-        bool [N]
-    """
-    # A tree's distances are differences in float64: torch.cdist's matrix products cancel far from the origin.
-    tree = KDTree(positions.detach().cpu().double().numpy())
-    distances, _ = tree.query(means.detach().cpu().double().numpy(), workers=-1)  # [N]
-    return torch.from_numpy(distances).to(means.device) >= radii
-
-
 def camera_extent(positions: Tensor) -> float:
     """The extent of the cameras, which is 1.1 times the largest distance from their centre (3DGS).
 

@@ -27,13 +27,8 @@ from torch import Tensor
 from sadgs_ns.data.cameras import refuse_unsupported_cameras
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.averaging import RunningMean
-from sadgs_ns.method.initialization import (
-    POINT_OPACITY,
-    camera_extent,
-    clear_of_cameras,
-    plausible_points,
-    starting_points,
-)
+from sadgs_ns.method.clearance import clear_of_cameras, limit_scales
+from sadgs_ns.method.initialization import POINT_OPACITY, camera_extent, plausible_points, starting_points
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.outliers import POINT_SHARE, REACH
@@ -42,6 +37,8 @@ from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_wor
 CAMERA_CLEARANCE = 2.0
 """Initial Gaussians nearer to a camera than this many of their standard deviations are dropped. The paper keeps them;
 on the scene `south` dropping them brought 1.7 dB, elsewhere nothing (docs/measurements.md)."""
+LIMIT_EVERY = 25
+"""Iterations between two times that scales are limited: an axis can grow by at most a factor of 3 until then."""
 BILATERAL_GRID_SHAPE = (16, 16, 8)
 """Cells of a view's bilateral grid in x, y and guidance, as in splatfacto and in "Bilateral Guided Radiance Field
 Processing"."""
@@ -90,6 +87,9 @@ class SadgsModelConfig(InstantiateConfig):
     averaged_share: float = 0.05
     """Share of the run, at its end, over which the Gaussians' parameters are averaged, in [0, 0.3].
     The finished run has the mean; 0 leaves it the last iteration's."""
+    max_angular_scale: float = 0.3
+    """Longest standard deviation of a Gaussian as a share of its distance from the nearest training camera.
+    With 0.3 no camera is within what is drawn of a Gaussian, which ends at 3.33 of them; 0 sets no limit."""
     use_scale_regularization: bool = False
     """Penalize Gaussians more than ten times as long as thick (PhysGaussian), against spikes."""
     use_bilateral_grid: bool = False
@@ -114,6 +114,10 @@ class SadgsModelConfig(InstantiateConfig):
             raise InputError(f"pipeline.model.opacity_reg must be in [0, 100], got {self.opacity_reg:g}.")
         if not 0 <= self.averaged_share <= 0.3:
             raise InputError(f"pipeline.model.averaged_share must be in [0, 0.3], got {self.averaged_share:g}.")
+        if not 0 <= self.max_angular_scale < math.inf:
+            raise InputError(
+                f"pipeline.model.max_angular_scale must be finite and not negative, got {self.max_angular_scale:g}."
+            )
         if not 0 <= self.sh_degree <= 4:
             raise InputError(f"pipeline.model.sh_degree must be in [0, 4], got {self.sh_degree}.")
         if not 1 <= self.num_random <= _MOST_RANDOM:
@@ -166,6 +170,7 @@ class SadgsModel(SplatfactoModel):
         self._lpips: list[torch.nn.Module | None] = []  # In a list its weights stay out of the checkpoint.
         self.step = 0
         self.average = RunningMean()
+        self.camera_positions: Tensor | None = None  # [C, 3]
         self.infos: list[dict[str, Any]] = []
         self.crop_box: OrientedBox | None = None
         self.viewer_outputs: Callable[[Cameras, dict[str, Tensor]], dict[str, Tensor]] | None = None
@@ -231,8 +236,9 @@ class SadgsModel(SplatfactoModel):
             positions: Camera centres in world units. [C, 3]
         """
         self.strategy_state["scene_scale"] = camera_extent(positions)
+        self.camera_positions = positions.to(self.means)
         radii = CAMERA_CLEARANCE * self.scales.detach().exp().amax(dim=1)  # [N]
-        keep = clear_of_cameras(self.means.detach(), radii, positions.to(self.means))  # [N]
+        keep = clear_of_cameras(self.means.detach(), radii, self.camera_positions)  # [N]
         if keep.any():
             for parameter in self.gauss_params.values():
                 parameter.data = parameter.data[keep]
@@ -254,7 +260,7 @@ class SadgsModel(SplatfactoModel):
         return super().get_training_callbacks(training_callback_attributes)
 
     def step_post_backward(self, step: int) -> None:
-        """Hand the step's forward passes to the strategy, and average the parameters when the run nears its end."""
+        """Hand the step's forward passes to the strategy, limit scales, and average the parameters at the run's end."""
         if self.infos:
             self.strategy.step_post_backward(
                 self.gauss_params, self.optimizers, self.strategy_state, self.step, self.infos
@@ -263,10 +269,13 @@ class SadgsModel(SplatfactoModel):
         iterations, done = self.strategy.run_length, self.step + 1
         if done <= iterations - round(self.config.averaged_share * iterations):
             self.average.clear()  # A run that was to end here, and is trained on, may have begun to average.
-            return
-        self.average.add(self.gauss_params)
-        if done >= iterations:
-            self.average.move_to(self.gauss_params)
+        else:
+            self.average.add(self.gauss_params)
+            if done >= iterations:
+                self.average.move_to(self.gauss_params)
+        share, positions = self.config.max_angular_scale, self.camera_positions
+        if share > 0 and positions is not None and (done % LIMIT_EVERY == 0 or done >= iterations):
+            limit_scales(self.scales, self.means, positions, share)
 
     def wants_structure_tensors(self, step: int) -> bool:
         """Tell whether the strategy will observe η at this step."""

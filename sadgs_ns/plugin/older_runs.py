@@ -58,7 +58,7 @@ CONSTANTS: dict[str, Any] = {
 """Removed options at the values that the method has kept: a run with these lacks nothing."""
 
 
-BEFORE: dict[str, Any] = {"rates_follow_views": False, "averaged_share": 0.0}
+BEFORE: dict[str, Any] = {"rates_follow_views": False, "averaged_share": 0.0, "max_angular_scale": 0.0}
 """New options whose default changes a run, at the value that runs of earlier versions had."""
 
 

@@ -8,7 +8,6 @@ import torch
 from sadgs_ns.method.initialization import (
     bounding_box_points,
     camera_extent,
-    clear_of_cameras,
     neighbour_scales,
     plausible_points,
     starting_points,
@@ -62,22 +61,6 @@ def test_points_come_first_and_the_faces_faint_grey_and_a_cell_large_after_them(
     ):
         assert torch.equal(value[:20], before) and len(value) == 20 + len(faces)
         torch.testing.assert_close(value[20:], torch.as_tensor(added).expand_as(value[20:]))
-
-
-def test_points_are_clear_of_cameras_from_their_radius_on():
-    means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]])
-    positions = torch.tensor([[0.0, 0, 2], [9, 0, 0]])
-    assert clear_of_cameras(means, torch.tensor([2.0, 2.5, 3.0]), positions).tolist() == [True, False, True]
-
-
-@pytest.mark.parametrize("offset", [0.0, 1_000.0, 100_000.0])
-def test_distances_to_cameras_are_exact_far_from_the_origin(offset: float):
-    generator = torch.Generator().manual_seed(0)
-    means = torch.rand((5_000, 3), generator=generator) + offset
-    positions = torch.rand((40, 3), generator=generator) + offset
-    distances = (means.double()[:, None] - positions.double()).norm(dim=-1).amin(dim=1)  # [5000]
-    radii = distances.float() * torch.where(torch.arange(5_000) % 2 == 0, 0.99, 1.01)
-    assert torch.equal(clear_of_cameras(means, radii, positions), distances >= radii)
 
 
 def test_one_wild_camera_does_not_decide_the_extent():

@@ -91,6 +91,11 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig
         ("viewer.websocket_port", 99999, "viewer.websocket_port must be in [1, 65535], got 99999."),
         ("pipeline.effort", 0.0, "pipeline.effort must be in (0, 100], got 0."),
         ("pipeline.model.averaged_share", 0.5, "pipeline.model.averaged_share must be in [0, 0.3], got 0.5."),
+        (
+            "pipeline.model.max_angular_scale",
+            -0.1,
+            "pipeline.model.max_angular_scale must be finite and not negative, got -0.1.",
+        ),
         ("pipeline.effort", math.nan, "pipeline.effort must be in (0, 100], got nan."),
         ("load_step", 3, "load_step is 3, but load_dir is not set: add --load-dir with the folder of a run."),
         ("optimizers.means.optimizer.lr", math.nan, "optimizers.means.optimizer.lr must be in [0, 1], got nan."),

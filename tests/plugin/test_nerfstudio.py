@@ -215,6 +215,7 @@ def test_a_finished_run_is_the_mean_of_its_last_iterations_also_when_it_was_stop
     def configured(folder: str, share: float) -> SadgsTrainerConfig:
         config = configure(tmp_path / folder, copy.deepcopy(colmap), iterations)
         config.pipeline.model.averaged_share = share
+        config.machine.device_type = "cpu"  # A GPU adds up gradients in no fixed order.
         return config
 
     iterates: list[dict[str, torch.Tensor]] = []
@@ -237,6 +238,30 @@ def test_a_finished_run_is_the_mean_of_its_last_iterations_also_when_it_was_stop
     config.load_dir, config.load_step = whole.checkpoint_dir, stop
     last = iterations - 1
     assert differences(checkpoint(train(config), last), checkpoint(whole, last)) == []
+
+
+@pytest.mark.parametrize("limit", [0.0, 0.3])
+def test_no_gaussian_of_a_run_is_larger_than_its_distance_from_the_cameras_allows(
+    limit: float, colmap: ColmapDataParserConfig, tmp_path: Path
+):
+    config = configure(tmp_path, copy.deepcopy(colmap), 28, refine_stop_iter=0)
+    config.pipeline.model.max_angular_scale = limit
+    config.optimizers["scales"]["optimizer"].lr = 0.3  # so that some grow into giants
+    largest: list[float] = []
+
+    def look(trainer: SadgsTrainer) -> None:
+        model, cameras = trainer.pipeline.model, trainer.pipeline.datamanager.train_dataset.cameras
+        positions = cameras.camera_to_worlds[:, :, 3].to(model.means)
+        distances = (model.means.detach()[:, None] - positions).norm(dim=-1).amin(dim=1)  # [N]
+        largest.append(float((model.scales.detach().exp().amax(dim=1) / distances).max()))
+
+    assert is_finite(train(config, look).pipeline.model)
+    at_limits = [largest[iteration - 1] for iteration in (25, 28)]
+    if limit:
+        assert max(at_limits) <= limit * 1.0001
+        assert max(largest) > 2 * limit  # in between they grow, or the limit would have nothing to do
+    else:
+        assert min(at_limits) > 1
 
 
 @pytest.mark.parametrize(("views", "share"), [(1, 0.1), (2, 0.1**0.5), (4, 1.0)])

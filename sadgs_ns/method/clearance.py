@@ -1,0 +1,55 @@
+"""How near Gaussians may come to cameras, for their size.
+
+What a Gaussian looks like is computed from its centre (EWA splatting): a linear approximation, which fails where the
+Gaussian subtends a large angle. A giant beside the field of view, whose tail is all that training views see of it, can
+cover every pixel of another view.
+"""
+
+from __future__ import annotations
+
+import torch
+from scipy.spatial import KDTree
+from torch import Tensor
+
+_PAIRS = 2**24
+"""Distances from Gaussians to cameras that are held at a time: 64 MB."""
+_LEAST_LIMIT = 1e-7
+"""World units. A Gaussian around a camera's very centre keeps this size, so that its logarithm is finite."""
+
+
+def clear_of_cameras(means: Tensor, radii: Tensor, positions: Tensor) -> Tensor:
+    """Which points have no camera nearer than their radius.
+
+    Args:
+        means: World units. [N, 3]
+        radii: World units. [N]
+        positions: Camera centres in world units. [C, 3]
+
+    Returns:
+        bool [N]
+    """
+    # A tree's distances are differences in float64: torch.cdist's matrix products cancel far from the origin.
+    tree = KDTree(positions.detach().cpu().double().numpy())
+    distances, _ = tree.query(means.detach().cpu().double().numpy(), workers=-1)  # [N]
+    return torch.from_numpy(distances).to(means.device) >= radii
+
+
+@torch.no_grad()
+def limit_scales(scales: Tensor, means: Tensor, positions: Tensor, angular_scale: float) -> None:
+    """Shorten, in place, the axes that are too long for the distance from the nearest camera.
+
+    The host does not wait for the device.
+
+    Args:
+        scales: Logarithms of the standard deviations along the Gaussians' axes, in world units. [N, 3]
+        means: World units. [N, 3]
+        positions: Camera centres in world units, C > 0. [C, 3]
+        angular_scale: Largest standard deviation, as a share of that distance, > 0.
+    """
+    step = max(_PAIRS // len(positions), 1)
+    for first in range(0, len(means), step):
+        rows = slice(first, first + step)
+        # Differences, not matrix products, which cancel far from the origin.
+        distances = torch.cdist(means[rows], positions, compute_mode="donot_use_mm_for_euclid_dist")  # [n, C]
+        limits = (angular_scale * distances.amin(dim=1)).clamp_min(_LEAST_LIMIT).log()  # [n]
+        scales[rows] = torch.minimum(scales[rows], limits[:, None])
