@@ -87,9 +87,9 @@ class SadgsModelConfig(InstantiateConfig):
     averaged_share: float = 0.05
     """Share of the run, at its end, over which the Gaussians' parameters are averaged, in [0, 0.3].
     The finished run has the mean; 0 leaves it the last iteration's."""
-    max_angular_scale: float = 0.3
+    max_angular_scale: float = 0.5
     """Longest standard deviation of a Gaussian as a share of its distance from the nearest training camera.
-    With 0.3 no camera is within what is drawn of a Gaussian, which ends at 3.33 of them; 0 sets no limit."""
+    A longer one can cover a view beside which it lies with haze; 0 sets no limit."""
     use_scale_regularization: bool = False
     """Penalize Gaussians more than ten times as long as thick (PhysGaussian), against spikes."""
     use_bilateral_grid: bool = False

@@ -306,7 +306,7 @@ def test_options_that_are_missing_in_an_older_config_get_their_defaults():
 
 def test_a_run_of_before_an_option_that_changes_training_goes_on_without_it():
     text = yaml.dump(preset("sadgs"))
-    for line in ("    averaged_share: 0.05\n", "    max_angular_scale: 0.3\n", "rates_follow_views: true\n"):
+    for line in ("    averaged_share: 0.05\n", "    max_angular_scale: 0.5\n", "rates_follow_views: true\n"):
         assert line in text
         text = text.replace(line, "")
     config = yaml.load(text, Loader=yaml.Loader)

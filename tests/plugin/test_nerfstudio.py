@@ -240,7 +240,7 @@ def test_a_finished_run_is_the_mean_of_its_last_iterations_also_when_it_was_stop
     assert differences(checkpoint(train(config), last), checkpoint(whole, last)) == []
 
 
-@pytest.mark.parametrize("limit", [0.0, 0.3])
+@pytest.mark.parametrize("limit", [0.0, 0.5])
 def test_no_gaussian_of_a_run_is_larger_than_its_distance_from_the_cameras_allows(
     limit: float, colmap: ColmapDataParserConfig, tmp_path: Path
 ):
