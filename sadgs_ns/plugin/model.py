@@ -38,7 +38,7 @@ CAMERA_CLEARANCE = 2.0
 """Initial Gaussians nearer to a camera than this many of their standard deviations are dropped. The paper keeps them;
 on the scene `south` dropping them brought 1.7 dB, elsewhere nothing (docs/measurements.md)."""
 LIMIT_EVERY = 25
-"""Iterations between two times that scales are limited: an axis can grow by at most a factor of 3 until then."""
+"""Iterations between two times that scales are limited; at the presets' rates an axis grows threefold until then."""
 BILATERAL_GRID_SHAPE = (16, 16, 8)
 """Cells of a view's bilateral grid in x, y and guidance, as in splatfacto and in "Bilateral Guided Radiance Field
 Processing"."""
