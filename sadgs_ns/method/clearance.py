@@ -8,7 +8,6 @@ cover every pixel of another view.
 from __future__ import annotations
 
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor
 
 _PAIRS = 2**24
@@ -28,10 +27,7 @@ def clear_of_cameras(means: Tensor, radii: Tensor, positions: Tensor) -> Tensor:
     Returns:
         bool [N]
     """
-    # A tree's distances are differences in float64: torch.cdist's matrix products cancel far from the origin.
-    tree = KDTree(positions.detach().cpu().double().numpy())
-    distances, _ = tree.query(means.detach().cpu().double().numpy(), workers=-1)  # [N]
-    return torch.from_numpy(distances).to(means.device) >= radii
+    return _distances(means, positions) >= radii
 
 
 @torch.no_grad()
@@ -46,10 +42,13 @@ def limit_scales(scales: Tensor, means: Tensor, positions: Tensor, angular_scale
         positions: Camera centres in world units, C > 0. [C, 3]
         angular_scale: Largest standard deviation, as a share of that distance, > 0.
     """
-    step = max(_PAIRS // len(positions), 1)
-    for first in range(0, len(means), step):
-        rows = slice(first, first + step)
-        # Differences, not matrix products, which cancel far from the origin.
-        distances = torch.cdist(means[rows], positions, compute_mode="donot_use_mm_for_euclid_dist")  # [n, C]
-        limits = (angular_scale * distances.amin(dim=1)).clamp_min(_LEAST_LIMIT).log()  # [n]
-        scales[rows] = torch.minimum(scales[rows], limits[:, None])
+    limits = (angular_scale * _distances(means, positions)).clamp_min(_LEAST_LIMIT).log()  # [N]
+    scales.copy_(torch.minimum(scales, limits[:, None]))
+
+
+def _distances(means: Tensor, positions: Tensor) -> Tensor:
+    """Return the distance of each point from the nearest camera. [N, 3], [C, 3] → [N]"""
+    some = means.split(max(_PAIRS // len(positions), 1))
+    # Differences, not matrix products, which cancel far from the origin.
+    mode = "donot_use_mm_for_euclid_dist"
+    return torch.cat([torch.cdist(part, positions, compute_mode=mode).amin(dim=1) for part in some])
