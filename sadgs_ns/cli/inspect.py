@@ -220,7 +220,7 @@ def conventional_step(model: SadgsModel, gradients: dict[str, Tensor]) -> Step:
 def view_panels(pipeline: SadgsPipeline, view: View, statistics: dict[str, Tensor]) -> dict[str, Panel]:
     """The pictures of one view, by name."""
     model, constant = pipeline.model, pipeline.config.frequency_constant
-    params, options = dict(model.gauss_params.items()), {"rasterize_mode": model.config.rasterize_mode}
+    params, options = dict(model.gauss_params.items()), model.drawing
     counts = model.strategy.children_now(model.gauss_params, statistics)
     is_low = model.strategy.consistently_low(statistics)
     height, width = view.photo.shape[:2]
@@ -267,7 +267,7 @@ def step_panels(model: SadgsModel, view: View, conventional: Step, structure: St
     camera = (viewmat, K * K.new_tensor([[enlarge], [enlarge], [1.0]]), enlarge * width, enlarge * height)
 
     def panel(title: str, params: Any, its_colors: Tensor) -> Panel:
-        render, _ = gaussian_maps.blend(params, its_colors, *camera, rasterize_mode=model.config.rasterize_mode)
+        render, _ = gaussian_maps.blend(params, its_colors, *camera, **model.drawing)
         return Panel(f"{title}: {len(params['means']):,} Gaussians", to_picture(render))
 
     return [

@@ -39,7 +39,7 @@ from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 PRESET = "sadgs"
-ABSGS_THRESHOLD_FACTOR = 12.0
+ABSGS_THRESHOLD_FACTOR = 16.0
 """What AbsGS's gradient thresholds are multiplied by. Gradients are normalised by the image's size and grow with a
 Gaussian's share of it; the demo's few are tens of times wider, relative to the image, than those of a photograph. At
 the preset's thresholds nearly all were split each time, and the cap was full before the first structure step."""

@@ -22,8 +22,8 @@ MOST_VIEWS = 4
 MORE_VISITS_FROM = (50, 90)
 """Number of training views up to which effort above 1 adds no visits, because they would overfit, and number from which
 it multiplies them."""
-GROWTH_WITH_EFFORT = (-0.74, 0.6)
-"""Power of effort that multiplies the thresholds of growth, and the least factor: effort 2 and more is 0.6."""
+GROWTH_WITH_EFFORT = (-0.32, 0.8)
+"""Power of effort that multiplies the thresholds of growth, and the least factor: effort 2 and more is 0.8."""
 DENSIFICATION_SHARE = 16 / 30
 """Share of a run in which Gaussians are added and removed."""
 _PARTS = 30

@@ -82,10 +82,10 @@ class StructureAwareStrategy(Strategy):
     child_scale: float = 1.5
     """k in [1, 2): children are k times the paper's s/n long on the axes that are split, which closes their gaps.
     They stand closer and are 1/k as opaque an axis, which keeps the covariance and the mass; 1 is the paper's."""
-    clone_grad2d: float = 5e-4
+    clone_grad2d: float = 3.75e-4
     """AbsGS: normalised mean screen gradient at which a small Gaussian is cloned; AbsGS's own is 2e-4.
-    In `ns-train` an effort above 1 lowers this and the next threshold, to 0.6 of what is set."""
-    split_absgrad2d: float = 1e-3
+    In `ns-train` an effort above 1 lowers this and the next threshold, to 0.8 of what is set."""
+    split_absgrad2d: float = 7.5e-4
     """AbsGS: normalised mean absolute screen gradient at which a large Gaussian is split; AbsGS's own is 4e-4."""
     absgs_long_axis: bool = True
     """AbsGS halves a large Gaussian's longest axis in its place, instead of drawing the places of two at random."""

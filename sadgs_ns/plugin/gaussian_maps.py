@@ -25,6 +25,7 @@ def blend(
     width: int,
     height: int,
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
+    max_off_axis: float = 0.0,
 ) -> tuple[Tensor, Tensor]:
     """Blend values of Gaussians as their colours are blended, front to back.
 
@@ -36,6 +37,7 @@ def blend(
         width: Width of the image in px.
         height: Height of the image in px.
         rasterize_mode: As for `rasterize`.
+        max_off_axis: As for `rasterize`.
 
     Returns:
         The blended values [H, W, D], and how much of each pixel is covered, in [0, 1] [H, W, 1].
@@ -51,6 +53,7 @@ def blend(
         width,
         height,
         rasterize_mode=rasterize_mode,
+        max_off_axis=max_off_axis,
     )
     return render[0], alpha[0]
 

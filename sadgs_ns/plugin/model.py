@@ -44,8 +44,6 @@ BILATERAL_GRID_SHAPE = (16, 16, 8)
 Processing"."""
 _MOST_RANDOM = 10_000_000
 """Largest number of random points to start from; they take the host's memory before the cap thins them out."""
-MAX_SCALE_RATIO = 10.0
-"""Ratio of the longest to the shortest scale from which scale regularization acts, as in splatfacto."""
 
 
 @dataclass
@@ -87,11 +85,12 @@ class SadgsModelConfig(InstantiateConfig):
     averaged_share: float = 0.05
     """Share of the run, at its end, over which the Gaussians' parameters are averaged, in [0, 0.3].
     The finished run has the mean; 0 leaves it the last iteration's."""
-    max_angular_scale: float = 0.5
+    max_off_axis: float = 4.0
+    """Gaussians whose centre is projected further from the image's centre, in half images along x or y, are not drawn.
+    Far off the axis a Gaussian's image is wrong, and can be haze over the view; 0 draws all."""
+    max_angular_scale: float = 0.3
     """Longest standard deviation of a Gaussian as a share of its distance from the nearest training camera.
     A longer one can cover a view beside which it lies with haze; 0 sets no limit."""
-    use_scale_regularization: bool = False
-    """Penalize Gaussians more than ten times as long as thick (PhysGaussian), against spikes."""
     use_bilateral_grid: bool = False
     """Learn a colour correction for each training image (bilateral grids), for photos with changing exposure."""
     color_corrected_metrics: bool = False
@@ -114,9 +113,13 @@ class SadgsModelConfig(InstantiateConfig):
             raise InputError(f"pipeline.model.opacity_reg must be in [0, 100], got {self.opacity_reg:g}.")
         if not 0 <= self.averaged_share <= 0.3:
             raise InputError(f"pipeline.model.averaged_share must be in [0, 0.3], got {self.averaged_share:g}.")
-        if not 0 <= self.max_angular_scale < math.inf:
+        for name in ("max_off_axis", "max_angular_scale"):
+            value = getattr(self, name)
+            if not 0 <= value < math.inf:
+                raise InputError(f"pipeline.model.{name} must be finite and not negative, got {value:g}.")
+        if 0 < self.max_off_axis < 1:
             raise InputError(
-                f"pipeline.model.max_angular_scale must be finite and not negative, got {self.max_angular_scale:g}."
+                f"pipeline.model.max_off_axis must be 0, or at least 1, the image's border, got {self.max_off_axis:g}."
             )
         if not 0 <= self.sh_degree <= 4:
             raise InputError(f"pipeline.model.sh_degree must be in [0, 4], got {self.sh_degree}.")
@@ -292,6 +295,11 @@ class SadgsModel(SplatfactoModel):
         inside = self.crop_box.within(self.means)
         return {name: value[inside] for name, value in values.items()}
 
+    @property
+    def drawing(self) -> dict[str, Any]:
+        """The options of `rasterize` that every picture of these Gaussians shares."""
+        return {"rasterize_mode": self.config.rasterize_mode, "max_off_axis": self.config.max_off_axis}
+
     def render(
         self,
         viewmats: Tensor,
@@ -334,8 +342,8 @@ class SadgsModel(SplatfactoModel):
             sh_degree=sh_degree,
             render_mode=render_mode,
             absgrad=absgrad,
-            rasterize_mode=self.config.rasterize_mode,
             fused=self.config.fused,
+            **self.drawing,
         )
 
     def get_training_outputs(
@@ -485,10 +493,6 @@ class SadgsModel(SplatfactoModel):
         losses = {"main_loss": loss}
         if self.training:
             outputs["psnr"] = psnr
-            if self.config.use_scale_regularization and self.step % 10 == 0:
-                scales = self.scales.exp()
-                ratio = scales.amax(dim=-1) / scales.amin(dim=-1)
-                losses["scale_reg"] = 0.1 * (ratio - MAX_SCALE_RATIO).clamp_min(0).mean()
             if self.config.opacity_reg > 0 and self.step < self.strategy.windows.refine_stop_iter:
                 losses["opacity_reg"] = self.config.opacity_reg * torch.sigmoid(self.opacities).mean()
             self.camera_optimizer.get_loss_dict(losses)

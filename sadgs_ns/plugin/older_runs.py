@@ -54,11 +54,17 @@ CONSTANTS: dict[str, Any] = {
     "eta_min_opacity": 0.3,
     "memory_budget_gb": None,
     "verbose": False,
+    "use_scale_regularization": False,
 }
 """Removed options at the values that the method has kept: a run with these lacks nothing."""
 
 
-BEFORE: dict[str, Any] = {"rates_follow_views": False, "averaged_share": 0.0, "max_angular_scale": 0.0}
+BEFORE: dict[str, Any] = {
+    "rates_follow_views": False,
+    "averaged_share": 0.0,
+    "max_off_axis": 0.0,
+    "max_angular_scale": 0.0,
+}
 """New options whose default changes a run, at the value that runs of earlier versions had."""
 
 

@@ -68,6 +68,7 @@ def paper_pipeline(views_per_iteration: int) -> SadgsPipelineConfig:
             ssim_lambda=0.2,
             opacity_reg=0.0,
             averaged_share=0.0,
+            max_off_axis=0.0,
             max_angular_scale=0.0,
             strategy=StructureAwareStrategy(
                 eta_every=1,

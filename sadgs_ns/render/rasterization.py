@@ -10,6 +10,7 @@ from torch import Tensor
 
 from sadgs_ns import kernels
 from sadgs_ns.render import splatter
+from sadgs_ns.render.off_axis import culling
 
 
 def rasterize(
@@ -27,6 +28,7 @@ def rasterize(
     render_mode: Literal["RGB", "RGB+ED"] = "RGB",
     absgrad: bool = False,
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
+    max_off_axis: float = 0.0,
     fused: bool = True,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians into C pinhole cameras on the device of `means`, unpacked.
@@ -46,6 +48,8 @@ def rasterize(
         render_mode: "RGB" renders colours, "RGB+ED" appends the expected depth.
         absgrad: Whether `backward` sets `info["means2d"].absgrad`. [C, N, 2]
         rasterize_mode: "antialiased" compensates opacities for the screen-space blur.
+        max_off_axis: Gaussians whose centre is projected further from the image's centre, in half images along x or y,
+            are culled (off_axis.py); 0 culls none.
         fused: On CUDA, list in each tile only the Gaussians that reach it, and differentiate the compositing of three
             channels, with Triton kernels; what is drawn is the same. Assumes rigid viewmats.
 
@@ -60,14 +64,17 @@ def rasterize(
         InputError: If there are more Gaussians, pixels or tile pairs than the Triton kernels can address
             (kernels/limits.py).
     """
+    culled: dict[str, Any] = {"max_off_axis": max_off_axis}
     rasterization: Any = splatter.rasterization
     fused = fused and kernels.available(means.device)
     # gsplat compiles its CUDA kernels when they are first used. These imports stand here so that nothing touches them
     # without a GPU.
     if fused:
-        from sadgs_ns.kernels.rasterization import rasterization
+        from sadgs_ns.render.fused import rasterization
     elif means.is_cuda:
-        from gsplat.rendering import rasterization
+        import gsplat.rendering
+
+        rasterization, culled = culling(gsplat.rendering.rasterization, max_off_axis), {}
     if isinstance(colors, tuple) and not fused:
         colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
     return rasterization(
@@ -85,6 +92,7 @@ def rasterize(
         render_mode=render_mode,
         absgrad=absgrad,
         rasterize_mode=rasterize_mode,
+        **culled,
     )
 
 

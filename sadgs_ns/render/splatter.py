@@ -21,6 +21,8 @@ from gsplat.cuda._torch_impl import _persp_proj, _quat_scale_to_covar_preci, _sp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from sadgs_ns.render.off_axis import near_axis
+
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RasterizeMode = Literal["classic", "antialiased"]
 
@@ -84,6 +86,7 @@ def rasterization(
     absgrad: bool = False,
     rasterize_mode: RasterizeMode = "classic",
     per_axis_radii: bool | None = None,
+    max_off_axis: float = 0.0,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians into C pinhole cameras, as gsplat's `rasterization(..., packed=False)` does.
 
@@ -114,6 +117,8 @@ def rasterization(
         per_axis_radii: Whether `info["radii"]` and the culling follow gsplat >= 1.5 (int32 [C, N, 2], the extent in x
             and y at which alpha falls below 1/255) or gsplat 1.4 (int32 [C, N], three standard deviations of the long
             axis); None follows the installed gsplat.
+        max_off_axis: Gaussians further off the axis are culled, in half images along x or y, which gsplat cannot
+            (off_axis.py); 0 culls none.
 
     Returns:
         `render_colors` [C, height, width, X] with X = D, 1 or D + 1 by `render_mode`; `render_alphas`
@@ -152,6 +157,8 @@ def rasterization(
     means2d, depths, conics, compensations, covars2d, valid = _project(
         means, quats, scales, viewmats, Ks, width, height, eps2d, near_plane, far_plane
     )
+    if max_off_axis > 0:
+        valid = valid & near_axis(means2d, width, height, max_off_axis)
     opacities = opacities.expand(C, N)
     if rasterize_mode == "antialiased":
         opacities = opacities * compensations

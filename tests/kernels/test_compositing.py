@@ -11,9 +11,10 @@ from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_cova
 from torch import Tensor
 
 from sadgs_ns.render import splatter
+from sadgs_ns.render.rasterization import visible
 
 compositing = pytest.importorskip("sadgs_ns.kernels.compositing", reason="Triton is not installed")
-rasterization = pytest.importorskip("sadgs_ns.kernels.rasterization", reason="Triton is not installed")
+rasterization = pytest.importorskip("sadgs_ns.render.fused", reason="Triton is not installed")
 tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not installed")
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -244,8 +245,8 @@ def test_autograd_gets_what_the_kernel_returns(monkeypatch, through):
 @pytest.mark.skipif(
     torch.cuda.is_available(), reason="with CUDA, tests/render/test_rasterization.py takes gsplat's own kernels"
 )
-@pytest.mark.parametrize("mode", ["classic", "antialiased"])
-def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatch, mode):
+@pytest.mark.parametrize(("mode", "max_off_axis"), [("classic", 0.0), ("antialiased", 0.0), ("classic", 0.5)])
+def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatch, mode, max_off_axis):
     """Everything around gsplat's two kernels, for two views; torch code stands in for these kernels."""
     width, height, depths = 22, 18, []
 
@@ -275,7 +276,7 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
     viewmats[1, :3, 3] = torch.tensor([0.2, 0.1, 0.3])
     Ks = scenes.camera(width, height, 30.0)[1].repeat(2, 1, 1)
     rest, v_renders = (0.1 * torch.randn(shape, generator=generator) for shape in ((60, 15, 3), (2, height, width, 3)))
-    results = []
+    results, drawn = [], []
     for function, dtype in ((rasterization.rasterization, torch.float32), (splatter.rasterization, torch.float64)):
         values = {name: p.detach() for name, p in scenes.random_params(60).items()} | {"rest": rest}
         values = {name: value.to(dtype, copy=True).requires_grad_() for name, value in values.items()}
@@ -285,10 +286,12 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
         geometry = values["means"], values["quats"], values["scales"].exp(), torch.sigmoid(values["opacities"])
         renders, _, info = function(
             *geometry, colors, viewmats.to(dtype), Ks.to(dtype), width, height,
-            sh_degree=3, packed=False, render_mode="RGB", absgrad=True, rasterize_mode=mode,
+            sh_degree=3, packed=False, render_mode="RGB", absgrad=True, rasterize_mode=mode, max_off_axis=max_off_axis,
         )  # fmt: skip
+        drawn.append(int(visible(info).sum()))
         renders.backward(v_renders.to(dtype))
         results.append({name: value.grad for name, value in values.items()} | {"absgrad": info["means2d"].absgrad})
+    assert drawn[0] == drawn[1] and (drawn[0] < 70) is (max_off_axis > 0)
     for name, expected in results[1].items():
         error = (results[0][name].double() - expected).norm() / expected.norm()
         assert error < (1e-4 if name == "absgrad" else 5e-6), (name, float(error))

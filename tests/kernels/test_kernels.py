@@ -502,17 +502,19 @@ def test_no_gaussian_in_sight_makes_empty_lists():
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat's kernels need CUDA")
-@pytest.mark.parametrize("render_mode", ["RGB", "RGB+ED"])
-def test_rasterization_equals_gsplats_own(render_mode):
+@pytest.mark.parametrize(("render_mode", "max_off_axis"), [("RGB", 0.0), ("RGB+ED", 0.0), ("RGB", 0.7)])
+def test_rasterization_equals_gsplats_own(render_mode, max_off_axis):
     from gsplat import rasterization as gsplats
 
-    from sadgs_ns.kernels import rasterization as ours
+    from sadgs_ns.render import fused as ours
+    from sadgs_ns.render.off_axis import culling
 
     scene = {name: value.float().cuda() for name, value in random_scene(3000, 128, seed=0).items()}
     del scene["weights"]
     shared = {"width": 128, "height": 128, "sh_degree": 3, "render_mode": render_mode, "packed": False}
     shared |= {"rasterize_mode": "antialiased", "absgrad": False}
+    gsplats = culling(gsplats, max_off_axis)
     expected, expected_alphas, _ = gsplats(**scene, **shared, tile_size=ours.TILE_SIZE)
-    renders, alphas, _ = ours.rasterization(**scene, **shared)
+    renders, alphas, _ = ours.rasterization(**scene, **shared, max_off_axis=max_off_axis)
     assert torch.equal(alphas, expected_alphas)
     torch.testing.assert_close(renders, expected, atol=1e-5, rtol=1e-5)

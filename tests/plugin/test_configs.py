@@ -306,12 +306,14 @@ def test_options_that_are_missing_in_an_older_config_get_their_defaults():
 
 def test_a_run_of_before_an_option_that_changes_training_goes_on_without_it():
     text = yaml.dump(preset("sadgs"))
-    for line in ("    averaged_share: 0.05\n", "    max_angular_scale: 0.5\n", "rates_follow_views: true\n"):
+    in_model = ("averaged_share: 0.05", "max_off_axis: 4.0", "max_angular_scale: 0.3")
+    for line in (*(f"    {line}\n" for line in in_model), "rates_follow_views: true\n"):
         assert line in text
         text = text.replace(line, "")
     config = yaml.load(text, Loader=yaml.Loader)
     model = config.pipeline.model
-    assert (model.averaged_share, model.max_angular_scale, config.rates_follow_views) == (0.0, 0.0, False)
+    assert (model.averaged_share, model.max_off_axis, model.max_angular_scale) == (0.0, 0.0, 0.0)
+    assert config.rates_follow_views is False
 
 
 def test_options_that_this_version_lacks_are_named_where_they_changed_the_run(capsys: pytest.CaptureFixture[str]):
@@ -399,7 +401,7 @@ def test_the_papers_presets_are_sadgs_without_what_we_added():
     model = config.pipeline.model
     assert model.ssim_lambda > 0.2 and model.opacity_reg > 0 and model.strategy.child_scale > 1
     model.ssim_lambda, model.opacity_reg, model.strategy.child_scale = 0.2, 0.0, 1.0
-    model.averaged_share = model.max_angular_scale = 0.0
+    model.averaged_share = model.max_off_axis = model.max_angular_scale = 0.0
     model.strategy.clone_grad2d, model.strategy.split_absgrad2d = 2e-4, 4e-4
     model.strategy.structure_every, model.strategy.absgs_every, model.strategy.reset_every = 500, 100, 1200
     model.strategy.min_opacity, model.strategy.refine_start_iter, model.strategy.refine_stop_iter = 0.005, 100, 1900

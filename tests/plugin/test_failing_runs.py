@@ -96,6 +96,16 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig
             -0.1,
             "pipeline.model.max_angular_scale must be finite and not negative, got -0.1.",
         ),
+        (
+            "pipeline.model.max_off_axis",
+            math.inf,
+            "pipeline.model.max_off_axis must be finite and not negative, got inf.",
+        ),
+        (
+            "pipeline.model.max_off_axis",
+            0.5,
+            "pipeline.model.max_off_axis must be 0, or at least 1, the image's border, got 0.5.",
+        ),
         ("pipeline.effort", math.nan, "pipeline.effort must be in (0, 100], got nan."),
         ("load_step", 3, "load_step is 3, but load_dir is not set: add --load-dir with the folder of a run."),
         ("optimizers.means.optimizer.lr", math.nan, "optimizers.means.optimizer.lr must be in [0, 1], got nan."),

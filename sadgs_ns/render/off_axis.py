@@ -1,0 +1,76 @@
+"""Which Gaussians lie too far off a view's axis to be drawn.
+
+What a Gaussian looks like is a linear approximation at its centre (EWA splatting). Far off the axis it is wrong: a
+Gaussian beside the camera, near the plane of its lens, covers the image with haze, although none of it is in sight.
+Viewers on the web leave out Gaussians whose centre is 1.2 to 1.4 half images from the image's centre.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import FunctionType
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+@torch.no_grad()
+def near_axis(means2d: Tensor, width: int, height: int, max_off_axis: float) -> Tensor:
+    """Tell which Gaussians' centres are projected near enough to the image.
+
+    Args:
+        means2d: Projected centres in px. [C, N, 2]
+        width: px.
+        height: px.
+        max_off_axis: Largest distance from the image's centre, in halves of its width and height along x and y, > 0.
+
+    Returns:
+        bool [C, N], False where the centre is not finite.
+    """
+    # Numbers, not a tensor of them, which the host would have to send to the device.
+    x, y = means2d.unbind(dim=-1)
+    half_width, half_height = width / 2, height / 2
+    return ((x - half_width).abs() < max_off_axis * half_width) & ((y - half_height).abs() < max_off_axis * half_height)
+
+
+def cull_off_axis(radii: Tensor, means2d: Tensor, width: int, height: int, max_off_axis: float) -> Tensor:
+    """Make the radii of Gaussians zero that are too far off the axis; gsplat draws no Gaussian whose radius is zero.
+
+    Args:
+        radii: px, of gsplat 1.4 [C, N] or 1.5 [C, N, 2].
+        means2d: As for `near_axis`. [C, N, 2]
+        width: px.
+        height: px.
+        max_off_axis: As for `near_axis`; 0 keeps all.
+
+    Returns:
+        Radii of the same shape and type.
+    """
+    if max_off_axis <= 0:
+        return radii
+    near = near_axis(means2d, width, height, max_off_axis)  # [C, N]
+    return radii * (near[..., None] if radii.dim() == means2d.dim() else near)
+
+
+def culling(rasterization: Callable[..., Any], max_off_axis: float) -> Callable[..., Any]:
+    """Make gsplat's `rasterization` cull Gaussians far off the axis.
+
+    Returns:
+        gsplat's own code, for unpacked calls, in which the name of the projection stands for one that also culls. The
+        module's own names stay as they are, since the viewer renders in another thread.
+    """
+    if max_off_axis <= 0:
+        return rasterization
+    assert isinstance(rasterization, FunctionType)
+    project = rasterization.__globals__["fully_fused_projection"]
+
+    def project_and_cull(*args: Any, **options: Any) -> tuple[Any, ...]:
+        radii, means2d, *others = project(*args, **options)
+        width, height = args[6:8]
+        return cull_off_axis(radii, means2d, width, height, max_off_axis), means2d, *others
+
+    names = rasterization.__globals__ | {"fully_fused_projection": project_and_cull}
+    same = FunctionType(rasterization.__code__, names, rasterization.__name__, rasterization.__defaults__)
+    same.__kwdefaults__ = rasterization.__kwdefaults__
+    return same
