@@ -118,7 +118,7 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
     with ThreadPoolExecutor() as pool:  # which waits for its threads, whatever happens
         pending |= {"the loss": pool.submit(loss), "S̄": pool.submit(structure), "Adam": pool.submit(update)}
         try:  # the other stages read this projection
-            _, _, info = rasterize(means, quats, scales, opacities, means, *camera)
+            _, _, info = rasterize(means, quats, scales, opacities, means, *camera, max_off_axis=config.max_off_axis)
         except Exception as error:
             failures["rasterization"] = error
         else:

@@ -12,8 +12,8 @@ from torch import Tensor
 from sadgs_ns.kernels import compositing
 from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
 from sadgs_ns.kernels.limits import check_gaussians, check_pixels
+from sadgs_ns.kernels.off_axis import cull_off_axis
 from sadgs_ns.kernels.tiles import intersect_tiles
-from sadgs_ns.render.off_axis import cull_off_axis
 
 BACKWARD: Literal["moments", "gsplat"] = "moments"
 """Which kernel differentiates the compositing of three channels: ours (compositing.py), or gsplat's as a reference."""
@@ -66,7 +66,8 @@ def rasterization(
         calc_compensations=rasterize_mode == "antialiased",
         **bound,
     )
-    radii = cull_off_axis(radii, means2d, width, height, max_off_axis)
+    if max_off_axis > 0:
+        radii = cull_off_axis(radii, means2d, width, height, max_off_axis)
     # One copy serves the tiles and compositing. `expand` would be slower: torch reduces its gradient over the views,
     # even over one, ten times as slowly as it adds.
     opacities = torch.stack([opacities] * num_views) if compensations is None else opacities * compensations

@@ -42,13 +42,11 @@ def cull_off_axis(radii: Tensor, means2d: Tensor, width: int, height: int, max_o
         means2d: As for `near_axis`. [C, N, 2]
         width: px.
         height: px.
-        max_off_axis: As for `near_axis`; 0 keeps all.
+        max_off_axis: As for `near_axis`.
 
     Returns:
         Radii of the same shape and type.
     """
-    if max_off_axis <= 0:
-        return radii
     near = near_axis(means2d, width, height, max_off_axis)  # [C, N]
     return radii * (near[..., None] if radii.dim() == means2d.dim() else near)
 

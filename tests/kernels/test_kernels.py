@@ -22,6 +22,7 @@ from sadgs_ns.method.codes import encode
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.plugin.optimizers import FusedAdam
+from sadgs_ns.render.off_axis import cull_off_axis
 
 codes = pytest.importorskip("sadgs_ns.kernels.codes", reason="Triton is not installed")
 adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
@@ -31,6 +32,7 @@ observation = pytest.importorskip("sadgs_ns.kernels.statistics", reason="Triton 
 photometric = pytest.importorskip("sadgs_ns.kernels.losses", reason="Triton is not installed")
 screen_gradients = pytest.importorskip("sadgs_ns.kernels.absgs", reason="Triton is not installed")
 tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not installed")
+off_axis = pytest.importorskip("sadgs_ns.kernels.off_axis", reason="Triton is not installed")
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 fused_photometric_loss = partial(photometric.photometric_loss, window=losses.WINDOW)
@@ -499,6 +501,20 @@ def test_no_gaussian_in_sight_makes_empty_lists():
     on_device = {name: value.to(DEVICE) for name, value in gaussians.items()}
     starts, ids = tiles.intersect_tiles(**on_device, width=32, height=32, tile_size=16).lists()
     assert len(ids) == 0 and (starts == 0).all()
+
+
+@pytest.mark.parametrize("shape", [(2, 300), (2, 300, 2)], ids=["one radius", "radii per axis"])
+def test_far_off_the_axis_radii_are_zero_as_torch_makes_them(shape):
+    generator = torch.Generator().manual_seed(0)
+    means2d = 50 * torch.randn((2, 300, 2), generator=generator)
+    means2d[0, :4] = torch.tensor([[math.nan, 1.0], [1.0, math.inf], [-40.0, 15.0], [20.0, 60.0]])
+    radii = torch.randint(0, 9, shape, generator=generator, dtype=torch.int32)
+    expected = cull_off_axis(radii, means2d, 40, 30, 3.0)
+    assert 100 < (expected > 0).sum() < (radii > 0).sum() - 100
+    before = radii.clone().to(DEVICE)
+    given = before.clone()
+    culled = off_axis.cull_off_axis(given, means2d.to(DEVICE), 40, 30, 3.0)
+    assert torch.equal(culled.cpu(), expected) and torch.equal(given, before)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat's kernels need CUDA")

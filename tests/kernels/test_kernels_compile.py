@@ -24,9 +24,10 @@ CONSTANTS = {
 INTEGERS = "n row height width taps num_gaussians num_views tile_width tile_height used stride start".split()
 INTEGERS += "channels weight_stride num_pairs rows view absolute_view absolute_row num_strips num_tiles".split()
 FLOATS = "exponent frequency beta1 beta2 eps l1_weight ssim_weight l2_weight".split()
-FLOATS += "scale_x scale_y ssim_lambda".split()
+FLOATS += "scale_x scale_y ssim_lambda half_width half_height reach_x reach_y".split()
 POINTERS = {
     "radii": "*i32", "counts": "*i64", "order": "*i64", "ends": "*i64", "tiles": "*i16", "ids": "*i32", "drawn": "*i1",
+    "culled": "*i32",
     "structure_tensors": "*u8", "starts": "*i32", "last_ids": "*i32",
 }
 TUPLES = {  # of Adam's kernel; the names mean single tensors elsewhere
@@ -67,7 +68,7 @@ def test_every_kernel_compiles_for_an_a100_and_an_h200(tmp_path):
     assert run.returncode == 0, run.stderr[-3000:]
     expected = {"_blur_along_rows", "_similarity", "_spread_along_rows", "_gradient", "_count", "_list", "_observe"}
     expected |= {"_forward", "_backward", "_update", "_correlate", "_differentiate", "_aggregate", "_write_one"}
-    expected |= {"_composite_backward", "_encode", "_accumulate_gradients", "_finish"}
+    expected |= {"_composite_backward", "_encode", "_accumulate_gradients", "_finish", "_cull"}
     assert set(run.stdout.split()) == expected
 
 
