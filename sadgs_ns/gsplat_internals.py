@@ -262,5 +262,6 @@ the first argument has another name in 1.5.3: pass it by its place."""
 update_param_with_optimizer = ops._update_param_with_optimizer
 """`(param_fn, optimizer_fn, params, optimizers, names=None)`: put `param_fn(name, parameter)` in the place of every
 parameter that is named, or of all, and `optimizer_fn(key, moment)` in that of every moment of their optimizers; `step`
-stays. gsplat's `duplicate`, `split` and `remove` are made of it. In 1.4 and 1.5; in 1.4 every parameter needs an
-optimizer, in 1.5 one that needs no gradient may have none."""
+stays. While it changes the moments of a parameter, its optimizer has no state, by which plugin/trainer.py recognizes
+that memory ran out meanwhile. gsplat's `duplicate`, `split` and `remove` are made of it. In 1.4 and 1.5; in 1.4 every
+parameter needs an optimizer, in 1.5 one that needs no gradient may have none."""

@@ -194,6 +194,20 @@ def test_width_and_height_are_the_seventh_and_eighth_that_the_projection_gets(mo
     assert sizes == [(40, 30)]
 
 
+def test_an_optimizer_whose_moments_were_being_changed_has_no_state():
+    def fail(key: str, moment: torch.Tensor) -> torch.Tensor:
+        raise MemoryError
+
+    params = {"means": torch.nn.Parameter(torch.zeros(N, 3))}
+    optimizers: dict[str, torch.optim.Optimizer] = {"means": torch.optim.Adam(params.values())}
+    params["means"].sum().backward()
+    optimizers["means"].step()
+    assert optimizers["means"].state
+    with pytest.raises(MemoryError):
+        gsplat_internals.update_param_with_optimizer(lambda name, p: p, fail, params, optimizers)
+    assert not optimizers["means"].state
+
+
 def test_the_module_of_the_cuda_extension_has_it():
     """The module is not imported: without a GPU it may begin to compile."""
     spec = importlib.util.find_spec("gsplat.cuda._backend")
