@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import graphlib
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -89,3 +90,55 @@ def test_the_method_knows_nothing_of_nerfstudio():
 
 def test_few_modules_lie_flat_in_the_package():
     assert len(list(ROOT.glob("*.py"))) <= MAX_FLAT
+
+
+def names_of_gsplat(path: Path) -> set[str]:
+    """Dotted names in gsplat that a file imports (for type checkers, too), reads from what it imports, or quotes."""
+    names, bound = set(), {}
+    nodes = list(ast.walk(ast.parse(path.read_text("utf8"))))
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                names.add(alias.name)
+                bound |= {alias.asname: alias.name} if alias.asname else {alias.name.partition(".")[0]: None}
+        elif isinstance(node, ast.ImportFrom):
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+            bound |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+    for node in nodes:
+        if isinstance(node, ast.Attribute):
+            first, _, rest = ast.unparse(node).partition(".")
+            if first in bound:
+                names.add(f"{bound[first] or first}.{rest}")
+        elif isinstance(node, ast.Constant) and re.fullmatch(r"gsplat(\.\w+)+", str(node.value)):
+            names.add(node.value)
+    return {name for name in names if f"{name}.".startswith("gsplat.")}
+
+
+def is_private(name: str) -> bool:
+    """Whether a dotted name in gsplat is one that a release may change: in `gsplat.cuda`, or behind an underscore."""
+    parts = name.split(".")[1:]
+    return parts[:1] == ["cuda"] or any(part.startswith("_") and not part.endswith("__") for part in parts)
+
+
+def test_one_module_knows_the_internals_of_gsplat():
+    private = {name: sorted(filter(is_private, names_of_gsplat(path))) for name, path in FILES.items()}
+    assert private.pop("sadgs_ns.gsplat_internals"), "the check should find what it looks for"
+    wrong = {name: names for name, names in private.items() if names}
+    assert not wrong, f"these belong in gsplat_internals.py: {wrong}"
+
+
+def test_private_names_of_gsplat_are_found_however_they_are_reached(tmp_path: Path):
+    for source, found in (
+        ("import gsplat.cuda._backend", True),
+        ("import gsplat\ngsplat.cuda._wrapper.f()", True),
+        ("from gsplat import cuda", True),
+        ("from gsplat.strategy import ops as o\no._update_param_with_optimizer()", True),
+        ("from gsplat.strategy.ops import _update_param_with_optimizer", True),
+        ("import importlib\nimportlib.import_module('gsplat.cuda._backend')", True),
+        ("import gsplat\nprint(gsplat.__version__, gsplat.rasterization)", False),
+        ("from gsplat.strategy.ops import remove\nimport torch\ntorch._dynamo", False),
+        ("import torch\n'gsplat.cuda is a folder'", False),
+    ):
+        file = tmp_path / "source.py"
+        file.write_text(source, "utf8")
+        assert any(map(is_private, names_of_gsplat(file))) is found, source

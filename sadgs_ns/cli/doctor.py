@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import ctypes.util
-import importlib
 import os
 import platform
 import shlex
@@ -95,8 +94,9 @@ def _check_cuda() -> Iterator[Finding]:
             "compiler and Python's headers.",
         )
     try:
-        backend = importlib.import_module("gsplat.cuda._backend")
-        problem = None if backend._C is not None else "neither prebuilt nor compiled"
+        from sadgs_ns import gsplat_internals
+
+        problem = None if gsplat_internals.cuda_extension() is not None else "neither prebuilt nor compiled"
     except Exception as error:  # Its compilation fails in many ways.
         problem = reason(error)
     if problem is None:

@@ -22,9 +22,10 @@ from typing import Any
 import torch
 import triton
 import triton.language as tl
-from gsplat.cuda import _wrapper
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+
+from sadgs_ns import gsplat_internals
 
 TILE_SIZE = 8
 """px. Each lane of the one warp that a tile gets has two pixels."""
@@ -279,20 +280,36 @@ def composite_backward(
     return v_means2d, v_conics, v_colors, v_opacities[..., 0], v_absolute if absgrad else None
 
 
-class _RasterizeToPixels(_wrapper._RasterizeToPixels):
-    """gsplat's autograd function, which saves the same tensors in 1.4 and 1.5, with another backward pass."""
+class _RasterizeToPixels(torch.autograd.Function):
+    """gsplat's forward pass and `composite_backward`."""
 
     @staticmethod
-    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor]:
+    def forward(  # type: ignore[override]
+        ctx: Any,
+        means2d: Tensor,  # [C, N, 2]
+        conics: Tensor,  # [C, N, 3]
+        colors: Tensor,  # [C, N, 3]
+        opacities: Tensor,  # [C, N]
+        width: int,
+        height: int,
+        isect_offsets: Tensor,  # [C, tile rows, tile columns]
+        flatten_ids: Tensor,  # [number of pairs]
+        absgrad: bool,
+    ) -> tuple[Tensor, Tensor]:
         ctx.set_materialize_grads(False)  # torch would fill an image with zeros where nothing depends on alphas
-        return _wrapper._RasterizeToPixels.forward(ctx, *inputs)
+        renders, alphas, last_ids = gsplat_internals.composite(
+            means2d, conics, colors, opacities, width, height, TILE_SIZE, isect_offsets, flatten_ids
+        )
+        ctx.save_for_backward(means2d, conics, colors, opacities, isect_offsets, flatten_ids, alphas, last_ids)
+        ctx.absgrad = absgrad
+        return renders, alphas
 
     @staticmethod
     @once_differentiable
     def backward(  # type: ignore[override]
         ctx: Any, v_renders: Tensor | None, v_alphas: Tensor | None
     ) -> tuple[Tensor | None, ...]:
-        means2d, conics, colors, opacities, _, _, starts, ids, alphas, last_ids = ctx.saved_tensors
+        means2d, conics, colors, opacities, starts, ids, alphas, last_ids = ctx.saved_tensors
         if v_renders is None:
             v_renders = torch.zeros((*last_ids.shape, 3), device=colors.device)
         v_means2d, v_conics, v_colors, v_opacities, v_absolute = composite_backward(
@@ -301,7 +318,7 @@ class _RasterizeToPixels(_wrapper._RasterizeToPixels):
         )  # fmt: skip
         if ctx.absgrad:
             means2d.absgrad = v_absolute
-        return v_means2d, v_conics, v_colors, v_opacities, *[None] * 8
+        return v_means2d, v_conics, v_colors, v_opacities, *[None] * 5
 
 
 def rasterize_to_pixels(
@@ -333,5 +350,5 @@ def rasterize_to_pixels(
     """
     return _RasterizeToPixels.apply(  # type: ignore[return-value]
         means2d.contiguous(), conics.contiguous(), colors.contiguous(), opacities.contiguous(),
-        None, None, width, height, TILE_SIZE, isect_offsets, flatten_ids, absgrad,
+        width, height, isect_offsets, flatten_ids, absgrad,
     )  # fmt: skip

@@ -8,9 +8,10 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from gsplat.strategy.ops import _update_param_with_optimizer
 from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
+
+from sadgs_ns.gsplat_internals import update_param_with_optimizer
 
 Params = MutableMapping[str, torch.nn.Parameter] | torch.nn.ParameterDict
 """gsplat's parameters by name, each with leading dimension N."""
@@ -148,7 +149,7 @@ def grid_split(
     def with_empty_children(key: str, v: Tensor) -> Tensor:
         return torch.cat([v[rest], v.new_zeros((len(parents), *v.shape[1:]))])
 
-    _update_param_with_optimizer(param_fn, with_empty_children, params, optimizers)  # type: ignore[arg-type]
+    update_param_with_optimizer(param_fn, with_empty_children, params, optimizers)  # type: ignore[arg-type]
     for key, value in state.items():
         if isinstance(value, Tensor):
             state[key] = with_empty_children(key, value)

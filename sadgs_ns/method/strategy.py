@@ -10,9 +10,10 @@ from typing import Any
 
 import torch
 from gsplat.strategy.base import Strategy
-from gsplat.strategy.ops import _update_param_with_optimizer, remove
+from gsplat.strategy.ops import remove
 from torch import Tensor
 
+from sadgs_ns.gsplat_internals import update_param_with_optimizer
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow
 from sadgs_ns.method.memory import StepSize, affordable_growth, free_bytes
 from sadgs_ns.method.schedule import Windows, windows
@@ -342,7 +343,7 @@ class StructureAwareStrategy(Strategy):
             changed = torch.logit(function(torch.sigmoid(p)).clamp(1e-6, 1 - 1e-6))
             return torch.nn.Parameter(changed, requires_grad=p.requires_grad)
 
-        _update_param_with_optimizer(
+        update_param_with_optimizer(
             param_fn, lambda key, v: torch.zeros_like(v), params, optimizers, names=["opacities"]
         )
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
 from typing import Any, Literal
 
 import torch
-from gsplat.cuda._wrapper import fully_fused_projection, rasterize_to_pixels, spherical_harmonics
 from torch import Tensor
 
+from sadgs_ns import gsplat_internals
 from sadgs_ns.kernels import compositing
 from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
 from sadgs_ns.kernels.limits import check_gaussians, check_pixels
@@ -19,8 +18,6 @@ BACKWARD: Literal["moments", "gsplat"] = "moments"
 """Which kernel differentiates the compositing of three channels: ours (compositing.py), or gsplat's as a reference."""
 TILE_SIZE = compositing.TILE_SIZE
 """px. gsplat's default of 16 saves list entries; with exact lists, saved pixels matter more (docs/measurements.md)."""
-_BOUNDS_RADII = "opacities" in inspect.signature(fully_fused_projection).parameters
-"""Whether the installed gsplat takes opacities to bound the radii, as 1.5 does."""
 
 
 def rasterization(
@@ -53,18 +50,8 @@ def rasterization(
     num_views = len(viewmats)
     check_gaussians(num_views, len(means))
     check_pixels(num_views, height, width)
-    bound: dict[str, Any] = {"opacities": opacities} if _BOUNDS_RADII else {}
-    radii, means2d, depths, conics, compensations = fully_fused_projection(
-        means,
-        None,
-        quats,
-        scales,
-        viewmats,
-        Ks,
-        width,
-        height,
-        calc_compensations=rasterize_mode == "antialiased",
-        **bound,
+    radii, means2d, depths, conics, compensations = gsplat_internals.project(
+        means, quats, scales, opacities, viewmats, Ks, width, height, rasterize_mode == "antialiased"
     )
     if max_off_axis > 0:
         radii = cull_off_axis(radii, means2d, width, height, max_off_axis)
@@ -84,9 +71,8 @@ def rasterization(
             coefficients = colors.expand(num_views, -1, -1, -1)
             # gsplat inverts the matrices, which makes the host wait for the device.
             positions = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:]).mT  # [C, 1, 3]
-            drawn = radii > 0  # [C, N] of gsplat 1.4, [C, N, 2] of 1.5
-            drawn = drawn.all(dim=-1) if drawn.dim() == 3 else drawn
-            colors = spherical_harmonics(sh_degree, means - positions, coefficients, masks=drawn)
+            drawn = gsplat_internals.drawn(radii, means2d)  # [C, N]
+            colors = gsplat_internals.spherical_harmonics(sh_degree, means - positions, coefficients, drawn)
             colors = torch.clamp_min(colors + 0.5, 0.0)
     if render_mode == "RGB+ED":
         colors = torch.cat([colors, depths[..., None]], dim=-1)
@@ -95,7 +81,7 @@ def rasterization(
     if BACKWARD == "moments" and colors.shape[-1] == 3:
         renders, alphas = compositing.rasterize_to_pixels(*splats, isect_offsets, flatten_ids, absgrad)
     else:
-        renders, alphas = rasterize_to_pixels(*splats, TILE_SIZE, isect_offsets, flatten_ids, absgrad=absgrad)
+        renders, alphas = gsplat_internals.rasterize_to_pixels(*splats, TILE_SIZE, isect_offsets, flatten_ids, absgrad)
     if render_mode == "RGB+ED":
         renders = torch.cat([renders[..., :-1], renders[..., -1:] / alphas.clamp_min(1e-10)], dim=-1)
     info = {

@@ -8,11 +8,13 @@ Viewers on the web leave out Gaussians whose centre is 1.2 to 1.4 half images fr
 from __future__ import annotations
 
 from collections.abc import Callable
-from types import FunctionType
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
+
+from sadgs_ns.gsplat_internals import has_radius_per_axis, with_changed_radii
 
 
 @torch.no_grad()
@@ -48,27 +50,19 @@ def cull_off_axis(radii: Tensor, means2d: Tensor, width: int, height: int, max_o
         Radii of the same shape and type.
     """
     near = near_axis(means2d, width, height, max_off_axis)  # [C, N]
-    return radii * (near[..., None] if radii.dim() == means2d.dim() else near)
+    return radii * (near[..., None] if has_radius_per_axis(radii, means2d) else near)
 
 
 def culling(rasterization: Callable[..., Any], max_off_axis: float) -> Callable[..., Any]:
     """Make gsplat's `rasterization` cull Gaussians far off the axis.
 
+    Args:
+        rasterization: `gsplat.rendering.rasterization`.
+        max_off_axis: As for `near_axis`; 0 culls none.
+
     Returns:
-        gsplat's own code, for unpacked calls, in which the name of the projection stands for one that also culls. The
-        module's own names stay as they are, since the viewer renders in another thread.
+        A function of the same arguments, for unpacked calls; where none is culled, the same function.
     """
     if max_off_axis <= 0:
         return rasterization
-    assert isinstance(rasterization, FunctionType)
-    project = rasterization.__globals__["fully_fused_projection"]
-
-    def project_and_cull(*args: Any, **options: Any) -> tuple[Any, ...]:
-        radii, means2d, *others = project(*args, **options)
-        width, height = args[6:8]
-        return cull_off_axis(radii, means2d, width, height, max_off_axis), means2d, *others
-
-    names = rasterization.__globals__ | {"fully_fused_projection": project_and_cull}
-    same = FunctionType(rasterization.__code__, names, rasterization.__name__, rasterization.__defaults__)
-    same.__kwdefaults__ = rasterization.__kwdefaults__
-    return same
+    return with_changed_radii(rasterization, partial(cull_off_axis, max_off_axis=max_off_axis))

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from sadgs_ns import kernels
+from sadgs_ns import gsplat_internals, kernels
 from sadgs_ns.render import splatter
 from sadgs_ns.render.off_axis import culling
 
@@ -105,9 +105,7 @@ def visible(info: Mapping[str, Any]) -> Tensor:
     Returns:
         bool [C, N]
     """
-    drawn = info["radii"] > 0
-    # The comparison of ranks also tells packed radii of 1.5 [nnz, 2] from unpacked radii of 1.4 [C, N].
-    return drawn.all(dim=-1) if drawn.dim() == info["means2d"].dim() else drawn
+    return gsplat_internals.drawn(info["radii"], info["means2d"])
 
 
 def viewmats_from_camera_to_world(

@@ -15,12 +15,17 @@ import math
 from collections.abc import Iterator
 from typing import Any, Literal, NamedTuple
 
-import gsplat
 import torch
-from gsplat.cuda._torch_impl import _persp_proj, _quat_scale_to_covar_preci, _spherical_harmonics, _world_to_cam
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from sadgs_ns.gsplat_internals import (
+    RADII_PER_AXIS,
+    torch_persp_proj,
+    torch_quat_scale_to_covar_preci,
+    torch_spherical_harmonics,
+    torch_world_to_cam,
+)
 from sadgs_ns.render.off_axis import near_axis
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
@@ -152,7 +157,7 @@ def rasterization(
     if sh_degree is not None and (sh_degree + 1) ** 2 > colors.shape[-2]:
         raise ValueError(f"sh_degree {sh_degree} needs {(sh_degree + 1) ** 2} coefficients, got {colors.shape[-2]}")
     if per_axis_radii is None:
-        per_axis_radii = tuple(int(part) for part in gsplat.__version__.split(".")[:2]) >= (1, 5)
+        per_axis_radii = RADII_PER_AXIS
 
     means2d, depths, conics, compensations, covars2d, valid = _project(
         means, quats, scales, viewmats, Ks, width, height, eps2d, near_plane, far_plane
@@ -189,7 +194,7 @@ def rasterization(
 
     if sh_degree is not None:
         dirs = means - torch.inverse(viewmats)[:, None, :3, 3]  # [C, N, 3]
-        colors = _spherical_harmonics(sh_degree, dirs, colors.expand(C, N, -1, 3))
+        colors = torch_spherical_harmonics(sh_degree, dirs, colors.expand(C, N, -1, 3))
         colors = (colors + 0.5).clamp_min(0.0)
     colors = colors.expand(C, N, -1)
     if render_mode != "RGB":
@@ -231,14 +236,14 @@ def _project(
     Returns:
         means2d [C, N, 2], depths [C, N], conics [C, N, 3], compensations [C, N], covars2d [C, N, 2, 2], valid [C, N].
     """
-    covars, _ = _quat_scale_to_covar_preci(quats, scales, compute_preci=False)
+    covars, _ = torch_quat_scale_to_covar_preci(quats, scales, compute_preci=False)
     assert covars is not None
-    means_c, covars_c = _world_to_cam(means, covars, viewmats)  # [C, N, 3], [C, N, 3, 3]
+    means_c, covars_c = torch_world_to_cam(means, covars, viewmats)  # [C, N, 3], [C, N, 3, 3]
     depths = means_c[..., 2]
     valid = (depths >= near_plane) & (depths <= far_plane)
     # Culled Gaussians are projected from somewhere harmless, or dividing by their depth could put NaN in gradients.
     means_c = torch.where(valid[..., None], means_c, means_c.new_tensor([0.0, 0.0, 1.0]))
-    means2d, covars2d = _persp_proj(means_c, covars_c, Ks, width, height)
+    means2d, covars2d = torch_persp_proj(means_c, covars_c, Ks, width, height)
     # Gaussians of billions of px, whose determinant overflows, have no inverse and are culled, too.
     valid = valid & _determinant(covars2d.detach()).isfinite()
     covars2d = torch.where(valid[..., None, None], covars2d, torch.eye(2, dtype=means.dtype, device=means.device))

@@ -17,7 +17,7 @@ import processes
 import pytest
 import torch
 
-from sadgs_ns import kernels
+from sadgs_ns import gsplat_internals, kernels
 from sadgs_ns.cli import doctor
 from sadgs_ns.data.validation import Finding
 from sadgs_ns.demo.scene import write_scene
@@ -39,23 +39,18 @@ def about(word: str) -> tuple[str, str]:
 @pytest.fixture
 def cuda(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     """Pretend that there is a GPU, on which everything works until the fields say otherwise."""
-    state = SimpleNamespace(backend=SimpleNamespace(_C=object()), compiles=True)
+    state = SimpleNamespace(extension=object(), compiles=True)
 
     def available(device: torch.device) -> bool:
         if not state.compiles:
             warnings.warn("Triton's kernels do not run here: no C compiler", stacklevel=2)
         return state.compiles
 
-    import_module = importlib.import_module
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (6_000_000_000, 8_000_000_000))
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "A GPU")
     monkeypatch.setattr(kernels, "available", available)
-    monkeypatch.setattr(
-        importlib,
-        "import_module",
-        lambda name: state.backend if name == "gsplat.cuda._backend" else import_module(name),
-    )
+    monkeypatch.setattr(gsplat_internals, "cuda_extension", lambda: state.extension)
     return state
 
 
@@ -119,7 +114,7 @@ def test_a_gpu_s_memory_and_its_kernels_are_notes(cuda: SimpleNamespace):
 
 
 def test_kernels_that_do_not_compile_say_why(cuda: SimpleNamespace):
-    cuda.compiles, cuda.backend = False, SimpleNamespace(_C=None)
+    cuda.compiles, cuda.extension = False, None
     severity, sentence = about("Triton")
     assert severity == "warning" and "(Triton's kernels do not run here: no C compiler): " in sentence
     assert sentence.endswith("install a torch whose Triton is 3.5 or newer, a C compiler and Python's headers.")

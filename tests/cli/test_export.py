@@ -12,7 +12,6 @@ import pycolmap
 import pytest
 import torch
 import trimesh
-from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci, _spherical_harmonics
 from hypothesis import given
 from hypothesis import strategies as st
 from kill_and_resume import configure, set_up
@@ -21,6 +20,7 @@ from plyfile import PlyData
 from sadgs_ns.cli import export
 from sadgs_ns.data.coordinates import Similarity, from_data, spherical_harmonics
 from sadgs_ns.demo.scene import SPARSE_FOLDER, write_scene
+from sadgs_ns.gsplat_internals import torch_quat_scale_to_covar_preci, torch_spherical_harmonics
 from sadgs_ns.plugin.trainer import SadgsTrainer
 from sadgs_ns.render import splatter
 
@@ -95,7 +95,7 @@ def test_the_harmonics_are_gsplat_s_and_orthonormal():
     basis = spherical_harmonics(directions(), 3)
     for band in range(16):
         coefficients = torch.eye(16, dtype=torch.float64)[band].repeat(100, 1)[..., None]
-        theirs = _spherical_harmonics(3, torch.from_numpy(directions()), coefficients)[:, 0]
+        theirs = torch_spherical_harmonics(3, torch.from_numpy(directions()), coefficients)[:, 0]
         np.testing.assert_allclose(basis[:, band], theirs, atol=2e-14)
     identity = Similarity(1.0, np.eye(3), np.zeros(3)).harmonics(3)
     np.testing.assert_allclose(identity, np.eye(16), atol=1e-14)
@@ -133,7 +133,9 @@ def test_covariances_turn_with_the_world(seed: int, reflection: bool):
     quats, scales, means = generator.normal(size=(5, 4)), generator.normal(size=(5, 3)), generator.normal(size=(5, 3))
 
     def covariances(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
-        return _quat_scale_to_covar_preci(torch.tensor(quats), torch.tensor(scales).exp(), True, False)[0].numpy()  # type: ignore[union-attr]
+        covars, _ = torch_quat_scale_to_covar_preci(torch.tensor(quats), torch.tensor(scales).exp(), True, False)
+        assert covars is not None
+        return covars.numpy()
 
     after = covariances(similarity.rotations(quats), similarity.log_scales(scales))
     expected = scale**2 * orthogonal @ covariances(quats, scales) @ orthogonal.T

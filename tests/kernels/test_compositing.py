@@ -7,9 +7,10 @@ from typing import Any
 import pytest
 import scenes
 import torch
-from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
+from gsplat.cuda._torch_impl import _fully_fused_projection
 from torch import Tensor
 
+from sadgs_ns import gsplat_internals
 from sadgs_ns.render import splatter
 from sadgs_ns.render.rasterization import visible
 
@@ -224,7 +225,7 @@ def test_autograd_gets_what_the_kernel_returns(monkeypatch, through):
     if DEVICE.type == "cpu":  # gsplat's forward pass needs CUDA
         renders = torch.zeros(1, 9, 9, 3)
         forward = lambda *_: (renders, alphas.float(), last_ids)  # noqa: E731
-        monkeypatch.setattr(compositing._wrapper, "_make_lazy_cuda_func", lambda name: forward)
+        monkeypatch.setattr(gsplat_internals, "composite", forward)
     inputs = {name: scene[name].clone() for name in NAMES[:4]}
     for name in ("means2d", "colors"):
         inputs[name].requires_grad_()
@@ -250,8 +251,8 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
     """Everything around gsplat's two kernels, for two views; torch code stands in for these kernels."""
     width, height, depths = 22, 18, []
 
-    def project(means, _, quats, scales, viewmats, Ks, width, height, calc_compensations):
-        covariances = _quat_scale_to_covar_preci(quats, scales, True, False)[0]
+    def project(means, quats, scales, opacities, viewmats, Ks, width, height, calc_compensations):
+        covariances = gsplat_internals.torch_quat_scale_to_covar_preci(quats, scales, True, False)[0]
         assert covariances is not None
         projected = _fully_fused_projection(
             means, covariances, viewmats, Ks, width, height, calc_compensations=calc_compensations
@@ -259,7 +260,7 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
         depths[:] = [projected[2].detach()]
         return projected
 
-    def draw(means2d, conics, colors, opacities, backgrounds, masks, width, height, tile_size, starts, ids):
+    def draw(means2d, conics, colors, opacities, width, height, tile_size, starts, ids):
         values = (value.detach().clone() for value in (means2d, conics, colors, opacities))
         scene = dict(zip(NAMES, values, strict=False)) | {"starts": starts, "ids": ids, "depths": depths[0]}
         scene["v_renders"], scene["v_alphas"] = torch.ones(2, height, width, 3), torch.ones(2, height, width, 1)
@@ -267,8 +268,8 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
             _, alphas, last_ids = reference(scene)
         return torch.zeros(2, height, width, 3), alphas.float(), last_ids  # nobody looks at the colours
 
-    monkeypatch.setattr(rasterization, "fully_fused_projection", project)
-    monkeypatch.setattr(compositing._wrapper, "_make_lazy_cuda_func", lambda name: draw)
+    monkeypatch.setattr(gsplat_internals, "project", project)
+    monkeypatch.setattr(gsplat_internals, "composite", draw)
     generator = torch.Generator().manual_seed(0)
     viewmats = torch.eye(4).repeat(2, 1, 1)
     viewmats[1, :3, :3] = torch.linalg.qr(torch.eye(3) + 0.05 * torch.randn(3, 3, generator=generator))[0]
@@ -304,8 +305,6 @@ def test_gradients_are_as_close_to_float64_as_gsplats(kind):
 
     Where ours may err more than gsplat's, it is by what the module states.
     """
-    from gsplat.cuda._wrapper import rasterize_to_pixels
-
     scene = make_scene(kind, num_views=2, n=300, width=93, height=70)
     expected, _, _ = reference(scene)
     errors = []
@@ -315,8 +314,8 @@ def test_gradients_are_as_close_to_float64_as_gsplats(kind):
         if ours:
             outputs = compositing.rasterize_to_pixels(means2d, conics, colors, opacities, 93, 70, *lists, True)
         else:
-            outputs = rasterize_to_pixels(
-                means2d, conics, colors, opacities, 93, 70, 8, *lists, absgrad=True
+            outputs = gsplat_internals.rasterize_to_pixels(
+                means2d, conics, colors, opacities, 93, 70, 8, *lists, True
             )  # fmt: skip
         torch.autograd.backward(outputs, [scene["v_renders"], scene["v_alphas"]])
         gradients: dict[str, Any] = dict(
