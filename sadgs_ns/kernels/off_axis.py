@@ -1,6 +1,6 @@
 """`render.off_axis.cull_off_axis` in one kernel."""
 
-# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
+# pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportIndexIssue=false
 # (Triton's launch syntax, kernel[grid](...), is not in its types.)
 
 from __future__ import annotations
