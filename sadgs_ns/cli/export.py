@@ -6,15 +6,17 @@ import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from sadgs_ns.atomic import atomic_path
 from sadgs_ns.data.coordinates import TRANSFORMS_NAME, Similarity, from_data
 from sadgs_ns.errors import InputError, RunError, WriteError
+
+if TYPE_CHECKING:  # torch takes seconds, which `--help` and a wrong path need not wait for
+    from torch import Tensor
 
 Frame = Literal["nerfstudio", "colmap"]
 
@@ -177,7 +179,10 @@ def _checkpoint_of(run: Path) -> Path:
 
 def _read(checkpoint: Path, latest: bool) -> dict[str, Tensor]:
     """The Gaussians' parameters, mapped from the file: what is not written takes no memory."""
-    from sadgs_ns.plugin import checkpoints  # here, since they import nerfstudio
+    # nerfstudio, which `checkpoints` imports, takes ten seconds, and `--help` need not wait for it.
+    from torch import Tensor
+
+    from sadgs_ns.plugin import checkpoints
 
     folder, single = (checkpoint.parent, None) if latest else (None, checkpoint)
     chosen = checkpoints.read_chosen(folder, None, single, _REMEDY, mmap=True)
