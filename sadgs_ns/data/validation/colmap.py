@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sadgs_ns.data import colmap
 from sadgs_ns.data.validation.findings import Finding, collect_findings
@@ -202,6 +201,8 @@ def _views(
     poses: Sequence[colmap.Pose], cameras: Mapping[int, colmap.Camera], poses_path: Path, cameras_path: Path
 ) -> list[View]:
     """Return the poses and their cameras, as the checks of geometry take them."""
+    from scipy.spatial.transform import Rotation  # It takes half a second to import, and other layouts do without.
+
     described = {camera_id: _describe(camera) for camera_id, camera in cameras.items()}
     quats = np.array([pose[[1, 2, 3, 0]] for _, _, pose in poses])  # xyzw [V, 4]
     rotations = Rotation.from_quat(quats).as_matrix()  # [V, 3, 3]
