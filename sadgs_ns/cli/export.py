@@ -179,7 +179,7 @@ def _checkpoint_of(run: Path) -> Path:
 
 def _read(checkpoint: Path, latest: bool) -> dict[str, Tensor]:
     """The Gaussians' parameters, mapped from the file: what is not written takes no memory."""
-    # nerfstudio, which `checkpoints` imports, takes ten seconds, and `--help` need not wait for it.
+    # torch, which both import, takes seconds, and `--help` and a wrong path need not wait for it.
     from torch import Tensor
 
     from sadgs_ns.plugin import checkpoints
