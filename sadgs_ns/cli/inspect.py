@@ -10,7 +10,7 @@ from pathlib import Path
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code, 2 if the input is wrong."""
+    """Run the command line and return its exit code, 2 if the input is wrong."""
     parser = argparse.ArgumentParser(
         prog="sadgs-inspect",
         description="Pictures of a view of a run: the photo's structure tensor as ellipses and local wavelength, η of "

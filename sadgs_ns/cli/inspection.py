@@ -35,9 +35,10 @@ from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 SEED = 0
 """Seed of the random colours and of AbsGS's children."""
 MIN_SIDE = 900
-"""Least longer side of a picture with ellipses, px."""
+"""Shortest length in px of the longer side of a picture with ellipses."""
 MIN_RENDER_SIDE = 640
-"""Least longer side of a rendering in random colours, px: on smaller ones Gaussians could not be told apart."""
+"""Shortest length in px of the longer side of a rendering in random colours. In a smaller one Gaussians could not be
+told apart."""
 _REMEDY = "give another with --load-step, or another run of sadgs"
 """What to do about a checkpoint that cannot be used."""
 
@@ -48,17 +49,17 @@ class View:
 
     name: str
     photo: Tensor
-    """In [0, 1]. [H, W, 3]"""
+    """Colours in [0, 1]. [H, W, 3]"""
     structure_tensor: Tensor
-    """S̄. [H, W, 3]"""
+    """S̄ of the photo. [H, W, 3]"""
     viewmat: Tensor
-    """World to camera. [4, 4]"""
+    """Transform from world to camera. [4, 4]"""
     K: Tensor
-    """px. [3, 3]"""
+    """Intrinsics in px. [3, 3]"""
 
     @property
     def camera(self) -> tuple[Tensor, Tensor, int, int]:
-        """viewmat, K, width and height, as `gaussian_maps.blend` takes them."""
+        """Return viewmat, K, width and height, as `gaussian_maps.blend` takes them."""
         height, width = self.photo.shape[:2]
         return self.viewmat, self.K, width, height
 
@@ -108,7 +109,7 @@ def load_run(path: Path, load_step: int | None = None, data: Path | None = None)
         pipeline.load_pipeline(state["pipeline"], state["step"])
     except InputError as error:
         raise InputError(f"{checkpoint} does not fit its run: {str(error).rstrip('.')}; {_REMEDY}.") from error
-    except (KeyError, RuntimeError) as error:  # what lacks, or has another size
+    except (KeyError, RuntimeError) as error:  # A part is missing or has another size.
         raise InputError(f"{checkpoint} is not of this version of sadgs ({reason(error)}): {_REMEDY}.") from error
     saved = state["pipeline"]["_extra_state"].get("schedule", {})  # Earlier versions did not derive it.
     pipeline.model.strategy.fit_to_run(saved.get("iterations", config.max_num_iterations))
@@ -116,7 +117,7 @@ def load_run(path: Path, load_step: int | None = None, data: Path | None = None)
 
 
 def get_view(pipeline: SadgsPipeline, index: int, split: Literal["train", "eval"] = "train") -> View:
-    """A view by its number, counted from 0 in the order of the split.
+    """Return a view by its number, counted from 0 in the order of the split.
 
     Raises:
         InputError: If there is no such view.
@@ -142,7 +143,11 @@ def get_view(pipeline: SadgsPipeline, index: int, split: Literal["train", "eval"
 
 
 def screen_gradients(pipeline: SadgsPipeline, progress: Callable[[range], Any]) -> dict[str, Tensor]:
-    """What AbsGS decides on: the loss's screen gradients of every training view, as training adds them up.
+    """Return what AbsGS decides on: the loss's screen gradients of all training views, added up as in training.
+
+    Args:
+        pipeline: A loaded run.
+        progress: Called with the range of the views' numbers; what it returns is iterated over.
 
     Returns:
         As `absgs.empty_gradients`.
@@ -172,14 +177,15 @@ class Step:
     params: dict[str, Tensor]
     """Raw parameters by name, leading dimension M."""
     origins: Tensor
-    """The Gaussian of before that each one was or came from. int64 [M]"""
+    """Number of the Gaussian before the step that each one was or came from. int64 [M]"""
 
 
 def _try(
     model: SadgsModel, state: dict[str, Any], densify: Callable[[dict[str, Any], Any, dict[str, Any]], Any]
 ) -> Step:
     params = {name: torch.nn.Parameter(value.detach().clone()) for name, value in model.gauss_params.items()}
-    # A parameter, since children take theirs from their parents; rows of the state begin anew. float64 counts exactly.
+    # The numbers are a parameter, since children take theirs from their parents, while rows of the state begin anew.
+    # float64 counts exactly.
     numbers = torch.arange(model.num_points, device=params["means"].device, dtype=torch.float64)
     params["origins"] = torch.nn.Parameter(numbers)
     optimizers = {name: torch.optim.SGD([parameter], lr=0.0) for name, parameter in params.items()}
@@ -189,16 +195,16 @@ def _try(
 
 
 def structure_step(model: SadgsModel, statistics: dict[str, Tensor]) -> Step:
-    """What a structure-aware step would split, without its pruning."""
+    """Try a structure-aware step without its pruning, and return what it makes of the Gaussians."""
     counts, child_scale = model.strategy.children_now(model.gauss_params, statistics), model.strategy.child_scale
     return _try(model, {}, lambda p, o, s: grid_split(p, o, s, counts, child_scale))
 
 
 def conventional_step(model: SadgsModel, gradients: dict[str, Tensor]) -> Step:
-    """What a conventional step (AbsGS: clone, or split in two) would add, without its pruning."""
+    """Try a conventional step (AbsGS: clone, or split in two) without its pruning, and return what it makes."""
     strategy, extent = model.strategy, float(model.strategy_state["scene_scale"])
     with torch.random.fork_rng(devices=[model.device] if model.device.type == "cuda" else []):
-        torch.manual_seed(SEED)  # gsplat draws the children's places
+        torch.manual_seed(SEED)  # gsplat draws the children's places at random.
         return _try(
             model,
             dict(gradients),
@@ -215,7 +221,7 @@ def conventional_step(model: SadgsModel, gradients: dict[str, Tensor]) -> Step:
 
 
 def view_panels(pipeline: SadgsPipeline, view: View, statistics: dict[str, Tensor]) -> dict[str, Panel]:
-    """The pictures of one view, by name."""
+    """Return the pictures of one view by their names."""
     model, constant = pipeline.model, pipeline.config.frequency_constant
     params, options = dict(model.gauss_params.items()), model.drawing
     counts = model.strategy.children_now(model.gauss_params, statistics)
@@ -255,7 +261,7 @@ def view_panels(pipeline: SadgsPipeline, view: View, statistics: dict[str, Tenso
 
 
 def step_panels(model: SadgsModel, view: View, conventional: Step, structure: Step) -> list[Panel]:
-    """The photo, and the Gaussians in random colours before and after one step of each kind (paper, figure 3)."""
+    """Return the photo, and the Gaussians in random colours before and after a step of each kind (paper, figure 3)."""
     generator = torch.Generator().manual_seed(SEED)
     colors = gaussian_maps.random_colors(model.num_points, generator).to(model.device)
 

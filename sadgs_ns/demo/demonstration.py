@@ -37,7 +37,7 @@ from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 PRESET = "sadgs"
 ABSGS_THRESHOLD_FACTOR = 16.0
-"""What AbsGS's gradient thresholds are multiplied by. Gradients are normalised by the image's size and grow with a
+"""Factor on AbsGS's gradient thresholds. Gradients are normalised by the image's size and grow with a
 Gaussian's share of it; the demo's few are tens of times wider, relative to the image, than those of a photograph. At
 the preset's thresholds nearly all were split each time, and the cap was full before the first structure step."""
 OPACITY_LR = 0.1
@@ -53,7 +53,7 @@ class Snapshot:
     """The Gaussians and their η just before the first structure step, if the run came that far."""
 
     params: dict[str, Tensor] = field(default_factory=dict)
-    """Raw parameters by name, leading dimension N."""
+    """Raw parameters by name, whose first dimension is N."""
     statistics: dict[str, Tensor] = field(default_factory=dict)
     """`eta_max`, the largest η seen per axis [N, 3], and `n_total`, the number of observations [N]."""
 
@@ -65,27 +65,27 @@ class Run:
     label: str
     pipeline: SadgsPipeline
     seconds: float
-    """Of the training loop."""
+    """Duration of the training loop."""
     renders: list[Tensor]
-    """Held-out views in [0, 1]. [H, W, 3] each"""
+    """Renderings of the held-out views in [0, 1]. [H, W, 3] each"""
     targets: list[Tensor]
-    """The same views as they are. [H, W, 3] each"""
+    """Images of the same views in [0, 1]. [H, W, 3] each"""
     before_split: Snapshot
     structure_growth: int
-    """Gaussians that the structure steps added, net of what they pruned."""
+    """Number of Gaussians that the structure steps added, less those that they pruned."""
 
     @property
     def model(self) -> SadgsModel:
-        """The trained Gaussians."""
+        """Return the trained Gaussians."""
         return self.pipeline.model
 
     def psnr(self) -> float:
-        """Mean over the held-out views, dB."""
+        """Return the mean PSNR over the held-out views in dB."""
         errors = [(a - b).square().mean() for a, b in zip(self.renders, self.targets, strict=True)]
         return float(torch.stack([-10 * error.log10() for error in errors]).mean())
 
     def ssim(self) -> float:
-        """Mean over the held-out views, 11×11 window."""
+        """Return the mean SSIM over the held-out views, with a window of 11×11 px."""
         first, second = (torch.stack(images).permute(0, 3, 1, 2) for images in (self.renders, self.targets))
         return float(ssim(first, second, data_range=1.0))
 
@@ -105,7 +105,7 @@ def fit_densification(strategy: StructureAwareStrategy, max_gaussians: int) -> N
 def run_config(
     scene: Path, output: Path, label: str, iterations: int, max_gaussians: int, densify: bool, split: bool = True
 ) -> SadgsTrainerConfig:
-    """The preset, set up for the demo: its own data, few iterations, no viewer, no evaluation on the way.
+    """Return the preset as the demo uses it: its own data, few iterations, no viewer, no evaluation on the way.
 
     Args:
         scene: The dataset's folder.
@@ -122,7 +122,7 @@ def run_config(
     config.max_num_iterations = iterations
     config.steps_per_save = config.steps_per_eval_image = 0
     config.logging.local_writer.enable = False
-    config.pipeline.datamanager.cache_images = "gpu"  # the training device; "cpu" pins memory, which needs CUDA
+    config.pipeline.datamanager.cache_images = "gpu"  # This is the training device; "cpu" pins memory, which needs CUDA
     config.pipeline.datamanager.dataparser = ColmapDataParserConfig(
         data=scene, colmap_path=SPARSE_FOLDER, downscale_factor=1, eval_mode="interval", eval_interval=EVAL_INTERVAL
     )
@@ -150,7 +150,7 @@ def train(config: SadgsTrainerConfig, label: str, on_step: Callable[[int, int], 
     trainer.setup()
     pipeline, snapshot = trainer.pipeline, Snapshot()
     windows = pipeline.model.strategy.windows
-    counts: list[int] = []  # before (negative) and after each structure step
+    counts: list[int] = []  # Numbers of Gaussians before (negative) and after each structure step.
 
     def at_structure_step(step: int) -> bool:
         return (
@@ -189,7 +189,7 @@ def train(config: SadgsTrainerConfig, label: str, on_step: Callable[[int, int], 
 
 
 def draw_side_by_side(path: Path, runs: Sequence[Run]) -> None:
-    """One row a held-out view: ground truth, then each run."""
+    """Draw a row for each held-out view: its image, then the rendering of each run."""
     labels = ["ground truth", *(run.label for run in runs)]
     rows = [
         torch.cat([target, *(run.renders[index] for run in runs)], dim=1)  # [H, columns · W, 3]
@@ -207,7 +207,7 @@ def draw_side_by_side(path: Path, runs: Sequence[Run]) -> None:
 
 
 def draw_wavelength_and_eta(path: Path, scene: SceneDescription, run: Run, index: int = 0) -> None:
-    """Four panels of a training view: image, estimated and true period of its texture, and η before the first split."""
+    """Draw a training view's image, the estimated and the true period of its texture, and η before the first split."""
     pipeline, before = run.pipeline, run.before_split
     view = get_view(pipeline, index)
     truth = expected_wavelength_map(scene.surfaces, next(v for v in scene.views if v.name == view.name))
@@ -224,7 +224,7 @@ def draw_wavelength_and_eta(path: Path, scene: SceneDescription, run: Run, index
 
 
 def verdict(absgs: Run, sadgs: Run, max_gaussians: int) -> str:
-    """What the table says about structure-aware splits, and what it cannot say."""
+    """Return what the table says about structure-aware splits, and what it cannot say."""
     if sadgs.structure_growth <= 0:
         return (
             f"Structure steps added no Gaussians within the cap of {max_gaussians}, so the difference above is the "
@@ -263,7 +263,7 @@ def demonstrate(output: Path, iterations: int, max_gaussians: int, width: int, h
     )
     runs: list[Run] = []
     columns = (TextColumn("{task.description:24s}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    CONSOLE.quiet, was_quiet = True, CONSOLE.quiet  # nerfstudio's console: the demo prints its own few lines
+    CONSOLE.quiet, was_quiet = True, CONSOLE.quiet  # This is nerfstudio's console; the demo prints its own few lines.
     try:
         with Progress(*columns, TextColumn("{task.fields[count]} Gaussians"), console=console) as progress:
             for label, (densify, split) in ROWS.items():
