@@ -35,7 +35,7 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from sadgs_ns.demo.__main__ import fit_densification
+from sadgs_ns.demo.demonstration import fit_densification
 from sadgs_ns.demo.scene import EVAL_INTERVAL, SPARSE_FOLDER, write_scene
 from sadgs_ns.plugin.presets import sadgs
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig

@@ -32,7 +32,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from sadgs_ns.bench import gate, protocol, results
+from sadgs_ns.bench import command_lines, gate, protocol, results
 from sadgs_ns.bench.protocol import Job
 from sadgs_ns.bench.results import Result
 from sadgs_ns.bench.table import markdown
@@ -227,6 +227,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     argv = sys.argv[1:] if argv is None else argv
     if argv and argv[0] in COMMANDS:
+        getattr(command_lines, argv[0])().parse_args(
+            argv[1:]
+        )  # It ends with help or an error before the slow imports below.
         return importlib.import_module(f"sadgs_ns.bench.{COMMANDS[argv[0]][0]}").main(argv[1:])
     parser = argparse.ArgumentParser(
         prog="sadgs-bench",

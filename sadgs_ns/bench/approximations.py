@@ -7,7 +7,6 @@ CPU of processor time.
 
 from __future__ import annotations
 
-import argparse
 import platform
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -19,7 +18,7 @@ import cv2
 import numpy as np
 import torch
 
-from sadgs_ns.bench import results
+from sadgs_ns.bench import command_lines, results
 from sadgs_ns.bench.eta_errors import RUNS, demo_training_set, footprint_rows, interval_rows, random_footprints
 from sadgs_ns.bench.tensor_errors import AXIS_LENGTHS, Image, Row, batch, robustness_rows, structure_tensor_rows
 from sadgs_ns.demo.scene import describe_scene, render
@@ -117,10 +116,10 @@ def markdown(rows: Sequence[Row]) -> str:
 class Workload:
     """How much is measured; the tests measure less."""
 
-    repeats: int = 5
+    repeats: int = command_lines.KERNEL_REPEATS
     longest_side: int | None = None
     """px; None is 1600 for a photo and 320 for the demo's images."""
-    gaussians: int = 5000
+    gaussians: int = command_lines.KERNEL_GAUSSIANS
     views: int = 24
     """Of the demo scene."""
     analysed_views: int = 2
@@ -197,20 +196,7 @@ def _device_name(device: torch.device) -> str:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Print the tables; returns the exit code, 2 if the input is wrong."""
-    default = Workload()
-    parser = argparse.ArgumentParser(prog="sadgs-bench kernels", description=(__doc__ or "").split("\n\n")[1])
-    parser.add_argument("--image", type=Path, metavar="FILE", help="a photo (default: images of the demo scene)")
-    parser.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N (default %(default)s)")
-    parser.add_argument("--repeats", type=int, default=default.repeats, help="timed calls (default %(default)s)")
-    parser.add_argument(
-        "--longest-side", type=int, metavar="PX",
-        help="a larger photo is reduced to it (default 1600), the demo is drawn at it (default 320)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--gaussians", type=int, default=default.gaussians, help="for the tables of η (default %(default)s)"
-    )
-    parser.add_argument("--output", type=Path, metavar="FILE", help="JSON-lines file that the rows are added to")
-    given = parser.parse_args(argv)
+    given = command_lines.kernels().parse_args(argv)
     try:
         for name, value, least in (("repeats", given.repeats, 1), ("gaussians", given.gaussians, 10),
                                    ("longest-side", given.longest_side, 32)):  # fmt: skip

@@ -7,7 +7,6 @@ updates the parameters.
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -17,6 +16,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
+from sadgs_ns.bench import command_lines
 from sadgs_ns.bench.step import rasterize_parameters
 from sadgs_ns.method import memory
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients
@@ -136,13 +136,7 @@ def measure(training: Training) -> dict[str, float]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Print the table; returns the exit code, 1 where there is no CUDA device."""
-    parser = argparse.ArgumentParser(
-        prog="sadgs-bench memory", description="Compare the memory plan with the real peaks of training steps."
-    )
-    parser.add_argument("--gaussians", type=int, nargs="+", default=[300_000, 1_000_000])
-    parser.add_argument("--megapixels", type=float, nargs="+", default=[0.4, 2.0, 5.0])
-    parser.add_argument("--views", type=int, nargs="+", default=[1, 4])
-    options = parser.parse_args(argv)
+    options = command_lines.memory().parse_args(argv)
     if not torch.cuda.is_available():
         print("This comparison needs a CUDA device, and torch finds none.")
         return 1

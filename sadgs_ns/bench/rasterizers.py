@@ -7,7 +7,6 @@ gsplat's as a markdown table.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,6 +14,7 @@ import gsplat
 import torch
 from torch import Tensor
 
+from sadgs_ns.bench import command_lines
 from sadgs_ns.render.rasterization import rasterize, visible
 
 _PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
@@ -82,13 +82,7 @@ def render_with_gradients(
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Print the table; returns the exit code, 1 where there is no CUDA device."""
-    parser = argparse.ArgumentParser(
-        prog="sadgs-bench rasterizers", description="Compare the torch splatter with gsplat on CUDA."
-    )
-    parser.add_argument("--gaussians", type=int, default=3000)
-    parser.add_argument("--size", type=int, default=128, help="width and height of the image in pixels")
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args(argv)
+    options = command_lines.rasterizers().parse_args(argv)
     if not torch.cuda.is_available():
         print("This comparison needs a CUDA device for gsplat, and torch finds none.")
         return 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import base64
 import importlib.resources
 import shlex
@@ -17,7 +16,7 @@ from typing import Any
 import jinja2
 from matplotlib.figure import Figure
 
-from sadgs_ns.bench import plots, results, table, views
+from sadgs_ns.bench import command_lines, plots, results, table, views
 from sadgs_ns.bench.plots import Groups
 from sadgs_ns.bench.results import Result
 
@@ -168,15 +167,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit code: 0, or 2 if the input is wrong.
     """
     argv = sys.argv[1:] if argv is None else argv
-    parser = argparse.ArgumentParser(prog="sadgs-bench report", description="Draw a results file: plots and a page.")
-    parser.add_argument("results", type=Path, help="JSON-lines file that sadgs-bench wrote")
-    parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="takes report.html and the plots")
-    parser.add_argument("--images", type=Path, metavar="FOLDER", help="held-out views that the runs wrote, to compare")
-    parser.add_argument("--views", type=int, default=3, metavar="N", help="held-out views to show of each scene")
-    parser.add_argument("--reference", metavar="LABEL", help="row whose loop seconds are 1 in the column Ratio")
-    parser.add_argument("--title", default="Benchmark", help="heading of the page")
-    parser.add_argument("--command", metavar="TEXT", help="command that made the results, to be shown on the page")
-    arguments = parser.parse_args(argv)
+    arguments = command_lines.report().parse_args(argv)
     commands = [*([arguments.command] if arguments.command else []), shlex.join(["sadgs-bench", "report", *argv])]
     try:
         if arguments.views < 1:

@@ -6,7 +6,6 @@ Adam with its moments. Each part is timed by itself, then the whole step, a spli
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -16,6 +15,7 @@ import gsplat
 import torch
 from torch import Tensor
 
+from sadgs_ns.bench import command_lines
 from sadgs_ns.method.codes import encode
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.split import grid_split
@@ -250,13 +250,7 @@ def time_structure_tensors(images: int, width: int, height: int) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Print the tables; returns the exit code, 1 where there is no CUDA device."""
-    parser = argparse.ArgumentParser(
-        prog="sadgs-bench step", description="Time the parts of a training step with and without our kernels."
-    )
-    parser.add_argument("--gaussians", type=int, nargs="+", default=[500_000, 4_000_000])
-    parser.add_argument("--width", type=int, default=1600, help="px")
-    parser.add_argument("--height", type=int, default=1060, help="px")
-    options = parser.parse_args(argv)
+    options = command_lines.step().parse_args(argv)
     if not torch.cuda.is_available():
         print("This comparison needs a CUDA device, and torch finds none.")
         return 1

@@ -8,7 +8,6 @@ rectangle in each training view, somewhere else in each and a quarter of it in a
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
 from collections.abc import Sequence
@@ -18,6 +17,7 @@ import numpy as np
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from PIL import Image
 
+from sadgs_ns.bench import command_lines
 from sadgs_ns.bench.datasets import image_names
 
 SPARSE = Path("sparse/0")
@@ -89,13 +89,7 @@ def write_transforms(scene: Path, out: Path) -> tuple[int, int]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Write the scenes and print how many views each has; returns the exit code, 2 where there is no scene."""
-    parser = argparse.ArgumentParser(
-        prog="sadgs-bench validation", description="Hold out validation views, and leave test views out."
-    )
-    parser.add_argument("root", type=Path, help="folder that holds the scenes")
-    parser.add_argument("out", type=Path, help="folder for the copies")
-    parser.add_argument("--masked", nargs="*", default=[], metavar="SCENE", help="also write NAME-masked of these")
-    arguments = parser.parse_args(argv)
+    arguments = command_lines.validation().parse_args(argv)
     folders = sorted(path for path in arguments.root.iterdir() if path.is_dir()) if arguments.root.is_dir() else []
     scenes = [path for path in folders if (path / SPARSE).is_dir() or (path / "transforms.json").exists()]
     if not scenes:

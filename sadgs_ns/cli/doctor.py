@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import ctypes.util
+import importlib.util
 import os
 import platform
 import shlex
@@ -19,8 +20,8 @@ from sadgs_ns.errors import free_space, reason
 
 PACKAGES = ("sadgs_ns", "torch", "torchvision", "gsplat", "nerfstudio", "triton", "pycolmap", "open3d")
 """Packages whose versions are printed."""
-_LPIPS_NETWORKS = {"AlexNet": "AlexNet_Weights", "VGG": "VGG16_Weights"}
-"""Networks of LPIPS, and what torchvision calls their weights."""
+_LPIPS_NETWORKS = {"AlexNet": "alexnet-owt-7be5be79.pth", "VGG": "vgg16-397923af.pth"}
+"""Networks of LPIPS, and the files in which torchvision keeps their weights."""
 
 
 def versions() -> dict[str, str]:
@@ -42,7 +43,8 @@ def check_machine() -> Iterator[Finding]:
     """
     try:
         import torch
-        import torchvision  # noqa: F401
+
+        _load_torchvision()
     except Exception as error:  # A broken installation raises anything.
         yield Finding("error", f"torch cannot be used ({reason(error)}): install the versions of constraints.txt.")
         return
@@ -65,6 +67,21 @@ def check_machine() -> Iterator[Finding]:
             yield Finding("note", f"{program}: {found}.")
         else:
             yield Finding("warning", f"{program} is missing: {use}; install the system's package {package}.")
+
+
+def _load_torchvision() -> None:
+    """Load the part of torchvision that is compiled for one version of torch; raise an error if it does not fit.
+
+    Importing all of torchvision takes two seconds more, since it imports torch's compiler, torch._dynamo.
+    """
+    import torch
+
+    spec = importlib.util.find_spec("torchvision")
+    libraries = [] if spec is None or spec.origin is None else sorted(Path(spec.origin).parent.glob("_C.*"))
+    if libraries:
+        torch.ops.load_library(libraries[0])
+    else:
+        import torchvision  # noqa: F401
 
 
 def _check_cuda() -> Iterator[Finding]:
@@ -111,10 +128,8 @@ def _check_cuda() -> Iterator[Finding]:
 def _check_lpips() -> Iterator[Finding]:
     """Check whether the weights of LPIPS are on the disk."""
     import torch
-    import torchvision
 
-    for name, weights in _LPIPS_NETWORKS.items():
-        file = Path(getattr(torchvision.models, weights).DEFAULT.url).name
+    for name, file in _LPIPS_NETWORKS.items():
         path = Path(torch.hub.get_dir(), "checkpoints", file)
         if path.is_file():
             yield Finding("note", f"LPIPS with {name} has its weights: {path}.")
@@ -125,6 +140,16 @@ def _check_lpips() -> Iterator[Finding]:
             )
         else:
             yield Finding("note", f"LPIPS with {name}, for benchmarks alone, has no weights: put them at {path}.")
+
+
+def check_all(data: Path | None) -> Iterator[Finding]:
+    """Check the machine and, if one is given, a data folder."""
+    yield from check_machine()
+    if data is not None:
+        findings = check_data(data)
+        yield from findings
+        if all(finding.severity == "note" for finding in findings):
+            yield Finding("note", f"{data}: nothing to complain about.")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -139,15 +164,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     given = parser.parse_args(arguments)
     print(", ".join(f"{package} {number}" for package, number in versions().items()))
-    findings = [Finding("note", f"Free disk space here: {free_space(Path())}."), *check_machine()]
-    if given.data is not None:
-        of_data = check_data(given.data)
-        findings += of_data
-        if not any(finding.severity != "note" for finding in of_data):
-            findings.append(Finding("note", f"{given.data}: nothing to complain about."))
-    for finding in findings:
-        print(f"{finding.severity}: {finding.sentence}")
-    failed = any(finding.severity == "error" for finding in findings)
+    print(f"note: Free disk space here: {free_space(Path())}.", flush=True)
+    failed = False
+    for finding in check_all(given.data):
+        print(f"{finding.severity}: {finding.sentence}", flush=True)  # The next one may take seconds.
+        failed |= finding.severity == "error"
     if given.data is not None and not failed:
         print(f"Next: ns-train sadgs --data {shlex.quote(str(given.data))}")
     return int(failed)

@@ -6,20 +6,22 @@ import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from sadgs_ns.atomic import atomic_path
 from sadgs_ns.data.coordinates import TRANSFORMS_NAME, Similarity, from_data
 from sadgs_ns.errors import InputError, RunError, WriteError
 
+if TYPE_CHECKING:  # torch takes seconds, which `--help` and a wrong path need not wait for
+    from torch import Tensor
+
 Frame = Literal["nerfstudio", "colmap"]
 
 _ROWS = 1 << 16
-"""Gaussians that are converted at a time, so that writing takes little memory beyond the Gaussians themselves."""
+"""Number of Gaussians that are converted at a time, so that writing takes little memory beyond their own."""
 _PREFIX = "_model.gauss_params."
 _DEGREE_0 = 0.5 / np.sqrt(np.pi)
 """The spherical harmonic of degree 0."""
@@ -97,7 +99,7 @@ def write_ply(
 def _rows(
     params: Mapping[str, NDArray[np.float64]], similarity: Similarity | None, rotate: NDArray[np.float64] | None
 ) -> NDArray[np.float32]:
-    """Gaussians as the file holds them. [n, 17 + 3 K]"""
+    """Return Gaussians as the file holds them. [n, 17 + 3 K]"""
     means, scales, quats = params["means"], params["scales"], params["quats"]
     rest = params["features_rest"].transpose(0, 2, 1)  # [n, 3, K]: the file has colour before band
     with np.errstate(all="ignore"):  # what is, or becomes, infinite is dropped
@@ -111,7 +113,7 @@ def _rows(
 
 
 def _header(count: int, bands: int, most: int) -> bytes:
-    """The file's head, equally long for every count up to `most`: the true one is known at the end only."""
+    """Return the file's head, equally long for every count up to `most`, since the count is known only at the end."""
     padding = " " * (len(str(most)) - len(str(count)))
     names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
     names += [f"f_rest_{i}" for i in range(3 * bands)]
@@ -163,7 +165,7 @@ def export(run: Path, output: Path, frame: Frame = "nerfstudio") -> int:
 
 
 def _checkpoint_of(run: Path) -> Path:
-    """The checkpoint that a run's folder, its `config.yml` or the checkpoint itself names."""
+    """Return the checkpoint that a run's folder, its `config.yml` or the checkpoint itself names."""
     if run.suffix == ".ckpt" and run.is_file():
         return run
     folder = run.parent if run.is_file() else run
@@ -176,8 +178,11 @@ def _checkpoint_of(run: Path) -> Path:
 
 
 def _read(checkpoint: Path, latest: bool) -> dict[str, Tensor]:
-    """The Gaussians' parameters, mapped from the file: what is not written takes no memory."""
-    from sadgs_ns.plugin import checkpoints  # here, since they import nerfstudio
+    """Return the Gaussians' parameters, mapped from the file, so that what is not written takes no memory."""
+    # torch, which both import, takes seconds, and `--help` and a wrong path need not wait for it.
+    from torch import Tensor
+
+    from sadgs_ns.plugin import checkpoints
 
     folder, single = (checkpoint.parent, None) if latest else (None, checkpoint)
     chosen = checkpoints.read_chosen(folder, None, single, _REMEDY, mmap=True)
@@ -194,7 +199,7 @@ def _read(checkpoint: Path, latest: bool) -> dict[str, Tensor]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code, 2 if the run or the output cannot be used."""
+    """Run the command line and return its exit code, 2 if the run or the output cannot be used."""
     parser = argparse.ArgumentParser(
         prog="sadgs-export",
         description="Write a trained run's Gaussians as the PLY that viewers of 3D Gaussian splatting read. It needs "

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from sadgs_ns.errors import InputError, reason
 
@@ -73,6 +72,10 @@ class Similarity:
         Returns:
             wxyz, of unit length; those without a direction stay as they are. [N, 4]
         """
+        from scipy.spatial.transform import (
+            Rotation,  # It takes half a second to import, and few commands turn anything.
+        )
+
         turn = Rotation.from_matrix(self.orthogonal * np.sign(np.linalg.det(self.orthogonal)))
         lengths, turned = np.linalg.norm(quats, axis=1), quats.copy()
         sound = (lengths > 0) & np.isfinite(lengths)  # Scipy refuses the others.

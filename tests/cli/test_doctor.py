@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes.util
-import importlib
+import importlib.util
 import re
 import shutil
 import sys
@@ -98,6 +98,21 @@ def test_torch_and_torchvision_that_do_not_fit_are_an_error(monkeypatch: pytest.
     (finding,) = doctor.check_machine()
     assert finding.severity == "error"
     assert re.fullmatch(r"torch cannot be used \(.+\): install the versions of constraints\.txt\.", finding.sentence)
+
+
+def test_a_torchvision_that_was_compiled_for_another_torch_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "_C.so").write_bytes(b"no library")
+    spec = SimpleNamespace(origin=str(tmp_path / "__init__.py"))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: spec)
+    (finding,) = doctor.check_machine()
+    assert (finding.severity, str(tmp_path / "_C.so") in finding.sentence) == ("error", True)
+
+
+def test_the_files_of_lpips_are_those_that_torchvision_downloads():
+    import torchvision  # It takes seconds, which the other tests need not wait for.
+
+    weights = (torchvision.models.AlexNet_Weights.DEFAULT, torchvision.models.VGG16_Weights.DEFAULT)
+    assert [Path(weight.url).name for weight in weights] == [*doctor._LPIPS_NETWORKS.values()]
 
 
 def test_a_machine_without_a_gpu_is_a_warning(monkeypatch: pytest.MonkeyPatch):

@@ -23,7 +23,7 @@ from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
 from PIL import Image
 
-from sadgs_ns.cli import inspect
+from sadgs_ns.cli import inspect, inspection
 from sadgs_ns.demo.scene import write_scene
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.codes import MASKED
@@ -58,7 +58,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def early(run: Path) -> SadgsPipeline:
     """The run after 9 iterations, to be looked at only."""
-    pipeline, iterations = inspect.load_run(run, load_step=8)
+    pipeline, iterations = inspection.load_run(run, load_step=8)
     assert iterations == 9
     return pipeline
 
@@ -66,7 +66,7 @@ def early(run: Path) -> SadgsPipeline:
 @pytest.fixture
 def panel(run: Path) -> StructurePanel:
     """Of a pipeline of its own, which is kept alive."""
-    pipeline, _ = inspect.load_run(run)
+    pipeline, _ = inspection.load_run(run)
     panel = pipeline.structure
     panel.keeps = [pipeline]  # type: ignore[assignment]
     return panel
@@ -105,7 +105,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("undrawn")
 def test_held_out_views_and_earlier_checkpoints_can_be_asked_for(run: Path, tmp_path: Path):
-    written = inspect.inspect_run(run.parent, EVAL_VIEWS - 1, "eval", tmp_path, load_step=8)
+    written = inspection.inspect_run(run.parent, EVAL_VIEWS - 1, "eval", tmp_path, load_step=8)
     assert all(path.name.startswith("eval-001-") and path.is_file() for path in written) and len(written) == 6
 
 
@@ -194,7 +194,7 @@ def test_a_gpu_that_is_full_is_one_sentence(
     def full(*_: Any) -> None:
         raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 22.00 MiB.")
 
-    monkeypatch.setattr(inspect, "inspect_run", full)
+    monkeypatch.setattr(inspection, "inspect_run", full)
     assert f"memory does not hold {run}: end other programs on it" in wrong([str(run)], capsys)
 
 
@@ -203,7 +203,7 @@ def test_a_gpu_that_is_full_is_one_sentence(
 
 def test_observing_all_views_finds_what_training_finds(run: Path):
     """Training's own code, shown every view once and nothing learned in between."""
-    pipeline, _ = inspect.load_run(run, load_step=8)
+    pipeline, _ = inspection.load_run(run, load_step=8)
     observed, model = observe_training_views(pipeline.structure_maps), pipeline.model
     model.train()
     model.optimizers = {}
@@ -226,7 +226,7 @@ def test_observing_leaves_the_run_as_it_was(early: SadgsPipeline):
     before, random = early.state_dict()["_model.gauss_params.means"].clone(), torch.get_rng_state()
     first = observe_training_views(early.structure_maps)
     torch.testing.assert_close(observe_training_views(early.structure_maps), first)
-    inspect.screen_gradients(early, iter)
+    inspection.screen_gradients(early, iter)
     assert torch.equal(torch.get_rng_state(), random)
     assert torch.equal(early.model.means, before)
     assert all(parameter.grad is None for parameter in early.model.parameters())
@@ -238,7 +238,7 @@ def test_the_structure_step_makes_the_children_of_the_plan(early: SadgsPipeline)
         model.gauss_params, statistics, model.strategy.max_gaussians - model.num_points
     )
     children = torch.where(fits, counts.prod(dim=1), 1)
-    step = inspect.structure_step(model, statistics)
+    step = inspection.structure_step(model, statistics)
     assert int(children.max()) > 1
     assert torch.equal(torch.bincount(step.origins, minlength=model.num_points), children)
     whole = step.origins[torch.bincount(step.origins)[step.origins] == 1]
@@ -246,14 +246,14 @@ def test_the_structure_step_makes_the_children_of_the_plan(early: SadgsPipeline)
 
 
 def test_the_conventional_step_clones_or_splits_in_two(early: SadgsPipeline):
-    model, gradients = early.model, inspect.screen_gradients(early, iter)
+    model, gradients = early.model, inspection.screen_gradients(early, iter)
     assert float(gradients["grad_count"].max()) == TRAIN_VIEWS
     assert float(gradients["absgrad2d"].max()) > float(gradients["grad2d"].max()) > 0
-    step = inspect.conventional_step(model, gradients)
+    step = inspection.conventional_step(model, gradients)
     sizes = torch.bincount(step.origins, minlength=model.num_points)
     assert set(sizes.unique().tolist()) == {1, 2}
     assert len(step.params["means"]) == len(step.origins) > model.num_points
-    assert torch.equal(inspect.conventional_step(model, gradients).params["means"], step.params["means"])
+    assert torch.equal(inspection.conventional_step(model, gradients).params["means"], step.params["means"])
 
 
 def test_the_photo_and_its_camera_belong_together(early: SadgsPipeline):
@@ -261,7 +261,7 @@ def test_the_photo_and_its_camera_belong_together(early: SadgsPipeline):
     assert early.model.seed_points is not None
     points, colors = (values.to(early.device).float() for values in early.model.seed_points)
     colors = colors / 255
-    views = [inspect.get_view(early, index) for index in range(TRAIN_VIEWS)]
+    views = [inspection.get_view(early, index) for index in range(TRAIN_VIEWS)]
     for number, view in enumerate(views):
         pixels = (points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]) @ view.K.T
         x, y = (pixels[:, :2] / pixels[:, 2:]).floor().long().unbind(-1)
@@ -484,11 +484,11 @@ def test_what_the_panel_draws_of_a_training_view_is_what_the_command_draws(panel
     panel.observe_now()
     statistics = panel.statistics()
     assert statistics is not None
-    view = inspect.get_view(pipeline, 2)
+    view = inspection.get_view(pipeline, 2)
     with torch.no_grad():
         rgb = pipeline.model.get_outputs_for_camera(a_camera(pipeline, 2))["rgb"]
     drawn = panel.picture("η", a_camera(pipeline, 2), rgb)  # too small for a legend
-    expected = inspect.view_panels(pipeline, view, statistics)["eta"].picture
+    expected = inspection.view_panels(pipeline, view, statistics)["eta"].picture
     assert (np.abs(drawn.astype(int) - expected) <= 2).mean() > 0.99
     near = panel.picture("wavelength of the nearest photo", a_camera(pipeline, 2), rgb)
     assert np.array_equal(near, color_scales.PERIOD(texture.texture_period(view.structure_tensor)))

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from numpy.typing import NDArray
 
 from sadgs_ns.data import colmap
 from sadgs_ns.data.validation.findings import Finding, collect_findings
@@ -203,8 +203,7 @@ def _views(
 ) -> list[View]:
     """Return the poses and their cameras, as the checks of geometry take them."""
     described = {camera_id: _describe(camera) for camera_id, camera in cameras.items()}
-    quats = np.array([pose[[1, 2, 3, 0]] for _, _, pose in poses])  # xyzw [V, 4]
-    rotations = Rotation.from_quat(quats).as_matrix()  # [V, 3, 3]
+    rotations = _rotations(np.array([pose[:4] for _, _, pose in poses]))
     return [
         View(
             f"{poses_path}: image {name}",
@@ -215,6 +214,24 @@ def _views(
         )
         for (name, camera_id, pose), rotation in zip(poses, rotations, strict=True)
     ]
+
+
+def _rotations(quats: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return quaternions as matrices; scipy, which could do it, takes half a second to import.
+
+    Args:
+        quats: wxyz, of any length but 0. [V, 4]
+
+    Returns:
+        Rotations. [V, 3, 3]
+    """
+    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.array(rows).transpose(2, 0, 1)
 
 
 def _describe(camera: colmap.Camera) -> Camera:

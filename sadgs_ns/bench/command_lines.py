@@ -1,0 +1,94 @@
+"""The options of the commands of `sadgs-bench` that measure something, apart from what they import.
+
+`sadgs-bench COMMAND --help` and wrong options so are answered before torch and nerfstudio are imported, which takes
+between two and ten seconds.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+KERNEL_REPEATS = 5
+"""Number of timed calls of `sadgs-bench kernels`."""
+KERNEL_GAUSSIANS = 5000
+"""Number of Gaussians in the tables of η of `sadgs-bench kernels`."""
+
+
+def report() -> argparse.ArgumentParser:
+    """Return the options of `sadgs-bench report`."""
+    parser = argparse.ArgumentParser(prog="sadgs-bench report", description="Draw a results file: plots and a page.")
+    parser.add_argument("results", type=Path, help="JSON-lines file that sadgs-bench wrote")
+    parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="takes report.html and the plots")
+    parser.add_argument("--images", type=Path, metavar="FOLDER", help="held-out views that the runs wrote, to compare")
+    parser.add_argument("--views", type=int, default=3, metavar="N", help="held-out views to show of each scene")
+    parser.add_argument("--reference", metavar="LABEL", help="row whose loop seconds are 1 in the column Ratio")
+    parser.add_argument("--title", default="Benchmark", help="heading of the page")
+    parser.add_argument("--command", metavar="TEXT", help="command that made the results, to be shown on the page")
+    return parser
+
+
+def kernels() -> argparse.ArgumentParser:
+    """Return the options of `sadgs-bench kernels`."""
+    parser = argparse.ArgumentParser(
+        prog="sadgs-bench kernels",
+        description="Four tables: how S̄ is computed and stored, how many samples a footprint gets, how often η is "
+        "observed, and how S̄ reacts to image perturbations as in the paper's supplement. Errors are against float64 or "
+        "brute force; times are medians, on a CPU of processor time.",
+    )
+    parser.add_argument("--image", type=Path, metavar="FILE", help="a photo (default: images of the demo scene)")
+    parser.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N (default %(default)s)")
+    parser.add_argument("--repeats", type=int, default=KERNEL_REPEATS, help="timed calls (default %(default)s)")
+    parser.add_argument(
+        "--longest-side", type=int, metavar="PX",
+        help="a larger photo is reduced to it (default 1600), the demo is drawn at it (default 320)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--gaussians", type=int, default=KERNEL_GAUSSIANS, help="for the tables of η (default %(default)s)"
+    )
+    parser.add_argument("--output", type=Path, metavar="FILE", help="JSON-lines file that the rows are added to")
+    return parser
+
+
+def step() -> argparse.ArgumentParser:
+    """Return the options of `sadgs-bench step`."""
+    parser = argparse.ArgumentParser(
+        prog="sadgs-bench step", description="Time the parts of a training step with and without our kernels."
+    )
+    parser.add_argument("--gaussians", type=int, nargs="+", default=[500_000, 4_000_000])
+    parser.add_argument("--width", type=int, default=1600, help="px")
+    parser.add_argument("--height", type=int, default=1060, help="px")
+    return parser
+
+
+def validation() -> argparse.ArgumentParser:
+    """Return the options of `sadgs-bench validation`."""
+    parser = argparse.ArgumentParser(
+        prog="sadgs-bench validation", description="Hold out validation views, and leave test views out."
+    )
+    parser.add_argument("root", type=Path, help="folder that holds the scenes")
+    parser.add_argument("out", type=Path, help="folder for the copies")
+    parser.add_argument("--masked", nargs="*", default=[], metavar="SCENE", help="also write NAME-masked of these")
+    return parser
+
+
+def memory() -> argparse.ArgumentParser:
+    """Return the options of `sadgs-bench memory`."""
+    parser = argparse.ArgumentParser(
+        prog="sadgs-bench memory", description="Compare the memory plan with the real peaks of training steps."
+    )
+    parser.add_argument("--gaussians", type=int, nargs="+", default=[300_000, 1_000_000])
+    parser.add_argument("--megapixels", type=float, nargs="+", default=[0.4, 2.0, 5.0])
+    parser.add_argument("--views", type=int, nargs="+", default=[1, 4])
+    return parser
+
+
+def rasterizers() -> argparse.ArgumentParser:
+    """Return the options of `sadgs-bench rasterizers`."""
+    parser = argparse.ArgumentParser(
+        prog="sadgs-bench rasterizers", description="Compare the torch splatter with gsplat on CUDA."
+    )
+    parser.add_argument("--gaussians", type=int, default=3000)
+    parser.add_argument("--size", type=int, default=128, help="width and height of the image in pixels")
+    parser.add_argument("--seed", type=int, default=0)
+    return parser

@@ -1,0 +1,340 @@
+"""The pictures of `sadgs-inspect`: what the method sees in a view of a run, and what one step would split.
+
+They are PNGs: S̄ as ellipses over the photo, the local wavelength, η of the Gaussians, how many children they would get,
+which are low, and one densification step, conventional against structure-aware.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import yaml
+from nerfstudio.engine.trainer import TrainerConfig
+from rich.console import Console
+from rich.progress import track
+from torch import Tensor
+
+from sadgs_ns.errors import InputError, reason
+from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow
+from sadgs_ns.method.codes import decode
+from sadgs_ns.method.split import grid_split, num_children
+from sadgs_ns.method.strategy import SMALL_SCALE
+from sadgs_ns.plugin import checkpoints, color_scales, gaussian_maps, texture
+from sadgs_ns.plugin.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
+from sadgs_ns.plugin.model import SadgsModel
+from sadgs_ns.plugin.pipeline import SadgsPipeline
+from sadgs_ns.plugin.structure_maps import observe_training_views
+from sadgs_ns.plugin.trainer import SadgsTrainerConfig
+from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
+
+SEED = 0
+"""Seed of the random colours and of AbsGS's children."""
+MIN_SIDE = 900
+"""Shortest length in px of the longer side of a picture with ellipses."""
+MIN_RENDER_SIDE = 640
+"""Shortest length in px of the longer side of a rendering in random colours. In a smaller one Gaussians could not be
+told apart."""
+_REMEDY = "give another with --load-step, or another run of sadgs"
+"""What to do about a checkpoint that cannot be used."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A photo of the data and its camera."""
+
+    name: str
+    photo: Tensor
+    """Colours in [0, 1]. [H, W, 3]"""
+    structure_tensor: Tensor
+    """S̄ of the photo. [H, W, 3]"""
+    viewmat: Tensor
+    """Transform from world to camera. [4, 4]"""
+    K: Tensor
+    """Intrinsics in px. [3, 3]"""
+
+    @property
+    def camera(self) -> tuple[Tensor, Tensor, int, int]:
+        """Return viewmat, K, width and height, as `gaussian_maps.blend` takes them."""
+        height, width = self.photo.shape[:2]
+        return self.viewmat, self.K, width, height
+
+
+def load_run(path: Path, load_step: int | None = None, data: Path | None = None) -> tuple[SadgsPipeline, int]:
+    """Load a finished or running run from its `config.yml`, as nerfstudio's `eval_setup` does.
+
+    The file is read with PyYAML's full loader, which calls what it names. Checkpoints are looked for beside it.
+
+    Args:
+        path: The run's config.yml, or its folder.
+        load_step: Of the checkpoint; None takes the latest that can be read.
+        data: The capture; None is where it was in training.
+
+    Returns:
+        The pipeline in evaluation mode, and the iterations that it was trained.
+
+    Raises:
+        InputError: If there is no such file or checkpoint, or they are of another method.
+    """
+    if path.is_dir():
+        path = path / "config.yml"
+    if not path.is_file():
+        raise InputError(f"{path} does not exist: give the config.yml of a run, outputs/…/sadgs/…/config.yml.")
+    try:
+        config = yaml.load(path.read_text("utf8"), Loader=yaml.Loader)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        what = " ".join(str(error).split())
+        raise InputError(f"{path} cannot be read as a run's config.yml ({what}): give one of sadgs.") from error
+    if not isinstance(config, SadgsTrainerConfig):
+        method = f"of the method {config.method_name}" if isinstance(config, TrainerConfig) else "no run's config.yml"
+        raise InputError(f"{path} is {method}: give one of a method whose name begins with sadgs.")
+    folder = path.parent / config.relative_model_dir
+    if not folder.is_dir() or not any(folder.iterdir()):
+        raise InputError(
+            f"{folder} holds no checkpoint yet: train to the end, or with --steps-per-save 500 to look on the way."
+        )
+    chosen = checkpoints.read_chosen(folder, load_step, None, _REMEDY)
+    assert chosen is not None
+    checkpoint, state = chosen
+    if data is not None:
+        config.pipeline.datamanager.data = data
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    pipeline: SadgsPipeline = config.pipeline.setup(device=device, test_mode="test")
+    pipeline.eval()
+    try:
+        pipeline.load_pipeline(state["pipeline"], state["step"])
+    except InputError as error:
+        raise InputError(f"{checkpoint} does not fit its run: {str(error).rstrip('.')}; {_REMEDY}.") from error
+    except (KeyError, RuntimeError) as error:  # A part is missing or has another size.
+        raise InputError(f"{checkpoint} is not of this version of sadgs ({reason(error)}): {_REMEDY}.") from error
+    saved = state["pipeline"]["_extra_state"].get("schedule", {})  # Earlier versions did not derive it.
+    pipeline.model.strategy.fit_to_run(saved.get("iterations", config.max_num_iterations))
+    return pipeline, state["step"] + 1
+
+
+def get_view(pipeline: SadgsPipeline, index: int, split: Literal["train", "eval"] = "train") -> View:
+    """Return a view by its number, counted from 0 in the order of the split.
+
+    Raises:
+        InputError: If there is no such view.
+    """
+    datamanager = pipeline.datamanager
+    dataset = datamanager.train_dataset if split == "train" else datamanager.eval_dataset
+    if not 0 <= index < len(dataset):
+        raise InputError(f"--view {index}: the {split} split has views 0 to {len(dataset) - 1}.")
+    # Loading the images undistorts them, which changes the intrinsics.
+    data = (datamanager.cached_train if split == "train" else datamanager.cached_eval)[index]
+    camera = dataset.cameras[index : index + 1]
+    return View(
+        name=dataset.image_filenames[index].name,
+        photo=pipeline.structure_maps.photo(data),
+        structure_tensor=decode(pipeline.structure_maps.codes_of([data])[0]),
+        viewmat=(
+            pipeline.views.viewmat(index)
+            if split == "train"
+            else viewmats_from_camera_to_world(camera.camera_to_worlds)[0]
+        ).to(pipeline.device),
+        K=camera.get_intrinsics_matrices()[0].to(pipeline.device),
+    )
+
+
+def screen_gradients(pipeline: SadgsPipeline, progress: Callable[[range], Any]) -> dict[str, Tensor]:
+    """Return what AbsGS decides on: the loss's screen gradients of all training views, added up as in training.
+
+    Args:
+        pipeline: A loaded run.
+        progress: Called with the range of the views' numbers; what it returns is iterated over.
+
+    Returns:
+        As `absgs.empty_gradients`.
+    """
+    model = pipeline.model
+    gradients = empty_gradients(model.num_points, pipeline.device)
+    background = model.photo_background.to(pipeline.device)
+    for index in progress(range(len(pipeline.datamanager.train_dataset))):
+        data = pipeline.datamanager.cached_train[index]
+        height, width = data["image"].shape[:2]
+        viewmats, Ks = pipeline.views.stacked_cameras([index])
+        with torch.enable_grad():
+            render, alpha, info = model.render(viewmats.detach(), Ks, width, height, "RGB", absgrad=True)
+            info["means2d"].retain_grad()
+            outputs = {"rgb": render[..., :3] + (1 - alpha) * background, "background": background}
+            batch = {name: data[name][None].to(pipeline.device) for name in ("image", "mask") if name in data}
+            model.get_loss_dict(outputs, batch)["main_loss"].backward()
+        accumulate_gradients(gradients, info, num_views=1, fused=model.strategy.fused)
+        model.zero_grad(set_to_none=True)
+    return gradients
+
+
+@dataclass(frozen=True)
+class Step:
+    """Gaussians after a densification step that was tried out."""
+
+    params: dict[str, Tensor]
+    """Raw parameters by name, leading dimension M."""
+    origins: Tensor
+    """Number of the Gaussian before the step that each one was or came from. int64 [M]"""
+
+
+def _try(
+    model: SadgsModel, state: dict[str, Any], densify: Callable[[dict[str, Any], Any, dict[str, Any]], Any]
+) -> Step:
+    params = {name: torch.nn.Parameter(value.detach().clone()) for name, value in model.gauss_params.items()}
+    # The numbers are a parameter, since children take theirs from their parents, while rows of the state begin anew.
+    # float64 counts exactly.
+    numbers = torch.arange(model.num_points, device=params["means"].device, dtype=torch.float64)
+    params["origins"] = torch.nn.Parameter(numbers)
+    optimizers = {name: torch.optim.SGD([parameter], lr=0.0) for name, parameter in params.items()}
+    densify(params, optimizers, state)
+    origins = params.pop("origins").detach().long()
+    return Step({name: value.detach() for name, value in params.items()}, origins)
+
+
+def structure_step(model: SadgsModel, statistics: dict[str, Tensor]) -> Step:
+    """Try a structure-aware step without its pruning, and return what it makes of the Gaussians."""
+    counts, child_scale = model.strategy.children_now(model.gauss_params, statistics), model.strategy.child_scale
+    return _try(model, {}, lambda p, o, s: grid_split(p, o, s, counts, child_scale))
+
+
+def conventional_step(model: SadgsModel, gradients: dict[str, Tensor]) -> Step:
+    """Try a conventional step (AbsGS: clone, or split in two) without its pruning, and return what it makes."""
+    strategy, extent = model.strategy, float(model.strategy_state["scene_scale"])
+    with torch.random.fork_rng(devices=[model.device] if model.device.type == "cuda" else []):
+        torch.manual_seed(SEED)  # gsplat draws the children's places at random.
+        return _try(
+            model,
+            dict(gradients),
+            lambda params, optimizers, state: grow(
+                params,
+                optimizers,
+                state,
+                clone_threshold=strategy.clone_grad2d,
+                split_threshold=strategy.split_absgrad2d,
+                size_threshold=SMALL_SCALE * extent,
+                budget=strategy.max_gaussians - model.num_points,
+            ),
+        )
+
+
+def view_panels(pipeline: SadgsPipeline, view: View, statistics: dict[str, Tensor]) -> dict[str, Panel]:
+    """Return the pictures of one view by their names."""
+    model, constant = pipeline.model, pipeline.config.frequency_constant
+    params, options = dict(model.gauss_params.items()), model.drawing
+    counts = model.strategy.children_now(model.gauss_params, statistics)
+    is_low = model.strategy.consistently_low(statistics)
+    height, width = view.photo.shape[:2]
+    enlarge = max(MIN_SIDE / max(height, width), 1.0)
+    size = (round(enlarge * height), round(enlarge * width))
+    split, added = int((counts > 1).any(dim=1).sum()), int((num_children(counts) - 1).sum())
+    photo = to_picture(view.photo)
+    return {
+        "ellipses": Panel(
+            f"{view.name}: the structure tensor, its inverse as ellipses",
+            texture.draw_ellipses(photo, view.structure_tensor, constant, size),
+            PERIOD,
+        ),
+        "wavelength": Panel(
+            f"{view.name}: local wavelength",
+            PERIOD(texture.texture_period(view.structure_tensor, constant)),
+            PERIOD,
+        ),
+        "eta": Panel(
+            f"{view.name}: η of the Gaussians, largest of their observations; over 1 violates",
+            ETA(gaussian_maps.eta_map(params, statistics, *view.camera, **options)),
+            ETA,
+        ),
+        "children": Panel(
+            f"{view.name}: {split:,} of {model.num_points:,} Gaussians would split, {added:,} more",
+            CHILDREN(gaussian_maps.children_map(params, counts, *view.camera, **options)),
+            CHILDREN,
+        ),
+        "low": Panel(
+            f"{view.name}: {int(is_low.sum()):,} of {model.num_points:,} Gaussians are consistently low (η < 0.1)",
+            LOW(gaussian_maps.share_map(params, is_low, *view.camera, **options)),
+            LOW,
+        ),
+    }
+
+
+def step_panels(model: SadgsModel, view: View, conventional: Step, structure: Step) -> list[Panel]:
+    """Return the photo, and the Gaussians in random colours before and after a step of each kind (paper, figure 3)."""
+    generator = torch.Generator().manual_seed(SEED)
+    colors = gaussian_maps.random_colors(model.num_points, generator).to(model.device)
+
+    viewmat, K, width, height = view.camera
+    enlarge = max(math.ceil(MIN_RENDER_SIDE / max(height, width)), 1)
+    camera = (viewmat, K * K.new_tensor([[enlarge], [enlarge], [1.0]]), enlarge * width, enlarge * height)
+
+    def panel(title: str, params: Any, its_colors: Tensor) -> Panel:
+        render, _ = gaussian_maps.blend(params, its_colors, *camera, **model.drawing)
+        return Panel(f"{title}: {len(params['means']):,} Gaussians", to_picture(render))
+
+    return [
+        Panel(f"photo {view.name}", to_picture(view.photo).repeat(enlarge, axis=0).repeat(enlarge, axis=1)),
+        panel("before", model.gauss_params, colors),
+        *(
+            panel(title, step.params, gaussian_maps.recolor(colors, step.origins, generator))
+            for title, step in (("one conventional step", conventional), ("one structure-aware step", structure))
+        ),
+    ]
+
+
+def inspect_run(
+    path: Path,
+    index: int,
+    split: Literal["train", "eval"] = "train",
+    output: Path | None = None,
+    load_step: int | None = None,
+    data: Path | None = None,
+    console: Console | None = None,
+) -> list[Path]:
+    """Write all pictures of one view of a run.
+
+    Args:
+        path: The run's config.yml, or its folder.
+        index: The view's number in its split.
+        split: "train" or "eval".
+        output: Folder, made if need be; None is `inspect` beside the config.
+        load_step: Step of the checkpoint; None takes the latest.
+        data: The capture; None is where it was in training.
+        console: For progress and numbers.
+
+    Returns:
+        The files.
+
+    Raises:
+        InputError: As `load_run` and `get_view`; nothing is written then.
+        WriteError: If a file cannot be written.
+    """
+    console = console or Console()
+
+    def progress(what: str) -> Callable[[range], Any]:
+        return lambda views: track(views, what, console=console, transient=True)
+
+    pipeline, iterations = load_run(path, load_step, data)
+    view = get_view(pipeline, index, split)
+    statistics = observe_training_views(pipeline.structure_maps, progress("η in all training views"))
+    gradients = screen_gradients(pipeline, progress("gradients of all training views"))
+    model = pipeline.model
+    seen = statistics["n_total"] > 0
+    violating = (statistics["eta_max"] > 1).any(dim=1)
+    console.print(
+        f"{path}: {model.num_points} Gaussians after {iterations} iterations. In {len(pipeline.views)} "
+        f"training views {int(seen.sum())} were observed, {int(violating.sum())} with η over 1 in one of them.",
+        soft_wrap=True,
+        highlight=False,
+    )
+    folder = output or (path if path.is_dir() else path.parent) / "inspect"
+    prefix = f"{split}-{index:03d}"
+    written = []
+    for name, panel in view_panels(pipeline, view, statistics).items():
+        written.append(folder / f"{prefix}-{name}.png")
+        color_scales.draw(written[-1], [panel])
+    steps = conventional_step(model, gradients), structure_step(model, statistics)
+    written.append(folder / f"{prefix}-step.png")
+    color_scales.draw(written[-1], step_panels(model, view, *steps), columns=2)
+    return written
