@@ -28,8 +28,15 @@ TILE_SIZE = 8
 """Size of a tile in px, as `kernels.compositing.TILE_SIZE`, which cannot be imported without Triton."""
 NEAR_PLANE = 0.01
 """Depth in world units from which gsplat and our splatter draw Gaussians."""
+MANY_IMAGES = 500
+"""Number of training images up to which nerfstudio keeps them on the device, whatever their size."""
 IMAGE_SHARE = 0.25
-"""Share of the device's free memory up to which the images of a large capture are kept on it."""
+"""Share of the device's free memory up to which more images than these are kept on it."""
+FEW_IMAGES_SHARE = 0.5
+"""The same of no more images than these."""
+HOST_SHARE = 0.5
+"""Share of the host's available memory up to which decoded images are kept in it. torch takes up to twice as much for
+pinned memory as is asked for, since it rounds up to powers of two."""
 _BLUR, _REACH = 0.3, 3.0
 """gsplat's screen-space blur in px², and the standard deviations that it draws."""
 
@@ -56,8 +63,11 @@ def training_size(datamanager: FullImageDatamanager, params: Params, views: int,
         fused: Whether the loss is computed by our kernels.
     """
     cameras = datamanager.train_dataset.cameras
-    kept = image_bytes(datamanager) if datamanager.config.cache_images == "gpu" else 0.0
     largest = int((cameras.height * cameras.width).max())
+    if datamanager.config.cache_images == "gpu":
+        kept = image_bytes(datamanager)
+    else:  # The images of the next step are there, too.
+        kept = float((3 * _value_bytes(datamanager) + CODE_BYTES) * views * largest)
     return TrainingSize(kept, StepSize(views, views * largest, views * estimate_pairs(params, cameras)), fused)
 
 
@@ -67,28 +77,41 @@ def image_bytes(datamanager: FullImageDatamanager) -> float:
         float((cameras.height * cameras.width).sum())
         for cameras in (datamanager.train_dataset.cameras, datamanager.eval_dataset.cameras)
     )  # px
-    value_bytes = 1 if datamanager.config.cache_images_type == "uint8" else 4
-    return 3 * value_bytes * (train + held_out) + CODE_BYTES * train
+    return 3 * _value_bytes(datamanager) * (train + held_out) + CODE_BYTES * train
 
 
-def keep_images_on_device(datamanager: FullImageDatamanager, device: torch.device) -> str | None:
-    """Keep images on the device although there are more than 500, where they take a small part of its memory.
+def _value_bytes(datamanager: FullImageDatamanager) -> int:
+    return 1 if datamanager.config.cache_images_type == "uint8" else 4
 
-    nerfstudio leaves more than 500 images on the host, whatever their size. With 525 of 640×480 px a step of four views
-    took 12 ms then, and 4.5 ms with fewer and larger images on the device (H200).
+
+def place_images(datamanager: FullImageDatamanager, device: torch.device) -> str | None:
+    """Decide where the images are kept, from the memory that is there.
+
+    nerfstudio keeps up to 500 images on the device and more on the host, whatever their size.
 
     Args:
         datamanager: Its images have not been loaded yet; its configuration is changed.
         device: The device of training.
 
     Returns:
-        A line for the user, or None if the images do not fit.
+        A line for the user; None where the images are kept as nerfstudio would keep them.
     """
-    size, (free, _) = image_bytes(datamanager), memory.available_bytes(device)
-    if size > IMAGE_SHARE * free:
-        return None
-    datamanager.config.cache_images = "gpu"
-    return f"They stay on the GPU all the same: images and their structure take {size / 1e9:.2g} GB of its memory."
+    config, size, host = datamanager.config, image_bytes(datamanager), memory.available_host_bytes()
+    many = len(datamanager.train_dataset) > MANY_IMAGES
+    free, share, name = host, HOST_SHARE, "the host"
+    if device.type == "cuda":
+        free, share, name = memory.available_bytes(device)[0], IMAGE_SHARE if many else FEW_IMAGES_SHARE, "the GPU"
+    needs = f"images and their structure take {size / 1e9:.2g} GB"
+    if size <= share * free:
+        config.cache_images = "gpu"
+        on_device = f"They stay on the GPU all the same: {needs} of its memory."
+        return on_device if many and device.type == "cuda" else None
+    needs = f"decoded {needs}, and {name} has {free / 1e9:.2g} GB free"
+    if device.type == "cuda" and size <= HOST_SHARE * host:
+        config.cache_images = "cpu"
+        return f"The images stay in the host's memory and are copied ahead of the steps: {needs}."
+    config.cache_images = "compressed"  # type: ignore[assignment]
+    return f"The images stay compressed and are decoded ahead of the steps: {needs}."
 
 
 @torch.no_grad()
