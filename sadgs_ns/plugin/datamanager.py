@@ -60,9 +60,8 @@ class SadgsDatamanagerConfig(FullImageDatamanagerConfig):
     camera_res_scale_factor: float = 1.0
     """Factor by which images and cameras are scaled when they are loaded; 0.5 trains at half the resolution."""
     cache_images: Literal["gpu", "cpu", "compressed"] = "gpu"  # type: ignore[assignment]
-    """Where the images are kept: "gpu" is the device of training, as long as they take a part of its memory that leaves
-    room; otherwise they are kept as with "cpu", decoded in host memory, or as with "compressed", as files that are
-    decoded ahead of the steps, whichever has room."""
+    """Where the images are kept: "gpu" is the device of training, as long as that leaves enough of its memory free.
+    Otherwise it is "cpu", decoded in the host's memory, or "compressed", files that are decoded ahead of their step."""
     cache_images_type: Literal["uint8", "float32"] = "uint8"
     """Type in which the images are kept; "uint8" takes a quarter of the memory."""
     max_thread_workers: Suppress[int | None] = None

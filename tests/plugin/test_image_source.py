@@ -10,11 +10,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
 from runs import blender_data, checkpoint, configure, nerfstudio_data, train
 from scenes import HEIGHT, VIEWS, WIDTH
@@ -48,14 +50,19 @@ def distorted(folder: Path, kind: str, masks: bool) -> DataParserConfig:
 
 
 def jpegs(folder: Path) -> DataParserConfig:
-    """A dataset of JPEGs, one of them grey."""
+    """A dataset of JPEGs of many kinds: grey, progressive, turned by a tag, with colours sampled in all usual ways."""
+    exif = Image.Exif()
+    exif[0x0112] = 6  # The camera was turned by a quarter.
+    kinds: list[dict[str, Any]] = [{"subsampling": kind} for kind in ("4:2:0", "4:2:2", "4:4:4")]
+    kinds += [{"progressive": True}, {"exif": exif}, {"quality": 30}, {"quality": 100}, {"keep_rgb": True}]
     parser = nerfstudio_data(folder)
     path = folder / "transforms.json"
     meta = json.loads(path.read_text())
     for index, frame in enumerate(meta["frames"]):
         with Image.open(folder / frame["file_path"]) as image:
             frame["file_path"] = frame["file_path"].replace(".png", ".jpg")
-            image.convert("L" if index == 3 else "RGB").save(folder / frame["file_path"], quality=80)
+            kind = {"quality": 80, **kinds[index % len(kinds)]}
+            image.convert("L" if index == 9 else "RGB").save(folder / frame["file_path"], **kind)
     path.write_text(json.dumps(meta))
     return parser
 
@@ -112,6 +119,25 @@ def test_images_and_cameras_are_nerfstudio_s_to_the_bit(data: str, tier: Any, op
         assert_same_cameras(camera, other)
     _, view = datamanager.next_train(0)  # This is what other methods' pipelines ask for.
     assert_same_images([view], [expected.next_train(0)[1]])
+
+
+@pytest.mark.parametrize("agrees", [True, False])
+def test_jpegs_are_decoded_by_opencv_only_if_it_agrees_with_pillow(
+    agrees: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    parser = jpegs(tmp_path)
+    expected = datamanager_of(parser, FullImageDatamanagerConfig, cache_images="gpu", cache_images_type="uint8")
+    assert len(expected.cached_train) == VIEWS - 1
+    by_pillow: list[int] = []
+    decode, read = cv2.imdecode, InputDataset.get_numpy_image
+    monkeypatch.setattr(cv2, "imdecode", lambda *args: decode(*args) + (0 if agrees else 1))
+    monkeypatch.setattr(
+        InputDataset, "get_numpy_image", lambda dataset, index: by_pillow.append(index) or read(dataset, index)
+    )
+    datamanager = datamanager_of(parser, cache_images=COMPRESSED)
+    assert_same_images(list(datamanager.cached_train), expected.cached_train)
+    assert_same_images(list(datamanager.cached_train), expected.cached_train)
+    assert by_pillow == ([0] if agrees else 2 * list(range(VIEWS - 1)))
 
 
 def test_files_are_read_once_and_kept_or_read_each_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
