@@ -187,9 +187,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
 
     @property
     def fixed_indices_eval_dataloader(self) -> Any:
-        """Cameras [1] and data of the held-out views, on the device; compressed images are decoded one by one."""
-        if isinstance(self.cached_eval, list):
-            return super().fixed_indices_eval_dataloader
+        """Cameras [1] and data of the held-out views, on the device; nerfstudio would copy all there at once."""
         return _HeldOutViews(self)
 
     def get_train_rays_per_batch(self) -> int:
@@ -200,7 +198,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
 
 @dataclass
 class _HeldOutViews(Sequence[tuple[Cameras, dict[str, Any]]]):
-    """What nerfstudio makes a list of, for images that are not all in memory."""
+    """Cameras and data of the held-out views, each of which is brought to the device when it is asked for."""
 
     datamanager: SadgsDatamanager
 

@@ -240,9 +240,8 @@ class ImagesAhead:
         self.images = images
         self.device = device
         self.threads = threads
-        self._decoded = isinstance(images, list)
         on_cuda = device.type == "cuda"
-        self._ready = self._decoded and all(not on_cuda or data["image"].is_pinned() for data in images)
+        self._ready = isinstance(images, list) and all(not on_cuda or data["image"].is_pinned() for data in images)
         """Whether all images can be copied as they are, without a thread's help."""
         self._stream = torch.cuda.Stream(device) if on_cuda else None
         self._pool: ThreadPoolExecutor | None = None

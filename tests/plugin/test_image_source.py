@@ -21,9 +21,11 @@ from PIL import Image
 from runs import blender_data, checkpoint, configure, nerfstudio_data, train
 from scenes import HEIGHT, VIEWS, WIDTH
 
+from sadgs_ns.cli.inspection import get_view
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig
 from sadgs_ns.plugin.image_source import ImagesAhead
+from sadgs_ns.plugin.structure_maps import StructureMaps, observe_training_views
 from sadgs_ns.plugin.trainer import SadgsTrainer
 
 COMPRESSED: Any = "compressed"
@@ -183,13 +185,18 @@ def run(parser: DataParserConfig, tier: Any, folder: Path, **options: Any) -> tu
 
 @pytest.mark.parametrize("data", ["masks and sizes", "alpha"])
 def test_training_is_the_same_bit_for_bit_wherever_images_are_kept(data: str, tmp_path: Path):
-    states, sums = [], []
+    states, sums, seen = [], [], []
     for tier in TIERS:
         trainer, steps = run(DATA[data](tmp_path / f"data {tier}"), tier, tmp_path / tier)
         assert isinstance(trainer.pipeline.datamanager.cached_train, list) is (tier != "compressed")
         assert (trainer.pipeline.views.ahead is None) is (tier == "gpu")
         states.append(checkpoint(trainer, ITERATIONS - 1)["pipeline"])
         sums.append(steps)
+        view = get_view(trainer.pipeline, 1)  # as sadgs-inspect and the viewer's panel ask for it
+        observed = observe_training_views(trainer.pipeline.structure_maps)
+        seen.append([view.photo, view.structure_tensor.nan_to_num(-1), view.K, *observed.values()])
+    for tensors in zip(*seen, strict=True):
+        assert all(torch.equal(tensor, tensors[0]) for tensor in tensors)
     assert sums[0] == sums[1] == sums[2]
     expected = states[0]
     for state in states[1:]:
@@ -269,8 +276,6 @@ def test_an_image_that_is_broken_at_the_start_ends_the_run_in_one_sentence(tmp_p
 def test_codes_are_computed_once_beside_decoded_images_and_anew_beside_compressed_ones(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    from sadgs_ns.plugin.structure_maps import StructureMaps
-
     number: list[int] = []
     codes_of = StructureMaps.codes_of
     monkeypatch.setattr(StructureMaps, "codes_of", lambda maps, data: number.append(len(data)) or codes_of(maps, data))
