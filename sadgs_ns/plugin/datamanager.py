@@ -128,7 +128,10 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         own = {Nerfstudio: _Nerfstudio, Blender: _Blender, ColmapDataParser: _Colmap}
         parser._target = own.get(parser._target, parser._target)
         config.dataparser = parser
+        # nerfstudio would keep more than 500 images on the host, whatever their size, and say so in a line.
+        asked, config.cache_images = config.cache_images, "cpu"
         super().__init__(config, *args, **kwargs)  # type: ignore[arg-type]
+        self.config.cache_images = asked
         for dataset in (self.train_dataset, self.eval_dataset):
             names.check_paths(dataset.image_filenames)
             _check_sizes(dataset)

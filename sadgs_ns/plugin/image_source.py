@@ -129,7 +129,7 @@ class ImagesOnDemand(Sequence[dict[str, Any]]):
         refuse_non_finite(image, name)
         return {**data, "image": image}
 
-    def _decode(self, index: int) -> NDArray[np.uint8]:
+    def _decode(self, image_idx: int) -> NDArray[np.uint8]:
         """Decode an image as nerfstudio's `get_numpy_image`, a whole JPEG with OpenCV instead of Pillow.
 
         Of 2 megapixels Pillow keeps other threads from running Python for 5 ms in all, and the training loop is such
@@ -139,7 +139,7 @@ class ImagesOnDemand(Sequence[dict[str, Any]]):
         Returns:
             [H, W, 3 or 4]
         """
-        content = self._dataset.image_filenames[index].getbuffer()  # type: ignore[attr-defined]
+        content = self._dataset.image_filenames[image_idx].getbuffer()  # type: ignore[attr-defined]
         image = None
         if self._opencv_agrees is not False and content[:2] == b"\xff\xd8" and content[-2:] == b"\xff\xd9":
             image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -147,7 +147,7 @@ class ImagesOnDemand(Sequence[dict[str, Any]]):
             image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
             if self._opencv_agrees:
                 return image  # type: ignore[return-value]
-        expected = InputDataset.get_numpy_image(self._dataset, index)
+        expected = InputDataset.get_numpy_image(self._dataset, image_idx)
         if image is not None:
             self._opencv_agrees = np.array_equal(image, expected)
         return expected

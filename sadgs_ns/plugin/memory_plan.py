@@ -29,11 +29,11 @@ TILE_SIZE = 8
 NEAR_PLANE = 0.01
 """Depth in world units from which gsplat and our splatter draw Gaussians."""
 MANY_IMAGES = 500
-"""Number of training images up to which nerfstudio keeps them on the device, whatever their size."""
+"""Number of training images up to which nerfstudio would keep them on the device, whatever their size."""
 IMAGE_SHARE = 0.25
 """Share of the device's free memory up to which more images than these are kept on it."""
 FEW_IMAGES_SHARE = 0.5
-"""The same of no more images than these."""
+"""The same share where there are no more than these."""
 HOST_SHARE = 0.5
 """Share of the host's available memory up to which decoded images are kept in it. torch takes up to twice as much for
 pinned memory as is asked for, since it rounds up to powers of two."""
@@ -87,26 +87,22 @@ def _value_bytes(datamanager: FullImageDatamanager) -> int:
 def place_images(datamanager: FullImageDatamanager, device: torch.device) -> str | None:
     """Decide where the images are kept, from the memory that is there.
 
-    nerfstudio keeps up to 500 images on the device and more on the host, whatever their size.
-
     Args:
         datamanager: Its images have not been loaded yet; its configuration is changed.
         device: The device of training.
 
     Returns:
-        A line for the user; None where the images are kept as nerfstudio would keep them.
+        A line for the user; None where they are kept on the device.
     """
     config, size, host = datamanager.config, image_bytes(datamanager), memory.available_host_bytes()
     many = len(datamanager.train_dataset) > MANY_IMAGES
     free, share, name = host, HOST_SHARE, "the host"
     if device.type == "cuda":
         free, share, name = memory.available_bytes(device)[0], IMAGE_SHARE if many else FEW_IMAGES_SHARE, "the GPU"
-    needs = f"images and their structure take {size / 1e9:.2g} GB"
     if size <= share * free:
         config.cache_images = "gpu"
-        on_device = f"They stay on the GPU all the same: {needs} of its memory."
-        return on_device if many and device.type == "cuda" else None
-    needs = f"decoded {needs}, and {name} has {free / 1e9:.2g} GB free"
+        return None
+    needs = f"decoded images and their structure take {size / 1e9:.2g} GB, and {name} has {free / 1e9:.2g} GB free"
     if device.type == "cuda" and size <= HOST_SHARE * host:
         config.cache_images = "cpu"
         return f"The images stay in the host's memory and are copied ahead of the steps: {needs}."

@@ -108,6 +108,7 @@ def test_images_and_cameras_are_nerfstudio_s_to_the_bit(data: str, tier: Any, op
     options = {"cache_images_type": "uint8", **options}
     expected: FullImageDatamanager = datamanager_of(parser, FullImageDatamanagerConfig, cache_images="gpu", **options)
     datamanager = datamanager_of(parser, cache_images=tier, **options)
+    assert datamanager.config.cache_images == tier
     for _ in range(2):  # Decoding an image again gives the same image.
         assert_same_images(datamanager.cached_train, expected.cached_train)
         assert_same_images(datamanager.cached_eval, expected.cached_eval)
@@ -288,6 +289,23 @@ def test_codes_are_computed_once_beside_decoded_images_and_anew_beside_compresse
     training = VIEWS - 1  # The parser holds out one view of ten.
     # A view that two steps in a row take is on its way to the second one before its codes are known.
     assert counts["gpu"] == training <= counts["cpu"] <= training + 2 < counts["compressed"] == observed
+
+
+def test_images_in_bytes_are_not_searched_for_nan_because_the_host_would_wait(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    known: list[bool] = []
+    compute = StructureMaps.of_images
+
+    def noted(maps: StructureMaps, images: Any, masks: Any = None, known_finite: bool = False) -> Any:
+        known.append(known_finite)
+        with monkeypatch.context() as patch:
+            patch.setattr(torch.Tensor, "isfinite", None)  # Asking for it is an error.
+            return compute(maps, images, masks, known_finite)
+
+    monkeypatch.setattr(StructureMaps, "of_images", noted)
+    run(nerfstudio_data(tmp_path / "data", masks=True), COMPRESSED, tmp_path)
+    assert known and all(known)
 
 
 # --- CUDA's streams, without CUDA ---
