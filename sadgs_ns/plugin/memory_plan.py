@@ -16,12 +16,15 @@ from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.split import Params
 from sadgs_ns.method.statistics import empty_statistics
 from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.plugin.structure_maps import PIXELS_PER_BATCH
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 PLANNED_SHARE = 0.8
 """Share of the available memory that is planned with; the rest is for fragments and other programs."""
 CODE_BYTES = 3
 """Bytes that the codes of S̄ take for each pixel of the training images (`method.codes`)."""
+STRUCTURE_PIXEL_BYTES = 300
+"""Bytes that a pixel takes at most while S̄ is computed."""
 SAMPLED_CAMERAS = 8
 """Training cameras in which the pairs of the initial Gaussians are counted."""
 TILE_SIZE = 8
@@ -51,6 +54,9 @@ class TrainingSize:
     """The largest step of the run, with the pairs of the initial Gaussians."""
     fused: bool = True
     """Whether the loss is computed by our kernels."""
+    structure_bytes: float = 0.0
+    """Bytes that S̄ of a step's images takes while it is computed, before they are rendered; 0 where that is done once,
+    with the initial Gaussians."""
 
 
 def training_size(datamanager: FullImageDatamanager, params: Params, views: int, fused: bool) -> TrainingSize:
@@ -64,11 +70,15 @@ def training_size(datamanager: FullImageDatamanager, params: Params, views: int,
     """
     cameras = datamanager.train_dataset.cameras
     largest = int((cameras.height * cameras.width).max())
+    structure = 0.0
     if datamanager.config.cache_images == "gpu":
         kept = image_bytes(datamanager)
     else:  # The images of the next step are there, too.
         kept = float((3 * _value_bytes(datamanager) + CODE_BYTES) * views * largest)
-    return TrainingSize(kept, StepSize(views, views * largest, views * estimate_pairs(params, cameras)), fused)
+        structure = float(STRUCTURE_PIXEL_BYTES * max(largest, min(PIXELS_PER_BATCH, views * largest)))
+    return TrainingSize(
+        kept, StepSize(views, views * largest, views * estimate_pairs(params, cameras)), fused, structure
+    )
 
 
 def image_bytes(datamanager: FullImageDatamanager) -> float:
@@ -184,10 +194,9 @@ def fit_to_memory(
         return None, None
     state = empty_statistics(0, device) | empty_gradients(0, device)
     each = memory.kept_bytes(params, state) + memory.widest_bytes(params)
-    fixed = size.image_bytes + max(memory.step_bytes(0, replace(size.step, pairs=0), size.fused).values())
 
     def need(num_gaussians: int, step: StepSize) -> float:
-        working = max(memory.step_bytes(num_gaussians, step, size.fused).values())
+        working = max(size.structure_bytes, *memory.step_bytes(num_gaussians, step, size.fused).values())
         return size.image_bytes + each * num_gaussians + working
 
     why = ""
@@ -196,7 +205,9 @@ def fit_to_memory(
         none = {name: value[:0] for name, value in params.items()}
         left = budget - size.image_bytes
         affordable = memory.affordable_growth(none, state, left, replace(size.step, pairs=0), size.fused)  # type: ignore[arg-type]
+        affordable = min(affordable, (left - size.structure_bytes) / each)
         if budget_gb is not None and affordable < 1:
+            fixed = need(0, replace(size.step, pairs=0))
             raise ValueError(
                 f"memory_budget_gb is {budget_gb:g} and leaves no room for Gaussians: images and rendering "
                 f"take {fixed / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; raise it, take fewer or "

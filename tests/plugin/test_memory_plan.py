@@ -170,6 +170,14 @@ def test_a_full_card_still_starts_and_a_budget_for_nothing_is_refused(card: Any)
     )
 
 
+def test_a_structure_tensor_that_is_computed_late_has_its_room_beside_the_gaussians(card: Any):
+    card(7.5, 8)
+    strategy = StructureAwareStrategy()
+    size = TrainingSize(0.0, StepSize(), structure_bytes=3e9)
+    fit_to_memory(strategy, params(), size)  # type: ignore[arg-type]
+    assert strategy.max_gaussians == int((0.8 * 7.5e9 - 3e9) // (KEPT + WIDEST)) < fit()[0]
+
+
 def test_without_cuda_nothing_changes():
     strategy = StructureAwareStrategy()
     size = TrainingSize(1e9, StepSize(1, 10**6, 10**6))
@@ -257,7 +265,9 @@ def test_the_size_of_a_run_is_that_of_its_images_and_largest_step():
     assert size.image_bytes == 3 * (3 * 64 * 48 + 2 * 1000) + 3 * 3 * 64 * 48
     assert size.step == StepSize(2, 2 * 64 * 48, 2 * estimate_pairs(drawn, train))
     datamanager.config.cache_images = "cpu"
-    assert training_size(datamanager, drawn, views=2, fused=True).image_bytes == 2 * 6 * 64 * 48  # of the next step
+    size = training_size(datamanager, drawn, views=2, fused=True)
+    assert size.image_bytes == 2 * 6 * 64 * 48  # of the next step
+    assert size.structure_bytes == 300 * 2 * 64 * 48  # Only images on the device have theirs from the start.
 
 
 def test_tiles_are_those_of_the_kernels():
