@@ -185,9 +185,8 @@ def _normalised(images: Tensor, masks: Tensor | None, known_finite: bool) -> tup
     # A transposed mask would stay so, and hand its strides on to whatever it is combined with.
     valid = torch.ones_like(image[:, :1]) if masks is None else masks[:, None].to(image).contiguous()
     image = torch.where(valid > 0, image, 0.0)  # a product would let NaN through
-    if (
-        not known_finite and not image.isfinite().all()
-    ):  # one would spread over the whole image: its contrast scales everything
+    # One such pixel would spread over the whole image, since its contrast scales everything.
+    if not known_finite and not image.isfinite().all():
         broken = (~image.isfinite()).flatten(1).any(dim=1).nonzero().flatten().tolist()
         raise ValueError(f"images {broken} of the batch hold NaN or infinite pixels; mask or replace those")
     brightest = image.abs().amax(dim=(1, 2, 3), keepdim=True).clamp_min(torch.finfo(image.dtype).tiny)
