@@ -10,8 +10,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-_PAIRS = 2**24
-"""Distances from Gaussians to cameras that are held at a time: 64 MB."""
+_PAIRS = 2**22
+"""Distances from Gaussians to cameras that are computed at a time, in three arrays of 16 MB."""
 _LEAST_LIMIT = 1e-7
 """World units. A Gaussian around a camera's very centre keeps this size, so that its logarithm is finite."""
 
@@ -47,8 +47,15 @@ def limit_scales(scales: Tensor, means: Tensor, positions: Tensor, angular_scale
 
 
 def _distances(means: Tensor, positions: Tensor) -> Tensor:
-    """Return the distance of each point from the nearest camera. [N, 3], [C, 3] → [N]"""
-    some = means.split(max(_PAIRS // len(positions), 1))
-    # Differences, not matrix products, which cancel far from the origin.
-    mode = "donot_use_mm_for_euclid_dist"
-    return torch.cat([torch.cdist(part, positions, compute_mode=mode).amin(dim=1) for part in some])
+    """Return the distance of each point from the nearest camera. [N, 3], [C, 3] → [N]
+
+    The differences are squared and added one axis at a time: matrix products cancel far from the origin, and without
+    them `torch.cdist` runs a block of CUDA threads for every single distance, 1.3 ms a million of them on an H200.
+    """
+    nearest = []
+    for part in means.split(max(_PAIRS // len(positions), 1)):
+        squares = part.new_zeros(())
+        for x, camera in zip(part.unbind(1), positions.unbind(1), strict=True):
+            squares = (x[:, None] - camera).square_() + squares  # [n, C]
+        nearest.append(squares.amin(dim=1).sqrt())
+    return torch.cat(nearest)
