@@ -16,9 +16,12 @@ _STEP = "sadgs_ns.bench.launches"
 """Name of a step's range in the profile."""
 _WAITS = ("cudaStreamSynchronize", "cudaEventSynchronize", "cudaDeviceSynchronize", "cudaMemcpy", "cuStreamSynchronize")
 """Calls in which the host waits for the device."""
+_LAUNCHES = ("cudaLaunchKernel", "cudaLaunchKernelExC", "cuLaunchKernel", "cuLaunchKernelEx", "cudaGraphLaunch")
+_LAUNCHES += ("cudaMemcpyAsync", "cudaMemsetAsync")
+"""Calls in which the host gives the device something to do."""
 
 
-def measure(trainer: Any, steps: int = STEPS) -> dict[str, float] | None:
+def measure(trainer: Any, steps: int = STEPS) -> dict[str, float | None] | None:
     """Train some steps beyond the end of a run under torch's profiler.
 
     They are steps of the densification window, as `phases.measure` takes apart. The profiler makes the host slower, so
@@ -46,7 +49,7 @@ def measure(trainer: Any, steps: int = STEPS) -> dict[str, float] | None:
     return summarize(profile.function_events or ())
 
 
-def summarize(events: Iterable[Any]) -> dict[str, float]:
+def summarize(events: Iterable[Any]) -> dict[str, float | None]:
     """Count what happened in the steps of a profile.
 
     Args:
@@ -54,24 +57,26 @@ def summarize(events: Iterable[Any]) -> dict[str, float]:
 
     Returns:
         Means of a step:
-            launches: Kernels, copies and fills that the device ran.
+            launches: Kernels, copies and fills that the host asked for; a graph is one.
             waits: Calls in which the host waited for the device.
             wait_milliseconds: How long these took.
-            busy: Share of the time from the first step's start to the last one's end in which the device worked.
+            busy: Share of the time from the first step's start to the last one's end in which the device worked; None
+                where the profiler saw nothing of the device, which some drivers forbid.
     """
     events = list(events)
     ranges = [e.time_range for e in events if e.name == _STEP and e.device_type.name == "CPU"]
     steps, start, end = len(ranges), min(r.start for r in ranges), max(r.end for r in ranges)
     # The profiler draws the host's named ranges on the device's timeline, too.
     work = [e for e in events if e.device_type.name == "CUDA" and not e.is_user_annotation]
-    waits = [e for e in events if e.name in _WAITS and start <= e.time_range.start < end]
+    calls = [e for e in events if start <= e.time_range.start < end]
+    waits = [e for e in calls if e.name in _WAITS]
     busy, until = 0.0, start
     for span in sorted((e.time_range for e in work), key=lambda span: span.start):
         busy += max(min(span.end, end) - max(span.start, until), 0.0)
         until = max(until, span.end)
     return {
-        "launches": len(work) / steps,
+        "launches": sum(e.name in _LAUNCHES for e in calls) / steps,
         "waits": len(waits) / steps,
         "wait_milliseconds": sum(e.time_range.end - e.time_range.start for e in waits) / steps / 1000,
-        "busy": busy / (end - start),
+        "busy": busy / (end - start) if work else None,
     }
