@@ -11,7 +11,6 @@ is drawn stays the same, bit for bit.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -106,20 +105,32 @@ def _count(
     tl.store(counts + g, count, g < n)
 
 
-@triton.jit(do_not_specialize=["n", "num_gaussians", "tile_width", "tile_height"])
+@triton.jit(
+    do_not_specialize=["n", "num_gaussians", "num_pairs", "num_tiles", "tile_width", "tile_height", "rows_per_view"]
+)
 def _list(
-    means2d, radii, conics, opacities, order, ends, tiles, ids, n, num_gaussians, tile_width, tile_height,
+    means2d, radii, conics, opacities, order, ends, tiles, ids,
+    n, num_gaussians, num_pairs, num_tiles, tile_width, tile_height, rows_per_view,
     PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
-    """Write the tile and the Gaussian of each pair, the nearest Gaussians first."""
+    """Write the tile and the Gaussian of each pair, the nearest Gaussians first.
+
+    The rest of the `num_pairs` places is given to the last tile. If there are more pairs than places, this tile gets
+    all places, and all radii become 0: nothing is drawn, and nobody counts the views.
+    """
     lane = tl.program_id(0) * LANES + tl.arange(0, LANES)
     exists = lane < n
+    needed = tl.load(ends + n - 1)
+    fits = needed <= num_pairs
     g = tl.load(order + lane, exists, 0).to(tl.int32)
     at = tl.load(ends + lane - 1, exists & (lane > 0), 0)
     x, y, a, b, c, level, determinant, proper, first_column, last_column, first_row, last_row = _load_ellipse(
         means2d, radii, conics, opacities, g, exists, tile_width, tile_height, PER_GAUSSIAN, TILE
     )
-    view = g // num_gaussians * tile_height
+    for i in tl.static_range(PER_GAUSSIAN):
+        tl.store(radii + PER_GAUSSIAN * g + i, 0, exists & (needed > num_pairs))
+    last_row = tl.where(fits, last_row, first_row)
+    view = g // num_gaussians * rows_per_view
     for i in range(tl.max(last_row - first_row)):
         row = first_row + i
         first, last = _columns_of_row(
@@ -132,12 +143,38 @@ def _list(
             tl.store(tiles + at, (tile - 32768).to(tiles.dtype.element_ty), listed)
             tl.store(ids + at, g, listed)
             at += listed.to(at.dtype)
+    stride = tl.num_programs(0) * LANES
+    used = tl.where(fits, needed, 0)
+    for i in range(tl.cdiv(num_pairs - used, stride)):
+        unused = used + i * stride + lane
+        tl.store(tiles + unused, (num_tiles - 32769 + lane * 0).to(tiles.dtype.element_ty), unused < num_pairs)
+        tl.store(ids + unused, lane * 0, unused < num_pairs)
 
 
 @lru_cache(maxsize=8)
 def _tile_numbers(num_tiles: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Numbers of all tiles in ascending order, which begin at −2^15. [num_tiles]"""
     return torch.arange(-(2**15), num_tiles - 2**15, dtype=dtype, device=device)
+
+
+@dataclass(frozen=True)
+class PairCounts:
+    """How many pairs of a Gaussian and a tile each view of a call has, on their way to the host."""
+
+    counts: Tensor
+    """They are in the host's memory once `arrived` has happened. int64 [C]"""
+    arrived: torch.cuda.Event | None
+    """None where the host need not wait."""
+
+    def ready(self) -> bool:
+        """Tell whether they have arrived, without waiting."""
+        return self.arrived is None or self.arrived.query()
+
+    def wait(self) -> list[int]:
+        """Wait until they have arrived, and return them."""
+        if self.arrived is not None:
+            self.arrived.synchronize()
+        return self.counts.tolist()
 
 
 @dataclass(frozen=True)
@@ -150,42 +187,52 @@ class PendingTiles:
     """Indices in C · N of the Gaussians of all views, from front to back. int64 [C * N]"""
     ends: Tensor
     """Where the pairs of each Gaussian end, in this order. int64 [C * N]"""
-    num_pairs: Tensor
-    """The last of `ends`, which is in the host's memory once `arrived` has happened. int64 [1]"""
-    arrived: torch.cuda.Event | None
-    """None where the host need not wait."""
+    pair_counts: PairCounts
+    """Their number in each view, whose sum is the last of `ends`."""
     tile_size: int
     """px."""
     tile_counts: tuple[int, int, int]
     """Numbers of views, and of rows and columns of tiles in each."""
 
     @torch.no_grad()
-    def lists(self) -> tuple[Tensor, Tensor]:
-        """Wait for the length and make the lists.
+    def lists(self, capacity: int | None = None) -> tuple[Tensor, Tensor]:
+        """Make the lists, in the length that they need or in a given one.
+
+        Lists of a given length have one more row of tiles in each view, which lies below the image. The last tile of
+        that row in the last view is given the places that are left, so that nobody draws them. If there are more pairs
+        than places, it is given all of them, and the radii that the lists were made of are set to 0: then nothing is
+        drawn, no gradient flows and no statistic counts the views. All of this is decided on the device.
+
+        Args:
+            capacity: Length of the lists, in [1, 2³¹), for which the host does not wait. With None it waits for the
+                exact length.
 
         Returns:
-            Where each tile's list starts, int32 [C, tile rows, tile columns]; and the indices in C · N that the lists
-            hold, from front to back, int32 [number of pairs].
+            Where each tile's list starts, int32 [C, tile rows (+ 1), tile columns]; and the indices in C · N that the
+            lists hold, from front to back, int32 [number of pairs, or `capacity`].
 
         Raises:
             InputError: If there are more pairs than 32 bits number.
         """
-        if self.arrived is not None:
-            self.arrived.synchronize()
-        num_pairs = int(self.num_pairs)
+        views, rows, columns = self.tile_counts
+        if capacity is None:
+            num_pairs, rows_per_view = sum(self.pair_counts.wait()), rows
+        else:
+            num_pairs, rows_per_view = capacity, rows + 1
         check_pairs(num_pairs)
-        num_tiles, device = math.prod(self.tile_counts), self.ends.device
+        num_tiles, device = views * rows_per_view * columns, self.ends.device
         # Tiles are numbered from −2^15, so that 16 bits tell 65,536 of them apart.
         tiles = torch.empty(num_pairs, dtype=torch.int16 if num_tiles <= 2**16 else torch.int32, device=device)
         ids = torch.empty(num_pairs, dtype=torch.int32, device=device)
         n = len(self.order)
         _list[triton.cdiv(n, _LANES),](
-            *self.ellipses, self.order, self.ends, tiles, ids, n, n // self.tile_counts[0],
-            self.tile_counts[2], self.tile_counts[1], self.ellipses[1].dim() - 1, self.tile_size, _LANES, num_warps=1,
+            *self.ellipses, self.order, self.ends, tiles, ids,
+            n, n // views, num_pairs, num_tiles, columns, rows, rows_per_view,
+            self.ellipses[1].dim() - 1, self.tile_size, _LANES, num_warps=1,
         )  # fmt: skip
         tiles, by_tile = tiles.sort(stable=True)
         starts = torch.searchsorted(tiles, _tile_numbers(num_tiles, tiles.dtype, device), out_int32=True)
-        return starts.reshape(self.tile_counts), ids[by_tile]
+        return starts.reshape(views, rows_per_view, columns), ids[by_tile]
 
 
 @torch.no_grad()
@@ -203,7 +250,8 @@ def intersect_tiles(
 
     Args:
         means2d: px. [C, N, 2]
-        radii: px, int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5; not positive where a Gaussian was culled.
+        radii: px, int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5; not positive where a Gaussian was culled. They should
+            be contiguous: `lists` sets them to 0 where its capacity is too small, and would do so to a copy of others.
         depths: Along the viewing axis. [C, N]
         conics: (a, b, c) of the inverse of the blurred Σ2D, in 1/px². [C, N, 3]
         opacities: In [0, 1]. [C, N]
@@ -227,9 +275,10 @@ def intersect_tiles(
     # sorts are stable, as gsplat's is.
     order = depths.flatten().argsort(stable=True)
     ends = counts[order].cumsum(0)
-    num_pairs, arrived = ends[-1:], None
+    per_view = ends[-1:] if num_views == 1 else counts.view(num_views, -1).sum(1)
+    pair_counts = PairCounts(per_view, None)
     if device.type == "cuda":
-        num_pairs = torch.empty(1, dtype=ends.dtype, pin_memory=True).copy_(ends[-1:], non_blocking=True)
-        arrived = torch.cuda.Event()
-        arrived.record()
-    return PendingTiles(ellipses, order, ends, num_pairs, arrived, tile_size, (num_views, tile_height, tile_width))
+        on_host = torch.empty(num_views, dtype=torch.int64, pin_memory=True).copy_(per_view, non_blocking=True)
+        pair_counts = PairCounts(on_host, torch.cuda.Event())
+        pair_counts.arrived.record()
+    return PendingTiles(ellipses, order, ends, pair_counts, tile_size, (num_views, tile_height, tile_width))

@@ -37,9 +37,13 @@ def rasterization(
     absgrad: bool,
     rasterize_mode: Literal["classic", "antialiased"],
     max_off_axis: float = 0.0,
+    tile_capacity: int | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render as the installed `gsplat.rasterization(..., tile_size=TILE_SIZE)` does; see
     `render.rasterization.rasterize`.
+
+    With `tile_capacity`, `isect_offsets` has one more row of tiles than `tile_height`, and the list of the last of them
+    is not drawn (`PendingTiles.lists`).
 
     Raises:
         ValueError: If `packed`.
@@ -55,10 +59,11 @@ def rasterization(
     )
     if max_off_axis > 0:
         radii = cull_off_axis(radii, means2d, width, height, max_off_axis)
+    radii = radii.contiguous()  # Where the tile lists are too short, they set these very radii to 0.
     # One copy serves the tiles and compositing. `expand` would be slower: torch reduces its gradient over the views,
     # even over one, ten times as slowly as it adds.
     opacities = torch.stack([opacities] * num_views) if compensations is None else opacities * compensations
-    # The host waits for the lists' length: the colours are computed meanwhile.
+    # Without a capacity the host waits for the lists' length: the colours are computed meanwhile.
     pending_tiles = intersect_tiles(means2d, radii, depths, conics, opacities, width, height, TILE_SIZE)
     if isinstance(colors, tuple) and sh_degree is not None and sh_degree <= MAX_DEGREE and not viewmats.requires_grad:
         colors = colors_from_harmonics(sh_degree, means, *colors, viewmats, radii)
@@ -76,9 +81,11 @@ def rasterization(
             colors = torch.clamp_min(colors + 0.5, 0.0)
     if render_mode == "RGB+ED":
         colors = torch.cat([colors, depths[..., None]], dim=-1)
-    isect_offsets, flatten_ids = pending_tiles.lists()
+    ours = BACKWARD == "moments" and colors.shape[-1] == 3
+    # gsplat's backward kernel would read the unused places, too, one after the other in a single block.
+    isect_offsets, flatten_ids = pending_tiles.lists(tile_capacity if ours else None)
     splats = (means2d, conics, colors, opacities, width, height)
-    if BACKWARD == "moments" and colors.shape[-1] == 3:
+    if ours:
         renders, alphas = compositing.rasterize_to_pixels(*splats, isect_offsets, flatten_ids, absgrad)
     else:
         renders, alphas = gsplat_internals.rasterize_to_pixels(*splats, TILE_SIZE, isect_offsets, flatten_ids, absgrad)
@@ -92,13 +99,14 @@ def rasterization(
         "depths": depths,
         "conics": conics,
         "opacities": opacities,
-        "tile_width": isect_offsets.shape[2],
-        "tile_height": isect_offsets.shape[1],
+        "tile_width": pending_tiles.tile_counts[2],
+        "tile_height": pending_tiles.tile_counts[1],
         "flatten_ids": flatten_ids,
         "isect_offsets": isect_offsets,
         "width": width,
         "height": height,
         "tile_size": TILE_SIZE,
         "n_cameras": num_views,
+        "pair_counts": pending_tiles.pair_counts,
     }
     return renders, alphas, info

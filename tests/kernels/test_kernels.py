@@ -495,6 +495,65 @@ def test_more_tiles_than_16_bits_number_are_listed_as_view_by_view():
     assert torch.equal(ids, torch.cat([listed for _, listed in parts])) and len(ids) > 500
 
 
+def listed_by_tile(lists: tuple[Tensor, Tensor], rows: int) -> list[list[int]]:
+    """What gsplat's forward pass reads for each tile of the image, view by view."""
+    starts, ids = (values.cpu() for values in lists)
+    places = starts.flatten().tolist()
+    by_tile = [ids[begin:end].tolist() for begin, end in zip(places, [*places[1:], len(ids)], strict=True)]
+    tiles_per_view, columns = starts[0].numel(), starts.shape[2]
+    return [listed for number, listed in enumerate(by_tile) if number % tiles_per_view < rows * columns]
+
+
+@pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
+@pytest.mark.parametrize(("num_views", "width", "height"), [(1, 75, 50), (3, 75, 50), (2, 64, 48)])
+def test_lists_longer_than_needed_equal_the_exact_ones_tile_by_tile(num_views, width, height, per_axis_radii):
+    """The last height is a multiple of a tile's: padding must not reach the image's last row of tiles there."""
+    gaussians = projected_gaussians(num_views, 120, width, height)
+    if per_axis_radii:
+        gaussians["radii"] = gaussians["radii"][..., None].repeat(1, 1, 2)
+    on_device = {name: value.to(DEVICE, copy=True) for name, value in gaussians.items()}
+    pending = tiles.intersect_tiles(**on_device, width=width, height=height, tile_size=8)
+    rows, columns = math.ceil(height / 8), math.ceil(width / 8)
+    exact = pending.lists()
+    num_pairs = len(exact[1])
+    counts = pending.pair_counts
+    assert counts.wait() == [
+        sum(view * 120 <= g < view * 120 + 120 for g in exact[1].tolist()) for view in range(num_views)
+    ]
+    assert counts.ready() and sum(counts.wait()) == num_pairs > 500
+    for capacity in (num_pairs, num_pairs + 1, 2 * num_pairs, num_pairs + 10_000):
+        starts, ids = pending.lists(capacity)
+        assert starts.shape == (num_views, rows + 1, columns) and len(ids) == capacity
+        assert starts.dtype == ids.dtype == torch.int32
+        assert listed_by_tile((starts, ids), rows) == listed_by_tile(exact, rows)
+        assert starts.flatten()[-1] == num_pairs and (ids[num_pairs:] == 0).all(), "padding is valid and at the end"
+    assert torch.equal(on_device["radii"].cpu(), gaussians["radii"])
+
+
+@pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
+@pytest.mark.parametrize("missing", [1, 400])
+def test_lists_shorter_than_needed_are_empty_and_nothing_counts_as_drawn(per_axis_radii, missing):
+    gaussians = projected_gaussians(2, 120, 75, 50)
+    if per_axis_radii:
+        gaussians["radii"] = gaussians["radii"][..., None].repeat(1, 1, 2)
+    on_device = {name: value.to(DEVICE) for name, value in gaussians.items()}
+    pending = tiles.intersect_tiles(**on_device, width=75, height=50, tile_size=8)
+    needed = sum(pending.pair_counts.wait())
+    lists = pending.lists(needed - missing)
+    assert len(lists[1]) == needed - missing and (lists[1] == 0).all()
+    assert not any(listed_by_tile(lists, rows=7))
+    assert (on_device["radii"] == 0).all()
+    assert sum(pending.pair_counts.wait()) == needed
+
+
+def test_a_row_of_tiles_below_the_image_may_need_numbers_of_32_bits():
+    """The image's 65,536 tiles have numbers of 16 bits; with the row below it they have not."""
+    gaussians = {name: value.to(DEVICE) for name, value in projected_gaussians(1, 40, 2048, 2048).items()}
+    pending = tiles.intersect_tiles(**gaussians, width=2048, height=2048, tile_size=8)
+    exact = pending.lists()
+    assert listed_by_tile(pending.lists(len(exact[1]) + 50), 256) == listed_by_tile(exact, 256)
+
+
 def test_no_gaussian_in_sight_makes_empty_lists():
     gaussians = projected_gaussians(1, 5, 32, 32)
     gaussians["radii"] = torch.zeros_like(gaussians["radii"])
