@@ -33,6 +33,7 @@ from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.outliers import POINT_SHARE, REACH
 from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world
+from sadgs_ns.render.tile_forecast import TileForecast
 
 CAMERA_CLEARANCE = 2.0
 """Initial Gaussians nearer to a camera than this many of their standard deviations are dropped. The paper keeps them;
@@ -175,6 +176,8 @@ class SadgsModel(SplatfactoModel):
         self.average = RunningMean()
         self.camera_positions: Tensor | None = None  # [C, 3]
         self.infos: list[dict[str, Any]] = []
+        # A bilateral grid would learn to brighten what a step without enough places in its tile lists leaves black.
+        self.tile_forecast = None if config.use_bilateral_grid else TileForecast()
         self.crop_box: OrientedBox | None = None
         self.viewer_outputs: Callable[[Cameras, dict[str, Tensor]], dict[str, Tensor]] | None = None
         # A random background is for training; viewers show viser's own instead.
@@ -308,6 +311,7 @@ class SadgsModel(SplatfactoModel):
         height: int,
         render_mode: Literal["RGB", "RGB+ED"],
         absgrad: bool = False,
+        tile_capacity: int | None = None,
     ) -> tuple[Tensor, Tensor, dict[str, Any]]:
         """Rasterize the Gaussians; in the viewer, those inside its crop box.
 
@@ -318,6 +322,7 @@ class SadgsModel(SplatfactoModel):
             height: px.
             render_mode: "RGB+ED" adds the expected depth as a fourth channel.
             absgrad: Whether the backward pass also sums absolute screen gradients, for AbsGS.
+            tile_capacity: Places in the tile lists of our kernels, as in `rasterize`; None waits for the exact number.
 
         Returns:
             Colours, not clamped, and depth [C, H, W, 3 or 4]; accumulated opacity [C, H, W, 1]; gsplat's meta.
@@ -343,6 +348,7 @@ class SadgsModel(SplatfactoModel):
             render_mode=render_mode,
             absgrad=absgrad,
             fused=self.config.fused,
+            tile_capacity=tile_capacity,
             **self.drawing,
         )
 
@@ -357,6 +363,9 @@ class SadgsModel(SplatfactoModel):
     ) -> dict[str, Tensor]:
         """Render training views of one size and let the strategy see the forward pass.
 
+        With our kernels the host does not wait for the length of the tile lists, but foresees it. Where that was too
+        short nothing is drawn, no gradient flows and the strategy counts nothing; `tile_forecast` then names the views.
+
         Args:
             viewmats: World to camera. [C, 4, 4]
             Ks: Intrinsics in px. [C, 3, 3]
@@ -369,7 +378,12 @@ class SadgsModel(SplatfactoModel):
             `rgb` [C, H, W, 3], not clamped, and `background` [3].
         """
         absgrad = self.strategy.needs_absgrad(self.step)
-        render, alpha, info = self.render(viewmats, Ks, width, height, "RGB", absgrad)
+        forecast, capacity = self.tile_forecast, None
+        if forecast is not None:
+            capacity = forecast.capacity(cam_indices, (width, height), self.num_points)
+        render, alpha, info = self.render(viewmats, Ks, width, height, "RGB", absgrad, capacity)
+        if forecast is not None and "pair_counts" in info:  # Only our kernels count pairs.
+            forecast.rendered(cam_indices, (width, height), capacity, info["pair_counts"])
         if self.step < self.strategy.windows.refine_stop_iter:
             info |= {"viewmats": viewmats.detach(), "Ks": Ks, "structure_tensors": structure_tensors}
             self.strategy.step_pre_backward(self.gauss_params, self.optimizers, self.strategy_state, self.step, info)
