@@ -276,9 +276,10 @@ def intersect_tiles(
     order = depths.flatten().argsort(stable=True)
     ends = counts[order].cumsum(0)
     per_view = ends[-1:] if num_views == 1 else counts.view(num_views, -1).sum(1)
-    pair_counts = PairCounts(per_view, None)
+    arrived = None
     if device.type == "cuda":
-        on_host = torch.empty(num_views, dtype=torch.int64, pin_memory=True).copy_(per_view, non_blocking=True)
-        pair_counts = PairCounts(on_host, torch.cuda.Event())
-        pair_counts.arrived.record()
-    return PendingTiles(ellipses, order, ends, pair_counts, tile_size, (num_views, tile_height, tile_width))
+        per_view = torch.empty(num_views, dtype=torch.int64, pin_memory=True).copy_(per_view, non_blocking=True)
+        arrived = torch.cuda.Event()
+        arrived.record()
+    tile_counts = num_views, tile_height, tile_width
+    return PendingTiles(ellipses, order, ends, PairCounts(per_view, arrived), tile_size, tile_counts)

@@ -60,10 +60,11 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
     cameras = pipeline.datamanager.train_dataset.cameras
 
     def tile_lists() -> None:
-        # The size is the run's: whether tiles are numbered in 16 or in 32 bits depends on how many there are.
-        rasterize(
-            means, quats, scales, opacities, means, viewmats, Ks, int(cameras.width.max()), int(cameras.height.max())
-        )
+        # The size is the run's: whether tiles are numbered in 16 or in 32 bits depends on how many there are, and lists
+        # of a given length have one more row of them.
+        size = int(cameras.width.max()), int(cameras.height.max())
+        for capacity in (None, 2**20):
+            rasterize(means, quats, scales, opacities, means, viewmats, Ks, *size, tile_capacity=capacity)
 
     def blank(name: str) -> Tensor:
         return means.new_zeros((n, *model.gauss_params[name].shape[1:]))
