@@ -60,9 +60,14 @@ def rasterization(
     if max_off_axis > 0:
         radii = cull_off_axis(radii, means2d, width, height, max_off_axis)
     radii = radii.contiguous()  # Where the tile lists are too short, they set these very radii to 0.
-    # One copy serves the tiles and compositing. `expand` would be slower: torch reduces its gradient over the views,
-    # even over one, ten times as slowly as it adds.
-    opacities = torch.stack([opacities] * num_views) if compensations is None else opacities * compensations
+    if compensations is not None:
+        opacities = opacities * compensations
+    elif num_views == 1:
+        opacities = opacities[None]
+    else:
+        # One copy serves the tiles and compositing. `expand` would be slower: torch reduces its gradient over the views
+        # ten times as slowly as it adds.
+        opacities = torch.stack([opacities] * num_views)
     # Without a capacity the host waits for the lists' length: the colours are computed meanwhile.
     pending_tiles = intersect_tiles(means2d, radii, depths, conics, opacities, width, height, TILE_SIZE)
     if isinstance(colors, tuple) and sh_degree is not None and sh_degree <= MAX_DEGREE and not viewmats.requires_grad:
