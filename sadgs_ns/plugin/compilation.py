@@ -19,6 +19,7 @@ from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
 from sadgs_ns.plugin.optimizers import FusedAdam, step_together
+from sadgs_ns.render.activations import activate
 from sadgs_ns.render.rasterization import rasterize
 
 if TYPE_CHECKING:
@@ -96,6 +97,12 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
         if absgrad:
             accumulate_gradients(empty_gradients(n, device), info, views, fused=strategy.fused)
 
+    def activations() -> None:
+        for weight in (0.0, 1.0):  # The loss has a part with the mean opacity, but not to the end.
+            parameters = scales.clone().requires_grad_(), opacities[:, None].clone().requires_grad_()
+            some = activate(*parameters, weight, fused=True)
+            torch.autograd.backward([value.sum() for value in some if value is not None])
+
     def harmonics() -> None:
         from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
 
@@ -118,6 +125,7 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
     pending: dict[str, Future[None]] = {}
     with ThreadPoolExecutor() as pool:  # which waits for its threads, whatever happens
         pending |= {"the loss": pool.submit(loss), "S̄": pool.submit(structure), "Adam": pool.submit(update)}
+        pending |= {"activations": pool.submit(activations)}
         try:  # the other stages read this projection
             _, _, info = rasterize(means, quats, scales, opacities, means, *camera, max_off_axis=config.max_off_axis)
         except Exception as error:

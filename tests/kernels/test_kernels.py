@@ -22,8 +22,10 @@ from sadgs_ns.method.codes import encode
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.plugin.optimizers import FusedAdam
+from sadgs_ns.render.activations import activate
 from sadgs_ns.render.off_axis import cull_off_axis
 
+activations = pytest.importorskip("sadgs_ns.kernels.activations", reason="Triton is not installed")
 codes = pytest.importorskip("sadgs_ns.kernels.codes", reason="Triton is not installed")
 adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
 structure = pytest.importorskip("sadgs_ns.kernels.structure_tensor", reason="Triton is not installed")
@@ -318,6 +320,34 @@ def test_screen_gradients_add_up_as_in_the_reference(monkeypatch, per_axis_radii
     assert torch.equal(fast.pop("grad_count"), reference["grad_count"])
     for name, value in fast.items():
         torch.testing.assert_close(value, reference[name], atol=1e-5, rtol=1e-6)
+
+
+@pytest.mark.parametrize("used", ["scales", "opacities", "penalty", "scales opacities penalty"])
+@pytest.mark.parametrize("n", [1, 37, 1024, 2050])
+def test_activations_and_their_gradients_equal_torchs_in_float64(monkeypatch, n, used):
+    generator = torch.Generator().manual_seed(n)
+    log_scales, logits, weights = (torch.randn(shape, generator=generator) for shape in ((n, 3), (n, 1), (n, 12)))
+    logits[0], log_scales[0] = -12.0, torch.tensor([-9.0, 3.0, 0.0])
+    penalty = 0.3 if "penalty" in used else 0.0
+    monkeypatch.setattr(kernels, "available", lambda device: True)
+    calls = recorded(monkeypatch, activations, "activate")
+    results = []
+    for fused, dtype in ((True, torch.float32), (False, torch.float64)):
+        inputs = [value.to(DEVICE, dtype, copy=True).requires_grad_() for value in (log_scales, logits)]
+        scales, opacities, penalized = activate(*inputs, penalty, fused=fused)
+        assert scales.shape == (n, 3) and opacities.shape == (n,) and (penalized is None) is (penalty == 0)
+        rows = weights.to(DEVICE, dtype)
+        outputs = {"scales": (scales, rows[:, :3]), "opacities": (opacities, rows[:, 5])}  # as compositing returns them
+        if penalized is not None:
+            outputs["penalty"] = penalized, torch.full_like(penalized, 1.7)
+        chosen = [outputs[name] for name in used.split()]
+        torch.autograd.backward([output for output, _ in chosen], [gradient for _, gradient in chosen])
+        results.append([value.detach().double() for value in (scales, opacities, penalized) if value is not None])
+        results[-1] += [
+            torch.zeros_like(value).double() if value.grad is None else value.grad.double() for value in inputs
+        ]
+    assert len(calls) == 1
+    torch.testing.assert_close(*results, atol=1e-9, rtol=3e-6)
 
 
 ADAM = {"betas": (0.9, 0.999), "eps": 1e-15}

@@ -334,16 +334,19 @@ def test_the_mean_opacity_weighs_in_the_loss_while_densification_runs(colmap: Co
     opacities: list[float] = []
     regularized: list[bool] = []
 
-    def look(trainer: SadgsTrainer) -> None:
-        model = trainer.pipeline.model
-        black = torch.zeros((16, 16, 3), device=model.device)
-        losses = model.get_loss_dict({"rgb": black, "background": black[0, 0]}, {"image": black})
-        regularized.append("opacity_reg" in losses)
-        opacities.append(float(torch.sigmoid(model.opacities.detach()).mean()))
-        if regularized[-1]:
-            assert float(losses["opacity_reg"]) == pytest.approx(100 * opacities[-1], rel=1e-5)
+    trainer = set_up(config)
+    model, get_losses = trainer.pipeline.model, trainer.pipeline.get_train_loss_dict
 
-    train(config, look)
+    def look(step: int) -> Any:
+        opacities.append(float(torch.sigmoid(model.opacities.detach()).mean()))
+        outputs, losses, metrics = get_losses(step)
+        regularized.append("opacity_reg" in losses)
+        if regularized[-1]:
+            assert float(losses["opacity_reg"].detach()) == pytest.approx(100 * opacities[-1], rel=1e-5)
+        return outputs, losses, metrics
+
+    trainer.pipeline.get_train_loss_dict = look  # type: ignore[method-assign]
+    trainer.train()
     assert regularized == [True] * 4 + [False] * 4
     assert opacities[0] > opacities[1] > opacities[2] > opacities[3]
 
