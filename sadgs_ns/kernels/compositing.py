@@ -254,7 +254,8 @@ def composite_backward(
         conics: In 1/px². [C, N, 3]
         colors: [C, N, 3]
         opacities: In [0, 1]. [C, N]
-        isect_offsets: Where each tile's list starts, int32 [C, tile rows, tile columns].
+        isect_offsets: Where each tile's list starts, int32 [C, tile rows, tile columns]. A list of a tile below the
+            image is passed over.
         flatten_ids: Indices in C·N, int32 [number of pairs].
         alphas: As rendered. [C, height, width, 1]
         last_ids: Place in the lists of the last Gaussian that a pixel drew, int32 [C, height, width].
