@@ -151,7 +151,7 @@ def _list(
         tl.store(ids + unused, lane * 0, unused < num_pairs)
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=32)  # Each size of image has two, for exact lists and for those of a given length.
 def _tile_numbers(num_tiles: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Numbers of all tiles in ascending order, which begin at −2^15. [num_tiles]"""
     return torch.arange(-(2**15), num_tiles - 2**15, dtype=dtype, device=device)
