@@ -28,7 +28,17 @@ _LANES = 4096
 """Partial sums that are added at once."""
 
 
-@triton.jit(do_not_specialize=["n"])
+@triton.jit
+def _target(y, i, exists):
+    """Numbers of the training views in [0, 1], which are floats or bytes in memory."""
+    value = tl.load(y + i, exists, 0).to(tl.float32)
+    if y.dtype.element_ty == tl.uint8:
+        value = value * 0.00392156862745098  # As torch divides by 255 on CUDA.
+    return value
+
+
+# One view of several may begin at no multiple of 16 bytes: Triton would compile another kernel for that.
+@triton.jit(do_not_specialize=["n"], do_not_specialize_on_alignment=["y"])
 def _blur_along_rows(x, y, blurred, sums, n, GAUSSIAN: tl.constexpr, STRIP: tl.constexpr):
     """Blur x, y, x², y² and xy along the rows, and sum |x − y| and (x − y)² in parts.
 
@@ -40,7 +50,7 @@ def _blur_along_rows(x, y, blurred, sums, n, GAUSSIAN: tl.constexpr, STRIP: tl.c
     e_y, e_xx, e_yy, e_xy = e_x, e_x, e_x, e_x
     for k in tl.static_range(len(GAUSSIAN)):
         exists = i < n - 3 * k
-        a, b = tl.load(x + i + 3 * k, exists, 0.0), tl.load(y + i + 3 * k, exists, 0.0)
+        a, b = tl.load(x + i + 3 * k, exists, 0.0), _target(y, i + 3 * k, exists)
         wa, wb = GAUSSIAN[k] * a, GAUSSIAN[k] * b
         e_x, e_y, e_xx, e_yy, e_xy = e_x + wa, e_y + wb, e_xx + wa * a, e_yy + wb * b, e_xy + wa * b
     size = tl.cast(n, tl.int64)
@@ -49,7 +59,7 @@ def _blur_along_rows(x, y, blurred, sums, n, GAUSSIAN: tl.constexpr, STRIP: tl.c
     tl.store(blurred + 2 * size + i, e_xx, inside)
     tl.store(blurred + 3 * size + i, e_yy, inside)
     tl.store(blurred + 4 * size + i, e_xy, inside)
-    difference = tl.load(x + i, inside, 0.0) - tl.load(y + i, inside, 0.0)
+    difference = tl.load(x + i, inside, 0.0) - _target(y, i, inside)
     tl.store(sums + tl.program_id(0), tl.sum(tl.abs(difference)))
     tl.store(sums + tl.num_programs(0) + tl.program_id(0), tl.sum(difference * difference))
 
@@ -157,7 +167,7 @@ def _spread_along_rows(slopes, spread, n, GAUSSIAN: tl.constexpr, STRIP: tl.cons
     tl.store(spread + 2 * size + i, by_xy, i < n)
 
 
-@triton.jit(do_not_specialize=["n", "height", "row"])
+@triton.jit(do_not_specialize=["n", "height", "row"], do_not_specialize_on_alignment=["y"])
 def _gradient(
     x, y, spread, upstream, gradient, n, height, row, l1_weight, ssim_weight, l2_weight,
     GAUSSIAN: tl.constexpr, RUN: tl.constexpr, COLUMNS: tl.constexpr,
@@ -175,7 +185,7 @@ def _gradient(
     by_xy = _blur_along_columns(spread + 2 * size, i - above * row, row, begin, end, exists, GAUSSIAN, RUN)
     for t in tl.static_range(RUN):
         inside = exists & (first + t < height)
-        a, b = tl.load(x + i + t * row, inside, 0.0), tl.load(y + i + t * row, inside, 0.0)
+        a, b = tl.load(x + i + t * row, inside, 0.0), _target(y, i + t * row, inside)
         sign = tl.where(a > b, 1.0, 0.0) - tl.where(a < b, 1.0, 0.0)
         of_ssim = by_x[t] + 2 * a * by_xx[t] + b * by_xy[t]
         total = l1_weight * sign + 2 * l2_weight * (a - b) - ssim_weight * of_ssim
@@ -230,7 +240,7 @@ def photometric_loss(
 
     Args:
         predicted: Rendered views, float32. [C, H, W, 3]
-        target: Training views in [0, 1], float32. [C, H, W, 3]
+        target: Training views, float32 in [0, 1] or uint8. [C, H, W, 3]
         window: Weights of SSIM's window along one axis, symmetric.
         ssim_lambda: λ in [0, 1].
         l2_lambda: λ_2 ≥ 0.

@@ -30,7 +30,7 @@ def photometric_loss(
 
     Args:
         predicted: Rendered views, not clamped, so that gradients reach colours outside [0, 1]. [C, H, W, 3]
-        target: Training views in [0, 1]. [C, H, W, 3]
+        target: Training views, floats in [0, 1] or uint8. [C, H, W, 3]
         ssim_lambda: λ in [0, 1].
         l2_lambda: λ_2 ≥ 0.
         fused: Use the Triton kernels where they run (CUDA) and apply (float32, views of at least 11×11 px).
@@ -42,11 +42,14 @@ def photometric_loss(
         ValueError: From pytorch_msssim, if views are one pixel high or wide.
         InputError: If the views have more pixels than the Triton kernels can address (kernels/limits.py).
     """
-    suits = predicted.dtype == target.dtype == torch.float32 and min(predicted.shape[1:3]) >= len(WINDOW)
+    suits = predicted.dtype == torch.float32 and target.dtype in (torch.float32, torch.uint8)
+    suits = suits and min(predicted.shape[1:3]) >= len(WINDOW)
     if fused and suits and kernels.available(predicted.device):
         from sadgs_ns.kernels.losses import photometric_loss as fused_photometric_loss
 
         return fused_photometric_loss(predicted, target, WINDOW, ssim_lambda=ssim_lambda, l2_lambda=l2_lambda)
+    if target.dtype == torch.uint8:
+        target = target / 255.0
     difference = predicted - target
     l1, l2 = difference.abs().mean(), difference.square().mean()
     # The copies are contiguous: with channels-last strides cuDNN convolves at a third of the speed, above all backward.

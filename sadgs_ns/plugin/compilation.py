@@ -73,9 +73,9 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
     def structure() -> None:
         encode(pipeline.structure_maps.of_images(image))
 
-    def loss() -> None:
+    def loss(dtype: torch.dtype) -> None:  # Images are bytes; behind a mask or with transparency they become floats.
         predicted = image.repeat(views, 1, 1, 1).requires_grad_()
-        photometric_loss(predicted, torch.zeros_like(predicted))[0].backward()
+        photometric_loss(predicted, torch.zeros_like(predicted, dtype=dtype))[0].backward()
 
     def update() -> None:
         log, twins = NonFiniteLog(device, capacity=1), []
@@ -124,8 +124,13 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
     failures: dict[str, BaseException] = {}
     pending: dict[str, Future[None]] = {}
     with ThreadPoolExecutor() as pool:  # which waits for its threads, whatever happens
-        pending |= {"the loss": pool.submit(loss), "S̄": pool.submit(structure), "Adam": pool.submit(update)}
-        pending |= {"activations": pool.submit(activations)}
+        pending |= {
+            "the loss": pool.submit(loss, torch.uint8),
+            "S̄": pool.submit(structure),
+            "Adam": pool.submit(update),
+            "the loss of masked images": pool.submit(loss, torch.float32),
+            "activations": pool.submit(activations),
+        }
         try:  # the other stages read this projection
             _, _, info = rasterize(means, quats, scales, opacities, means, *camera, max_off_axis=config.max_off_axis)
         except Exception as error:

@@ -505,8 +505,9 @@ class SadgsModel(SplatfactoModel):
                 of the loss. In training, PSNR is added as `psnr`.
             batch: `image` of the same leading shape and, optionally, a boolean `mask` [..., H, W, 1].
         """
-        target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
-        predicted = outputs["rgb"]
+        target, predicted = batch["image"].to(self.device), outputs["rgb"]
+        if "mask" in batch or target.shape[-1] == 4:  # Otherwise the loss reads bytes as they are.
+            target = self.composite_with_background(self.get_gt_img(target), outputs["background"])
         if "mask" in batch:
             mask = batch["mask"].to(self.device)
             target, predicted = target * mask, predicted * mask

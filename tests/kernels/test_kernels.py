@@ -70,6 +70,21 @@ def test_loss_and_gradient_equal_the_float64_reference(shape):
     torch.testing.assert_close(fast[2], reference[2], atol=5e-5 * float(reference[2].abs().max()), rtol=0)
 
 
+def test_the_loss_reads_bytes_as_the_floats_that_they_stand_for():
+    generator = torch.Generator().manual_seed(0)
+    images = torch.randint(0, 256, (2, 21, 47, 3), generator=generator, dtype=torch.uint8).to(DEVICE)
+    predicted = torch.rand((2, 21, 47, 3), generator=generator).to(DEVICE)
+    results = []
+    for target in (images, images * torch.tensor(1 / 255)):
+        x = predicted.clone().requires_grad_()
+        loss, psnr = fused_photometric_loss(x, target, ssim_lambda=0.3, l2_lambda=1.5)
+        loss.backward()
+        results.append([loss.detach(), psnr, x.grad])
+    assert all(map(torch.equal, *results))
+    slow = losses.photometric_loss(predicted, images, ssim_lambda=0.3, l2_lambda=1.5, fused=False)
+    torch.testing.assert_close(results[0][:2], list(slow), atol=1e-5, rtol=1e-5)
+
+
 def test_flat_images_have_a_finite_gradient():
     x = torch.zeros((1, 16, 16, 3), device=DEVICE, requires_grad=True)
     loss, _ = fused_photometric_loss(x, torch.zeros_like(x), ssim_lambda=0.2, l2_lambda=2.0)

@@ -55,7 +55,8 @@ for module in pkgutil.iter_modules(package.__path__):
                 signature[parameter.name] = "fp32"
             else:
                 signature[parameter.name] = POINTERS.get(parameter.name, "*fp32")
-        signatures = [signature] if name != "_list" else [signature, signature | {"tiles": "*i32"}]
+        others = {"_list": {"tiles": "*i32"}, "_blur_along_rows": {"y": "*u8"}, "_gradient": {"y": "*u8"}}
+        signatures = [signature, *([signature | others[name]] if name in others else [])]
         for signature in signatures:
             for capability in (80, 90):  # A100, H200
                 triton.compile(ASTSource(kernel, signature, constants), target=GPUTarget("cuda", capability, 32))
