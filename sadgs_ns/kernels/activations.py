@@ -3,7 +3,7 @@
 The torch functions and the mean opacity take five launches forward and six backward, which small scenes wait for.
 """
 
-# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
+# pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportIndexIssue=false
 # (Triton's launch syntax, kernel[grid](...), is not in its types.)
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ class RunningMean:
             self.means = {name: parameter.detach().clone() for name, parameter in params.items()}
             return
         # One launch for all parameters; each of their means is computed as lerp_ does it.
-        torch._foreach_lerp_(list(self.means.values()), [params[name] for name in self.means], 1 / self.count)
+        torch._foreach_lerp_(list(self.means.values()), [params[name] for name in self.means], 1 / self.count)  # type: ignore[attr-defined]
 
     @torch.no_grad()
     def move_to(self, params: Params) -> None:

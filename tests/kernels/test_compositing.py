@@ -334,11 +334,15 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
 @pytest.mark.parametrize(("num_views", "width", "height"), [(1, 96, 64), (3, 93, 70)])
 def test_gsplats_kernel_draws_nothing_of_a_row_of_tiles_below_the_image(num_views, width, height):
     scene = make_scene("usual", num_views, 300, width, height)
-    splats = (*(scene[name].contiguous() for name in NAMES[:4]), width, height, 8)
-    expected = gsplat_internals.composite(*splats, scene["starts"], scene["ids"])
-    padded = gsplat_internals.composite(*splats, *scene["pending"].lists(len(scene["ids"]) + 5000))
+    means2d, conics, colors, opacities = (scene[name].contiguous() for name in NAMES[:4])
+    needed = len(scene["ids"])
+    expected, padded, void = (
+        gsplat_internals.composite(
+            means2d, conics, colors, opacities, width, height, 8, *scene["pending"].lists(places)
+        )
+        for places in (None, needed + 5000, needed - 1)
+    )
     assert all(map(torch.equal, padded, expected)) and expected[1].max() > 0.5
-    void = gsplat_internals.composite(*splats, *scene["pending"].lists(len(scene["ids"]) - 1))
     assert not any(value.any() for value in void)
 
 

@@ -349,7 +349,7 @@ def test_activations_and_their_gradients_equal_torchs_in_float64(monkeypatch, n,
     results = []
     for fused, dtype in ((True, torch.float32), (False, torch.float64)):
         inputs = [value.to(DEVICE, dtype, copy=True).requires_grad_() for value in (log_scales, logits)]
-        scales, opacities, penalized = activate(*inputs, penalty, fused=fused)
+        scales, opacities, penalized = activate(inputs[0], inputs[1], penalty, fused=fused)
         assert scales.shape == (n, 3) and opacities.shape == (n,) and (penalized is None) is (penalty == 0)
         rows = weights.to(DEVICE, dtype)
         outputs = {"scales": (scales, rows[:, :3]), "opacities": (opacities, rows[:, 5])}  # as compositing returns them

@@ -77,7 +77,7 @@ def test_tile_lists_are_tried_in_the_size_of_the_run(config: SadgsTrainerConfig,
 def test_what_cannot_be_compiled_leaves_the_run_as_it_was(
     config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """In Triton's interpreter the loss, S̄, activations and Adam run; tile lists need gsplat's projection, which needs CUDA."""
+    """In Triton's interpreter all run but what needs a projection, which is gsplat's and needs CUDA."""
     pytest.importorskip("triton", reason="Triton is not installed")
     trainer = SadgsTrainer(config)
     trainer.setup()
