@@ -42,7 +42,7 @@ def _activate_backward(
     scales, opacities, v_scales, v_opacities, v_penalty, v_log_scales, v_logits, n, row, penalty,
     PENALTY: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
-    """Gradients by the parameters; those by the opacities lie `row` numbers apart."""
+    """Write the gradients by the parameters; those by the opacities lie `row` numbers apart."""
     program = tl.program_id(0).to(tl.int64)
     lane = tl.arange(0, LANES)
     size = tl.cast(n, tl.int64)
@@ -79,7 +79,7 @@ class _Activate(torch.autograd.Function):
         v_scales = torch.zeros_like(scales) if v_scales is None else v_scales.contiguous()
         v_opacities = torch.zeros_like(opacities) if v_opacities is None else v_opacities
         v_log_scales, v_logits = torch.empty_like(scales), opacities.new_empty((n, 1))
-        # The gradients by all partial sums are that of their sum.
+        # The partial sums all have the gradient of their sum, so the kernel reads the first one's.
         _activate_backward[triton.cdiv(n, _LANES),](
             scales, opacities, v_scales, v_opacities, opacities if v_sums is None else v_sums, v_log_scales, v_logits,
             n, v_opacities.stride(0), ctx.weight, v_sums is not None, _LANES,

@@ -30,7 +30,7 @@ _LANES = 4096
 
 @triton.jit
 def _target(y, i, exists):
-    """Numbers of the training views in [0, 1], which are floats or bytes in memory."""
+    """Load numbers of the training views, which are floats or bytes in memory, as floats in [0, 1]."""
     value = tl.load(y + i, exists, 0).to(tl.float32)
     if y.dtype.element_ty == tl.uint8:
         value = value * 0.00392156862745098  # As torch divides by 255 on CUDA.
@@ -66,7 +66,7 @@ def _blur_along_rows(x, y, blurred, sums, n, GAUSSIAN: tl.constexpr, STRIP: tl.c
 
 @triton.jit
 def _blur_along_columns(x, i, row, begin, end, exists, GAUSSIAN: tl.constexpr, RUN: tl.constexpr):
-    """RUN blurred numbers below each other in the columns from i on, of which the rows from `begin` to `end` exist.
+    """Blur RUN numbers below each other in the columns from i on, of which the rows from `begin` to `end` exist.
 
     Each number is loaded once for all of them: with loads for each by itself the kernels took 255 registers, not 96.
     """
@@ -127,7 +127,7 @@ def _similarity(
 
 @triton.jit
 def _total(values, count, LANES: tl.constexpr):
-    """Sum of all values in an order that is always the same; each lane adds few, so that rounding stays a tree's."""
+    """Sum all values in an order that is always the same; each lane adds few, so that rounding stays a tree's."""
     sums = tl.zeros([LANES], tl.float32)
     for start in range(0, count, LANES):
         i = start + tl.arange(0, LANES)
@@ -151,7 +151,7 @@ def _finish(
 
 @triton.jit(do_not_specialize=["n"])
 def _spread_along_rows(slopes, spread, n, GAUSSIAN: tl.constexpr, STRIP: tl.constexpr):
-    """Adjoint of the blur along the rows, of three derivatives; before a row's start lie the zeros of another's end."""
+    """Apply the blur's adjoint along the rows to three derivatives; before a row lie the zeros of another's end."""
     i = tl.program_id(0) * STRIP + tl.arange(0, STRIP)
     size = tl.cast(n, tl.int64)
     by_x = tl.zeros([STRIP], tl.float32)
@@ -172,7 +172,7 @@ def _gradient(
     x, y, spread, upstream, gradient, n, height, row, l1_weight, ssim_weight, l2_weight,
     GAUSSIAN: tl.constexpr, RUN: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
-    """Adjoint of the blur along the columns, and with it the gradient of the whole loss by x."""
+    """Apply the blur's adjoint along the columns, and compute with it the gradient of the whole loss by x."""
     c = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)
     first = tl.program_id(1) * RUN
     exists = c < row

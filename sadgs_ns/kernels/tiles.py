@@ -30,7 +30,7 @@ def _load_ellipse(
     means2d, radii, conics, opacities, g, exists, tile_width, tile_height,
     PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr,
 ):  # fmt: skip
-    """What decides which tiles the Gaussians with indices g in C · N reach.
+    """Load what decides which tiles the Gaussians with indices g in C · N reach.
 
     Returns:
         The centre x, y; the conic a, b, c; the level 2 ln(255 α) at which the ellipse ends; the conic's determinant;
@@ -70,7 +70,7 @@ def _load_ellipse(
 
 @triton.jit
 def _columns_of_row(row, x, y, a, b, c, level, determinant, proper, first_column, last_column, TILE: tl.constexpr):
-    """First and one past the last column of the tiles in a row that the ellipse meets."""
+    """Return the first, and one past the last, column of the tiles in a row that the ellipse meets."""
     low = row * TILE + 0.5 - y  # the row's first pixel centres, from the Gaussian's
     high = low + (TILE - 1)
     reach_x = tl.sqrt(level * c / determinant)
@@ -153,7 +153,7 @@ def _list(
 
 @lru_cache(maxsize=32)  # Each size of image has two, for exact lists and for those of a given length.
 def _tile_numbers(num_tiles: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Numbers of all tiles in ascending order, which begin at −2^15. [num_tiles]"""
+    """Return the numbers of all tiles in ascending order, which begin at −2^15. [num_tiles]"""
     return torch.arange(-(2**15), num_tiles - 2**15, dtype=dtype, device=device)
 
 
