@@ -549,9 +549,18 @@ def listed_by_tile(lists: tuple[Tensor, Tensor], rows: int) -> list[list[int]]:
     return [listed for number, listed in enumerate(by_tile) if number % tiles_per_view < rows * columns]
 
 
+@pytest.fixture
+def few_programs(monkeypatch):
+    """Each program handles more Gaussians than on a GPU, since the interpreter runs one program after the other."""
+    if DEVICE.type == "cpu":
+        monkeypatch.setattr(tiles, "_LANES", 128)
+
+
 @pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
 @pytest.mark.parametrize(("num_views", "width", "height"), [(1, 75, 50), (3, 75, 50), (2, 64, 48)])
-def test_lists_longer_than_needed_equal_the_exact_ones_tile_by_tile(num_views, width, height, per_axis_radii):
+def test_lists_longer_than_needed_equal_the_exact_ones_tile_by_tile(
+    few_programs, num_views, width, height, per_axis_radii
+):
     """The last height is a multiple of a tile's: padding must not reach the image's last row of tiles there."""
     gaussians = projected_gaussians(num_views, 120, width, height)
     if per_axis_radii:
@@ -577,7 +586,7 @@ def test_lists_longer_than_needed_equal_the_exact_ones_tile_by_tile(num_views, w
 
 @pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
 @pytest.mark.parametrize("missing", [1, 400])
-def test_lists_shorter_than_needed_are_empty_and_nothing_counts_as_drawn(per_axis_radii, missing):
+def test_lists_shorter_than_needed_are_empty_and_nothing_counts_as_drawn(few_programs, per_axis_radii, missing):
     gaussians = projected_gaussians(2, 120, 75, 50)
     if per_axis_radii:
         gaussians["radii"] = gaussians["radii"][..., None].repeat(1, 1, 2)
@@ -591,7 +600,7 @@ def test_lists_shorter_than_needed_are_empty_and_nothing_counts_as_drawn(per_axi
     assert sum(pending.pair_counts.wait()) == needed
 
 
-def test_a_row_of_tiles_below_the_image_may_need_numbers_of_32_bits():
+def test_a_row_of_tiles_below_the_image_may_need_numbers_of_32_bits(few_programs):
     """The image's 65,536 tiles have numbers of 16 bits; with the row below it they have not."""
     gaussians = {name: value.to(DEVICE) for name, value in projected_gaussians(1, 40, 2048, 2048).items()}
     pending = tiles.intersect_tiles(**gaussians, width=2048, height=2048, tile_size=8)
