@@ -205,12 +205,12 @@ def measure(trainer: Any, steps: int = STEPS) -> dict[str, float]:
         for step in range(first, first + WARMUP + steps):
             if step == first + WARMUP:
                 watch.restart()
-            _step(trainer, step)
+            train_step(trainer, step)
         seconds = watch.seconds()
     return {phase: 1000 * value / steps for phase, value in seconds.items()}
 
 
-def _step(trainer: Any, step: int) -> None:
+def train_step(trainer: Any, step: int) -> None:
     """One turn of nerfstudio's training loop."""
     from nerfstudio.engine.callbacks import TrainingCallbackLocation
 

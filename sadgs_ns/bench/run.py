@@ -123,6 +123,7 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
         `evaluate`); and `train_psnr` over some training views, `fps`, `gaussians`, `peak_gb`, how many views there
         were, the machine's `gpu`.
             phases: Milliseconds a step, by phase; see `phases.measure`.
+            launches: Launches, waits and the device's load in a step; see `launches.measure`. None without CUDA.
             curve: Only if the job asks for it: the points of `curve.Curve`, the last one being the finished run.
                 None of the times above contains its evaluations.
             images: Only with `images`: the renderings' paths in that folder.
@@ -138,7 +139,7 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
     # ns-train's own module: importing it also sets cuDNN as in a user's run.
     from nerfstudio.scripts.train import _set_random_seed
 
-    from sadgs_ns.bench import evaluate, phases
+    from sadgs_ns.bench import evaluate, launches, phases
     from sadgs_ns.bench import images as pictures
     from sadgs_ns.bench.curve import Curve, point
     from sadgs_ns.bench.timer import CompileTimer, LoopTimer
@@ -230,7 +231,8 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
         names = [Path(path).stem for path in datamanager.eval_dataset.image_filenames]
         where = (images, job.scene.name, job.row.label, job.seed)
         record["images"] = pictures.save(model, views, names, *where)
-    record["phases"] = phases.measure(trainer)  # last: it goes on training the model
+    record["phases"] = phases.measure(trainer)  # from here on the model is trained further
+    record["launches"] = launches.measure(trainer)
     return record
 
 

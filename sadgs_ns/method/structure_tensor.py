@@ -80,6 +80,7 @@ def multiscale_structure_tensor(
     truncation: float = TRUNCATION,
     incremental: bool = False,
     fused: bool = True,
+    known_finite: bool = False,
 ) -> Tensor:
     """Aggregate the per-scale structure tensors of a batch of images of one size (paper, eq. 2–5).
 
@@ -102,6 +103,7 @@ def multiscale_structure_tensor(
         incremental: Blur level l − 1 by √(σ_l² − σ_{l−1}²) instead of the image by σ_l: shorter kernels, but each
             level inherits what the one before it lost at borders and by truncation.
         fused: Use our Triton kernels where they run: CUDA, float32.
+        known_finite: The valid pixels are known to be finite. To find that out, the host waits for the device.
 
     Returns:
         S̄ as (xx, xy, yy) in 1/px², positive semidefinite, trace ≤ (c / σ_0)²; NaN at masked pixels, where it is not
@@ -114,7 +116,7 @@ def multiscale_structure_tensor(
     """
     if epsilon is not None and not epsilon > 0:
         raise ValueError(f"epsilon must be positive, or None for one relative to the contrast, got {epsilon:g}")
-    image, valid, brightest, contrast = _normalised(images, masks)
+    image, valid, brightest, contrast = _normalised(images, masks, known_finite)
     levels = [SCALE_STEP**level for level in range(NUM_LEVELS)]  # σ_l in px
     if epsilon is None:
         noise = (noise_floor * contrast).clamp_min(_ROUNDING_FLOOR)  # [B, 1, 1, 1]
@@ -156,12 +158,13 @@ def multiscale_structure_tensor(
     return result.permute(0, 2, 3, 1).contiguous()
 
 
-def _normalised(images: Tensor, masks: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _normalised(images: Tensor, masks: Tensor | None, known_finite: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Check the images, and scale and centre their valid pixels.
 
     Args:
         images: [B, H, W, C]
         masks: bool [B, H, W] or None.
+        known_finite: Do not check whether valid pixels are finite.
 
     Returns:
         The images in [−1, 1] around a mean of 0, 0 where masked [B, C, H, W]; 1 at valid pixels and 0 at masked ones
@@ -182,7 +185,8 @@ def _normalised(images: Tensor, masks: Tensor | None) -> tuple[Tensor, Tensor, T
     # A transposed mask would stay so, and hand its strides on to whatever it is combined with.
     valid = torch.ones_like(image[:, :1]) if masks is None else masks[:, None].to(image).contiguous()
     image = torch.where(valid > 0, image, 0.0)  # a product would let NaN through
-    if not image.isfinite().all():  # one would spread over the whole image: its contrast scales everything
+    # One such pixel would spread over the whole image, since its contrast scales everything.
+    if not known_finite and not image.isfinite().all():
         broken = (~image.isfinite()).flatten(1).any(dim=1).nonzero().flatten().tolist()
         raise ValueError(f"images {broken} of the batch hold NaN or infinite pixels; mask or replace those")
     brightest = image.abs().amax(dim=(1, 2, 3), keepdim=True).clamp_min(torch.finfo(image.dtype).tiny)

@@ -7,13 +7,15 @@ import contextlib
 import copy
 import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers import blender_dataparser, nerfstudio_dataparser
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
@@ -22,6 +24,7 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, Colm
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from numpy.typing import NDArray
+from rich.progress import track
 from torch import Tensor
 from tyro.conf import Suppress
 
@@ -31,6 +34,8 @@ from sadgs_ns.data.validation import names
 from sadgs_ns.data.validation.layouts import COLMAP_FOLDERS
 from sadgs_ns.data.validation.transforms import read_json
 from sadgs_ns.errors import InputError
+from sadgs_ns.method.memory import available_host_bytes
+from sadgs_ns.plugin.image_source import ImagesOnDemand, thread_count
 
 
 @dataclass
@@ -54,18 +59,23 @@ class SadgsDatamanagerConfig(FullImageDatamanagerConfig):
     """Not read where whole images are cached."""
     camera_res_scale_factor: float = 1.0
     """Factor by which images and cameras are scaled when they are loaded; 0.5 trains at half the resolution."""
-    cache_images: Literal["cpu", "gpu"] = "gpu"
-    """Where the images are kept: "gpu" is the device of training, whatever it is."""
+    cache_images: Literal["gpu", "cpu", "compressed"] = "gpu"  # type: ignore[assignment]
+    """Where the images are kept: "gpu" is the device of training, as long as that leaves enough of its memory free.
+    Otherwise it is "cpu", decoded in the host's memory, or "compressed", files that are decoded ahead of their step."""
     cache_images_type: Literal["uint8", "float32"] = "uint8"
     """Type in which the images are kept; "uint8" takes a quarter of the memory."""
     max_thread_workers: Suppress[int | None] = None
-    """Threads that load images; None leaves their number to Python."""
+    """Threads that decode images; None is one for each core, up to 16."""
     train_cameras_sampling_strategy: Literal["random", "fps"] = "random"
     """Order of the training views: "random" takes each once a round; "fps" takes views far from each other first."""
     train_cameras_sampling_seed: int = 42
     """Seed of the order of the training views."""
     fps_reset_every: Suppress[int] = 100
     """Views after which "fps" starts again; it draws no more than there are."""
+
+
+KEPT_FILES_SHARE = 0.25
+"""Share of the host's free memory up to which the files of compressed images are kept in it."""
 
 
 def check_options(config: FullImageDatamanagerConfig) -> None:
@@ -90,7 +100,8 @@ def check_options(config: FullImageDatamanagerConfig) -> None:
 
 
 class SadgsDatamanager(FullImageDatamanager[InputDataset]):
-    """A loader that checks the images' names and places, and reads SfM points once, faster and without open3d.
+    """A loader that checks the images' names and places, decodes them in more threads, or only when they are needed,
+    and reads SfM points once, faster and without open3d.
 
     The checks are here rather than in the pipeline, because `ns-render dataset` makes a datamanager of its own.
 
@@ -117,7 +128,10 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         own = {Nerfstudio: _Nerfstudio, Blender: _Blender, ColmapDataParser: _Colmap}
         parser._target = own.get(parser._target, parser._target)
         config.dataparser = parser
+        # nerfstudio would keep more than 500 images on the host, whatever their size, and say so in a line.
+        asked, config.cache_images = config.cache_images, "cpu"
         super().__init__(config, *args, **kwargs)  # type: ignore[arg-type]
+        self.config.cache_images = asked
         for dataset in (self.train_dataset, self.eval_dataset):
             names.check_paths(dataset.image_filenames)
             _check_sizes(dataset)
@@ -136,6 +150,68 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         if hasattr(parser, "load_3D_points"):
             parser.load_3D_points = False
         return super().create_eval_dataset()
+
+    def _load_images(self, split: Literal["train", "eval"], cache_images_device: str) -> Any:
+        """Load and undistort the images of a split as nerfstudio does, or make a sequence that does so at each access.
+
+        Returns:
+            `image` [H, W, 3 or 4] and, where there is one, boolean `mask` [H, W, 1] of each view, on the device of
+            training with `cache_images` "gpu", else on the host, and pinned there if training is on CUDA.
+
+        Raises:
+            InputError: As `ImagesOnDemand.__getitem__`, unless images stay compressed.
+        """
+        device, dataset = torch.device(self.device), self.train_dataset if split == "train" else self.eval_dataset
+        on_demand = cache_images_device == "compressed"
+        files = sum(path.stat().st_size for path in dataset.image_filenames) if on_demand else 0
+        keep = on_demand and files <= KEPT_FILES_SHARE * available_host_bytes()
+        images = ImagesOnDemand(dataset, self.config.cache_images_type, keep)
+        self.train_cameras = self.train_dataset.cameras
+        if on_demand:
+            return images
+
+        def place(tensor: Tensor) -> Tensor:
+            if cache_images_device == "gpu":
+                return tensor.to(device)
+            return tensor.pin_memory() if device.type == "cuda" else tensor
+
+        loaded = []
+        with ThreadPoolExecutor(thread_count(self.config.max_thread_workers)) as pool:
+            decoded = pool.map(images.__getitem__, range(len(images)))
+            try:
+                for data in track(decoded, f"Loading the {split} images", total=len(images), transient=True):
+                    loaded.append(data | {name: place(data[name]) for name in ("image", "mask") if name in data})
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+        if cache_images_device == "gpu":
+            self.train_cameras = self.train_cameras.to(device)
+        return loaded
+
+    @property
+    def fixed_indices_eval_dataloader(self) -> Any:
+        """Cameras [1] and data of the held-out views, on the device; nerfstudio would copy all there at once."""
+        return _HeldOutViews(self)
+
+    def get_train_rays_per_batch(self) -> int:
+        """Return the number of pixels of the first training image, which nerfstudio's trainer asks for in each step."""
+        cameras = self.train_dataset.cameras
+        return int(cameras.height[0]) * int(cameras.width[0])
+
+
+@dataclass
+class _HeldOutViews(Sequence[tuple[Cameras, dict[str, Any]]]):
+    """Cameras and data of the held-out views, each of which is brought to the device when it is asked for."""
+
+    datamanager: SadgsDatamanager
+
+    def __len__(self) -> int:
+        return len(self.datamanager.eval_dataset)
+
+    def __getitem__(self, index: Any) -> Any:
+        device, data = self.datamanager.device, self.datamanager.cached_eval[index]
+        camera = self.datamanager.eval_dataset.cameras[index : index + 1].to(device)
+        return camera, {**data, "image": data["image"].to(device)}
 
 
 def _check_sizes(dataset: InputDataset) -> None:

@@ -16,20 +16,30 @@ from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.split import Params
 from sadgs_ns.method.statistics import empty_statistics
 from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.plugin.structure_maps import PIXELS_PER_BATCH
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 PLANNED_SHARE = 0.8
 """Share of the available memory that is planned with; the rest is for fragments and other programs."""
 CODE_BYTES = 3
 """Bytes that the codes of S̄ take for each pixel of the training images (`method.codes`)."""
+STRUCTURE_PIXEL_BYTES = 300
+"""Bytes that a pixel takes at most while S̄ is computed."""
 SAMPLED_CAMERAS = 8
 """Training cameras in which the pairs of the initial Gaussians are counted."""
 TILE_SIZE = 8
 """Size of a tile in px, as `kernels.compositing.TILE_SIZE`, which cannot be imported without Triton."""
 NEAR_PLANE = 0.01
 """Depth in world units from which gsplat and our splatter draw Gaussians."""
+MANY_IMAGES = 500
+"""Number of training images up to which nerfstudio would keep them on the device, whatever their size."""
 IMAGE_SHARE = 0.25
-"""Share of the device's free memory up to which the images of a large capture are kept on it."""
+"""Share of the device's free memory up to which more images than these are kept on it."""
+FEW_IMAGES_SHARE = 0.5
+"""The same share where there are no more than these."""
+HOST_SHARE = 0.5
+"""Share of the host's available memory up to which decoded images are kept in it. torch takes up to twice as much for
+pinned memory as is asked for, since it rounds up to powers of two."""
 _BLUR, _REACH = 0.3, 3.0
 """gsplat's screen-space blur in px², and the standard deviations that it draws."""
 
@@ -44,6 +54,9 @@ class TrainingSize:
     """The largest step of the run, with the pairs of the initial Gaussians."""
     fused: bool = True
     """Whether the loss is computed by our kernels."""
+    structure_bytes: float = 0.0
+    """Bytes that S̄ of a step's images takes while it is computed, before they are rendered; 0 where that is done once,
+    with the initial Gaussians."""
 
 
 def training_size(datamanager: FullImageDatamanager, params: Params, views: int, fused: bool) -> TrainingSize:
@@ -56,9 +69,16 @@ def training_size(datamanager: FullImageDatamanager, params: Params, views: int,
         fused: Whether the loss is computed by our kernels.
     """
     cameras = datamanager.train_dataset.cameras
-    kept = image_bytes(datamanager) if datamanager.config.cache_images == "gpu" else 0.0
     largest = int((cameras.height * cameras.width).max())
-    return TrainingSize(kept, StepSize(views, views * largest, views * estimate_pairs(params, cameras)), fused)
+    structure = 0.0
+    if datamanager.config.cache_images == "gpu":
+        kept = image_bytes(datamanager)
+    else:  # The images of the next step are there, too.
+        kept = float((3 * _value_bytes(datamanager) + CODE_BYTES) * views * largest)
+        structure = float(STRUCTURE_PIXEL_BYTES * max(largest, min(PIXELS_PER_BATCH, views * largest)))
+    return TrainingSize(
+        kept, StepSize(views, views * largest, views * estimate_pairs(params, cameras)), fused, structure
+    )
 
 
 def image_bytes(datamanager: FullImageDatamanager) -> float:
@@ -67,28 +87,37 @@ def image_bytes(datamanager: FullImageDatamanager) -> float:
         float((cameras.height * cameras.width).sum())
         for cameras in (datamanager.train_dataset.cameras, datamanager.eval_dataset.cameras)
     )  # px
-    value_bytes = 1 if datamanager.config.cache_images_type == "uint8" else 4
-    return 3 * value_bytes * (train + held_out) + CODE_BYTES * train
+    return 3 * _value_bytes(datamanager) * (train + held_out) + CODE_BYTES * train
 
 
-def keep_images_on_device(datamanager: FullImageDatamanager, device: torch.device) -> str | None:
-    """Keep images on the device although there are more than 500, where they take a small part of its memory.
+def _value_bytes(datamanager: FullImageDatamanager) -> int:
+    return 1 if datamanager.config.cache_images_type == "uint8" else 4
 
-    nerfstudio leaves more than 500 images on the host, whatever their size. With 525 of 640×480 px a step of four views
-    took 12 ms then, and 4.5 ms with fewer and larger images on the device (H200).
+
+def place_images(datamanager: FullImageDatamanager, device: torch.device) -> str | None:
+    """Decide where the images are kept, from the memory that is there.
 
     Args:
         datamanager: Its images have not been loaded yet; its configuration is changed.
         device: The device of training.
 
     Returns:
-        A line for the user, or None if the images do not fit.
+        A line for the user; None where they are kept on the device.
     """
-    size, (free, _) = image_bytes(datamanager), memory.available_bytes(device)
-    if size > IMAGE_SHARE * free:
+    config, size, host = datamanager.config, image_bytes(datamanager), memory.available_host_bytes()
+    many = len(datamanager.train_dataset) > MANY_IMAGES
+    free, share, name = host, HOST_SHARE, "the host"
+    if device.type == "cuda":
+        free, share, name = memory.available_bytes(device)[0], IMAGE_SHARE if many else FEW_IMAGES_SHARE, "the GPU"
+    if size <= share * free:
+        config.cache_images = "gpu"
         return None
-    datamanager.config.cache_images = "gpu"
-    return f"They stay on the GPU all the same: images and their structure take {size / 1e9:.2g} GB of its memory."
+    needs = f"decoded images and their structure take {size / 1e9:.2g} GB, and {name} has {free / 1e9:.2g} GB free"
+    if device.type == "cuda" and size <= HOST_SHARE * host:
+        config.cache_images = "cpu"
+        return f"The images stay in the host's memory and are copied ahead of the steps: {needs}."
+    config.cache_images = "compressed"  # type: ignore[assignment]
+    return f"The images stay compressed and are decoded ahead of the steps: {needs}."
 
 
 @torch.no_grad()
@@ -165,10 +194,9 @@ def fit_to_memory(
         return None, None
     state = empty_statistics(0, device) | empty_gradients(0, device)
     each = memory.kept_bytes(params, state) + memory.widest_bytes(params)
-    fixed = size.image_bytes + max(memory.step_bytes(0, replace(size.step, pairs=0), size.fused).values())
 
     def need(num_gaussians: int, step: StepSize) -> float:
-        working = max(memory.step_bytes(num_gaussians, step, size.fused).values())
+        working = max(size.structure_bytes, *memory.step_bytes(num_gaussians, step, size.fused).values())
         return size.image_bytes + each * num_gaussians + working
 
     why = ""
@@ -177,7 +205,9 @@ def fit_to_memory(
         none = {name: value[:0] for name, value in params.items()}
         left = budget - size.image_bytes
         affordable = memory.affordable_growth(none, state, left, replace(size.step, pairs=0), size.fused)  # type: ignore[arg-type]
+        affordable = min(affordable, (left - size.structure_bytes) / each)
         if budget_gb is not None and affordable < 1:
+            fixed = need(0, replace(size.step, pairs=0))
             raise ValueError(
                 f"memory_budget_gb is {budget_gb:g} and leaves no room for Gaussians: images and rendering "
                 f"take {fixed / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; raise it, take fewer or "

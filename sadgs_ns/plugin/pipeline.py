@@ -27,8 +27,8 @@ from sadgs_ns.method.initialization import camera_extent
 from sadgs_ns.method.schedule import growth_threshold, schedule
 from sadgs_ns.method.structure_tensor import ENERGY_BLUR, FREQUENCY_CONSTANT
 from sadgs_ns.plugin import nonfinite
-from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig, check_options
-from sadgs_ns.plugin.memory_plan import NEAR_PLANE, fit_to_memory, keep_images_on_device, training_size
+from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig, check_options
+from sadgs_ns.plugin.memory_plan import NEAR_PLANE, fit_to_memory, place_images, training_size
 from sadgs_ns.plugin.model import SadgsModel, SadgsModelConfig
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
 from sadgs_ns.plugin.optimizers import FusedAdam
@@ -119,11 +119,12 @@ class SadgsPipeline(VanillaPipeline):
         super().__init__(config, *args, **kwargs)
         for dataset in (self.datamanager.train_dataset, self.datamanager.eval_dataset):
             refuse_unsupported_cameras(dataset.cameras)
-        if self.device.type == "cpu":
-            # "gpu" is the training device; "cpu" would pin memory for CUDA.
-            self.datamanager.config.cache_images = "gpu"
-        elif config.datamanager.cache_images == "gpu" and self.datamanager.config.cache_images == "cpu":
-            line = keep_images_on_device(self.datamanager, self.device)
+        if not isinstance(self.datamanager, SadgsDatamanager):
+            if self.device.type == "cpu":
+                # "gpu" is the training device; nerfstudio would pin memory for CUDA with "cpu".
+                self.datamanager.config.cache_images = "gpu"
+        elif config.datamanager.cache_images == "gpu" and kwargs.get("test_mode") != "inference":
+            line = place_images(self.datamanager, self.device)
             if line is not None:
                 CONSOLE.print(line, highlight=False, soft_wrap=True)
         parsed_on = getattr(self.datamanager.dataparser.config, "alpha_color", None)
@@ -287,12 +288,12 @@ class SadgsPipeline(VanillaPipeline):
         """Render the iteration's views and return the outputs of the last size, mean losses and mean metrics."""
         self._repeat_overflowed()
         groups: dict[torch.Size, list[tuple[int, dict[str, Any]]]] = defaultdict(list)
-        for index, data in self.views.draw(self.views_per_iteration):
+        observes, observes_next = (self.model.wants_structure_tensors(step + k) for k in (0, 1))
+        for index, data in self.views.draw(self.views_per_iteration, (observes, observes_next)):
             groups[data["image"].shape].append((index, data))
         losses: dict[str, Tensor] = {}
         metrics: dict[str, Any] = {}
         outputs: dict[str, Any] = {}
-        observes = self.model.wants_structure_tensors(step)
         for (height, width, _), views in groups.items():
             indices = [index for index, _ in views]
             batch = {"image": _stack([data["image"] for _, data in views])}
@@ -301,10 +302,7 @@ class SadgsPipeline(VanillaPipeline):
                 batch["mask"] = _stack(
                     [data.get("mask", everything).to(self.device, non_blocking=True) for _, data in views]
                 )
-            tensors = None
-            if observes:
-                codes = self.structure_maps.codes
-                tensors = _stack([codes[index].to(self.device, non_blocking=True) for index in indices])
+            tensors = _stack(self.structure_maps.of_views(views)) if observes else None
             viewmats, Ks = self.views.stacked_cameras(indices)
             outputs = self.model.get_training_outputs(viewmats, Ks, width, height, indices, tensors)
             group_losses = self.model.get_loss_dict(outputs, batch)

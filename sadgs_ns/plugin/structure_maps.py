@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -35,28 +36,51 @@ class StructureMaps:
         self.options = options
 
     @cached_property
-    def codes(self) -> list[Tensor]:
-        """Codes (`codes.encode`) of S̄ of every training image, where the images are cached. uint8 [H, W, 3] each"""
+    def codes(self) -> Sequence[Tensor]:
+        """Codes (`codes.encode`) of S̄ of every training image, on the device. uint8 [H, W, 3] each
+
+        Where the images are on the host, those of a view are computed whenever they are asked for.
+        """
         cached = self.views.datamanager.cached_train
+        if self.views.ahead is not None:
+            return _CodesOnDemand(self, cached)
         by_size = defaultdict(list)
         for index, data in enumerate(cached):
             by_size[data["image"].shape[:2]].append(index)
         codes: list[Tensor] = [torch.empty(0)] * len(cached)
-        for (height, width), indices in by_size.items():
-            batch_size = max(PIXELS_PER_BATCH // (height * width), 1)
-            for start in range(0, len(indices), batch_size):
-                batch = indices[start : start + batch_size]
-                for index, code in zip(batch, self.codes_of([cached[index] for index in batch]), strict=True):
-                    moved = code.to(cached[index]["image"].device)
-                    # nerfstudio pins the images that it leaves on the host, too: a step's copy then stops nobody.
-                    on_host = code.device.type == "cuda" and moved.device.type == "cpu"
-                    codes[index] = moved.pin_memory() if on_host else moved
+        for indices in by_size.values():
+            of_size = self._in_batches([cached[index] for index in indices])
+            for index, code in zip(indices, of_size, strict=True):
+                codes[index] = code
         return codes
+
+    def of_views(self, views: Sequence[tuple[int, dict[str, Any]]]) -> list[Tensor]:
+        """Codes of S̄ of a step's views, which have one size. uint8 [H, W, 3] each
+
+        Where images are on the host, codes that did not come with a view are computed, and kept where there is room.
+
+        Args:
+            views: Number and data of each, as drawn.
+        """
+        ahead = self.views.ahead
+        if ahead is None:
+            return [self.codes[index] for index, _ in views]
+        missing = [(index, data) for index, data in views if "codes" not in data]
+        for (index, data), codes in zip(missing, self._in_batches([data for _, data in missing]), strict=True):
+            data["codes"] = codes
+            ahead.keep_codes(index, codes)
+        return [data["codes"] for _, data in views]
+
+    def _in_batches(self, data: Sequence[Mapping[str, Any]]) -> Iterator[Tensor]:
+        """Yield the codes of S̄ of images that have one size, computing those of several at once."""
+        at_once = max(PIXELS_PER_BATCH // math.prod(data[0]["image"].shape[:2]), 1) if data else 1
+        for start in range(0, len(data), at_once):
+            yield from self.codes_of(data[start : start + at_once])
 
     def photo(self, data: Mapping[str, Any]) -> Tensor:
         """An image of the datamanager as the loss sees it: on the training device and on the background. [H, W, 3]"""
         model = self.views.model
-        background = model.photo_background.to(model.device)
+        background = model.photo_background.to(model.device, non_blocking=True)
         return model.composite_with_background(model.get_gt_img(data["image"]), background).to(model.device)
 
     def codes_of(self, data: Sequence[Mapping[str, Any]]) -> Tensor:
@@ -73,12 +97,14 @@ class StructureMaps:
         if any("mask" in d for d in data):
             everything = torch.ones(images.shape[1:3], dtype=torch.bool, device=images.device)
             masks = torch.stack([d["mask"][..., 0].to(images.device) if "mask" in d else everything for d in data])
-        return encode(self.of_images(images, masks), self.views.model.config.fused)
+        in_bytes = all(d["image"].dtype == torch.uint8 for d in data)
+        return encode(self.of_images(images, masks, known_finite=in_bytes), self.views.model.config.fused)
 
     def of_images(
         self,
         images: Tensor,  # [B, H, W, 3]
         masks: Tensor | None = None,  # [B, H, W]
+        known_finite: bool = False,
     ) -> Tensor:
         """S̄ of images in [0, 1], where they have one, within their masks. [B, H, W, 3]"""
         return multiscale_structure_tensor(
@@ -86,8 +112,22 @@ class StructureMaps:
             masks,
             frequency_constant=self.frequency_constant,
             fused=self.views.model.config.fused,
+            known_finite=known_finite,
             **self.options,  # type: ignore[arg-type]
         )
+
+
+class _CodesOnDemand(Sequence[Tensor]):
+    """Codes of S̄ of images that are not on the device."""
+
+    def __init__(self, maps: StructureMaps, images: Sequence[Mapping[str, Any]]) -> None:
+        self._maps, self._images = maps, images
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self._maps.codes_of([self._images[index]])[0]
 
 
 @torch.no_grad()

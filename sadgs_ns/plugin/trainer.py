@@ -222,7 +222,7 @@ class SadgsTrainer(Trainer):
         """Train up to `max_num_iterations` in all, where nerfstudio 1.1.5 would train that many more after resuming.
 
         Raises:
-            RunError: If the GPU's memory is full, or nothing is learned any more.
+            RunError: If the GPU's memory is full, nothing is learned any more, or an image cannot be decoded any more.
             WriteError: If a checkpoint or log could not be written.
             SystemExit: If SIGINT, SIGTERM or SIGHUP came. A checkpoint is saved then, a line says how to go on, and the
                 exit code is the one that shells give these signals.
@@ -253,6 +253,14 @@ class SadgsTrainer(Trainer):
                     if interruption is None or self._stepping:
                         raise
                     self._stop(interruption, total)
+        except InputError as error:
+            if self._completed_step == self._saved_step:
+                raise
+            # An image that is decoded ahead of its step is gone or damaged, and no step is half done.
+            self.save_checkpoint(self._completed_step)
+            raise RunError(
+                f"{error} What was trained is saved and goes on with --load-dir {self.checkpoint_dir}."
+            ) from error
         except torch.cuda.OutOfMemoryError as error:
             out_of_memory = _memory(error)  # The RunError is raised below, when the failed step's tensors are gone.
         except OSError as error:
@@ -264,6 +272,7 @@ class SadgsTrainer(Trainer):
             raise WriteError(Path(os.fsdecode(error.filename or self.base_dir)), error) from error
         finally:
             self.config.max_num_iterations = total
+            self.pipeline.views.close()
             remove_tables()
         if out_of_memory:
             raise RunError(self._rescue(out_of_memory))

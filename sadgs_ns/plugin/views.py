@@ -11,7 +11,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from torch import Tensor
 
 from sadgs_ns.data.cameras import refuse_failed_undistortion
-from sadgs_ns.errors import InputError
+from sadgs_ns.plugin.image_source import ImagesAhead, refuse_non_finite, thread_count
 from sadgs_ns.plugin.model import SadgsModel
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
@@ -27,12 +27,21 @@ class TrainingViews:
     def __init__(self, datamanager: FullImageDatamanager, model: SadgsModel) -> None:
         self.datamanager = datamanager
         self.model = model
+        self._next_round: tuple[Any, list[int]] = None, []  # It is drawn from this state of the random generator.
 
     def __len__(self) -> int:
         """Number of training views."""
         return len(self.datamanager.train_dataset)
 
-    def draw(self, number: int) -> list[tuple[int, dict[str, Any]]]:
+    @cached_property
+    def ahead(self) -> ImagesAhead | None:
+        """What brings images from the host ahead of their step; None where all images are on the device."""
+        config = self.datamanager.config
+        if config.cache_images == "gpu":
+            return None
+        return ImagesAhead(self.datamanager.cached_train, self.model.device, thread_count(config.max_thread_workers))
+
+    def draw(self, number: int, codes: tuple[bool, bool] = (False, False)) -> list[tuple[int, dict[str, Any]]]:
         """Draw the views of one step in nerfstudio's order, which is a sequence of rounds through all views.
 
         Where a round ends inside the step, the next one begins with those of its views that the step does not have yet;
@@ -41,23 +50,52 @@ class TrainingViews:
 
         Args:
             number: Views to draw, at least 1 and at most as many as there are.
+            codes: Whether this step, and whether the next one, needs the codes of S̄.
 
         Returns:
-            Index and data of each view; the image is on the training device.
+            Index and data of each view; the image is on the training device, and where images travel so is the mask.
+
+        Raises:
+            InputError: As `ImagesAhead.take`.
         """
-        datamanager, device = self.datamanager, self.model.device
-        drawn: dict[int, dict[str, Any]] = {}
-        views = []
+        datamanager, device, ahead = self.datamanager, self.model.device, self.ahead
+        indices: list[int] = []
         for _ in range(number):
             order = datamanager.train_unseen_cameras
-            position = next((position for position, index in enumerate(order) if index not in drawn), 0)
-            index = order.pop(position)
+            position = next((position for position, index in enumerate(order) if index not in indices), 0)
+            indices.append(order.pop(position))
             if not order:
                 datamanager.train_unseen_cameras = datamanager.sample_train_cameras()
-            data = datamanager.cached_train[index]
-            drawn[index] = {**data, "image": data["image"].to(device, non_blocking=True)}
-            views.append((index, drawn[index]))
-        return views
+        drawn: dict[int, dict[str, Any]] = {}
+        if ahead is None:
+            for index in indices:
+                data = datamanager.cached_train[index]
+                drawn[index] = {**data, "image": data["image"].to(device, non_blocking=True)}
+        else:
+            upcoming = self._upcoming(ahead.threads + 2 * number)
+            ahead.load([*indices, *upcoming])
+            drawn = {index: ahead.take(index, codes[0]) for index in dict.fromkeys(indices)}
+            ahead.load(upcoming)  # A view that was just taken may come again soon.
+            ahead.send(upcoming[:number], codes[1])
+        return [(index, drawn[index]) for index in indices]
+
+    def _upcoming(self, number: int) -> list[int]:
+        """Return the views that will be drawn next, as far as they are known without changing what will be drawn."""
+        datamanager = self.datamanager
+        order = datamanager.train_unseen_cameras
+        generator = getattr(datamanager, "random_generator", None)  # Farthest-point sampling has none.
+        if len(order) < number and generator is not None:
+            state = generator.getstate()
+            if self._next_round[0] != state:
+                self._next_round = state, datamanager.sample_train_cameras()
+                generator.setstate(state)
+            order = order + self._next_round[1]
+        return order[:number]
+
+    def close(self) -> None:
+        """End the threads that decode images; they start again if another view is drawn."""
+        if vars(self).get("ahead") is not None:
+            vars(self)["ahead"].close()
 
     def put_back(self, indices: Sequence[int]) -> None:
         """Let views be the first of the next step, since what was drawn of them did not count.
@@ -79,10 +117,9 @@ class TrainingViews:
                 or if undistorting it failed.
         """
         dataset = self.datamanager.train_dataset
-        for index, data in enumerate(self.datamanager.cached_train):  # undistorting the images changes the intrinsics
-            if data["image"].is_floating_point() and not data["image"].isfinite().all():
-                name = dataset.image_filenames[index]
-                raise InputError(f"{name} holds NaN or infinite pixels: replace them, or leave the image out.")
+        images = self.datamanager.cached_train  # Undistorting the images has changed the intrinsics.
+        for index, data in enumerate(images) if isinstance(images, list) else ():
+            refuse_non_finite(data["image"], dataset.image_filenames[index])
         cameras, device = dataset.cameras, self.model.device
         refuse_failed_undistortion(cameras, dataset.image_filenames)
         viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)

@@ -25,7 +25,7 @@ from sadgs_ns.plugin.memory_plan import (
     estimate_pairs,
     fit_to_memory,
     image_bytes,
-    keep_images_on_device,
+    place_images,
     training_size,
 )
 
@@ -170,6 +170,14 @@ def test_a_full_card_still_starts_and_a_budget_for_nothing_is_refused(card: Any)
     )
 
 
+def test_a_structure_tensor_that_is_computed_late_has_its_room_beside_the_gaussians(card: Any):
+    card(7.5, 8)
+    strategy = StructureAwareStrategy()
+    size = TrainingSize(0.0, StepSize(), structure_bytes=3e9)
+    fit_to_memory(strategy, params(), size)  # type: ignore[arg-type]
+    assert strategy.max_gaussians == int((0.8 * 7.5e9 - 3e9) // (KEPT + WIDEST)) < fit()[0]
+
+
 def test_without_cuda_nothing_changes():
     strategy = StructureAwareStrategy()
     size = TrainingSize(1e9, StepSize(1, 10**6, 10**6))
@@ -257,7 +265,9 @@ def test_the_size_of_a_run_is_that_of_its_images_and_largest_step():
     assert size.image_bytes == 3 * (3 * 64 * 48 + 2 * 1000) + 3 * 3 * 64 * 48
     assert size.step == StepSize(2, 2 * 64 * 48, 2 * estimate_pairs(drawn, train))
     datamanager.config.cache_images = "cpu"
-    assert training_size(datamanager, drawn, views=2, fused=True).image_bytes == 0
+    size = training_size(datamanager, drawn, views=2, fused=True)
+    assert size.image_bytes == 2 * 6 * 64 * 48  # of the next step
+    assert size.structure_bytes == 300 * 2 * 64 * 48  # Only images on the device have theirs from the start.
 
 
 def test_tiles_are_those_of_the_kernels():
@@ -304,23 +314,71 @@ def test_a_budget_for_nothing_ends_ns_train_with_one_sentence(card: Any, tmp_pat
         set_up(config)
 
 
-def test_many_small_images_stay_on_the_device_and_many_large_ones_on_the_host(card: Any):
+@pytest.mark.parametrize("number", [600, 500])
+def test_images_are_kept_where_there_is_room(number: int, card: Any, monkeypatch: pytest.MonkeyPatch):
     def datamanager(side: int) -> Any:
         def dataset(number: int) -> Any:
-            return SimpleNamespace(
-                cameras=SimpleNamespace(height=torch.full((number, 1), side), width=torch.tensor(side))
-            )
+            cameras = SimpleNamespace(height=torch.full((number, 1), side), width=torch.tensor(side))
+            return type("Dataset", (), {"cameras": cameras, "__len__": lambda _: number})()
 
-        config = SimpleNamespace(cache_images="cpu", cache_images_type="uint8")
-        return SimpleNamespace(config=config, train_dataset=dataset(600), eval_dataset=dataset(100))
+        config = SimpleNamespace(cache_images="gpu", cache_images_type="uint8")
+        return SimpleNamespace(config=config, train_dataset=dataset(number), eval_dataset=dataset(100))
 
-    small, large, device = datamanager(100), datamanager(10_000), torch.device("cuda")
-    assert image_bytes(small) == 3 * 700 * 100**2 + 3 * 600 * 100**2
-    card(0.16, 80)  # It takes 39 MB, and a quarter of 160.
-    assert keep_images_on_device(small, device) == (
-        "They stay on the GPU all the same: images and their structure take 0.039 GB of its memory."
-    )
+    gpu, share = torch.device("cuda"), 0.25 if number > 500 else 0.5
+    small, large = datamanager(100), datamanager(10_000)
+    size = image_bytes(small)
+    assert size == 3 * (number + 100) * 100**2 + 3 * number * 100**2
+    monkeypatch.setattr(memory, "available_host_bytes", lambda: 1e15)
+
+    card(1.01 * size / share / 1e9, 80)
+    assert place_images(small, gpu) is None
     assert small.config.cache_images == "gpu"
+    card(0.99 * size / share / 1e9, 80)
+    assert (place_images(small, gpu) or "").startswith(
+        "The images stay in the host's memory and are copied ahead of the steps: decoded images and their structure "
+        f"take {size / 1e9:.2g} GB, and the GPU has 0."
+    )
+    assert small.config.cache_images == "cpu"
+
     card(80, 80)
-    assert keep_images_on_device(large, device) is None
-    assert large.config.cache_images == "cpu"
+    monkeypatch.setattr(memory, "available_host_bytes", lambda: 1.99 * image_bytes(large))
+    for device, name in ((gpu, "GPU"), (torch.device("cpu"), "host")):
+        line = place_images(large, device) or ""
+        assert line.startswith("The images stay compressed and are decoded ahead of the steps: decoded images and ")
+        assert f" take {image_bytes(large) / 1e9:.2g} GB, and the {name} has " in line
+        assert large.config.cache_images == "compressed"
+    monkeypatch.setattr(memory, "available_host_bytes", lambda: 2.01 * image_bytes(large))
+    assert place_images(large, torch.device("cpu")) is None
+    assert large.config.cache_images == "gpu"  # the training device
+
+
+@pytest.mark.parametrize(
+    ("files", "expected"),
+    [
+        ({}, math.inf),
+        ({"proc/meminfo": "MemTotal: 9 kB\nMemAvailable:    2000 kB\n"}, 2048000),
+        (
+            {"memory.max": "max\n", "memory.current": "1\n", "memory.stat": "inactive_file 1\n"},
+            math.inf,
+        ),
+        (
+            {"memory.max": "5000\n", "memory.current": "3000\n", "memory.stat": "anon 7\ninactive_file 400\n"},
+            2400,
+        ),
+        (
+            {
+                "memory/memory.limit_in_bytes": "5000\n",
+                "memory/memory.usage_in_bytes": "3000\n",
+                "memory/memory.stat": "inactive_file 9\ntotal_inactive_file 300\n",
+            },
+            2300,
+        ),
+    ],
+)
+def test_the_host_s_memory_is_what_linux_and_a_container_leave(files: dict, expected: float, tmp_path: Path):
+    for name, text in files.items():
+        path = tmp_path / (name if name.startswith("proc") else f"sys/fs/cgroup/{name}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    assert memory.available_host_bytes(tmp_path) == expected
+    assert memory.available_host_bytes() > 0

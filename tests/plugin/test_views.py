@@ -56,6 +56,28 @@ def test_no_view_comes_twice_in_a_step_and_all_come_equally_often(total: int, nu
         assert max(counts) - min(counts) <= 1
 
 
+@pytest.mark.parametrize(
+    ("total", "number", "strategy"), [(60, 4, "random"), (10, 3, "random"), (5, 4, "random"), (60, 4, "fps")]
+)
+def test_images_that_are_decoded_ahead_change_no_order_and_are_awaited_once(total: int, number: int, strategy: Any):
+    options = {"train_cameras_sampling_strategy": strategy, "max_thread_workers": 2}
+    expected = steps_of(views_of(Datamanager(total, **options)), number, steps=100)
+    datamanager = Datamanager(total, cache_images="cpu", **options)
+    datamanager.cached_train = tuple(datamanager.cached_train)  # type: ignore[assignment]
+    views = views_of(datamanager)
+    awaited = 0
+    for step in expected:
+        assert views.ahead is not None
+        known = views.ahead._loading.keys() | views.ahead._sent.keys()
+        drawn = [index for index, _ in views.draw(number)]
+        assert drawn == step
+        awaited += not known.issuperset(drawn)
+        assert len(views.ahead._loading) + len(views.ahead._sent) <= 2 + 2 * number
+    rounds = 100 * number // total
+    assert awaited == 1 or (strategy == "fps" and awaited <= rounds + 1)  # fps draws a round when it begins.
+    views.close()
+
+
 @pytest.mark.parametrize(("total", "number"), [(10, 5), (10, 1), (4, 4)])
 def test_the_order_is_nerfstudio_s_where_rounds_end_with_steps(total: int, number: int):
     drawn = steps_of(views_of(Datamanager(total)), number, steps=20)
