@@ -12,7 +12,6 @@ is drawn stays the same, bit for bit.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import torch
 import triton
@@ -23,6 +22,8 @@ from sadgs_ns.kernels.limits import check_pairs
 
 _LANES = 32
 """Gaussians that one program handles: one warp of them, so that a large Gaussian holds up only 31 others."""
+_ORDER_LANES = 512
+"""Pairs or tiles that one program handles where the lists are put in order."""
 
 
 @triton.jit
@@ -151,10 +152,29 @@ def _list(
         tl.store(ids + unused, lane * 0, unused < num_pairs)
 
 
-@lru_cache(maxsize=32)  # Each size of image has two, for exact lists and for those of a given length.
-def _tile_numbers(num_tiles: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return the numbers of all tiles in ascending order, which begin at −2^15. [num_tiles]"""
-    return torch.arange(-(2**15), num_tiles - 2**15, dtype=dtype, device=device)
+@triton.jit(do_not_specialize=["num_pairs", "num_tiles", "halvings"])
+def _order(tiles, by_tile, ids, ordered, starts, num_pairs, num_tiles, halvings, LANES: tl.constexpr):
+    """Bring the Gaussians of the pairs into the order of the tiles, and find where each tile's list starts.
+
+    The first programs handle LANES pairs each, and the others LANES tiles, whose starts they find by bisection.
+    """
+    program, lane = tl.program_id(0), tl.arange(0, LANES)
+    of_pairs = tl.cdiv(num_pairs, LANES)
+    if program < of_pairs:
+        at = program.to(tl.int64) * LANES + lane
+        exists = at < num_pairs
+        tl.store(ordered + at, tl.load(ids + tl.load(by_tile + at, exists, 0), exists, 0), exists)
+    else:
+        tile = (program - of_pairs) * LANES + lane
+        low = tile.to(tl.int64) * 0
+        high = low + num_pairs
+        for _ in range(halvings):
+            middle = (low + high) // 2
+            searching = low < high
+            before = tl.load(tiles + middle, searching, 0).to(tl.int32) < tile - 32768
+            low = tl.where(searching & before, middle + 1, low)
+            high = tl.where(searching & ~before, middle, high)
+        tl.store(starts + tile, low.to(tl.int32), tile < num_tiles)
 
 
 @dataclass(frozen=True)
@@ -231,8 +251,11 @@ class PendingTiles:
             self.ellipses[1].dim() - 1, self.tile_size, _LANES, num_warps=1,
         )  # fmt: skip
         tiles, by_tile = tiles.sort(stable=True)
-        starts = torch.searchsorted(tiles, _tile_numbers(num_tiles, tiles.dtype, device), out_int32=True)
-        return starts.reshape(views, rows_per_view, columns), ids[by_tile]
+        starts, ordered = ids.new_empty((views, rows_per_view, columns)), torch.empty_like(ids)
+        _order[triton.cdiv(num_pairs, _ORDER_LANES) + triton.cdiv(num_tiles, _ORDER_LANES),](
+            tiles, by_tile, ids, ordered, starts, num_pairs, num_tiles, num_pairs.bit_length(), _ORDER_LANES
+        )
+        return starts, ordered
 
 
 @torch.no_grad()

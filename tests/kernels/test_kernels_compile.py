@@ -23,12 +23,12 @@ CONSTANTS = {
 }
 INTEGERS = "n row height width taps num_gaussians num_views tile_width tile_height used stride start".split()
 INTEGERS += "channels weight_stride num_pairs rows view absolute_view absolute_row num_strips num_tiles".split()
-INTEGERS += ["rows_per_view"]
+INTEGERS += ["rows_per_view", "halvings"]
 FLOATS = "exponent frequency beta1 beta2 eps l1_weight ssim_weight l2_weight".split()
 FLOATS += "scale_x scale_y ssim_lambda half_width half_height reach_x reach_y penalty".split()
 POINTERS = {
     "radii": "*i32", "counts": "*i64", "order": "*i64", "ends": "*i64", "tiles": "*i16", "ids": "*i32", "drawn": "*i1",
-    "culled": "*i32",
+    "by_tile": "*i64", "ordered": "*i32",
     "structure_tensors": "*u8", "starts": "*i32", "last_ids": "*i32",
 }
 TUPLES = {  # of Adam's kernel; the names mean single tensors elsewhere
@@ -55,7 +55,7 @@ for module in pkgutil.iter_modules(package.__path__):
                 signature[parameter.name] = "fp32"
             else:
                 signature[parameter.name] = POINTERS.get(parameter.name, "*fp32")
-        others = {"_list": {"tiles": "*i32"}, "_blur_along_rows": {"y": "*u8"}, "_gradient": {"y": "*u8"}}
+        others = {"_list": {"tiles": "*i32"}, "_order": {"tiles": "*i32"}, "_blur_along_rows": {"y": "*u8"}, "_gradient": {"y": "*u8"}}
         signatures = [signature, *([signature | others[name]] if name in others else [])]
         for signature in signatures:
             for capability in (80, 90):  # A100, H200
