@@ -88,13 +88,23 @@ def _columns_of_row(row, x, y, a, b, c, level, determinant, proper, first_column
 
 @triton.jit(do_not_specialize=["n", "tile_width", "tile_height"])
 def _count(
-    means2d, radii, conics, opacities, counts, n, tile_width, tile_height,
-    PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr, LANES: tl.constexpr,
+    means2d, radii, conics, opacities, counts, n, tile_width, tile_height, half_width, half_height, reach_x, reach_y,
+    PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr, CULL: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
-    """Count the tiles that each Gaussian reaches in each view."""
+    """Count the tiles that each Gaussian reaches in each view.
+
+    With CULL the radii of Gaussians whose centre is out of reach of the image's centre, or NaN, become 0 first.
+    """
     g = tl.program_id(0) * LANES + tl.arange(0, LANES)
+    exists = g < n
+    if CULL:
+        x, y = tl.load(means2d + 2 * g, exists, 0.0), tl.load(means2d + 2 * g + 1, exists, 0.0)
+        near = (tl.abs(x - half_width) < reach_x) & (tl.abs(y - half_height) < reach_y)
+        for i in tl.static_range(PER_GAUSSIAN):
+            tl.store(radii + PER_GAUSSIAN * g + i, 0, exists & ~near)
+        exists = exists & near
     x, y, a, b, c, level, determinant, proper, first_column, last_column, first_row, last_row = _load_ellipse(
-        means2d, radii, conics, opacities, g, g < n, tile_width, tile_height, PER_GAUSSIAN, TILE
+        means2d, radii, conics, opacities, g, exists, tile_width, tile_height, PER_GAUSSIAN, TILE
     )
     count = tl.zeros([LANES], tl.int32)
     for i in range(tl.max(last_row - first_row)):
@@ -268,19 +278,23 @@ def intersect_tiles(
     width: int,
     height: int,
     tile_size: int,
+    max_off_axis: float = 0.0,
 ) -> PendingTiles:
     """Begin to list the Gaussians of each tile; in place of gsplat's `isect_tiles` and `isect_offset_encode`.
 
     Args:
         means2d: px. [C, N, 2]
         radii: px, int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5; not positive where a Gaussian was culled. They should
-            be contiguous: `lists` sets them to 0 where its capacity is too small, and would do so to a copy of others.
+            be contiguous: they are set to 0 where a Gaussian is culled here, and by `lists` where its capacity is too
+            small, which would happen to a copy of others.
         depths: Along the viewing axis. [C, N]
         conics: (a, b, c) of the inverse of the blurred Σ2D, in 1/px². [C, N, 3]
         opacities: In [0, 1]. [C, N]
         width: Of the image in px.
         height: Of the image in px.
         tile_size: Side of a tile in px, a power of two.
+        max_off_axis: Gaussians whose centre is further from the image's centre, in halves of its width and height along
+            x and y, are culled, as `render.off_axis.cull_off_axis` does; 0 culls none.
 
     Returns:
         An object that makes the lists when it is asked for them; by then the host should have given the device work.
@@ -291,7 +305,9 @@ def intersect_tiles(
     n, device = num_views * num_gaussians, means2d.device
     counts = torch.empty(n, dtype=torch.int64, device=device)  # cumsum would convert others
     _count[triton.cdiv(n, _LANES),](
-        *ellipses, counts, n, tile_width, tile_height, radii.dim() - 1, tile_size, _LANES, num_warps=1
+        *ellipses, counts, n, tile_width, tile_height,
+        width / 2, height / 2, max_off_axis * width / 2, max_off_axis * height / 2,
+        radii.dim() - 1, tile_size, max_off_axis > 0, _LANES, num_warps=1,
     )  # fmt: skip
     # The Gaussians are sorted by depth, and then their pairs by tile: in 16 bits up to 4.2 megapixels of all views (in
     # tiles of 8 px), in 32 beyond. That moves a fraction of the bytes of one sort of the pairs by both in 64 bits. Both

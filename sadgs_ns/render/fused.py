@@ -11,7 +11,6 @@ from sadgs_ns import gsplat_internals
 from sadgs_ns.kernels import compositing
 from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
 from sadgs_ns.kernels.limits import check_gaussians, check_pixels
-from sadgs_ns.kernels.off_axis import cull_off_axis
 from sadgs_ns.kernels.tiles import intersect_tiles
 
 BACKWARD: Literal["moments", "gsplat"] = "moments"
@@ -57,9 +56,7 @@ def rasterization(
     radii, means2d, depths, conics, compensations = gsplat_internals.project(
         means, quats, scales, opacities, viewmats, Ks, width, height, rasterize_mode == "antialiased"
     )
-    if max_off_axis > 0:
-        radii = cull_off_axis(radii, means2d, width, height, max_off_axis)
-    radii = radii.contiguous()  # Where the tile lists are too short, they set these very radii to 0.
+    radii = radii.contiguous()  # Culling, and tile lists that are too short, set these very radii to 0.
     if compensations is not None:
         opacities = opacities * compensations
     elif num_views == 1:
@@ -69,7 +66,7 @@ def rasterization(
         # ten times as slowly as it adds.
         opacities = torch.stack([opacities] * num_views)
     # Without a capacity the host waits for the lists' length: the colours are computed meanwhile.
-    pending_tiles = intersect_tiles(means2d, radii, depths, conics, opacities, width, height, TILE_SIZE)
+    pending_tiles = intersect_tiles(means2d, radii, depths, conics, opacities, width, height, TILE_SIZE, max_off_axis)
     if isinstance(colors, tuple) and sh_degree is not None and sh_degree <= MAX_DEGREE and not viewmats.requires_grad:
         colors = colors_from_harmonics(sh_degree, means, *colors, viewmats, radii)
     else:

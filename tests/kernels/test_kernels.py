@@ -25,6 +25,7 @@ from sadgs_ns.plugin.optimizers import FusedAdam
 from sadgs_ns.render.activations import activate
 from sadgs_ns.render.off_axis import cull_off_axis
 
+triton = pytest.importorskip("triton", reason="Triton is not installed")
 activations = pytest.importorskip("sadgs_ns.kernels.activations", reason="Triton is not installed")
 codes = pytest.importorskip("sadgs_ns.kernels.codes", reason="Triton is not installed")
 adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
@@ -34,7 +35,6 @@ observation = pytest.importorskip("sadgs_ns.kernels.statistics", reason="Triton 
 photometric = pytest.importorskip("sadgs_ns.kernels.losses", reason="Triton is not installed")
 screen_gradients = pytest.importorskip("sadgs_ns.kernels.absgs", reason="Triton is not installed")
 tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not installed")
-off_axis = pytest.importorskip("sadgs_ns.kernels.off_axis", reason="Triton is not installed")
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 fused_photometric_loss = partial(photometric.photometric_loss, window=losses.WINDOW)
@@ -616,18 +616,40 @@ def test_no_gaussian_in_sight_makes_empty_lists():
     assert len(ids) == 0 and (starts == 0).all()
 
 
-@pytest.mark.parametrize("shape", [(2, 300), (2, 300, 2)], ids=["one radius", "radii per axis"])
-def test_far_off_the_axis_radii_are_zero_as_torch_makes_them(shape):
+@pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
+def test_far_off_the_axis_radii_are_zero_as_torch_makes_them(few_programs, per_axis_radii):
+    """The lists are those of the radii that torch culls."""
+    gaussians = projected_gaussians(2, 150, 40, 30)
+    if per_axis_radii:
+        gaussians["radii"] = gaussians["radii"][..., None] * torch.tensor([1, 2], dtype=torch.int32)
+    gaussians["means2d"][0, :4] = torch.tensor([[math.nan, 1.0], [1.0, math.inf], [-15.0, 15.0], [20.0, 36.5]])
+    expected = cull_off_axis(gaussians["radii"], gaussians["means2d"], 40, 30, 0.8)
+    assert 60 < (expected > 0).sum() < (gaussians["radii"] > 0).sum() - 60
+    lists = []
+    for radii, max_off_axis in ((expected, 0.0), (gaussians["radii"], 0.8)):
+        on_device = {name: value.to(DEVICE, copy=True) for name, value in (gaussians | {"radii": radii}).items()}
+        pending = tiles.intersect_tiles(**on_device, width=40, height=30, tile_size=8, max_off_axis=max_off_axis)
+        lists.append(pending.lists())
+        assert torch.equal(on_device["radii"].cpu(), expected)
+    assert all(map(torch.equal, *lists)) and len(lists[0][1]) > 100
+
+
+@pytest.mark.parametrize("dtype", [torch.int16, torch.int32])
+@pytest.mark.parametrize(("num_pairs", "num_tiles"), [(0, 5), (1, 1), (700, 40), (1000, 1500), (513, 512)])
+def test_the_lists_order_and_starts_are_torchs(dtype, num_pairs, num_tiles):
+    """Most tiles have no pair in the longest case, and neither number is a multiple of what a program handles."""
     generator = torch.Generator().manual_seed(0)
-    means2d = 50 * torch.randn((2, 300, 2), generator=generator)
-    means2d[0, :4] = torch.tensor([[math.nan, 1.0], [1.0, math.inf], [-40.0, 15.0], [20.0, 60.0]])
-    radii = torch.randint(0, 9, shape, generator=generator, dtype=torch.int32)
-    expected = cull_off_axis(radii, means2d, 40, 30, 3.0)
-    assert 100 < (expected > 0).sum() < (radii > 0).sum() - 100
-    before = radii.clone().to(DEVICE)
-    given = before.clone()
-    culled = off_axis.cull_off_axis(given, means2d.to(DEVICE), 40, 30, 3.0)
-    assert torch.equal(culled.cpu(), expected) and torch.equal(given, before)
+    numbers = torch.randint(0, num_tiles, (num_pairs,), generator=generator) - 2**15
+    sorted_tiles, by_tile = numbers.to(dtype).to(DEVICE).sort(stable=True)
+    ids = torch.randperm(num_pairs, generator=generator).int().to(DEVICE)
+    ordered, starts = torch.empty_like(ids), ids.new_empty(num_tiles)
+    programs = triton.cdiv(num_pairs, tiles._ORDER_LANES) + triton.cdiv(num_tiles, tiles._ORDER_LANES)
+    tiles._order[programs,](
+        sorted_tiles, by_tile, ids, ordered, starts, num_pairs, num_tiles, num_pairs.bit_length(), tiles._ORDER_LANES
+    )
+    every = torch.arange(num_tiles, device=DEVICE) - 2**15
+    assert torch.equal(starts, torch.searchsorted(sorted_tiles.long(), every, out_int32=True))
+    assert torch.equal(ordered, ids[by_tile])
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat's kernels need CUDA")
