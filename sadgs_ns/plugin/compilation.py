@@ -65,7 +65,10 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
         # of a given length have one more row of them.
         size = int(cameras.width.max()), int(cameras.height.max())
         for capacity in (None, 2**20):
-            rasterize(means, quats, scales, opacities, means, viewmats, Ks, *size, tile_capacity=capacity)
+            rasterize(
+                means, quats, scales, opacities, means, viewmats, Ks, *size,
+                tile_capacity=capacity, max_off_axis=config.max_off_axis,
+            )  # fmt: skip
 
     def blank(name: str) -> Tensor:
         return means.new_zeros((n, *model.gauss_params[name].shape[1:]))
@@ -90,10 +93,11 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
     def composite(absgrad: bool) -> None:
         centres = means.clone().requires_grad_()
         renders, alphas, info = rasterize(
-            centres, quats, scales, opacities, means, *camera, absgrad=absgrad, rasterize_mode=config.rasterize_mode
+            centres, quats, scales, opacities, means, *camera, absgrad=absgrad, **model.drawing
         )  # fmt: skip
-        info["means2d"].retain_grad()
-        (renders.sum() if config.background_color == "black" else renders.sum() + alphas.sum()).backward()
+        means2d = info["means2d"]
+        result = renders.sum() if config.background_color == "black" else renders.sum() + alphas.sum()
+        (means2d.grad,) = torch.autograd.grad(result, means2d)  # The projection is differentiated elsewhere.
         if absgrad:
             accumulate_gradients(empty_gradients(n, device), info, views, fused=strategy.fused)
 
@@ -103,13 +107,18 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
             some = activate(*parameters, weight, fused=True)
             torch.autograd.backward([value.sum() for value in some if value is not None])
 
-    def harmonics() -> None:
+    def projection() -> None:
         from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
+        from sadgs_ns.kernels.projection import project
 
+        parameters = (value.clone().requires_grad_() for value in (means, quats, scales))
+        antialiased = config.rasterize_mode == "antialiased"
+        radii, means2d, _, conics, compensations, centres = project(*parameters, opacities, *camera, antialiased)
+        results = [means2d, conics] if compensations is None else [means2d, conics, compensations]
         if 0 < config.sh_degree <= MAX_DEGREE:
             coefficients = blank("features_dc"), blank("features_rest")
-            centres = means.clone().requires_grad_()
-            colors_from_harmonics(config.sh_degree, centres, *coefficients, viewmats, info["radii"]).sum().backward()
+            results.append(colors_from_harmonics(config.sh_degree, centres, *coefficients, viewmats, radii))
+        torch.autograd.backward([value.sum() for value in results])
 
     def observation() -> None:
         params = {"means": means, "quats": quats, "scales": scales.log()}
@@ -137,7 +146,7 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
             failures["rasterization"] = error
         else:
             pending |= {
-                "spherical harmonics": pool.submit(harmonics),
+                "projection and spherical harmonics": pool.submit(projection),
                 "η": pool.submit(observation),
                 "tile lists": pool.submit(tile_lists),
                 "compositing with AbsGS": pool.submit(composite, True),

@@ -11,10 +11,12 @@ from sadgs_ns import gsplat_internals
 from sadgs_ns.kernels import compositing
 from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
 from sadgs_ns.kernels.limits import check_gaussians, check_pixels
+from sadgs_ns.kernels.projection import project
 from sadgs_ns.kernels.tiles import intersect_tiles
 
 BACKWARD: Literal["moments", "gsplat"] = "moments"
-"""Which kernel differentiates the compositing of three channels: ours (compositing.py), or gsplat's as a reference."""
+"""Whose kernels differentiate the projection and the compositing of three channels: ours (projection.py,
+compositing.py), or gsplat's as a reference."""
 TILE_SIZE = compositing.TILE_SIZE
 """px. gsplat's default of 16 saves list entries; with exact lists, saved pixels matter more (docs/measurements.md)."""
 
@@ -53,9 +55,12 @@ def rasterization(
     num_views = len(viewmats)
     check_gaussians(num_views, len(means))
     check_pixels(num_views, height, width)
-    radii, means2d, depths, conics, compensations = gsplat_internals.project(
-        means, quats, scales, opacities, viewmats, Ks, width, height, rasterize_mode == "antialiased"
-    )
+    geometry = means, quats, scales, opacities, viewmats, Ks, width, height, rasterize_mode == "antialiased"
+    if BACKWARD == "moments" and not viewmats.requires_grad:
+        # Colours take these centres, so that their gradient is added in the projection's backward kernel.
+        radii, means2d, depths, conics, compensations, means = project(*geometry)
+    else:
+        radii, means2d, depths, conics, compensations = gsplat_internals.project(*geometry)
     radii = radii.contiguous()  # Culling, and tile lists that are too short, set these very radii to 0.
     if compensations is not None:
         opacities = opacities * compensations
