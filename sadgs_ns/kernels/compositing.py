@@ -318,7 +318,7 @@ class _RasterizeToPixels(torch.autograd.Function):
             v_renders.contiguous(), None if v_alphas is None else v_alphas.contiguous(), ctx.absgrad,
         )  # fmt: skip
         if ctx.absgrad:
-            means2d.absgrad = v_absolute
+            means2d.absgrad, means2d.grad2d = v_absolute, v_means2d
         return v_means2d, v_conics, v_colors, v_opacities, *[None] * 5
 
 
@@ -336,8 +336,11 @@ def rasterize_to_pixels(
     """Do what gsplat's `rasterize_to_pixels` does with three channels in tiles of TILE_SIZE, but differentiate it with
     `composite_backward`.
 
+    With `absgrad`, `means2d` gets an attribute `grad2d`, which `backward` sets to its gradient, and which is None until
+    then: `retain_grad` would copy the gradient.
+
     Args:
-        means2d: px; with `absgrad`, `backward` sets its attribute of that name. [C, N, 2]
+        means2d: px; with `absgrad`, `backward` sets its attribute of that name, too. [C, N, 2]
         conics: In 1/px². [C, N, 3]
         colors: [C, N, 3]
         opacities: In [0, 1]. [C, N]
@@ -350,7 +353,10 @@ def rasterize_to_pixels(
     Returns:
         Colours [C, height, width, 3] and alphas [C, height, width, 1].
     """
+    means2d = means2d.contiguous()
+    if absgrad:
+        means2d.grad2d = None  # type: ignore[attr-defined]
     return _RasterizeToPixels.apply(  # type: ignore[return-value]
-        means2d.contiguous(), conics.contiguous(), colors.contiguous(), opacities.contiguous(),
+        means2d, conics.contiguous(), colors.contiguous(), opacities.contiguous(),
         width, height, isect_offsets, flatten_ids, absgrad,
     )  # fmt: skip

@@ -95,9 +95,9 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
         renders, alphas, info = rasterize(
             centres, quats, scales, opacities, means, *camera, absgrad=absgrad, **model.drawing
         )  # fmt: skip
-        means2d = info["means2d"]
         result = renders.sum() if config.background_color == "black" else renders.sum() + alphas.sum()
-        (means2d.grad,) = torch.autograd.grad(result, means2d)  # The projection is differentiated elsewhere.
+        # The projection is differentiated elsewhere.
+        (info["means2d"].grad2d,) = torch.autograd.grad(result, info["means2d"])
         if absgrad:
             accumulate_gradients(empty_gradients(n, device), info, views, fused=strategy.fused)
 

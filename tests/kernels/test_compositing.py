@@ -11,6 +11,7 @@ from gsplat.cuda._torch_impl import _fully_fused_projection
 from torch import Tensor
 
 from sadgs_ns import gsplat_internals
+from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, keep_gradient
 from sadgs_ns.render import splatter
 from sadgs_ns.render.rasterization import visible
 
@@ -261,6 +262,8 @@ def test_autograd_gets_what_the_kernel_returns(monkeypatch, through):
     torch.autograd.backward([outputs[name] for name in used], [scene[name] for name in used])
     for name, value in expected.items():
         found = inputs["means2d"].absgrad if name == "absgrad" else inputs[name].grad
+        if name == "means2d":
+            assert torch.equal(inputs[name].grad2d, found)
         if name in ("conics", "opacities"):
             assert found is None
         else:
@@ -322,8 +325,13 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
             needed = sum(info["pair_counts"].wait())
             assert len(info["flatten_ids"]) == (capacity or needed) >= needed > 150
         drawn.append(int(visible(info).sum()))
+        keep_gradient(info["means2d"])
+        assert info["means2d"].retains_grad is (dtype == torch.float64), "torch would copy the gradient"
         renders.backward(v_renders.to(dtype))
+        sums = empty_gradients(60, torch.device("cpu"))
+        accumulate_gradients(sums, info, num_views=2)
         results.append({name: value.grad for name, value in values.items()} | {"absgrad": info["means2d"].absgrad})
+        results[-1]["summed gradient"] = sums["grad2d"]
     assert drawn[0] == drawn[1] and (drawn[0] < 70) is (max_off_axis > 0)
     for name, expected in results[1].items():
         error = (results[0][name].double() - expected).norm() / expected.norm()
