@@ -96,7 +96,8 @@ def activate(log_scales: Tensor, logits: Tensor, penalty: float) -> tuple[Tensor
         penalty: Factor on the mean opacity.
 
     Returns:
-        Standard deviations [N, 3], opacities [N], and the penalty, a scalar, or None where the factor is 0.
+        Standard deviations [N, 3], opacities [N], and the penalty in parts [P], or None where the factor is 0. The
+        gradient of the first part is taken for that of all, which are to be summed.
     """
     scales, opacities, sums = _Activate.apply(log_scales.contiguous(), logits.contiguous(), penalty / len(logits))  # type: ignore[misc]
-    return scales, opacities, sums.sum() if penalty > 0 else None
+    return scales, opacities, sums if penalty > 0 else None

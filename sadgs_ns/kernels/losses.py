@@ -135,15 +135,16 @@ def _total(values, count, LANES: tl.constexpr):
     return tl.sum(sums)
 
 
-@triton.jit(do_not_specialize=["n", "num_strips", "num_tiles"])
+@triton.jit(do_not_specialize=["n", "num_strips", "num_tiles", "num_parts"])
 def _finish(
-    differences, similarities, loss, psnr, n, num_strips, num_tiles, ssim_lambda, l1_weight, ssim_weight, l2_weight,
-    LANES: tl.constexpr,
+    differences, similarities, parts, loss, psnr, n, num_strips, num_tiles, num_parts,
+    ssim_lambda, l1_weight, ssim_weight, l2_weight, LANES: tl.constexpr,
 ):  # fmt: skip
-    """Compute the loss and PSNR from the partial sums, in one program."""
+    """Compute the loss and PSNR from the partial sums, in one program, and add the sum of `parts` to the loss."""
     absolute, square = _total(differences, num_strips, LANES), _total(differences + num_strips, num_strips, LANES)
     of_ssim = ssim_lambda - ssim_weight * _total(similarities, num_tiles, LANES)
-    tl.store(loss + tl.program_id(0), l1_weight * absolute + of_ssim + l2_weight * square)
+    photometric = l1_weight * absolute + of_ssim + l2_weight * square
+    tl.store(loss + tl.program_id(0), photometric + _total(parts, num_parts, LANES))
     mse = square / n
     decibels = -3.010299956639812 * tl.log2(tl.where(mse > 0, mse, 1.0))
     tl.store(psnr + tl.program_id(0), tl.where(mse > 0, decibels, tl.where(mse == 0, float("inf"), mse)))
@@ -195,7 +196,13 @@ def _gradient(
 class _PhotometricLoss(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, x: Tensor, y: Tensor, window: tuple[float, ...], ssim_lambda: float, l2_lambda: float
+        ctx: Any,
+        x: Tensor,  # [C, H, W, 3]
+        y: Tensor,  # [C, H, W, 3]
+        window: tuple[float, ...],
+        ssim_lambda: float,
+        l2_lambda: float,
+        parts: Tensor | None,  # [P]
     ) -> tuple[Tensor, Tensor]:
         views, height, width, _ = x.shape
         n, row = x.numel(), 3 * width
@@ -206,13 +213,13 @@ class _PhotometricLoss(torch.autograd.Function):
         _blur_along_rows[strips,](x, y, blurred, differences, n, window, _STRIP)
         _similarity[tiles](blurred, slopes, similarities, n, height, row, window, _RUN, _COLUMNS)
         ctx.save_for_backward(x, y, slopes)
-        ctx.window = window
+        ctx.window, ctx.num_parts = window, 0 if parts is None else len(parts)
         n_valid = 3 * views * (height - len(window) + 1) * (width - len(window) + 1)
         ctx.weights = (1 - ssim_lambda) / n, ssim_lambda / n_valid, l2_lambda / n
         loss, psnr = x.new_empty(()), x.new_empty(())
         _finish[1,](
-            differences, similarities, loss, psnr, n, strips, similarities.numel(), ssim_lambda, *ctx.weights, _LANES,
-            num_warps=8,
+            differences, similarities, differences if parts is None else parts, loss, psnr,
+            n, strips, similarities.numel(), ctx.num_parts, ssim_lambda, *ctx.weights, _LANES, num_warps=8,
         )  # fmt: skip
         ctx.mark_non_differentiable(psnr)
         ctx.set_materialize_grads(False)  # torch would fill PSNR's gradient with zeros on the device
@@ -220,7 +227,7 @@ class _PhotometricLoss(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, upstream: Tensor, _: Tensor) -> tuple[Tensor, None, None, None, None]:
+    def backward(ctx: Any, upstream: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         x, y, slopes = ctx.saved_tensors
         views, height, width, _ = x.shape
         n, row = x.numel(), 3 * width
@@ -230,11 +237,17 @@ class _PhotometricLoss(torch.autograd.Function):
         _gradient[tiles](
             x, y, spread, upstream, gradient, n, height, row, *ctx.weights, ctx.window, _RUN, _COLUMNS
         )  # fmt: skip
-        return gradient, None, None, None, None
+        return gradient, *[None] * 4, upstream.expand(ctx.num_parts) if ctx.num_parts else None
 
 
 def photometric_loss(
-    predicted: Tensor, target: Tensor, window: tuple[float, ...], *, ssim_lambda: float, l2_lambda: float
+    predicted: Tensor,
+    target: Tensor,
+    window: tuple[float, ...],
+    *,
+    ssim_lambda: float,
+    l2_lambda: float,
+    parts: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Do what `method.losses.photometric_loss` does, for views at least as large as SSIM's window.
 
@@ -244,6 +257,7 @@ def photometric_loss(
         window: Weights of SSIM's window along one axis, symmetric.
         ssim_lambda: λ in [0, 1].
         l2_lambda: λ_2 ≥ 0.
+        parts: Numbers whose sum is added to the loss, contiguous float32. [P]
 
     Returns:
         The loss, and PSNR in dB without gradient; both scalars.
@@ -252,4 +266,6 @@ def photometric_loss(
         InputError: If the views have more pixels than the kernels can address (limits.py).
     """
     check_pixels(*predicted.shape[:3])
-    return _PhotometricLoss.apply(predicted.contiguous(), target.contiguous(), window, ssim_lambda, l2_lambda)  # type: ignore[return-value]
+    return _PhotometricLoss.apply(  # type: ignore[return-value]
+        predicted.contiguous(), target.contiguous(), window, ssim_lambda, l2_lambda, parts
+    )

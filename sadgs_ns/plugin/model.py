@@ -329,7 +329,7 @@ class SadgsModel(SplatfactoModel):
 
         Returns:
             Colours, not clamped, and depth [C, H, W, 3 or 4]; accumulated opacity [C, H, W, 1]; gsplat's meta, and in
-            it `opacity_reg`, the mean opacity times this factor, a scalar, or None where it is 0.
+            it `opacity_reg`, numbers [P] whose sum is the mean opacity times this factor, or None where it is 0.
         """
         params = self.cropped(dict(self.gauss_params.items()))
         if self.config.sh_degree > 0:
@@ -383,7 +383,7 @@ class SadgsModel(SplatfactoModel):
 
         Returns:
             `rgb` [C, H, W, 3], not clamped, and `background` [3]; while densification runs, and where the loss has that
-            part, `opacity_reg`, a scalar.
+            part, `opacity_reg`, numbers [P] whose sum is that part.
         """
         absgrad = self.strategy.needs_absgrad(self.step)
         forecast, capacity = self.tile_forecast, None
@@ -498,11 +498,12 @@ class SadgsModel(SplatfactoModel):
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: Mapping[str, Any], metrics_dict: Mapping[str, Any] | None = None
     ) -> dict[str, Tensor]:
-        """Return the photometric loss of views of one size, and the regularizers that are on.
+        """Return the loss of views of one size: the photometric one with the mean opacity's, and other regularizers.
 
         Args:
             outputs: `rgb` [C, H, W, 3] or [H, W, 3], `background`, and in training `opacity_reg` where that is a part
-                of the loss. In training, PSNR is added as `psnr`.
+                of the loss: it is added to `main_loss`, for which the kernels need no launch more. In training, PSNR is
+                added as `psnr`.
             batch: `image` of the same leading shape and, optionally, a boolean `mask` [..., H, W, 1].
         """
         target, predicted = batch["image"].to(self.device), outputs["rgb"]
@@ -516,13 +517,12 @@ class SadgsModel(SplatfactoModel):
             predicted.reshape(-1, height, width, 3),
             target.reshape(-1, height, width, 3),
             ssim_lambda=self.config.ssim_lambda,
+            parts=outputs.get("opacity_reg") if self.training else None,
             fused=self.config.fused,
         )
         losses = {"main_loss": loss}
         if self.training:
             outputs["psnr"] = psnr
-            if "opacity_reg" in outputs:
-                losses["opacity_reg"] = outputs["opacity_reg"]
             self.camera_optimizer.get_loss_dict(losses)
             if self.config.use_bilateral_grid:
                 losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)

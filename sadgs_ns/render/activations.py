@@ -24,12 +24,12 @@ def activate(
         fused: Use the Triton kernels where they run: CUDA, float32.
 
     Returns:
-        Standard deviations in world units [N, 3]; opacities in [0, 1] [N]; and their mean times `penalty`, a scalar, or
-        None where `penalty` is 0.
+        Standard deviations in world units [N, 3]; opacities in [0, 1] [N]; and numbers [P] whose sum is their mean
+        times `penalty`, and of which nothing but the sum may be differentiated, or None where `penalty` is 0.
     """
     if fused and kernels.available(logits.device) and logits.dtype == torch.float32:
         from sadgs_ns.kernels.activations import activate as fused_activate
 
         return fused_activate(log_scales, logits, penalty)
     opacities = torch.sigmoid(logits).squeeze(-1)
-    return torch.exp(log_scales), opacities, penalty * opacities.mean() if penalty > 0 else None
+    return torch.exp(log_scales), opacities, penalty * opacities.mean()[None] if penalty > 0 else None

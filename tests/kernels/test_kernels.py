@@ -59,9 +59,10 @@ def test_loss_and_gradient_equal_the_float64_reference(shape):
     for function, dtype in ((fused_photometric_loss, torch.float32), (losses.photometric_loss, torch.float64)):
         y = target.to(DEVICE, dtype)
         x = (target + noise).to(DEVICE, dtype).requires_grad_()
-        loss, psnr = function(x, y, ssim_lambda=0.3, l2_lambda=1.5)
+        parts = torch.linspace(-0.1, 0.3, 7).to(DEVICE, dtype).requires_grad_()
+        loss, psnr = function(x, y, ssim_lambda=0.3, l2_lambda=1.5, parts=parts)
         (3 * loss).backward()
-        assert x.grad is not None
+        assert x.grad is not None and parts.grad is not None and parts.grad.tolist() == [3.0] * 7
         results.append((loss.detach().double(), psnr.double(), x.grad.double()))
     fast, reference = results
     assert not torch.equal(reference[2], torch.zeros_like(reference[2]))
@@ -113,14 +114,17 @@ def test_partial_sums_are_added_as_accurately_as_torch_adds_them():
     """There are as many as two views of 1920×1080 px leave, which is no multiple of what is added at once."""
     generator = torch.Generator().manual_seed(0)
     differences, similarities = torch.rand((2, 12150), generator=generator), torch.rand(12240, generator=generator)
+    parts = torch.rand(5000, generator=generator) / 5e6
     loss, psnr = torch.zeros((), device=DEVICE), torch.zeros((), device=DEVICE)
     n = 12150 * 1024
     weights = 0.8 / n, 0.2 / n, 2.0 / n
     photometric._finish[1,](
-        differences.to(DEVICE), similarities.to(DEVICE), loss, psnr, n, 12150, 12240, 0.2, *weights, photometric._LANES
+        differences.to(DEVICE), similarities.to(DEVICE), parts.to(DEVICE), loss, psnr,
+        n, 12150, 12240, 5000, 0.2, *weights, photometric._LANES,
     )  # fmt: skip
-    l1, l2, of_ssim = (float(values.double().sum()) for values in (*differences, similarities))
-    assert float(loss) == pytest.approx(weights[0] * l1 + 0.2 - weights[1] * of_ssim + weights[2] * l2, abs=3e-8)
+    l1, l2, of_ssim, more = (float(values.double().sum()) for values in (*differences, similarities, parts))
+    expected = weights[0] * l1 + 0.2 - weights[1] * of_ssim + weights[2] * l2 + more
+    assert float(loss) == pytest.approx(expected, abs=3e-8)
     assert float(psnr) == pytest.approx(-10 * math.log10(l2 / n), rel=1e-6)
 
 
@@ -357,7 +361,8 @@ def test_activations_and_their_gradients_equal_torchs_in_float64(monkeypatch, n,
             outputs["penalty"] = penalized, torch.full_like(penalized, 1.7)
         chosen = [outputs[name] for name in used.split()]
         torch.autograd.backward([output for output, _ in chosen], [gradient for _, gradient in chosen])
-        results.append([value.detach().double() for value in (scales, opacities, penalized) if value is not None])
+        whole = [scales, opacities] if penalized is None else [scales, opacities, penalized.sum()]
+        results.append([value.detach().double() for value in whole])
         results[-1] += [
             torch.zeros_like(value).double() if value.grad is None else value.grad.double() for value in inputs
         ]
