@@ -111,9 +111,11 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
         from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
         from sadgs_ns.kernels.projection import project
 
-        parameters = (value.clone().requires_grad_() for value in (means, quats, scales))
         antialiased = config.rasterize_mode == "antialiased"
-        radii, means2d, _, conics, compensations, centres = project(*parameters, opacities, *camera, antialiased)
+        centres, rotations, sizes = (value.clone().requires_grad_() for value in (means, quats, scales))
+        radii, means2d, _, conics, compensations, centres = project(
+            centres, rotations, sizes, opacities, *camera, antialiased
+        )
         results = [means2d, conics] if compensations is None else [means2d, conics, compensations]
         if 0 < config.sh_degree <= MAX_DEGREE:
             coefficients = blank("features_dc"), blank("features_rest")

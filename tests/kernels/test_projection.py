@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ N = 150
 OUTPUTS = ("means2d", "depths", "conics", "compensations", "passed")
 
 
-def scene(num_views: int) -> dict[str, Tensor]:
+def scene(num_views: int) -> dict[str, Any]:
     """N Gaussians, of which some are beside and some behind the cameras, in float64."""
     generator = torch.Generator().manual_seed(0)
 
@@ -55,19 +56,20 @@ def project_in_torch(
     radii, *others = _fully_fused_projection(
         means, covariances, viewmats, Ks, width, height, calc_compensations=calc_compensations
     )
+    assert others[0] is not None
     seen = gsplat_internals.drawn(radii, others[0])
     radii = seen.int() * 3
     return (torch.stack([radii, 2 * radii], dim=-1) if per_axis_radii else radii), *others
 
 
 def gradients_of(
-    outputs: dict[str, Tensor], inputs: dict[str, Tensor], upstream: dict[str, Tensor]
+    outputs: Mapping[str, Any], inputs: Mapping[str, Any], upstream: dict[str, Tensor]
 ) -> dict[str, Tensor]:
     """Gradients by the inputs, in float64 on the CPU, of outputs of which nothing depends on what was not drawn."""
     names = [name for name in outputs if name in upstream]
     gradients = [upstream[name].to(outputs[name]) for name in names]
     torch.autograd.backward([outputs[name] for name in names], gradients)
-    return {name: inputs[name].grad.double().cpu() for name in ("means", "quats", "scales")}  # type: ignore[union-attr]
+    return {name: inputs[name].grad.double().cpu() for name in ("means", "quats", "scales")}
 
 
 def upstream_of(seen: Tensor, names: tuple[str, ...]) -> dict[str, Tensor]:
@@ -95,14 +97,14 @@ def test_gradients_equal_float64_autograd(monkeypatch, num_views, names, per_axi
     if DEVICE.type == "cuda" and per_axis_radii is not gsplat_internals.RADII_PER_AXIS:
         pytest.skip("gsplat's kernel makes radii in one of the layouts")
     values, antialiased = scene(num_views), "compensations" in names
-    inputs = {name: value.clone().requires_grad_() for name, value in values.items()}
-    radii, *others = project_in_torch(*inputs.values(), WIDTH, HEIGHT, antialiased)
+    inputs: dict[str, Any] = {name: value.clone().requires_grad_() for name, value in values.items()}
+    radii, *others = project_in_torch(**inputs, width=WIDTH, height=HEIGHT, calc_compensations=antialiased)
     seen = radii > 0
     assert 0.3 < seen.float().mean() < 0.9
     ratios = others[0][seen] / torch.tensor([WIDTH, HEIGHT])
     assert ((ratios < -0.15) | (ratios > 1.15)).any(dim=1).sum() > 5, "the Jacobian should be clamped for some"
     upstream = upstream_of(seen, names)
-    outputs = dict(zip(OUTPUTS, [*others, 1 * inputs["means"]], strict=True))
+    outputs: dict[str, Any] = dict(zip(OUTPUTS, [*others, 1 * inputs["means"]], strict=True))
     expected = gradients_of(outputs, inputs, upstream)
 
     if DEVICE.type == "cpu":  # gsplat's kernels need CUDA
@@ -112,7 +114,7 @@ def test_gradients_equal_float64_autograd(monkeypatch, num_views, names, per_axi
     inputs = {name: value.float().to(DEVICE) for name, value in values.items()}
     for name in ("means", "quats", "scales"):
         inputs[name].requires_grad_()
-    radii, *others = projection.project(*inputs.values(), WIDTH, HEIGHT, antialiased)
+    radii, *others = projection.project(**inputs, width=WIDTH, height=HEIGHT, calc_compensations=antialiased)
     assert not radii.requires_grad and torch.equal(gsplat_internals.drawn(radii, others[0]).cpu(), seen)
     found = gradients_of(dict(zip(OUTPUTS, others, strict=True)), inputs, upstream)
     for name, value in expected.items():
@@ -134,7 +136,7 @@ def test_what_no_view_draws_has_gradients_of_zero_whatever_its_numbers_are(monke
             if broken:
                 inputs[name][:50] = torch.tensor([torch.nan, torch.inf, 0.0, -1.0, 1e30]).repeat(10)[:, None]
             inputs[name].requires_grad_()
-        radii, *others = projection.project(*inputs.values(), WIDTH, HEIGHT, False)
+        radii, *others = projection.project(**inputs, width=WIDTH, height=HEIGHT, calc_compensations=False)
         radii.data[:, :50] = 0  # as kernels do, of whose changes autograd does not know
         upstream = upstream_of(gsplat_internals.drawn(radii, others[0]).cpu(), ("means2d", "conics"))
         with np.errstate(all="ignore"):  # Triton's interpreter computes with numpy
@@ -148,7 +150,7 @@ def test_what_no_view_draws_has_gradients_of_zero_whatever_its_numbers_are(monke
 def test_gradients_are_as_close_to_float64_as_gsplats():
     values = scene(3)
     inputs = {name: value.clone().requires_grad_() for name, value in values.items()}
-    radii, *others = project_in_torch(*inputs.values(), WIDTH, HEIGHT, True)
+    radii, *others = project_in_torch(**inputs, width=WIDTH, height=HEIGHT, calc_compensations=True)
     upstream = upstream_of(radii > 0, OUTPUTS[:4])
     expected = gradients_of(dict(zip(OUTPUTS, others, strict=False)), inputs, upstream)
     errors = []
@@ -156,7 +158,7 @@ def test_gradients_are_as_close_to_float64_as_gsplats():
         inputs = {name: value.float().to(DEVICE) for name, value in values.items()}
         for name in ("means", "quats", "scales"):
             inputs[name].requires_grad_()
-        others = function(*inputs.values(), WIDTH, HEIGHT, True)[1:5]
+        others = function(**inputs, width=WIDTH, height=HEIGHT, calc_compensations=True)[1:5]
         found = gradients_of(dict(zip(OUTPUTS, others, strict=False)), inputs, upstream)
         errors.append({name: float((found[name] - v).norm() / v.norm()) for name, v in expected.items()})
     for name, error in errors[0].items():
