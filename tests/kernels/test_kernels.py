@@ -261,8 +261,9 @@ def test_colours_and_gradients_equal_gsplats_float64_harmonics(monkeypatch, degr
         torch.testing.assert_close(actual.grad.double().cpu(), gradient, atol=2e-5, rtol=2e-5)
 
 
+@pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
 @pytest.mark.parametrize("kept", [Tensor.half, encode], ids=["float16", "8 bits"])
-def test_observation_equals_the_reference(monkeypatch, kept):
+def test_observation_equals_the_reference(monkeypatch, kept, per_axis_radii):
     n, width, height = 150, 40, 30
     params = {name: p.detach() for name, p in scenes.random_params(n).items()}
     params["scales"][::9] += 3  # reaches over the border
@@ -272,6 +273,8 @@ def test_observation_equals_the_reference(monkeypatch, kept):
     viewmats[1, :3, :3] = torch.linalg.qr(torch.eye(3) + 0.1)[0]
     viewmats[1, :3, 3] = torch.tensor([0.1, -0.2, 0.5])
     _, _, info = scenes.splat({name: torch.nn.Parameter(p) for name, p in params.items()}, viewmats, Ks, width, height)
+    radius = info["radii"] if info["radii"].dim() == 2 else info["radii"].amin(dim=-1)
+    info["radii"] = torch.stack([radius, 2 * radius], dim=-1) if per_axis_radii else radius
     generator = torch.Generator().manual_seed(0)
     factors = torch.randn((2, height, width, 2, 2), generator=generator)
     tensors = factors @ factors.mT

@@ -28,7 +28,7 @@ INTEGERS += ["rows_per_view", "halvings", "num_parts", "row2d", "row_conic"]
 FLOATS = "exponent frequency beta1 beta2 eps l1_weight ssim_weight l2_weight".split()
 FLOATS += "scale_x scale_y ssim_lambda half_width half_height reach_x reach_y penalty".split()
 POINTERS = {
-    "radii": "*i32", "counts": "*i64", "order": "*i64", "ends": "*i64", "tiles": "*i16", "ids": "*i32", "drawn": "*i1",
+    "radii": "*i32", "counts": "*i64", "order": "*i64", "ends": "*i64", "tiles": "*i16", "ids": "*i32",
     "by_tile": "*i64", "ordered": "*i32",
     "structure_tensors": "*u8", "starts": "*i32", "last_ids": "*i32",
 }
