@@ -162,14 +162,14 @@ def _list(
         tl.store(ids + unused, lane * 0, unused < num_pairs)
 
 
-@triton.jit(do_not_specialize=["num_pairs", "num_tiles", "halvings"])
-def _order(tiles, by_tile, ids, ordered, starts, num_pairs, num_tiles, halvings, LANES: tl.constexpr):
+@triton.jit(do_not_specialize=["num_pairs", "num_tiles", "of_pairs", "halvings"])
+def _order(tiles, by_tile, ids, ordered, starts, num_pairs, num_tiles, of_pairs, halvings, LANES: tl.constexpr):
     """Bring the Gaussians of the pairs into the order of the tiles, and find where each tile's list starts.
 
-    The first programs handle LANES pairs each, and the others LANES tiles, whose starts they find by bisection.
+    The first `of_pairs` programs handle LANES pairs each, and the others LANES tiles, whose starts they find by
+    bisection.
     """
     program, lane = tl.program_id(0), tl.arange(0, LANES)
-    of_pairs = tl.cdiv(num_pairs, LANES)
     if program < of_pairs:
         at = program.to(tl.int64) * LANES + lane
         exists = at < num_pairs
@@ -262,8 +262,9 @@ class PendingTiles:
         )  # fmt: skip
         tiles, by_tile = tiles.sort(stable=True)
         starts, ordered = ids.new_empty((views, rows_per_view, columns)), torch.empty_like(ids)
-        _order[triton.cdiv(num_pairs, _ORDER_LANES) + triton.cdiv(num_tiles, _ORDER_LANES),](
-            tiles, by_tile, ids, ordered, starts, num_pairs, num_tiles, num_pairs.bit_length(), _ORDER_LANES
+        of_pairs = triton.cdiv(num_pairs, _ORDER_LANES)
+        _order[of_pairs + triton.cdiv(num_tiles, _ORDER_LANES),](
+            tiles, by_tile, ids, ordered, starts, num_pairs, num_tiles, of_pairs, num_pairs.bit_length(), _ORDER_LANES
         )
         return starts, ordered
 

@@ -651,9 +651,10 @@ def test_the_lists_order_and_starts_are_torchs(dtype, num_pairs, num_tiles):
     sorted_tiles, by_tile = numbers.to(dtype).to(DEVICE).sort(stable=True)
     ids = torch.randperm(num_pairs, generator=generator).int().to(DEVICE)
     ordered, starts = torch.empty_like(ids), ids.new_empty(num_tiles)
-    programs = triton.cdiv(num_pairs, tiles._ORDER_LANES) + triton.cdiv(num_tiles, tiles._ORDER_LANES)
-    tiles._order[programs,](
-        sorted_tiles, by_tile, ids, ordered, starts, num_pairs, num_tiles, num_pairs.bit_length(), tiles._ORDER_LANES
+    lanes = tiles._ORDER_LANES
+    of_pairs = triton.cdiv(num_pairs, lanes)
+    tiles._order[of_pairs + triton.cdiv(num_tiles, lanes),](
+        sorted_tiles, by_tile, ids, ordered, starts, num_pairs, num_tiles, of_pairs, num_pairs.bit_length(), lanes
     )
     every = torch.arange(num_tiles, device=DEVICE) - 2**15
     assert torch.equal(starts, torch.searchsorted(sorted_tiles.long(), every, out_int32=True))

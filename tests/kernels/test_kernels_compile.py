@@ -24,7 +24,7 @@ CONSTANTS = {
 }
 INTEGERS = "n row height width taps num_gaussians num_views tile_width tile_height used stride start".split()
 INTEGERS += "channels weight_stride num_pairs rows view absolute_view absolute_row num_strips num_tiles".split()
-INTEGERS += ["rows_per_view", "halvings", "num_parts", "row2d", "row_conic"]
+INTEGERS += ["rows_per_view", "halvings", "of_pairs", "num_parts", "row2d", "row_conic"]
 FLOATS = "exponent frequency beta1 beta2 eps l1_weight ssim_weight l2_weight".split()
 FLOATS += "scale_x scale_y ssim_lambda half_width half_height reach_x reach_y penalty".split()
 POINTERS = {
