@@ -74,8 +74,8 @@ def _by_row(ratio, slope, inverse, scale, by_first, by_last):
     return by_x, scale * inverse * (slope * by_last - by_first) - slope * by_x
 
 
-# One view's intrinsics may be part of a tensor of several views, and gradients part of rows, which begin at no multiple of
-# 16 bytes: Triton would compile another kernel for that.
+# One view's intrinsics may be part of a tensor of several views, and gradients part of rows. They begin at no multiple
+# of 16 bytes, for which Triton would compile another kernel.
 @triton.jit(
     do_not_specialize=["n", "num_views", "width", "height", "row2d", "row_conic"],
     do_not_specialize_on_alignment=["Ks", "v_means2d", "v_conics"],
