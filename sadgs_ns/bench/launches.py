@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch.autograd import profiler
 
-from sadgs_ns.bench.phases import WARMUP, train_step, within_densification
+from sadgs_ns.bench.phases import WARMUP, steps_after_run, train_step, within_densification
 
 STEPS = 20
 """Steps that are counted, at least."""
@@ -33,17 +33,13 @@ def measure(trainer: Any, steps: int = STEPS) -> dict[str, float] | None:
     """
     if torch.device(trainer.device).type != "cuda":
         return None
-    strategy = getattr(trainer.pipeline.model, "strategy", None)
-    windows = getattr(strategy, "windows", None)
-    every = 1 if windows is None else windows.eta_every
-    steps = -(-steps // every) * every
-    first = trainer.config.max_num_iterations
-    with within_densification(strategy):
-        for step in range(first, first + WARMUP):
+    measured = steps_after_run(trainer, steps)
+    with within_densification(getattr(trainer.pipeline.model, "strategy", None)):
+        for step in range(measured.start - WARMUP, measured.start):
             train_step(trainer, step)
         profile = profiler.profile(use_device="cuda")
         with profile:
-            for step in range(first + WARMUP, first + WARMUP + steps):
+            for step in measured:
                 with profiler.record_function(_STEP):
                     train_step(trainer, step)
             torch.cuda.synchronize()

@@ -194,20 +194,23 @@ def measure(trainer: Any, steps: int = STEPS) -> dict[str, float]:
     Returns:
         Milliseconds of each phase in a step, the mean over the steps; their sum is the step's wall time.
     """
-    model = trainer.pipeline.model
-    strategy = getattr(model, "strategy", None)
-    windows = getattr(strategy, "windows", None)
-    every = 1 if windows is None else windows.eta_every
-    steps = -(-steps // every) * every
-    first = trainer.config.max_num_iterations
+    model, measured = trainer.pipeline.model, steps_after_run(trainer, steps)
     watch = Stopwatch(torch.device(model.device))
-    with within_densification(strategy), booked(trainer, watch):
-        for step in range(first, first + WARMUP + steps):
-            if step == first + WARMUP:
+    with within_densification(getattr(model, "strategy", None)), booked(trainer, watch):
+        for step in range(measured.start - WARMUP, measured.stop):
+            if step == measured.start:
                 watch.restart()
             train_step(trainer, step)
         seconds = watch.seconds()
-    return {phase: 1000 * value / steps for phase, value in seconds.items()}
+    return {phase: 1000 * value / len(measured) for phase, value in seconds.items()}
+
+
+def steps_after_run(trainer: Any, at_least: int) -> range:
+    """Return the steps to be measured: beyond the end of a run and `WARMUP` more, in whole periods of η."""
+    windows = getattr(getattr(trainer.pipeline.model, "strategy", None), "windows", None)
+    every = 1 if windows is None else windows.eta_every
+    first = trainer.config.max_num_iterations + WARMUP
+    return range(first, first + -(-at_least // every) * every)
 
 
 def train_step(trainer: Any, step: int) -> None:

@@ -163,8 +163,9 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         """
         device, dataset = torch.device(self.device), self.train_dataset if split == "train" else self.eval_dataset
         on_demand = cache_images_device == "compressed"
-        files = sum(path.stat().st_size for path in dataset.image_filenames) if on_demand else 0
-        keep = on_demand and files <= KEPT_FILES_SHARE * available_host_bytes()
+        keep = on_demand and (
+            sum(path.stat().st_size for path in dataset.image_filenames) <= KEPT_FILES_SHARE * available_host_bytes()
+        )
         images = ImagesOnDemand(dataset, self.config.cache_images_type, keep)
         self.train_cameras = self.train_dataset.cameras
         if on_demand:

@@ -66,11 +66,9 @@ class TrainingViews:
             indices.append(order.pop(position))
             if not order:
                 datamanager.train_unseen_cameras = datamanager.sample_train_cameras()
-        drawn: dict[int, dict[str, Any]] = {}
         if ahead is None:
-            for index in indices:
-                data = datamanager.cached_train[index]
-                drawn[index] = {**data, "image": data["image"].to(device, non_blocking=True)}
+            data = {index: datamanager.cached_train[index] for index in indices}
+            drawn = {i: {**its, "image": its["image"].to(device, non_blocking=True)} for i, its in data.items()}
         else:
             upcoming = self._upcoming(ahead.threads + 2 * number)
             ahead.load([*indices, *upcoming])
