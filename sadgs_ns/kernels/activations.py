@@ -15,6 +15,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from sadgs_ns.kernels import cdiv
+
 _LANES = 1024
 """Gaussians that one program handles."""
 
@@ -62,7 +64,7 @@ class _Activate(torch.autograd.Function):
     def forward(ctx: Any, log_scales: Tensor, logits: Tensor, weight: float) -> tuple[Tensor, Tensor, Tensor]:
         n = len(logits)
         scales, opacities = torch.empty_like(log_scales), logits.new_empty(n)
-        sums = logits.new_empty(triton.cdiv(n, _LANES))
+        sums = logits.new_empty(cdiv(n, _LANES))
         _activate[len(sums),](log_scales, logits, scales, opacities, sums, n, weight, _LANES)
         ctx.save_for_backward(scales, opacities)
         ctx.weight = weight
@@ -80,7 +82,7 @@ class _Activate(torch.autograd.Function):
         v_opacities = torch.zeros_like(opacities) if v_opacities is None else v_opacities
         v_log_scales, v_logits = torch.empty_like(scales), opacities.new_empty((n, 1))
         # The partial sums all have the gradient of their sum, so the kernel reads the first one's.
-        _activate_backward[triton.cdiv(n, _LANES),](
+        _activate_backward[cdiv(n, _LANES),](
             scales, opacities, v_scales, v_opacities, opacities if v_sums is None else v_sums, v_log_scales, v_logits,
             n, v_opacities.stride(0), ctx.weight, v_sums is not None, _LANES,
         )  # fmt: skip

@@ -18,6 +18,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.limits import check_pixels
 
 _STRIP = 256
@@ -207,8 +208,8 @@ class _PhotometricLoss(torch.autograd.Function):
         views, height, width, _ = x.shape
         n, row = x.numel(), 3 * width
         blurred, slopes = x.new_empty((5, n)), x.new_empty((3, n))
-        strips = triton.cdiv(n, _STRIP)
-        tiles = (triton.cdiv(row, _COLUMNS), triton.cdiv(height, _RUN), views)
+        strips = cdiv(n, _STRIP)
+        tiles = (cdiv(row, _COLUMNS), cdiv(height, _RUN), views)
         differences, similarities = x.new_empty((2, strips)), x.new_empty(math.prod(tiles))
         _blur_along_rows[strips,](x, y, blurred, differences, n, window, _STRIP)
         _similarity[tiles](blurred, slopes, similarities, n, height, row, window, _RUN, _COLUMNS)
@@ -232,8 +233,8 @@ class _PhotometricLoss(torch.autograd.Function):
         views, height, width, _ = x.shape
         n, row = x.numel(), 3 * width
         spread, gradient = torch.empty_like(slopes), torch.empty_like(x)
-        tiles = (triton.cdiv(row, _COLUMNS), triton.cdiv(height, _RUN), views)
-        _spread_along_rows[triton.cdiv(n, _STRIP),](slopes, spread, n, ctx.window, _STRIP)
+        tiles = (cdiv(row, _COLUMNS), cdiv(height, _RUN), views)
+        _spread_along_rows[cdiv(n, _STRIP),](slopes, spread, n, ctx.window, _STRIP)
         _gradient[tiles](
             x, y, spread, upstream, gradient, n, height, row, *ctx.weights, ctx.window, _RUN, _COLUMNS
         )  # fmt: skip

@@ -20,6 +20,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sadgs_ns import gsplat_internals
+from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.visibility import drawn
 
 _LANES = 128
@@ -272,7 +273,7 @@ class _Project(torch.autograd.Function):
             conics if value is None else value.contiguous() for value in (v_depths, v_compensations, v_passed)
         )
         n = len(means)
-        _project_backward[triton.cdiv(n, _LANES),](
+        _project_backward[cdiv(n, _LANES),](
             means, quats, scales, viewmats, Ks, radii, conics, conics if compensations is None else compensations,
             v_means2d, v_conics, depths, by_compensation, passed, v_means, v_quats, v_scales,
             n, len(viewmats), *ctx.size, row2d, row_conic,

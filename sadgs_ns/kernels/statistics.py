@@ -9,6 +9,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.visibility import drawn
 
 _LANES = 128
@@ -200,7 +201,7 @@ def observe_views(
     inputs = (*params, radii, means2d, conics, jitter, structure_tensors, viewmats, Ks)
     num_views, n = radii.shape[:2]
     height, width = structure_tensors.shape[1:3]
-    _observe[triton.cdiv(n, _LANES),](
+    _observe[cdiv(n, _LANES),](
         *(value.contiguous() for value in inputs), *statistics, n, num_views, width, height,
         *thresholds, *constants, *code_range, radii.dim() - 1, _LANES,
     )  # fmt: skip

@@ -18,6 +18,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.limits import check_pairs
 
 _LANES = 32
@@ -255,15 +256,15 @@ class PendingTiles:
         tiles = torch.empty(num_pairs, dtype=torch.int16 if num_tiles <= 2**16 else torch.int32, device=device)
         ids = torch.empty(num_pairs, dtype=torch.int32, device=device)
         n = len(self.order)
-        _list[triton.cdiv(n, _LANES),](
+        _list[cdiv(n, _LANES),](
             *self.ellipses, self.order, self.ends, tiles, ids,
             n, n // views, num_pairs, num_tiles, columns, rows, rows_per_view,
             self.ellipses[1].dim() - 1, self.tile_size, _LANES, num_warps=1,
         )  # fmt: skip
         tiles, by_tile = tiles.sort(stable=True)
         starts, ordered = ids.new_empty((views, rows_per_view, columns)), torch.empty_like(ids)
-        of_pairs = triton.cdiv(num_pairs, _ORDER_LANES)
-        _order[of_pairs + triton.cdiv(num_tiles, _ORDER_LANES),](
+        of_pairs = cdiv(num_pairs, _ORDER_LANES)
+        _order[of_pairs + cdiv(num_tiles, _ORDER_LANES),](
             tiles, by_tile, ids, ordered, starts, num_pairs, num_tiles, of_pairs, num_pairs.bit_length(), _ORDER_LANES
         )
         return starts, ordered
@@ -301,11 +302,11 @@ def intersect_tiles(
         An object that makes the lists when it is asked for them; by then the host should have given the device work.
     """
     num_views, num_gaussians = means2d.shape[:2]
-    tile_width, tile_height = triton.cdiv(width, tile_size), triton.cdiv(height, tile_size)
+    tile_width, tile_height = cdiv(width, tile_size), cdiv(height, tile_size)
     ellipses = [value.contiguous() for value in (means2d, radii, conics, opacities)]
     n, device = num_views * num_gaussians, means2d.device
     counts = torch.empty(n, dtype=torch.int64, device=device)  # cumsum would convert others
-    _count[triton.cdiv(n, _LANES),](
+    _count[cdiv(n, _LANES),](
         *ellipses, counts, n, tile_width, tile_height,
         width / 2, height / 2, max_off_axis * width / 2, max_off_axis * height / 2,
         radii.dim() - 1, tile_size, max_off_axis > 0, _LANES, num_warps=1,

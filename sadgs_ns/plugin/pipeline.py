@@ -159,6 +159,10 @@ class SadgsPipeline(VanillaPipeline):
         """The model, which is never wrapped for several devices."""
         return self._model  # type: ignore[return-value]
 
+    def train(self, mode: bool = True) -> SadgsPipeline:
+        """Set the mode of all modules, unless they have it: nerfstudio asks before every step, and torch visits all."""
+        return self if mode == self.training == self.model.training else super().train(mode)
+
     @property
     def views_per_iteration(self) -> int:
         """Number of views in a step, at most as many as there are: a view that is rendered twice would count twice."""

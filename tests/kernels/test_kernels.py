@@ -81,7 +81,10 @@ def test_the_loss_reads_bytes_as_the_floats_that_they_stand_for():
         loss, psnr = fused_photometric_loss(x, target, ssim_lambda=0.3, l2_lambda=1.5)
         loss.backward()
         results.append([loss.detach(), psnr, x.grad])
-    assert all(map(torch.equal, *results))
+    # On a GPU the product with 1/255 is fused with the sum that follows it, and not rounded in between.
+    rounding = 1e-6 if DEVICE.type == "cuda" else 0.0
+    for of_bytes, of_floats in zip(*results, strict=True):
+        torch.testing.assert_close(of_bytes, of_floats, atol=rounding * float(of_floats.abs().max()), rtol=0)
     slow = losses.photometric_loss(predicted, images, ssim_lambda=0.3, l2_lambda=1.5, fused=False)
     torch.testing.assert_close(results[0][:2], list(slow), atol=1e-5, rtol=1e-5)
 

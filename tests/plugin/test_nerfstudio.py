@@ -657,6 +657,14 @@ def test_held_out_cameras_render_as_nerfstudio_expects(trained: SadgsTrainer):
 
 
 @torch.no_grad()
+def test_after_the_viewer_has_rendered_the_whole_model_trains_again(trained: SadgsTrainer):
+    pipeline = trained.pipeline
+    pipeline.train()
+    pipeline.model.eval()  # as nerfstudio's viewer does
+    assert pipeline.train() is pipeline and all(module.training for module in pipeline.modules())
+    assert not any(module.training for module in pipeline.eval().modules())
+
+
 def test_a_crop_box_hides_what_lies_outside(trained: SadgsTrainer):
     model, camera = trained.pipeline.model, trained.pipeline.datamanager.eval_dataset.cameras[:1]
 
