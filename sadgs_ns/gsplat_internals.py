@@ -164,6 +164,11 @@ def composite(
     The kernel is called `rasterize_to_pixels_fwd` in 1.4 and `rasterize_to_pixels_3dgs_fwd` in 1.5; both take the same
     arguments. It is reached through gsplat's private `_make_lazy_cuda_func`, which is the same in 1.4 and 1.5.
 
+    The lists may have a row of tiles below the image, as those of a given length have (kernels/tiles.py): in 1.4 and
+    1.5 the kernel takes the numbers of tiles from the shape of `isect_offsets`, the end of the last list from the
+    length of `flatten_ids`, and the block of a tile all of whose pixels are outside the image ends before it reads its
+    list.
+
     Args:
         means2d: px; this and all other tensors must be contiguous. [C, N, 2]
         conics: In 1/px². [C, N, 3]
@@ -172,7 +177,7 @@ def composite(
         width: px.
         height: px.
         tile_size: px.
-        isect_offsets: Where each tile's list starts, int32 [C, tile rows, tile columns].
+        isect_offsets: Where each tile's list starts, int32 [C, tile rows, tile columns]; the rows may be too many.
         flatten_ids: Indices in C · N, int32 [number of pairs].
 
     Returns:

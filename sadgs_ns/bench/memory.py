@@ -19,7 +19,7 @@ from torch import Tensor
 from sadgs_ns.bench import command_lines
 from sadgs_ns.bench.step import rasterize_parameters
 from sadgs_ns.method import memory
-from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients
+from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, keep_gradient
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.statistics import empty_statistics, observe
@@ -92,7 +92,7 @@ class Training:
             parameter.grad = None
         renders, alphas, info = rasterize_parameters(p, self.viewmats, self.Ks, self.width, self.height, absgrad=True)
         self.size = StepSize.of([info])
-        info["means2d"].retain_grad()
+        keep_gradient(info["means2d"])
         tensors = torch.stack(self.codes)
         seen = info | {"viewmats": self.viewmats, "Ks": self.Ks, "structure_tensors": tensors}
         observe(self.state, p, seen)  # type: ignore[arg-type]

@@ -20,7 +20,7 @@ from rich.progress import track
 from torch import Tensor
 
 from sadgs_ns.errors import InputError, reason
-from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow
+from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow, keep_gradient
 from sadgs_ns.method.codes import decode
 from sadgs_ns.method.split import grid_split, num_children
 from sadgs_ns.method.strategy import SMALL_SCALE
@@ -161,7 +161,7 @@ def screen_gradients(pipeline: SadgsPipeline, progress: Callable[[range], Any]) 
         viewmats, Ks = pipeline.views.stacked_cameras([index])
         with torch.enable_grad():
             render, alpha, info = model.render(viewmats.detach(), Ks, width, height, "RGB", absgrad=True)
-            info["means2d"].retain_grad()
+            keep_gradient(info["means2d"])
             outputs = {"rgb": render[..., :3] + (1 - alpha) * background, "background": background}
             batch = {name: data[name][None].to(pipeline.device) for name in ("image", "mask") if name in data}
             model.get_loss_dict(outputs, batch)["main_loss"].backward()

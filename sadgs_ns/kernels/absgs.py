@@ -9,6 +9,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.visibility import drawn
 
 _LANES = 256
@@ -64,7 +65,7 @@ def accumulate_gradients(
     num_views, n = radii.shape[:2]
     # The kernel reads parts of rows where they lie, but expects x and y side by side: other layouts are copied.
     gradient, absolute = (value if value.stride(2) == 1 else value.contiguous() for value in (gradient, absolute))
-    _accumulate_gradients[triton.cdiv(n, _LANES),](
+    _accumulate_gradients[cdiv(n, _LANES),](
         radii.contiguous(), gradient, absolute, *sums, n, num_views, gradient.stride(0), gradient.stride(1),
         absolute.stride(0), absolute.stride(1), *scales, radii.dim() - 1, _LANES,
     )  # fmt: skip

@@ -10,6 +10,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from sadgs_ns.kernels import cdiv
+
 _PIXELS = 1024
 """Pixels that one program handles."""
 _TINY = 1.1754943508222875e-38
@@ -60,5 +62,5 @@ def encode(tensor: Tensor, highest_frequency: float, octaves: float, masked: int
     tensor = tensor.contiguous()
     codes = torch.empty_like(tensor, dtype=torch.uint8)
     n = tensor.numel() // 3
-    _encode[triton.cdiv(n, _PIXELS),](tensor, codes, n, highest_frequency, octaves, masked, _TINY, _PIXELS)
+    _encode[cdiv(n, _PIXELS),](tensor, codes, n, highest_frequency, octaves, masked, _TINY, _PIXELS)
     return codes

@@ -41,7 +41,7 @@ _STRIDE = 12
 
 @triton.jit
 def _row(values, ROW: tl.constexpr):
-    """One row of a block. Adding −0.0 changes nothing, so that the compiler removes the sum."""
+    """Return one row of a block. Adding −0.0 changes nothing, so that the compiler removes the sum."""
     rows = tl.arange(0, values.shape[0])[:, None]
     return tl.sum(tl.where(rows == ROW, values, -0.0), axis=0)
 
@@ -50,7 +50,7 @@ if isinstance(_row, triton.JITFunction):
 
     @triton.jit
     def _reciprocal(value):
-        """1 / value in one instruction; Triton's division spends four more on denormals."""
+        """Return 1 / value in one instruction; Triton's division spends four more on denormals."""
         return tl.inline_asm_elementwise(
             "rcp.approx.ftz.f32 $0, $1;", "=r,r", [value], tl.float32, is_pure=True, pack=1
         )  # fmt: skip
@@ -63,13 +63,13 @@ else:  # Triton's interpreter, which knows no PTX
 
 @triton.jit
 def _rounded(values):
-    """Values rounded to the nearest that tensor cores read, which cut the rest off: errors then average out."""
+    """Round values to the nearest that tensor cores read, which cut the rest off: errors then average out."""
     return ((values.to(tl.int32, bitcast=True) + 4096) & -8192).to(tl.float32, bitcast=True)
 
 
 @triton.jit
 def _split4(values):
-    """Columns of [N, 4]."""
+    """Return the columns of a block [N, 4]."""
     even, odd = tl.split(tl.reshape(values, [values.shape[0], 2, 2]))
     c0, c2 = tl.split(even)
     c1, c3 = tl.split(odd)
@@ -78,7 +78,7 @@ def _split4(values):
 
 @triton.jit
 def _split8(values):
-    """Columns of [N, 8]."""
+    """Return the columns of a block [N, 8]."""
     even, odd = tl.split(tl.reshape(values, [values.shape[0], 4, 2]))
     c0, c2, c4, c6 = _split4(even)
     c1, c3, c5, c7 = _split4(odd)
@@ -87,13 +87,13 @@ def _split8(values):
 
 @triton.jit
 def _join4(c0, c1, c2, c3):
-    """[N, 4] of its columns."""
+    """Make a block [N, 4] of its columns."""
     return tl.reshape(tl.join(tl.join(c0, c2), tl.join(c1, c3)), [c0.shape[0], 4])
 
 
 @triton.jit
 def _load_gaussians(means2d, conics, colors, opacities, g):
-    """Centre and opacity, conic, and colour of the Gaussians with indices g [N, 1]: three blocks [N, 4].
+    """Load centre and opacity, conic, and colour of the Gaussians with indices g [N, 1] into three blocks [N, 4].
 
     Triton spreads a block over the threads if it has at least as many values; of a smaller one every thread would load
     everything.
@@ -244,7 +244,7 @@ def composite_backward(
     v_alphas: Tensor | None,
     absgrad: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]:
-    """Gradients of gsplat's compositing of three channels in tiles of TILE_SIZE; all tensors are contiguous float32.
+    """Differentiate gsplat's compositing of three channels in tiles of TILE_SIZE; all tensors are contiguous float32.
 
     A pixel whose gradient is not finite, or at least 1e18, makes the gradients of the Gaussians that it sees NaN, and
     of no others.
@@ -254,7 +254,8 @@ def composite_backward(
         conics: In 1/px². [C, N, 3]
         colors: [C, N, 3]
         opacities: In [0, 1]. [C, N]
-        isect_offsets: Where each tile's list starts, int32 [C, tile rows, tile columns].
+        isect_offsets: Where each tile's list starts, int32 [C, tile rows, tile columns]. A list of a tile below the
+            image is passed over.
         flatten_ids: Indices in C·N, int32 [number of pairs].
         alphas: As rendered. [C, height, width, 1]
         last_ids: Place in the lists of the last Gaussian that a pixel drew, int32 [C, height, width].
@@ -317,7 +318,7 @@ class _RasterizeToPixels(torch.autograd.Function):
             v_renders.contiguous(), None if v_alphas is None else v_alphas.contiguous(), ctx.absgrad,
         )  # fmt: skip
         if ctx.absgrad:
-            means2d.absgrad = v_absolute
+            means2d.absgrad, means2d.grad2d = v_absolute, v_means2d
         return v_means2d, v_conics, v_colors, v_opacities, *[None] * 5
 
 
@@ -332,10 +333,14 @@ def rasterize_to_pixels(
     flatten_ids: Tensor,
     absgrad: bool,
 ) -> tuple[Tensor, Tensor]:
-    """gsplat's `rasterize_to_pixels` of three channels in tiles of TILE_SIZE, with `composite_backward`.
+    """Do what gsplat's `rasterize_to_pixels` does with three channels in tiles of TILE_SIZE, but differentiate it with
+    `composite_backward`.
+
+    With `absgrad`, `means2d` gets an attribute `grad2d`, which `backward` sets to its gradient, and which is None until
+    then: `retain_grad` would copy the gradient.
 
     Args:
-        means2d: px; with `absgrad`, `backward` sets its attribute of that name. [C, N, 2]
+        means2d: px; with `absgrad`, `backward` sets its attribute of that name, too. [C, N, 2]
         conics: In 1/px². [C, N, 3]
         colors: [C, N, 3]
         opacities: In [0, 1]. [C, N]
@@ -348,7 +353,10 @@ def rasterize_to_pixels(
     Returns:
         Colours [C, height, width, 3] and alphas [C, height, width, 1].
     """
+    means2d = means2d.contiguous()
+    if absgrad:
+        means2d.grad2d = None  # type: ignore[attr-defined]
     return _RasterizeToPixels.apply(  # type: ignore[return-value]
-        means2d.contiguous(), conics.contiguous(), colors.contiguous(), opacities.contiguous(),
+        means2d, conics.contiguous(), colors.contiguous(), opacities.contiguous(),
         width, height, isect_offsets, flatten_ids, absgrad,
     )  # fmt: skip

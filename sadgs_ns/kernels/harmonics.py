@@ -16,6 +16,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.visibility import drawn
 
 MAX_DEGREE = 3
@@ -241,7 +242,7 @@ class _Colors(torch.autograd.Function):
     ) -> Tensor:
         num_views, n = radii.shape[:2]
         colors = means.new_empty((num_views, n, 3))
-        grid = (triton.cdiv(n, _LANES), num_views)
+        grid = (cdiv(n, _LANES), num_views)
         _forward[grid](
             means, viewmats, first, rest, radii, colors, n, used, rest.shape[1] * 3, radii.dim() - 1, _LANES
         )  # fmt: skip
@@ -262,7 +263,7 @@ class _Colors(torch.autograd.Function):
         if v_colors.stride() != (n * row, row, 1):  # parts of rows, which compositing makes, are read where they lie
             v_colors, row = v_colors.contiguous(), 3
         for start in range(0, num_views, _VIEWS):
-            _backward[triton.cdiv(n, _BACKWARD_LANES),](
+            _backward[cdiv(n, _BACKWARD_LANES),](
                 means, viewmats, rest, radii, colors, v_colors, v_means, v_first, v_rest,
                 n, start, num_views, ctx.used, stride, row, radii.dim() - 1, _BACKWARD_LANES, _VIEWS,
             )  # fmt: skip

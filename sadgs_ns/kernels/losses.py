@@ -18,6 +18,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.limits import check_pixels
 
 _STRIP = 256
@@ -28,7 +29,17 @@ _LANES = 4096
 """Partial sums that are added at once."""
 
 
-@triton.jit(do_not_specialize=["n"])
+@triton.jit
+def _target(y, i, exists):
+    """Load numbers of the training views, which are floats or bytes in memory, as floats in [0, 1]."""
+    value = tl.load(y + i, exists, 0).to(tl.float32)
+    if y.dtype.element_ty == tl.uint8:
+        value = value * 0.00392156862745098  # As torch divides by 255 on CUDA.
+    return value
+
+
+# One view of several may begin at no multiple of 16 bytes: Triton would compile another kernel for that.
+@triton.jit(do_not_specialize=["n"], do_not_specialize_on_alignment=["y"])
 def _blur_along_rows(x, y, blurred, sums, n, GAUSSIAN: tl.constexpr, STRIP: tl.constexpr):
     """Blur x, y, x², y² and xy along the rows, and sum |x − y| and (x − y)² in parts.
 
@@ -40,7 +51,7 @@ def _blur_along_rows(x, y, blurred, sums, n, GAUSSIAN: tl.constexpr, STRIP: tl.c
     e_y, e_xx, e_yy, e_xy = e_x, e_x, e_x, e_x
     for k in tl.static_range(len(GAUSSIAN)):
         exists = i < n - 3 * k
-        a, b = tl.load(x + i + 3 * k, exists, 0.0), tl.load(y + i + 3 * k, exists, 0.0)
+        a, b = tl.load(x + i + 3 * k, exists, 0.0), _target(y, i + 3 * k, exists)
         wa, wb = GAUSSIAN[k] * a, GAUSSIAN[k] * b
         e_x, e_y, e_xx, e_yy, e_xy = e_x + wa, e_y + wb, e_xx + wa * a, e_yy + wb * b, e_xy + wa * b
     size = tl.cast(n, tl.int64)
@@ -49,14 +60,14 @@ def _blur_along_rows(x, y, blurred, sums, n, GAUSSIAN: tl.constexpr, STRIP: tl.c
     tl.store(blurred + 2 * size + i, e_xx, inside)
     tl.store(blurred + 3 * size + i, e_yy, inside)
     tl.store(blurred + 4 * size + i, e_xy, inside)
-    difference = tl.load(x + i, inside, 0.0) - tl.load(y + i, inside, 0.0)
+    difference = tl.load(x + i, inside, 0.0) - _target(y, i, inside)
     tl.store(sums + tl.program_id(0), tl.sum(tl.abs(difference)))
     tl.store(sums + tl.num_programs(0) + tl.program_id(0), tl.sum(difference * difference))
 
 
 @triton.jit
 def _blur_along_columns(x, i, row, begin, end, exists, GAUSSIAN: tl.constexpr, RUN: tl.constexpr):
-    """RUN blurred numbers below each other in the columns from i on, of which the rows from `begin` to `end` exist.
+    """Blur RUN numbers below each other in the columns from i on, of which the rows from `begin` to `end` exist.
 
     Each number is loaded once for all of them: with loads for each by itself the kernels took 255 registers, not 96.
     """
@@ -117,7 +128,7 @@ def _similarity(
 
 @triton.jit
 def _total(values, count, LANES: tl.constexpr):
-    """Sum of all values in an order that is always the same; each lane adds few, so that rounding stays a tree's."""
+    """Sum all values in an order that is always the same; each lane adds few, so that rounding stays a tree's."""
     sums = tl.zeros([LANES], tl.float32)
     for start in range(0, count, LANES):
         i = start + tl.arange(0, LANES)
@@ -125,15 +136,16 @@ def _total(values, count, LANES: tl.constexpr):
     return tl.sum(sums)
 
 
-@triton.jit(do_not_specialize=["n", "num_strips", "num_tiles"])
+@triton.jit(do_not_specialize=["n", "num_strips", "num_tiles", "num_parts"])
 def _finish(
-    differences, similarities, loss, psnr, n, num_strips, num_tiles, ssim_lambda, l1_weight, ssim_weight, l2_weight,
-    LANES: tl.constexpr,
+    differences, similarities, parts, loss, psnr, n, num_strips, num_tiles, num_parts,
+    ssim_lambda, l1_weight, ssim_weight, l2_weight, LANES: tl.constexpr,
 ):  # fmt: skip
-    """Compute the loss and PSNR from the partial sums, in one program."""
+    """Compute the loss and PSNR from the partial sums, in one program, and add the sum of `parts` to the loss."""
     absolute, square = _total(differences, num_strips, LANES), _total(differences + num_strips, num_strips, LANES)
     of_ssim = ssim_lambda - ssim_weight * _total(similarities, num_tiles, LANES)
-    tl.store(loss + tl.program_id(0), l1_weight * absolute + of_ssim + l2_weight * square)
+    photometric = l1_weight * absolute + of_ssim + l2_weight * square
+    tl.store(loss + tl.program_id(0), photometric + _total(parts, num_parts, LANES))
     mse = square / n
     decibels = -3.010299956639812 * tl.log2(tl.where(mse > 0, mse, 1.0))
     tl.store(psnr + tl.program_id(0), tl.where(mse > 0, decibels, tl.where(mse == 0, float("inf"), mse)))
@@ -141,7 +153,7 @@ def _finish(
 
 @triton.jit(do_not_specialize=["n"])
 def _spread_along_rows(slopes, spread, n, GAUSSIAN: tl.constexpr, STRIP: tl.constexpr):
-    """Adjoint of the blur along the rows, of three derivatives; before a row's start lie the zeros of another's end."""
+    """Apply the blur's adjoint along the rows to three derivatives; before a row lie the zeros of another's end."""
     i = tl.program_id(0) * STRIP + tl.arange(0, STRIP)
     size = tl.cast(n, tl.int64)
     by_x = tl.zeros([STRIP], tl.float32)
@@ -157,12 +169,12 @@ def _spread_along_rows(slopes, spread, n, GAUSSIAN: tl.constexpr, STRIP: tl.cons
     tl.store(spread + 2 * size + i, by_xy, i < n)
 
 
-@triton.jit(do_not_specialize=["n", "height", "row"])
+@triton.jit(do_not_specialize=["n", "height", "row"], do_not_specialize_on_alignment=["y"])
 def _gradient(
     x, y, spread, upstream, gradient, n, height, row, l1_weight, ssim_weight, l2_weight,
     GAUSSIAN: tl.constexpr, RUN: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
-    """Adjoint of the blur along the columns, and with it the gradient of the whole loss by x."""
+    """Apply the blur's adjoint along the columns, and compute with it the gradient of the whole loss by x."""
     c = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)
     first = tl.program_id(1) * RUN
     exists = c < row
@@ -175,7 +187,7 @@ def _gradient(
     by_xy = _blur_along_columns(spread + 2 * size, i - above * row, row, begin, end, exists, GAUSSIAN, RUN)
     for t in tl.static_range(RUN):
         inside = exists & (first + t < height)
-        a, b = tl.load(x + i + t * row, inside, 0.0), tl.load(y + i + t * row, inside, 0.0)
+        a, b = tl.load(x + i + t * row, inside, 0.0), _target(y, i + t * row, inside)
         sign = tl.where(a > b, 1.0, 0.0) - tl.where(a < b, 1.0, 0.0)
         of_ssim = by_x[t] + 2 * a * by_xx[t] + b * by_xy[t]
         total = l1_weight * sign + 2 * l2_weight * (a - b) - ssim_weight * of_ssim
@@ -185,24 +197,30 @@ def _gradient(
 class _PhotometricLoss(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, x: Tensor, y: Tensor, window: tuple[float, ...], ssim_lambda: float, l2_lambda: float
+        ctx: Any,
+        x: Tensor,  # [C, H, W, 3]
+        y: Tensor,  # [C, H, W, 3]
+        window: tuple[float, ...],
+        ssim_lambda: float,
+        l2_lambda: float,
+        parts: Tensor | None,  # [P]
     ) -> tuple[Tensor, Tensor]:
         views, height, width, _ = x.shape
         n, row = x.numel(), 3 * width
         blurred, slopes = x.new_empty((5, n)), x.new_empty((3, n))
-        strips = triton.cdiv(n, _STRIP)
-        tiles = (triton.cdiv(row, _COLUMNS), triton.cdiv(height, _RUN), views)
+        strips = cdiv(n, _STRIP)
+        tiles = (cdiv(row, _COLUMNS), cdiv(height, _RUN), views)
         differences, similarities = x.new_empty((2, strips)), x.new_empty(math.prod(tiles))
         _blur_along_rows[strips,](x, y, blurred, differences, n, window, _STRIP)
         _similarity[tiles](blurred, slopes, similarities, n, height, row, window, _RUN, _COLUMNS)
         ctx.save_for_backward(x, y, slopes)
-        ctx.window = window
+        ctx.window, ctx.num_parts = window, 0 if parts is None else len(parts)
         n_valid = 3 * views * (height - len(window) + 1) * (width - len(window) + 1)
         ctx.weights = (1 - ssim_lambda) / n, ssim_lambda / n_valid, l2_lambda / n
         loss, psnr = x.new_empty(()), x.new_empty(())
         _finish[1,](
-            differences, similarities, loss, psnr, n, strips, similarities.numel(), ssim_lambda, *ctx.weights, _LANES,
-            num_warps=8,
+            differences, similarities, differences if parts is None else parts, loss, psnr,
+            n, strips, similarities.numel(), ctx.num_parts, ssim_lambda, *ctx.weights, _LANES, num_warps=8,
         )  # fmt: skip
         ctx.mark_non_differentiable(psnr)
         ctx.set_materialize_grads(False)  # torch would fill PSNR's gradient with zeros on the device
@@ -210,30 +228,37 @@ class _PhotometricLoss(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, upstream: Tensor, _: Tensor) -> tuple[Tensor, None, None, None, None]:
+    def backward(ctx: Any, upstream: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         x, y, slopes = ctx.saved_tensors
         views, height, width, _ = x.shape
         n, row = x.numel(), 3 * width
         spread, gradient = torch.empty_like(slopes), torch.empty_like(x)
-        tiles = (triton.cdiv(row, _COLUMNS), triton.cdiv(height, _RUN), views)
-        _spread_along_rows[triton.cdiv(n, _STRIP),](slopes, spread, n, ctx.window, _STRIP)
+        tiles = (cdiv(row, _COLUMNS), cdiv(height, _RUN), views)
+        _spread_along_rows[cdiv(n, _STRIP),](slopes, spread, n, ctx.window, _STRIP)
         _gradient[tiles](
             x, y, spread, upstream, gradient, n, height, row, *ctx.weights, ctx.window, _RUN, _COLUMNS
         )  # fmt: skip
-        return gradient, None, None, None, None
+        return gradient, *[None] * 4, upstream.expand(ctx.num_parts) if ctx.num_parts else None
 
 
 def photometric_loss(
-    predicted: Tensor, target: Tensor, window: tuple[float, ...], *, ssim_lambda: float, l2_lambda: float
+    predicted: Tensor,
+    target: Tensor,
+    window: tuple[float, ...],
+    *,
+    ssim_lambda: float,
+    l2_lambda: float,
+    parts: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Do what `method.losses.photometric_loss` does, for views at least as large as SSIM's window.
 
     Args:
         predicted: Rendered views, float32. [C, H, W, 3]
-        target: Training views in [0, 1], float32. [C, H, W, 3]
+        target: Training views, float32 in [0, 1] or uint8. [C, H, W, 3]
         window: Weights of SSIM's window along one axis, symmetric.
         ssim_lambda: λ in [0, 1].
         l2_lambda: λ_2 ≥ 0.
+        parts: Numbers whose sum is added to the loss, contiguous float32. [P]
 
     Returns:
         The loss, and PSNR in dB without gradient; both scalars.
@@ -242,4 +267,6 @@ def photometric_loss(
         InputError: If the views have more pixels than the kernels can address (limits.py).
     """
     check_pixels(*predicted.shape[:3])
-    return _PhotometricLoss.apply(predicted.contiguous(), target.contiguous(), window, ssim_lambda, l2_lambda)  # type: ignore[return-value]
+    return _PhotometricLoss.apply(  # type: ignore[return-value]
+        predicted.contiguous(), target.contiguous(), window, ssim_lambda, l2_lambda, parts
+    )

@@ -9,6 +9,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from sadgs_ns.kernels import cdiv
+from sadgs_ns.kernels.visibility import drawn
+
 _LANES = 128
 """Gaussians that one program handles."""
 
@@ -65,10 +68,11 @@ def _add_axis(n_high, n_low, eta_max, at, high, low, most, changed):
     do_not_specialize_on_alignment=["structure_tensors", "Ks"],
 )
 def _observe(
-    means, quats, scales, drawn, means2d, conics, jitter, structure_tensors, viewmats, Ks,
+    means, quats, scales, radii, means2d, conics, jitter, structure_tensors, viewmats, Ks,
     n_high, n_low, eta_max, n_total, n, num_views, width, height,
     HIGH: tl.constexpr, LOW: tl.constexpr, BLUR: tl.constexpr, MARGIN: tl.constexpr, EPSILON: tl.constexpr,
-    HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, MASKED: tl.constexpr, LANES: tl.constexpr,
+    HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, MASKED: tl.constexpr, PER_GAUSSIAN: tl.constexpr,
+    LANES: tl.constexpr,
 ):  # fmt: skip
     """Observe LANES Gaussians in all views."""
     g = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
@@ -88,7 +92,7 @@ def _observe(
     most0, most1, most2, total = zero, zero, zero, zero
     for view in range(num_views):
         at = view * tl.cast(n, tl.int64) + g
-        seen = candidate & (tl.load(drawn + at, candidate, 0) != 0)
+        seen = drawn(radii, at, candidate, PER_GAUSSIAN)
         # The sample comes from the Cholesky factor of Σ2D, in float64: a long thin Gaussian's determinant cancels.
         a = tl.load(conics + 3 * at, seen, 1.0).to(tl.float64)
         b = tl.load(conics + 3 * at + 1, seen, 0.0).to(tl.float64)
@@ -166,7 +170,7 @@ def _observe(
 def observe_views(
     statistics: tuple[Tensor, Tensor, Tensor, Tensor],
     params: tuple[Tensor, Tensor, Tensor],
-    drawn: Tensor,
+    radii: Tensor,
     means2d: Tensor,
     conics: Tensor,
     jitter: Tensor,
@@ -183,7 +187,7 @@ def observe_views(
     Args:
         statistics: n_high, n_low, eta_max [N, 3] and n_total [N], float32, updated in place.
         params: means [N, 3], quats [N, 4] and log scales [N, 3], float32.
-        drawn: Which Gaussians the forward pass drew. bool [C, N]
+        radii: px, int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5; not positive where a Gaussian was not drawn.
         means2d: px. [C, N, 2]
         conics: 1/px². [C, N, 3]
         jitter: In [0, 1). [C, N, 2]
@@ -194,10 +198,10 @@ def observe_views(
         constants: gsplat's blur in px², its margin of the frustum, and ε of the wavelength in 1/px.
         code_range: HIGHEST_FREQUENCY, OCTAVES and MASKED of `method.codes`.
     """
-    inputs = (*params, drawn, means2d, conics, jitter, structure_tensors, viewmats, Ks)
-    num_views, n = drawn.shape
+    inputs = (*params, radii, means2d, conics, jitter, structure_tensors, viewmats, Ks)
+    num_views, n = radii.shape[:2]
     height, width = structure_tensors.shape[1:3]
-    _observe[triton.cdiv(n, _LANES),](
+    _observe[cdiv(n, _LANES),](
         *(value.contiguous() for value in inputs), *statistics, n, num_views, width, height,
-        *thresholds, *constants, *code_range, _LANES,
+        *thresholds, *constants, *code_range, radii.dim() - 1, _LANES,
     )  # fmt: skip

@@ -15,6 +15,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from sadgs_ns.kernels import cdiv
+
 _TILES = {2: (16, 64), 3: (2, 512)}
 """Rows and columns that a program handles, by the axis: tall where the neighbours are above and below."""
 _PIXELS = 1024
@@ -112,7 +114,7 @@ def correlate(image: Tensor, kernel: Tensor, axis: int) -> Tensor:
     batch, channels, height, width = image.shape
     result = torch.empty_like(image)
     rows, columns = _TILES[axis]
-    grid = (triton.cdiv(width, columns), triton.cdiv(height, rows), batch * channels)
+    grid = (cdiv(width, columns), cdiv(height, rows), batch * channels)
     _correlate[grid](image, kernel, result, height, width, len(kernel), axis == 2, rows, columns)
     return result
 
@@ -124,7 +126,7 @@ def differentiate(
     batch, channels, height, width = blurs[0].shape
     products, energy = (blurs[0].new_empty((batch, planes, height, width)) for planes in (3, 1))
     n = height * width
-    _differentiate[triton.cdiv(n, _PIXELS), batch](
+    _differentiate[cdiv(n, _PIXELS), batch](
         *blurs, *totals, weight, previous, products, energy,
         n, channels, n * (len(weight) > 1), _PIXELS,
     )  # fmt: skip
@@ -142,7 +144,7 @@ def aggregate(
 ) -> None:
     """Do what `_aggregate` of `method.structure_tensor` does, in float32."""
     n = tensor[0].shape[2] * tensor[0].shape[3]
-    _aggregate[triton.cdiv(n, _PIXELS), len(tensor[0])](
+    _aggregate[cdiv(n, _PIXELS), len(tensor[0])](
         *tensor, *energy, trace_floor, numerator, denominator,
         n, n * (len(tensor[1]) > 1), exponent, frequency, _TINY, _PIXELS,
     )  # fmt: skip

@@ -11,19 +11,20 @@ is drawn stays the same, bit for bit.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from functools import lru_cache
 
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
+from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.limits import check_pairs
 
 _LANES = 32
 """Gaussians that one program handles: one warp of them, so that a large Gaussian holds up only 31 others."""
+_ORDER_LANES = 512
+"""Pairs or tiles that one program handles where the lists are put in order."""
 
 
 @triton.jit
@@ -31,7 +32,7 @@ def _load_ellipse(
     means2d, radii, conics, opacities, g, exists, tile_width, tile_height,
     PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr,
 ):  # fmt: skip
-    """What decides which tiles the Gaussians with indices g in C · N reach.
+    """Load what decides which tiles the Gaussians with indices g in C · N reach.
 
     Returns:
         The centre x, y; the conic a, b, c; the level 2 ln(255 α) at which the ellipse ends; the conic's determinant;
@@ -71,7 +72,7 @@ def _load_ellipse(
 
 @triton.jit
 def _columns_of_row(row, x, y, a, b, c, level, determinant, proper, first_column, last_column, TILE: tl.constexpr):
-    """First and one past the last column of the tiles in a row that the ellipse meets."""
+    """Return the first, and one past the last, column of the tiles in a row that the ellipse meets."""
     low = row * TILE + 0.5 - y  # the row's first pixel centres, from the Gaussian's
     high = low + (TILE - 1)
     reach_x = tl.sqrt(level * c / determinant)
@@ -88,13 +89,23 @@ def _columns_of_row(row, x, y, a, b, c, level, determinant, proper, first_column
 
 @triton.jit(do_not_specialize=["n", "tile_width", "tile_height"])
 def _count(
-    means2d, radii, conics, opacities, counts, n, tile_width, tile_height,
-    PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr, LANES: tl.constexpr,
+    means2d, radii, conics, opacities, counts, n, tile_width, tile_height, half_width, half_height, reach_x, reach_y,
+    PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr, CULL: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
-    """Count the tiles that each Gaussian reaches in each view."""
+    """Count the tiles that each Gaussian reaches in each view.
+
+    With CULL the radii of Gaussians whose centre is out of reach of the image's centre, or NaN, become 0 first.
+    """
     g = tl.program_id(0) * LANES + tl.arange(0, LANES)
+    exists = g < n
+    if CULL:
+        x, y = tl.load(means2d + 2 * g, exists, 0.0), tl.load(means2d + 2 * g + 1, exists, 0.0)
+        near = (tl.abs(x - half_width) < reach_x) & (tl.abs(y - half_height) < reach_y)
+        for i in tl.static_range(PER_GAUSSIAN):
+            tl.store(radii + PER_GAUSSIAN * g + i, 0, exists & ~near)
+        exists = exists & near
     x, y, a, b, c, level, determinant, proper, first_column, last_column, first_row, last_row = _load_ellipse(
-        means2d, radii, conics, opacities, g, g < n, tile_width, tile_height, PER_GAUSSIAN, TILE
+        means2d, radii, conics, opacities, g, exists, tile_width, tile_height, PER_GAUSSIAN, TILE
     )
     count = tl.zeros([LANES], tl.int32)
     for i in range(tl.max(last_row - first_row)):
@@ -106,20 +117,32 @@ def _count(
     tl.store(counts + g, count, g < n)
 
 
-@triton.jit(do_not_specialize=["n", "num_gaussians", "tile_width", "tile_height"])
+@triton.jit(
+    do_not_specialize=["n", "num_gaussians", "num_pairs", "num_tiles", "tile_width", "tile_height", "rows_per_view"]
+)
 def _list(
-    means2d, radii, conics, opacities, order, ends, tiles, ids, n, num_gaussians, tile_width, tile_height,
+    means2d, radii, conics, opacities, order, ends, tiles, ids,
+    n, num_gaussians, num_pairs, num_tiles, tile_width, tile_height, rows_per_view,
     PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
-    """Write the tile and the Gaussian of each pair, the nearest Gaussians first."""
+    """Write the tile and the Gaussian of each pair, the nearest Gaussians first.
+
+    The rest of the `num_pairs` places is given to the last tile. If there are more pairs than places, this tile gets
+    all places, and all radii become 0: nothing is drawn, and nobody counts the views.
+    """
     lane = tl.program_id(0) * LANES + tl.arange(0, LANES)
     exists = lane < n
+    needed = tl.load(ends + n - 1)
+    fits = needed <= num_pairs
     g = tl.load(order + lane, exists, 0).to(tl.int32)
     at = tl.load(ends + lane - 1, exists & (lane > 0), 0)
     x, y, a, b, c, level, determinant, proper, first_column, last_column, first_row, last_row = _load_ellipse(
         means2d, radii, conics, opacities, g, exists, tile_width, tile_height, PER_GAUSSIAN, TILE
     )
-    view = g // num_gaussians * tile_height
+    for i in tl.static_range(PER_GAUSSIAN):
+        tl.store(radii + PER_GAUSSIAN * g + i, 0, exists & (needed > num_pairs))
+    last_row = tl.where(fits, last_row, first_row)
+    view = g // num_gaussians * rows_per_view
     for i in range(tl.max(last_row - first_row)):
         row = first_row + i
         first, last = _columns_of_row(
@@ -132,12 +155,57 @@ def _list(
             tl.store(tiles + at, (tile - 32768).to(tiles.dtype.element_ty), listed)
             tl.store(ids + at, g, listed)
             at += listed.to(at.dtype)
+    stride = tl.num_programs(0) * LANES
+    used = tl.where(fits, needed, 0)
+    for i in range(tl.cdiv(num_pairs - used, stride)):
+        unused = used + i * stride + lane
+        tl.store(tiles + unused, (num_tiles - 32769 + lane * 0).to(tiles.dtype.element_ty), unused < num_pairs)
+        tl.store(ids + unused, lane * 0, unused < num_pairs)
 
 
-@lru_cache(maxsize=8)
-def _tile_numbers(num_tiles: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Numbers of all tiles in ascending order, which begin at −2^15. [num_tiles]"""
-    return torch.arange(-(2**15), num_tiles - 2**15, dtype=dtype, device=device)
+@triton.jit(do_not_specialize=["num_pairs", "num_tiles", "of_pairs", "halvings"])
+def _order(tiles, by_tile, ids, ordered, starts, num_pairs, num_tiles, of_pairs, halvings, LANES: tl.constexpr):
+    """Bring the Gaussians of the pairs into the order of the tiles, and find where each tile's list starts.
+
+    The first `of_pairs` programs handle LANES pairs each, and the others LANES tiles, whose starts they find by
+    bisection.
+    """
+    program, lane = tl.program_id(0), tl.arange(0, LANES)
+    if program < of_pairs:
+        at = program.to(tl.int64) * LANES + lane
+        exists = at < num_pairs
+        tl.store(ordered + at, tl.load(ids + tl.load(by_tile + at, exists, 0), exists, 0), exists)
+    else:
+        tile = (program - of_pairs) * LANES + lane
+        low = tile.to(tl.int64) * 0
+        high = low + num_pairs
+        for _ in range(halvings):
+            middle = (low + high) // 2
+            searching = low < high
+            before = tl.load(tiles + middle, searching, 0).to(tl.int32) < tile - 32768
+            low = tl.where(searching & before, middle + 1, low)
+            high = tl.where(searching & ~before, middle, high)
+        tl.store(starts + tile, low.to(tl.int32), tile < num_tiles)
+
+
+@dataclass(frozen=True)
+class PairCounts:
+    """How many pairs of a Gaussian and a tile each view of a call has, on their way to the host."""
+
+    counts: Tensor
+    """They are in the host's memory once `arrived` has happened. int64 [C]"""
+    arrived: torch.cuda.Event | None
+    """None where the host need not wait."""
+
+    def ready(self) -> bool:
+        """Tell whether they have arrived, without waiting."""
+        return self.arrived is None or self.arrived.query()
+
+    def wait(self) -> list[int]:
+        """Wait until they have arrived, and return them."""
+        if self.arrived is not None:
+            self.arrived.synchronize()
+        return self.counts.tolist()
 
 
 @dataclass(frozen=True)
@@ -150,42 +218,56 @@ class PendingTiles:
     """Indices in C · N of the Gaussians of all views, from front to back. int64 [C * N]"""
     ends: Tensor
     """Where the pairs of each Gaussian end, in this order. int64 [C * N]"""
-    num_pairs: Tensor
-    """The last of `ends`, which is in the host's memory once `arrived` has happened. int64 [1]"""
-    arrived: torch.cuda.Event | None
-    """None where the host need not wait."""
+    pair_counts: PairCounts
+    """Their number in each view, whose sum is the last of `ends`."""
     tile_size: int
     """px."""
     tile_counts: tuple[int, int, int]
     """Numbers of views, and of rows and columns of tiles in each."""
 
     @torch.no_grad()
-    def lists(self) -> tuple[Tensor, Tensor]:
-        """Wait for the length and make the lists.
+    def lists(self, capacity: int | None = None) -> tuple[Tensor, Tensor]:
+        """Make the lists, in the length that they need or in a given one.
+
+        Lists of a given length have one more row of tiles in each view, which lies below the image. The last tile of
+        that row in the last view is given the places that are left, so that nobody draws them. If there are more pairs
+        than places, it is given all of them, and the radii that the lists were made of are set to 0: then nothing is
+        drawn, no gradient flows and no statistic counts the views. All of this is decided on the device.
+
+        Args:
+            capacity: Length of the lists, in [1, 2³¹), for which the host does not wait. With None it waits for the
+                exact length.
 
         Returns:
-            Where each tile's list starts, int32 [C, tile rows, tile columns]; and the indices in C · N that the lists
-            hold, from front to back, int32 [number of pairs].
+            Where each tile's list starts, int32 [C, tile rows (+ 1), tile columns]; and the indices in C · N that the
+            lists hold, from front to back, int32 [number of pairs, or `capacity`].
 
         Raises:
             InputError: If there are more pairs than 32 bits number.
         """
-        if self.arrived is not None:
-            self.arrived.synchronize()
-        num_pairs = int(self.num_pairs)
+        views, rows, columns = self.tile_counts
+        if capacity is None:
+            num_pairs, rows_per_view = sum(self.pair_counts.wait()), rows
+        else:
+            num_pairs, rows_per_view = capacity, rows + 1
         check_pairs(num_pairs)
-        num_tiles, device = math.prod(self.tile_counts), self.ends.device
+        num_tiles, device = views * rows_per_view * columns, self.ends.device
         # Tiles are numbered from −2^15, so that 16 bits tell 65,536 of them apart.
         tiles = torch.empty(num_pairs, dtype=torch.int16 if num_tiles <= 2**16 else torch.int32, device=device)
         ids = torch.empty(num_pairs, dtype=torch.int32, device=device)
         n = len(self.order)
-        _list[triton.cdiv(n, _LANES),](
-            *self.ellipses, self.order, self.ends, tiles, ids, n, n // self.tile_counts[0],
-            self.tile_counts[2], self.tile_counts[1], self.ellipses[1].dim() - 1, self.tile_size, _LANES, num_warps=1,
+        _list[cdiv(n, _LANES),](
+            *self.ellipses, self.order, self.ends, tiles, ids,
+            n, n // views, num_pairs, num_tiles, columns, rows, rows_per_view,
+            self.ellipses[1].dim() - 1, self.tile_size, _LANES, num_warps=1,
         )  # fmt: skip
         tiles, by_tile = tiles.sort(stable=True)
-        starts = torch.searchsorted(tiles, _tile_numbers(num_tiles, tiles.dtype, device), out_int32=True)
-        return starts.reshape(self.tile_counts), ids[by_tile]
+        starts, ordered = ids.new_empty((views, rows_per_view, columns)), torch.empty_like(ids)
+        of_pairs = cdiv(num_pairs, _ORDER_LANES)
+        _order[of_pairs + cdiv(num_tiles, _ORDER_LANES),](
+            tiles, by_tile, ids, ordered, starts, num_pairs, num_tiles, of_pairs, num_pairs.bit_length(), _ORDER_LANES
+        )
+        return starts, ordered
 
 
 @torch.no_grad()
@@ -198,38 +280,47 @@ def intersect_tiles(
     width: int,
     height: int,
     tile_size: int,
+    max_off_axis: float = 0.0,
 ) -> PendingTiles:
     """Begin to list the Gaussians of each tile; in place of gsplat's `isect_tiles` and `isect_offset_encode`.
 
     Args:
         means2d: px. [C, N, 2]
-        radii: px, int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5; not positive where a Gaussian was culled.
+        radii: px, int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5; not positive where a Gaussian was culled. They should
+            be contiguous: they are set to 0 where a Gaussian is culled here, and by `lists` where its capacity is too
+            small, which would happen to a copy of others.
         depths: Along the viewing axis. [C, N]
         conics: (a, b, c) of the inverse of the blurred Σ2D, in 1/px². [C, N, 3]
         opacities: In [0, 1]. [C, N]
         width: Of the image in px.
         height: Of the image in px.
         tile_size: Side of a tile in px, a power of two.
+        max_off_axis: Gaussians whose centre is further from the image's centre, in halves of its width and height along
+            x and y, are culled, as `render.off_axis.cull_off_axis` does; 0 culls none.
 
     Returns:
         An object that makes the lists when it is asked for them; by then the host should have given the device work.
     """
     num_views, num_gaussians = means2d.shape[:2]
-    tile_width, tile_height = triton.cdiv(width, tile_size), triton.cdiv(height, tile_size)
+    tile_width, tile_height = cdiv(width, tile_size), cdiv(height, tile_size)
     ellipses = [value.contiguous() for value in (means2d, radii, conics, opacities)]
     n, device = num_views * num_gaussians, means2d.device
     counts = torch.empty(n, dtype=torch.int64, device=device)  # cumsum would convert others
-    _count[triton.cdiv(n, _LANES),](
-        *ellipses, counts, n, tile_width, tile_height, radii.dim() - 1, tile_size, _LANES, num_warps=1
+    _count[cdiv(n, _LANES),](
+        *ellipses, counts, n, tile_width, tile_height,
+        width / 2, height / 2, max_off_axis * width / 2, max_off_axis * height / 2,
+        radii.dim() - 1, tile_size, max_off_axis > 0, _LANES, num_warps=1,
     )  # fmt: skip
     # The Gaussians are sorted by depth, and then their pairs by tile: in 16 bits up to 4.2 megapixels of all views (in
     # tiles of 8 px), in 32 beyond. That moves a fraction of the bytes of one sort of the pairs by both in 64 bits. Both
     # sorts are stable, as gsplat's is.
     order = depths.flatten().argsort(stable=True)
     ends = counts[order].cumsum(0)
-    num_pairs, arrived = ends[-1:], None
+    per_view = ends[-1:] if num_views == 1 else counts.view(num_views, -1).sum(1)
+    arrived = None
     if device.type == "cuda":
-        num_pairs = torch.empty(1, dtype=ends.dtype, pin_memory=True).copy_(ends[-1:], non_blocking=True)
+        per_view = torch.empty(num_views, dtype=torch.int64, pin_memory=True).copy_(per_view, non_blocking=True)
         arrived = torch.cuda.Event()
         arrived.record()
-    return PendingTiles(ellipses, order, ends, num_pairs, arrived, tile_size, (num_views, tile_height, tile_width))
+    tile_counts = num_views, tile_height, tile_width
+    return PendingTiles(ellipses, order, ends, PairCounts(per_view, arrived), tile_size, tile_counts)

@@ -25,6 +25,18 @@ def empty_gradients(num_gaussians: int, device: torch.device) -> dict[str, Tenso
     return {"grad2d": zeros, "absgrad2d": zeros.clone(), "grad_count": zeros.clone()}
 
 
+def keep_gradient(means2d: Tensor) -> None:
+    """Have the backward pass keep the gradient of projected centres for `accumulate_gradients`.
+
+    Our compositing keeps it by itself, without the copy that torch makes.
+
+    Args:
+        means2d: Of gsplat's meta, from a call with `absgrad`. [C, N, 2]
+    """
+    if not hasattr(means2d, "grad2d"):
+        means2d.retain_grad()
+
+
 @torch.no_grad()
 def accumulate_gradients(
     gradients: MutableMapping[str, Tensor], info: Mapping[str, Any], num_views: int, *, fused: bool = True
@@ -36,22 +48,26 @@ def accumulate_gradients(
 
     Args:
         gradients: As made by `empty_gradients`.
-        info: gsplat's meta, unpacked, whose `means2d` [C, N, 2] kept its `.grad` and `.absgrad`.
+        info: gsplat's meta, unpacked, whose `means2d` [C, N, 2] kept its `absgrad`, and its gradient as `keep_gradient`
+            made it or in `grad`.
         num_views: Views that the loss is a mean of.
         fused: Use the Triton kernel where it runs: CUDA, float32.
     """
     means2d = info["means2d"]
+    gradient = getattr(means2d, "grad2d", None)
+    if gradient is None:
+        gradient = means2d.grad
     # Python numbers: a tensor made of them here would make the host wait for its copy to the device.
     scale_x, scale_y = info["width"] / 2.0 * num_views, info["height"] / 2.0 * num_views
     if fused and means2d.dtype == torch.float32 and kernels.available(means2d.device):
         from sadgs_ns.kernels import absgs as kernel
 
         sums = gradients["grad2d"], gradients["absgrad2d"], gradients["grad_count"]
-        kernel.accumulate_gradients(sums, info["radii"], means2d.grad, means2d.absgrad, (scale_x, scale_y))
+        kernel.accumulate_gradients(sums, info["radii"], gradient, means2d.absgrad, (scale_x, scale_y))
         return
     seen = visible(info)  # [C, N]
-    for key, gradient in (("grad2d", means2d.grad), ("absgrad2d", means2d.absgrad)):
-        norm = torch.hypot(gradient[..., 0] * scale_x, gradient[..., 1] * scale_y)  # [C, N]
+    for key, value in (("grad2d", gradient), ("absgrad2d", means2d.absgrad)):
+        norm = torch.hypot(value[..., 0] * scale_x, value[..., 1] * scale_y)  # [C, N]
         gradients[key] += torch.where(seen, norm, 0.0).nansum(0)
     gradients["grad_count"] += seen.sum(0)
 

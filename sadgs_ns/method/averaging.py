@@ -37,8 +37,8 @@ class RunningMean:
         if self.count == 1:
             self.means = {name: parameter.detach().clone() for name, parameter in params.items()}
             return
-        for name, mean in self.means.items():
-            mean.lerp_(params[name], 1 / self.count)
+        # One launch for all parameters; each of their means is computed as lerp_ does it.
+        torch._foreach_lerp_(list(self.means.values()), [params[name] for name in self.means], 1 / self.count)  # type: ignore[attr-defined]
 
     @torch.no_grad()
     def move_to(self, params: Params) -> None:

@@ -22,7 +22,13 @@ def _window(device: torch.device, dtype: torch.dtype) -> Tensor:
 
 
 def photometric_loss(
-    predicted: Tensor, target: Tensor, *, ssim_lambda: float = 0.2, l2_lambda: float = 2.0, fused: bool = True
+    predicted: Tensor,  # [C, H, W, 3]
+    target: Tensor,  # [C, H, W, 3]
+    *,
+    ssim_lambda: float = 0.2,
+    l2_lambda: float = 2.0,
+    parts: Tensor | None = None,  # [P]
+    fused: bool = True,
 ) -> tuple[Tensor, Tensor]:
     """(1 − λ) L1 + λ (1 − SSIM) + λ_2 ℓ2, each a mean over views, pixels and channels.
 
@@ -30,9 +36,11 @@ def photometric_loss(
 
     Args:
         predicted: Rendered views, not clamped, so that gradients reach colours outside [0, 1]. [C, H, W, 3]
-        target: Training views in [0, 1]. [C, H, W, 3]
+        target: Training views, floats in [0, 1] or uint8. [C, H, W, 3]
         ssim_lambda: λ in [0, 1].
         l2_lambda: λ_2 ≥ 0.
+        parts: Numbers whose sum is added to the loss, such as a penalty from `render.activations.activate`, which takes
+            the Triton kernels no launch more. [P]
         fused: Use the Triton kernels where they run (CUDA) and apply (float32, views of at least 11×11 px).
 
     Returns:
@@ -42,11 +50,16 @@ def photometric_loss(
         ValueError: From pytorch_msssim, if views are one pixel high or wide.
         InputError: If the views have more pixels than the Triton kernels can address (kernels/limits.py).
     """
-    suits = predicted.dtype == target.dtype == torch.float32 and min(predicted.shape[1:3]) >= len(WINDOW)
+    suits = predicted.dtype == torch.float32 and target.dtype in (torch.float32, torch.uint8)
+    suits = suits and min(predicted.shape[1:3]) >= len(WINDOW)
     if fused and suits and kernels.available(predicted.device):
         from sadgs_ns.kernels.losses import photometric_loss as fused_photometric_loss
 
-        return fused_photometric_loss(predicted, target, WINDOW, ssim_lambda=ssim_lambda, l2_lambda=l2_lambda)
+        return fused_photometric_loss(
+            predicted, target, WINDOW, ssim_lambda=ssim_lambda, l2_lambda=l2_lambda, parts=parts
+        )
+    if target.dtype == torch.uint8:
+        target = target / 255.0
     difference = predicted - target
     l1, l2 = difference.abs().mean(), difference.square().mean()
     # The copies are contiguous: with channels-last strides cuDNN convolves at a third of the speed, above all backward.
@@ -56,4 +69,5 @@ def photometric_loss(
         data_range=1.0,
         win=_window(predicted.device, predicted.dtype),
     )
-    return (1 - ssim_lambda) * l1 + ssim_lambda * (1 - similarity) + l2_lambda * l2, -10 * l2.detach().log10()
+    loss = (1 - ssim_lambda) * l1 + ssim_lambda * (1 - similarity) + l2_lambda * l2
+    return loss if parts is None else loss + parts.sum(), -10 * l2.detach().log10()

@@ -65,7 +65,8 @@ class StepSize:
     pixels: int = 0
     """Number of pixels of all views."""
     pairs: float = 0
-    """Number of pairs of a Gaussian and a tile that it reaches, in all views."""
+    """Number of pairs of a Gaussian and a tile that it reaches, in all views, with the places of tile lists that a step
+    left unused because their length was foreseen (render/tile_forecast.py)."""
 
     @classmethod
     def of(cls, infos: Sequence[Mapping[str, Any]]) -> StepSize:

@@ -65,16 +65,16 @@ def observe(
         generator: Source of the jitter.
         fused: Use the Triton kernel where it runs: CUDA, float32.
     """
-    seen = visible(info)  # [C, N]
-    jitter = torch.rand((*seen.shape, 2), generator=generator, device=seen.device)  # [C, N, 2]
-    if fused and kernels.available(seen.device) and params["means"].dtype == torch.float32:
+    means2d = info["means2d"]
+    jitter = torch.rand(means2d.shape, generator=generator, device=means2d.device)  # [C, N, 2]
+    if fused and kernels.available(means2d.device) and params["means"].dtype == torch.float32:
         from sadgs_ns.kernels.statistics import observe_views
 
         observe_views(
             (statistics["n_high"], statistics["n_low"], statistics["eta_max"], statistics["n_total"]),
             (params["means"], params["quats"], params["scales"]),
-            seen,
-            info["means2d"],
+            info["radii"],
+            means2d,
             info["conics"],
             jitter,
             info["structure_tensors"],
@@ -85,6 +85,7 @@ def observe(
             code_range=(HIGHEST_FREQUENCY, OCTAVES, MASKED),
         )
         return
+    seen = visible(info)  # [C, N]
     num_cameras, num_gaussians = seen.shape
     scales = torch.exp(params["scales"])
     # Every Gaussian is measured and the unseen are masked out: selecting them first would make the host wait.

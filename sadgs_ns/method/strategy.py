@@ -14,7 +14,7 @@ from gsplat.strategy.ops import remove
 from torch import Tensor
 
 from sadgs_ns.gsplat_internals import update_param_with_optimizer
-from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow
+from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow, keep_gradient
 from sadgs_ns.method.memory import StepSize, affordable_growth, free_bytes
 from sadgs_ns.method.schedule import Windows, windows
 from sadgs_ns.method.split import Params, children_per_axis, grid_split, limit_growth, num_children
@@ -195,7 +195,7 @@ class StructureAwareStrategy(Strategy):
         self._ensure_statistics(params, state)
         for view in _views(info):
             if self.needs_absgrad(step):
-                view["means2d"].retain_grad()
+                keep_gradient(view["means2d"])
             if self.observes(step):
                 observe(state, params, view, fused=self.fused)
 

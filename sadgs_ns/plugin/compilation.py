@@ -19,6 +19,7 @@ from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
 from sadgs_ns.plugin.optimizers import FusedAdam, step_together
+from sadgs_ns.render.activations import activate
 from sadgs_ns.render.rasterization import rasterize
 
 if TYPE_CHECKING:
@@ -60,10 +61,14 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
     cameras = pipeline.datamanager.train_dataset.cameras
 
     def tile_lists() -> None:
-        # The size is the run's: whether tiles are numbered in 16 or in 32 bits depends on how many there are.
-        rasterize(
-            means, quats, scales, opacities, means, viewmats, Ks, int(cameras.width.max()), int(cameras.height.max())
-        )
+        # The size is the run's: whether tiles are numbered in 16 or in 32 bits depends on how many there are, and lists
+        # of a given length have one more row of them.
+        size = int(cameras.width.max()), int(cameras.height.max())
+        for capacity in (None, 2**20):
+            rasterize(
+                means, quats, scales, opacities, means, viewmats, Ks, *size,
+                tile_capacity=capacity, max_off_axis=config.max_off_axis,
+            )  # fmt: skip
 
     def blank(name: str) -> Tensor:
         return means.new_zeros((n, *model.gauss_params[name].shape[1:]))
@@ -71,9 +76,9 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
     def structure() -> None:
         encode(pipeline.structure_maps.of_images(image))
 
-    def loss() -> None:
+    def loss(dtype: torch.dtype) -> None:  # Images are bytes; behind a mask or with transparency they become floats.
         predicted = image.repeat(views, 1, 1, 1).requires_grad_()
-        photometric_loss(predicted, torch.zeros_like(predicted))[0].backward()
+        photometric_loss(predicted, torch.zeros_like(predicted, dtype=dtype))[0].backward()
 
     def update() -> None:
         log, twins = NonFiniteLog(device, capacity=1), []
@@ -88,20 +93,34 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
     def composite(absgrad: bool) -> None:
         centres = means.clone().requires_grad_()
         renders, alphas, info = rasterize(
-            centres, quats, scales, opacities, means, *camera, absgrad=absgrad, rasterize_mode=config.rasterize_mode
+            centres, quats, scales, opacities, means, *camera, absgrad=absgrad, **model.drawing
         )  # fmt: skip
-        info["means2d"].retain_grad()
-        (renders.sum() if config.background_color == "black" else renders.sum() + alphas.sum()).backward()
+        result = renders.sum() if config.background_color == "black" else renders.sum() + alphas.sum()
+        # The projection is differentiated elsewhere.
+        (info["means2d"].grad2d,) = torch.autograd.grad(result, info["means2d"])
         if absgrad:
             accumulate_gradients(empty_gradients(n, device), info, views, fused=strategy.fused)
 
-    def harmonics() -> None:
-        from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
+    def activations() -> None:
+        for weight in (0.0, 1.0):  # The loss has a part with the mean opacity, but not to the end.
+            parameters = scales.clone().requires_grad_(), opacities[:, None].clone().requires_grad_()
+            some = activate(*parameters, weight, fused=True)
+            torch.autograd.backward([value.sum() for value in some if value is not None])
 
+    def projection() -> None:
+        from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
+        from sadgs_ns.kernels.projection import project
+
+        antialiased = config.rasterize_mode == "antialiased"
+        centres, rotations, sizes = (value.clone().requires_grad_() for value in (means, quats, scales))
+        radii, means2d, _, conics, compensations, centres = project(
+            centres, rotations, sizes, opacities, *camera, antialiased
+        )
+        results = [means2d, conics] if compensations is None else [means2d, conics, compensations]
         if 0 < config.sh_degree <= MAX_DEGREE:
             coefficients = blank("features_dc"), blank("features_rest")
-            centres = means.clone().requires_grad_()
-            colors_from_harmonics(config.sh_degree, centres, *coefficients, viewmats, info["radii"]).sum().backward()
+            results.append(colors_from_harmonics(config.sh_degree, centres, *coefficients, viewmats, radii))
+        torch.autograd.backward([value.sum() for value in results])
 
     def observation() -> None:
         params = {"means": means, "quats": quats, "scales": scales.log()}
@@ -116,14 +135,20 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
     failures: dict[str, BaseException] = {}
     pending: dict[str, Future[None]] = {}
     with ThreadPoolExecutor() as pool:  # which waits for its threads, whatever happens
-        pending |= {"the loss": pool.submit(loss), "S̄": pool.submit(structure), "Adam": pool.submit(update)}
+        pending |= {
+            "the loss": pool.submit(loss, torch.uint8),
+            "S̄": pool.submit(structure),
+            "Adam": pool.submit(update),
+            "the loss of masked images": pool.submit(loss, torch.float32),
+            "activations": pool.submit(activations),
+        }
         try:  # the other stages read this projection
             _, _, info = rasterize(means, quats, scales, opacities, means, *camera, max_off_axis=config.max_off_axis)
         except Exception as error:
             failures["rasterization"] = error
         else:
             pending |= {
-                "spherical harmonics": pool.submit(harmonics),
+                "projection and spherical harmonics": pool.submit(projection),
                 "η": pool.submit(observation),
                 "tile lists": pool.submit(tile_lists),
                 "compositing with AbsGS": pool.submit(composite, True),

@@ -32,7 +32,9 @@ from sadgs_ns.method.initialization import POINT_OPACITY, camera_extent, plausib
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.outliers import POINT_SHARE, REACH
+from sadgs_ns.render.activations import activate
 from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world
+from sadgs_ns.render.tile_forecast import TileForecast
 
 CAMERA_CLEARANCE = 2.0
 """Initial Gaussians nearer to a camera than this many of their standard deviations are dropped. The paper keeps them;
@@ -175,6 +177,8 @@ class SadgsModel(SplatfactoModel):
         self.average = RunningMean()
         self.camera_positions: Tensor | None = None  # [C, 3]
         self.infos: list[dict[str, Any]] = []
+        # A bilateral grid would learn to brighten what a step without enough places in its tile lists leaves black.
+        self.tile_forecast = None if config.use_bilateral_grid else TileForecast()
         self.crop_box: OrientedBox | None = None
         self.viewer_outputs: Callable[[Cameras, dict[str, Tensor]], dict[str, Tensor]] | None = None
         # A random background is for training; viewers show viser's own instead.
@@ -308,6 +312,8 @@ class SadgsModel(SplatfactoModel):
         height: int,
         render_mode: Literal["RGB", "RGB+ED"],
         absgrad: bool = False,
+        tile_capacity: int | None = None,
+        opacity_reg: float = 0.0,
     ) -> tuple[Tensor, Tensor, dict[str, Any]]:
         """Rasterize the Gaussians; in the viewer, those inside its crop box.
 
@@ -318,9 +324,12 @@ class SadgsModel(SplatfactoModel):
             height: px.
             render_mode: "RGB+ED" adds the expected depth as a fourth channel.
             absgrad: Whether the backward pass also sums absolute screen gradients, for AbsGS.
+            tile_capacity: Places in the tile lists of our kernels, as in `rasterize`; None waits for the exact number.
+            opacity_reg: Factor on the mean opacity.
 
         Returns:
-            Colours, not clamped, and depth [C, H, W, 3 or 4]; accumulated opacity [C, H, W, 1]; gsplat's meta.
+            Colours, not clamped, and depth [C, H, W, 3 or 4]; accumulated opacity [C, H, W, 1]; gsplat's meta, and in
+            it `opacity_reg`, numbers [P] whose sum is the mean opacity times this factor, or None where it is 0.
         """
         params = self.cropped(dict(self.gauss_params.items()))
         if self.config.sh_degree > 0:
@@ -329,11 +338,13 @@ class SadgsModel(SplatfactoModel):
             sh_degree = min(self.step, self.config.sh_degree)
         else:
             colors, sh_degree = torch.sigmoid(params["features_dc"]), None  # [N, 3]
-        return rasterize(
+        fused = self.config.fused
+        scales, opacities, penalty = activate(params["scales"], params["opacities"], opacity_reg, fused=fused)
+        render, alpha, info = rasterize(
             params["means"],
             params["quats"],
-            torch.exp(params["scales"]),
-            torch.sigmoid(params["opacities"]).squeeze(-1),
+            scales,
+            opacities,
             colors,
             viewmats,
             Ks,
@@ -342,9 +353,11 @@ class SadgsModel(SplatfactoModel):
             sh_degree=sh_degree,
             render_mode=render_mode,
             absgrad=absgrad,
-            fused=self.config.fused,
+            fused=fused,
+            tile_capacity=tile_capacity,
             **self.drawing,
         )
+        return render, alpha, info | {"opacity_reg": penalty}
 
     def get_training_outputs(
         self,
@@ -357,6 +370,9 @@ class SadgsModel(SplatfactoModel):
     ) -> dict[str, Tensor]:
         """Render training views of one size and let the strategy see the forward pass.
 
+        With our kernels the host does not wait for the length of the tile lists, but foresees it. Where that was too
+        short nothing is drawn, no gradient flows and the strategy counts nothing; `tile_forecast` then names the views.
+
         Args:
             viewmats: World to camera. [C, 4, 4]
             Ks: Intrinsics in px. [C, 3, 3]
@@ -366,11 +382,20 @@ class SadgsModel(SplatfactoModel):
             structure_tensors: S̄ of the views, or codes of it, [C, H, W, 3]; None where η is not observed.
 
         Returns:
-            `rgb` [C, H, W, 3], not clamped, and `background` [3].
+            `rgb` [C, H, W, 3], not clamped, and `background` [3]; while densification runs, and where the loss has that
+            part, `opacity_reg`, numbers [P] whose sum is that part.
         """
         absgrad = self.strategy.needs_absgrad(self.step)
-        render, alpha, info = self.render(viewmats, Ks, width, height, "RGB", absgrad)
-        if self.step < self.strategy.windows.refine_stop_iter:
+        forecast, capacity = self.tile_forecast, None
+        if forecast is not None:
+            capacity = forecast.capacity(cam_indices, (width, height), self.num_points)
+        densifies = self.step < self.strategy.windows.refine_stop_iter
+        opacity_reg = self.config.opacity_reg if densifies else 0.0
+        render, alpha, info = self.render(viewmats, Ks, width, height, "RGB", absgrad, capacity, opacity_reg)
+        if forecast is not None and "pair_counts" in info:  # Only our kernels count pairs.
+            forecast.rendered(cam_indices, (width, height), capacity, info["pair_counts"])
+        penalty = info.pop("opacity_reg")
+        if densifies:
             info |= {"viewmats": viewmats.detach(), "Ks": Ks, "structure_tensors": structure_tensors}
             self.strategy.step_pre_backward(self.gauss_params, self.optimizers, self.strategy_state, self.step, info)
             self.infos.append(info)
@@ -383,7 +408,8 @@ class SadgsModel(SplatfactoModel):
                     for view, i in zip(rgb, cam_indices, strict=True)
                 ]
             )
-        return {"rgb": rgb, "background": background}
+        outputs = {"rgb": rgb, "background": background}
+        return outputs if penalty is None else outputs | {"opacity_reg": penalty}
 
     def get_outputs(self, camera: Cameras) -> dict[str, Any]:
         """Render one camera for the viewer, evaluation and rendering.
@@ -472,14 +498,17 @@ class SadgsModel(SplatfactoModel):
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: Mapping[str, Any], metrics_dict: Mapping[str, Any] | None = None
     ) -> dict[str, Tensor]:
-        """Return the photometric loss of views of one size, and the regularizers that are on.
+        """Return the loss of views of one size: the photometric one with the mean opacity's, and other regularizers.
 
         Args:
-            outputs: `rgb` [C, H, W, 3] or [H, W, 3], and `background`. In training, PSNR is added as `psnr`.
+            outputs: `rgb` [C, H, W, 3] or [H, W, 3], `background`, and in training `opacity_reg` where that is a part
+                of the loss: it is added to `main_loss`, for which the kernels need no launch more. In training, PSNR is
+                added as `psnr`.
             batch: `image` of the same leading shape and, optionally, a boolean `mask` [..., H, W, 1].
         """
-        target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
-        predicted = outputs["rgb"]
+        target, predicted = batch["image"].to(self.device), outputs["rgb"]
+        if "mask" in batch or target.shape[-1] == 4:  # Otherwise the loss reads bytes as they are.
+            target = self.composite_with_background(self.get_gt_img(target), outputs["background"])
         if "mask" in batch:
             mask = batch["mask"].to(self.device)
             target, predicted = target * mask, predicted * mask
@@ -488,13 +517,12 @@ class SadgsModel(SplatfactoModel):
             predicted.reshape(-1, height, width, 3),
             target.reshape(-1, height, width, 3),
             ssim_lambda=self.config.ssim_lambda,
+            parts=outputs.get("opacity_reg") if self.training else None,
             fused=self.config.fused,
         )
         losses = {"main_loss": loss}
         if self.training:
             outputs["psnr"] = psnr
-            if self.config.opacity_reg > 0 and self.step < self.strategy.windows.refine_stop_iter:
-                losses["opacity_reg"] = self.config.opacity_reg * torch.sigmoid(self.opacities).mean()
             self.camera_optimizer.get_loss_dict(losses)
             if self.config.use_bilateral_grid:
                 losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)

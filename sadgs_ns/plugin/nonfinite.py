@@ -21,6 +21,7 @@ class NonFiniteLog:
     """A log of the losses, and of gradients that were left out, in the training steps since it was last read.
 
     Attributes:
+        capacity: Number of steps that the log holds.
         steps: Number of all steps that have been read.
         streak: Number of the latest of these in a row in which something was not finite.
 
@@ -30,28 +31,28 @@ class NonFiniteLog:
     """
 
     def __init__(self, device: torch.device | str, capacity: int = 100) -> None:
-        self._losses = torch.zeros(capacity, device=device)
+        self._losses: list[Tensor] = []  # They are scalars, which stay where they are until the log is read.
         # The first column is NaN where a gradient was left out. Rows have 16 bytes, because Triton would compile Adam
         # anew for rows that are less aligned.
         self._gradients = torch.zeros((capacity, 4), device=device)
         self._slots = self._gradients[:, :1].unbind()  # They are made once, because slicing takes the host long.
         self._steps: list[tuple[int, list[int]]] = []
-        self.steps = self.streak = 0
+        self.capacity, self.steps, self.streak = capacity, 0, 0
 
     @property
     def full(self) -> bool:
         """Whether the log must be read before it can hold another step."""
-        return len(self._steps) == len(self._losses)
+        return len(self._steps) >= self.capacity
 
     def begin_step(self, step: int, views: list[int], loss: Tensor) -> None:
-        """Note a step's loss, which takes one small copy on the device.
+        """Note a step's loss, which takes the device no work.
 
         Args:
             step: The step, counted from 0.
             views: Indices of the step's training views.
-            loss: The step's loss, a scalar.
+            loss: The step's loss, a scalar that nobody changes in place.
         """
-        self._losses[len(self._steps)] = loss.detach()
+        self._losses.append(loss.detach())
         self._steps.append((step, views))
 
     @property
@@ -65,10 +66,11 @@ class NonFiniteLog:
         Returns:
             For each such step its number, its views, and "the loss was nan" (or inf) or "gradients were not finite".
         """
+        if not self._steps:
+            return []
         wrong = []
-        for (step, views), loss, gradient in zip(
-            self._steps, self._losses.tolist(), self._gradients[:, 0].tolist(), strict=False
-        ):
+        losses, gradients = torch.stack(self._losses).tolist(), self._gradients[: len(self._steps), 0].tolist()
+        for (step, views), loss, gradient in zip(self._steps, losses, gradients, strict=True):
             if not math.isfinite(loss):
                 what = f"the loss was {loss}"
             elif not math.isfinite(gradient):
@@ -80,6 +82,7 @@ class NonFiniteLog:
             wrong.append((step, views, what))
         self.steps += len(self._steps)
         self._steps.clear()
+        self._losses.clear()
         self._gradients.zero_()
         return wrong
 

@@ -159,6 +159,10 @@ class SadgsPipeline(VanillaPipeline):
         """The model, which is never wrapped for several devices."""
         return self._model  # type: ignore[return-value]
 
+    def train(self, mode: bool = True) -> SadgsPipeline:
+        """Set the mode of all modules, unless they have it: nerfstudio asks before every step, and torch visits all."""
+        return self if mode == self.training == self.model.training else super().train(mode)
+
     @property
     def views_per_iteration(self) -> int:
         """Number of views in a step, at most as many as there are: a view that is rendered twice would count twice."""
@@ -196,7 +200,7 @@ class SadgsPipeline(VanillaPipeline):
         counts = TrainingCallback(after, lambda step: self.structure.refresh())
         after_step = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
         read = TrainingCallback(after_step, lambda step: self._report_nonfinite() if self.log.full else None)
-        last = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self._report_nonfinite(last=True))
+        last = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self._report_at_the_end())
         # The log is read before densification makes new parameters, which have no gradients.
         return [read, *super().get_training_callbacks(training_callback_attributes), counts, last]
 
@@ -265,8 +269,28 @@ class SadgsPipeline(VanillaPipeline):
                 f"(images {', '.join(names[:_NAMED_STEPS])}{more})"
             )
 
+    def _repeat_overflowed(self, *, wait: bool = False) -> None:
+        """Put back the views that were not drawn, because their tile lists were longer than foreseen."""
+        forecast = self.model.tile_forecast
+        if forecast is not None and (lost := forecast.overflowed(wait=wait)):
+            self.views.put_back(lost)
+
+    def _report_at_the_end(self) -> None:
+        """Say what was not finite in the last iterations, and how often nothing was drawn."""
+        self._report_nonfinite(last=True)
+        self._repeat_overflowed(wait=True)
+        forecast = self.model.tile_forecast
+        if forecast is not None and (times := forecast.times_overflowed) > 0:
+            CONSOLE.print(
+                f"In {times:,} iteration{'s' * (times > 1)} nothing was drawn, since the Gaussians reached more tiles "
+                "than foreseen; these views were drawn again later.",
+                highlight=False,
+                soft_wrap=True,
+            )
+
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
         """Render the iteration's views and return the outputs of the last size, mean losses and mean metrics."""
+        self._repeat_overflowed()
         groups: dict[torch.Size, list[tuple[int, dict[str, Any]]]] = defaultdict(list)
         observes, observes_next = (self.model.wants_structure_tensors(step + k) for k in (0, 1))
         for index, data in self.views.draw(self.views_per_iteration, (observes, observes_next)):
@@ -385,6 +409,7 @@ class SadgsPipeline(VanillaPipeline):
 
         With nerfstudio's farthest-point sampling of views, the order after the present round is drawn anew.
         """
+        self._repeat_overflowed(wait=True)  # The views that are put back are part of the order.
         state: dict[str, Any] = {
             "torch": torch.get_rng_state(),
             "view_order": list(self.datamanager.train_unseen_cameras),

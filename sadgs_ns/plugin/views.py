@@ -95,6 +95,14 @@ class TrainingViews:
         if vars(self).get("ahead") is not None:
             vars(self)["ahead"].close()
 
+    def put_back(self, indices: Sequence[int]) -> None:
+        """Let views be the first of the next step, since what was drawn of them did not count.
+
+        Args:
+            indices: Views that were drawn.
+        """
+        self.datamanager.train_unseen_cameras = [*indices, *self.datamanager.train_unseen_cameras]
+
     @cached_property
     def cameras(self) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
         """World-to-camera matrices [4, 4] and intrinsics in px [3, 3] of all training views, each a tensor of its own.

@@ -11,11 +11,12 @@ from sadgs_ns import gsplat_internals
 from sadgs_ns.kernels import compositing
 from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
 from sadgs_ns.kernels.limits import check_gaussians, check_pixels
-from sadgs_ns.kernels.off_axis import cull_off_axis
+from sadgs_ns.kernels.projection import project
 from sadgs_ns.kernels.tiles import intersect_tiles
 
 BACKWARD: Literal["moments", "gsplat"] = "moments"
-"""Which kernel differentiates the compositing of three channels: ours (compositing.py), or gsplat's as a reference."""
+"""Whose kernels differentiate the projection and the compositing of three channels: ours (projection.py,
+compositing.py), or gsplat's as a reference."""
 TILE_SIZE = compositing.TILE_SIZE
 """px. gsplat's default of 16 saves list entries; with exact lists, saved pixels matter more (docs/measurements.md)."""
 
@@ -37,9 +38,13 @@ def rasterization(
     absgrad: bool,
     rasterize_mode: Literal["classic", "antialiased"],
     max_off_axis: float = 0.0,
+    tile_capacity: int | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render as the installed `gsplat.rasterization(..., tile_size=TILE_SIZE)` does; see
     `render.rasterization.rasterize`.
+
+    With `tile_capacity`, `isect_offsets` has one more row of tiles than `tile_height`, and the list of the last of them
+    is not drawn (`PendingTiles.lists`).
 
     Raises:
         ValueError: If `packed`.
@@ -50,16 +55,23 @@ def rasterization(
     num_views = len(viewmats)
     check_gaussians(num_views, len(means))
     check_pixels(num_views, height, width)
-    radii, means2d, depths, conics, compensations = gsplat_internals.project(
-        means, quats, scales, opacities, viewmats, Ks, width, height, rasterize_mode == "antialiased"
-    )
-    if max_off_axis > 0:
-        radii = cull_off_axis(radii, means2d, width, height, max_off_axis)
-    # One copy serves the tiles and compositing. `expand` would be slower: torch reduces its gradient over the views,
-    # even over one, ten times as slowly as it adds.
-    opacities = torch.stack([opacities] * num_views) if compensations is None else opacities * compensations
-    # The host waits for the lists' length: the colours are computed meanwhile.
-    pending_tiles = intersect_tiles(means2d, radii, depths, conics, opacities, width, height, TILE_SIZE)
+    geometry = means, quats, scales, opacities, viewmats, Ks, width, height, rasterize_mode == "antialiased"
+    if BACKWARD == "moments" and not viewmats.requires_grad:
+        # Colours take these centres, so that their gradient is added in the projection's backward kernel.
+        radii, means2d, depths, conics, compensations, means = project(*geometry)
+    else:
+        radii, means2d, depths, conics, compensations = gsplat_internals.project(*geometry)
+    radii = radii.contiguous()  # Culling, and tile lists that are too short, set these very radii to 0.
+    if compensations is not None:
+        opacities = opacities * compensations
+    elif num_views == 1:
+        opacities = opacities[None]
+    else:
+        # One copy serves the tiles and compositing. `expand` would be slower: torch reduces its gradient over the views
+        # ten times as slowly as it adds.
+        opacities = torch.stack([opacities] * num_views)
+    # Without a capacity the host waits for the lists' length: the colours are computed meanwhile.
+    pending_tiles = intersect_tiles(means2d, radii, depths, conics, opacities, width, height, TILE_SIZE, max_off_axis)
     if isinstance(colors, tuple) and sh_degree is not None and sh_degree <= MAX_DEGREE and not viewmats.requires_grad:
         colors = colors_from_harmonics(sh_degree, means, *colors, viewmats, radii)
     else:
@@ -76,9 +88,11 @@ def rasterization(
             colors = torch.clamp_min(colors + 0.5, 0.0)
     if render_mode == "RGB+ED":
         colors = torch.cat([colors, depths[..., None]], dim=-1)
-    isect_offsets, flatten_ids = pending_tiles.lists()
+    ours = BACKWARD == "moments" and colors.shape[-1] == 3
+    # gsplat's backward kernel would read the unused places, too, one after the other in a single block.
+    isect_offsets, flatten_ids = pending_tiles.lists(tile_capacity if ours else None)
     splats = (means2d, conics, colors, opacities, width, height)
-    if BACKWARD == "moments" and colors.shape[-1] == 3:
+    if ours:
         renders, alphas = compositing.rasterize_to_pixels(*splats, isect_offsets, flatten_ids, absgrad)
     else:
         renders, alphas = gsplat_internals.rasterize_to_pixels(*splats, TILE_SIZE, isect_offsets, flatten_ids, absgrad)
@@ -92,13 +106,14 @@ def rasterization(
         "depths": depths,
         "conics": conics,
         "opacities": opacities,
-        "tile_width": isect_offsets.shape[2],
-        "tile_height": isect_offsets.shape[1],
+        "tile_width": pending_tiles.tile_counts[2],
+        "tile_height": pending_tiles.tile_counts[1],
         "flatten_ids": flatten_ids,
         "isect_offsets": isect_offsets,
         "width": width,
         "height": height,
         "tile_size": TILE_SIZE,
         "n_cameras": num_views,
+        "pair_counts": pending_tiles.pair_counts,
     }
     return renders, alphas, info

@@ -30,6 +30,7 @@ def rasterize(
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
     max_off_axis: float = 0.0,
     fused: bool = True,
+    tile_capacity: int | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians into C pinhole cameras on the device of `means`, unpacked.
 
@@ -52,11 +53,14 @@ def rasterize(
             are culled (off_axis.py); 0 culls none.
         fused: On CUDA, list in each tile only the Gaussians that reach it, and differentiate the compositing of three
             channels, with Triton kernels; what is drawn is the same. Assumes rigid viewmats.
+        tile_capacity: Number of pairs of a Gaussian and a tile, in all views, for which the Triton kernels make room,
+            so that the host does not wait for the exact number. If there are more, nothing is drawn, no gradient flows
+            and all `radii` are 0. With None the host waits. gsplat and the splatter need no such number.
 
     Returns:
         Colours [C, height, width, X] with X = D or D + 1 by `render_mode`, alphas [C, height, width, 1] in [0, 1],
         and what strategies read of gsplat's `info`, in which `radii` depends on the gsplat version: read it through
-        `visible`.
+        `visible`. From the Triton kernels it also holds `pair_counts` (kernels/tiles.py), the exact numbers of pairs.
 
     Raises:
         ValueError: From the splatter, if a mode is unknown or a shape does not match. gsplat raises AssertionError; our
@@ -64,17 +68,19 @@ def rasterize(
         InputError: If there are more Gaussians, pixels or tile pairs than the Triton kernels can address
             (kernels/limits.py).
     """
-    culled: dict[str, Any] = {"max_off_axis": max_off_axis}
+    options: dict[str, Any] = {"max_off_axis": max_off_axis}
     rasterization: Any = splatter.rasterization
     fused = fused and kernels.available(means.device)
     # gsplat compiles its CUDA kernels when they are first used. These imports stand here so that nothing touches them
     # without a GPU.
     if fused:
         from sadgs_ns.render.fused import rasterization
+
+        options["tile_capacity"] = tile_capacity
     elif means.is_cuda:
         import gsplat.rendering
 
-        rasterization, culled = culling(gsplat.rendering.rasterization, max_off_axis), {}
+        rasterization, options = culling(gsplat.rendering.rasterization, max_off_axis), {}
     if isinstance(colors, tuple) and not fused:
         colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
     return rasterization(
@@ -92,7 +98,7 @@ def rasterize(
         render_mode=render_mode,
         absgrad=absgrad,
         rasterize_mode=rasterize_mode,
-        **culled,
+        **options,
     )
 
 

@@ -11,6 +11,7 @@ from gsplat.cuda._torch_impl import _fully_fused_projection
 from torch import Tensor
 
 from sadgs_ns import gsplat_internals
+from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, keep_gradient
 from sadgs_ns.render import splatter
 from sadgs_ns.render.rasterization import visible
 
@@ -67,9 +68,10 @@ def make_scene(
     }
     scene = {name: value.to(DEVICE) for name, value in scene.items()}
     radii = torch.full((num_views, n), 10**6, dtype=torch.int32, device=DEVICE)
-    scene["starts"], scene["ids"] = tiles.intersect_tiles(
+    scene["pending"] = tiles.intersect_tiles(
         scene["means2d"], radii, scene["depths"], scene["conics"], scene["opacities"], width, height, 8
-    ).lists()
+    )
+    scene["starts"], scene["ids"] = scene["pending"].lists()
     return scene
 
 
@@ -201,6 +203,29 @@ def test_nothing_in_sight_has_gradients_of_zero():
     assert all((value == 0).all() for value in gradients_of(scene, alphas, last_ids).values())
 
 
+@pytest.mark.parametrize(("num_views", "width", "height"), [(2, 21, 18), (1, 16, 16)])
+def test_places_that_no_list_needs_change_nothing(num_views, width, height):
+    scene = make_scene("usual", num_views, 30, width, height)
+    _, alphas, last_ids = reference(scene)
+    expected = gradients_of(scene, alphas, last_ids)
+    scene["starts"], scene["ids"] = scene["pending"].lists(len(scene["ids"]) + 300)
+    _, alphas_again, last_ids_again = reference(scene)
+    assert torch.equal(alphas_again, alphas) and torch.equal(last_ids_again, last_ids)
+    gradients = gradients_of(scene, alphas, last_ids)
+    for name, value in expected.items():
+        if DEVICE.type == "cpu":
+            assert torch.equal(gradients[name], value), name
+        else:  # atomic additions come in any order
+            torch.testing.assert_close(gradients[name], value, atol=1e-5, rtol=1e-5)
+
+
+def test_lists_that_are_too_short_have_gradients_of_zero():
+    scene = make_scene("usual", 2, 30)
+    scene["starts"], scene["ids"] = scene["pending"].lists(len(scene["ids"]) - 1)
+    alphas, last_ids = torch.zeros(2, 18, 21, 1), torch.zeros(2, 18, 21, dtype=torch.int32)
+    assert all((value == 0).all() for value in gradients_of(scene, alphas, last_ids).values())
+
+
 def test_tiles_without_gaussians_stay_out_of_the_others_lists():
     # The one Gaussian is first in the only list; pixels that draw nothing name the same place as their last.
     scene = make_scene("usual", n=1, width=40, height=40)
@@ -237,6 +262,8 @@ def test_autograd_gets_what_the_kernel_returns(monkeypatch, through):
     torch.autograd.backward([outputs[name] for name in used], [scene[name] for name in used])
     for name, value in expected.items():
         found = inputs["means2d"].absgrad if name == "absgrad" else inputs[name].grad
+        if name == "means2d":
+            assert torch.equal(inputs[name].grad2d, found)
         if name in ("conics", "opacities"):
             assert found is None
         else:
@@ -246,8 +273,11 @@ def test_autograd_gets_what_the_kernel_returns(monkeypatch, through):
 @pytest.mark.skipif(
     torch.cuda.is_available(), reason="with CUDA, tests/render/test_rasterization.py takes gsplat's own kernels"
 )
-@pytest.mark.parametrize(("mode", "max_off_axis"), [("classic", 0.0), ("antialiased", 0.0), ("classic", 0.5)])
-def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatch, mode, max_off_axis):
+@pytest.mark.parametrize(
+    ("mode", "max_off_axis", "capacity"),
+    [("classic", 0.0, None), ("antialiased", 0.0, None), ("classic", 0.5, None), ("classic", 0.0, 3000)],
+)
+def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatch, mode, max_off_axis, capacity):
     """Everything around gsplat's two kernels, for two views; torch code stands in for these kernels."""
     width, height, depths = 22, 18, []
 
@@ -285,17 +315,43 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
         if dtype == torch.float64:
             colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
         geometry = values["means"], values["quats"], values["scales"].exp(), torch.sigmoid(values["opacities"])
+        options = {"tile_capacity": capacity} if dtype == torch.float32 else {}
         renders, _, info = function(
-            *geometry, colors, viewmats.to(dtype), Ks.to(dtype), width, height,
+            *geometry, colors, viewmats.to(dtype), Ks.to(dtype), width, height, **options,
             sh_degree=3, packed=False, render_mode="RGB", absgrad=True, rasterize_mode=mode, max_off_axis=max_off_axis,
         )  # fmt: skip
+        if options:
+            assert info["tile_height"] == info["tile_width"] == 3
+            needed = sum(info["pair_counts"].wait())
+            assert len(info["flatten_ids"]) == (capacity or needed) >= needed > 150
         drawn.append(int(visible(info).sum()))
+        keep_gradient(info["means2d"])
+        assert info["means2d"].retains_grad is (dtype == torch.float64), "torch would copy the gradient"
         renders.backward(v_renders.to(dtype))
+        sums = empty_gradients(60, torch.device("cpu"))
+        accumulate_gradients(sums, info, num_views=2)
         results.append({name: value.grad for name, value in values.items()} | {"absgrad": info["means2d"].absgrad})
+        results[-1]["summed gradient"] = sums["grad2d"]
     assert drawn[0] == drawn[1] and (drawn[0] < 70) is (max_off_axis > 0)
     for name, expected in results[1].items():
         error = (results[0][name].double() - expected).norm() / expected.norm()
         assert error < (1e-4 if name == "absgrad" else 5e-6), (name, float(error))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat's kernels need CUDA")
+@pytest.mark.parametrize(("num_views", "width", "height"), [(1, 96, 64), (3, 93, 70)])
+def test_gsplats_kernel_draws_nothing_of_a_row_of_tiles_below_the_image(num_views, width, height):
+    scene = make_scene("usual", num_views, 300, width, height)
+    means2d, conics, colors, opacities = (scene[name].contiguous() for name in NAMES[:4])
+    needed = len(scene["ids"])
+    expected, padded, void = (
+        gsplat_internals.composite(
+            means2d, conics, colors, opacities, width, height, 8, *scene["pending"].lists(places)
+        )
+        for places in (None, needed + 5000, needed - 1)
+    )
+    assert all(map(torch.equal, padded, expected)) and expected[1].max() > 0.5
+    assert not any(value.any() for value in void)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat's kernels need CUDA")

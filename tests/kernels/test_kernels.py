@@ -22,8 +22,11 @@ from sadgs_ns.method.codes import encode
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.plugin.optimizers import FusedAdam
+from sadgs_ns.render.activations import activate
 from sadgs_ns.render.off_axis import cull_off_axis
 
+triton = pytest.importorskip("triton", reason="Triton is not installed")
+activations = pytest.importorskip("sadgs_ns.kernels.activations", reason="Triton is not installed")
 codes = pytest.importorskip("sadgs_ns.kernels.codes", reason="Triton is not installed")
 adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
 structure = pytest.importorskip("sadgs_ns.kernels.structure_tensor", reason="Triton is not installed")
@@ -32,7 +35,6 @@ observation = pytest.importorskip("sadgs_ns.kernels.statistics", reason="Triton 
 photometric = pytest.importorskip("sadgs_ns.kernels.losses", reason="Triton is not installed")
 screen_gradients = pytest.importorskip("sadgs_ns.kernels.absgs", reason="Triton is not installed")
 tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not installed")
-off_axis = pytest.importorskip("sadgs_ns.kernels.off_axis", reason="Triton is not installed")
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 fused_photometric_loss = partial(photometric.photometric_loss, window=losses.WINDOW)
@@ -57,15 +59,34 @@ def test_loss_and_gradient_equal_the_float64_reference(shape):
     for function, dtype in ((fused_photometric_loss, torch.float32), (losses.photometric_loss, torch.float64)):
         y = target.to(DEVICE, dtype)
         x = (target + noise).to(DEVICE, dtype).requires_grad_()
-        loss, psnr = function(x, y, ssim_lambda=0.3, l2_lambda=1.5)
+        parts = torch.linspace(-0.1, 0.3, 7).to(DEVICE, dtype).requires_grad_()
+        loss, psnr = function(x, y, ssim_lambda=0.3, l2_lambda=1.5, parts=parts)
         (3 * loss).backward()
-        assert x.grad is not None
+        assert x.grad is not None and parts.grad is not None and parts.grad.tolist() == [3.0] * 7
         results.append((loss.detach().double(), psnr.double(), x.grad.double()))
     fast, reference = results
     assert not torch.equal(reference[2], torch.zeros_like(reference[2]))
     torch.testing.assert_close(fast[0], reference[0], atol=2e-6, rtol=0)
     torch.testing.assert_close(fast[1], reference[1], atol=1e-5, rtol=0)
     torch.testing.assert_close(fast[2], reference[2], atol=5e-5 * float(reference[2].abs().max()), rtol=0)
+
+
+def test_the_loss_reads_bytes_as_the_floats_that_they_stand_for():
+    generator = torch.Generator().manual_seed(0)
+    images = torch.randint(0, 256, (2, 21, 47, 3), generator=generator, dtype=torch.uint8).to(DEVICE)
+    predicted = torch.rand((2, 21, 47, 3), generator=generator).to(DEVICE)
+    results = []
+    for target in (images, images * torch.tensor(1 / 255)):
+        x = predicted.clone().requires_grad_()
+        loss, psnr = fused_photometric_loss(x, target, ssim_lambda=0.3, l2_lambda=1.5)
+        loss.backward()
+        results.append([loss.detach(), psnr, x.grad])
+    # On a GPU the product with 1/255 is fused with the sum that follows it, and not rounded in between.
+    rounding = 1e-6 if DEVICE.type == "cuda" else 0.0
+    for of_bytes, of_floats in zip(*results, strict=True):
+        torch.testing.assert_close(of_bytes, of_floats, atol=rounding * float(of_floats.abs().max()), rtol=0)
+    slow = losses.photometric_loss(predicted, images, ssim_lambda=0.3, l2_lambda=1.5, fused=False)
+    torch.testing.assert_close(results[0][:2], list(slow), atol=1e-5, rtol=1e-5)
 
 
 def test_flat_images_have_a_finite_gradient():
@@ -96,14 +117,17 @@ def test_partial_sums_are_added_as_accurately_as_torch_adds_them():
     """There are as many as two views of 1920×1080 px leave, which is no multiple of what is added at once."""
     generator = torch.Generator().manual_seed(0)
     differences, similarities = torch.rand((2, 12150), generator=generator), torch.rand(12240, generator=generator)
+    parts = torch.rand(5000, generator=generator) / 5e6
     loss, psnr = torch.zeros((), device=DEVICE), torch.zeros((), device=DEVICE)
     n = 12150 * 1024
     weights = 0.8 / n, 0.2 / n, 2.0 / n
     photometric._finish[1,](
-        differences.to(DEVICE), similarities.to(DEVICE), loss, psnr, n, 12150, 12240, 0.2, *weights, photometric._LANES
+        differences.to(DEVICE), similarities.to(DEVICE), parts.to(DEVICE), loss, psnr,
+        n, 12150, 12240, 5000, 0.2, *weights, photometric._LANES,
     )  # fmt: skip
-    l1, l2, of_ssim = (float(values.double().sum()) for values in (*differences, similarities))
-    assert float(loss) == pytest.approx(weights[0] * l1 + 0.2 - weights[1] * of_ssim + weights[2] * l2, abs=3e-8)
+    l1, l2, of_ssim, more = (float(values.double().sum()) for values in (*differences, similarities, parts))
+    expected = weights[0] * l1 + 0.2 - weights[1] * of_ssim + weights[2] * l2 + more
+    assert float(loss) == pytest.approx(expected, abs=3e-8)
     assert float(psnr) == pytest.approx(-10 * math.log10(l2 / n), rel=1e-6)
 
 
@@ -240,8 +264,9 @@ def test_colours_and_gradients_equal_gsplats_float64_harmonics(monkeypatch, degr
         torch.testing.assert_close(actual.grad.double().cpu(), gradient, atol=2e-5, rtol=2e-5)
 
 
+@pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
 @pytest.mark.parametrize("kept", [Tensor.half, encode], ids=["float16", "8 bits"])
-def test_observation_equals_the_reference(monkeypatch, kept):
+def test_observation_equals_the_reference(monkeypatch, kept, per_axis_radii):
     n, width, height = 150, 40, 30
     params = {name: p.detach() for name, p in scenes.random_params(n).items()}
     params["scales"][::9] += 3  # reaches over the border
@@ -251,6 +276,8 @@ def test_observation_equals_the_reference(monkeypatch, kept):
     viewmats[1, :3, :3] = torch.linalg.qr(torch.eye(3) + 0.1)[0]
     viewmats[1, :3, 3] = torch.tensor([0.1, -0.2, 0.5])
     _, _, info = scenes.splat({name: torch.nn.Parameter(p) for name, p in params.items()}, viewmats, Ks, width, height)
+    radius = info["radii"] if info["radii"].dim() == 2 else info["radii"].amin(dim=-1)
+    info["radii"] = torch.stack([radius, 2 * radius], dim=-1) if per_axis_radii else radius
     generator = torch.Generator().manual_seed(0)
     factors = torch.randn((2, height, width, 2, 2), generator=generator)
     tensors = factors @ factors.mT
@@ -318,6 +345,35 @@ def test_screen_gradients_add_up_as_in_the_reference(monkeypatch, per_axis_radii
     assert torch.equal(fast.pop("grad_count"), reference["grad_count"])
     for name, value in fast.items():
         torch.testing.assert_close(value, reference[name], atol=1e-5, rtol=1e-6)
+
+
+@pytest.mark.parametrize("used", ["scales", "opacities", "penalty", "scales opacities penalty"])
+@pytest.mark.parametrize("n", [1, 37, 1024, 2050])
+def test_activations_and_their_gradients_equal_torchs_in_float64(monkeypatch, n, used):
+    generator = torch.Generator().manual_seed(n)
+    log_scales, logits, weights = (torch.randn(shape, generator=generator) for shape in ((n, 3), (n, 1), (n, 12)))
+    logits[0], log_scales[0] = -12.0, torch.tensor([-9.0, 3.0, 0.0])
+    penalty = 0.3 if "penalty" in used else 0.0
+    monkeypatch.setattr(kernels, "available", lambda device: True)
+    calls = recorded(monkeypatch, activations, "activate")
+    results = []
+    for fused, dtype in ((True, torch.float32), (False, torch.float64)):
+        inputs = [value.to(DEVICE, dtype, copy=True).requires_grad_() for value in (log_scales, logits)]
+        scales, opacities, penalized = activate(inputs[0], inputs[1], penalty, fused=fused)
+        assert scales.shape == (n, 3) and opacities.shape == (n,) and (penalized is None) is (penalty == 0)
+        rows = weights.to(DEVICE, dtype)
+        outputs = {"scales": (scales, rows[:, :3]), "opacities": (opacities, rows[:, 5])}  # as compositing returns them
+        if penalized is not None:
+            outputs["penalty"] = penalized, torch.full_like(penalized, 1.7)
+        chosen = [outputs[name] for name in used.split()]
+        torch.autograd.backward([output for output, _ in chosen], [gradient for _, gradient in chosen])
+        whole = [scales, opacities] if penalized is None else [scales, opacities, penalized.sum()]
+        results.append([value.detach().double() for value in whole])
+        results[-1] += [
+            torch.zeros_like(value).double() if value.grad is None else value.grad.double() for value in inputs
+        ]
+    assert len(calls) == 1
+    torch.testing.assert_close(*results, atol=1e-9, rtol=3e-6)
 
 
 ADAM = {"betas": (0.9, 0.999), "eps": 1e-15}
@@ -495,6 +551,74 @@ def test_more_tiles_than_16_bits_number_are_listed_as_view_by_view():
     assert torch.equal(ids, torch.cat([listed for _, listed in parts])) and len(ids) > 500
 
 
+def listed_by_tile(lists: tuple[Tensor, Tensor], rows: int) -> list[list[int]]:
+    """What gsplat's forward pass reads for each tile of the image, view by view."""
+    starts, ids = (values.cpu() for values in lists)
+    places = starts.flatten().tolist()
+    by_tile = [ids[begin:end].tolist() for begin, end in zip(places, [*places[1:], len(ids)], strict=True)]
+    tiles_per_view, columns = starts[0].numel(), starts.shape[2]
+    return [listed for number, listed in enumerate(by_tile) if number % tiles_per_view < rows * columns]
+
+
+@pytest.fixture
+def few_programs(monkeypatch):
+    """Each program handles more Gaussians than on a GPU, since the interpreter runs one program after the other."""
+    if DEVICE.type == "cpu":
+        monkeypatch.setattr(tiles, "_LANES", 128)
+
+
+@pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
+@pytest.mark.parametrize(("num_views", "width", "height"), [(1, 75, 50), (3, 75, 50), (2, 64, 48)])
+def test_lists_longer_than_needed_equal_the_exact_ones_tile_by_tile(
+    few_programs, num_views, width, height, per_axis_radii
+):
+    """The last height is a multiple of a tile's: padding must not reach the image's last row of tiles there."""
+    gaussians = projected_gaussians(num_views, 120, width, height)
+    if per_axis_radii:
+        gaussians["radii"] = gaussians["radii"][..., None].repeat(1, 1, 2)
+    on_device = {name: value.to(DEVICE, copy=True) for name, value in gaussians.items()}
+    pending = tiles.intersect_tiles(**on_device, width=width, height=height, tile_size=8)
+    rows, columns = math.ceil(height / 8), math.ceil(width / 8)
+    exact = pending.lists()
+    num_pairs = len(exact[1])
+    counts = pending.pair_counts
+    assert counts.wait() == [
+        sum(view * 120 <= g < view * 120 + 120 for g in exact[1].tolist()) for view in range(num_views)
+    ]
+    assert counts.ready() and sum(counts.wait()) == num_pairs > 500
+    for capacity in (num_pairs, num_pairs + 1, 2 * num_pairs):
+        starts, ids = pending.lists(capacity)
+        assert starts.shape == (num_views, rows + 1, columns) and len(ids) == capacity
+        assert starts.dtype == ids.dtype == torch.int32
+        assert listed_by_tile((starts, ids), rows) == listed_by_tile(exact, rows)
+        assert starts.flatten()[-1] == num_pairs and (ids[num_pairs:] == 0).all(), "padding is valid and at the end"
+    assert torch.equal(on_device["radii"].cpu(), gaussians["radii"])
+
+
+@pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
+@pytest.mark.parametrize("missing", [1, 400])
+def test_lists_shorter_than_needed_are_empty_and_nothing_counts_as_drawn(few_programs, per_axis_radii, missing):
+    gaussians = projected_gaussians(2, 120, 75, 50)
+    if per_axis_radii:
+        gaussians["radii"] = gaussians["radii"][..., None].repeat(1, 1, 2)
+    on_device = {name: value.to(DEVICE) for name, value in gaussians.items()}
+    pending = tiles.intersect_tiles(**on_device, width=75, height=50, tile_size=8)
+    needed = sum(pending.pair_counts.wait())
+    lists = pending.lists(needed - missing)
+    assert len(lists[1]) == needed - missing and (lists[1] == 0).all()
+    assert not any(listed_by_tile(lists, rows=7))
+    assert (on_device["radii"] == 0).all()
+    assert sum(pending.pair_counts.wait()) == needed
+
+
+def test_a_row_of_tiles_below_the_image_may_need_numbers_of_32_bits(few_programs):
+    """The image's 65,536 tiles have numbers of 16 bits; with the row below it they have not."""
+    gaussians = {name: value.to(DEVICE) for name, value in projected_gaussians(1, 40, 2048, 2048).items()}
+    pending = tiles.intersect_tiles(**gaussians, width=2048, height=2048, tile_size=8)
+    exact = pending.lists()
+    assert listed_by_tile(pending.lists(len(exact[1]) + 50), 256) == listed_by_tile(exact, 256)
+
+
 def test_no_gaussian_in_sight_makes_empty_lists():
     gaussians = projected_gaussians(1, 5, 32, 32)
     gaussians["radii"] = torch.zeros_like(gaussians["radii"])
@@ -503,18 +627,41 @@ def test_no_gaussian_in_sight_makes_empty_lists():
     assert len(ids) == 0 and (starts == 0).all()
 
 
-@pytest.mark.parametrize("shape", [(2, 300), (2, 300, 2)], ids=["one radius", "radii per axis"])
-def test_far_off_the_axis_radii_are_zero_as_torch_makes_them(shape):
+@pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
+def test_far_off_the_axis_radii_are_zero_as_torch_makes_them(few_programs, per_axis_radii):
+    """The lists are those of the radii that torch culls."""
+    gaussians = projected_gaussians(2, 150, 40, 30)
+    if per_axis_radii:
+        gaussians["radii"] = gaussians["radii"][..., None] * torch.tensor([1, 2], dtype=torch.int32)
+    gaussians["means2d"][0, :4] = torch.tensor([[math.nan, 1.0], [1.0, math.inf], [-15.0, 15.0], [20.0, 36.5]])
+    expected = cull_off_axis(gaussians["radii"], gaussians["means2d"], 40, 30, 0.8)
+    assert 60 < (expected > 0).sum() < (gaussians["radii"] > 0).sum() - 60
+    lists = []
+    for radii, max_off_axis in ((expected, 0.0), (gaussians["radii"], 0.8)):
+        on_device = {name: value.to(DEVICE, copy=True) for name, value in (gaussians | {"radii": radii}).items()}
+        pending = tiles.intersect_tiles(**on_device, width=40, height=30, tile_size=8, max_off_axis=max_off_axis)
+        lists.append(pending.lists())
+        assert torch.equal(on_device["radii"].cpu(), expected)
+    assert all(map(torch.equal, *lists)) and len(lists[0][1]) > 100
+
+
+@pytest.mark.parametrize("dtype", [torch.int16, torch.int32])
+@pytest.mark.parametrize(("num_pairs", "num_tiles"), [(0, 5), (1, 1), (700, 40), (1000, 1500), (513, 512)])
+def test_the_lists_order_and_starts_are_torchs(dtype, num_pairs, num_tiles):
+    """Most tiles have no pair in the longest case, and neither number is a multiple of what a program handles."""
     generator = torch.Generator().manual_seed(0)
-    means2d = 50 * torch.randn((2, 300, 2), generator=generator)
-    means2d[0, :4] = torch.tensor([[math.nan, 1.0], [1.0, math.inf], [-40.0, 15.0], [20.0, 60.0]])
-    radii = torch.randint(0, 9, shape, generator=generator, dtype=torch.int32)
-    expected = cull_off_axis(radii, means2d, 40, 30, 3.0)
-    assert 100 < (expected > 0).sum() < (radii > 0).sum() - 100
-    before = radii.clone().to(DEVICE)
-    given = before.clone()
-    culled = off_axis.cull_off_axis(given, means2d.to(DEVICE), 40, 30, 3.0)
-    assert torch.equal(culled.cpu(), expected) and torch.equal(given, before)
+    numbers = torch.randint(0, num_tiles, (num_pairs,), generator=generator) - 2**15
+    sorted_tiles, by_tile = numbers.to(dtype).to(DEVICE).sort(stable=True)
+    ids = torch.randperm(num_pairs, generator=generator).int().to(DEVICE)
+    ordered, starts = torch.empty_like(ids), ids.new_empty(num_tiles)
+    lanes = tiles._ORDER_LANES
+    of_pairs = triton.cdiv(num_pairs, lanes)
+    tiles._order[of_pairs + triton.cdiv(num_tiles, lanes),](
+        sorted_tiles, by_tile, ids, ordered, starts, num_pairs, num_tiles, of_pairs, num_pairs.bit_length(), lanes
+    )
+    every = torch.arange(num_tiles, device=DEVICE) - 2**15
+    assert torch.equal(starts, torch.searchsorted(sorted_tiles.long(), every, out_int32=True))
+    assert torch.equal(ordered, ids[by_tile])
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat's kernels need CUDA")

@@ -19,15 +19,17 @@ CONSTANTS = {
     "VIEWS": 2, "BLOCK": 1024, "HIGH": 1.0, "LOW": 0.1, "BLUR": 0.3, "MARGIN": 0.3, "EPSILON": 1e-5,
     "VERTICAL": False, "MAX": 1e18, "PIXELS": 1024, "TINY": 1e-38, "HIGHEST": 4.0,
     "OCTAVES": 12.0, "MASKED": 255, "WIDTHS": (3, 45, 1), "PER_GAUSSIAN": 2, "GAUSSIANS": 16, "STRIDE": 12,
-    "ALPHAS": True, "ABSGRAD": True, "PRECISION": "tf32x3",
+    "ALPHAS": True, "ABSGRAD": True, "PRECISION": "tf32x3", "PENALTY": True, "CULL": True,
+    "DEPTHS": True, "COMPENSATIONS": True, "PASSED": True,
 }
 INTEGERS = "n row height width taps num_gaussians num_views tile_width tile_height used stride start".split()
 INTEGERS += "channels weight_stride num_pairs rows view absolute_view absolute_row num_strips num_tiles".split()
+INTEGERS += ["rows_per_view", "halvings", "of_pairs", "num_parts", "row2d", "row_conic"]
 FLOATS = "exponent frequency beta1 beta2 eps l1_weight ssim_weight l2_weight".split()
-FLOATS += "scale_x scale_y ssim_lambda half_width half_height reach_x reach_y".split()
+FLOATS += "scale_x scale_y ssim_lambda half_width half_height reach_x reach_y penalty".split()
 POINTERS = {
-    "radii": "*i32", "counts": "*i64", "order": "*i64", "ends": "*i64", "tiles": "*i16", "ids": "*i32", "drawn": "*i1",
-    "culled": "*i32",
+    "radii": "*i32", "counts": "*i64", "order": "*i64", "ends": "*i64", "tiles": "*i16", "ids": "*i32",
+    "by_tile": "*i64", "ordered": "*i32",
     "structure_tensors": "*u8", "starts": "*i32", "last_ids": "*i32",
 }
 TUPLES = {  # of Adam's kernel; the names mean single tensors elsewhere
@@ -54,7 +56,9 @@ for module in pkgutil.iter_modules(package.__path__):
                 signature[parameter.name] = "fp32"
             else:
                 signature[parameter.name] = POINTERS.get(parameter.name, "*fp32")
-        signatures = [signature] if name != "_list" else [signature, signature | {"tiles": "*i32"}]
+        others = dict.fromkeys(["_list", "_order"], {"tiles": "*i32"})
+        others |= dict.fromkeys(["_blur_along_rows", "_gradient"], {"y": "*u8"})
+        signatures = [signature, *([signature | others[name]] if name in others else [])]
         for signature in signatures:
             for capability in (80, 90):  # A100, H200
                 triton.compile(ASTSource(kernel, signature, constants), target=GPUTarget("cuda", capability, 32))
@@ -68,7 +72,8 @@ def test_every_kernel_compiles_for_an_a100_and_an_h200(tmp_path):
     assert run.returncode == 0, run.stderr[-3000:]
     expected = {"_blur_along_rows", "_similarity", "_spread_along_rows", "_gradient", "_count", "_list", "_observe"}
     expected |= {"_forward", "_backward", "_update", "_correlate", "_differentiate", "_aggregate", "_write_one"}
-    expected |= {"_composite_backward", "_encode", "_accumulate_gradients", "_finish", "_cull"}
+    expected |= {"_composite_backward", "_encode", "_accumulate_gradients", "_finish", "_order"}
+    expected |= {"_activate", "_activate_backward", "_project_backward"}
     assert set(run.stdout.split()) == expected
 
 

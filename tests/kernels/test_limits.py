@@ -51,7 +51,8 @@ def test_too_many_gaussians_pixels_or_tile_pairs_are_refused_before_anything_run
     with pytest.raises(InputError, match="take fewer views at once, or smaller images"):
         losses.photometric_loss(image, image, (1.0,), ssim_lambda=0.2, l2_lambda=2.0)
     empty = torch.empty(0)
-    pending = tiles.PendingTiles([], empty, empty, torch.tensor([2**31]), None, 8, (1, 1, 1))
+    counts = tiles.PairCounts(torch.tensor([2**31 - 1, 1]), None)
+    pending = tiles.PendingTiles([], empty, empty, counts, 8, (2, 1, 1))
     with pytest.raises(InputError, match=r"pairs of a Gaussian and a tile .* are 2,147,483,648"):
         pending.lists()
 

@@ -41,3 +41,15 @@ def test_it_goes_on_from_a_checkpoint():
     second.add(params)
     assert torch.equal(second.means["means"], whole.means["means"])
     assert float(whole.means["means"]) == 5.0
+
+
+def test_all_parameters_are_averaged_as_each_by_itself():
+    generator = torch.Generator().manual_seed(0)
+    shapes, average = {"means": (7, 3), "opacities": (7, 1), "features_rest": (7, 0, 3)}, RunningMean()
+    expected: dict[str, torch.Tensor] = {}
+    for count in (1, 2, 3):
+        params = {name: torch.nn.Parameter(torch.randn(shape, generator=generator)) for name, shape in shapes.items()}
+        average.add(params)
+        for name, parameter in params.items():
+            expected[name] = expected.get(name, parameter.detach()).lerp(parameter.detach(), 1 / count)
+    assert all(torch.equal(average.means[name], value) for name, value in expected.items())

@@ -412,13 +412,15 @@ def test_absgs_sums_skip_what_is_no_number_and_ignore_what_overflowed():
 
 
 class HostWaits(TorchDispatchMode):
-    """Counts operations that would make the host wait for a device."""
+    """Counts operations that would make the host wait for a device, and names all."""
 
     def __init__(self) -> None:
         super().__init__()
         self.number = 0
+        self.names: set[str] = set()
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.names.add(func.__name__.split(".")[0])
         self.number += func.__name__.split(".")[0] in ("_local_scalar_dense", "nonzero", "is_nonzero", "equal")
         return func(*args, **(kwargs or {}))
 
@@ -435,6 +437,14 @@ def test_the_guard_never_waits_within_a_step():
     with HostWaits() as waits:
         float(loss)
     assert waits.number == 1
+
+
+def test_noting_a_loss_gives_the_device_no_work():
+    log, loss = nonfinite.NonFiniteLog(CPU, capacity=2), torch.tensor(math.nan)
+    with HostWaits() as operations:
+        log.begin_step(0, [0], loss)
+    assert operations.names <= {"detach", "alias"}, "these make views"
+    assert log.read() == [(0, [0], "the loss was nan")]
 
 
 def test_the_log_names_steps_and_forgets_them_once_read():
@@ -519,7 +529,7 @@ def test_the_log_is_read_before_it_overflows(
     config = configure(tmp_path, colmap, iterations=5)
     config.pipeline.model.strategy.refine_stop_iter = 0
     trainer = set_up(config)
-    trainer.pipeline.log._losses = trainer.pipeline.log._losses[:2]
+    trainer.pipeline.log.capacity = 2
     _ = trainer.pipeline.views.cameras  # which looks for such images, once
     image = trainer.pipeline.datamanager.cached_train[0]["image"]
     for data in trainer.pipeline.datamanager.cached_train:

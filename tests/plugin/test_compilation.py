@@ -77,7 +77,7 @@ def test_tile_lists_are_tried_in_the_size_of_the_run(config: SadgsTrainerConfig,
 def test_what_cannot_be_compiled_leaves_the_run_as_it_was(
     config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """In Triton's interpreter the loss, S̄ and Adam run; tile lists need gsplat's projection, which needs CUDA."""
+    """In Triton's interpreter all run but what needs a projection, which is gsplat's and needs CUDA."""
     pytest.importorskip("triton", reason="Triton is not installed")
     trainer = SadgsTrainer(config)
     trainer.setup()
@@ -88,7 +88,7 @@ def test_what_cannot_be_compiled_leaves_the_run_as_it_was(
         compilation, "ThreadPoolExecutor", lambda: ThreadPoolExecutor(1)
     )  # the interpreter knows one thread
     monkeypatch.setattr(kernels, "available", lambda device: True)
-    for name in ("encode", "photometric_loss", "step_together", "rasterize", "observe"):
+    for name in ("encode", "photometric_loss", "step_together", "rasterize", "observe", "activate"):
         original = getattr(compilation, name)
 
         def launch(*args, name=name, original=original, **options):
@@ -99,7 +99,7 @@ def test_what_cannot_be_compiled_leaves_the_run_as_it_was(
     parameters = {name: value.detach().clone() for name, value in trainer.pipeline.model.gauss_params.items()}
     random_state = torch.get_rng_state()
     compilation.compile_kernels(trainer.pipeline, trainer.optimizers.optimizers)
-    assert sorted(launched) == ["encode", "photometric_loss", "rasterize", "step_together"]
+    assert sorted(launched) == [*["activate"] * 2, "encode", *["photometric_loss"] * 2, "rasterize", "step_together"]
     assert "The kernels of rasterization could not be compiled and tried before training (" in capsys.readouterr().out
     assert torch.equal(torch.get_rng_state(), random_state)
     assert all(torch.equal(trainer.pipeline.model.gauss_params[name], value) for name, value in parameters.items())

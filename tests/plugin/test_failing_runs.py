@@ -469,7 +469,7 @@ def poison(trainer: SadgsTrainer, what: str) -> None:
         outputs, losses, metrics = get_loss(step)
         if what == "loss":
             losses["main_loss"] = losses["main_loss"] * math.nan
-            trainer.pipeline.log._losses[len(trainer.pipeline.log._steps) - 1] = math.nan
+            trainer.pipeline.log._losses[-1] = torch.tensor(math.nan)
         return outputs, losses, metrics
 
     trainer.pipeline.get_train_loss_dict = poisoned  # type: ignore[method-assign]
@@ -493,7 +493,7 @@ def test_a_run_that_learns_nothing_stops_with_one_sentence_and_a_finite_checkpoi
     config.max_num_iterations, config.steps_per_save = 24, 3
     config.pipeline.model.strategy.refine_stop_iter = 0
     trainer = set_up(config)
-    trainer.pipeline.log._losses = trainer.pipeline.log._losses[:4]  # read every 4 iterations
+    trainer.pipeline.log.capacity = 4  # read every 4 iterations
     location = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
     trainer.callbacks.append(
         TrainingCallback(location, lambda step: poison(trainer, what) if step == 4 else None)  # the second of a window

@@ -334,16 +334,21 @@ def test_the_mean_opacity_weighs_in_the_loss_while_densification_runs(colmap: Co
     opacities: list[float] = []
     regularized: list[bool] = []
 
-    def look(trainer: SadgsTrainer) -> None:
-        model = trainer.pipeline.model
-        black = torch.zeros((16, 16, 3), device=model.device)
-        losses = model.get_loss_dict({"rgb": black, "background": black[0, 0]}, {"image": black})
-        regularized.append("opacity_reg" in losses)
-        opacities.append(float(torch.sigmoid(model.opacities.detach()).mean()))
-        if regularized[-1]:
-            assert float(losses["opacity_reg"]) == pytest.approx(100 * opacities[-1], rel=1e-5)
+    trainer = set_up(config)
+    model, get_losses = trainer.pipeline.model, trainer.pipeline.get_train_loss_dict
 
-    train(config, look)
+    def look(step: int) -> Any:
+        opacities.append(float(torch.sigmoid(model.opacities.detach()).mean()))
+        outputs, losses, metrics = get_losses(step)
+        regularized.append("opacity_reg" in outputs)
+        if regularized[-1]:
+            penalty = float(outputs["opacity_reg"].detach().sum())
+            assert penalty == pytest.approx(100 * opacities[-1], rel=1e-5)
+            assert 0 < float(losses["main_loss"].detach()) - penalty < 2, "the rest is the photometric loss"
+        return outputs, losses, metrics
+
+    trainer.pipeline.get_train_loss_dict = look  # type: ignore[method-assign]
+    trainer.train()
     assert regularized == [True] * 4 + [False] * 4
     assert opacities[0] > opacities[1] > opacities[2] > opacities[3]
 
@@ -652,6 +657,14 @@ def test_held_out_cameras_render_as_nerfstudio_expects(trained: SadgsTrainer):
 
 
 @torch.no_grad()
+def test_after_the_viewer_has_rendered_the_whole_model_trains_again(trained: SadgsTrainer):
+    pipeline = trained.pipeline
+    pipeline.train()
+    pipeline.model.eval()  # as nerfstudio's viewer does
+    assert pipeline.train() is pipeline and all(module.training for module in pipeline.modules())
+    assert not any(module.training for module in pipeline.eval().modules())
+
+
 def test_a_crop_box_hides_what_lies_outside(trained: SadgsTrainer):
     model, camera = trained.pipeline.model, trained.pipeline.datamanager.eval_dataset.cameras[:1]
 

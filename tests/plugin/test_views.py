@@ -96,6 +96,25 @@ def test_a_view_that_is_passed_over_comes_first_in_the_next_step():
     assert steps_of(views_of(datamanager), 3, steps=2) == [[2, 3, 0], [3, 2, 1]]
 
 
+@pytest.mark.parametrize(("total", "number"), [(10, 4), (5, 4), (10, 1)])
+def test_views_that_are_put_back_come_next_and_all_count_equally_often(total: int, number: int):
+    """Every seventh step fails, which is found out only when two more steps have been drawn."""
+    views = views_of(Datamanager(total))
+    visits: Counter[int] = Counter()
+    lost: dict[int, list[int]] = {}
+    for step in range(STEPS):
+        views.put_back(back := lost.pop(step - 3, []))
+        drawn = [index for index, _ in views.draw(number)]
+        assert len(set(drawn)) == number and set(drawn) >= set(back)
+        if step % 7 == 0:
+            lost[step] = drawn
+        else:
+            visits.update(drawn)
+        missing = Counter(index for indices in lost.values() for index in indices)
+        counts = [visits[index] + missing[index] for index in range(total)]
+        assert max(counts) - min(counts) <= 1
+
+
 def test_a_round_of_fewer_views_than_a_step_takes_repeats_some():
     datamanager = Datamanager(9, train_cameras_sampling_strategy="fps", fps_reset_every=2)
     assert all(len(drawn) == 5 for drawn in steps_of(views_of(datamanager), 5, steps=50))
@@ -115,6 +134,7 @@ def test_a_resumed_run_goes_on_with_the_views_of_the_run_that_was_never_stopped(
             _settings=dict,
             schedule=Schedule(iterations=10, views_per_iteration=number),
             config=SimpleNamespace(effort=1.0),
+            _repeat_overflowed=lambda wait: None,
         )
         state = SadgsPipeline.get_extra_state(pipeline)
         datamanager = pipeline.datamanager = Datamanager(total)

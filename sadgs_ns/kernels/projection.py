@@ -1,0 +1,314 @@
+"""gsplat's projection with a backward pass of our own, in one launch.
+
+gsplat's backward pass adds with atomic operations, also where there is one view, to gradients that it fills with zeros
+first, and takes contiguous copies of the gradients that compositing gives it in the rows of one tensor. With these
+fills and copies it is eight launches. Here each Gaussian's gradients are summed over the views in registers and written
+once, and what else depends on the centres is added on the way. The formulas are those of gsplat 1.4.0 and 1.5.3.
+"""
+
+# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false
+# (Triton's launch syntax, kernel[grid](...), and its functions are not in its types.)
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from sadgs_ns import gsplat_internals
+from sadgs_ns.kernels import cdiv
+from sadgs_ns.kernels.visibility import drawn
+
+_LANES = 128
+"""Gaussians that one program handles."""
+BLUR = 0.3
+"""px². gsplat adds it to the diagonal of each Σ2D."""
+
+
+@triton.jit
+def _load3(values, at, exists):
+    """Load three numbers that lie side by side, 0 where they do not exist."""
+    return (
+        tl.load(values + at, exists, 0.0),
+        tl.load(values + at + 1, exists, 0.0),
+        tl.load(values + at + 2, exists, 0.0),
+    )
+
+
+@triton.jit
+def _store3(values, at, x, y, z, exists):
+    """Store three numbers side by side."""
+    tl.store(values + at, x, exists)
+    tl.store(values + at + 1, y, exists)
+    tl.store(values + at + 2, z, exists)
+
+
+@triton.jit
+def _rotation(w, x, y, z):
+    """Return the nine entries, row by row, of the rotation that a unit quaternion stands for."""
+    return (
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
+
+
+@triton.jit
+def _clamped(ratio, focal, centre, size):
+    """Clamp x / z where the Jacobian is taken: 0.3 half images beyond the image's border."""
+    margin = 0.15 * size / focal
+    return tl.minimum(tl.maximum(ratio, -(centre / focal + margin)), (size - centre) / focal + margin)
+
+
+@triton.jit
+def _by_row(ratio, slope, inverse, scale, by_first, by_last):
+    """Differentiate the entries `scale` = focal / z and −scale · slope of the Jacobian; `slope` is the clamped x / z.
+
+    Returns:
+        What the entries' gradients `by_first` and `by_last` add to those of x and of z.
+    """
+    by_x = tl.where(ratio == slope, -scale * inverse * by_last, 0.0)
+    return by_x, scale * inverse * (slope * by_last - by_first) - slope * by_x
+
+
+# One view's intrinsics may be part of a tensor of several views, and gradients part of rows. They begin at no multiple
+# of 16 bytes, for which Triton would compile another kernel.
+@triton.jit(
+    do_not_specialize=["n", "num_views", "width", "height", "row2d", "row_conic"],
+    do_not_specialize_on_alignment=["Ks", "v_means2d", "v_conics"],
+)
+def _project_backward(
+    means, quats, scales, viewmats, Ks, radii, conics, compensations,
+    v_means2d, v_conics, v_depths, v_compensations, v_passed, v_means, v_quats, v_scales,
+    n, num_views, width, height, row2d, row_conic,
+    DEPTHS: tl.constexpr, COMPENSATIONS: tl.constexpr, PASSED: tl.constexpr, PER_GAUSSIAN: tl.constexpr,
+    BLUR: tl.constexpr, LANES: tl.constexpr,
+):  # fmt: skip
+    """Write the gradients by centres, quaternions and standard deviations, summed over the views.
+
+    Those by the projected centres and by the conics lie `row2d` and `row_conic` numbers apart.
+    """
+    g = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
+    exists = g < n
+    mean_x, mean_y, mean_z = _load3(means, 3 * g, exists)
+    qw = tl.load(quats + 4 * g, exists, 1.0)
+    qx, qy, qz = _load3(quats, 4 * g + 1, exists)
+    inverse_norm = 1 / tl.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
+    qw, qx, qy, qz = qw * inverse_norm, qx * inverse_norm, qy * inverse_norm, qz * inverse_norm
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(qw, qx, qy, qz)
+    sx, sy, sz = _load3(scales, 3 * g, exists)
+    m00, m01, m02 = r00 * sx, r01 * sy, r02 * sz  # M = R S, and Σ = M Mᵀ
+    m10, m11, m12 = r10 * sx, r11 * sy, r12 * sz
+    m20, m21, m22 = r20 * sx, r21 * sy, r22 * sz
+    xx, xy, xz = m00 * m00 + m01 * m01 + m02 * m02, m00 * m10 + m01 * m11 + m02 * m12, m00 * m20 + m01 * m21 + m02 * m22
+    yy, yz, zz = m10 * m10 + m11 * m11 + m12 * m12, m10 * m20 + m11 * m21 + m12 * m22, m20 * m20 + m21 * m21 + m22 * m22
+    v_x = tl.zeros([LANES], tl.float32)
+    v_y, v_z, v_xx, v_xy, v_xz, v_yy, v_yz, v_zz, count = v_x, v_x, v_x, v_x, v_x, v_x, v_x, v_x, v_x
+    for i in range(num_views):
+        at = i * tl.cast(n, tl.int64) + g
+        seen = drawn(radii, at, exists, PER_GAUSSIAN)
+        viewmat, K = viewmats + 16 * i, Ks + 9 * i
+        w00, w01, w02, t0 = tl.load(viewmat), tl.load(viewmat + 1), tl.load(viewmat + 2), tl.load(viewmat + 3)
+        w10, w11, w12, t1 = tl.load(viewmat + 4), tl.load(viewmat + 5), tl.load(viewmat + 6), tl.load(viewmat + 7)
+        w20, w21, w22, t2 = tl.load(viewmat + 8), tl.load(viewmat + 9), tl.load(viewmat + 10), tl.load(viewmat + 11)
+        fx, cx, fy, cy = tl.load(K), tl.load(K + 2), tl.load(K + 4), tl.load(K + 5)
+        x = w00 * mean_x + w01 * mean_y + w02 * mean_z + t0
+        y = w10 * mean_x + w11 * mean_y + w12 * mean_z + t1
+        z = tl.where(seen, w20 * mean_x + w21 * mean_y + w22 * mean_z + t2, 1.0)
+        inverse = 1 / z
+
+        # The gradient H of Σ2D, of whose blurred inverse the conic has three entries.
+        a, b, c = _load3(conics, 3 * at, seen)
+        h_a, h_b, h_c = _load3(v_conics, at * row_conic, seen)
+        h_b = 0.5 * h_b
+        top, right, left, bottom = a * h_a + b * h_b, a * h_b + b * h_c, b * h_a + c * h_b, b * h_b + c * h_c
+        h00, h01, h11 = -(top * a + right * b), -(top * b + right * c), -(left * b + bottom * c)
+        if COMPENSATIONS:
+            compensation = tl.load(compensations + at, seen, 0.0)
+            by_square = 0.5 * tl.load(v_compensations + at, seen, 0.0) / (compensation + 1e-6)
+            rest, blurred = 1 - compensation * compensation, BLUR * (a * c - b * b)
+            h00 += by_square * (rest * a - blurred)
+            h01 += by_square * rest * b
+            h11 += by_square * (rest * c - blurred)
+
+        # Σ2D = T Σ Tᵀ with T = J W, where W is the camera's rotation and J the Jacobian [2, 3] of the projection.
+        slope_x, slope_y = _clamped(x * inverse, fx, cx, width), _clamped(y * inverse, fy, cy, height)
+        jx, jy = fx * inverse, fy * inverse
+        t00, t01, t02 = jx * (w00 - slope_x * w20), jx * (w01 - slope_x * w21), jx * (w02 - slope_x * w22)
+        t10, t11, t12 = jy * (w10 - slope_y * w20), jy * (w11 - slope_y * w21), jy * (w12 - slope_y * w22)
+        k00, k01, k02 = h00 * t00 + h01 * t10, h00 * t01 + h01 * t11, h00 * t02 + h01 * t12  # H T
+        k10, k11, k12 = h01 * t00 + h11 * t10, h01 * t01 + h11 * t11, h01 * t02 + h11 * t12
+        v_xx += tl.where(seen, t00 * k00 + t10 * k10, 0.0)
+        v_xy += tl.where(seen, t00 * k01 + t10 * k11, 0.0)
+        v_xz += tl.where(seen, t00 * k02 + t10 * k12, 0.0)
+        v_yy += tl.where(seen, t01 * k01 + t11 * k11, 0.0)
+        v_yz += tl.where(seen, t01 * k02 + t11 * k12, 0.0)
+        v_zz += tl.where(seen, t02 * k02 + t12 * k12, 0.0)
+
+        # The gradient 2 H T Σ Wᵀ of J, of which four entries depend on the centre.
+        u00, u01, u02 = k00 * xx + k01 * xy + k02 * xz, k00 * xy + k01 * yy + k02 * yz, k00 * xz + k01 * yz + k02 * zz
+        u10, u11, u12 = k10 * xx + k11 * xy + k12 * xz, k10 * xy + k11 * yy + k12 * yz, k10 * xz + k11 * yz + k12 * zz
+        by_x, by_z_of_x = _by_row(
+            x * inverse, slope_x, inverse, jx,
+            2 * (u00 * w00 + u01 * w01 + u02 * w02), 2 * (u00 * w20 + u01 * w21 + u02 * w22),
+        )  # fmt: skip
+        by_y, by_z_of_y = _by_row(
+            y * inverse, slope_y, inverse, jy,
+            2 * (u10 * w10 + u11 * w11 + u12 * w12), 2 * (u10 * w20 + u11 * w21 + u12 * w22),
+        )  # fmt: skip
+        at_row = at * row2d
+        v_u, v_v = jx * tl.load(v_means2d + at_row, seen, 0.0), jy * tl.load(v_means2d + at_row + 1, seen, 0.0)
+        by_x, by_y = by_x + v_u, by_y + v_v
+        by_z = by_z_of_x + by_z_of_y - (x * v_u + y * v_v) * inverse
+        if DEPTHS:
+            by_z += tl.load(v_depths + at, seen, 0.0)
+        v_x += tl.where(seen, w00 * by_x + w10 * by_y + w20 * by_z, 0.0)
+        v_y += tl.where(seen, w01 * by_x + w11 * by_y + w21 * by_z, 0.0)
+        v_z += tl.where(seen, w02 * by_x + w12 * by_y + w22 * by_z, 0.0)
+        count += seen
+
+    if PASSED:
+        x, y, z = _load3(v_passed, 3 * g, exists)
+        v_x, v_y, v_z = v_x + x, v_y + y, v_z + z
+    _store3(v_means, 3 * g, v_x, v_y, v_z, exists)
+    seen = count > 0  # What no view drew has gradients of 0, whatever its numbers are.
+    # v_M = 2 v_Σ M, of which R's gradient is v_M S.
+    n00, n01, n02 = (
+        v_xx * m00 + v_xy * m10 + v_xz * m20,
+        v_xx * m01 + v_xy * m11 + v_xz * m21,
+        v_xx * m02 + v_xy * m12 + v_xz * m22,
+    )
+    n10, n11, n12 = (
+        v_xy * m00 + v_yy * m10 + v_yz * m20,
+        v_xy * m01 + v_yy * m11 + v_yz * m21,
+        v_xy * m02 + v_yy * m12 + v_yz * m22,
+    )
+    n20, n21, n22 = (
+        v_xz * m00 + v_yz * m10 + v_zz * m20,
+        v_xz * m01 + v_yz * m11 + v_zz * m21,
+        v_xz * m02 + v_yz * m12 + v_zz * m22,
+    )
+    v_sx, v_sy, v_sz = (
+        r00 * n00 + r10 * n10 + r20 * n20,
+        r01 * n01 + r11 * n11 + r21 * n21,
+        r02 * n02 + r12 * n12 + r22 * n22,
+    )
+    _store3(
+        v_scales, 3 * g, tl.where(seen, 2 * v_sx, 0.0), tl.where(seen, 2 * v_sy, 0.0), tl.where(seen, 2 * v_sz, 0.0),
+        exists,
+    )  # fmt: skip
+    sx, sy, sz = 4 * sx, 4 * sy, 4 * sz  # both factors 2: of v_M and of the rotation's derivatives
+    n00, n10, n20, n01, n11, n21, n02, n12, n22 = (
+        n00 * sx, n10 * sx, n20 * sx, n01 * sy, n11 * sy, n21 * sy, n02 * sz, n12 * sz, n22 * sz
+    )  # fmt: skip
+    v_qw = qx * (n21 - n12) + qy * (n02 - n20) + qz * (n10 - n01)
+    v_qx = qy * (n10 + n01) + qz * (n20 + n02) + qw * (n21 - n12) - 2 * qx * (n11 + n22)
+    v_qy = qx * (n10 + n01) + qz * (n21 + n12) + qw * (n02 - n20) - 2 * qy * (n00 + n22)
+    v_qz = qx * (n20 + n02) + qy * (n21 + n12) + qw * (n10 - n01) - 2 * qz * (n00 + n11)
+    along = v_qw * qw + v_qx * qx + v_qy * qy + v_qz * qz
+    tl.store(v_quats + 4 * g, tl.where(seen, (v_qw - along * qw) * inverse_norm, 0.0), exists)
+    _store3(
+        v_quats, 4 * g + 1, tl.where(seen, (v_qx - along * qx) * inverse_norm, 0.0),
+        tl.where(seen, (v_qy - along * qy) * inverse_norm, 0.0),
+        tl.where(seen, (v_qz - along * qz) * inverse_norm, 0.0), exists,
+    )  # fmt: skip
+
+
+def _rows(gradient: Tensor | None, like: Tensor) -> tuple[Tensor, int]:
+    """Return a gradient [C, N, D] whose rows are equally far apart, and how many numbers; zeros where there is none."""
+    if gradient is None:
+        gradient = torch.zeros_like(like)
+    row = gradient.stride(1)
+    if gradient.stride() != (gradient.shape[1] * row, row, 1):  # compositing's, parts of rows, are read where they lie
+        gradient, row = gradient.contiguous(), gradient.shape[2]
+    return gradient, row
+
+
+class _Project(torch.autograd.Function):
+    """gsplat's forward pass and `_project_backward`."""
+
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any,
+        means: Tensor,  # [N, 3]
+        quats: Tensor,  # [N, 4]
+        scales: Tensor,  # [N, 3]
+        opacities: Tensor,  # [N]
+        viewmats: Tensor,  # [C, 4, 4]
+        Ks: Tensor,  # [C, 3, 3]
+        width: int,
+        height: int,
+        calc_compensations: bool,
+    ) -> tuple[Tensor | None, ...]:
+        radii, means2d, depths, conics, compensations = gsplat_internals.project(
+            means, quats, scales, opacities, viewmats, Ks, width, height, calc_compensations
+        )
+        radii = radii.contiguous()
+        ctx.mark_non_differentiable(radii)
+        ctx.set_materialize_grads(False)  # torch would fill gradients with zeros where nothing depends on an output
+        ctx.save_for_backward(means, quats, scales, viewmats, Ks, radii, means2d, conics, compensations)
+        ctx.size = width, height
+        return radii, means2d, depths, conics, compensations, means
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # type: ignore[override]
+        ctx: Any,
+        _: None,
+        v_means2d: Tensor | None,
+        v_depths: Tensor | None,
+        v_conics: Tensor | None,
+        v_compensations: Tensor | None,
+        v_passed: Tensor | None,
+    ) -> tuple[Tensor | None, ...]:
+        means, quats, scales, viewmats, Ks, radii, means2d, conics, compensations = ctx.saved_tensors
+        v_means, v_quats, v_scales = torch.empty_like(means), torch.empty_like(quats), torch.empty_like(scales)
+        (v_means2d, row2d), (v_conics, row_conic) = _rows(v_means2d, means2d), _rows(v_conics, conics)
+        # The kernel reads no tensor that stands in for one that is None.
+        depths, by_compensation, passed = (
+            conics if value is None else value.contiguous() for value in (v_depths, v_compensations, v_passed)
+        )
+        n = len(means)
+        _project_backward[cdiv(n, _LANES),](
+            means, quats, scales, viewmats, Ks, radii, conics, conics if compensations is None else compensations,
+            v_means2d, v_conics, depths, by_compensation, passed, v_means, v_quats, v_scales,
+            n, len(viewmats), *ctx.size, row2d, row_conic,
+            v_depths is not None, v_compensations is not None, v_passed is not None, radii.dim() - 1, BLUR, _LANES,
+        )  # fmt: skip
+        return v_means, v_quats, v_scales, *[None] * 6
+
+
+def project(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    calc_compensations: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None, Tensor]:
+    """Do what `gsplat_internals.project` does, but differentiate it with one kernel.
+
+    Args:
+        means: Centres in world space, float32. [N, 3]
+        quats: Rotations as wxyz quaternions; need not have unit length. [N, 4]
+        scales: Standard deviations in world units, > 0. [N, 3]
+        opacities: In [0, 1], which get no gradient. [N]
+        viewmats: World-to-camera transforms, which get no gradient. [C, 4, 4]
+        Ks: Intrinsics in px, which get no gradient. [C, 3, 3]
+        width: px.
+        height: px.
+        calc_compensations: Whether to compute how much the blur must lower the opacities.
+
+    Returns:
+        What `gsplat_internals.project` returns, whose radii may be set to 0 in place until the backward pass; and
+        `means`. If what else depends on the centres takes this tensor, the backward kernel adds its gradient to theirs.
+    """
+    tensors = (value.contiguous() for value in (means, quats, scales, opacities, viewmats, Ks))
+    return _Project.apply(*tensors, width, height, calc_compensations)  # type: ignore[return-value]

@@ -1,0 +1,165 @@
+"""The projection's backward pass against float64 autograd through gsplat's torch code, and on CUDA against gsplat's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gsplat.cuda._torch_impl import _fully_fused_projection
+from torch import Tensor
+
+from sadgs_ns import gsplat_internals
+
+projection = pytest.importorskip("sadgs_ns.kernels.projection", reason="Triton is not installed")
+
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+WIDTH, HEIGHT = 40, 30
+N = 150
+OUTPUTS = ("means2d", "depths", "conics", "compensations", "passed")
+
+
+def scene(num_views: int) -> dict[str, Any]:
+    """N Gaussians, of which some are beside and some behind the cameras, in float64."""
+    generator = torch.Generator().manual_seed(0)
+
+    def random(*shape: int) -> Tensor:
+        return torch.randn(shape, generator=generator, dtype=torch.float64)
+
+    viewmats = torch.eye(4, dtype=torch.float64).repeat(num_views, 1, 1)
+    viewmats[:, :3, :3] = torch.linalg.qr(torch.eye(3) + 0.1 * random(num_views, 3, 3))[0]
+    viewmats[:, :3, :3] *= viewmats[:, :3, :3].diagonal(dim1=1, dim2=2).sign()[:, None]
+    viewmats[:, :3, 3] = 0.2 * random(num_views, 3)
+    K = torch.tensor([[35.0, 0.0, 19.0], [0.0, 45.0, 16.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    means = random(N, 3) * torch.tensor([2.0, 2.0, 1.0]) + torch.tensor([0.0, 0.0, 3.0])
+    means[::10, 2] = -1.0
+    values = {
+        "means": means,
+        "quats": 3 * random(N, 4),
+        "scales": (0.5 * random(N, 3) - 1.5).exp(),
+        "opacities": torch.full((N,), 0.5, dtype=torch.float64),
+        "viewmats": viewmats,
+        "Ks": K.repeat(num_views, 1, 1),
+    }
+    return {name: value.float().double() for name, value in values.items()}
+
+
+def project_in_torch(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor,
+    width: int, height: int, calc_compensations: bool, per_axis_radii: bool = False,
+) -> tuple[Any, ...]:  # fmt: skip
+    """Do what `gsplat_internals.project` does, with radii in either layout."""
+    covariances, _ = gsplat_internals.torch_quat_scale_to_covar_preci(quats, scales, True, False)
+    assert covariances is not None
+    radii, *others = _fully_fused_projection(
+        means, covariances, viewmats, Ks, width, height, calc_compensations=calc_compensations
+    )
+    assert others[0] is not None
+    seen = gsplat_internals.drawn(radii, others[0])
+    radii = seen.int() * 3
+    return (torch.stack([radii, 2 * radii], dim=-1) if per_axis_radii else radii), *others
+
+
+def gradients_of(
+    outputs: Mapping[str, Any], inputs: Mapping[str, Any], upstream: dict[str, Tensor]
+) -> dict[str, Tensor]:
+    """Gradients by the inputs, in float64 on the CPU, of outputs of which nothing depends on what was not drawn."""
+    names = [name for name in outputs if name in upstream]
+    gradients = [upstream[name].to(outputs[name]) for name in names]
+    torch.autograd.backward([outputs[name] for name in names], gradients)
+    return {name: inputs[name].grad.double().cpu() for name in ("means", "quats", "scales")}
+
+
+def upstream_of(seen: Tensor, names: tuple[str, ...]) -> dict[str, Tensor]:
+    """Gradients of the outputs, 0 where a Gaussian was not drawn; two are parts of rows, as compositing makes them."""
+    generator = torch.Generator().manual_seed(1)
+    rows = torch.randn((*seen.shape, 12), generator=generator, dtype=torch.float64) * seen[..., None]
+    passed = torch.randn((N, 3), generator=generator, dtype=torch.float64)
+    every = {
+        "means2d": rows[..., :2],
+        "conics": rows[..., 2:5],
+        "depths": rows[..., 5],
+        "compensations": rows[..., 6],
+        "passed": passed,
+    }
+    return {name: every[name] for name in names}
+
+
+@pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
+@pytest.mark.parametrize(
+    ("num_views", "names"),
+    [(1, ("means2d", "conics", "passed")), (3, OUTPUTS), (2, ("means2d", "conics", "compensations")), (1, ("conics",))],
+    ids=lambda value: "-".join(value) if isinstance(value, tuple) else str(value),
+)
+def test_gradients_equal_float64_autograd(monkeypatch, num_views, names, per_axis_radii):
+    if DEVICE.type == "cuda" and per_axis_radii is not gsplat_internals.RADII_PER_AXIS:
+        pytest.skip("gsplat's kernel makes radii in one of the layouts")
+    values, antialiased = scene(num_views), "compensations" in names
+    inputs: dict[str, Any] = {name: value.clone().requires_grad_() for name, value in values.items()}
+    radii, *others = project_in_torch(**inputs, width=WIDTH, height=HEIGHT, calc_compensations=antialiased)
+    seen = radii > 0
+    assert 0.3 < seen.float().mean() < 0.9
+    ratios = others[0][seen] / torch.tensor([WIDTH, HEIGHT])
+    assert ((ratios < -0.15) | (ratios > 1.15)).any(dim=1).sum() > 5, "the Jacobian should be clamped for some"
+    upstream = upstream_of(seen, names)
+    outputs: dict[str, Any] = dict(zip(OUTPUTS, [*others, 1 * inputs["means"]], strict=True))
+    expected = gradients_of(outputs, inputs, upstream)
+
+    if DEVICE.type == "cpu":  # gsplat's kernels need CUDA
+        monkeypatch.setattr(
+            gsplat_internals, "project", lambda *arguments: project_in_torch(*arguments, per_axis_radii=per_axis_radii)
+        )
+    inputs = {name: value.float().to(DEVICE) for name, value in values.items()}
+    for name in ("means", "quats", "scales"):
+        inputs[name].requires_grad_()
+    radii, *others = projection.project(**inputs, width=WIDTH, height=HEIGHT, calc_compensations=antialiased)
+    assert not radii.requires_grad and torch.equal(gsplat_internals.drawn(radii, others[0]).cpu(), seen)
+    found = gradients_of(dict(zip(OUTPUTS, others, strict=True)), inputs, upstream)
+    for name, value in expected.items():
+        error = float((found[name] - value).norm() / value.norm())
+        assert error < 2e-5, (name, error)
+    if "passed" not in names:
+        never = ~seen.any(dim=0)
+        assert never.any() and not any(value[never].any() for value in found.values())
+
+
+def test_what_no_view_draws_has_gradients_of_zero_whatever_its_numbers_are(monkeypatch):
+    """Also where it is culled, or where tile lists overflow, after the projection."""
+    values = {name: value.float().to(DEVICE) for name, value in scene(2).items()}
+    monkeypatch.setattr(gsplat_internals, "project", project_in_torch)
+    results = []
+    for broken in (False, True):
+        inputs = {name: value.clone() for name, value in values.items()}
+        for name in ("means", "quats", "scales"):
+            if broken:
+                inputs[name][:50] = torch.tensor([torch.nan, torch.inf, 0.0, -1.0, 1e30]).repeat(10)[:, None]
+            inputs[name].requires_grad_()
+        radii, *others = projection.project(**inputs, width=WIDTH, height=HEIGHT, calc_compensations=False)
+        radii.data[:, :50] = 0  # as kernels do, of whose changes autograd does not know
+        upstream = upstream_of(gsplat_internals.drawn(radii, others[0]).cpu(), ("means2d", "conics"))
+        with np.errstate(all="ignore"):  # Triton's interpreter computes with numpy
+            results.append(gradients_of(dict(zip(OUTPUTS, others, strict=True)), inputs, upstream))
+    for name, value in results[1].items():
+        assert not value[:50].any() and value[50:].any()
+        torch.testing.assert_close(value, results[0][name])
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat's kernels need CUDA")
+def test_gradients_are_as_close_to_float64_as_gsplats():
+    values = scene(3)
+    inputs = {name: value.clone().requires_grad_() for name, value in values.items()}
+    radii, *others = project_in_torch(**inputs, width=WIDTH, height=HEIGHT, calc_compensations=True)
+    upstream = upstream_of(radii > 0, OUTPUTS[:4])
+    expected = gradients_of(dict(zip(OUTPUTS, others, strict=False)), inputs, upstream)
+    errors = []
+    for function in (projection.project, gsplat_internals.project):
+        inputs = {name: value.float().to(DEVICE) for name, value in values.items()}
+        for name in ("means", "quats", "scales"):
+            inputs[name].requires_grad_()
+        others = function(**inputs, width=WIDTH, height=HEIGHT, calc_compensations=True)[1:5]
+        found = gradients_of(dict(zip(OUTPUTS, others, strict=False)), inputs, upstream)
+        errors.append({name: float((found[name] - v).norm() / v.norm()) for name, v in expected.items()})
+    for name, error in errors[0].items():
+        assert error < max(2 * errors[1][name], 1e-5), (name, *errors)

@@ -1,0 +1,196 @@
+"""Whole runs with tile lists of a length that is foreseen: as with exact lists, and repeated where they are too short.
+
+Triton's interpreter runs the kernels that make the lists. Torch code stands in for gsplat's projection, and the
+splatter's compositing, which reads the lists as gsplat's kernel does, for the compositing.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from gsplat.cuda._torch_impl import _fully_fused_projection
+from kill_and_resume import set_up
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from runs import TRAIN_VIEWS, configure
+from torch import Tensor
+
+from sadgs_ns import gsplat_internals
+from sadgs_ns.plugin.model import SadgsModel
+from sadgs_ns.plugin.trainer import SadgsTrainerConfig
+from sadgs_ns.render import rasterization, splatter
+from sadgs_ns.render.tile_forecast import TileForecast
+
+compositing = pytest.importorskip("sadgs_ns.kernels.compositing", reason="Triton is not installed")
+harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")
+tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not installed")
+
+pytestmark = pytest.mark.skipif(torch.cuda.is_available(), reason="on the CPU Triton is interpreted")
+
+ITERATIONS = 14
+
+
+def project(
+    means: Tensor,  # [N, 3]
+    quats: Tensor,  # [N, 4]
+    scales: Tensor,  # [N, 3]
+    opacities: Tensor,  # [N]
+    viewmats: Tensor,  # [C, 4, 4]
+    Ks: Tensor,  # [C, 3, 3]
+    width: int,
+    height: int,
+    calc_compensations: bool,
+) -> tuple[Tensor, ...]:
+    """`gsplat_internals.project` in torch."""
+    covariances = gsplat_internals.torch_quat_scale_to_covar_preci(quats, scales, True, False)[0]
+    return _fully_fused_projection(
+        means,
+        covariances,  # type: ignore[arg-type]
+        viewmats,
+        Ks,
+        width,
+        height,
+        calc_compensations=calc_compensations,
+    )
+
+
+def composite(
+    means2d: Tensor,  # [C, N, 2]
+    conics: Tensor,  # [C, N, 3]
+    colors: Tensor,  # [C, N, 3]
+    opacities: Tensor,  # [C, N]
+    width: int,
+    height: int,
+    starts: Tensor,  # [C, tile rows, tile columns]
+    ids: Tensor,  # [number of pairs]
+    absgrad: bool,
+) -> tuple[Tensor, Tensor]:
+    """`compositing.rasterize_to_pixels` in torch: a list ends where the next begins, and the last at the end."""
+    views, size = len(starts), compositing.TILE_SIZE
+    rows, columns = -(-height // size), -(-width // size)
+    ends = torch.cat([starts.flatten()[1:], torch.tensor([len(ids)])]).view_as(starts)
+    starts, ends = (places[:, :rows].flatten().long() for places in (starts, ends))
+    row, column = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
+    origins = (torch.stack([column, row], dim=-1) * size).reshape(-1, 2).repeat(views, 1)
+    tiles = splatter._Tiles(size, origins, starts, ends - starts, ids.long())
+    canvas: Any = splatter._Composite.apply(means2d, conics, colors, opacities, tiles, absgrad)
+    image = canvas.reshape(views, rows, columns, size, size, 4).transpose(2, 3).reshape(views, rows * size, -1, 4)
+    return image[:, :height, :width, :3], image[:, :height, :width, 3:]
+
+
+@pytest.fixture
+def our_rasterizer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rasterization, "kernels", SimpleNamespace(available=lambda device: True))
+    monkeypatch.setattr(gsplat_internals, "project", project)
+    monkeypatch.setattr(compositing, "rasterize_to_pixels", composite)
+    for module, name in ((tiles, "_LANES"), (harmonics, "_LANES"), (harmonics, "_BACKWARD_LANES")):
+        monkeypatch.setattr(module, name, 1024)  # The interpreter runs one program after the other.
+
+
+@pytest.fixture
+def short(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig:
+    """A run of a few steps of two views, with densification, η and AbsGS."""
+    config = configure(tmp_path, colmap, ITERATIONS, structure_every=8, absgs_every=5, refine_stop_iter=8)
+    config.pipeline.views_per_iteration = 2
+    config.machine.device_type = "cpu"
+    return config
+
+
+class Observed(TileForecast):
+    """A forecast that keeps what it foresaw, and foresees far too little at the steps that it is told."""
+
+    def __init__(self, too_short: Sequence[int] = ()) -> None:
+        super().__init__()
+        self.too_short = too_short
+        self.capacities: list[int | None] = []
+        self.views: list[list[int]] = []
+
+    def capacity(self, views: Sequence[int], size: tuple[int, int], num_gaussians: int) -> int | None:
+        foreseen = super().capacity(views, size, num_gaussians)
+        self.capacities.append(7 if len(self.capacities) in self.too_short else foreseen)
+        self.views.append(list(views))
+        return self.capacities[-1]
+
+
+def train(
+    config: SadgsTrainerConfig, forecast: TileForecast | None, after_step: Callable[[SadgsModel, int], None]
+) -> None:
+    """Train to the end with a forecast, or waiting, and call `after_step` with the model and the step after each."""
+    trainer = set_up(config)
+    model = trainer.pipeline.model
+    model.tile_forecast = forecast
+    location = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+    trainer.callbacks.append(TrainingCallback(location, lambda step: after_step(model, step)))
+    trainer.train()
+
+
+def state_of(model: SadgsModel) -> dict[str, Tensor]:
+    """Copies of the parameters and of the statistics."""
+    values = {**model.gauss_params, **model.strategy_state}
+    return {name: value.detach().clone() for name, value in values.items() if isinstance(value, Tensor)}
+
+
+def test_a_run_that_foresees_equals_one_that_waits_bit_for_bit(
+    our_rasterizer: None, short: SadgsTrainerConfig, capsys: pytest.CaptureFixture[str]
+):
+    forecast, states = Observed(), []
+    for way in (None, forecast):
+        states.append([])
+        train(short, way, lambda model, step: states[-1].append(state_of(model)))
+    assert len(forecast.capacities) == ITERATIONS and sum(map(bool, forecast.capacities)) > ITERATIONS / 3
+    assert forecast.times_overflowed == 0 and "nothing was drawn" not in capsys.readouterr().out
+    for expected, foreseen in zip(*states, strict=True):
+        assert expected.keys() == foreseen.keys()
+        assert all(torch.equal(foreseen[name], value) for name, value in expected.items())
+
+
+def test_steps_whose_lists_are_too_short_count_nothing_and_their_views_come_again(
+    our_rasterizer: None, short: SadgsTrainerConfig, capsys: pytest.CaptureFixture[str]
+):
+    """Only the mean opacity still has a gradient then. Densification follows the steps 4 and 7."""
+    too_short = (2, 6, 9)
+    forecast, states = Observed(too_short), []
+    statistics = ("n_total", "n_high", "n_low", "eta_max", "grad_count", "grad2d", "absgrad2d")
+
+    def look(model: SadgsModel, step: int) -> None:
+        states.append(state_of(model))
+        if step in too_short:
+            assert not any(model.gauss_params[name].grad.any() for name in ("means", "scales", "quats", "features_dc"))  # type: ignore[union-attr]
+        if step in (2, 6):
+            assert states[step]["n_total"].sum() > 0 and (step > 4 or states[step]["grad_count"].sum() > 0)
+            assert all(torch.equal(states[step][name], states[step - 1][name]) for name in statistics)
+
+    train(short, forecast, look)
+    assert all(forecast.views[step + 1] == forecast.views[step] for step in too_short)
+    assert forecast.times_overflowed == 3
+    visits = Counter(index for step, views in enumerate(forecast.views) if step not in too_short for index in views)
+    assert max(visits.values()) - min(visits.values()) <= 1 and len(visits) == TRAIN_VIEWS
+    assert "In 3 iterations nothing was drawn" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_checkpoint_after_an_overflow_has_the_views_that_must_be_drawn_again(
+    our_rasterizer: None, short: SadgsTrainerConfig
+):
+    short.max_num_iterations = 5
+    forecast, orders = Observed([3]), []
+    trainer = set_up(short)
+    trainer.pipeline.model.tile_forecast = forecast
+    location = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+    keep = lambda step: orders.append(trainer.pipeline.get_extra_state()["view_order"])  # noqa: E731
+    trainer.callbacks.append(TrainingCallback(location, keep))
+    trainer.train()
+    assert orders[3][:2] == forecast.views[3] and forecast.views[4] == forecast.views[3]
+
+
+def test_a_bilateral_grid_never_sees_a_black_rendering(short: SadgsTrainerConfig):
+    """It would learn to brighten it: such a run waits for the exact lists."""
+    short.pipeline.model.use_bilateral_grid = True
+    trainer = set_up(short)
+    assert trainer.pipeline.model.tile_forecast is None
+    trainer.shutdown()
