@@ -61,6 +61,19 @@ def step() -> argparse.ArgumentParser:
     return parser
 
 
+def growth() -> argparse.ArgumentParser:
+    """Return the options of `sadgs-bench growth`."""
+    parser = argparse.ArgumentParser(
+        prog="sadgs-bench growth", description="Time training steps of more and more Gaussians, and of larger images."
+    )
+    numbers, sizes = [1_000_000, 100_000, 300_000, 4_000_000, 16_000_000], [2.0, 0.3, 1.0, 4.0, 8.0, 16.0]
+    of_first = "the first of them goes with all"
+    parser.add_argument("--gaussians", type=int, nargs="+", default=numbers, help=f"{of_first} sizes")
+    parser.add_argument("--megapixels", type=float, nargs="+", default=sizes, help=f"{of_first} numbers of Gaussians")
+    parser.add_argument("--output", type=Path, default=Path("growth"), help="folder for growth.csv, .png and .svg")
+    return parser
+
+
 def validation() -> argparse.ArgumentParser:
     """Return the options of `sadgs-bench validation`."""
     parser = argparse.ArgumentParser(

@@ -13,7 +13,7 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 from matplotlib.artist import Artist
@@ -99,6 +99,15 @@ class Style:
         """Arguments of `Axes.plot`."""
         looks = {"color": self.color, "marker": self.marker, "fillstyle": self.fill, "linestyle": self.line}
         return {**looks, "markerfacecoloralt": "white", **changes}
+
+
+class Growth(NamedTuple):
+    """Milliseconds of a training step of one view; None where the memory was too small."""
+
+    gaussians: int
+    megapixels: float
+    ours: float | None
+    gsplat: float | None
 
 
 def styles(labels: Iterable[str]) -> dict[str, Style]:
@@ -221,6 +230,36 @@ def _stacked_bars(figure: SubFigure, groups: Groups, names: dict[str, str], titl
     panels[-1].set_xlabel(title)
     panels[-1].set_xlim(0, 1.1 * longest or 1)
     _legend(figure, [Patch(**look, label=names[name]) for name, look in looks.items()], 2.5)
+
+
+@_styled
+def growth(rows: Sequence[Growth]) -> Figure:
+    """Milliseconds of a step against the number of Gaussians, and against pixels, both axes logarithmic.
+
+    Args:
+        rows: The first one's size goes with all numbers of Gaussians, and its number with all sizes.
+    """
+    number, size = rows[0].gaussians, rows[0].megapixels
+    figure = Figure(figsize=(_WIDTH, 2.8))
+    left, right = figure.subplots(1, 2, sharey=True)
+    looks = styles(("ours", "gsplat and torch"))
+    panels = (
+        (left, [(row.gaussians, row) for row in rows if row.megapixels == size], f"{size:g} megapixels"),
+        (right, [(1e6 * row.megapixels, row) for row in rows if row.gaussians == number], f"{number:,} Gaussians"),
+    )
+    for axes, points, title in panels:
+        for label, field in (("ours", "ours"), ("gsplat and torch", "gsplat")):
+            timed = sorted((x, getattr(row, field)) for x, row in points if getattr(row, field) is not None)
+            axes.plot(*zip(*timed, strict=True), label=label, **looks[label].line2d())
+        axes.set(xscale="log", yscale="log", title=title)
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_minor_locator(NullLocator())
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
+    left.set(xlabel="Gaussians", ylabel="Milliseconds a training step")
+    right.set_xlabel("Pixels")
+    left.legend()
+    return figure
 
 
 @_styled
