@@ -14,7 +14,6 @@ from sadgs_ns.bench.step import Step, milliseconds
 
 ASPECT = 1.5
 """Width of the images, relative to their height."""
-FIELDS = ("gaussians", "megapixels", "ours_ms", "gsplat_ms")
 
 
 def whole_step(gaussians: int, megapixels: float, fused: bool) -> float | None:
@@ -60,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     rows = measure(options.gaussians, options.megapixels)
     written = io.StringIO()
     table = csv.writer(written, lineterminator="\n")
-    table.writerows([FIELDS, *rows])
+    table.writerows([plots.Growth._fields, *rows])
     options.output.mkdir(parents=True, exist_ok=True)
     (options.output / "growth.csv").write_text(written.getvalue(), encoding="utf-8")
     plots.save(plots.growth(rows), options.output / "growth")

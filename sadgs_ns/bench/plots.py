@@ -106,8 +106,8 @@ class Growth(NamedTuple):
 
     gaussians: int
     megapixels: float
-    ours: float | None
-    gsplat: float | None
+    ours_ms: float | None
+    gsplat_ms: float | None
 
 
 def styles(labels: Iterable[str]) -> dict[str, Style]:
@@ -248,7 +248,7 @@ def growth(rows: Sequence[Growth]) -> Figure:
         (right, [(1e6 * row.megapixels, row) for row in rows if row.gaussians == number], f"{number:,} Gaussians"),
     )
     for axes, points, title in panels:
-        for label, field in (("ours", "ours"), ("gsplat and torch", "gsplat")):
+        for label, field in (("ours", "ours_ms"), ("gsplat and torch", "gsplat_ms")):
             timed = sorted((x, getattr(row, field)) for x, row in points if getattr(row, field) is not None)
             axes.plot(*zip(*timed, strict=True), label=label, **looks[label].line2d())
         axes.set(xscale="log", yscale="log", title=title)

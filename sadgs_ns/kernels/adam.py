@@ -14,6 +14,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from sadgs_ns.kernels import cdiv
+
 _BLOCK = 1024
 """Numbers that one program updates."""
 
@@ -101,7 +103,7 @@ def adam_step(
     scales = tuple((1 - beta2**step) ** -0.5 for step in steps)
     rows = parameters[0].shape[:1].numel()  # 1 without dimensions
     widths = tuple(parameter.shape[1:].numel() for parameter in parameters)
-    grid = (sum(-(-rows * width // _BLOCK) for width in widths),)
+    grid = (sum(cdiv(rows * width, _BLOCK) for width in widths),)
     _update[grid](
         parameters, gradients, exp_avgs, exp_avg_sqs, rates, scales, noted, rows, beta1, beta2, eps,
         widths, max_gradient, _BLOCK,
