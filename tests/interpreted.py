@@ -15,6 +15,7 @@ from sadgs_ns.render import rasterization, splatter
 
 compositing = pytest.importorskip("sadgs_ns.kernels.compositing", reason="Triton is not installed")
 harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")
+projection = pytest.importorskip("sadgs_ns.kernels.projection", reason="Triton is not installed")
 tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not installed")
 
 
@@ -71,5 +72,6 @@ def use_our_rasterizer(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rasterization, "kernels", SimpleNamespace(available=lambda device: True))
     monkeypatch.setattr(gsplat_internals, "project", project)
     monkeypatch.setattr(compositing, "rasterize_to_pixels", composite)
-    for module, name in ((tiles, "_LANES"), (harmonics, "_LANES"), (harmonics, "_BACKWARD_LANES")):
+    lanes = [(tiles, "_LANES"), (harmonics, "_LANES"), (harmonics, "_BACKWARD_LANES"), (projection, "_LANES")]
+    for module, name in lanes:
         monkeypatch.setattr(module, name, 1024)  # The interpreter runs one program after the other.

@@ -115,7 +115,7 @@ class CudaGraphs:
         torch.cuda.synchronize(self._device)
 
     def _repair_generator(self) -> None:
-        """Let random numbers be drawn again, for which torch's generator waits after a capture that did not end well."""
+        """Let random numbers be drawn again, which torch refuses after a capture that did not end well."""
         generator = torch.cuda.default_generators[torch.cuda.current_device()]
         generator.graphsafe_set_state(generator.clone_state())
 
