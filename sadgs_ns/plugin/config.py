@@ -96,7 +96,7 @@ class CheckedTrainerConfig(TrainerConfig):
     rates_follow_views: bool = True
     """Whether the rates of positions, opacities, scales and rotations, set for one view a step, change with more views.
     The mean over more views is less noisy, so that they may be higher, and fall further."""
-    graphed_steps: bool = True
+    cuda_graphs: bool = True
     """Whether the host launches steps of few Gaussians at once, as CUDA graphs, instead of kernel by kernel.
     Only where there is CUDA, and up to a million Gaussians, counted in each view; what is trained is the same."""
     steps_per_save: int = 0

@@ -204,7 +204,7 @@ class GraphedSteps:
         """Return what graphs the steps of a run; None where its steps must always be launched one by one."""
         config, pipeline, optimizers = trainer.config, trainer.pipeline, trainer.optimizers
         model = pipeline.model
-        if not config.graphed_steps or config.log_gradients or not model.config.fused:
+        if not config.cuda_graphs or config.log_gradients or not model.config.fused:
             return None
         # Without a forecast the host waits in each step, and what a camera optimizer does is not in the graphs.
         if not kernels.available(model.device) or model.tile_forecast is None:

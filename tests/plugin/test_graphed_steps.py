@@ -82,7 +82,7 @@ def short(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig:
 def run(config: SadgsTrainerConfig, graphed: bool) -> tuple[SadgsTrainer, list[Any]]:
     """Train to the end; also return the loss, PSNR, views and rates of each step, as they are after the whole run."""
     config = copy.deepcopy(config)
-    config.graphed_steps = graphed
+    config.cuda_graphs = graphed
     trainer, trace = set_up(config), []
     iterate, begin = trainer.train_iteration, trainer.pipeline.log.begin_step
 
@@ -289,7 +289,7 @@ def test_steps_of_many_gaussians_or_of_masked_views_are_launched_one_by_one(
 @pytest.mark.parametrize(
     "change",
     [
-        lambda config: setattr(config, "graphed_steps", False),
+        lambda config: setattr(config, "cuda_graphs", False),
         lambda config: setattr(config, "log_gradients", True),
         lambda config: setattr(config.pipeline.model, "fused", False),
         lambda config: setattr(config.pipeline.model, "use_bilateral_grid", True),
