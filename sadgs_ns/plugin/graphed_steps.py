@@ -41,7 +41,7 @@ class Results(NamedTuple):
     """What a step leaves on the device for the host; the next replay of its graph overwrites it."""
 
     values: Tensor
-    """Loss, PSNR in dB, and NaN if a gradient was left out, else 0. [3]"""
+    """Loss, PSNR in dB, two numbers that mean nothing, and NaN if a gradient was left out, else 0. [5]"""
     pair_counts: Tensor
     """Pairs of a Gaussian and a tile of each view. int64 [V]"""
     means_gradient: Tensor
@@ -161,12 +161,15 @@ def launch_step(
         keep_gradient(info["means2d"])
     loss = model.get_loss_dict(outputs, {"image": inputs.images})["main_loss"]
     loss.backward()
-    noted = torch.zeros(1, device=loss.device)
+    # What notes gradients begins at 16 bytes, because Triton would compile Adam anew for what is less aligned.
+    values = torch.zeros(5, device=loss.device)
     gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
-    update.launch(gradients, noted, inputs.factors)
+    update.launch(gradients, values[4:], inputs.factors)
     if kind.absgrad:
         accumulate_gradients(dict(sums), info, len(inputs.viewmats), fused=model.strategy.fused)
-    values = torch.stack([loss.detach(), outputs["psnr"], noted[0]])
+    # These are copies of memory. A kernel that no step has launched before would be loaded while it is captured.
+    values[0].copy_(loss.detach())
+    values[1].copy_(outputs["psnr"])
     return Results(values, info["pair_counts"].counts.clone(), gradients["means"])
 
 
@@ -265,7 +268,7 @@ class GraphedSteps:
         values = results.values.clone()
         loss, psnr = values[:2].unbind()
         pipeline.log.begin_step(step, indices, loss)
-        pipeline.log.gradients.copy_(values[2:])
+        pipeline.log.gradients.copy_(values[4:])
         counts = PairCounts.sent(results.pair_counts)
         forecast.rendered(indices, (width, height), kind.tile_capacity, counts)
         return loss, {"main_loss": loss}, model.get_metrics_dict({"psnr": psnr}, {})
@@ -288,9 +291,9 @@ class GraphedSteps:
             self._addresses = addresses
         key = kind, images[0].dtype, len(images)
         if key in self._launched and key not in self._graphs and len(self._graphs) < MOST_GRAPHS:
-            factors = viewmats.new_zeros((2, len(update.parameters)))
-            inputs = _Inputs(viewmats.clone(), Ks.clone(), torch.stack(list(images)), factors)
             try:
+                factors = viewmats.new_zeros((2, len(update.parameters)))
+                inputs = _Inputs(viewmats.clone(), Ks.clone(), torch.stack(list(images)), factors)
                 self._recorder = self._recorder or CudaGraphs(viewmats.device)
                 step = partial(launch_step, self._pipeline.model, kind, inputs, update, sums)
                 self._graphs[key] = self._recorder.capture(step), inputs

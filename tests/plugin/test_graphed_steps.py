@@ -17,6 +17,7 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from runs import configure
 from torch import Tensor
 
+from sadgs_ns import kernels
 from sadgs_ns.bench import phases
 from sadgs_ns.plugin import graphed_steps, optimizers
 from sadgs_ns.plugin.graphed_steps import Results
@@ -125,9 +126,8 @@ def assert_equal(one: dict[str, Tensor], other: dict[str, Tensor], what: str = "
 
 
 @on_cpu
-@pytest.mark.parametrize("views", [1, 2])
-def test_a_run_of_graphs_equals_one_of_launches_bit_for_bit(without_cuda: None, short: SadgsTrainerConfig, views: int):
-    short.pipeline.views_per_iteration = views
+def test_a_run_of_graphs_equals_one_of_launches_bit_for_bit(without_cuda: None, short: SadgsTrainerConfig):
+    short.pipeline.views_per_iteration = 2
     (launched, expected), (replayed, found) = run(short, False), run(short, True)
     assert launched.graphed is None and replayed.graphed is not None and not replayed.graphed.failure
     assert replayed.graphed.replayed > ITERATIONS / 3
@@ -328,11 +328,11 @@ def test_a_gpu_trains_alike_with_graphs(colmap: ColmapDataParserConfig, tmp_path
     config = configure(tmp_path, colmap, 300, **schedule, refine_start_iter=60)
     config.pipeline.views_per_iteration = views
     (launched, expected), (replayed, found) = run(config, False), run(config, True)
-    if not launched.pipeline.model.config.fused or replayed.graphed is None:
+    if not kernels.available(replayed.pipeline.model.device):
         pytest.skip("Triton does not run here")
-    assert not replayed.graphed.failure, replayed.graphed.failure
+    assert replayed.graphed is not None and replayed.graphed.failure == ""
     assert replayed.graphed.replayed > 150, f"of 300 steps {replayed.graphed.replayed} were replayed"
-    assert [of_step for of_step in expected[::2]] == [of_step for of_step in found[::2]]  # the views
+    assert expected[::2] == found[::2], "the same views come in the same order"
     losses = [torch.stack([loss for loss, *_ in trace[1::2]]).cpu() for trace in (expected, found)]
     torch.testing.assert_close(losses[1][:50], losses[0][:50], rtol=1e-3, atol=0)
     counts = [trainer.pipeline.model.num_points for trainer in (launched, replayed)]
