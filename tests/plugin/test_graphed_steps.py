@@ -77,6 +77,7 @@ def short(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig:
     config = configure(tmp_path, colmap, ITERATIONS, **schedule)
     config.machine.device_type = "cpu"
     config.pipeline.views_per_iteration = 1
+    config.cuda_graphs = True
     return config
 
 
