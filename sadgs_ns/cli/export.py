@@ -96,9 +96,9 @@ def export(run: Path, output: Path, frame: Frame = "nerfstudio", data: Path | No
         params["features_dc"] = (params["features_dc"].sigmoid() - 0.5) / DEGREE_0
     start = None
     if as_page:
-        from sadgs_ns.data.training_cameras import read_training_cameras
+        from sadgs_ns.data.run_cameras import read_cameras
 
-        cameras = read_training_cameras(folder, data)
+        cameras = read_cameras(folder, data)
         pose, K = cameras.camera_to_worlds[0].double().numpy(), cameras.Ks[0]
         start = html.start_at(pose, max(cameras.sizes[0]), float(K[0, 0]), params["means"].numpy())
     try:

@@ -98,7 +98,7 @@ def read(path: Path) -> Gaussians:
 
 def errors(written: Gaussians, found: Gaussians) -> dict[str, float]:
     """Largest errors, Gaussian by Gaussian, whose order in the file is another; of quaternions the angle in degrees."""
-    distances, order = KDTree(found.means).query(written.means)
+    distances, order = map(np.asarray, KDTree(found.means).query(written.means))
     assert len(found) == len(written) == len(np.unique(order)), "each Gaussian must be there once"
     found = found[order]
     cosines = np.abs((written.quats.astype(np.float64) * found.quats).sum(axis=1)).clip(0, 1)
@@ -115,7 +115,7 @@ BOUNDS: dict[str, dict[str, float]] = {
     ".compressed.ply": {"means": 3 / 1023, "scales": 4 / 2046 + 1e-5, "quats": 0.25, "alphas": ALPHA,
                         "features_dc": 5 / 510 + 1e-5, "features_rest": 1 / 64 + 1e-6},
     ".spz": {"means": 2e-6, "scales": 1 / 32 + 1e-6, "quats": 0.25, "alphas": ALPHA, "features_dc": 0.5 / 38.25 + 1e-6,
-             "features_rest": 9 / 128},
+             "features_rest": 1 / 64 + 1e-6},
     # The levels of the rarest values are the furthest apart. There are half as many sets of harmonics as Gaussians.
     ".sog": {"means": 2e-4, "scales": 0.05, "quats": 1.0, "alphas": ALPHA, "features_dc": 0.06, "features_rest": 0.45},
     ".glb": {"means": 0, "scales": 1e-5, "quats": 0.05, "alphas": 1e-6, "features_dc": 0, "features_rest": 0},

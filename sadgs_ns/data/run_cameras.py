@@ -1,4 +1,4 @@
-"""The training cameras of a finished run, read from its capture; nothing of the run's files is executed."""
+"""The cameras of a finished run, read from its capture; nothing of the run's files is executed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sadgs_ns.errors import InputError, reason
 
 
 @dataclass(frozen=True)
-class TrainingCameras:
+class RunCameras:
     """C pinhole cameras in the frame of training; distortion is left out."""
 
     camera_to_worlds: Tensor
@@ -24,6 +24,8 @@ class TrainingCameras:
     """Intrinsics in px. [C, 3, 3]"""
     sizes: list[tuple[int, int]]
     """Width and height in px. C of them"""
+    photos: list[Path]
+    """The image files. C of them"""
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -62,12 +64,13 @@ def find_capture(run: Path) -> Path:
     return data
 
 
-def read_training_cameras(run: Path, data: Path | None = None) -> TrainingCameras:
-    """Read a run's training cameras, in its frame, with the parser that fits the capture's folder.
+def read_cameras(run: Path, data: Path | None = None, split: str = "train") -> RunCameras:
+    """Read a run's cameras, in its frame, with the parser that fits the capture's folder.
 
     Args:
         run: The run's folder.
         data: The capture's folder; None is where the run's `config.yml` says it was.
+        split: "train", or "test" for the views that are held out.
 
     Raises:
         InputError: If the capture is not there or cannot be read, or the run does not tell how it was moved.
@@ -81,7 +84,7 @@ def read_training_cameras(run: Path, data: Path | None = None) -> TrainingCamera
     config = FullImageDatamanagerConfig(data=data, dataparser=AutomaticDataParserConfig(data=data))  # type: ignore[arg-type]
     try:
         choose_parser(config)
-        outputs = config.dataparser.setup().get_dataparser_outputs(split="train")
+        outputs = config.dataparser.setup().get_dataparser_outputs(split=split)
     except InputError:
         raise
     except Exception as error:  # The parsers' errors are of every kind.
@@ -93,6 +96,9 @@ def read_training_cameras(run: Path, data: Path | None = None) -> TrainingCamera
             poses[:, :, :3] = similarity.orthogonal @ poses[:, :, :3]
             poses[:, :, 3] = similarity.positions(poses[:, :, 3])
     sizes = torch.cat([cameras.width, cameras.height], dim=1).tolist()
-    return TrainingCameras(
-        torch.from_numpy(poses).float(), cameras.get_intrinsics_matrices(), [(width, height) for width, height in sizes]
+    return RunCameras(
+        torch.from_numpy(poses).float(),
+        cameras.get_intrinsics_matrices(),
+        [(width, height) for width, height in sizes],
+        outputs.image_filenames,
     )
