@@ -8,6 +8,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sadgs_ns.data.coordinates import TRANSFORMS_NAME, Similarity, from_data
 from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.formats import files, html
@@ -17,6 +20,11 @@ from sadgs_ns.formats.gaussians import DEGREE_0, of_parameters
 if TYPE_CHECKING:  # torch takes seconds, which `--help` and a wrong path need not wait for
     from torch import Tensor
 
+    from sadgs_ns.data.run_cameras import RunCameras
+    from sadgs_ns.method.cleaning import Cleaning
+
+_MAX_OFF_AXIS = 4.0
+"""As `sadgs` draws; what it leaves out has no true size on the screen."""
 _PREFIX = "_model.gauss_params."
 _REMEDY = "give another checkpoint step-*.ckpt of a run of sadgs or splatfacto"
 """What to do about a checkpoint that cannot be used."""
@@ -49,7 +57,7 @@ def write_gaussians(
         InputError: If nothing is left to write, or the format cannot hold it.
         WriteError: If the file could not be written.
     """
-    gaussians = of_parameters({name: tensor.detach().cpu().numpy() for name, tensor in params.items()})
+    gaussians = of_parameters(_arrays(params))
     sound = (gaussians if similarity is None else gaussians.moved(similarity)).finite()
     files.write(path, sound, frame, start)
     if len(sound) < len(gaussians):
@@ -57,11 +65,24 @@ def write_gaussians(
     return len(sound)
 
 
-def export(run: Path, output: Path, frame: Frame = "nerfstudio", data: Path | None = None) -> int:
-    """Write the Gaussians of a run of sadgs or splatfacto.
+def _arrays(params: Mapping[str, Tensor]) -> dict[str, NDArray[np.floating]]:
+    return {name: tensor.detach().cpu().numpy() for name, tensor in params.items()}
+
+
+def export(
+    run: Path,
+    output: Path,
+    frame: Frame = "nerfstudio",
+    data: Path | None = None,
+    min_views: int = 0,
+    max_extent: float | None = None,
+    crop: Sequence[float] | None = None,
+    dust: float = 0.0,
+) -> int:
+    """Write the Gaussians of a run of sadgs or splatfacto, and say what was taken away of them.
 
     Nothing in the run's folder is executed, not even its `config.yml`, and the data need not be there any more, except
-    for the camera with which an HTML page opens.
+    for `min_views` and `dust`, and for the camera with which an HTML page opens.
 
     Args:
         run: The run's folder, its `config.yml`, or one of its checkpoints; without one the latest is taken.
@@ -69,18 +90,26 @@ def export(run: Path, output: Path, frame: Frame = "nerfstudio", data: Path | No
         frame: "nerfstudio" is the frame of training: centred, upright, cameras within ±1. "colmap" is that of the
             COLMAP model, or of `transforms.json` where no COLMAP model stands behind it.
         data: The capture's folder, where cameras are needed; None is where the run's `config.yml` says it was.
+        min_views: As in `Cleaning`, whose units are those of nerfstudio's frame, and so the next three.
+        max_extent: As in `Cleaning`.
+        crop: As in `Cleaning`; six numbers.
+        dust: As in `Cleaning`.
 
     Returns:
         The number of Gaussians written.
 
     Raises:
-        InputError: If the run, the capture or the output cannot be used.
+        InputError: If the run, the capture, an option or the output cannot be used.
         WriteError: If the file could not be written.
     """
     as_page = format_of(output) == ".html"
     if as_page and frame != "nerfstudio":
         raise InputError("--frame colmap is for files that other programs read: leave it out for a page.")
     checkpoint = _checkpoint_of(run)
+    from sadgs_ns.method.cleaning import Cleaning  # It imports torch.
+
+    box = None if crop is None else (crop[0], crop[1], crop[2], crop[3], crop[4], crop[5])
+    cleaning = Cleaning(min_views, max_extent, box, dust)
     folders = checkpoint.absolute().parents[:2]
     folder = next((folder for folder in folders if (folder / TRANSFORMS_NAME).is_file()), folders[-1])
     similarity = None
@@ -94,19 +123,51 @@ def export(run: Path, output: Path, frame: Frame = "nerfstudio", data: Path | No
     params = _read(checkpoint, latest=checkpoint != run)
     if params["features_rest"].shape[1] == 0:  # then training holds colours' logits
         params["features_dc"] = (params["features_dc"].sigmoid() - 0.5) / DEGREE_0
-    start = None
-    if as_page:
+    start, cameras = None, None
+    if as_page or cleaning.needs_views:
         from sadgs_ns.data.run_cameras import read_cameras
 
         cameras = read_cameras(folder, data)
-        pose, K = cameras.camera_to_worlds[0].double().numpy(), cameras.Ks[0]
-        start = html.start_at(pose, max(cameras.sizes[0]), float(K[0, 0]), params["means"].numpy())
     try:
+        of_parameters(_arrays(params))
+        params = _cleaned(params, cleaning, cameras)
+        if as_page and cameras is not None:
+            pose, K = cameras.camera_to_worlds[0].double().numpy(), cameras.Ks[0]
+            start = html.start_at(pose, max(cameras.sizes[0]), float(K[0, 0]), params["means"].numpy())
         return write_gaussians(output, params, frame, similarity, start)
     except InputError:
         raise
     except ValueError as error:
         raise InputError(f"{checkpoint} holds no Gaussians that can be exported ({error}): {_REMEDY}.") from error
+
+
+def _cleaned(params: dict[str, Tensor], cleaning: Cleaning, cameras: RunCameras | None) -> dict[str, Tensor]:
+    """Return the parameters of the Gaussians that stay, and print how many each option takes away."""
+    if cleaning == type(cleaning)():
+        return params
+    import torch
+    from rich.console import Console
+    from rich.progress import track
+
+    from sadgs_ns.method.cleaning import Seen, find, see
+    from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
+
+    seen = None
+    if cleaning.needs_views and cameras is not None:
+        device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        viewmats, Ks = viewmats_from_camera_to_world(cameras.camera_to_worlds).to(device), cameras.Ks.to(device)
+        views = [(viewmat, K, *size) for viewmat, K, size in zip(viewmats, Ks, cameras.sizes, strict=True)]
+        console = Console(stderr=True)
+        shown = track(views, "Looking from the training views", console=console, disable=not console.is_terminal)
+        seen = see({name: value.to(device) for name, value in params.items()}, shown, max_off_axis=_MAX_OFF_AXIS)
+        seen = Seen(seen.views.cpu(), seen.pixels.cpu(), seen.total)
+    stays, sentences = find(params, cleaning, seen)
+    print("\n".join(sentences))
+    if not stays.any():
+        raise InputError(
+            f"These options take away all {len(stays):,} Gaussians: nothing is written, so take fewer away."
+        )
+    return {name: value[stays] for name, value in params.items()}
 
 
 def _checkpoint_of(run: Path) -> Path:
@@ -164,12 +225,33 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="coordinates: nerfstudio's, centred, upright and with cameras within ±1, or those of the COLMAP model or "
         "transforms.json that the data came with (default %(default)s)",
     )
+    cleaning = parser.add_argument_group(
+        "cleaning", "What is taken away, by default nothing; units are those of nerfstudio's frame."
+    )
+    cleaning.add_argument(
+        "--min-views", type=int, default=0, metavar="K", help="Gaussians that fewer than K training views see"
+    )
+    cleaning.add_argument(
+        "--max-extent", type=float, metavar="UNITS", help="Gaussians whose longest standard deviation is more than this"
+    )
+    cleaning.add_argument(
+        "--crop", type=float, nargs=6, metavar=("X", "Y", "Z", "X", "Y", "Z"),
+        help="Gaussians whose centre is outside the box from the lowest x, y and z to the highest",
+    )  # fmt: skip
+    cleaning.add_argument(
+        "--dust", type=float, default=0.0, metavar="PX",
+        help="Gaussians that make up less than this many pixels of each training view: opacity times area, less what "
+        "others hide",
+    )  # fmt: skip
     parser.add_argument(
-        "--data", type=Path, help="folder of the capture, for .html (default: where it was in training)"
+        "--data",
+        type=Path,
+        help="folder of the capture, for .html, --min-views and --dust (default: where it was in training)",
     )
     given = parser.parse_args(argv)
+    options = {name: value for name, value in vars(given).items() if name not in ("run", "output", "frame", "data")}
     try:
-        count = export(given.run, given.output, given.frame, given.data)
+        count = export(given.run, given.output, given.frame, given.data, **options)
     except (InputError, RunError, WriteError) as error:
         print(f"sadgs-export: {error}", file=sys.stderr)
         return 2

@@ -355,6 +355,50 @@ def test_a_capture_that_cannot_be_read_is_named(tmp_path: Path, capsys: pytest.C
     assert capsys.readouterr().err.startswith("sadgs-export: --frame colmap is for files that other programs read: ")
 
 
+# --- cleaning ---
+
+
+def test_what_is_taken_away_is_told_and_not_in_the_file(
+    trained: tuple[Path, SadgsTrainer], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    _, trainer = trained
+    model, path = trainer.pipeline.model, tmp_path / "splat.ply"
+    means = model.means.detach().numpy()
+    low, high = (np.round(np.quantile(means, q, axis=0), 3) for q in (0.1, 0.9))
+    extents = model.scales.detach().exp().amax(dim=1).numpy()
+    longest = float(np.round(np.quantile(extents, 0.9), 4))
+    options = ["--crop", *map(str, low), *map(str, high), "--max-extent", str(longest), "--min-views", "2"]
+    assert export.main([str(trainer.base_dir), "--output", str(path), *options, "--dust", "0.01"]) == 0
+    told = [int(line.split()[0].replace(",", "")) for line in capsys.readouterr().out.splitlines()[:4]]
+    inside = ((means >= low.astype(np.float32)) & (means <= high.astype(np.float32))).all(axis=1)
+    assert told[0] == (~inside).sum() > 0 and told[1] == (extents[inside] > longest).sum() > 0
+    kept = read(path, "x", "y", "z")
+    assert len(kept) == model.num_points - sum(told) > 0
+    assert (kept >= low - 1e-6).all() and (kept <= high + 1e-6).all()
+    known = {tuple(row) for row in means[inside & (extents <= longest)]}
+    assert {tuple(row) for row in kept} <= known
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ("--min-views -1", r"--min-views -1 must be 0, which takes nothing away, or more\."),
+        ("--dust nan", r"--dust nan must be 0, .*\."),
+        ("--max-extent 0", r"--max-extent 0 must be more than 0: leave it out to take nothing away\."),
+        ("--crop 0 0 0 1 -1 1", r"--crop 0 0 0 1 -1 1 is no box: give the lowest x, y and z, then the highest .*\."),
+        ("--max-extent 1e-9", r"These options take away all 3 Gaussians: nothing is written, so take fewer away\."),
+        ("--min-views 2", r".*config\.yml does not tell where the capture is \(.*\): give its folder with --data\."),
+    ],
+)
+def test_cleaning_that_cannot_be_meant_is_refused(
+    options: str, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    run = write_run(tmp_path / "run", gaussians(3))
+    assert export.main([str(run), "--output", str(tmp_path / "a.ply"), *options.split()]) == 2
+    assert re.fullmatch(f"sadgs-export: {sentence}\n", capsys.readouterr().err)
+    assert not (tmp_path / "a.ply").exists()
+
+
 # --- which run, and what goes wrong ---
 
 
