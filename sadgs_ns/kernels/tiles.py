@@ -203,7 +203,7 @@ class PairCounts:
 
     def wait(self) -> list[int]:
         """Wait until they have arrived, and return them."""
-        if self.arrived is not None:
+        if self.arrived is not None and not self.arrived.query():
             self.arrived.synchronize()
         return self.counts.tolist()
 

@@ -464,7 +464,7 @@ def poison(trainer: SadgsTrainer, what: str) -> None:
         outputs, losses, metrics = get_loss(step)
         if what == "loss":
             losses["main_loss"] = losses["main_loss"] * math.nan
-            trainer.pipeline.log._losses[-1] = torch.tensor(math.nan)
+            trainer.pipeline.log._losses[-1] = losses["main_loss"].detach()
         return outputs, losses, metrics
 
     trainer.pipeline.get_train_loss_dict = poisoned  # type: ignore[method-assign]
