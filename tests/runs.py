@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import json
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from PIL import Image
 from scenes import HEIGHT, POINTS, VIEWS, WIDTH
 
@@ -53,6 +55,23 @@ def configure(output: Path, parser: DataParserConfig, iterations: int = 6, **str
     config.pipeline.model.num_random = POINTS
     config.pipeline.model.strategy = dataclasses.replace(config.pipeline.model.strategy, **{**SCHEDULE, **strategy})
     return config
+
+
+def in_the_viewer(function: Callable[[], Any]) -> Any:
+    """Call it as the viewer's rendering thread does."""
+    result: list[Any] = []
+
+    class Thread(RenderStateMachine):
+        def __init__(self) -> None:
+            threading.Thread.__init__(self)
+
+        def run(self) -> None:
+            result.append(function())
+
+    thread = Thread()
+    thread.start()
+    thread.join()
+    return result[0]
 
 
 def as_saved_before_the_folders(config: str) -> str:

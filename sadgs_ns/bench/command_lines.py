@@ -105,3 +105,15 @@ def rasterizers() -> argparse.ArgumentParser:
     parser.add_argument("--size", type=int, default=128, help="width and height of the image in pixels")
     parser.add_argument("--seed", type=int, default=0)
     return parser
+
+
+def formats() -> argparse.ArgumentParser:
+    """Return the options of `sadgs-bench formats`."""
+    parser = argparse.ArgumentParser(
+        prog="sadgs-bench formats",
+        description="Write a run's Gaussians in every format, read them back, and compare sizes and renderings.",
+    )
+    parser.add_argument("run", type=Path, help="folder of a run, or its config.yml")
+    parser.add_argument("--output", type=Path, default=Path("formats"), metavar="FOLDER", help="takes the files")
+    parser.add_argument("--data", type=Path, help="folder of the capture (default: where it was in training)")
+    return parser

@@ -1,4 +1,4 @@
-"""`sadgs-export RUN --output FILE.ply`: a run's Gaussians in the layout of the original 3D Gaussian splatting code."""
+"""`sadgs-export RUN --output FILE`: a run's Gaussians as a file for viewers, in the format that its name asks for."""
 
 from __future__ import annotations
 
@@ -6,162 +6,167 @@ import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sadgs_ns.atomic import atomic_path
 from sadgs_ns.data.coordinates import TRANSFORMS_NAME, Similarity, from_data
 from sadgs_ns.errors import InputError, RunError, WriteError
+from sadgs_ns.formats import files, html
+from sadgs_ns.formats.files import SUFFIXES, Frame, format_of
+from sadgs_ns.formats.gaussians import DEGREE_0, of_parameters
 
 if TYPE_CHECKING:  # torch takes seconds, which `--help` and a wrong path need not wait for
     from torch import Tensor
 
-Frame = Literal["nerfstudio", "colmap"]
+    from sadgs_ns.data.run_cameras import RunCameras
+    from sadgs_ns.method.cleaning import Cleaning
 
-_ROWS = 1 << 16
-"""Number of Gaussians that are converted at a time, so that writing takes little memory beyond their own."""
+_MAX_OFF_AXIS = 4.0
+"""As `sadgs` draws; what it leaves out has no true size on the screen."""
 _PREFIX = "_model.gauss_params."
-_DEGREE_0 = 0.5 / np.sqrt(np.pi)
-"""The spherical harmonic of degree 0."""
 _REMEDY = "give another checkpoint step-*.ckpt of a run of sadgs or splatfacto"
 """What to do about a checkpoint that cannot be used."""
 
 
-def write_ply(
+def write_gaussians(
     path: Path,
-    means: Tensor,
-    scales: Tensor,
-    quats: Tensor,
-    opacities: Tensor,
-    features_dc: Tensor,
-    features_rest: Tensor,
+    params: Mapping[str, Tensor],
+    frame: Frame = "nerfstudio",
     similarity: Similarity | None = None,
+    start: html.Start | None = None,
 ) -> int:
-    """Write Gaussians as binary little-endian PLY.
+    """Write a model's Gaussians in the format that the file's name asks for.
 
-    The columns are x y z, nx ny nz (zero), f_dc_*, f_rest_* (all of red, then green, then blue), opacity, scale_*,
-    rot_*: the raw parameters, as training holds them. Rows with a value that is not finite are dropped, and one printed
-    line says how many. The file appears complete or not at all.
+    Those with a value that is not finite are dropped, and one printed line says how many. The file appears complete or
+    not at all.
 
     Args:
         path: Created, with its parents, or replaced.
-        means: Positions. [N, 3]
-        scales: Log of the standard deviations. [N, 3]
-        quats: wxyz; written normalised. [N, 4]
-        opacities: Logits. [N, 1] or [N]
-        features_dc: Spherical harmonics of degree 0. [N, 3]
-        features_rest: The higher degrees. [N, K, 3] with a K of 0, 3, 8 or 15.
-        similarity: From the Gaussians' frame to the file's; None leaves them as they are.
+        params: The parameters as training holds them, shaped as `of_parameters` takes them.
+        frame: The frame of the file.
+        similarity: From the parameters' frame to the file's; None leaves them as they are.
+        start: Where an HTML page opens, in the file's frame; it must be given for one.
 
     Returns:
         The number of Gaussians written.
 
     Raises:
         ValueError: If a tensor has another shape than the number of means asks for, naming it.
+        InputError: If nothing is left to write, or the format cannot hold it.
         WriteError: If the file could not be written.
     """
-    count = len(means)
-    bands = features_rest.shape[1] if features_rest.dim() == 3 else 0
-    if bands not in (0, 3, 8, 15):
-        raise ValueError(f"features_rest must hold the 0, 3, 8 or 15 harmonics of degree 1 to 3, got {bands}")
-    shapes: dict[str, tuple[Tensor, tuple[int, ...]]] = {
-        "means": (means, (count, 3)),
-        "features_dc": (features_dc, (count, 3)),
-        "features_rest": (features_rest, (count, bands, 3)),
-        "opacities": (opacities if opacities.dim() == 2 else opacities[:, None], (count, 1)),
-        "scales": (scales, (count, 3)),
-        "quats": (quats, (count, 4)),
-    }
-    for name, (tensor, shape) in shapes.items():
-        if tuple(tensor.shape) != shape:
-            raise ValueError(f"{name} must have the shape {list(shape)}, got {list(tensor.shape)}")
-    params = {name: tensor.detach() for name, (tensor, _) in shapes.items()}
-    rotate = None if similarity is None else similarity.harmonics(degree=round((bands + 1) ** 0.5) - 1)[1:, 1:]
-    written = 0
-    with atomic_path(path) as partial, partial.open("wb") as file:
-        file.write(_header(count, bands, most=count))
-        for start in range(0, count, _ROWS):
-            chunk = {name: value[start : start + _ROWS].cpu().double().numpy() for name, value in params.items()}
-            rows = _rows(chunk, similarity, rotate)
-            finite = np.isfinite(rows).all(axis=1)
-            rows = rows if finite.all() else rows[finite]
-            file.write(rows.data)
-            written += len(rows)
-        file.seek(0)
-        file.write(_header(written, bands, most=count))
-    if written < count:
-        print(f"{path}: dropped {count - written} of {count} Gaussians that are not finite")
-    return written
+    gaussians = of_parameters(_arrays(params))
+    sound = (gaussians if similarity is None else gaussians.moved(similarity)).finite()
+    files.write(path, sound, frame, start)
+    if len(sound) < len(gaussians):
+        print(f"{path}: dropped {len(gaussians) - len(sound)} of {len(gaussians)} Gaussians that are not finite")
+    return len(sound)
 
 
-def _rows(
-    params: Mapping[str, NDArray[np.float64]], similarity: Similarity | None, rotate: NDArray[np.float64] | None
-) -> NDArray[np.float32]:
-    """Return Gaussians as the file holds them. [n, 17 + 3 K]"""
-    means, scales, quats = params["means"], params["scales"], params["quats"]
-    rest = params["features_rest"].transpose(0, 2, 1)  # [n, 3, K]: the file has colour before band
-    with np.errstate(all="ignore"):  # what is, or becomes, infinite is dropped
-        if similarity is not None and rotate is not None:
-            means, scales = similarity.positions(means), similarity.log_scales(scales)
-            quats = similarity.rotations(quats)
-            rest = rest.reshape(-1, len(rotate)) @ rotate.T if len(rotate) else rest
-        quats = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
-        parts = [means, np.zeros_like(means), params["features_dc"], rest.reshape(len(means), -1)]
-        return np.concatenate([*parts, params["opacities"], scales, quats], axis=1).astype("<f4")
+def _arrays(params: Mapping[str, Tensor]) -> dict[str, NDArray[np.floating]]:
+    return {name: tensor.detach().cpu().numpy() for name, tensor in params.items()}
 
 
-def _header(count: int, bands: int, most: int) -> bytes:
-    """Return the file's head, equally long for every count up to `most`, since the count is known only at the end."""
-    padding = " " * (len(str(most)) - len(str(count)))
-    names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
-    names += [f"f_rest_{i}" for i in range(3 * bands)]
-    names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
-    lines = ["ply", "format binary_little_endian 1.0", f"comment sadgs_ns{padding}", f"element vertex {count}"]
-    return "\n".join([*lines, *(f"property float {name}" for name in names), "end_header\n"]).encode()
+def export(
+    run: Path,
+    output: Path,
+    frame: Frame = "nerfstudio",
+    data: Path | None = None,
+    min_views: int = 0,
+    max_extent: float | None = None,
+    crop: Sequence[float] | None = None,
+    dust: float = 0.0,
+) -> int:
+    """Write the Gaussians of a run of sadgs or splatfacto, and say what was taken away of them.
 
-
-def export(run: Path, output: Path, frame: Frame = "nerfstudio") -> int:
-    """Write the Gaussians of a run of sadgs or splatfacto.
-
-    Nothing in the run's folder is executed, not even its `config.yml`, and the data need not be there any more.
+    Nothing in the run's folder is executed, not even its `config.yml`, and the data need not be there any more, except
+    for `min_views` and `dust`, and for the camera with which an HTML page opens.
 
     Args:
         run: The run's folder, its `config.yml`, or one of its checkpoints; without one the latest is taken.
-        output: The PLY.
+        output: The file, whose name ends in one of `SUFFIXES`.
         frame: "nerfstudio" is the frame of training: centred, upright, cameras within ±1. "colmap" is that of the
             COLMAP model, or of `transforms.json` where no COLMAP model stands behind it.
+        data: The capture's folder, where cameras are needed; None is where the run's `config.yml` says it was.
+        min_views: As in `Cleaning`, whose units are those of nerfstudio's frame, and so the next three.
+        max_extent: As in `Cleaning`.
+        crop: As in `Cleaning`; six numbers.
+        dust: As in `Cleaning`.
 
     Returns:
         The number of Gaussians written.
 
     Raises:
-        InputError: If the run or the output cannot be used.
+        InputError: If the run, the capture, an option or the output cannot be used.
         WriteError: If the file could not be written.
     """
-    if output.suffix.lower() != ".ply":
-        raise InputError(f"--output {output} must end in .ply, the one format that is written.")
-    if output.is_dir():
-        raise InputError(f"--output {output} is a folder: name a file in it.")
+    as_page = format_of(output) == ".html"
+    if as_page and frame != "nerfstudio":
+        raise InputError("--frame colmap is for files that other programs read: leave it out for a page.")
     checkpoint = _checkpoint_of(run)
+    from sadgs_ns.method.cleaning import Cleaning  # It imports torch.
+
+    box = None if crop is None else (crop[0], crop[1], crop[2], crop[3], crop[4], crop[5])
+    cleaning = Cleaning(min_views, max_extent, box, dust)
+    folders = checkpoint.absolute().parents[:2]
+    folder = next((folder for folder in folders if (folder / TRANSFORMS_NAME).is_file()), folders[-1])
     similarity = None
     if frame == "colmap":
-        folders = checkpoint.absolute().parents[:2]
-        path = next((folder / TRANSFORMS_NAME for folder in folders if (folder / TRANSFORMS_NAME).is_file()), None)
-        if path is None:
+        if not (folder / TRANSFORMS_NAME).is_file():
             raise InputError(
-                f"{folders[-1]} holds no {TRANSFORMS_NAME}, where nerfstudio notes how it moved the data: give the run "
+                f"{folder} holds no {TRANSFORMS_NAME}, where nerfstudio notes how it moved the data: give the run "
                 "where it was made, or export in nerfstudio's frame."
             )
-        similarity = from_data(path).inverse()
+        similarity = from_data(folder / TRANSFORMS_NAME).inverse()
     params = _read(checkpoint, latest=checkpoint != run)
     if params["features_rest"].shape[1] == 0:  # then training holds colours' logits
-        params["features_dc"] = (params["features_dc"].sigmoid() - 0.5) / _DEGREE_0
+        params["features_dc"] = (params["features_dc"].sigmoid() - 0.5) / DEGREE_0
+    start, cameras = None, None
+    if as_page or cleaning.needs_views:
+        from sadgs_ns.data.run_cameras import read_cameras
+
+        cameras = read_cameras(folder, data)
     try:
-        return write_ply(output, **params, similarity=similarity)
+        of_parameters(_arrays(params))  # It refuses shapes that do not fit.
+        params = _cleaned(params, cleaning, cameras)
+        if as_page and cameras is not None:
+            pose, K = cameras.camera_to_worlds[0].double().numpy(), cameras.Ks[0]
+            start = html.start_at(pose, max(cameras.sizes[0]), float(K[0, 0]), params["means"].numpy())
+        return write_gaussians(output, params, frame, similarity, start)
+    except InputError:
+        raise
     except ValueError as error:
         raise InputError(f"{checkpoint} holds no Gaussians that can be exported ({error}): {_REMEDY}.") from error
+
+
+def _cleaned(params: dict[str, Tensor], cleaning: Cleaning, cameras: RunCameras | None) -> dict[str, Tensor]:
+    """Return the parameters of the Gaussians that stay, and print how many each option takes away."""
+    import torch
+    from rich.console import Console
+    from rich.progress import track
+
+    from sadgs_ns.method.cleaning import Cleaning, find, see
+    from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
+
+    if cleaning == Cleaning():
+        return params
+    device, seen = torch.device("cuda" if torch.cuda.is_available() else "cpu"), None
+    shapes = {name: params[name].to(device) for name in ("means", "quats", "scales", "opacities")}
+    if cleaning.needs_views and cameras is not None:
+        viewmats, Ks = viewmats_from_camera_to_world(cameras.camera_to_worlds).to(device), cameras.Ks.to(device)
+        views = [(viewmat, K, *size) for viewmat, K, size in zip(viewmats, Ks, cameras.sizes, strict=True)]
+        console = Console(stderr=True)
+        shown = track(views, "Looking from the training views", console=console, disable=not console.is_terminal)
+        seen = see(shapes, shown, max_off_axis=_MAX_OFF_AXIS)
+    stays, sentences = find(shapes, cleaning, seen)
+    print("\n".join(sentences))
+    if not stays.any():
+        raise InputError(
+            f"These options take away all {len(stays):,} Gaussians: nothing is written, so take fewer away."
+        )
+    return {name: value[stays.cpu()] for name, value in params.items()}
 
 
 def _checkpoint_of(run: Path) -> Path:
@@ -202,11 +207,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code, 2 if the run or the output cannot be used."""
     parser = argparse.ArgumentParser(
         prog="sadgs-export",
-        description="Write a trained run's Gaussians as the PLY that viewers of 3D Gaussian splatting read. It needs "
-        "neither a GPU nor the data, and executes nothing of the run's files.",
+        description="Write a trained run's Gaussians as a file for viewers of 3D Gaussian splatting. The end of its "
+        "name chooses the format: .ply, the largest, which all viewers read; .compressed.ply, .spz and .sog, which are "
+        "smaller and lose a little; .glb, which is glTF with KHR_gaussian_splatting; .html, a page that opens in a "
+        "browser without a network, for which Node.js must be installed. A GPU is not needed, and nothing of the run's "
+        "files is executed.",
     )
     parser.add_argument("run", type=Path, help="folder of a run, its config.yml, or one of its checkpoints")
-    parser.add_argument("--output", "-o", type=Path, required=True, metavar="FILE.ply", help="the PLY to write")
+    parser.add_argument(
+        "--output", "-o", type=Path, required=True, metavar="FILE", help=f"the file to write: {', '.join(SUFFIXES)}"
+    )
     parser.add_argument(
         "--frame",
         choices=["nerfstudio", "colmap"],
@@ -214,9 +224,33 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="coordinates: nerfstudio's, centred, upright and with cameras within ±1, or those of the COLMAP model or "
         "transforms.json that the data came with (default %(default)s)",
     )
+    cleaning = parser.add_argument_group(
+        "cleaning", "What is taken away, by default nothing; units are those of nerfstudio's frame."
+    )
+    cleaning.add_argument(
+        "--min-views", type=int, default=0, metavar="K", help="Gaussians that fewer than K training views see"
+    )
+    cleaning.add_argument(
+        "--max-extent", type=float, metavar="UNITS", help="Gaussians whose longest standard deviation is more than this"
+    )
+    cleaning.add_argument(
+        "--crop", type=float, nargs=6, metavar=("X", "Y", "Z", "X", "Y", "Z"),
+        help="Gaussians whose centre is outside the box from the lowest x, y and z to the highest",
+    )  # fmt: skip
+    cleaning.add_argument(
+        "--dust", type=float, default=0.0, metavar="PX",
+        help="Gaussians that make up less than this many pixels of each training view: opacity times area, less what "
+        "others hide",
+    )  # fmt: skip
+    parser.add_argument(
+        "--data",
+        type=Path,
+        help="folder of the capture, for .html, --min-views and --dust (default: where it was in training)",
+    )
     given = parser.parse_args(argv)
+    options = {name: value for name, value in vars(given).items() if name not in ("run", "output", "frame", "data")}
     try:
-        count = export(given.run, given.output, given.frame)
+        count = export(given.run, given.output, given.frame, given.data, **options)
     except (InputError, RunError, WriteError) as error:
         print(f"sadgs-export: {error}", file=sys.stderr)
         return 2

@@ -25,7 +25,7 @@ from rich.table import Table
 from torch import Tensor
 
 from sadgs_ns.atomic import atomic_path
-from sadgs_ns.cli.export import write_ply
+from sadgs_ns.cli.export import write_gaussians
 from sadgs_ns.cli.inspection import get_view
 from sadgs_ns.demo.scene import EVAL_INTERVAL, SPARSE_FOLDER, SceneDescription, expected_wavelength_map, write_scene
 from sadgs_ns.method.strategy import StructureAwareStrategy
@@ -279,7 +279,7 @@ def demonstrate(output: Path, iterations: int, max_gaussians: int, width: int, h
         CONSOLE.quiet = was_quiet
     draw_side_by_side(output / "side_by_side.png", runs)
     draw_wavelength_and_eta(output / "wavelength_and_eta.png", scene, runs[-1])
-    write_ply(output / "splat.ply", **runs[-1].model.gauss_params)
+    write_gaussians(output / "splat.ply", dict(runs[-1].model.gauss_params.items()))
     table = Table("held-out views", "PSNR (dB)", "SSIM", "Gaussians", "seconds")
     for run in runs:
         label = f"{run.label} (same iterations, no densification)" if run.label == UNSPLIT else run.label

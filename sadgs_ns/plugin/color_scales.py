@@ -1,4 +1,4 @@
-"""Colour scales of the quantities that are shown, and pictures with a scale beside them.
+"""Colour scales of the quantities that are shown, their legends, and pictures with a scale beside them.
 
 The colour maps are those of matplotlib that colour-blind readers can tell apart. Its figures and fonts, which take a
 fifth of a second to import, are imported where they are drawn: training needs none.
@@ -6,6 +6,8 @@ fifth of a second to import, are imported where they are drawn: training needs n
 
 from __future__ import annotations
 
+import base64
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -78,52 +80,48 @@ def to_picture(image: Tensor) -> Picture:
     return (255 * image.detach().float().clamp(0, 1)).round().byte().cpu().numpy()
 
 
-@lru_cache(maxsize=8)
-def _font(size: int) -> ImageFont.FreeTypeFont:
-    from matplotlib.font_manager import findfont
-
-    return ImageFont.truetype(findfont("DejaVu Sans"), size)
-
-
-@lru_cache(maxsize=8)
-def _bar(scale: Scale, width: int, height: int) -> Image.Image:
-    ramp = scale.colormap(np.linspace(0, 1, width), bytes=True)[None, :, :3]
-    return Image.fromarray(np.repeat(ramp, height, axis=0))
-
-
-def annotate(picture: Picture, text: str, scale: Scale | None = None) -> Picture:
-    """Return a picture with a line of text, and the scale's colours and numbers, at its upper edge.
-
-    The viewer's pictures have no margin, and its axes lie at the lower edge. Pictures under 160×120 px stay as they
-    are.
+def bar(scale: Scale, width: int = 720) -> Picture:
+    """Return the scale's colours with its numbers below them, to be shown at about half its size.
 
     Args:
-        picture: The picture, which is not changed. [H, W, 3]
-        text: One line.
-        scale: The scale to show, or None for the text alone.
+        scale: The scale.
+        width: Width in px.
 
     Returns:
-        A picture of the same size. [H, W, 3]
+        The picture. [H, W, 3]
     """
-    height, width = picture.shape[:2]
-    if height < 120 or width < 160:
-        return picture
-    size = max(min(height // 30, width // 40), 9)
-    size = max(min(size, int(size * (width - 2 * size) / _font(size).getlength(text))), 6)  # The whole text fits.
-    strip = 4 * size if scale is not None else 2 * size
-    image = Image.fromarray(picture)
-    image.paste((20, 20, 20), (0, 0, width, strip))
-    pen, font, x0 = ImageDraw.Draw(image), _font(size), size
-    pen.text((x0, size // 3), text, fill="white", font=font)
-    if scale is None:
-        return np.array(image)
-    length = width - 4 * size
-    image.paste(_bar(scale, length, size // 2), (x0, 2 * size - size // 4))
+    from matplotlib.font_manager import findfont
+
+    size = width // 24
+    font, x0, length = ImageFont.truetype(findfont("DejaVu Sans"), size), size, width - 3 * size
+    image = Image.new("RGB", (width, 3 * size), (20, 20, 20))
+    ramp = scale.colormap(np.linspace(0, 1, length), bytes=True)[None, :, :3]
+    image.paste(Image.fromarray(np.repeat(ramp, size, axis=0)), (x0, size // 3))
+    pen = ImageDraw.Draw(image)
     for tick in scale.ticks:
         half = font.getlength(f"{tick:g}") / 2
         x = max(x0 + float(scale.norm(tick)) * length, half + 1)
-        pen.text((x, strip - size - size // 2), f"{tick:g}", fill="white", font=font, anchor="ma")
+        pen.text((x, size + size // 2), f"{tick:g}", fill="white", font=font, anchor="ma")
     return np.array(image)
+
+
+def legend(text: str, scale: Scale | None = None) -> str:
+    """Return a legend as Markdown: a line of text, and the scale's colours and numbers as an image in it.
+
+    Args:
+        text: One line.
+        scale: The scale to show, or None for the text alone.
+    """
+    if scale is None:
+        return text
+    return f"{text}\n\n![{scale.label}](data:image/png;base64,{_encoded_bar(scale)})"
+
+
+@lru_cache(maxsize=8)
+def _encoded_bar(scale: Scale) -> str:
+    png = io.BytesIO()
+    Image.fromarray(bar(scale)).save(png, "png")
+    return base64.b64encode(png.getvalue()).decode()
 
 
 @dataclass(frozen=True)

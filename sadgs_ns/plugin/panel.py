@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,7 +19,6 @@ from nerfstudio.viewer.viewer_elements import (
     ViewerButton,
     ViewerControl,
     ViewerDropdown,
-    ViewerElement,
     ViewerNumber,
     ViewerParameter,
     ViewerSlider,
@@ -31,13 +30,11 @@ from sadgs_ns.errors import reason
 from sadgs_ns.method.codes import decode
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin import color_scales, gaussian_maps, texture
-from sadgs_ns.plugin.color_scales import CHILDREN, ETA, LOW, PERIOD, Picture, to_picture
+from sadgs_ns.plugin.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
 from sadgs_ns.plugin.model import SadgsModel, in_viewer
 from sadgs_ns.plugin.structure_maps import StructureMaps, observe_training_views
+from sadgs_ns.plugin.viewer import ViewerMarkdown, show_output
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
-
-if TYPE_CHECKING:
-    from viser import ViserServer
 
 OUTPUT = "structure"
 """Name of the panel's picture among the viewer's output types."""
@@ -117,32 +114,6 @@ def nearest_view(cameras: Tensor, camera: Tensor, extent: float) -> int:
     return int((distance + angle).argmin())
 
 
-class ViewerMarkdown(ViewerElement[str]):
-    """A text in the viewer; unlike a parameter, it calls nobody when it changes.
-
-    Args:
-        name: Name of the element.
-        text: Called for the text when the element is installed, and at every `refresh`.
-    """
-
-    def __init__(self, name: str, text: Callable[[], str]) -> None:
-        super().__init__(name)
-        self.text = text
-        self._shown = ""
-
-    def _create_gui_handle(self, viser_server: ViserServer) -> None:
-        self._shown = self.text()
-        self.gui_handle: Any = viser_server.gui.add_markdown(self._shown)
-
-    def install(self, viser_server: ViserServer) -> None:
-        self._create_gui_handle(viser_server)
-
-    def refresh(self) -> None:
-        """Send the text to the viewer, if there is one and the text has changed."""
-        if self.gui_handle is not None and (text := self.text()) != self._shown:
-            self._shown = self.gui_handle.content = text
-
-
 class StructurePanel(torch.nn.Module):
     """Elements of the viewer, and the picture that they choose.
 
@@ -159,6 +130,7 @@ class StructurePanel(torch.nn.Module):
         self._refreshed = 0.0
         self._status = ""
         self._shown = OFF
+        self._legend = ""
         strategy = self._model.strategy
         self.choice = ViewerDropdown(
             "Show",
@@ -167,6 +139,7 @@ class StructurePanel(torch.nn.Module):
             cb_hook=lambda _: self._told(self.choose),
             hint="What the output type “structure” shows",
         )
+        self.legend = ViewerMarkdown("legend", lambda: self._legend)
         self.observe = ViewerButton("Observe all training views", cb_hook=lambda _: self._told(self.observe_now))
         self.set_max_gaussians = ViewerNumber(
             "max_gaussians",
@@ -294,12 +267,9 @@ class StructurePanel(torch.nn.Module):
             self._read_photos()
             self._say("")
         self._shown = chosen
-        viewer = getattr(self.viewer, "viewer", None)  # It is set when the viewer is made.
-        if viewer is not None:
-            output = viewer.control_panel._output_render  # nerfstudio 1.1 has no public way.
-            name = "rgb" if chosen == OFF else OUTPUT
-            if name in output.options:
-                output.value = name
+        if chosen == OFF:
+            self._say_of_picture("")
+        show_output(self.viewer, "rgb" if chosen == OFF else OUTPUT)
 
     def outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return what the viewer may show besides the model's own outputs; evaluation and `ns-render` get nothing.
@@ -317,12 +287,18 @@ class StructurePanel(torch.nn.Module):
             return {}
         if self._shown == OFF:
             return {OUTPUT: rendered["rgb"]}
-        picture = self.picture(self._shown, camera, rendered["rgb"])
-        return {OUTPUT: torch.from_numpy(picture).to(rendered["rgb"]) / 255}
+        drawn = self.picture(self._shown, camera, rendered["rgb"])
+        self._say_of_picture(color_scales.legend(drawn.title, drawn.scale))
+        return {OUTPUT: torch.from_numpy(drawn.picture).to(rendered["rgb"]) / 255}
+
+    def _say_of_picture(self, legend: str) -> None:
+        """Show a legend beside the picture, which the viewer would shrink with the picture if it were in it."""
+        self._legend = legend
+        self.legend.refresh()
 
     @torch.no_grad()
-    def picture(self, choice: str, camera: Cameras, rgb: Tensor) -> Picture:
-        """Draw one of `CHOICES` as a camera sees it, with its legend.
+    def picture(self, choice: str, camera: Cameras, rgb: Tensor) -> Panel:
+        """Draw one of `CHOICES` as a camera sees it.
 
         Args:
             choice: Any of `CHOICES` but "off".
@@ -330,7 +306,7 @@ class StructurePanel(torch.nn.Module):
             rgb: What it sees, in [0, 1]. [H, W, 3]
 
         Returns:
-            The picture. [H, W, 3]
+            The picture [H, W, 3], what its legend says, and its scale.
         """
         maps, datamanager, (height, width) = self._maps, self._maps.views.datamanager, rgb.shape[:2]
         constant = maps.frequency_constant
@@ -344,7 +320,7 @@ class StructurePanel(torch.nn.Module):
             index = nearest_view(cameras, camera.camera_to_worlds[0].to(cameras), extent)
             photo = to_picture(maps.photo(datamanager.cached_train[index]))
             tensor = decode(maps.codes[index])
-            name = f"the nearest training view, {datamanager.train_dataset.image_filenames[index].name}"
+            name = f"the nearest training view, `{datamanager.train_dataset.image_filenames[index].name}`"
         scale = min(height / photo.shape[0], width / photo.shape[1])
         size = max(round(scale * photo.shape[0]), 1), max(round(scale * photo.shape[1]), 1)
         if choice in (ELLIPSES_HERE, ELLIPSES_NEAR):
@@ -358,13 +334,13 @@ class StructurePanel(torch.nn.Module):
         top, left = (height - size[0]) // 2, (width - size[1]) // 2
         whole = np.zeros((height, width, 3), np.uint8)
         whole[top : top + size[0], left : left + size[1]] = drawn
-        return color_scales.annotate(whole, f"{what} of {name}", PERIOD)
+        return Panel(f"{what} of {name}", whole, PERIOD)
 
-    def _of_gaussians(self, choice: str, camera: Cameras, width: int, height: int) -> Picture:
+    def _of_gaussians(self, choice: str, camera: Cameras, width: int, height: int) -> Panel:
         model, statistics = self._model, self.statistics()
         if statistics is None:
             text = "No observations yet: press “Observe all training views”, or wait for some iterations."
-            return color_scales.annotate(np.zeros((height, width, 3), np.uint8), text)
+            return Panel(text, np.zeros((height, width, 3), np.uint8))
         strategy = model.strategy
         kept = {name: statistics[name] for name in ("eta_max", "n_total")}
         kept |= {
@@ -373,7 +349,7 @@ class StructurePanel(torch.nn.Module):
         }
         rows = model.cropped({**model.gauss_params, **kept})
         if len(rows["means"]) == 0:
-            return color_scales.annotate(np.zeros((height, width, 3), np.uint8), "No Gaussians in the crop box.")
+            return Panel("No Gaussians in the crop box.", np.zeros((height, width, 3), np.uint8))
         viewmat = viewmats_from_camera_to_world(camera.camera_to_worlds)[0].to(model.device)
         view = viewmat, camera.get_intrinsics_matrices()[0].to(model.device), width, height
         seen = f"{int((statistics['n_total'] > 0).sum()):,} of {model.num_points:,} Gaussians observed"
@@ -387,4 +363,4 @@ class StructurePanel(torch.nn.Module):
         else:
             drawn, scale = gaussian_maps.share_map(rows, rows["low"], *view, **model.drawing), LOW
             text = f"share of consistently low Gaussians, {int(kept['low'].sum()):,} in all ({seen})"
-        return color_scales.annotate(scale(drawn), text, scale)
+        return Panel(text, scale(drawn), scale)

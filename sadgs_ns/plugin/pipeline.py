@@ -27,6 +27,7 @@ from sadgs_ns.method.initialization import camera_extent
 from sadgs_ns.method.schedule import growth_threshold, schedule
 from sadgs_ns.method.structure_tensor import ENERGY_BLUR, FREQUENCY_CONSTANT
 from sadgs_ns.plugin import nonfinite
+from sadgs_ns.plugin.cleaning_panel import CleaningPanel
 from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig, check_options
 from sadgs_ns.plugin.memory_plan import NEAR_PLANE, fit_to_memory, place_images, training_size
 from sadgs_ns.plugin.model import SadgsModel, SadgsModelConfig
@@ -156,7 +157,10 @@ class SadgsPipeline(VanillaPipeline):
         self._checkpoint_views: tuple[list[str], Tensor] | None = None  # These are names and positions [C, 3].
         self.stuck = ""  # It says why, where nothing is learned any more.
         self.structure = StructurePanel(self.structure_maps)
-        self.model.viewer_outputs = self.structure.outputs
+        self.cleaning = CleaningPanel(self.views)
+        self.model.viewer_outputs = lambda camera, rendered: (
+            self.structure.outputs(camera, rendered) | self.cleaning.outputs(camera, rendered)
+        )
 
     @property
     def model(self) -> SadgsModel:

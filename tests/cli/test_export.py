@@ -19,7 +19,10 @@ from plyfile import PlyData
 
 from sadgs_ns.cli import export
 from sadgs_ns.data.coordinates import Similarity, from_data, spherical_harmonics
+from sadgs_ns.data.run_cameras import find_capture, read_cameras
 from sadgs_ns.demo.scene import SPARSE_FOLDER, write_scene
+from sadgs_ns.errors import InputError
+from sadgs_ns.formats import html
 from sadgs_ns.gsplat_internals import torch_quat_scale_to_covar_preci, torch_spherical_harmonics
 from sadgs_ns.plugin.trainer import SadgsTrainer
 from sadgs_ns.render import splatter
@@ -280,6 +283,122 @@ def test_a_reflection_of_the_world_is_undone_as_well(tmp_path: Path):
     )
 
 
+# --- the other formats ---
+
+
+@pytest.mark.parametrize("suffix", [".compressed.ply", ".spz", ".sog", ".glb"])
+def test_every_format_is_written_of_a_run(
+    suffix: str, trained: tuple[Path, SadgsTrainer], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """tests/formats reads them back."""
+    _, trainer = trained
+    path = tmp_path / f"splat{suffix}"
+    assert export.main([str(trainer.base_dir), "--output", str(path), "--frame", "colmap"]) == 0
+    assert f"splat{suffix}: {trainer.pipeline.model.num_points:,} Gaussians, " in capsys.readouterr().out
+    assert path.stat().st_size > 1000
+
+
+def test_the_cameras_of_a_run_are_those_of_training_however_it_moved_the_capture(trained: tuple[Path, SadgsTrainer]):
+    """The run scaled the capture by 0.4, which the parser does not do by itself."""
+    scene, trainer = trained
+    expected = trainer.pipeline.datamanager.train_dataset
+    found = read_cameras(trainer.base_dir)
+    np.testing.assert_allclose(found.camera_to_worlds, expected.cameras.camera_to_worlds, atol=1e-5)
+    np.testing.assert_allclose(found.Ks, expected.cameras.get_intrinsics_matrices())
+    assert found.sizes == [(WIDTH, HEIGHT)] * len(expected) and found.photos == expected.image_filenames
+    held_out = {path.name for path in read_cameras(trainer.base_dir, scene, split="test").photos}
+    assert held_out and not held_out & {path.name for path in found.photos}
+
+
+def test_a_page_opens_at_the_first_training_camera(
+    trained: tuple[Path, SadgsTrainer], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    _, trainer = trained
+    page = b'<script type="application/json" id="sse-bootstrap">{"settings": {}}</script>'
+    monkeypatch.setattr(html, "_page", lambda: page)
+    assert export.main([str(trainer.base_dir / "config.yml"), "--output", str(tmp_path / "splat.html")]) == 0
+    settings = json.loads(re.findall(r">(.*)<", (tmp_path / "splat.html").read_text())[0])["settings"]
+    x, y, z = trainer.pipeline.datamanager.train_dataset.cameras.camera_to_worlds[0, :, 3].tolist()
+    np.testing.assert_allclose(settings["cameras"][0]["initial"]["position"], [x, z, -y], atol=1e-5)
+
+
+def test_the_capture_is_found_without_executing_the_config(tmp_path: Path):
+    config = """!!python/object:a.Config
+_target: !!python/name:b.C ''
+other: !!python/object/apply:os.abort []
+pipeline: !!python/object:c.Pipeline
+  datamanager: !!python/object:d.Manager
+    data: &id !!python/object/apply:pathlib.PosixPath [{}]
+    dataparser: {{data: *id}}
+"""
+    parts = ", ".join(f"'{part}'" for part in tmp_path.parts)
+    (tmp_path / "config.yml").write_text(config.format(parts))
+    assert find_capture(tmp_path) == tmp_path
+    (tmp_path / "config.yml").write_text(config.format("gone"))
+    with pytest.raises(InputError, match=r"^gone, on which .* was trained, is not there: give the .* with --data\.$"):
+        find_capture(tmp_path)
+    for broken in ("a: [", "a: 1", "!!python/object/apply:os.abort []"):
+        (tmp_path / "config.yml").write_text(broken)
+        with pytest.raises(
+            InputError, match=r"config\.yml does not tell where the capture is \(.+\): give .*--data\.$"
+        ):
+            find_capture(tmp_path)
+
+
+def test_a_capture_that_cannot_be_read_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    run = write_run(tmp_path / "run", gaussians(3))
+    (tmp_path / "empty").mkdir()
+    options = [str(run), "--output", str(tmp_path / "a.html"), "--data", str(tmp_path / "empty")]
+    assert export.main(options) == 2
+    assert re.fullmatch(r"sadgs-export: .*empty.*\.\n", capsys.readouterr().err)
+    assert export.main([*options, "--frame", "colmap"]) == 2
+    assert capsys.readouterr().err.startswith("sadgs-export: --frame colmap is for files that other programs read: ")
+
+
+# --- cleaning ---
+
+
+def test_what_is_taken_away_is_told_and_not_in_the_file(
+    trained: tuple[Path, SadgsTrainer], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    _, trainer = trained
+    model, path = trainer.pipeline.model, tmp_path / "splat.ply"
+    means = model.means.detach().numpy()
+    low, high = (np.round(np.quantile(means, q, axis=0), 3) for q in (0.1, 0.9))
+    extents = model.scales.detach().exp().amax(dim=1).numpy()
+    longest = float(np.round(np.quantile(extents, 0.9), 4))
+    options = ["--crop", *map(str, low), *map(str, high), "--max-extent", str(longest), "--min-views", "2"]
+    assert export.main([str(trainer.base_dir), "--output", str(path), *options, "--dust", "0.01"]) == 0
+    told = [int(line.split()[0].replace(",", "")) for line in capsys.readouterr().out.splitlines()[:4]]
+    inside = ((means >= low.astype(np.float32)) & (means <= high.astype(np.float32))).all(axis=1)
+    assert told[0] == (~inside).sum() > 0 and told[1] == (extents[inside] > longest).sum() > 0
+    kept = read(path, "x", "y", "z")
+    assert len(kept) == model.num_points - sum(told) > 0
+    assert (kept >= low - 1e-6).all() and (kept <= high + 1e-6).all()
+    known = {tuple(row) for row in means[inside & (extents <= longest)]}
+    assert {tuple(row) for row in kept} <= known
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ("--min-views -1", r"--min-views -1 must be 0, which takes nothing away, or more\."),
+        ("--dust nan", r"--dust nan must be 0, .*\."),
+        ("--max-extent 0", r"--max-extent 0 must be more than 0: leave it out to take nothing away\."),
+        ("--crop 0 0 0 1 -1 1", r"--crop 0 0 0 1 -1 1 is no box: give the lowest x, y and z, then the highest .*\."),
+        ("--max-extent 1e-9", r"These options take away all 3 Gaussians: nothing is written, so take fewer away\."),
+        ("--min-views 2", r".*config\.yml does not tell where the capture is \(.*\): give its folder with --data\."),
+    ],
+)
+def test_cleaning_that_cannot_be_meant_is_refused(
+    options: str, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    run = write_run(tmp_path / "run", gaussians(3))
+    assert export.main([str(run), "--output", str(tmp_path / "a.ply"), *options.split()]) == 2
+    assert re.fullmatch(f"sadgs-export: {sentence}\n", capsys.readouterr().err)
+    assert not (tmp_path / "a.ply").exists()
+
+
 # --- which run, and what goes wrong ---
 
 
@@ -315,7 +434,7 @@ def test_a_damaged_latest_checkpoint_is_passed_over_aloud(tmp_path: Path, capsys
         ("shear", r".*transforms\.json does not tell .* \(it is no rotation, scale and translation\): copy .*\."),
         ("not json", r".*transforms\.json does not tell how to return to the data's frame \(.*\): copy it .*\."),
         ("nan", r".*transforms\.json does not tell .*\): copy it from the run again, or export in .*\."),
-        ("suffix", r"--output .*a\.splat must end in \.ply, the one format that is written\."),
+        ("suffix", r"--output .*a\.splat must end in \.ply, \.compressed\.ply, .* or \.html\."),
         ("folder", r"--output .*a\.ply is a folder: name a file in it\."),
     ],
 )  # fmt: skip

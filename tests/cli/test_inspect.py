@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import copy
 import math
+import re
 import shutil
-import threading
-from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,10 +18,10 @@ from kill_and_resume import configure, set_up
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.configs.method_configs import method_configs
 from nerfstudio.data.scene_box import OrientedBox
-from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
 from PIL import Image
+from runs import in_the_viewer
 
 from sadgs_ns.cli import inspect, inspection
 from sadgs_ns.demo.scene import write_scene
@@ -273,32 +273,15 @@ def test_the_photo_and_its_camera_belong_together(early: SadgsPipeline):
 # --- the panel ---
 
 
-def in_the_viewer(function: Callable[[], Any]) -> Any:
-    """Call it as the viewer's rendering thread does."""
-    result: list[Any] = []
-
-    class Thread(RenderStateMachine):
-        def __init__(self) -> None:
-            threading.Thread.__init__(self)
-
-        def run(self) -> None:
-            result.append(function())
-
-    thread = Thread()
-    thread.start()
-    thread.join()
-    return result[0]
-
-
 def a_camera(pipeline: SadgsPipeline, index: int = 0) -> Cameras:
     return pipeline.datamanager.train_dataset.cameras[index : index + 1]
 
 
 @pytest.mark.filterwarnings("ignore:This property will be removed:DeprecationWarning")  # of torchmetrics, not ours
 def test_the_viewer_finds_the_elements_in_their_order(panel: StructurePanel):
-    found = parse_object(pipeline_of(panel), ViewerElement, "Custom Elements")
-    assert [path.removeprefix("Custom Elements/structure/") for path, _ in found] == [
-        "choice", "observe", "set_max_gaussians", "set_tau_split", "table",
+    found = [path for path, _ in parse_object(pipeline_of(panel), ViewerElement, "Custom Elements")]
+    assert [path.removeprefix("Custom Elements/structure/") for path in found if "/structure/" in path] == [
+        "choice", "legend", "observe", "set_max_gaussians", "set_tau_split", "table",
     ]  # fmt: skip
 
 
@@ -310,19 +293,30 @@ def test_the_panel_is_no_part_of_a_checkpoint(panel: StructurePanel):
 def test_every_choice_is_a_picture_for_the_viewer_and_nothing_for_evaluation(panel: StructurePanel):
     pipeline = pipeline_of(panel)
     camera = a_camera(pipeline)
-    camera.rescale_output_resolution(4)  # smaller pictures have no legend
-    shown = {}
+    camera.rescale_output_resolution(4)
+    panel.legend.gui_handle = told = SimpleNamespace(content="")
+    shown, legends = {}, {}
     for choice in CHOICES:
         panel.choice.value = choice
         panel.choose()
         assert OUTPUT not in pipeline.model.get_outputs_for_camera(camera)
         outputs = in_the_viewer(lambda: pipeline.model.get_outputs_for_camera(camera))
-        shown[choice] = outputs[OUTPUT]
+        shown[choice], legends[choice] = outputs[OUTPUT], told.content
         assert outputs[OUTPUT].shape == outputs["rgb"].shape == (4 * HEIGHT, 4 * WIDTH, 3)
         assert 0 <= float(outputs[OUTPUT].min()) < float(outputs[OUTPUT].max()) <= 1
     assert torch.equal(shown[OFF], outputs["rgb"])
+    assert not legends[OFF] and all(
+        "](data:image/png;base64," in legends[choice] for choice in CHOICES if choice != OFF
+    )
+    assert "Gaussians observed)" in legends["η"] and re.search(
+        r"view, `\d+\.png`", legends["ellipses of the nearest photo"]
+    )
+    panel.choice.value = OFF
+    panel.choose()
+    assert told.content == "", "nothing is said of a picture that is not shown"
     pairs = [(a, b) for i, a in enumerate(CHOICES) for b in CHOICES[:i]]
-    assert not [pair for pair in pairs if torch.equal(shown[pair[0]], shown[pair[1]])]
+    same = [pair for pair in pairs if torch.equal(shown[pair[0]], shown[pair[1]])]
+    assert not [pair for pair in same if legends[pair[0]] == legends[pair[1]]]
 
 
 @pytest.mark.parametrize("choice", ["wavelength of the nearest photo", "ellipses of the nearest photo", "η"])
@@ -401,7 +395,7 @@ def test_where_every_pixel_is_masked_the_panel_says_that_none_was_observed(panel
     panel.choose()
     statistics = panel.statistics()
     assert statistics is not None and not (statistics["n_total"] > 0).any()
-    picture = panel.picture("η", a_camera(pipeline), torch.zeros(HEIGHT, WIDTH, 3))
+    picture = panel.picture("η", a_camera(pipeline), torch.zeros(HEIGHT, WIDTH, 3)).picture
     assert (picture == 0).all(), "black"
 
 
@@ -487,8 +481,8 @@ def test_what_the_panel_draws_of_a_training_view_is_what_the_command_draws(panel
     view = inspection.get_view(pipeline, 2)
     with torch.no_grad():
         rgb = pipeline.model.get_outputs_for_camera(a_camera(pipeline, 2))["rgb"]
-    drawn = panel.picture("η", a_camera(pipeline, 2), rgb)  # too small for a legend
+    drawn = panel.picture("η", a_camera(pipeline, 2), rgb).picture
     expected = inspection.view_panels(pipeline, view, statistics)["eta"].picture
     assert (np.abs(drawn.astype(int) - expected) <= 2).mean() > 0.99
-    near = panel.picture("wavelength of the nearest photo", a_camera(pipeline, 2), rgb)
+    near = panel.picture("wavelength of the nearest photo", a_camera(pipeline, 2), rgb).picture
     assert np.array_equal(near, color_scales.PERIOD(texture.texture_period(view.structure_tensor)))

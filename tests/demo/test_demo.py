@@ -17,7 +17,7 @@ from PIL import Image
 from plyfile import PlyData
 
 from sadgs_ns.atomic import atomic_path
-from sadgs_ns.cli.export import write_ply
+from sadgs_ns.cli.export import write_gaussians
 from sadgs_ns.demo import scene as demo_scene
 from sadgs_ns.demo.scene import (
     EVAL_INTERVAL,
@@ -235,7 +235,7 @@ def gaussians(count: int, bands: int) -> dict[str, Any]:
 def test_ply_round_trip(tmp_path: Path, bands: int) -> None:
     params = gaussians(7, bands)
     path = tmp_path / "new folder" / "splat.ply"
-    assert write_ply(path, **params) == 7
+    assert write_gaussians(path, params) == 7
     vertex = PlyData.read(str(path))["vertex"]
     columns = [p.name for p in vertex.properties]
     assert columns[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
@@ -259,7 +259,7 @@ def test_ply_drops_what_is_not_finite(tmp_path: Path, capsys: pytest.CaptureFixt
     params = gaussians(5, 3)
     params["means"][1, 0] = torch.nan
     params["features_rest"][3, 2, 1] = torch.inf
-    assert write_ply(tmp_path / "splat.ply", **params) == 3
+    assert write_gaussians(tmp_path / "splat.ply", params) == 3
     assert "dropped 2 of 5 Gaussians" in capsys.readouterr().out
     np.testing.assert_array_equal(
         PlyData.read(str(tmp_path / "splat.ply"))["vertex"]["x"], params["means"][[0, 2, 4], 0]
@@ -270,7 +270,7 @@ def test_ply_names_the_tensor_of_another_shape(tmp_path: Path) -> None:
     params = gaussians(5, 3)
     params["quats"] = params["quats"][:, :3]
     with pytest.raises(ValueError, match=r"quats must have the shape \[5, 4\], got \[5, 3\]"):
-        write_ply(tmp_path / "splat.ply", **params)
+        write_gaussians(tmp_path / "splat.ply", params)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -21,7 +21,7 @@ from nerfstudio.utils import writer
 from runs import checkpoint, configure, is_finite, set_up, train
 from scenes import HEIGHT, WIDTH
 
-from sadgs_ns.cli.export import write_ply
+from sadgs_ns.cli.export import write_gaussians
 from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.plugin import checkpoints, nonfinite
 from sadgs_ns.plugin.presets import sadgs
@@ -310,14 +310,9 @@ def test_what_was_trained_is_saved_where_a_logger_fails_after_a_step(
 
 def test_a_full_disk_leaves_the_previous_export(tmp_path: Path):
     def write(count: int) -> None:
-        parts: dict[str, Any] = {name: torch.zeros(count, 3) for name in ("means", "scales", "features_dc")}
-        write_ply(
-            tmp_path / "splat.ply",
-            **parts,
-            quats=torch.ones(count, 4),
-            opacities=torch.zeros(count, 1),
-            features_rest=torch.zeros(count, 0, 3),
-        )
+        params = {name: torch.zeros(count, 3) for name in ("means", "scales", "features_dc")}
+        params |= {"quats": torch.ones(count, 4), "opacities": torch.zeros(count, 1)}
+        write_gaussians(tmp_path / "splat.ply", params | {"features_rest": torch.zeros(count, 0, 3)})
 
     write(10)
     before = (tmp_path / "splat.ply").read_bytes()

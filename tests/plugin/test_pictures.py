@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import math
+import re
 from pathlib import Path
 
 import matplotlib
@@ -110,7 +113,7 @@ def test_images_of_any_size_can_be_drawn(size: tuple[int, int]):
     image = torch.rand((*size, 3), generator=torch.Generator().manual_seed(0))
     tensor = structure_tensor(image)
     assert texture.draw_ellipses(color_scales.to_picture(image), tensor).shape == (*size, 3)
-    assert color_scales.annotate(PERIOD(texture.texture_period(tensor)), "text", PERIOD).shape == (*size, 3)
+    assert PERIOD(texture.texture_period(tensor)).shape == (*size, 3)
 
 
 def test_eta_is_colored_around_one():
@@ -157,15 +160,21 @@ def test_only_children_get_new_colors():
     assert not (after[2:, None] == colors[None]).all(dim=-1).any() and len(after.unique(dim=0)) == 5
 
 
-def test_a_legend_takes_the_upper_edge_only():
-    picture = np.full((300, 400, 3), 77, np.uint8)
-    with_legend = color_scales.annotate(picture, "η", ETA)
-    assert (with_legend[60:] == 77).all() and not (with_legend[:40] == 77).all()
-    long = color_scales.annotate(picture, 5 * "a long text ", ETA)
-    assert (long[:, -3:].max(axis=-1) <= 77).all(), "no text is cut off"
-    shown = {tuple(color) for color in with_legend[:60].reshape(-1, 3)}
+def test_a_legend_has_the_scale_s_colours_and_numbers_as_an_image_in_its_text():
+    assert color_scales.legend("No observations yet.") == "No observations yet."
+    text, _, image = color_scales.legend("largest η", ETA).partition("\n\n")
+    assert text == "largest η"
+    (encoded,) = re.findall(r"^!\[largest η\]\(data:image/png;base64,(\S+)\)$", image)
+    with Image.open(io.BytesIO(base64.b64decode(encoded))) as shown:
+        pixels = np.asarray(shown)
+    assert np.array_equal(pixels, color_scales.bar(ETA))
+    colors = {tuple(color) for color in pixels.reshape(-1, 3)}
     for value in (ETA.low, 1.0, ETA.high):
-        assert tuple(ETA(torch.full((1, 1), value))[0, 0]) in shown
+        assert tuple(ETA(torch.full((1, 1), value))[0, 0]) in colors
+    below = pixels[len(pixels) // 2 :]
+    assert (below == 255).all(axis=-1).sum() > 500, "the numbers stand below the colours"
+    for scale in (PERIOD, ETA, CHILDREN, LOW):
+        assert (color_scales.bar(scale)[:, [0, -1]].max(axis=-1) <= 20).all(), "no number is cut off"
 
 
 def test_figures_are_written_whole_with_all_panels(tmp_path: Path):

@@ -1,0 +1,84 @@
+"""Compressed PLY, PlayCanvas's layout: chunks of 256 Gaussians, quantised between each chunk's extremes, 16 bytes each.
+
+Positions and scales have 11, 10 and 11 bits, colours 8 bits between the chunk's extremes, opacities 8 bits, quaternions
+10 bits for each of the three smallest components, and the higher harmonics 8 bits in ±4, which is an error of up to
+1/64. Scales are cut at e^±20.
+"""
+
+from __future__ import annotations
+
+from typing import IO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sadgs_ns.formats.gaussians import DEGREE_0, Gaussians
+from sadgs_ns.formats.packing import morton_order, sigmoid, smallest_three
+
+_CHUNK = 256
+"""Number of Gaussians that share their extremes."""
+_HARMONICS_SPAN = 8.0
+"""The higher harmonics lie between −4 and 4."""
+
+
+def write(file: IO[bytes], gaussians: Gaussians) -> None:
+    """Write Gaussians as compressed PLY, in an order that keeps neighbours in one chunk.
+
+    Args:
+        file: Open for writing.
+        gaussians: What is written, at least one.
+    """
+    gaussians = gaussians[morton_order(gaussians.means)]
+    count, bands = gaussians.features_rest.shape[:2]
+    means, mean_extremes = _in_chunk(gaussians.means)
+    scales, scale_extremes = _in_chunk(gaussians.scales.clip(-20, 20))
+    colors, color_extremes = _in_chunk(np.float32(DEGREE_0) * gaussians.features_dc + np.float32(0.5))
+    largest, others = smallest_three(gaussians.quats)
+    rotations = [_steps(value, 10) for value in (others * np.float32(np.sqrt(0.5)) + 0.5).T]
+    alphas = _steps(sigmoid(gaussians.opacities), 8)
+    packed = [
+        _pack(means, (11, 10, 11)),
+        largest.astype("<u4") << 30 | rotations[0] << 20 | rotations[1] << 10 | rotations[2],
+        _pack(scales, (11, 10, 11)),
+        _pack(colors, (8, 8, 8)) << 8 | alphas,
+    ]
+    chunk = [f"{end}_{of}{axis}" for of, axes in (("", "xyz"), ("scale_", "xyz"), ("", "rgb")) for end in ("min", "max")
+             for axis in axes]  # fmt: skip
+    vertex = [f"packed_{name}" for name in ("position", "rotation", "scale", "color")]
+    lines = ["ply", "format binary_little_endian 1.0", "comment sadgs_ns", f"element chunk {len(mean_extremes)}"]
+    lines += [*(f"property float {name}" for name in chunk), f"element vertex {count}"]
+    lines += [f"property uint {name}" for name in vertex]
+    if bands:
+        lines += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(3 * bands))]
+    file.write("\n".join([*lines, "end_header\n"]).encode())
+    file.write(np.concatenate([mean_extremes, scale_extremes, color_extremes], axis=1).astype("<f4").tobytes())
+    file.write(np.stack(packed, axis=1).astype("<u4").tobytes())
+    if bands:
+        rest = gaussians.features_rest.transpose(0, 2, 1).reshape(count, -1)  # The file has colour before band.
+        file.write(np.floor((rest / _HARMONICS_SPAN + 0.5) * 256).clip(0, 255).astype(np.uint8).tobytes())
+
+
+def _in_chunk(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return values as shares, in [0, 1], of the way between the extremes of their chunk, and these extremes.
+
+    [N, 3] → [N, 3], [chunks, 6]: the three lowest and the three highest values
+    """
+    starts = np.arange(0, len(values), _CHUNK)
+    low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
+    chunk = np.arange(len(values)) // _CHUNK
+    span = np.where(high > low, high - low, np.float32(1))
+    return ((values - low[chunk]) / span[chunk]).astype(np.float32), np.concatenate([low, high], axis=1)
+
+
+def _steps(shares: NDArray[np.float32], bits: int) -> NDArray[np.uint32]:
+    """Return shares, in [0, 1], in steps of so many bits. [N] → [N]"""
+    most = (1 << bits) - 1
+    return np.floor(shares * most + np.float32(0.5)).clip(0, most).astype(np.uint32)
+
+
+def _pack(shares: NDArray[np.float32], bits: tuple[int, int, int]) -> NDArray[np.uint32]:
+    """Return three shares in one number, the first of them in its highest bits. [N, 3] → [N]"""
+    packed = np.zeros(len(shares), np.uint32)
+    for values, number in zip(shares.T, bits, strict=True):
+        packed = packed << np.uint32(number) | _steps(values, number)
+    return packed

@@ -1,0 +1,97 @@
+"""The Gaussians that files are written of: what training learned, in the file's frame, without what is not finite."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sadgs_ns.data.coordinates import Similarity
+
+DEGREE_0 = 0.5 / np.sqrt(np.pi)
+"""The spherical harmonic of degree 0."""
+_ROWS = 1 << 16
+"""Number of Gaussians that are converted at a time, so that float64 takes little memory."""
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N Gaussians, in the parameters of the original 3D Gaussian splatting code."""
+
+    means: Array
+    """Positions in the file's frame. [N, 3]"""
+    scales: Array
+    """Logarithms of the standard deviations in the file's units. [N, 3]"""
+    quats: Array
+    """Rotations, wxyz, of unit length. [N, 4]"""
+    opacities: Array
+    """Logits. [N]"""
+    features_dc: Array
+    """Spherical harmonics of degree 0; the colour is 0.5 + `DEGREE_0` times this. [N, 3]"""
+    features_rest: Array
+    """The higher degrees, with a K of 0, 3, 8 or 15. [N, K, 3]"""
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def __getitem__(self, rows: slice | NDArray[np.generic]) -> Gaussians:
+        """Return some of the Gaussians, by a slice, a mask or indices."""
+        return Gaussians(**{name: value[rows] for name, value in vars(self).items()})
+
+    @property
+    def degree(self) -> int:
+        """Highest degree of the harmonics, 0 … 3."""
+        return round((1 + self.features_rest.shape[1]) ** 0.5) - 1
+
+    def finite(self) -> Gaussians:
+        """Return those of which every number is finite."""
+        sound = np.ones(len(self), bool)
+        for value in vars(self).values():
+            sound &= np.isfinite(value).reshape(len(self), -1).all(axis=1)
+        return self if sound.all() else self[sound]
+
+    def moved(self, similarity: Similarity) -> Gaussians:
+        """Return the Gaussians in another frame, with their harmonics turned; some may become infinite there."""
+        parts, turn = {name: np.empty_like(value) for name, value in vars(self).items()}, None
+        if self.degree:
+            turn = similarity.harmonics(self.degree)[1:, 1:]
+        with np.errstate(all="ignore"):
+            for start in range(0, len(self), _ROWS):
+                rows = slice(start, start + _ROWS)
+                parts["means"][rows] = similarity.positions(self.means[rows].astype(np.float64))
+                parts["scales"][rows] = similarity.log_scales(self.scales[rows].astype(np.float64))
+                parts["quats"][rows] = similarity.rotations(self.quats[rows].astype(np.float64))
+                if turn is not None:
+                    parts["features_rest"][rows] = turn @ self.features_rest[rows].astype(np.float64)
+        return replace(self, **{name: parts[name] for name in ("means", "scales", "quats", "features_rest")})
+
+
+def of_parameters(params: Mapping[str, NDArray[np.floating]]) -> Gaussians:
+    """Return the Gaussians that a run's parameters are.
+
+    Args:
+        params: `means` [N, 3], `scales` (logarithms) [N, 3], `quats` (wxyz, of any length) [N, 4], `opacities` (logits)
+            [N, 1] or [N], `features_dc` [N, 3] and `features_rest` [N, K, 3] with a K of 0, 3, 8 or 15.
+
+    Raises:
+        ValueError: If an array has another shape than the number of means asks for, naming it.
+    """
+    count = len(params["means"])
+    rest = params["features_rest"]
+    bands = rest.shape[1] if rest.ndim == 3 else 0
+    if bands not in (0, 3, 8, 15):
+        raise ValueError(f"features_rest must hold the 0, 3, 8 or 15 harmonics of degree 1 to 3, got {bands}")
+    opacities = params["opacities"]
+    arrays = {**params, "opacities": opacities[:, 0] if opacities.shape[1:] == (1,) else opacities}
+    shapes = {"means": (3,), "features_dc": (3,), "features_rest": (bands, 3), "opacities": (), "scales": (3,)}
+    shapes |= {"quats": (4,)}
+    for name, shape in shapes.items():
+        if arrays[name].shape != (count, *shape):
+            raise ValueError(f"{name} must have the shape {[count, *shape]}, got {list(arrays[name].shape)}")
+    with np.errstate(all="ignore"):  # What is not finite is dropped later.
+        arrays["quats"] = arrays["quats"] / np.maximum(np.linalg.norm(arrays["quats"], axis=1, keepdims=True), 1e-12)
+    return Gaussians(**{name: np.ascontiguousarray(arrays[name], dtype=np.float32) for name in shapes})

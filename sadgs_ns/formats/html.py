@@ -1,0 +1,140 @@
+"""One HTML file that opens without a network: PlayCanvas's SuperSplat viewer, with the Gaussians as SOG inside.
+
+The viewer is the one that `@playcanvas/splat-transform` puts into the pages that it makes. It is a program for Node.js,
+so Node must be there when the file is written, and a network the first time. It makes the page of a single Gaussian;
+ours are put in its place, because they are compressed here in a fraction of its time.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import math
+import re
+import shutil
+import subprocess
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sadgs_ns.data.coordinates import Similarity
+from sadgs_ns.errors import InputError, reason
+from sadgs_ns.formats import ply, sog
+from sadgs_ns.formats.gaussians import Gaussians
+
+VIEWER = "@playcanvas/splat-transform@3.7.0"
+"""The package on npm."""
+_SECONDS = 300
+"""Longest time that making the page may take, with its download."""
+_BOOTSTRAP = re.compile(rb'(<script type="application/json" id="sse-bootstrap">)(.*?)(</script>)', re.DOTALL)
+"""Where the page holds its settings and what it shows."""
+_TO_VIEWER = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+"""From z up to the viewer's frame, in which y is up."""
+_TO_CONTENT = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
+"""From z up to the content's frame, which the viewer turns by half a turn around its z."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """The camera with which the page opens, in the Gaussians' frame; it stands upright."""
+
+    position: tuple[float, float, float]
+    target: tuple[float, float, float]
+    """A point that it looks at, around which the mouse turns it."""
+    degrees: float
+    """Angle of view along the longer side of the window."""
+
+
+def write(file: IO[bytes], gaussians: Gaussians, start: Start) -> None:
+    """Write a page that shows Gaussians.
+
+    Args:
+        file: Open for writing.
+        gaussians: What is shown, in a frame in which z is up; at least one.
+        start: Where the page opens.
+
+    Raises:
+        InputError: If Node.js or its package cannot be run, or there are more Gaussians than SOG can hold.
+    """
+    page, content = _page(), io.BytesIO()
+    sog.write(content, gaussians.moved(Similarity(1.0, _TO_CONTENT, np.zeros(3))))
+    encoded = base64.b64encode(content.getvalue()).decode()
+
+    def fill(found: re.Match[bytes]) -> bytes:
+        bootstrap = json.loads(found[2])
+        bootstrap["settings"] |= _settings(start)
+        bootstrap["contentUrl"] = f"data:application/octet-stream;base64,{encoded}"
+        return found[1] + json.dumps(bootstrap).encode() + found[3]
+
+    page, number = _BOOTSTRAP.subn(fill, page)
+    if number != 1:
+        raise InputError(f"{VIEWER} made a page of another kind than this version knows: choose another format.")
+    file.write(page)
+
+
+def _settings(start: Start) -> dict[str, Any]:
+    """Return the viewer's settings that depend on the start, and that show colours as they were trained."""
+    pose: dict[str, Any] = {
+        "position": (_TO_VIEWER @ start.position).tolist(),
+        "target": (_TO_VIEWER @ start.target).tolist(),
+    }
+    values = pose | {"fov": [start.degrees]}
+    track = {"name": "start", "duration": 1, "frameRate": 1, "loopMode": "none", "interpolation": "step"}
+    return {
+        "cameras": [{"initial": pose | {"fov": start.degrees}}],
+        # Without a track, here of one position, the viewer begins with a flight of its own.
+        "animTracks": [{**track, "smoothness": 0, "keyframes": {"times": [0], "values": values}}],
+        "startMode": "animTrack",
+        "tonemapping": "none",
+    }
+
+
+def _page() -> bytes:
+    """Return the page of a single Gaussian."""
+    remedy = "install Node.js 22 or newer, be online the first time, or choose another format"
+    npx = shutil.which("npx")
+    if npx is None:
+        raise InputError(f"HTML is written with the help of Node.js, whose npx is not there: {remedy}.")
+    one = np.zeros((1, 3), np.float32)
+    point = Gaussians(one, one - 5, np.eye(1, 4, dtype=np.float32), one[:, 0], one, np.zeros((1, 0, 3), np.float32))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "point.ply"
+        with path.open("wb") as file:
+            ply.write(file, point)
+        command = [npx, "--yes", VIEWER, "--quiet", "--gpu", "cpu", str(path), str(path.with_suffix(".html"))]
+        try:
+            subprocess.run(command, check=True, capture_output=True, text=True, timeout=_SECONDS, cwd=folder)
+            return path.with_suffix(".html").read_bytes()
+        except subprocess.TimeoutExpired as error:
+            raise InputError(f"`npx {VIEWER}` took more than {_SECONDS} s: {remedy}.") from error
+        except (subprocess.CalledProcessError, OSError) as error:
+            said = error.stderr.strip() if isinstance(error, subprocess.CalledProcessError) else ""
+            what = said.splitlines()[-1] if said else reason(error)
+            raise InputError(f"`npx {VIEWER}` failed ({what}): {remedy}.") from error
+
+
+def start_at(
+    camera_to_world: NDArray[np.float64],  # [3, 4]
+    side: int,
+    focal: float,
+    means: NDArray[np.float32],  # [N, 3]
+) -> Start:
+    """Return the start at a camera, which looks at a point as deep as what it has in the middle of its view.
+
+    Args:
+        camera_to_world: Pose with OpenGL axes, in the Gaussians' frame. [3, 4]
+        side: Longer side of the image in px.
+        focal: Focal length in px.
+        means: Positions of the Gaussians. [N, 3]
+    """
+    position, forward = camera_to_world[:, 3], -camera_to_world[:, 2]
+    depths = (means - position) @ forward
+    across = np.linalg.norm(means - position - depths[:, None] * forward, axis=1)
+    middle = depths[across < 0.2 * depths]
+    target = position + forward * (np.median(middle) if len(middle) else 1.0)
+    return Start(tuple(position.tolist()), tuple(target.tolist()), math.degrees(2 * math.atan(side / (2 * focal))))

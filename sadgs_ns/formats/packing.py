@@ -1,0 +1,107 @@
+"""What several formats have in common: an order in space, quaternions by their three smallest components, codebooks."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+_BITS = 21
+"""Bits of each coordinate in a Morton code of 63 bits."""
+_BINS = 256
+"""Bins of the histogram from which a codebook begins."""
+_SAMPLE = 1 << 18
+"""Number of values from which a codebook is made."""
+_ROUNDS = 20
+"""Rounds in which a codebook's levels move to the means of the values that are nearest to them."""
+
+
+def morton_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Return the order along a Z-shaped curve through space, which keeps neighbours together.
+
+    Args:
+        means: Positions. [N, 3]
+
+    Returns:
+        Indices. [N]
+    """
+    low, high = means.min(axis=0), means.max(axis=0)
+    cells = (means - low) / np.maximum(high - low, 1e-30).astype(np.float64)
+    codes = np.zeros(len(means), np.uint64)
+    for axis, bits in enumerate((cells * ((1 << _BITS) - 1)).astype(np.uint64).T):
+        spread = bits
+        for shift, mask in (
+            (32, 0x1F00000000FFFF),
+            (16, 0x1F0000FF0000FF),
+            (8, 0x100F00F00F00F00F),
+            (4, 0x10C30C30C30C30C3),
+            (2, 0x1249249249249249),
+        ):
+            spread = (spread | (spread << np.uint64(shift))) & np.uint64(mask)
+        codes |= spread << np.uint64(axis)
+    return np.argsort(codes, kind="stable")
+
+
+def smallest_three(quats: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Return which component of each unit quaternion is the largest, and the others, signed so that it is positive.
+
+    Args:
+        quats: Unit quaternions, in any order of components. [N, 4]
+
+    Returns:
+        The index of the largest component [N], and the others, in ±√½, in their order [N, 3].
+    """
+    largest = np.abs(quats).argmax(axis=1)
+    rows = np.arange(len(quats))
+    signs = np.where(quats[rows, largest] < 0, np.float32(-1), np.float32(1))
+    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
+    return largest, quats[rows[:, None], others] * signs[:, None]
+
+
+def codebook(values: NDArray[np.float32], size: int = 256) -> NDArray[np.float32]:
+    """Return levels that quantise values with little mean square error.
+
+    They begin with the cube root of the values' density, which is the best one where there are many levels, and a fifth
+    of them evenly, so that no rare value is far from a level. Lloyd's algorithm makes them better.
+
+    Args:
+        values: Any number of them, at least one; of any shape.
+        size: Number of levels.
+
+    Returns:
+        The levels, ascending. [size]
+    """
+    counts, edges = np.histogram(values, _BINS)
+    density = np.cbrt(counts)
+    mass = np.concatenate([[0.0], np.cumsum(density + 0.25 * density.mean())])
+    values = values.flatten()[:: math.ceil(values.size / _SAMPLE)]
+    levels = np.interp((np.arange(size) + 0.5) / size * mass[-1], mass, edges)
+    for _ in range(_ROUNDS):
+        labels = nearest_level(values, levels)
+        numbers = np.bincount(labels, minlength=size)
+        levels = np.where(numbers > 0, np.bincount(labels, values, size) / np.maximum(numbers, 1), levels)
+    return levels.astype(np.float32)
+
+
+def nearest_level(values: NDArray[np.floating], levels: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Return the index of the level that is nearest to each value.
+
+    Args:
+        values: [...]
+        levels: Ascending, at most 256.
+
+    Returns:
+        [...]
+    """
+    return np.searchsorted((levels[1:] + levels[:-1]) / 2, values).astype(np.uint8)
+
+
+def to_bytes(values: NDArray[np.number]) -> NDArray[np.uint8]:
+    """Round values to 0 … 255; those beyond become the ends. [...] → [...]"""
+    return np.rint(values).clip(0, 255).astype(np.uint8)
+
+
+def sigmoid(logits: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return opacities in [0, 1] of logits of any size. [...] → [...]"""
+    return np.float32(0.5) + np.float32(0.5) * np.tanh(np.float32(0.5) * logits)

@@ -1,0 +1,148 @@
+"""SOG, PlayCanvas's layout, version 2: a zip archive of lossless WebP images, one pixel a Gaussian, and `meta.json`.
+
+Positions have 16 bits, evenly in sign(x) ln(1 + |x|); quaternions 8 bits for each of the three smallest components;
+opacities 8 bits; scales and colours one of 256 levels each, chosen for the scene; the higher harmonics of a Gaussian
+are one of up to 65,536 sets that were found by k-means, their values one of 256 levels.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import warnings
+import zipfile
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from sadgs_ns.errors import InputError
+from sadgs_ns.formats.gaussians import Gaussians
+from sadgs_ns.formats.packing import codebook, morton_order, nearest_level, sigmoid, smallest_three, to_bytes
+
+_MOST_PIXELS = 16383
+"""Longest side of a WebP image."""
+_PALETTE = 1 << 16
+"""Most sets of higher harmonics."""
+_SETS_A_ROW = 64
+"""Sets of harmonics in a row of their image."""
+_SAMPLE = 1 << 16
+"""Number of sets from which the coarse clusters are found."""
+_ROUNDS = 8
+"""Rounds of k-means."""
+
+
+def write(file: IO[bytes], gaussians: Gaussians) -> None:
+    """Write Gaussians as SOG, in an order that keeps neighbours together.
+
+    Args:
+        file: Open for writing.
+        gaussians: What is written, at least one.
+
+    Raises:
+        InputError: If there are more than fit into an image.
+    """
+    gaussians = gaussians[morton_order(gaussians.means)]
+    count = len(gaussians)
+    width = 4 * math.ceil(math.sqrt(count) / 4)
+    if width > _MOST_PIXELS:
+        raise InputError(f"{count:,} Gaussians are more than SOG can hold: choose another format.")
+    logs = np.sign(gaussians.means) * np.log1p(np.abs(gaussians.means.astype(np.float64)))
+    low, high = logs.min(axis=0), logs.max(axis=0)
+    positions = np.rint((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(np.uint16)
+    largest, others = smallest_three(gaussians.quats)
+    rotations = np.c_[to_bytes(255 * (others * math.sqrt(0.5) + 0.5)), (252 + largest).astype(np.uint8)]
+    scales, colors = codebook(gaussians.scales), codebook(gaussians.features_dc)
+    alphas = to_bytes(255 * sigmoid(gaussians.opacities))
+    images = {
+        "means_l": (positions & 255).astype(np.uint8),
+        "means_u": (positions >> 8).astype(np.uint8),
+        "quats": rotations,
+        "scales": nearest_level(gaussians.scales, scales),
+        "sh0": np.c_[nearest_level(gaussians.features_dc, colors), alphas],
+    }
+    images = {name: _image(pixels, width) for name, pixels in images.items()}
+    meta: dict[str, Any] = {
+        "version": 2,
+        "asset": {"generator": "sadgs_ns"},
+        "count": count,
+        "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
+        "scales": {"codebook": scales.tolist(), "files": ["scales.webp"]},
+        "quats": {"files": ["quats.webp"]},
+        "sh0": {"codebook": colors.tolist(), "files": ["sh0.webp"]},
+    }
+    if gaussians.degree:
+        sets, labels = palette(gaussians.features_rest.reshape(count, -1))
+        levels = codebook(sets)
+        sets = nearest_level(sets, levels).reshape(-1, 3)
+        images["shN_centroids"] = _image(sets, _SETS_A_ROW * gaussians.features_rest.shape[1])
+        images["shN_labels"] = _image(np.stack([labels & 255, labels >> 8, 0 * labels], 1).astype(np.uint8), width)
+        meta["shN"] = {
+            "count": len(sets) // gaussians.features_rest.shape[1],
+            "bands": gaussians.degree,
+            "codebook": levels.tolist(),
+            "files": ["shN_centroids.webp", "shN_labels.webp"],
+        }
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, image in images.items():
+            encoded = io.BytesIO()
+            image.save(encoded, "webp", lossless=True, exact=True, quality=50, method=4)
+            archive.writestr(zipfile.ZipInfo(f"{name}.webp"), encoded.getvalue())
+        archive.writestr(zipfile.ZipInfo("meta.json"), json.dumps(meta))
+
+
+def _image(pixels: NDArray[np.uint8], width: int) -> Image.Image:
+    """Return an image of opaque RGB, or RGBA, pixels in rows. [P, 3] or [P, 4]"""
+    height = math.ceil(len(pixels) / width)
+    whole = np.zeros((height * width, 4), np.uint8)
+    whole[:, 3] = 255
+    whole[: len(pixels), : pixels.shape[1]] = pixels
+    return Image.fromarray(whole.reshape(height, width, 4))
+
+
+def palette(vectors: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Return vectors that stand for all, at most `_PALETTE`, and which of them stands for each.
+
+    k-means runs twice: it finds coarse clusters of a sample, and then, in each, as many fine ones as its members' share
+    asks for. Compared with one k-means of all this takes the square root of the distances.
+
+    Args:
+        vectors: At least one. [N, D]
+
+    Returns:
+        The palette [P, D], and for each vector an index into it [N].
+    """
+    number = min(_PALETTE, len(vectors) // 2 + 1)
+    generator = np.random.default_rng(0)
+    sample = vectors if len(vectors) <= _SAMPLE else vectors[generator.choice(len(vectors), _SAMPLE, replace=False)]
+    coarse = _k_means(sample, math.isqrt(number), generator)
+    belongs = np.concatenate([_nearest(part, coarse) for part in np.array_split(vectors, len(vectors) // _SAMPLE + 1)])
+    centers, labels, used = [], np.empty(len(vectors), np.int64), 0
+    for cluster in range(len(coarse)):
+        members = (belongs == cluster).nonzero()[0]
+        if len(members):
+            share = max(number * len(members) // len(vectors) - 1, 1)  # Rounding up must not exceed the palette.
+            fine = _k_means(vectors[members], share, generator)
+            labels[members] = used + _nearest(vectors[members], fine)
+            centers.append(fine)
+            used += len(fine)
+    return np.concatenate(centers), labels
+
+
+def _k_means(vectors: NDArray[np.float32], number: int, generator: np.random.Generator) -> NDArray[np.float32]:
+    """Return so many centres of vectors, which are at least as many. [N, D] → [number, D]"""
+    from scipy.cluster.vq import kmeans2  # It takes a third of a second to import.
+
+    start = vectors[generator.choice(len(vectors), number, replace=False)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Of clusters that became empty, which keep their centre.
+        return kmeans2(vectors, start, _ROUNDS, minit="matrix")[0].astype(np.float32)
+
+
+def _nearest(vectors: NDArray[np.float32], centers: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Return the index of the centre that is nearest to each vector. [N, D], [M, D] → [N]"""
+    from scipy.cluster.vq import vq
+
+    return vq(vectors, centers, check_finite=False)[0]

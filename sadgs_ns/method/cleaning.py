@@ -1,0 +1,137 @@
+"""Which Gaussians a finished model can do without: those few views see, giants, those outside a box, and dust."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sadgs_ns.errors import InputError
+from sadgs_ns.render.rasterization import rasterize
+
+Box = tuple[float, float, float, float, float, float]
+"""Lowest x, y and z, then highest x, y and z."""
+
+_SEEN = 1 / 255
+"""Pixels: a view sees a Gaussian that makes up at least this much of its image, the smallest opacity that is drawn."""
+
+
+@dataclass(frozen=True)
+class Cleaning:
+    """What is taken away; by default nothing."""
+
+    min_views: int = 0
+    """Take away Gaussians that fewer training views see; 0 takes none."""
+    max_extent: float | None = None
+    """Take away Gaussians whose longest standard deviation is more than this, in world units; None takes none."""
+    crop: Box | None = None
+    """Take away Gaussians whose centre is outside this box, in world units; None takes none."""
+    dust: float = 0.0
+    """Take away Gaussians that make up less than this, in pixels, of the image of every training view; 0 takes none."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be meant.
+
+        Raises:
+            InputError: If a number is negative or not finite, an extent is 0, or the box has a corner that is reversed.
+        """
+        for name, value in (("--min-views", self.min_views), ("--dust", self.dust)):
+            if not 0 <= value < math.inf:
+                raise InputError(f"{name} {value:g} must be 0, which takes nothing away, or more.")
+        if self.max_extent is not None and not 0 < self.max_extent < math.inf:
+            raise InputError(
+                f"--max-extent {self.max_extent:g} must be more than 0: leave it out to take nothing away."
+            )
+        if self.crop is not None and not all(
+            -math.inf < low < high < math.inf for low, high in zip(self.crop[:3], self.crop[3:], strict=True)
+        ):
+            box = " ".join(f"{value:g}" for value in self.crop)
+            raise InputError(f"--crop {box} is no box: give the lowest x, y and z, then the highest x, y and z.")
+
+    @property
+    def needs_views(self) -> bool:
+        """Whether `find` must be told what the training views see."""
+        return self.min_views > 0 or self.dust > 0
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What the training views see of N Gaussians."""
+
+    views: Tensor
+    """Number of views that see each. int64 [N]"""
+    pixels: Tensor
+    """How many pixels each makes up in the view where these are most. [N]"""
+    total: int
+    """Number of views."""
+
+
+def see(
+    params: Mapping[str, Tensor],
+    cameras: Iterable[tuple[Tensor, Tensor, int, int]],
+    **drawing: Any,
+) -> Seen:
+    """Measure how many pixels Gaussians make up in training views: opacity × area, less what is hidden by others.
+
+    Args:
+        params: `means` [N, 3], `quats` [N, 4], log `scales` [N, 3], logit `opacities` [N] or [N, 1].
+        cameras: World-to-camera matrix [4, 4], intrinsics in px [3, 3], width and height in px of each view.
+        drawing: Further options of `rasterize`.
+    """
+    shapes = [params[name].detach() for name in ("means", "quats", "scales")]
+    opacities = params["opacities"].detach().flatten().sigmoid()
+    sound = torch.cat([*shapes, opacities[:, None]], dim=1).isfinite().all(dim=1)  # What is not cannot be drawn.
+    means, quats, scales = (torch.where(sound[:, None], value, 0.0) for value in shapes)
+    scales, opacities = scales.exp(), torch.where(sound, opacities, 0.0)
+    views, pixels = means.new_zeros(len(means), dtype=torch.int64), means.new_zeros(len(means))
+    number = 0
+    for viewmat, K, width, height in cameras:
+        with torch.enable_grad():
+            # An image is a sum of colours times weights, so its derivative by a colour is the weight.
+            colors = torch.ones_like(means, requires_grad=True)
+            image, _, _ = rasterize(
+                means, quats, scales, opacities, colors, viewmat[None], K[None], width, height, **drawing
+            )
+            (weights,) = torch.autograd.grad(image.sum(), colors)
+        views += weights[:, 0] >= _SEEN
+        pixels = torch.maximum(pixels, weights[:, 0])
+        number += 1
+    return Seen(views, pixels, number)
+
+
+@torch.no_grad()
+def find(params: Mapping[str, Tensor], cleaning: Cleaning, seen: Seen | None = None) -> tuple[Tensor, list[str]]:
+    """Find which Gaussians stay.
+
+    Args:
+        params: `means` [N, 3] and log `scales` [N, 3].
+        cleaning: What is taken away.
+        seen: Of these Gaussians, where `cleaning.needs_views`.
+
+    Returns:
+        Which stay, bool [N]; and a sentence for each of the options that are set, with the number that it takes away of
+        those that the ones before it left.
+    """
+    means, extents = params["means"].detach(), params["scales"].detach().amax(dim=1).exp()
+    goes: list[tuple[Tensor, str]] = []
+    if cleaning.crop is not None:
+        low, high = means.new_tensor(cleaning.crop).view(2, 3)
+        goes.append((~((means >= low) & (means <= high)).all(dim=1), "outside the box"))
+    if cleaning.max_extent is not None:
+        goes.append((extents > cleaning.max_extent, f"longer than {cleaning.max_extent:g}"))
+    if cleaning.needs_views:
+        assert seen is not None
+        few = f"seen by fewer than {cleaning.min_views} of {seen.total} training views"
+        dust = f"of less than {cleaning.dust:g} px in every training view"
+        goes += [(seen.views < cleaning.min_views, few)] if cleaning.min_views else []
+        goes += [(seen.pixels < cleaning.dust, dust)] if cleaning.dust else []
+    stays, sentences = torch.ones(len(means), dtype=torch.bool, device=means.device), []
+    for taken, which in goes:
+        number = int((stays & taken).sum())
+        stays &= ~taken
+        sentences.append(f"{number:,} Gaussians {which} are taken away.")
+    return stays, sentences

@@ -1,0 +1,319 @@
+"""The formats, read back by readers that are not ours: gsply for PLY, SPZ and SOG, and glTF by its specification."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import math
+import re
+import struct
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gsply
+import numpy as np
+import pytest
+from gsply.sog_reader import sogread
+from gsply.spz import read_spz
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from sadgs_ns.data.coordinates import Similarity
+from sadgs_ns.errors import InputError
+from sadgs_ns.formats import compressed_ply, files, glb, html, packing, ply, sog, spz
+from sadgs_ns.formats.gaussians import Gaussians, of_parameters
+
+START = html.Start((0.0, -2.0, 1.0), (0.0, 0.0, 0.5), 60.0)
+
+
+def random_gaussians(count: int, bands: int = 15, seed: int = 0) -> Gaussians:
+    """Gaussians of the sizes, opacities and colours that training makes, no two of them near each other."""
+    generator = np.random.default_rng(seed)
+    side = math.ceil(count ** (1 / 3))
+    grid = np.stack(np.meshgrid(*[np.linspace(-2, 3, side)] * 3), -1).reshape(-1, 3)[:count]
+    arrays = {
+        "means": grid + generator.uniform(-0.3, 0.3, grid.shape) * 5 / side,
+        "scales": generator.normal(-4, 0.7, (count, 3)).clip(-6, -2),
+        "quats": generator.normal(size=(count, 4)),
+        "opacities": generator.normal(0, 2, count),
+        "features_dc": generator.normal(0, 0.8, (count, 3)).clip(-2.5, 2.5),
+        "features_rest": generator.normal(0, 0.1, (count, bands, 3)),
+    }
+    return of_parameters(arrays)
+
+
+def of_gsply(read: Any) -> Gaussians:
+    rest = read.shN if read.shN is not None else np.zeros((len(read.means), 0, 3), np.float32)
+    arrays = {"means": read.means, "scales": read.scales, "quats": read.quats, "opacities": read.opacities}
+    return of_parameters({**arrays, "features_dc": read.sh0, "features_rest": rest})
+
+
+def of_glb(path: Path) -> tuple[Gaussians, dict[str, Any]]:
+    """A GLB's Gaussians, and its JSON, whose parts are checked against the lengths that the container gives."""
+    data = path.read_bytes()
+    magic, version, total, length, kind = struct.unpack("<4sIIII", data[:20])
+    assert (magic, version, total, kind) == (b"glTF", 2, len(data), 0x4E4F534A)
+    document = json.loads(data[20 : 20 + length])
+    size, kind = struct.unpack("<II", data[20 + length : 28 + length])
+    binary = data[28 + length :]
+    assert length % 4 == 0 and kind == 0x004E4942 and size == len(binary) == document["buffers"][0]["byteLength"]
+
+    def array(index: int) -> NDArray[Any]:
+        accessor = document["accessors"][index]
+        view = document["bufferViews"][accessor["bufferView"]]
+        dtype = {5126: np.float32, 5121: np.uint8}[accessor["componentType"]]
+        part = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+        return np.frombuffer(part, dtype).reshape(accessor["count"], -1)
+
+    (primitive,) = document["meshes"][0]["primitives"]
+    assert "KHR_gaussian_splatting" in document["extensionsUsed"] and primitive["mode"] == 0
+    attributes = {name.rpartition(":")[2]: array(index) for name, index in primitive["attributes"].items()}
+    rest = [attributes[f"SH_DEGREE_{d}_COEF_{m}"] for d in (1, 2, 3) for m in range(2 * d + 1)
+            if f"SH_DEGREE_{d}_COEF_{m}" in attributes]  # fmt: skip
+    count = len(attributes["POSITION"])
+    alphas = attributes["OPACITY"][:, 0].astype(np.float64)
+    arrays = {
+        "means": attributes["POSITION"],
+        "scales": np.log(attributes["SCALE"]),
+        "quats": attributes["ROTATION"][:, [3, 0, 1, 2]],
+        "opacities": np.log(alphas / (1 - alphas)),
+        "features_dc": attributes["SH_DEGREE_0_COEF_0"],
+        "features_rest": np.stack(rest, 1) if rest else np.zeros((count, 0, 3)),
+    }
+    shown = np.c_[0.28209479 * attributes["SH_DEGREE_0_COEF_0"] + 0.5, alphas].clip(0, 1)
+    np.testing.assert_allclose(attributes["COLOR_0"] / 255, shown, atol=0.51 / 255)
+    return of_parameters(arrays), document
+
+
+def read(path: Path) -> Gaussians:
+    suffix = files.format_of(path)
+    if suffix == ".glb":
+        return of_glb(path)[0]
+    return of_gsply({".spz": read_spz, ".sog": sogread}.get(suffix, gsply.plyread)(str(path)))
+
+
+def errors(written: Gaussians, found: Gaussians) -> dict[str, float]:
+    """Largest errors, Gaussian by Gaussian, whose order in the file is another; of quaternions the angle in degrees."""
+    distances, order = map(np.asarray, KDTree(found.means).query(written.means))
+    assert len(found) == len(written) == len(np.unique(order)), "each Gaussian must be there once"
+    found = found[order]
+    cosines = np.abs((written.quats.astype(np.float64) * found.quats).sum(axis=1)).clip(0, 1)
+    result = {"means": float(distances.max()), "quats": float(np.degrees(2 * np.arccos(cosines)).max())}
+    result["alphas"] = float(np.abs(packing.sigmoid(written.opacities) - packing.sigmoid(found.opacities)).max())
+    for name in ("scales", "features_dc", "features_rest"):
+        result[name] = float(np.abs(getattr(written, name) - getattr(found, name)).max(initial=0))
+    return result
+
+
+ALPHA = 0.5 / 255 + 1e-5
+BOUNDS: dict[str, dict[str, float]] = {
+    # A chunk of 256 of these 3,000 spans up to 3 units, in y in 10 bits; colours span up to 5, scales 4.
+    ".compressed.ply": {"means": 3 / 1023, "scales": 4 / 2046 + 1e-5, "quats": 0.25, "alphas": ALPHA,
+                        "features_dc": 5 / 510 + 1e-5, "features_rest": 1 / 64 + 1e-6},
+    ".spz": {"means": 2e-6, "scales": 1 / 32 + 1e-6, "quats": 0.25, "alphas": ALPHA, "features_dc": 0.5 / 38.25 + 1e-6,
+             "features_rest": 1 / 64 + 1e-6},
+    # The levels of the rarest values are the furthest apart. There are half as many sets of harmonics as Gaussians.
+    ".sog": {"means": 2e-4, "scales": 0.05, "quats": 1.0, "alphas": ALPHA, "features_dc": 0.06, "features_rest": 0.45},
+    ".glb": {"means": 0, "scales": 1e-5, "quats": 0.05, "alphas": 1e-6, "features_dc": 0, "features_rest": 0},
+    ".ply": {"means": 0, "scales": 0, "quats": 0.05, "alphas": 0, "features_dc": 0, "features_rest": 0},
+}  # fmt: skip
+"""Largest errors that the formats' bits allow."""
+
+
+@pytest.mark.parametrize("bands", [0, 3, 8, 15])
+@pytest.mark.parametrize("suffix", BOUNDS)
+def test_a_foreign_reader_finds_the_gaussians_within_the_format_s_error(suffix: str, bands: int, tmp_path: Path):
+    written = random_gaussians(3000, bands)
+    path = tmp_path / f"splat{suffix}"
+    files.write(path, written)
+    found = read(path)
+    assert found.features_rest.shape == written.features_rest.shape
+    for name, error in errors(written, found).items():
+        assert error <= BOUNDS[suffix][name], (name, error)
+
+
+@pytest.mark.parametrize("suffix", BOUNDS)
+@pytest.mark.parametrize("count", [1, 256, 257])
+def test_few_gaussians_and_whole_chunks_are_written_too(suffix: str, count: int, tmp_path: Path):
+    written = random_gaussians(count)
+    path = tmp_path / f"splat{suffix}"
+    files.write(path, written)
+    found = errors(written, read(path))
+    bounds = BOUNDS[suffix] | ({"means": 6 / 1023} if suffix == ".compressed.ply" else {})
+    assert all(found[name] <= bounds[name] for name in bounds), found
+
+
+def test_the_harmonics_of_many_gaussians_are_found_again(tmp_path: Path):
+    """Two hundred kinds of harmonics, of which k-means must find each one."""
+    written = random_gaussians(3000)
+    kinds = random_gaussians(200, seed=1).features_rest
+    shared = np.random.default_rng(2).integers(0, 200, 3000)
+    written.features_rest[:] = kinds[shared]
+    files.write(tmp_path / "splat.sog", written)
+    assert errors(written, read(tmp_path / "splat.sog"))["features_rest"] < 0.02
+
+
+def test_a_palette_stays_within_its_size(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sog, "_PALETTE", 100)
+    vectors = np.random.default_rng(0).normal(size=(3000, 9)).astype(np.float32)
+    sets, labels = sog.palette(vectors)
+    assert 80 <= len(sets) <= 100 and labels.min() == 0 and labels.max() == len(sets) - 1
+    error = np.square(sets[labels] - vectors).mean()
+    assert error < 0.75, "the mean alone would leave 1"
+
+
+def test_codebooks_serve_rare_values_too():
+    values = np.r_[np.random.default_rng(0).normal(size=100_000), -20.0, 30.0].astype(np.float32)
+    levels = packing.codebook(values)
+    error = np.abs(levels[packing.nearest_level(values, levels)] - values)
+    assert error.max() < 1.0 and error[:-2].std() < 0.02
+
+
+def test_a_morton_order_keeps_neighbours_together():
+    gaussians = random_gaussians(4096)
+    order = packing.morton_order(gaussians.means)
+    assert sorted(order) == list(range(4096))
+    steps = np.linalg.norm(np.diff(gaussians.means[order], axis=0), axis=1)
+    assert (
+        steps.mean()
+        < 0.3 * np.linalg.norm(np.diff(np.random.default_rng(0).permutation(gaussians.means), axis=0), axis=1).mean()
+    )
+
+
+def test_positions_of_spz_are_as_fine_as_the_furthest_one_leaves(tmp_path: Path):
+    written = random_gaussians(8)
+    for reach, step in ((3.0, 2.0**-20), (1000.0, 2.0**-13), (8191.9995, 2.0**-10)):
+        written.means[0, 0] = reach
+        files.write(tmp_path / "splat.spz", written)
+        assert errors(written, read(tmp_path / "splat.spz"))["means"] <= step
+    written.means[0, 0] = 1e6
+    with pytest.raises(
+        InputError, match=r"^The Gaussians reach 1,000,000 units .*: take the far ones away with --crop"
+    ):
+        files.write(tmp_path / "far.spz", written)
+    assert [path.name for path in tmp_path.iterdir()] == ["splat.spz"]
+
+
+def test_values_beyond_a_format_s_range_are_cut_and_not_wrapped(tmp_path: Path):
+    written = random_gaussians(300, 3)
+    written.opacities[:2], written.scales[:2] = [-50, 50], [[-40] * 3, [7] * 3]
+    written.features_rest[:2], written.features_dc[:2] = [[[-9.0] * 3] * 3, [[9.0] * 3] * 3], [[-9] * 3, [9] * 3]
+    for suffix, low, high in ((".compressed.ply", -20, 7), (".spz", -10, 95 / 16 + 1e-6), (".sog", -40, 7)):
+        files.write(tmp_path / f"splat{suffix}", written)
+        found = read(tmp_path / f"splat{suffix}")
+        alphas = packing.sigmoid(found.opacities)
+        assert alphas.min() < 0.01 and alphas.max() > 0.99
+        assert low - 0.5 <= found.scales.min() <= low + 0.5 and high - 0.5 <= found.scales.max() <= high
+        assert found.features_rest.min() < -0.9 and found.features_rest.max() > 0.9
+        assert np.median(np.abs(found.features_rest)) < 0.2
+
+
+# --- glTF ---
+
+
+@pytest.mark.parametrize(("frame", "up"), [("nerfstudio", [0, 0, 1]), ("colmap", [0, -1, 0])])
+def test_the_node_of_a_glb_turns_up_to_y(frame: Any, up: list[int], tmp_path: Path):
+    files.write(tmp_path / "splat.glb", random_gaussians(5), frame)
+    _, document = of_glb(tmp_path / "splat.glb")
+    turned = Rotation.from_quat(document["nodes"][0]["rotation"]).apply(up)
+    np.testing.assert_allclose(turned, [0, 1, 0], atol=1e-12)
+
+
+def test_a_glb_of_more_than_four_gigabytes_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    monkeypatch.setattr(glb, "_MOST_BYTES", 1000)
+    with pytest.raises(InputError, match=r"^5 Gaussians take more than the 4 GB that glTF can hold: choose"):
+        files.write(tmp_path / "splat.glb", random_gaussians(5))
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- HTML ---
+
+PAGE = (
+    b'<p>\n<script type="application/json" id="sse-bootstrap">{"settings": {"a": 1}, "contentUrl": "x"}</script>\n</p>'
+)
+
+
+def test_a_page_holds_the_gaussians_turned_for_the_viewer_and_the_start(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    monkeypatch.setattr(html, "_page", lambda: PAGE)
+    written = random_gaussians(300)
+    files.write(tmp_path / "splat.html", written, start=START)
+    bootstrap = json.loads(re.findall(rb">(\{.*\})<", (tmp_path / "splat.html").read_bytes())[0])
+    assert bootstrap["settings"]["a"] == 1, "what else is set stays"
+    (tmp_path / "splat.sog").write_bytes(base64.b64decode(bootstrap["contentUrl"].partition(",")[2]))
+    found = read(tmp_path / "splat.sog")
+    half_turn = Similarity(1.0, np.diag([-1.0, -1.0, 1.0]), np.zeros(3))  # The viewer turns what it loads by this.
+    up = Similarity(1.0, np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.zeros(3))
+    assert errors(written.moved(up), found.moved(half_turn))["means"] < BOUNDS[".sog"]["means"]
+    camera = bootstrap["settings"]["cameras"][0]["initial"]
+    assert camera == {"position": [0.0, 1.0, 2.0], "target": [0.0, 0.5, 0.0], "fov": 60.0}
+    (track,) = bootstrap["settings"]["animTracks"]
+    values = track["keyframes"]["values"]
+    assert values == {"position": camera["position"], "target": camera["target"], "fov": [60.0]}
+
+
+def test_the_start_looks_where_the_camera_does_at_the_depth_of_what_is_there():
+    pose = np.array([[1.0, 0, 0, 0], [0, 0, -1, -5], [0, 1, 0, 0]])  # It stands at y = −5 and looks along y.
+    means = np.array([[0, -2, 0], [0.1, 0, 0], [0, 2, 0], [50, 0, 0], [0, -9, 0]], np.float32)
+    start = html.start_at(pose, 200, 100.0, means)
+    np.testing.assert_allclose([*start.position, *start.target], [0, -5, 0, 0, 0, 0], atol=1e-6)
+    assert start.degrees == pytest.approx(90)
+    assert html.start_at(pose, 200, 100.0, means[4:]).target == (0, -4, 0), (
+        "where it sees nothing it looks one unit far"
+    )
+
+
+def _raise(error: Exception) -> Callable[..., Any]:
+    def fail(*_: Any, **__: Any) -> Any:
+        raise error
+
+    return fail
+
+
+def test_what_goes_wrong_with_node_is_one_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    def fails(message: str) -> None:
+        with pytest.raises(InputError, match=message):
+            files.write(tmp_path / "splat.html", random_gaussians(5), start=START)
+        assert list(tmp_path.iterdir()) == []
+
+    remedy = r": install Node\.js 22 or newer, be online the first time, or choose another format\.$"
+    monkeypatch.setattr(html.shutil, "which", lambda _: None)
+    fails(r"^HTML is written with the help of Node\.js, whose npx is not there" + remedy)
+    monkeypatch.setattr(html.shutil, "which", lambda _: "npx")
+    failed = subprocess.CalledProcessError(1, "npx", stderr="npm warn\nnpm error network\n")
+    monkeypatch.setattr(html.subprocess, "run", _raise(failed))
+    fails(r"^`npx @playcanvas/splat-transform@\S+` failed \(npm error network\)" + remedy)
+    monkeypatch.setattr(html.subprocess, "run", _raise(subprocess.TimeoutExpired("npx", 300)))
+    fails(r"^`npx @playcanvas/splat-transform@\S+` took more than 300 s" + remedy)
+    monkeypatch.setattr(html, "_page", lambda: b"<p>another page</p>")
+    fails(r"made a page of another kind than this version knows: choose another format\.$")
+
+
+# --- names ---
+
+
+@pytest.mark.parametrize("suffix", files.SUFFIXES)
+def test_the_format_follows_the_name_in_any_case(suffix: str, tmp_path: Path):
+    assert files.format_of(tmp_path / f"a.b{suffix.upper()}") == suffix
+
+
+def test_nothing_is_written_of_nothing(tmp_path: Path):
+    for suffix in BOUNDS:
+        if suffix != ".ply":
+            with pytest.raises(InputError, match=r"would hold no Gaussians: take away fewer of them\.$"):
+                files.write(tmp_path / f"splat{suffix}", random_gaussians(8)[:0])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_same_gaussians_make_the_same_bytes():
+    gaussians = random_gaussians(300)
+    for write in (ply.write, compressed_ply.write, spz.write, sog.write):
+        first, second = io.BytesIO(), io.BytesIO()
+        write(first, gaussians)
+        write(second, gaussians)
+        assert first.getvalue() == second.getvalue()
