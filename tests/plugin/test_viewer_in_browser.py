@@ -8,6 +8,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import browser
@@ -33,9 +34,15 @@ def eventually(condition: Callable[[], bool], seconds: float = 60) -> None:
 
 
 def select(page: Page, label: str, option: str) -> None:
-    page.click(ELEMENT.format(label))
-    page.wait_for(f"!!{OPTION.format(option)}")
-    page.click(OPTION.format(option))
+    """Choose an option; once more where the panel moved under the mouse, because a text above it changed."""
+    for _ in range(5):
+        page.click(ELEMENT.format(label))
+        with suppress(TimeoutError):
+            page.wait_for(f"!!{OPTION.format(option)}", 10)
+            page.click(OPTION.format(option))
+            page.wait_for(f"{ELEMENT.format(label)}.value == '{option}'", 5)
+            return
+    raise TimeoutError(f"{label} never became {option}")
 
 
 LEGEND = "[...document.querySelectorAll('img')].filter(i => i.alt == 'largest η' && i.naturalWidth == 720)[0]"
@@ -76,6 +83,13 @@ def test_the_panel_shows_and_sets_what_is_chosen_in_a_browser(tmp_path: Path):
             page.press("Enter", 13)
             eventually(lambda: strategy.max_gaussians == 4567)
             page.wait_for("document.body.innerText.includes('cap 4,567')")
+            select(page, "Preview", "what stays")
+            number = pipeline.model.num_points
+            page.wait_for(f"document.body.innerText.includes('{number:,} of {number:,} Gaussians would stay.')")
+            page.wait_for(f"{ELEMENT.format('Output type')}.value == 'cleaned'")
+            page.click(ELEMENT.format("min views"))  # In the middle of the slider.
+            page.wait_for("document.body.innerText.includes('of 8 training views are taken away.')")
+            assert pipeline.cleaning.cleaning.min_views > 0
             select(page, "Show", "off")
             page.wait_for(f"{ELEMENT.format('Output type')}.value == 'rgb' && !{LEGEND}")
     finally:
