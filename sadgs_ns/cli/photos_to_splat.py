@@ -91,12 +91,12 @@ class PhotosToSplat:
         self._run = self.folder / "training" / "sadgs" / "run"
         self._asked: dict[str, Any] = {"source": os.path.realpath(self.source), "--max-size": self.max_size}
         self._asked |= {"--effort": self.effort, "options of ns-train": list(self.options)}
-        self._check_source()
         for option in self.options:
             name = option.partition("=")[0].lstrip("-").replace("_", "-")
             if option.startswith("--") and name in _OURS:
                 raise InputError(f"--{name} is set by sadgs itself: leave it out, or use ns-train.")
         self._settings = self._read_settings()
+        self._check_source()
 
     def _check_source(self) -> None:
         if self.source.is_file():
@@ -104,7 +104,7 @@ class PhotosToSplat:
                 kinds = ", ".join(sorted(VIDEO_SUFFIXES))
                 raise InputError(f"{self.source} is neither a folder of photos nor a video ({kinds}).")
         else:
-            find_photos(self.source, self.folder)
+            find_photos(self.source, self._scene)
 
     def _read_settings(self) -> dict[str, Any]:
         """Return the settings that the folder was begun with, with what is not decided yet as it is asked for now.
@@ -199,18 +199,17 @@ class PhotosToSplat:
         raise InputError(f"{told}.") if code == 2 else RunError(f"{told}, and the same command goes on.")
 
     def _make_cameras(self) -> None:
-        found, roughly, finished = "", "", False
+        found, others, roughly, finished = "", "", "", False
 
         def hear(printed: str) -> None:
-            nonlocal found, roughly, finished
+            nonlocal found, others, roughly, finished
             if step := _STEP.match(printed):
                 line.tell(f"{step[1]} {step[2]} of {step[3]}{roughly}")
             elif duration := _ROUGHLY.search(printed):
                 roughly = f" ({duration[1]} in all)"
             elif registered := _REGISTERED.match(printed):
-                found = registered[0] + (
-                    "" if registered[1] == registered[2] else ", of the others log/cameras.txt tells"
-                )
+                found = registered[0]
+                others = "" if registered[1] == registered[2] else ", log/cameras.txt tells of the others"
             finished |= printed.endswith(" is finished; delete it to make it again.")
 
         with Line("cameras", self.console) as line:
@@ -227,12 +226,12 @@ class PhotosToSplat:
                 line.tell(found)
                 if not self.anyway:
                     raise self._few_registered() from None
-            line.tell(found + "; done before" * finished)
+            line.tell(found + others + "; done before" * finished)
 
     def _few_registered(self) -> RunError:
         again = shlex.join(["sadgs-process", str(self.source), str(self._scene), "--matching", "exhaustive"])
         return RunError(
-            f"only {self._settings['few'].partition(',')[0]}, so the splat would show only what these saw: take more "
+            f"only {self._settings['few']}, so the splat would show only what these saw: take more "
             "photos between the others, with two thirds of overlap, and begin another --output; or compare more "
             f"pairs of them with `{again}`, and give the same command again; or go on with these with --anyway."
         )
@@ -257,7 +256,7 @@ class PhotosToSplat:
             if (trained := self._settings.get("trained")) and self._checkpoint():
                 line.tell(f"{trained}; done before")
                 return
-            line.tell("starting")
+            line.tell("going on" if self._checkpoint() else "starting")
             arguments = ["sadgs", "--data", str(self._scene.absolute()), "--output-dir", str(self.folder.absolute())]
             arguments += ["--experiment-name", "training", "--timestamp", "run", "--vis", "tensorboard"]
             arguments += ["--steps-per-eval-image", "0", "--pipeline.effort", f"{self.effort:g}"]
@@ -359,7 +358,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     folder: Path | None = given.output
     try:
         refuse_deleted_working_directory()
-        folder = folder or Path(f"{given.source.resolve().stem or 'photos'}-splat")
+        source = given.source.resolve()
+        folder = folder or Path(f"{(source.name if source.is_dir() else source.stem) or 'photos'}-splat")
         with Interrupts(waiting=lambda: False) as interrupts:
             formats = _formats(given.formats, console)
             work = PhotosToSplat(
