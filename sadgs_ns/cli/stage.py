@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import itertools
 import os
 import re
 import shlex
@@ -183,9 +184,9 @@ def _end_with_parent() -> None:
 
 
 def _last_sentence(lines: Sequence[str]) -> str:
-    """Return what a command said last; of a box, as around a wrong option, the first line inside."""
-    boxed = [line.strip("│ ") for line in lines if line.startswith("│ ")]
+    """Return what a command said last; of a box, as around a wrong option, its first paragraph."""
     if lines and lines[-1].startswith("╰"):
-        return boxed[0].rstrip(".") if boxed else ""
+        boxed = (line.strip("│ ") for line in lines if line.startswith("│ "))
+        return " ".join(filter(None, itertools.takewhile(lambda text: not text.startswith("──"), boxed))).rstrip(".")
     last = next((line.strip() for line in reversed(lines) if re.search(r"\w", line)), "it printed nothing")
     return _PREFIX.sub("", last).rstrip(".")
