@@ -226,6 +226,8 @@ class PhotosToSplat:
                 line.tell(found)
                 if not self.anyway:
                     raise self._few_registered() from None
+            else:
+                self._settings.pop("few", None)
             line.tell(found + others + "; done before" * finished)
 
     def _few_registered(self) -> RunError:

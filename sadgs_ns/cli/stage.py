@@ -167,10 +167,11 @@ def run_stage(
 
 def _stop(process: subprocess.Popen[bytes], error: BaseException, line: Line) -> None:
     """Pass an interruption on and wait until the process has saved what it did; a second Ctrl-C kills it."""
-    line.tell("stopping")
     with suppress(ProcessLookupError):
         os.killpg(process.pid, error.number if isinstance(error, Interrupted) else signal.SIGTERM)
     try:
+        with suppress(OSError):  # The terminal may be gone.
+            line.tell("stopping")
         process.wait()
     except KeyboardInterrupt:
         os.killpg(process.pid, signal.SIGKILL)
@@ -186,7 +187,8 @@ def _end_with_parent() -> None:
 def _last_sentence(lines: Sequence[str]) -> str:
     """Return what a command said last; of a box, as around a wrong option, its first paragraph."""
     if lines and lines[-1].startswith("╰"):
-        boxed = (line.strip("│ ") for line in lines if line.startswith("│ "))
-        return " ".join(filter(None, itertools.takewhile(lambda text: not text.startswith("──"), boxed))).rstrip(".")
+        boxed = [line.strip("│ ") for line in lines if line.startswith("│ ")]
+        paragraph = itertools.takewhile(lambda text: not text.startswith("──"), boxed)
+        return " ".join(text for text in paragraph if text).rstrip(".")
     last = next((line.strip() for line in reversed(lines) if re.search(r"\w", line)), "it printed nothing")
     return _PREFIX.sub("", last).rstrip(".")
