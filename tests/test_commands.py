@@ -13,7 +13,7 @@ from sadgs_ns.bench.__main__ import COMMANDS
 from sadgs_ns.demo.scene import write_scene
 
 PYPROJECT = Path(__file__).parents[1] / "pyproject.toml"
-SCRIPTS = dict(re.findall(r'^(sadgs-\w+) = "(.+):main"$', PYPROJECT.read_text("utf8"), re.MULTILINE))
+SCRIPTS = dict(re.findall(r'^(sadgs(?:-\w+)?) = "(.+):main"$', PYPROJECT.read_text("utf8"), re.MULTILINE))
 """The commands that are installed, and the module whose `main` each is."""
 SLOW = ("torch", "nerfstudio", "torchvision", "gsplat", "scipy", "matplotlib", "pycolmap")
 """Packages that take between a third of a second and ten seconds to import."""

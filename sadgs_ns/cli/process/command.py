@@ -18,6 +18,7 @@ import shutil
 import signal
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -42,6 +43,8 @@ from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
 
 MIN_SIZE = 64
 """Smallest longest side of the result in px; no structure is left in smaller images."""
+_SECONDS_PER_LINE = 1.0
+"""Least time between two lines of a stage's progress in a file."""
 _STAGES = "sadgs_ns.cli.process.stages"
 _UNFINISHED = (
     "frames.partial",
@@ -132,7 +135,7 @@ def process(
         tell(f"{out} is finished; delete it to make it again.")
         return Summary(**finished)
     columns = (TextColumn("{task.description:>24}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns) as progress, contextlib.ExitStack() as alone:
+    with Progress(*columns, disable=not sys.stdout.isatty()) as progress, contextlib.ExitStack() as alone:
         report = _reporter(progress)
         if is_video:
             folder = work / "frames"
@@ -216,13 +219,19 @@ def _read_settings(noted: Path) -> dict:
 
 
 def _reporter(progress: Progress) -> Report:
-    """Return a function that shows each stage as a bar of its own."""
+    """Return a function that shows each stage as a bar of its own; where there is no terminal, as lines of a number."""
     tasks: dict[str, TaskID] = {}
+    printed = 0.0
 
     def report(stage: str, done: int, total: int) -> None:
-        if stage not in tasks:
+        nonlocal printed
+        begins = stage not in tasks
+        if begins:
             tasks[stage] = progress.add_task(stage, total=total)
         progress.update(tasks[stage], completed=done)
+        if progress.disable and (begins or done == total or time.monotonic() >= printed + _SECONDS_PER_LINE):
+            print(f"{stage} {done}/{total}", flush=True)
+            printed = time.monotonic()
 
     return report
 

@@ -1,0 +1,275 @@
+"""From photos to a splat with one command: a whole run that is interrupted in each stage, and what goes wrong."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from rich.console import Console
+from test_process import draw_photos
+
+from sadgs_ns.cli import photos_to_splat, stage
+from sadgs_ns.cli.photos_to_splat import main
+from sadgs_ns.data.ply import read_points
+from sadgs_ns.errors import RunError
+from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
+
+TRAINING = ["--", "--max-num-iterations", "15"]
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("source") / "my room"
+    folder.mkdir()
+    for i, photo in enumerate(draw_photos()):
+        photo.save(folder / f"{i:02d}.png")
+    return folder
+
+
+@pytest.fixture
+def stop(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Have the command get a SIGINT once a stage's line says what a pattern finds."""
+    tell = stage.Line.tell
+
+    def stop_at(pattern: str) -> None:
+        sent = False
+
+        def tell_and_stop(line: stage.Line, told: str) -> None:
+            nonlocal sent
+            tell(line, told)
+            if not sent and re.search(pattern, told):
+                sent = True
+                os.kill(os.getpid(), signal.SIGINT)
+
+        monkeypatch.setattr(stage.Line, "tell", tell_and_stop)
+
+    return stop_at
+
+
+def lines_of(printed: str) -> dict[str, str]:
+    """The last of each stage's lines, without its time, which must be there."""
+    found = re.findall(r"^(cameras|training|export|in all) +(?:\d+:)?\d+:\d\d(?:  (.*))?$", printed, re.MULTILINE)
+    return dict(found)
+
+
+def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothing(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], stop
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    command = [str(photos), "--formats", "ply", "--max-size", "120", *TRAINING]
+    folder = tmp_path / "my room-splat"
+
+    stop("^matches")
+    assert main(command) == 130
+    printed = capsys.readouterr()
+    assert printed.err == "sadgs: stopped; the same command goes on.\n"
+    assert lines_of(printed.out) == {"cameras": "stopping"}
+    assert not (folder / "scene" / "transforms.json").exists()
+
+    stop("^iteration 10 of 15, about .* left")
+    assert main(command) == 130
+    printed = capsys.readouterr()
+    assert printed.err == "sadgs: stopped; the same command goes on.\n"
+    assert lines_of(printed.out) == {"cameras": "10 of 10 photos registered", "training": "stopping"}
+    assert photos_to_splat._ON_CPU in printed.out
+    (checkpoint,) = folder.glob("training/sadgs/run/nerfstudio_models/step-*.ckpt")
+    assert 10 <= int(checkpoint.stem[5:]) < 14
+    assert main([*command, "--pipeline.effort", "2"]) == 2
+    assert "options of ns-train was --max-num-iterations 15" in capsys.readouterr().err
+
+    stop("splat.ply$")
+    assert main(command) == 130
+    printed = capsys.readouterr()
+    lines = lines_of(printed.out)
+    assert lines["cameras"] == "10 of 10 photos registered; done before"
+    assert re.fullmatch(r"15 iterations, [\d,]+ Gaussians", lines["training"]) and lines["export"] == "stopping"
+    resumed = (folder / "log" / "training.txt").read_text("utf8").rpartition("\n$ ")[2]
+    assert f"Resuming after step {int(checkpoint.stem[5:])} of {checkpoint}" in resumed
+
+    stop("nothing")
+    assert main(command) == 0
+    lines = lines_of(capsys.readouterr().out)
+    assert lines["training"].endswith(" Gaussians; done before") and lines["export"].endswith(" MB")
+    assert lines["in all"] == "The splat is my room-splat/splat.ply."
+    assert len(read_points(folder / "splat.ply")[0]) > 0
+
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.suffix not in (".json", ".txt")}
+    assert main(command) == 0
+    lines = lines_of(capsys.readouterr().out)
+    assert all(lines[name].endswith("; done before") for name in ("cameras", "training", "export"))
+    assert before == {path: path.stat().st_mtime_ns for path in before}
+    for changed, told in (
+        (["--effort", "2"], "--effort was 1.0, is 2.0"),
+        (["--max-size", "160"], "--max-size was 120, is 160"),
+    ):
+        assert main([*command[:5], *changed, *TRAINING]) == 2
+        assert f"({told}); give another --output or delete it." in capsys.readouterr().err
+
+
+def test_few_registered_photos_end_it_until_it_shall_go_on_anyway(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    source = tmp_path / "photos"
+    source.mkdir()
+    for i, path in enumerate(sorted(photos.iterdir())[:5]):
+        (source / path.name).write_bytes(path.read_bytes())
+        Image.new("RGB", (160, 120), (9 * i, 90, 90)).save(source / f"fog-{i}.png")
+    Image.new("RGB", (160, 120)).save(source / "fog.png")
+    command = [str(source), "--output", str(tmp_path / "out"), "--formats", "ply"]
+    assert main(command) == 1
+    printed = capsys.readouterr()
+    assert re.search(r"^sadgs: only \d of 11 photos registered, so .* go on with these with --anyway\.$", printed.err)
+    assert lines_of(printed.out) == {"cameras": f"{printed.err.split()[2]} of 11 photos registered"}
+    # Training is refused here before it starts, because that is quicker.
+    assert main([*command, "--anyway", "--", "--no-such-option"]) == 2
+    printed = capsys.readouterr()
+    assert lines_of(printed.out)["cameras"].endswith(" of 11 photos registered; done before")
+    log = tmp_path / "out" / "log" / "training.txt"
+    assert printed.err.startswith("sadgs: training: Unrecognized options: --no-such-option. All that it printed is in")
+    assert str(log) in printed.err and "sadgs --data" in log.read_text("utf8")
+
+
+def test_wrong_input_is_told_in_a_sentence_before_any_work(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "others").mkdir()
+    (tmp_path / "others" / "letter.txt").write_text("x")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "damaged").mkdir()
+    (tmp_path / "damaged" / "settings.json").write_text("{")
+    before = sorted(tmp_path.rglob("*"))
+    source = str(photos)
+    for arguments, told in (
+        (["nowhere"], "nowhere does not exist; give a folder of photos or a video."),
+        (["others/letter.txt"], "others/letter.txt is neither a folder of photos nor a video (.avi"),
+        (["empty"], "empty holds 0 photos; a reconstruction needs at least 3"),
+        ([source, "-o", "others"], "others exists and is not a folder that sadgs began; give another --output."),
+        ([source, "-o", "others/letter.txt"], "others/letter.txt exists and is not a folder"),
+        ([source, "-o", "damaged"], "damaged/settings.json is damaged (Expecting property name"),
+        ([source, "--", "--load-dir=x"], "--load-dir is set by sadgs itself: leave it out, or use ns-train."),
+        ([source, "--formats", "html,ply"], "a page is made with the help of Node.js: install version 22 or newer"),
+    ):
+        monkeypatch.setattr(photos_to_splat.shutil, "which", lambda _: None)
+        assert main(arguments) == 2, arguments
+        printed = capsys.readouterr().err
+        assert printed.startswith(f"sadgs: {told}") and printed.count("\n") == 1
+    for arguments, told in (
+        (
+            [source, "--formats", "ply,splat"],
+            "--formats knows ply, compressed.ply, spz, sog, glb, html, and not 'splat'",
+        ),
+        ([source, "--effort", "0"], "--effort must be more than 0"),
+        ([source, "--max-size", "20"], "--max-size must be at least 64 px, or 0 to keep the photos' size"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            main(arguments)
+        assert ended.value.code == 2 and told in capsys.readouterr().err
+    assert main([source, "-o", "others/letter.txt/below"]) == 1
+    assert "could not be written (Not a directory" in capsys.readouterr().err
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_two_runs_do_not_work_in_one_folder(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(photos_to_splat, "_LOCK_SECONDS", 0.0)
+    with Interrupts(waiting=lambda: False) as interrupts:
+        work = photos_to_splat.PhotosToSplat(photos, tmp_path / "out", interrupts)
+        work._note()
+        with work._alone():
+            assert main([str(photos), "-o", str(tmp_path / "out"), "--formats", "ply"]) == 2
+    assert f"another sadgs works in {tmp_path / 'out'}; wait for it, or stop it." in capsys.readouterr().err
+
+
+class Program:
+    """A module that a stage runs."""
+
+    def __init__(self, folder: Path, code: str) -> None:
+        (folder / "program.py").write_text(code)
+        self.log, self.heard = folder / "log.txt", []
+
+    def run(self, arguments: list[str], interrupts: Interrupts) -> tuple[int, str]:
+        lock = os.open(self.log.parent, os.O_RDONLY)
+        try:
+            with stage.Line("stage", Console(quiet=True)) as line:
+                return stage.run_stage("program", arguments, self.log, line, self.hear, interrupts, lock)
+        finally:
+            os.close(lock)
+
+    def hear(self, printed: str) -> None:
+        self.heard.append(printed)
+        if printed == "ready":
+            os.kill(os.getpid(), signal.SIGTERM)
+
+
+@pytest.fixture
+def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Program]]:
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    yield lambda code: Program(tmp_path, code)
+
+
+@pytest.mark.parametrize(
+    ("code", "expected"),
+    [
+        ("print('one'); print('error: It is [so].')", (0, "It is [so]")),
+        ("import sys; print('sadgs-process: no photos.', file=sys.stderr); print(); sys.exit(2)", (2, "no photos")),
+        ("raise SystemExit(3)", (3, "it printed nothing")),
+        (
+            "print('╭─ Wrong ─╮\\n│ Wrong: --a │\\n│ or -b. │\\n│ ── │\\n│ Help │\\n╰────╯'); raise SystemExit(2)",
+            (2, "Wrong: --a or -b"),
+        ),
+    ],
+)
+def test_a_stage_ends_with_its_code_and_its_last_sentence(program, code: str, expected: tuple[int, str]):
+    ran = program(code)
+    assert ran.run(["a b"], Interrupts(waiting=lambda: False)) == expected
+    assert re.search(r"^\$ .* -m program 'a b'\n", ran.log.read_text("utf8"))
+
+
+def test_a_signal_is_passed_on_once_and_the_stage_may_save(program):
+    ran = program(
+        "import signal, sys, time\n"
+        "def save(*signal): time.sleep(0.5); print('saved'); sys.exit(143)\n"
+        "signal.signal(signal.SIGTERM, save)\nprint('ready')\ntime.sleep(60)"
+    )
+    with pytest.raises(Interrupted, match="SIGTERM"), Interrupts(waiting=lambda: False) as interrupts:
+        ran.run([], interrupts)
+    assert ran.log.read_text("utf8").endswith("ready\nsaved\n")
+
+
+def test_a_stage_that_is_killed_is_told_of(program):
+    ran = program("import os, signal; os.kill(os.getpid(), signal.SIGKILL)")
+    with pytest.raises(RunError, match="ended by SIGKILL, most likely for want of memory; all that it printed is in"):
+        ran.run([], Interrupts(waiting=lambda: False))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the lock keeps the next run away until the stage ends")
+def test_a_stage_does_not_outlive_the_command_that_is_killed(program, tmp_path: Path):
+    ran = program("import os, time\nprint(f'pid {os.getpid()}')\ntime.sleep(60)")
+    parent = (
+        "import os, pathlib; from rich.console import Console\n"
+        "from sadgs_ns.cli.stage import Line, run_stage; from sadgs_ns.plugin.interrupts import Interrupts\n"
+        "with Line('stage', Console()) as line:\n"
+        f"    log, lock = pathlib.Path({str(ran.log)!r}), os.open('/', os.O_RDONLY)\n"
+        "    run_stage('program', [], log, line, print, Interrupts(waiting=lambda: False), lock)"
+    )
+    command = subprocess.Popen([sys.executable, "-c", parent])
+    while not (ran.log.exists() and (found := re.search(r"^pid (\d+)$", ran.log.read_text("utf8"), re.MULTILINE))):
+        assert command.poll() is None
+        time.sleep(0.05)
+    command.kill()
+    command.wait()
+    end = time.monotonic() + 20
+    while Path(f"/proc/{found[1]}/stat").exists() and " Z " not in Path(f"/proc/{found[1]}/stat").read_text():
+        assert time.monotonic() < end
+        time.sleep(0.05)
