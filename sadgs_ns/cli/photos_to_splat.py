@@ -36,7 +36,6 @@ from sadgs_ns.errors import (
     WriteError,
     free_space,
     reason,
-    refuse_deleted_working_directory,
 )
 from sadgs_ns.formats.files import SUFFIXES
 from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
@@ -99,6 +98,9 @@ class PhotosToSplat:
         self._check_source()
 
     def _check_source(self) -> None:
+        for path in (self.source, self.folder):
+            if not str(path).isprintable():
+                raise InputError(f"{str(path)!a} has unprintable characters in its name: rename it.")
         if self.source.is_file():
             if self.source.suffix.lower() not in VIDEO_SUFFIXES:
                 kinds = ", ".join(sorted(VIDEO_SUFFIXES))
@@ -288,6 +290,12 @@ class PhotosToSplat:
         return output
 
 
+def _default_folder(source: Path) -> Path:
+    """Return the folder that is named after the photos or the video, in the working directory."""
+    source = Path(os.path.realpath(source))
+    return Path(f"{(source.name if source.is_dir() else source.stem) or 'photos'}-splat")
+
+
 def _shown(value: Any) -> str:
     return (shlex.join(value) or "none") if isinstance(value, list) else str(value)
 
@@ -359,9 +367,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     given, console, start = _parse(sys.argv[1:] if argv is None else argv), Console(highlight=False), time.monotonic()
     folder: Path | None = given.output
     try:
-        refuse_deleted_working_directory()
-        source = given.source.resolve()
-        folder = folder or Path(f"{(source.name if source.is_dir() else source.stem) or 'photos'}-splat")
+        folder = folder or _default_folder(given.source)
         with Interrupts(waiting=lambda: False) as interrupts:
             formats = _formats(given.formats, console)
             work = PhotosToSplat(

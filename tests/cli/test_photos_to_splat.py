@@ -145,6 +145,7 @@ def test_wrong_input_is_told_in_a_sentence_before_any_work(
     (tmp_path / "others").mkdir()
     (tmp_path / "others" / "letter.txt").write_text("x")
     (tmp_path / "empty").mkdir()
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
     (tmp_path / "damaged").mkdir()
     (tmp_path / "damaged" / "settings.json").write_text("{")
     before = sorted(tmp_path.rglob("*"))
@@ -152,6 +153,8 @@ def test_wrong_input_is_told_in_a_sentence_before_any_work(
     for arguments, told in (
         (["nowhere"], "nowhere does not exist; give a folder of photos or a video."),
         (["others/letter.txt"], "others/letter.txt is neither a folder of photos nor a video (.avi"),
+        (["loop"], "loop does not exist; give a folder of photos or a video."),
+        ([source, "-o", "a\udcffb"], "'a\\udcffb' has unprintable characters in its name: rename it."),
         (["empty"], "empty holds 0 photos; a reconstruction needs at least 3"),
         ([source, "-o", "others"], "others exists and is not a folder that sadgs began; give another --output."),
         ([source, "-o", "others/letter.txt"], "others/letter.txt exists and is not a folder"),
