@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from typing import Any
 
@@ -21,7 +22,7 @@ _LAUNCHES += ("cudaMemcpyAsync", "cudaMemsetAsync")
 """Calls in which the host gives the device something to do."""
 
 
-def measure(trainer: Any, steps: int = STEPS) -> dict[str, float | None] | None:
+def measure(trainer: Any, steps: int = STEPS) -> dict[str, Any] | None:
     """Train some steps beyond the end of a run under torch's profiler.
 
     They are steps of the densification window, as `phases.measure` takes apart. The profiler makes the host slower, so
@@ -49,7 +50,7 @@ def measure(trainer: Any, steps: int = STEPS) -> dict[str, float | None] | None:
     return summarize(profile.function_events or ())
 
 
-def summarize(events: Iterable[Any]) -> dict[str, float | None]:
+def summarize(events: Iterable[Any]) -> dict[str, Any]:
     """Count what happened in the steps of a profile.
 
     Args:
@@ -58,6 +59,7 @@ def summarize(events: Iterable[Any]) -> dict[str, float | None]:
     Returns:
         Means of a step:
             launches: Kernels, copies and fills that the host asked for; a graph is one.
+            calls: The same by the name of CUDA's function; Triton launches with `cuLaunchKernelEx`.
             waits: Calls in which the host waited for the device.
             wait_milliseconds: How long these took.
             busy: Share of the time from the first step's start to the last one's end in which the device worked; None
@@ -74,8 +76,10 @@ def summarize(events: Iterable[Any]) -> dict[str, float | None]:
     for span in sorted((e.time_range for e in work), key=lambda span: span.start):
         busy += max(min(span.end, end) - max(span.start, until), 0.0)
         until = max(until, span.end)
+    launched = Counter(e.name for e in calls if e.name in _LAUNCHES)
     return {
-        "launches": sum(e.name in _LAUNCHES for e in calls) / steps,
+        "launches": launched.total() / steps,
+        "calls": {name: number / steps for name, number in launched.items()},
         "waits": len(waits) / steps,
         "wait_milliseconds": sum(e.time_range.end - e.time_range.start for e in waits) / steps / 1000,
         "busy": busy / (end - start) if work else None,

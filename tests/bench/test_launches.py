@@ -37,6 +37,7 @@ def test_launches_waits_and_load_of_two_steps():
             event("cudaDeviceSynchronize", 2000, 2300, cpu),  # the profile's own
         ]
     )
+    assert counted.pop("calls") == {"cudaLaunchKernel": 0.5, "cuLaunchKernelEx": 0.5, "cudaMemcpyAsync": 0.5}
     assert counted == pytest.approx({"launches": 1.5, "waits": 0.5, "wait_milliseconds": 0.2, "busy": 0.35})
 
 
@@ -47,7 +48,7 @@ def test_a_real_profile_has_the_fields_that_are_read():
             with profiler.record_function(launches._STEP):
                 torch.ones(1000).exp()
     counted = launches.summarize(profile.function_events or ())
-    assert counted == {"launches": 0, "waits": 0, "wait_milliseconds": 0, "busy": None}
+    assert counted == {"launches": 0, "calls": {}, "waits": 0, "wait_milliseconds": 0, "busy": None}
 
 
 def test_without_cuda_nothing_is_trained_or_counted():
