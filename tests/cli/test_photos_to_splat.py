@@ -128,6 +128,7 @@ def test_few_registered_photos_end_it_until_it_shall_go_on_anyway(
     assert main(command) == 1
     printed = capsys.readouterr()
     assert re.search(r"^sadgs: only \d of 11 photos registered, so .* go on with these with --anyway\.$", printed.err)
+    assert "--matching" not in printed.err, "all pairs were compared"
     assert lines_of(printed.out) == {"cameras": f"{printed.err.split()[2]} of 11 photos registered"}
     # Training is refused here before it starts, because that is quicker.
     assert main([*command, "--anyway", "--", "--no-such-option"]) == 2
@@ -188,7 +189,6 @@ def test_two_runs_do_not_work_in_one_folder(
     monkeypatch.setattr(photos_to_splat, "_LOCK_SECONDS", 0.0)
     with Interrupts(waiting=lambda: False) as interrupts:
         work = photos_to_splat.PhotosToSplat(photos, tmp_path / "out", interrupts)
-        work._note()
         with work._alone():
             assert main([str(photos), "-o", str(tmp_path / "out"), "--formats", "ply"]) == 2
     assert f"another sadgs works in {tmp_path / 'out'}; wait for it, or stop it." in capsys.readouterr().err
