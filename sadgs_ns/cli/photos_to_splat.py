@@ -36,6 +36,8 @@ from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
 
 _OURS = ("data", "output-dir", "experiment-name", "timestamp", "vis", "load-dir", "load-checkpoint", "load-config")
 """Options of ns-train that this command sets."""
+_CAMERAS, _TRAINING, _EXPORT = "sadgs_ns.cli.process.command", "nerfstudio.scripts.train", "sadgs_ns.cli.export"
+"""The stages' modules."""
 _LOCK_SECONDS = 10.0
 """Time that a killed run's last stage is given to save."""
 _STEP = re.compile(r"^(\S.*) (\d+)/(\d+)$")
@@ -220,7 +222,7 @@ class PhotosToSplat:
                 return
             arguments = [os.path.abspath(self.source), str(self._scene), "--max-size", str(self.max_size)]
             try:
-                self._stage(line, "cameras", "sadgs_ns.cli.process.command", arguments, hear)
+                self._stage(line, "cameras", _CAMERAS, arguments, hear)
             except RunError:
                 if not (found and (self._scene / "transforms.json").exists()):
                     raise
@@ -265,7 +267,7 @@ class PhotosToSplat:
             arguments += ["--experiment-name", "training", "--timestamp", "run", "--vis", "tensorboard"]
             arguments += ["--steps-per-eval-image", "0", "--pipeline.effort", f"{self.effort:g}"]
             arguments += ["--load-dir", str(self._run.absolute())] if self._checkpoint() else []
-            self._stage(line, "training", "nerfstudio.scripts.train", [*arguments, *self.options], hear)
+            self._stage(line, "training", _TRAINING, [*arguments, *self.options], hear)
             if not self._checkpoint():
                 raise RunError(f"training ended without a checkpoint; all that it printed is in {self.folder}/log.")
             told = f"{total} iterations, {count} Gaussians"
@@ -285,7 +287,7 @@ class PhotosToSplat:
                 line.tell(f"{output}; done before")
                 return output
             line.tell(str(output))
-            self._stage(line, "export", "sadgs_ns.cli.export", [str(self._run), "--output", str(output)], hear)
+            self._stage(line, "export", _EXPORT, [str(self._run), "--output", str(output)], hear)
             line.tell(f"{output}, {size}")
         return output
 
