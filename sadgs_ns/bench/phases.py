@@ -147,6 +147,8 @@ def booked(trainer: Any, watch: Stopwatch) -> Iterator[None]:
         stack.enter_context(replaced(sadgs_ns.method.strategy, "observe", watch.during("eta")))
         for name in ("zero_grad_some", "optimizer_scaler_step_some", "scheduler_step_all"):
             stack.enter_context(replaced(optimizers, name, watch.during("optimizer")))
+        if getattr(trainer, "graphed", None) is not None:  # A graph has no seams.
+            stack.enter_context(replaced(trainer, "graphed", lambda graphed: None))  # type: ignore[arg-type]
         yield
 
 

@@ -129,7 +129,7 @@ def export(
 
         cameras = read_cameras(folder, data)
     try:
-        of_parameters(_arrays(params))
+        of_parameters(_arrays(params))  # It refuses shapes that do not fit.
         params = _cleaned(params, cleaning, cameras)
         if as_page and cameras is not None:
             pose, K = cameras.camera_to_worlds[0].double().numpy(), cameras.Ks[0]
@@ -143,31 +143,30 @@ def export(
 
 def _cleaned(params: dict[str, Tensor], cleaning: Cleaning, cameras: RunCameras | None) -> dict[str, Tensor]:
     """Return the parameters of the Gaussians that stay, and print how many each option takes away."""
-    if cleaning == type(cleaning)():
-        return params
     import torch
     from rich.console import Console
     from rich.progress import track
 
-    from sadgs_ns.method.cleaning import Seen, find, see
+    from sadgs_ns.method.cleaning import Cleaning, find, see
     from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
-    seen = None
+    if cleaning == Cleaning():
+        return params
+    device, seen = torch.device("cuda" if torch.cuda.is_available() else "cpu"), None
+    shapes = {name: params[name].to(device) for name in ("means", "quats", "scales", "opacities")}
     if cleaning.needs_views and cameras is not None:
-        device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         viewmats, Ks = viewmats_from_camera_to_world(cameras.camera_to_worlds).to(device), cameras.Ks.to(device)
         views = [(viewmat, K, *size) for viewmat, K, size in zip(viewmats, Ks, cameras.sizes, strict=True)]
         console = Console(stderr=True)
         shown = track(views, "Looking from the training views", console=console, disable=not console.is_terminal)
-        seen = see({name: value.to(device) for name, value in params.items()}, shown, max_off_axis=_MAX_OFF_AXIS)
-        seen = Seen(seen.views.cpu(), seen.pixels.cpu(), seen.total)
-    stays, sentences = find(params, cleaning, seen)
+        seen = see(shapes, shown, max_off_axis=_MAX_OFF_AXIS)
+    stays, sentences = find(shapes, cleaning, seen)
     print("\n".join(sentences))
     if not stays.any():
         raise InputError(
             f"These options take away all {len(stays):,} Gaussians: nothing is written, so take fewer away."
         )
-    return {name: value[stays] for name, value in params.items()}
+    return {name: value[stays.cpu()] for name, value in params.items()}
 
 
 def _checkpoint_of(run: Path) -> Path:

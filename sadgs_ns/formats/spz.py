@@ -67,7 +67,7 @@ def _fractional_bits(reach: float) -> int:
     bits = min(_MOST_BITS, 22 - math.floor(math.log2(max(reach, 1e-6))))
     if bits < _LEAST_BITS:
         raise InputError(
-            f"The Gaussians reach {reach:,.0f} units from the origin, and SPZ would hold positions to less than "
-            f"1/{1 << _LEAST_BITS} of a unit: take away the far ones with --crop, or choose another format."
+            f"The Gaussians reach {reach:,.0f} units from the origin, so that SPZ would hold positions in steps "
+            f"of over 1/{1 << _LEAST_BITS} of a unit: take the far ones away with --crop, or choose another format."
         )
     return bits

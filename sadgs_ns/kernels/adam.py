@@ -34,9 +34,12 @@ def _moments_and_step(g, m, v, rate, scale, beta1, beta2, eps, noted, i, exists,
 @triton.jit(do_not_specialize=["rows"])
 def _update(
     parameters, gradients, means, squares, rates, scales, noted, rows, beta1, beta2, eps,
-    WIDTHS: tl.constexpr, MAX: tl.constexpr, BLOCK: tl.constexpr,
+    WIDTHS: tl.constexpr, MAX: tl.constexpr, BLOCK: tl.constexpr, ON_DEVICE: tl.constexpr,
 ):  # fmt: skip
     """Update a block of one of the parameters, which together are covered by the grid.
+
+    With ON_DEVICE `rates` and `scales` are pointers to the numbers.
+
 
     The parameters' sizes are computed from `rows` here. If they were passed as a tuple, Triton would specialise the
     kernel on which of them 16 divides, and compile anew when densification changes that.
@@ -53,6 +56,8 @@ def _update(
             parameter, gradient, mean, square, rate, scale = (
                 parameters[k], gradients[k], means[k], squares[k], rates[k], scales[k]
             )  # fmt: skip
+    if ON_DEVICE:
+        rate, scale = tl.load(rate), tl.load(scale)
     i = block * BLOCK + tl.arange(0, BLOCK)
     if (block + 1) * BLOCK <= n:  # the block is whole: without a mask, memory is read in wide words
         g, m, v = tl.load(gradient + i), tl.load(mean + i), tl.load(square + i)
@@ -67,6 +72,24 @@ def _update(
         tl.store(mean + i, m, exists)
         tl.store(square + i, v, exists)
         tl.store(parameter + i, tl.load(parameter + i, exists) - change, exists)
+
+
+def rates_and_scales(
+    steps: Sequence[int], lrs: Sequence[float], betas: tuple[float, float]
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return what an update does with the corrections of Adam's running means, which begin at 0.
+
+    Args:
+        steps: Which update this is of each parameter, from 1.
+        lrs: Learning rate of each.
+        betas: Decay of the two running means, in [0, 1).
+
+    Returns:
+        Factors on the running means of the gradients, and on the roots of those of their squares.
+    """
+    beta1, beta2 = betas
+    rates = tuple(lr / (1 - beta1**step) for lr, step in zip(lrs, steps, strict=True))
+    return rates, tuple((1 - beta2**step) ** -0.5 for step in steps)
 
 
 def adam_step(
@@ -98,13 +121,55 @@ def adam_step(
         eps: Added to the denominator.
         max_gradient: Absolute value from which a gradient is left out.
     """
-    beta1, beta2 = betas
-    rates = tuple(lr / (1 - beta1**step) for lr, step in zip(lrs, steps, strict=True))
-    scales = tuple((1 - beta2**step) ** -0.5 for step in steps)
+    factors = rates_and_scales(steps, lrs, betas)
+    _launch(parameters, gradients, exp_avgs, exp_avg_sqs, noted, factors, betas, eps, max_gradient)
+
+
+def adam_step_with_factors(
+    parameters: tuple[Tensor, ...],
+    gradients: tuple[Tensor, ...],
+    exp_avgs: tuple[Tensor, ...],
+    exp_avg_sqs: tuple[Tensor, ...],
+    noted: Tensor,
+    factors: Tensor,
+    *,
+    betas: tuple[float, float],
+    eps: float,
+    max_gradient: float,
+) -> None:
+    """Do what `adam_step` does, to the bit, in a launch whose arguments are the same in every update of a parameter.
+
+    Args:
+        parameters: As of `adam_step`, which also describes the arguments that are not described here.
+        gradients: As of `adam_step`.
+        exp_avgs: As of `adam_step`.
+        exp_avg_sqs: As of `adam_step`.
+        noted: As of `adam_step`. float32 [1]
+        factors: What `rates_and_scales` returns for this update, on the device, contiguous float32. [2, P]
+        betas: As of `adam_step`.
+        eps: As of `adam_step`.
+        max_gradient: As of `adam_step`.
+    """
+    rates, scales = (row.unbind() for row in factors)
+    _launch(parameters, gradients, exp_avgs, exp_avg_sqs, noted, (rates, scales), betas, eps, max_gradient)
+
+
+def _launch(
+    parameters: tuple[Tensor, ...],
+    gradients: tuple[Tensor, ...],
+    exp_avgs: tuple[Tensor, ...],
+    exp_avg_sqs: tuple[Tensor, ...],
+    noted: Tensor,
+    factors: tuple[tuple[float, ...], tuple[float, ...]] | tuple[tuple[Tensor, ...], tuple[Tensor, ...]],
+    betas: tuple[float, float],
+    eps: float,
+    max_gradient: float,
+) -> None:
+    """Launch the kernel with factors that are numbers, or scalars on the device."""
     rows = parameters[0].shape[:1].numel()  # 1 without dimensions
     widths = tuple(parameter.shape[1:].numel() for parameter in parameters)
     grid = (sum(cdiv(rows * width, _BLOCK) for width in widths),)
     _update[grid](
-        parameters, gradients, exp_avgs, exp_avg_sqs, rates, scales, noted, rows, beta1, beta2, eps,
-        widths, max_gradient, _BLOCK,
+        parameters, gradients, exp_avgs, exp_avg_sqs, *factors, noted, rows, *betas, eps,
+        widths, max_gradient, _BLOCK, isinstance(factors[0][0], Tensor),
     )  # fmt: skip

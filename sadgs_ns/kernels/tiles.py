@@ -193,9 +193,24 @@ class PairCounts:
     """How many pairs of a Gaussian and a tile each view of a call has, on their way to the host."""
 
     counts: Tensor
-    """They are in the host's memory once `arrived` has happened. int64 [C]"""
+    """They are in the host's memory once `arrived` has happened; on the device while a CUDA graph is captured, in which
+    nothing happens yet. int64 [C]"""
     arrived: torch.cuda.Event | None
     """None where the host need not wait."""
+
+    @staticmethod
+    def sent(counts: Tensor) -> PairCounts:
+        """Start to copy the numbers to the host.
+
+        Args:
+            counts: On any device; they may change after this call. int64 [C]
+        """
+        if counts.device.type != "cuda":
+            return PairCounts(counts.clone(), None)
+        on_host = torch.empty(counts.shape, dtype=torch.int64, pin_memory=True).copy_(counts, non_blocking=True)
+        arrived = torch.cuda.Event()
+        arrived.record()
+        return PairCounts(on_host, arrived)
 
     def ready(self) -> bool:
         """Tell whether they have arrived, without waiting."""
@@ -317,10 +332,6 @@ def intersect_tiles(
     order = depths.flatten().argsort(stable=True)
     ends = counts[order].cumsum(0)
     per_view = ends[-1:] if num_views == 1 else counts.view(num_views, -1).sum(1)
-    arrived = None
-    if device.type == "cuda":
-        per_view = torch.empty(num_views, dtype=torch.int64, pin_memory=True).copy_(per_view, non_blocking=True)
-        arrived = torch.cuda.Event()
-        arrived.record()
-    tile_counts = num_views, tile_height, tile_width
-    return PendingTiles(ellipses, order, ends, PairCounts(per_view, arrived), tile_size, tile_counts)
+    capturing = device.type == "cuda" and torch.cuda.is_current_stream_capturing()
+    pair_counts = PairCounts(per_view, None) if capturing else PairCounts.sent(per_view)
+    return PendingTiles(ellipses, order, ends, pair_counts, tile_size, (num_views, tile_height, tile_width))

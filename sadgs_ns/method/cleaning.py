@@ -82,8 +82,11 @@ def see(
         cameras: World-to-camera matrix [4, 4], intrinsics in px [3, 3], width and height in px of each view.
         drawing: Further options of `rasterize`.
     """
-    means, scales = params["means"].detach(), params["scales"].detach().exp()
-    quats, opacities = params["quats"].detach(), params["opacities"].detach().flatten().sigmoid()
+    shapes = [params[name].detach() for name in ("means", "quats", "scales")]
+    opacities = params["opacities"].detach().flatten().sigmoid()
+    sound = torch.cat([*shapes, opacities[:, None]], dim=1).isfinite().all(dim=1)  # What is not cannot be drawn.
+    means, quats, scales = (torch.where(sound[:, None], value, 0.0) for value in shapes)
+    scales, opacities = scales.exp(), torch.where(sound, opacities, 0.0)
     views, pixels = means.new_zeros(len(means), dtype=torch.int64), means.new_zeros(len(means))
     number = 0
     for viewmat, K, width, height in cameras:

@@ -171,6 +171,14 @@ class StructureAwareStrategy(Strategy):
             _next_due(step + 1, windows.structure_every) <= windows.refine_stop_iter
         )
 
+    def densifies(self, step: int) -> bool:
+        """Whether `step_post_backward` may put other tensors in the place of parameters or statistics at this step."""
+        iteration, windows = step + 1, self.windows
+        if not windows.refine_start_iter <= iteration <= windows.refine_stop_iter:
+            return False
+        periods = windows.structure_every, windows.absgs_every, windows.reset_every
+        return iteration == windows.refine_stop_iter or any(_due(iteration, every) for every in periods)
+
     def needs_absgrad(self, step: int) -> bool:
         """Whether the rasterizer must provide absolute screen gradients: an AbsGS step will read this step's.
 

@@ -56,7 +56,7 @@ class CleaningPanel(torch.nn.Module):
         self._stays = torch.ones(0, dtype=torch.bool)
         self._shown, self._text = OFF, ""
         self.choice = ViewerDropdown(
-            "Show", OFF, [OFF, STAYS, GOES], cb_hook=self._changed, hint="What the output type “cleaned” shows"
+            "Preview", OFF, [OFF, STAYS, GOES], cb_hook=self._changed, hint="What the output type “cleaned” shows"
         )
         self.crop_from = ViewerVec3("crop from", NEAREST, cb_hook=self._changed, hint="Lowest x, y and z that stay")
         self.crop_to = ViewerVec3("crop to", FURTHEST, cb_hook=self._changed, hint="Highest x, y and z that stay")

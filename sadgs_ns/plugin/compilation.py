@@ -18,7 +18,7 @@ from sadgs_ns.method.codes import encode
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
-from sadgs_ns.plugin.optimizers import FusedAdam, step_together
+from sadgs_ns.plugin.optimizers import FusedAdam, RepeatedUpdate, step_together
 from sadgs_ns.render.activations import activate
 from sadgs_ns.render.rasterization import rasterize
 
@@ -81,14 +81,17 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
         photometric_loss(predicted, torch.zeros_like(predicted, dtype=dtype))[0].backward()
 
     def update() -> None:
-        log, twins = NonFiniteLog(device, capacity=1), []
+        log, twins = NonFiniteLog(device, capacity=1), {}
         for name, optimizer in optimizers.items():
             if name in model.gauss_params and isinstance(optimizer, FusedAdam) and optimizer.triton:
                 parameter = torch.nn.Parameter(blank(name))
                 parameter.grad = torch.zeros_like(parameter)
-                twins.append(FusedAdam([parameter], **{key: optimizer.defaults[key] for key in ("betas", "eps")}))
-                twins[-1].log = log  # all share one log, like the run's, and are stepped in one launch
-        step_together(twins)
+                twins[name] = FusedAdam([parameter], **{key: optimizer.defaults[key] for key in ("betas", "eps")})
+                twins[name].log = log  # all share one log, like the run's, and are stepped in one launch
+        step_together(twins.values())
+        if twins and (repeated := RepeatedUpdate(twins)).in_one_launch:  # as CUDA graphs do it
+            gradients = {name: torch.zeros_like(parameter) for name, parameter in repeated.parameters.items()}
+            repeated.launch(gradients, log.gradients, repeated.factors().to(device))
 
     def composite(absgrad: bool) -> None:
         centres = means.clone().requires_grad_()

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
@@ -138,6 +138,23 @@ class SadgsModelConfig(InstantiateConfig):
             self.strategy.check()
         except ValueError as error:
             raise InputError(f"pipeline.model.{error}") from error
+
+
+class StepKind(NamedTuple):
+    """What the launches of a training step depend on, besides tensors; the views of the step have one size."""
+
+    width: int
+    """px."""
+    height: int
+    """px."""
+    sh_degree: int | None
+    """Degree of the harmonics that are drawn; None where colours do not depend on the direction."""
+    absgrad: bool
+    """Whether absolute screen gradients are summed, for AbsGS."""
+    opacity_reg: float
+    """Factor on the mean opacity in the loss."""
+    tile_capacity: int | None
+    """Places in the tile lists of our kernels; None waits for the exact number."""
 
 
 class SadgsModel(SplatfactoModel):
@@ -300,6 +317,12 @@ class SadgsModel(SplatfactoModel):
         return {name: value[inside] for name, value in values.items()}
 
     @property
+    def sh_degree_now(self) -> int | None:
+        """Degree of the harmonics that are drawn at this step; None where colours do not depend on the direction."""
+        # Each iteration adds a degree: 3DGS's 1,000 iterations between them leave too few of so short a run.
+        return min(self.step, self.config.sh_degree) if self.config.sh_degree > 0 else None
+
+    @property
     def drawing(self) -> dict[str, Any]:
         """The options of `rasterize` that every picture of these Gaussians shares."""
         return {"rasterize_mode": self.config.rasterize_mode, "max_off_axis": self.config.max_off_axis}
@@ -314,6 +337,9 @@ class SadgsModel(SplatfactoModel):
         absgrad: bool = False,
         tile_capacity: int | None = None,
         opacity_reg: float = 0.0,
+        *,
+        params: Mapping[str, Tensor] | None = None,
+        sh_degree: int | None = None,
     ) -> tuple[Tensor, Tensor, dict[str, Any]]:
         """Rasterize the Gaussians; in the viewer, those inside its crop box.
 
@@ -326,16 +352,17 @@ class SadgsModel(SplatfactoModel):
             absgrad: Whether the backward pass also sums absolute screen gradients, for AbsGS.
             tile_capacity: Places in the tile lists of our kernels, as in `rasterize`; None waits for the exact number.
             opacity_reg: Factor on the mean opacity.
+            params: Parameters by name; None is the model's own.
+            sh_degree: Degree of the harmonics; None is the present step's.
 
         Returns:
             Colours, not clamped, and depth [C, H, W, 3 or 4]; accumulated opacity [C, H, W, 1]; gsplat's meta, and in
             it `opacity_reg`, numbers [P] whose sum is the mean opacity times this factor, or None where it is 0.
         """
-        params = self.cropped(dict(self.gauss_params.items()))
+        params = self.cropped(dict(self.gauss_params.items()) if params is None else params)
         if self.config.sh_degree > 0:
             colors: Tensor | tuple[Tensor, Tensor] = (params["features_dc"], params["features_rest"])
-            # Each iteration adds a degree: 3DGS's 1,000 iterations between them leave too few of so short a run.
-            sh_degree = min(self.step, self.config.sh_degree)
+            sh_degree = self.sh_degree_now if sh_degree is None else sh_degree
         else:
             colors, sh_degree = torch.sigmoid(params["features_dc"]), None  # [N, 3]
         fused = self.config.fused
@@ -358,6 +385,45 @@ class SadgsModel(SplatfactoModel):
             **self.drawing,
         )
         return render, alpha, info | {"opacity_reg": penalty}
+
+    def kind_of_step(self, width: int, height: int, cam_indices: list[int]) -> StepKind:
+        """Return what the launches of this step depend on; the length of its tile lists is foreseen.
+
+        Args:
+            width: px.
+            height: px.
+            cam_indices: The views' indices among the training cameras.
+        """
+        forecast, capacity = self.tile_forecast, None
+        if forecast is not None:
+            capacity = forecast.capacity(cam_indices, (width, height), self.num_points)
+        opacity_reg = self.config.opacity_reg if self.step < self.strategy.windows.refine_stop_iter else 0.0
+        absgrad = self.strategy.needs_absgrad(self.step)
+        return StepKind(width, height, self.sh_degree_now, absgrad, opacity_reg, capacity)
+
+    def render_step(
+        self, kind: StepKind, viewmats: Tensor, Ks: Tensor, params: Mapping[str, Tensor]
+    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Render training views, and change nothing of the model.
+
+        Args:
+            kind: What `kind_of_step` returned.
+            viewmats: World to camera. [C, 4, 4]
+            Ks: Intrinsics in px. [C, 3, 3]
+            params: Parameters by name.
+
+        Returns:
+            `rgb` [C, H, W, 3], not clamped, `background` [3] and, where the loss has that part, `opacity_reg`, numbers
+            [P] whose sum is that part; and gsplat's meta.
+        """
+        render, alpha, info = self.render(
+            viewmats, Ks, kind.width, kind.height, "RGB", kind.absgrad, kind.tile_capacity, kind.opacity_reg,
+            params=params, sh_degree=kind.sh_degree,
+        )  # fmt: skip
+        penalty, background = info.pop("opacity_reg"), self._get_background_color()
+        rgb = render[..., :3] if self.config.background_color == "black" else render[..., :3] + (1 - alpha) * background
+        outputs = {"rgb": rgb, "background": background}
+        return outputs if penalty is None else outputs | {"opacity_reg": penalty}, info
 
     def get_training_outputs(
         self,
@@ -385,31 +451,22 @@ class SadgsModel(SplatfactoModel):
             `rgb` [C, H, W, 3], not clamped, and `background` [3]; while densification runs, and where the loss has that
             part, `opacity_reg`, numbers [P] whose sum is that part.
         """
-        absgrad = self.strategy.needs_absgrad(self.step)
-        forecast, capacity = self.tile_forecast, None
-        if forecast is not None:
-            capacity = forecast.capacity(cam_indices, (width, height), self.num_points)
-        densifies = self.step < self.strategy.windows.refine_stop_iter
-        opacity_reg = self.config.opacity_reg if densifies else 0.0
-        render, alpha, info = self.render(viewmats, Ks, width, height, "RGB", absgrad, capacity, opacity_reg)
+        kind, forecast = self.kind_of_step(width, height, cam_indices), self.tile_forecast
+        outputs, info = self.render_step(kind, viewmats, Ks, dict(self.gauss_params.items()))
         if forecast is not None and "pair_counts" in info:  # Only our kernels count pairs.
-            forecast.rendered(cam_indices, (width, height), capacity, info["pair_counts"])
-        penalty = info.pop("opacity_reg")
-        if densifies:
+            forecast.rendered(cam_indices, (width, height), kind.tile_capacity, info["pair_counts"])
+        if self.step < self.strategy.windows.refine_stop_iter:
             info |= {"viewmats": viewmats.detach(), "Ks": Ks, "structure_tensors": structure_tensors}
             self.strategy.step_pre_backward(self.gauss_params, self.optimizers, self.strategy_state, self.step, info)
             self.infos.append(info)
-        background = self._get_background_color()
-        rgb = render[..., :3] if self.config.background_color == "black" else render[..., :3] + (1 - alpha) * background
         if self.config.use_bilateral_grid:
-            rgb = torch.stack(
+            outputs["rgb"] = torch.stack(
                 [
                     self._apply_bilateral_grid(view[None], i, height, width)[0]
-                    for view, i in zip(rgb, cam_indices, strict=True)
+                    for view, i in zip(outputs["rgb"], cam_indices, strict=True)
                 ]
             )
-        outputs = {"rgb": rgb, "background": background}
-        return outputs if penalty is None else outputs | {"opacity_reg": penalty}
+        return outputs
 
     def get_outputs(self, camera: Cameras) -> dict[str, Any]:
         """Render one camera for the viewer, evaluation and rendering.

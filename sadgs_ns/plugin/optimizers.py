@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
+from torch import Tensor
 from torch.cuda.amp.grad_scaler import GradScaler
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
@@ -82,16 +83,84 @@ def step_together(optimizers: Iterable[FusedAdam]) -> None:
                 if not state:
                     state["step"] = torch.tensor(0.0)
                     state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-                state["step"] = step = state["step"].cpu() + _ONE
+                step = _count(state)
                 key = optimizer.log, group["betas"], group["eps"], parameter.shape[:1]
                 launches.setdefault(key, []).append(
-                    (parameter, gradient.contiguous(), state["exp_avg"], state["exp_avg_sq"], int(step), group["lr"])
+                    (parameter, gradient.contiguous(), state["exp_avg"], state["exp_avg_sq"], step, group["lr"])
                 )
     for (log, betas, eps, _), updates in launches.items():
         parameters, gradients, exp_avgs, exp_avg_sqs, steps, lrs = zip(*updates, strict=True)
         adam_step(
             parameters, gradients, exp_avgs, exp_avg_sqs, log.gradients,
             steps=steps, lrs=lrs, betas=betas, eps=eps, max_gradient=MAX_GRADIENT,
+        )  # fmt: skip
+
+
+def _count(state: dict[str, Any]) -> int:
+    """Count an update in the state of a parameter, and return which one it is, from 1."""
+    state["step"] = state["step"].cpu() + _ONE
+    return int(state["step"])
+
+
+class RepeatedUpdate:
+    """An update of the same parameters that a CUDA graph repeats, with rates that are read from the device.
+
+    It equals `step_together` to the bit.
+
+    Attributes:
+        parameters: By names, as they are now.
+        exp_avgs: Their first moments.
+        exp_avg_sqs: Their second moments.
+        in_one_launch: Whether one launch can update them: each has been updated before, and they do not differ in
+            length, betas or eps.
+
+    Args:
+        optimizers: Optimizers that use the Triton kernel, of one parameter each, by names.
+    """
+
+    def __init__(self, optimizers: Mapping[str, FusedAdam]) -> None:
+        self._groups = [optimizer.param_groups[0] for optimizer in optimizers.values()]
+        self.parameters: dict[str, Tensor] = {}
+        self._states: list[dict[str, Any]] = []
+        for (name, optimizer), group in zip(optimizers.items(), self._groups, strict=True):
+            self.parameters[name] = parameter = group["params"][0]
+            self._states.append(optimizer.state.get(parameter) or {})
+        self._betas, self._eps = self._groups[0]["betas"], self._groups[0]["eps"]
+        alike = {len(parameter) for parameter in self.parameters.values()}
+        self.in_one_launch = len(alike) == 1 and all(
+            state and group["betas"] == self._betas and group["eps"] == self._eps
+            for state, group in zip(self._states, self._groups, strict=True)
+        )
+        self.exp_avgs, self.exp_avg_sqs = (
+            tuple(state[key] for state in self._states if state) for key in ("exp_avg", "exp_avg_sq")
+        )
+
+    def factors(self) -> Tensor:
+        """Count an update of each parameter and return its factors on the host, float32 [2, P].
+
+        They are in pinned memory where there is CUDA.
+        """
+        from sadgs_ns.kernels.adam import rates_and_scales
+
+        steps, lrs = [_count(state) for state in self._states], [group["lr"] for group in self._groups]
+        on_cuda = next(iter(self.parameters.values())).is_cuda
+        return torch.tensor(rates_and_scales(steps, lrs, self._betas), pin_memory=on_cuda)
+
+    @torch.no_grad()
+    def launch(self, gradients: Mapping[str, Tensor], noted: Tensor, factors: Tensor) -> None:
+        """Update the parameters, without counting that.
+
+        Args:
+            gradients: By the parameters' names, of their shapes.
+            noted: Becomes NaN if a gradient was not finite. float32 [1]
+            factors: What `factors` returned, on the parameters' device. [2, P]
+        """
+        from sadgs_ns.kernels.adam import adam_step_with_factors
+
+        in_order = tuple(gradients[name].contiguous() for name in self.parameters)
+        adam_step_with_factors(
+            tuple(self.parameters.values()), in_order, self.exp_avgs, self.exp_avg_sqs, noted, factors,
+            betas=self._betas, eps=self._eps, max_gradient=MAX_GRADIENT,
         )  # fmt: skip
 
 

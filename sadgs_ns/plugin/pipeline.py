@@ -48,6 +48,8 @@ _SAMPLED = 1000
 """About so many cameras, and Gaussians, are enough to find out whether training can see anything."""
 _FAR_PLANE = 1e10
 """Depth in world units up to which gsplat and our splatter draw Gaussians."""
+Drawn = dict[torch.Size, list[tuple[int, dict[str, Any]]]]
+"""Indices and data of a step's views by the shapes of their images, [H, W, 3 or 4]."""
 _SAME_PLACE = 1e-3
 """Share of the cameras' extent up to which two cameras are taken for one."""
 
@@ -149,6 +151,8 @@ class SadgsPipeline(VanillaPipeline):
         strategy, less = self.model.strategy, growth_threshold(config.effort)
         strategy.clone_grad2d, strategy.split_absgrad2d = less * strategy.clone_grad2d, less * strategy.split_absgrad2d
         self.log = NonFiniteLog(self.device)
+        self.put_aside: Drawn | None = None
+        """Views that were drawn for the present step and not rendered yet."""
         self._checkpoint_cap: int | None = None
         self._checkpoint_views: tuple[list[str], Tensor] | None = None  # These are names and positions [C, 3].
         self.stuck = ""  # It says why, where nothing is learned any more.
@@ -292,13 +296,19 @@ class SadgsPipeline(VanillaPipeline):
                 soft_wrap=True,
             )
 
+    def draw(self, step: int) -> Drawn:
+        """Draw the views of a step, unless they were drawn and put aside, and bring their images to the device."""
+        drawn, self.put_aside = self.put_aside, None
+        if drawn is None:
+            self._repeat_overflowed()
+            drawn, wants = defaultdict(list), self.model.wants_structure_tensors
+            for index, data in self.views.draw(self.views_per_iteration, (wants(step), wants(step + 1))):
+                drawn[data["image"].shape].append((index, data))
+        return drawn
+
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
         """Render the iteration's views and return the outputs of the last size, mean losses and mean metrics."""
-        self._repeat_overflowed()
-        groups: dict[torch.Size, list[tuple[int, dict[str, Any]]]] = defaultdict(list)
-        observes, observes_next = (self.model.wants_structure_tensors(step + k) for k in (0, 1))
-        for index, data in self.views.draw(self.views_per_iteration, (observes, observes_next)):
-            groups[data["image"].shape].append((index, data))
+        groups, observes = self.draw(step), self.model.wants_structure_tensors(step)
         losses: dict[str, Tensor] = {}
         metrics: dict[str, Any] = {}
         outputs: dict[str, Any] = {}

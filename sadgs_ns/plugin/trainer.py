@@ -24,6 +24,7 @@ from sadgs_ns.method.schedule import between_one_and_four, schedule
 from sadgs_ns.plugin import checkpoints, older_runs
 from sadgs_ns.plugin.compilation import compile_kernels
 from sadgs_ns.plugin.config import ONE_DEVICE, CheckedTrainerConfig
+from sadgs_ns.plugin.graphed_steps import GraphedSteps
 from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
 from sadgs_ns.plugin.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig, SadgsOptimizers
 from sadgs_ns.plugin.pipeline import SadgsPipeline
@@ -72,6 +73,8 @@ class SadgsTrainer(Trainer):
         config.check()
         super().__init__(config, local_rank, world_size)
         self._stepping = False
+        self.graphed: GraphedSteps | None = None
+        """What trains steps by CUDA graphs; None where all are launched one by one."""
         self._checkpoint: tuple[Path, dict[str, Any]] | None = None  # It is kept from its reading to its loading.
         self._derived = config.max_num_iterations is None
         self._completed_step = self._saved_step = -1
@@ -93,6 +96,7 @@ class SadgsTrainer(Trainer):
             last = [TrainingCallbackLocation.AFTER_TRAIN]
             self.callbacks.append(TrainingCallback(last, lambda step: self._say_what_is_next()))
             compile_kernels(self.pipeline, self.optimizers.optimizers)
+            self.graphed = GraphedSteps.of(self)
         except torch.cuda.OutOfMemoryError as error:
             raise RunError(f"The GPU's memory is too small to start ({_memory(error)}): {_LESS_MEMORY}.") from error
         except KeyboardInterrupt:
@@ -307,9 +311,16 @@ class SadgsTrainer(Trainer):
         )
 
     def train_iteration(self, step: int) -> Any:
-        """Run nerfstudio's iteration; no signal may stop the run from here to `_update_viewer_state`."""
+        """Run nerfstudio's iteration, by a graph where there is one.
+
+        No signal may stop the run from here to `_update_viewer_state`.
+        """
         self._stepping = True
-        return super().train_iteration(step)
+        trained = None if self.graphed is None else self.graphed.train(step)
+        if trained is None:
+            return super().train_iteration(step)
+        self.optimizers.scheduler_step_all(step)
+        return trained
 
     def _update_viewer_state(self, step: int) -> None:
         """Stop or save where that is due; nerfstudio calls this after every step, when densification is done."""

@@ -439,8 +439,8 @@ def test_the_time_that_it_takes_is_told_roughly(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     told = {
         (10, "exhaustive"): "10 photos, up to 45 pairs to match: roughly a minute on 2 processor cores.",
-        (300, "sequential"): "300 photos, up to 4,800 pairs to match: roughly 1.1 hours on 2 processor cores.",
-        (300, "exhaustive"): "300 photos, up to 44,850 pairs to match: roughly 4.8 hours on 2 processor cores.",
+        (300, "sequential"): "300 photos, up to 4,800 pairs to match: roughly 17 minutes on 2 processor cores.",
+        (300, "exhaustive"): "300 photos, up to 44,850 pairs to match: roughly 1.1 hours on 2 processor cores.",
     }
     for (count, matching), sentence in told.items():
         photos = [dataclasses.replace(photo, size=(4000, 3000)) for photo in numbered(count)]
@@ -557,7 +557,7 @@ def test_a_model_that_colmap_could_not_write_is_told(run: Run, tmp_path: Path, n
     model.write(tmp_path)
     check_written(tmp_path, model)
     (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:500])
-    with pytest.raises((OSError, IndexError, ValueError)):
+    with pytest.raises(OSError, match="not written completely"):
         check_written(tmp_path, model)
 
 

@@ -192,7 +192,7 @@ def test_positions_of_spz_are_as_fine_as_the_furthest_one_leaves(tmp_path: Path)
         assert errors(written, read(tmp_path / "splat.spz"))["means"] <= step
     written.means[0, 0] = 1e6
     with pytest.raises(
-        InputError, match=r"^The Gaussians reach 1,000,000 units .*: take away the far ones with --crop"
+        InputError, match=r"^The Gaussians reach 1,000,000 units .*: take the far ones away with --crop"
     ):
         files.write(tmp_path / "far.spz", written)
     assert [path.name for path in tmp_path.iterdir()] == ["splat.spz"]

@@ -417,6 +417,24 @@ def test_adam_in_one_launch_equals_torchs_and_one_launch_for_each_parameter(rows
         torch.testing.assert_close(actual.to("cpu", dtype), parameter.detach(), atol=tolerance, rtol=tolerance)
 
 
+def test_adam_with_factors_on_the_device_equals_adam_with_factors_from_the_host():
+    start = [torch.linspace(-1, 1, 37 * math.prod(width)).view(37, *width) for width in WIDTHS]
+    host, device, noted = with_moments(start), with_moments(start), torch.zeros(1, device=DEVICE)
+    factors, options = torch.empty((2, 5), device=DEVICE), {name: OURS[name] for name in ("eps", "max_gradient")}
+    for step in range(1, 5):
+        gradients, steps = tuple(p.sin() for p in host[0]), [step, step, 3 * step, step, 2 * step]
+        adam.adam_step(host[0], gradients, *host[1:], noted, steps=steps, lrs=LRS, betas=(0.9, 0.999), **options)
+        factors.copy_(torch.tensor(adam.rates_and_scales(steps, LRS, (0.9, 0.999))))
+        adam.adam_step_with_factors(
+            device[0], gradients, *device[1:], noted, factors, betas=(0.9, 0.999), **options
+        )  # fmt: skip
+    for one, other in zip(host, device, strict=True):
+        if torch.device("cpu") == DEVICE:
+            assert all(map(torch.equal, one, other))
+        else:  # compiled, a product and a sum may round once in one kernel and twice in another
+            torch.testing.assert_close(one, other, atol=1e-7, rtol=2e-6)
+
+
 def test_adam_counts_each_parameters_own_updates():
     start = [torch.linspace(-1, 1, 50), torch.linspace(1, 2, 50)]
     expected = [torch.nn.Parameter(p.double()) for p in start]

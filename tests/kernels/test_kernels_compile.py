@@ -20,7 +20,7 @@ CONSTANTS = {
     "VERTICAL": False, "MAX": 1e18, "PIXELS": 1024, "TINY": 1e-38, "HIGHEST": 4.0,
     "OCTAVES": 12.0, "MASKED": 255, "WIDTHS": (3, 45, 1), "PER_GAUSSIAN": 2, "GAUSSIANS": 16, "STRIDE": 12,
     "ALPHAS": True, "ABSGRAD": True, "PRECISION": "tf32x3", "PENALTY": True, "CULL": True,
-    "DEPTHS": True, "COMPENSATIONS": True, "PASSED": True,
+    "DEPTHS": True, "COMPENSATIONS": True, "PASSED": True, "ON_DEVICE": False,
 }
 INTEGERS = "n row height width taps num_gaussians num_views tile_width tile_height used stride start".split()
 INTEGERS += "channels weight_stride num_pairs rows view absolute_view absolute_row num_strips num_tiles".split()
@@ -78,12 +78,13 @@ def test_every_kernel_compiles_for_an_a100_and_an_h200(tmp_path):
 
 
 WIDE = """
-import re
+import re, sys
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 from sadgs_ns.kernels.adam import _update
 
+on_device = sys.argv[1] == "True"
 tensors, rates = ["parameters", "gradients", "means", "squares"], ["rates", "scales", "beta1", "beta2", "eps"]
 signature, aligned = {}, {}
 for i, parameter in enumerate(_update.params):
@@ -92,18 +93,19 @@ for i, parameter in enumerate(_update.params):
         signature[name] = ("*fp32",) * 3
         aligned |= {(i, k): [["tt.divisibility", 16]] for k in range(3)}
     elif name in rates:
-        signature[name] = ("fp32",) * 3 if name in rates[:2] else "fp32"
+        signature[name] = ("*fp32" if on_device else "fp32",) * 3 if name in rates[:2] else "fp32"
     else:
         signature[name] = {"noted": "*fp32", "rows": "i32"}.get(name, "constexpr")
-constants = {"WIDTHS": (3, 45, 1), "MAX": 1e18, "BLOCK": 1024}
+constants = {"WIDTHS": (3, 45, 1), "MAX": 1e18, "BLOCK": 1024, "ON_DEVICE": on_device}
 ptx = triton.compile(ASTSource(_update, signature, constants, aligned), target=GPUTarget("cuda", 90, 32)).asm["ptx"]
 print(len(re.findall(r"ld\\.global\\.v4", ptx)), len(re.findall(r"st\\.global\\.v4", ptx)))
 """
 
 
-def test_adam_reads_and_writes_memory_in_wide_words_whichever_parameter_it_is(tmp_path):
+@pytest.mark.parametrize("on_device", [False, True], ids=["rates from the host", "rates on the device"])
+def test_adam_reads_and_writes_memory_in_wide_words_whichever_parameter_it_is(tmp_path, on_device):
     """Each of 128 threads has 8 numbers of a block: two words for each of four tensors, of which three are written."""
-    run = run_with_the_compiler(tmp_path, WIDE)
+    run = run_with_the_compiler(tmp_path, WIDE, str(on_device))
     assert run.stdout.split() == ["8", "6"], run.stderr[-3000:]
 
 

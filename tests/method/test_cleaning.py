@@ -69,6 +69,15 @@ def test_looking_changes_nothing_and_needs_no_gradients():
     assert int(seen.views.sum()) > 25
 
 
+def test_what_is_not_finite_is_not_seen_and_hides_nothing():
+    params = balls(*[((0.0, 0.0, 4.0), 0.2, 0.5)] * 4)
+    expected = see(balls(((0, 0, 4), 0.2, 0.5)), [view()]).pixels
+    params["means"][0, 0], params["scales"][1, 1], params["opacities"][2, 0] = math.nan, math.inf, math.nan
+    seen = see(params, [view()])
+    assert seen.views.tolist() == [0, 0, 0, 1]
+    torch.testing.assert_close(seen.pixels[3:], expected)
+
+
 def test_each_option_takes_what_it_says_and_tells_how_many():
     params = balls(((0, 0, 0), 0.1, 0.5), ((9, 0, 0), 0.1, 0.5), ((0, 0, 0), 3.0, 0.5), ((9, 0, 0), 3.0, 0.5))
     seen = Seen(torch.tensor([1, 2, 3, 4]), torch.tensor([0.4, 3.0, 0.2, 7.0]), 5)

@@ -331,6 +331,7 @@ def test_the_mean_opacity_weighs_in_the_loss_while_densification_runs(colmap: Co
         reset_every=0,
     )
     config.pipeline.model.opacity_reg = 100.0  # against which the images weigh nothing
+    config.cuda_graphs = False  # A graph would not ask what is replaced below.
     opacities: list[float] = []
     regularized: list[bool] = []
 
@@ -410,7 +411,9 @@ def test_a_training_step_updates_the_gaussians_in_one_launch(
 ):
     adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
     launch, launched = adam.adam_step, []
-    trainer = set_up(configure(tmp_path, colmap, 3))  # On a GPU this launches the kernel once to compile it.
+    config = configure(tmp_path, colmap, 3)
+    config.cuda_graphs = False  # A graph would not ask what is replaced below.
+    trainer = set_up(config)  # On a GPU this launches the kernel once to compile it.
 
     def counted(parameters: tuple[torch.Tensor, ...], *args: Any, **kwargs: Any) -> None:
         launched.append(len(parameters))
@@ -515,6 +518,7 @@ def test_views_of_two_sizes_train_together(tmp_path: Path):
     sizes = [(WIDTH, HEIGHT), (40, 30)]
     config = configure(tmp_path / "out", nerfstudio_data(tmp_path / "data", sizes), iterations=13)
     config.pipeline.views_per_iteration = 2
+    config.cuda_graphs = False  # A graph would not ask what is replaced below.
     numbers_of_sizes: list[int] = []
     trainer = set_up(config)
     pipeline = trainer.pipeline

@@ -9,88 +9,28 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
-from gsplat.cuda._torch_impl import _fully_fused_projection
+from interpreted import use_our_rasterizer
 from kill_and_resume import set_up
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from runs import TRAIN_VIEWS, configure
 from torch import Tensor
 
-from sadgs_ns import gsplat_internals
 from sadgs_ns.plugin.model import SadgsModel
 from sadgs_ns.plugin.trainer import SadgsTrainerConfig
-from sadgs_ns.render import rasterization, splatter
 from sadgs_ns.render.tile_forecast import TileForecast
-
-compositing = pytest.importorskip("sadgs_ns.kernels.compositing", reason="Triton is not installed")
-harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")
-tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not installed")
 
 pytestmark = pytest.mark.skipif(torch.cuda.is_available(), reason="on the CPU Triton is interpreted")
 
 ITERATIONS = 14
 
 
-def project(
-    means: Tensor,  # [N, 3]
-    quats: Tensor,  # [N, 4]
-    scales: Tensor,  # [N, 3]
-    opacities: Tensor,  # [N]
-    viewmats: Tensor,  # [C, 4, 4]
-    Ks: Tensor,  # [C, 3, 3]
-    width: int,
-    height: int,
-    calc_compensations: bool,
-) -> tuple[Tensor, ...]:
-    """`gsplat_internals.project` in torch."""
-    covariances = gsplat_internals.torch_quat_scale_to_covar_preci(quats, scales, True, False)[0]
-    return _fully_fused_projection(
-        means,
-        covariances,  # type: ignore[arg-type]
-        viewmats,
-        Ks,
-        width,
-        height,
-        calc_compensations=calc_compensations,
-    )
-
-
-def composite(
-    means2d: Tensor,  # [C, N, 2]
-    conics: Tensor,  # [C, N, 3]
-    colors: Tensor,  # [C, N, 3]
-    opacities: Tensor,  # [C, N]
-    width: int,
-    height: int,
-    starts: Tensor,  # [C, tile rows, tile columns]
-    ids: Tensor,  # [number of pairs]
-    absgrad: bool,
-) -> tuple[Tensor, Tensor]:
-    """`compositing.rasterize_to_pixels` in torch: a list ends where the next begins, and the last at the end."""
-    views, size = len(starts), compositing.TILE_SIZE
-    rows, columns = -(-height // size), -(-width // size)
-    ends = torch.cat([starts.flatten()[1:], torch.tensor([len(ids)])]).view_as(starts)
-    starts, ends = (places[:, :rows].flatten().long() for places in (starts, ends))
-    row, column = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
-    origins = (torch.stack([column, row], dim=-1) * size).reshape(-1, 2).repeat(views, 1)
-    tiles = splatter._Tiles(size, origins, starts, ends - starts, ids.long())
-    canvas: Any = splatter._Composite.apply(means2d, conics, colors, opacities, tiles, absgrad)
-    image = canvas.reshape(views, rows, columns, size, size, 4).transpose(2, 3).reshape(views, rows * size, -1, 4)
-    return image[:, :height, :width, :3], image[:, :height, :width, 3:]
-
-
 @pytest.fixture
 def our_rasterizer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rasterization, "kernels", SimpleNamespace(available=lambda device: True))
-    monkeypatch.setattr(gsplat_internals, "project", project)
-    monkeypatch.setattr(compositing, "rasterize_to_pixels", composite)
-    for module, name in ((tiles, "_LANES"), (harmonics, "_LANES"), (harmonics, "_BACKWARD_LANES")):
-        monkeypatch.setattr(module, name, 1024)  # The interpreter runs one program after the other.
+    use_our_rasterizer(monkeypatch)
 
 
 @pytest.fixture

@@ -45,6 +45,19 @@ def test_a_view_is_foreseen_from_its_second_visit_on_with_a_margin():
     assert MARGIN * 1_000_000 < capacity <= MARGIN * 1_000_000 * 17 / 16 + 1
 
 
+@pytest.mark.parametrize("coarse", [False, True])
+def test_capacities_suffice_and_are_few(coarse: bool):
+    capacities = []
+    for pairs in range(100_000, 3_000_000, 10_007):
+        forecast = TileForecast()
+        forecast.coarse = coarse
+        render(forecast, [0], [pairs])
+        capacity = forecast.capacity([0], SIZE, 100)
+        assert capacity is not None and MARGIN * pairs < capacity <= MARGIN * pairs * (3 / 2 if coarse else 17 / 16) + 1
+        capacities.append(capacity)
+    assert capacities == sorted(capacities) and len(set(capacities)) == (11 if coarse else 72)
+
+
 def test_views_that_are_rendered_together_add_up_and_one_unknown_makes_all_wait():
     forecast = TileForecast()
     render(forecast, [0, 1], [1_000_000, 3_000_000])

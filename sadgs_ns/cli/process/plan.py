@@ -12,12 +12,14 @@ from sadgs_ns.errors import InputError, RunError
 
 EXHAUSTIVE_LIMIT = 200
 """Photos up to which every pair is matched; twice the photos take four times as long."""
-_FEATURES_PER_MEGAPIXEL = 2.2
-"""Processor time in s to find features in a million pixels, as measured on fox, south and bonsai."""
-_PAIR_PER_MEGAPIXEL, _LONGEST_PAIR = 0.3, 0.65
-"""Processor time in s to match two photos of a million pixels, and of so many that COLMAP's limit of features holds."""
+_FEATURES_PER_MEGAPIXEL = 0.55
+"""Processor time in s to find features in a million pixels, as measured on castle, fox and tree."""
+_PAIR_PER_MEGAPIXEL, _LONGEST_PAIR = 0.12, 0.14
+"""Processor time in s to match two photos of a million pixels, and of so many that the limit of features holds."""
+_POSE = 0.5
+"""Processor time in s to find a photo's camera; .2 to 1.1 as measured."""
 _MAX_SIDE = 3200
-"""Longest side in px to which COLMAP scales photos down to find features."""
+"""Longest side in px to which photos are scaled down to find features; `features.py` is slow to import."""
 _PAIRS_PER_PHOTO = {"sequential": 16, "spatial": 50, "vocabulary": 100}
 """Other photos that each photo is matched with, at most."""
 Matching = Literal["auto", "exhaustive", "sequential", "spatial", "vocabulary"]
@@ -111,7 +113,7 @@ def expected_work(photos: Sequence[Photo], matching: str) -> str:
     pairs = min(len(photos) * _PAIRS_PER_PHOTO.get(matching, len(photos)), len(photos) * (len(photos) - 1) // 2)
     per_pair = min(_PAIR_PER_MEGAPIXEL * megapixels / len(photos), _LONGEST_PAIR)
     cores = os.cpu_count() or 1
-    minutes = (megapixels * _FEATURES_PER_MEGAPIXEL + pairs * per_pair) / cores / 60
+    minutes = (megapixels * _FEATURES_PER_MEGAPIXEL + pairs * per_pair + len(photos) * _POSE) / cores / 60
     duration = (
         f"{minutes / 60:.1f} hours" if minutes >= 60 else f"{minutes:.0f} minutes" if minutes >= 2 else "a minute"
     )

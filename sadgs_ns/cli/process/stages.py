@@ -6,11 +6,9 @@ module of the package may import this one.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import itertools
 import shutil
-import sqlite3
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
@@ -19,12 +17,16 @@ import numpy as np
 import pycolmap
 
 from sadgs_ns.cli.process.apart import Report
+from sadgs_ns.cli.process.features import extract
 from sadgs_ns.cli.process.photos import empty_folder, in_order
 from sadgs_ns.cli.process.plan import Matching, Summary
 from sadgs_ns.errors import InputError
 
 _SEED = 0
 """Seed of COLMAP's random samples, so that equal photos give nearly equal cameras; COLMAP's own seed is the clock."""
+_TRIALS = 2000
+"""Random samples after which COLMAP gives a pair of photos up. Its own 10,000 take three times as long, for pairs that
+have hardly anything in common, and find no more matches in the others."""
 FEW_FEATURES = 500
 """Keypoints under which a photo counts as blurred or empty."""
 
@@ -99,33 +101,6 @@ def sequential_pairs(names: Sequence[str], overlap: int = 10) -> list[tuple[str,
     return [(names[i], names[i + step]) for i in range(len(names)) for step in steps if i + step < len(names)]
 
 
-def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, report: Report) -> None:
-    """Find SIFT features in the photos that have none yet; each group of photos shares a camera."""
-    total = sum(map(len, groups))
-    report("features", 0, total)
-    with ThreadPoolExecutor(1) as pool:
-        for group in groups:
-            reader = pycolmap.ImageReaderOptions(camera_model="OPENCV")
-            if database.exists():
-                with pycolmap.Database.open(database) as opened:  # An interrupted run has made the camera.
-                    known = {image.name: image.camera_id for image in opened.read_all_images()}
-                reader.existing_camera_id = next((known[name] for name in group if name in known), -1)
-            extraction = pool.submit(
-                pycolmap.extract_features, database, photos, list(group), pycolmap.CameraMode.SINGLE, reader
-            )
-            while not extraction.done():
-                wait([extraction], timeout=0.5)
-                with contextlib.suppress(sqlite3.Error), contextlib.closing(_reading(database)) as connection:
-                    report("features", connection.execute("SELECT COUNT(*) FROM keypoints").fetchone()[0], total)
-            extraction.result()
-    report("features", total, total)
-
-
-def _reading(database: Path) -> sqlite3.Connection:
-    """Open a connection that takes no lock, because COLMAP aborts where it meets one; it may read half-written rows."""
-    return sqlite3.connect(f"{database.resolve().as_uri()}?immutable=1", uri=True)
-
-
 def match(names: Sequence[str], database: Path, pair_list: Path, matching: Matching, report: Report) -> None:
     """Match features between photos; pairs that an earlier run matched are skipped.
 
@@ -139,6 +114,7 @@ def match(names: Sequence[str], database: Path, pair_list: Path, matching: Match
     stage = f"matches ({matching})"
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = _SEED
+    verification.ransac.max_num_trials = _TRIALS
     # COLMAP separates the names in a list of pairs by spaces.
     listable = not any(character.isspace() for name in names for character in name)
     if matching in ("spatial", "vocabulary") or not listable:  # these functions tell nothing of their progress
@@ -214,9 +190,13 @@ def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
     Raises:
         OSError: If the folder holds less than the model.
     """
-    sizes = [(len(one.images), one.num_points3D()) for one in (pycolmap.Reconstruction(folder), model)]
-    if sizes[0] != sizes[1]:
-        raise OSError(f"{folder} was not written completely: the disk is full")
+    told = f"{folder} was not written completely: the disk is full"
+    try:
+        written = pycolmap.Reconstruction(folder)
+    except (IndexError, MemoryError, ValueError) as error:  # What is missing counts as any number.
+        raise OSError(told) from error
+    if (len(written.images), written.num_points3D()) != (len(model.images), model.num_points3D()):
+        raise OSError(told)
 
 
 def undistort(photos: Path, alphas: Path, model: Path, folder: Path, max_size: int, report: Report) -> None:
