@@ -186,13 +186,7 @@ class PhotosToSplat:
             os.close(lock)
 
     def _stage(self, line: Line, log: str, module: str, arguments: Sequence[str], hear: Callable[[str], None]) -> None:
-        """Run a stage to its end.
-
-        Raises:
-            InputError: If the stage cannot use what it is given.
-            Interrupted: If a signal came.
-            RunError: If it fails.
-        """
+        """Run a stage to its end, and raise as `make` does."""
         path = self.folder / "log" / f"{log}.txt"
         code, sentence = run_stage(module, arguments, path, line, hear, self.interrupts, self._lock)
         if code == 0:
