@@ -30,18 +30,14 @@ from sadgs_ns.cli.process.command import MIN_SIZE
 from sadgs_ns.cli.process.photos import find_photos
 from sadgs_ns.cli.process.video import VIDEO_SUFFIXES
 from sadgs_ns.cli.stage import Line, clock, run_stage
-from sadgs_ns.errors import (
-    InputError,
-    RunError,
-    WriteError,
-    free_space,
-    reason,
-)
+from sadgs_ns.errors import InputError, RunError, WriteError, free_space, reason
 from sadgs_ns.formats.files import SUFFIXES
 from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
 
 _OURS = ("data", "output-dir", "experiment-name", "timestamp", "vis", "load-dir", "load-checkpoint", "load-config")
 """Options of ns-train that this command sets."""
+_CAMERAS, _TRAINING, _EXPORT = "sadgs_ns.cli.process.command", "nerfstudio.scripts.train", "sadgs_ns.cli.export"
+"""The stages' modules."""
 _LOCK_SECONDS = 10.0
 """Time that a killed run's last stage is given to save."""
 _STEP = re.compile(r"^(\S.*) (\d+)/(\d+)$")
@@ -155,9 +151,9 @@ class PhotosToSplat:
             OSError: If a file cannot be written.
             RunError: If a stage fails, or few photos registered.
         """
-        self._note()
         with self._alone() as lock:
-            self._lock = lock
+            self._lock, self._settings = lock, self._read_settings()  # Another run may have gone on meanwhile.
+            self._note()
             self._make_cameras()
             self._train()
             return [self._export(name) for name in sorted(self.formats, key=lambda name: name == "html")]
@@ -168,7 +164,12 @@ class PhotosToSplat:
 
         Raises:
             InputError: If another run works there.
+            WriteError: If the folder cannot be made.
         """
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise WriteError(self.folder, error) from error
         lock, end = os.open(self.folder, os.O_RDONLY), time.monotonic() + _LOCK_SECONDS
         try:
             while True:
@@ -185,13 +186,7 @@ class PhotosToSplat:
             os.close(lock)
 
     def _stage(self, line: Line, log: str, module: str, arguments: Sequence[str], hear: Callable[[str], None]) -> None:
-        """Run a stage to its end.
-
-        Raises:
-            InputError: If the stage cannot use what it is given.
-            Interrupted: If a signal came.
-            RunError: If it fails.
-        """
+        """Run a stage to its end, and raise as `make` does."""
         path = self.folder / "log" / f"{log}.txt"
         code, sentence = run_stage(module, arguments, path, line, hear, self.interrupts, self._lock)
         if code == 0:
@@ -201,10 +196,10 @@ class PhotosToSplat:
         raise InputError(f"{told}.") if code == 2 else RunError(f"{told}, and the same command goes on.")
 
     def _make_cameras(self) -> None:
-        found, others, roughly, finished = "", "", "", False
+        found, others, roughly, finished, more_pairs = "", "", "", False, False
 
         def hear(printed: str) -> None:
-            nonlocal found, others, roughly, finished
+            nonlocal found, others, roughly, finished, more_pairs
             if step := _STEP.match(printed):
                 line.tell(f"{step[1]} {step[2]} of {step[3]}{roughly}")
             elif duration := _ROUGHLY.search(printed):
@@ -213,6 +208,7 @@ class PhotosToSplat:
                 found = registered[0]
                 others = "" if registered[1] == registered[2] else ", log/cameras.txt tells of the others"
             finished |= printed.endswith(" is finished; delete it to make it again.")
+            more_pairs |= printed.startswith("warning: ") and " --matching exhaustive" in printed
 
         with Line("cameras", self.console) as line:
             if self._settings.get("few") and (self.anyway or self._checkpoint()):
@@ -220,24 +216,24 @@ class PhotosToSplat:
                 return
             arguments = [os.path.abspath(self.source), str(self._scene), "--max-size", str(self.max_size)]
             try:
-                self._stage(line, "cameras", "sadgs_ns.cli.process.command", arguments, hear)
+                self._stage(line, "cameras", _CAMERAS, arguments, hear)
             except RunError:
                 if not (found and (self._scene / "transforms.json").exists()):
                     raise
                 self._note(few=found)
                 line.tell(found)
                 if not self.anyway:
-                    raise self._few_registered() from None
+                    raise self._few_registered(more_pairs) from None
             else:
                 self._settings.pop("few", None)
             line.tell(found + others + "; done before" * finished)
 
-    def _few_registered(self) -> RunError:
-        again = shlex.join(["sadgs-process", str(self.source), str(self._scene), "--matching", "exhaustive"])
+    def _few_registered(self, more_pairs: bool) -> RunError:
+        command = shlex.join(["sadgs-process", str(self.source), str(self._scene), "--matching", "exhaustive"])
+        again = f"or compare more pairs of them with `{command}`, and give the same command again; " * more_pairs
         return RunError(
-            f"only {self._settings['few']}, so the splat would show only what these saw: take more "
-            "photos between the others, with two thirds of overlap, and begin another --output; or compare more "
-            f"pairs of them with `{again}`, and give the same command again; or go on with these with --anyway."
+            f"only {self._settings['few']}, so the splat would show only what these saw: take more photos between the "
+            f"others, with two thirds of overlap, and begin another --output; {again}or go on with these with --anyway."
         )
 
     def _train(self) -> None:
@@ -265,7 +261,7 @@ class PhotosToSplat:
             arguments += ["--experiment-name", "training", "--timestamp", "run", "--vis", "tensorboard"]
             arguments += ["--steps-per-eval-image", "0", "--pipeline.effort", f"{self.effort:g}"]
             arguments += ["--load-dir", str(self._run.absolute())] if self._checkpoint() else []
-            self._stage(line, "training", "nerfstudio.scripts.train", [*arguments, *self.options], hear)
+            self._stage(line, "training", _TRAINING, [*arguments, *self.options], hear)
             if not self._checkpoint():
                 raise RunError(f"training ended without a checkpoint; all that it printed is in {self.folder}/log.")
             told = f"{total} iterations, {count} Gaussians"
@@ -285,7 +281,7 @@ class PhotosToSplat:
                 line.tell(f"{output}; done before")
                 return output
             line.tell(str(output))
-            self._stage(line, "export", "sadgs_ns.cli.export", [str(self._run), "--output", str(output)], hear)
+            self._stage(line, "export", _EXPORT, [str(self._run), "--output", str(output)], hear)
             line.tell(f"{output}, {size}")
         return output
 

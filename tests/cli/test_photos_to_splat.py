@@ -23,6 +23,8 @@ from sadgs_ns.errors import RunError
 from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
 
 TRAINING = ["--", "--max-num-iterations", "15"]
+BOX = "╭─ Wrong ─╮\n│ Wrong options: --a │\n│ or -b. │\n│ ── │\n│ For help │\n╰──╯"
+"""What a command prints of a wrong option."""
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +118,7 @@ def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothin
 
 
 def test_few_registered_photos_end_it_until_it_shall_go_on_anyway(
-    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], program
 ):
     source = tmp_path / "photos"
     source.mkdir()
@@ -128,14 +130,16 @@ def test_few_registered_photos_end_it_until_it_shall_go_on_anyway(
     assert main(command) == 1
     printed = capsys.readouterr()
     assert re.search(r"^sadgs: only \d of 11 photos registered, so .* go on with these with --anyway\.$", printed.err)
+    assert "--matching" not in printed.err, "all pairs were compared"
     assert lines_of(printed.out) == {"cameras": f"{printed.err.split()[2]} of 11 photos registered"}
-    # Training is refused here before it starts, because that is quicker.
+    program(f"print({BOX!r}); raise SystemExit(2)")  # It takes the place of training.
+    monkeypatch.setattr(photos_to_splat, "_TRAINING", "program")
     assert main([*command, "--anyway", "--", "--no-such-option"]) == 2
     printed = capsys.readouterr()
     assert lines_of(printed.out)["cameras"].endswith(" of 11 photos registered; done before")
     log = tmp_path / "out" / "log" / "training.txt"
-    assert printed.err.startswith("sadgs: training: Unrecognized options: --no-such-option. All that it printed is in")
-    assert str(log) in printed.err and "sadgs --data" in log.read_text("utf8")
+    assert printed.err.startswith("sadgs: training: Wrong options: --a or -b. All that it printed is in")
+    assert str(log) in printed.err and " -m program sadgs --data " in log.read_text("utf8")
 
 
 def test_wrong_input_is_told_in_a_sentence_before_any_work(
@@ -188,7 +192,6 @@ def test_two_runs_do_not_work_in_one_folder(
     monkeypatch.setattr(photos_to_splat, "_LOCK_SECONDS", 0.0)
     with Interrupts(waiting=lambda: False) as interrupts:
         work = photos_to_splat.PhotosToSplat(photos, tmp_path / "out", interrupts)
-        work._note()
         with work._alone():
             assert main([str(photos), "-o", str(tmp_path / "out"), "--formats", "ply"]) == 2
     assert f"another sadgs works in {tmp_path / 'out'}; wait for it, or stop it." in capsys.readouterr().err
