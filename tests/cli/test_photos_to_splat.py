@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 from rich.console import Console
-from test_process import draw_photos
+from room import draw_photos
 
 from sadgs_ns.cli import photos_to_splat, stage
 from sadgs_ns.cli.photos_to_splat import main

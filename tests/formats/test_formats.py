@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import json
-import math
 import re
 import struct
 import subprocess
@@ -16,6 +15,7 @@ from typing import Any
 import gsply
 import numpy as np
 import pytest
+from gaussians import random_gaussians
 from gsply.sog_reader import sogread
 from gsply.spz import read_spz
 from numpy.typing import NDArray
@@ -28,22 +28,6 @@ from sadgs_ns.formats import compressed_ply, files, glb, html, packing, ply, sog
 from sadgs_ns.formats.gaussians import Gaussians, of_parameters
 
 START = html.Start((0.0, -2.0, 1.0), (0.0, 0.0, 0.5), 60.0)
-
-
-def random_gaussians(count: int, bands: int = 15, seed: int = 0) -> Gaussians:
-    """Gaussians of the sizes, opacities and colours that training makes, no two of them near each other."""
-    generator = np.random.default_rng(seed)
-    side = math.ceil(count ** (1 / 3))
-    grid = np.stack(np.meshgrid(*[np.linspace(-2, 3, side)] * 3), -1).reshape(-1, 3)[:count]
-    arrays = {
-        "means": grid + generator.uniform(-0.3, 0.3, grid.shape) * 5 / side,
-        "scales": generator.normal(-4, 0.7, (count, 3)).clip(-6, -2),
-        "quats": generator.normal(size=(count, 4)),
-        "opacities": generator.normal(0, 2, count),
-        "features_dc": generator.normal(0, 0.8, (count, 3)).clip(-2.5, 2.5),
-        "features_rest": generator.normal(0, 0.1, (count, bands, 3)),
-    }
-    return of_parameters(arrays)
 
 
 def of_gsply(read: Any) -> Gaussians:

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 from browser import open_page
+from gaussians import random_gaussians
 from PIL import Image
-from test_formats import random_gaussians
 
 from sadgs_ns.errors import InputError
 from sadgs_ns.formats import files, html
