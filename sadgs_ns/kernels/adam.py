@@ -40,7 +40,6 @@ def _update(
 
     With ON_DEVICE `rates` and `scales` are pointers to the numbers.
 
-
     The parameters' sizes are computed from `rows` here. If they were passed as a tuple, Triton would specialise the
     kernel on which of them 16 divides, and compile anew when densification changes that.
     """

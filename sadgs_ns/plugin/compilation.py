@@ -31,7 +31,9 @@ _PATIENCE = 2.0
 """Seconds after which the user is told what the run is waiting for."""
 
 
-def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
+def compile_kernels(
+    pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer], cuda_graphs: bool = False
+) -> None:
     """Launch the kernels of training once, on a few Gaussians and in threads, whose compilations then overlap.
 
     Triton keeps what it compiled on the disk: a machine's first run takes seconds here, a later one none. The run
@@ -43,6 +45,7 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
     Args:
         pipeline: A pipeline whose model and data are set up.
         optimizers: The run's optimizers, by the names of their parameters.
+        cuda_graphs: Whether steps may be captured as CUDA graphs, whose Adam reads its rates from the device.
     """
     model, device = pipeline.model, pipeline.device
     config, strategy = model.config, model.strategy
@@ -89,7 +92,7 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
                 twins[name] = FusedAdam([parameter], **{key: optimizer.defaults[key] for key in ("betas", "eps")})
                 twins[name].log = log  # all share one log, like the run's, and are stepped in one launch
         step_together(twins.values())
-        if twins and (repeated := RepeatedUpdate(twins)).in_one_launch:  # as CUDA graphs do it
+        if cuda_graphs and twins and (repeated := RepeatedUpdate(twins)).in_one_launch:
             gradients = {name: torch.zeros_like(parameter) for name, parameter in repeated.parameters.items()}
             repeated.launch(gradients, log.gradients, repeated.factors().to(device))
 

@@ -95,7 +95,7 @@ class SadgsTrainer(Trainer):
             self._say_what_was_chosen()
             last = [TrainingCallbackLocation.AFTER_TRAIN]
             self.callbacks.append(TrainingCallback(last, lambda step: self._say_what_is_next()))
-            compile_kernels(self.pipeline, self.optimizers.optimizers)
+            compile_kernels(self.pipeline, self.optimizers.optimizers, self.config.cuda_graphs)
             self.graphed = GraphedSteps.of(self)
         except torch.cuda.OutOfMemoryError as error:
             raise RunError(f"The GPU's memory is too small to start ({_memory(error)}): {_LESS_MEMORY}.") from error
