@@ -13,12 +13,11 @@ import numpy as np
 import pycolmap
 
 from sadgs_ns.cli.process.apart import Report
+from sadgs_ns.cli.process.plan import MAX_SIDE, searched_pixels
 from sadgs_ns.method.memory import available_host_bytes
 
 MOST_FEATURES = 8192
 """Features of a photo, of which the most contrasted are taken; COLMAP's own limit."""
-MAX_SIDE = 3200
-"""Longest side in px to which photos are scaled down to find features, as COLMAP does."""
 _CONTRAST = 0.02
 """Least contrast of a feature, COLMAP's: a photo in [0, 1] needs a third of it in a scale of three per octave."""
 _BYTES_PER_PIXEL = 240
@@ -98,6 +97,6 @@ def sift(photo: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _num_threads(sizes: Sequence[tuple[int, int]]) -> int:
     """Return how many photos of these sizes in px are searched at a time: one on each core, if memory allows."""
-    pixels = max((width * height * min(1.0, MAX_SIDE / max(width, height)) ** 2 for width, height in sizes), default=1)
+    pixels = max(map(searched_pixels, sizes), default=1.0)
     at_a_time = 0.5 * available_host_bytes() / (_BYTES_PER_PIXEL * pixels)
     return max(1, int(min(os.cpu_count() or 1, at_a_time)))

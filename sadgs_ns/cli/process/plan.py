@@ -18,8 +18,8 @@ _PAIR_PER_MEGAPIXEL, _LONGEST_PAIR = 0.12, 0.14
 """Processor time in s to match two photos of a million pixels, and of so many that the limit of features holds."""
 _POSE = 0.5
 """Processor time in s to find a photo's camera; .2 to 1.1 as measured."""
-_MAX_SIDE = 3200
-"""Longest side in px to which photos are scaled down to find features; `features.py` is slow to import."""
+MAX_SIDE = 3200
+"""Longest side in px to which photos are scaled down to find features, as COLMAP does."""
 _PAIRS_PER_PHOTO = {"sequential": 16, "spatial": 50, "vocabulary": 100}
 """Other photos that each photo is matched with, at most."""
 Matching = Literal["auto", "exhaustive", "sequential", "spatial", "vocabulary"]
@@ -104,12 +104,15 @@ def choose_matching(
     return "vocabulary", ""
 
 
+def searched_pixels(size: tuple[int, int]) -> float:
+    """Return in how many pixels the features of a photo of this width and height in px are searched."""
+    width, height = size
+    return width * height * min(1.0, MAX_SIDE / max(width, height)) ** 2
+
+
 def expected_work(photos: Sequence[Photo], matching: str) -> str:
     """Return a sentence on how much there is to do, and roughly how long it takes on this machine."""
-    megapixels = 0.0
-    for photo in photos:
-        width, height = photo.size
-        megapixels += width * height / 1e6 * min(1.0, _MAX_SIDE / max(width, height)) ** 2
+    megapixels = sum(searched_pixels(photo.size) for photo in photos) / 1e6
     pairs = min(len(photos) * _PAIRS_PER_PHOTO.get(matching, len(photos)), len(photos) * (len(photos) - 1) // 2)
     per_pair = min(_PAIR_PER_MEGAPIXEL * megapixels / len(photos), _LONGEST_PAIR)
     cores = os.cpu_count() or 1
