@@ -183,7 +183,7 @@ def project(
     max_off_axis: float = 0.0,
     per_axis_radii: bool | None = None,
 ) -> Projected:
-    """Project Gaussians and compute their colours; arguments are those of `rasterization`, which does not check them."""
+    """Project Gaussians and compute their colours; arguments are those of `rasterization`, and are not checked."""
     C, N = viewmats.shape[0], means.shape[0]
     if per_axis_radii is None:
         per_axis_radii = RADII_PER_AXIS
