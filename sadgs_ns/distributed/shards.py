@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -130,7 +131,7 @@ class Shards:
         new = self.even_sizes(self.total)
         sent, received = _overlaps(self.sizes, new, self.rank), _overlaps(new, self.sizes, self.rank)
         result = rows.new_empty((new[self.rank], *rows.shape[1:]))
-        if rows[:1].numel():
+        if math.prod(rows.shape[1:]):
             dist.all_to_all_single(result, rows.contiguous(), received, sent)
         return result
 
@@ -144,19 +145,20 @@ class Shards:
             At rank 0 the rows of all, in the order of the ranks [total, …]; elsewhere this process's own.
         """
         rows = rows.detach()
+        starts = [range(0, size if math.prod(rows.shape[1:]) else 0, _ROWS_AT_ONCE) for size in self.sizes]
         if self.rank > 0:
-            for part in rows.split(_ROWS_AT_ONCE) if rows[:1].numel() else ():
-                dist.send(part.contiguous(), 0)
+            for start in starts[self.rank]:
+                dist.send(rows[start : start + _ROWS_AT_ONCE].contiguous(), 0)
             return rows
         gathered = torch.empty((self.total, *rows.shape[1:]), dtype=rows.dtype)
         gathered[: len(rows)] = rows.cpu()
-        start = len(rows)
+        end = len(rows)
         for rank, size in enumerate(self.sizes[1:], start=1):
-            for first in range(0, size, _ROWS_AT_ONCE) if rows[:1].numel() else ():
-                part = rows.new_empty((min(size - first, _ROWS_AT_ONCE), *rows.shape[1:]))
+            for start in starts[rank]:
+                part = rows.new_empty((min(size - start, _ROWS_AT_ONCE), *rows.shape[1:]))
                 dist.recv(part, rank)
-                gathered[start + first : start + first + len(part)] = part.cpu()
-            start += size
+                gathered[end + start : end + start + len(part)] = part.cpu()
+            end += size
         return gathered
 
 

@@ -70,11 +70,14 @@ class StepSize:
 
     @classmethod
     def of(cls, infos: Sequence[Mapping[str, Any]]) -> StepSize:
-        """The size of a step that was rendered, from gsplat's `info` of each of its groups of views."""
+        """The size of a step that was rendered, from the `info` of each of its groups of views.
+
+        That is gsplat's, or that of `distributed.rasterization`, which says what this process composited.
+        """
         return cls(
             sum(info["n_cameras"] for info in infos),
-            sum(info["n_cameras"] * info["width"] * info["height"] for info in infos),
-            sum(len(info["flatten_ids"]) for info in infos),
+            sum(info.get("num_pixels", info["n_cameras"] * info["width"] * info["height"]) for info in infos),
+            sum(info["num_pairs"] if "num_pairs" in info else len(info["flatten_ids"]) for info in infos),
         )
 
 
