@@ -88,7 +88,7 @@ class Shards:
 
     def least(self, number: float) -> float:
         """Return the least of the numbers that the processes pass, of which any may be infinite."""
-        return float(self.gather(torch.tensor([number], dtype=torch.float32, device=self.device)).min())
+        return float(self.gather(torch.tensor([number], dtype=torch.float64, device=self.device)).min())
 
     def all(self, condition: bool) -> bool:
         """Tell whether a condition holds in all processes."""

@@ -367,11 +367,11 @@ class StructureAwareStrategy(Strategy):
     def _opacities(params: Params) -> Tensor:
         return torch.sigmoid(params["opacities"].detach().flatten())  # [N]
 
-    @staticmethod
-    def _prune(params: Any, optimizers: Any, state: Any, mask: Tensor) -> int:
-        """Remove Gaussians, unless none would be left to train."""
+    def _prune(self, params: Any, optimizers: Any, state: Any, mask: Tensor) -> int:
+        """Remove Gaussians, unless none would be left to train; a process may lose all that it has."""
         n_prune = int(mask.sum())
-        if n_prune == len(mask):
+        of_all, total = self._of_all(n_prune, len(mask))
+        if of_all == total:
             return 0
         if n_prune > 0:
             remove(params, optimizers, state, mask)
