@@ -133,12 +133,12 @@ class _Exchanged(torch.autograd.Function):
     def backward(ctx: Any, _: Tensor | None, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         exchange: Exchange = ctx.exchange
         (means2d,) = ctx.saved_tensors
-        widths = [2, 3, 1, ctx.num_colors, 1, *[2] * exchange.absgrad]
+        widths = [2, 3, 1, ctx.num_colors, *[2] * exchange.absgrad]
         parts = []
         for i, centres in enumerate(exchange.means2d):
             number = sum(row[i] for row in exchange.counts)
-            _, v_means2d, v_depths, v_conics, v_opacities, v_colors = gradients[6 * i : 6 * i + 6]
-            columns = [v_means2d, v_conics, v_opacities, v_colors, v_depths]
+            _, v_means2d, _, v_conics, v_opacities, v_colors = gradients[6 * i : 6 * i + 6]  # Depths decide no colour.
+            columns = [v_means2d, v_conics, v_opacities, v_colors]
             if exchange.absgrad:
                 columns.append(getattr(centres, "absgrad", None))
             filled = [
@@ -149,10 +149,10 @@ class _Exchanged(torch.autograd.Function):
         exchange.means2d = []  # They hold the graph, and so this object, which would hold them.
         rows = exchange.back(parts, sum(widths))
         dense = means2d.new_zeros((ctx.shape.numel(), sum(widths))).index_add_(0, exchange.places, rows)
-        v_means2d, v_conics, v_opacities, v_colors, v_depths, *v_absolute = dense.view(*ctx.shape, -1).split(widths, -1)
+        v_means2d, v_conics, v_opacities, v_colors, *v_absolute = dense.view(*ctx.shape, -1).split(widths, -1)
         if exchange.absgrad:
             means2d.absgrad, means2d.grad2d = v_absolute[0], v_means2d
-        return None, None, v_means2d, v_depths[..., 0], v_conics, v_opacities[..., 0], v_colors
+        return None, None, v_means2d, None, v_conics, v_opacities[..., 0], v_colors
 
 
 @torch.no_grad()

@@ -43,12 +43,22 @@ def inputs(part: slice = slice(None)) -> dict[str, Tensor]:
     return {name: value[part].clone().requires_grad_() for name, value in values.items()}
 
 
+def splats(leaves: dict[str, Tensor]) -> tuple[Any, ...]:
+    """The first arguments of `rasterize`."""
+    *others, colors = leaves.values()
+    return *others, (colors[:, 0], colors[:, 1:])
+
+
 def weights(views: int) -> Tensor:
     """What the pixels' sum in the loss is weighted with, so that each gradient is its own."""
     return torch.rand((views, HEIGHT, WIDTH, 4), generator=torch.Generator().manual_seed(2))
 
 
-def draw_together(shards: Shards, views: int, mode: str, uneven: bool) -> dict[str, Any]:
+def draw_together(shards: Shards, views: int, mode: str, uneven: bool, fused: bool) -> dict[str, Any]:
+    if fused:
+        from interpreted import use_our_rasterizer
+
+        use_our_rasterizer(pytest.MonkeyPatch())
     part = shards.take_even_part(GAUSSIANS)
     if uneven:  # The last process has nothing that anybody sees.
         shards.sizes = [GAUSSIANS - 3 * (shards.num_ranks - 1), *[3] * (shards.num_ranks - 1)]
@@ -58,7 +68,7 @@ def draw_together(shards: Shards, views: int, mode: str, uneven: bool) -> dict[s
     viewmats, Ks = cameras(views)
     options: dict[str, Any] = {"sh_degree": 1, "absgrad": True, "rasterize_mode": mode, "max_off_axis": 1.5}
     shards.request = 1 << shards.rank
-    rendered, loss, info = rasterize(shards, *leaves.values(), viewmats, Ks, WIDTH, HEIGHT, **options)
+    rendered, loss, info = rasterize(shards, *splats(leaves), viewmats, Ks, WIDTH, HEIGHT, **options)
     images = []
     for band, colors, alphas in rendered:
         rows = slice(band.first - band.top, band.last - band.top)
@@ -78,16 +88,24 @@ def draw_together(shards: Shards, views: int, mode: str, uneven: bool) -> dict[s
 
 
 @pytest.mark.parametrize(
-    ("ranks", "views", "mode", "uneven"),
-    [(2, 2, "classic", False), (3, 4, "antialiased", False), (3, 1, "classic", True), (2, 3, "classic", False)],
+    ("ranks", "views", "mode", "uneven", "fused"),
+    [
+        (2, 2, "classic", False, False),
+        (3, 4, "antialiased", False, False),
+        (3, 1, "classic", True, False),
+        (2, 3, "classic", False, True),
+    ],
 )
 def test_processes_draw_and_differentiate_what_one_does(
-    ranks: int, views: int, mode: Any, uneven: bool, tmp_path: Path
+    ranks: int, views: int, mode: Any, uneven: bool, fused: bool, tmp_path: Path
 ):
+    """With `fused`, the processes draw with our kernels in Triton's interpreter."""
+    if fused:
+        pytest.importorskip("interpreted", reason="Triton is not installed", exc_type=ImportError)
     leaves = inputs()
     viewmats, Ks = cameras(views)
     colors, alphas, info = rasterize_alone(
-        *leaves.values(), viewmats, Ks, WIDTH, HEIGHT,
+        *splats(leaves), viewmats, Ks, WIDTH, HEIGHT,
         sh_degree=1, absgrad=True, rasterize_mode=mode, max_off_axis=1.5,
     )  # fmt: skip
     info["means2d"].retain_grad()
@@ -96,7 +114,7 @@ def test_processes_draw_and_differentiate_what_one_does(
     loss.backward()
     assert not visible(info).all(), "some Gaussians should be out of sight"
 
-    results = run_ranks(draw_together, ranks, tmp_path, views, mode, uneven)
+    results = run_ranks(draw_together, ranks, tmp_path, views, mode, uneven, fused)
 
     covered = torch.zeros(views, HEIGHT)
     for result in results:

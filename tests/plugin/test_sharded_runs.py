@@ -19,7 +19,7 @@ STRUCTURE_EVERY = 6
 
 
 def few_steps(scene: Path, output: Path, views: int) -> SadgsTrainerConfig:
-    """A run of which the first half ends with a structure step, and in which every step observes η and sums AbsGS's gradients."""
+    """A run whose first half ends with a structure step; every step before that is observed by all statistics."""
     config = configure(scene, output, 2 * STRUCTURE_EVERY, save_every=0)
     config.pipeline.views_per_iteration = views
     # Gaussians start as spheres: their rotations have no gradient, and Adam would make steps of what rounding leaves.
