@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import random
+import socket
+import time
 from datetime import timedelta
 from typing import TYPE_CHECKING
 
@@ -18,6 +20,8 @@ from sadgs_ns.errors import InputError
 if TYPE_CHECKING:
     from sadgs_ns.plugin.config import CheckedTrainerConfig
 
+_REAPED_SECONDS = 5.0
+"""Longest time from a message that fails because its process has ended to the operating system's forgetting that."""
 _TIMEOUT = timedelta(minutes=30)
 """Longest time that one process waits for another, as in nerfstudio: rank 0 may write a large checkpoint meanwhile."""
 
@@ -72,6 +76,35 @@ def check(config: CheckedTrainerConfig) -> None:
     ):
         if given:
             raise InputError(f"{name} works on one device only, and this run takes several: {remedy}.")
+
+
+class Peers:
+    """The processes of a run, as the operating system knows them."""
+
+    def __init__(self) -> None:
+        mine = (socket.gethostname(), os.getpid())
+        self._places: list[tuple[str, int]] = [mine] * dist.get_world_size()
+        dist.all_gather_object(self._places, mine)
+
+    def ended(self) -> list[int]:
+        """Return the ranks of the processes of this machine that have ended, after waiting some seconds for one."""
+        end, here = time.monotonic() + _REAPED_SECONDS, socket.gethostname()
+        while True:
+            ranks = [rank for rank, (host, pid) in enumerate(self._places) if host == here and not _exists(pid)]
+            if ranks or time.monotonic() > end:
+                return ranks
+            time.sleep(0.1)
+
+
+def _exists(pid: int) -> bool:
+    """Tell whether there is a process of this user, or one that ended and of which its parent has not learned yet."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # The number is another user's process's by now.
+        return False
+    return True
 
 
 def join(config: CheckedTrainerConfig, local_rank: int) -> tuple[Shards | None, int]:

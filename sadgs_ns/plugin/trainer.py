@@ -74,6 +74,7 @@ class SadgsTrainer(Trainer):
         config = copy.copy(config)  # Where there are several processes, they agree on what the file does not say.
         self.shards, local_rank = processes.join(config, local_rank)
         """What this process knows of the others; None where it is alone."""
+        self._peers = None if self.shards is None else processes.Peers()
         self._vis = config.vis
         if self.shards is not None and (config.is_viewer_enabled() or config.is_viewer_legacy_enabled()):
             CONSOLE.print("The viewer is off, since no device holds all Gaussians; `ns-viewer` shows the finished run.")
@@ -280,6 +281,8 @@ class SadgsTrainer(Trainer):
             raise RunError(
                 f"{error} What was trained is saved and goes on with --load-dir {self.checkpoint_dir}."
             ) from error
+        except RunError:
+            raise
         except torch.cuda.OutOfMemoryError as error:
             out_of_memory = _memory(error)  # The RunError is raised below, when the failed step's tensors are gone.
         except OSError as error:
@@ -289,6 +292,14 @@ class SadgsTrainer(Trainer):
             if not self._stepping and self._completed_step > self._saved_step and self.shards is None:
                 self.save_checkpoint(self._completed_step)
             raise WriteError(Path(os.fsdecode(error.filename or self.base_dir)), error) from error
+        except RuntimeError as error:
+            ended = [] if self._peers is None else self._peers.ended()
+            if not ended:
+                raise
+            raise RunError(
+                f"Process {' and '.join(map(str, ended))} of {processes.number_of_processes()} ended (counted from 0), "
+                f"and the others with it: what the last checkpoint holds goes on with --load-dir {self.checkpoint_dir}."
+            ) from error
         finally:
             self.config.max_num_iterations = total
             self.pipeline.views.close()

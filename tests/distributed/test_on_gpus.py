@@ -76,6 +76,7 @@ def test_a_run_on_two_gpus_ends_with_one_checkpoint(start: str, scene: Path, tmp
     options = [
         "sadgs", "--data", str(scene), "--output-dir", str(tmp_path), "--experiment-name", "test",
         "--max-num-iterations", "60", "--pipeline.views-per-iteration", "2",
+        "--pipeline.model.strategy.max-gaussians", "5000",
     ]  # fmt: skip
     if start == "nerfstudio":
         command = [sys.executable, "-m", "nerfstudio.scripts.train", *options, "--machine.num-devices", "2"]

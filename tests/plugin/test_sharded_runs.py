@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import os
+import signal
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from kill_and_resume import configure, set_up
+from kill_and_resume import configure, differences, set_up
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 from ranks import run_ranks
 
 from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.errors import RunError
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 STRUCTURE_EVERY = 6
@@ -79,3 +85,128 @@ def test_the_first_steps_are_those_of_one_process(ranks: int, views: int, scene:
         # A sample that lies at a threshold may fall to either side of it.
         close = torch.isclose(together, value, rtol=1e-3, atol=1e-4 * float(value.abs().max()))
         assert close.float().mean() > 0.995, name
+
+
+def train_until(shards: Shards, config: SadgsTrainerConfig, stop: int | None) -> dict[str, Any]:
+    """Train, until the last process alone is sent SIGTERM in the step `stop`.
+
+    Returns:
+        What the process held at the start and holds at the end, the exit code, and the last step's loss.
+    """
+    CONSOLE.quiet = True
+    trainer = config.setup(local_rank=shards.rank, world_size=shards.num_ranks)
+    trainer.setup()
+    return train_set_up(trainer, stop if shards.rank == shards.num_ranks - 1 else None)
+
+
+def held(trainer: SadgsTrainer) -> dict[str, torch.Tensor]:
+    """The Gaussians of this process, with Adam's moments, by names."""
+    values = {name: value.detach().clone() for name, value in trainer.pipeline.model.gauss_params.items()}
+    for name in list(values):
+        for state in trainer.optimizers.optimizers[name].state.values():
+            values |= {f"{name}.{key}": state[key].clone() for key in ("exp_avg", "exp_avg_sq")}
+    return values
+
+
+def train_set_up(trainer: SadgsTrainer, stop: int | None) -> dict[str, Any]:
+    """`train_until` of a trainer that is set up."""
+    result: dict[str, Any] = {"start": held(trainer), "code": 0}
+    iterate = trainer.train_iteration
+
+    def noted(step: int) -> Any:
+        if step == stop:
+            os.kill(os.getpid(), signal.SIGTERM)
+        outcome = iterate(step)
+        result["loss"] = float(outcome[0])
+        return outcome
+
+    trainer.train_iteration = noted  # type: ignore[method-assign]
+    try:
+        trainer.train()
+    except SystemExit as ending:
+        result["code"] = ending.code
+    return result | {"end": held(trainer), "gaussians": trainer.pipeline.model.num_gaussians}
+
+
+def saved(folder: Path) -> tuple[int, dict[str, torch.Tensor]]:
+    """The step of the only checkpoint, and what `held` returns of a process that has all of it."""
+    (path,) = folder.glob("*.ckpt")
+    state = torch.load(path, weights_only=True)
+    parameters = {
+        name.rpartition(".")[2]: value for name, value in state["pipeline"].items() if ".gauss_params." in name
+    }
+    for name in list(parameters):
+        for moments in state["optimizers"][name]["state"].values():
+            parameters |= {f"{name}.{key}": moments[key] for key in ("exp_avg", "exp_avg_sq")}
+    return state["step"], parameters
+
+
+def test_a_run_goes_on_with_fewer_processes(scene: Path, tmp_path: Path):
+    """With three, then with two, which a signal to one of them ends, then with one."""
+    config = configure(scene, tmp_path / "runs", 20, save_every=0)
+    config.pipeline.views_per_iteration = 2
+    folder = config.get_checkpoint_dir()
+    parameters: dict[str, torch.Tensor] = {}
+    for ranks, stop in ((3, 5), (2, 11)):
+        results = run_ranks(train_until, ranks, tmp_path / str(ranks), copy.deepcopy(config), stop)
+        assert [result["code"] for result in results] == [128 + signal.SIGTERM] * ranks
+        if parameters:
+            together = {name: torch.cat([result["start"][name] for result in results]) for name in parameters}
+            assert not differences(together, parameters), "each process should take its part of the checkpoint"
+        last, parameters = saved(folder)
+        assert last == stop
+        together = {name: torch.cat([result["end"][name] for result in results]) for name in parameters}
+        assert not differences(together, parameters), "the checkpoint should hold what the processes have"
+        sizes = [len(result["end"]["means"]) for result in results]
+        assert max(sizes) <= 1.1 * min(sizes) + 1 and sum(sizes) == results[0]["gaussians"]
+        config.load_dir = folder
+    alone = train_set_up(set_up(copy.deepcopy(config)), None)
+    assert not differences(alone["start"], parameters) and saved(folder)[0] == 19
+    undisturbed = configure(scene, tmp_path / "undisturbed", 20, save_every=0)
+    undisturbed.pipeline.views_per_iteration = 2
+    expected = train_set_up(set_up(undisturbed), None)
+    assert alone["loss"] == pytest.approx(expected["loss"], rel=0.05)
+    assert alone["gaussians"] == pytest.approx(expected["gaussians"], rel=0.1)
+
+
+def test_a_whole_run_reaches_the_quality_of_one_process(scene: Path, tmp_path: Path):
+    def configured(name: str) -> SadgsTrainerConfig:
+        config = configure(scene, tmp_path / name, 60, save_every=0)
+        config.pipeline.views_per_iteration = 2
+        return config
+
+    alone = set_up(configured("alone"))
+    alone.train()
+    together = configured("together")
+    run_ranks(train_until, 2, tmp_path / "meet", copy.deepcopy(together), None)
+    together.load_dir = together.get_checkpoint_dir()
+    psnr = [
+        trainer.pipeline.get_average_eval_image_metrics()["psnr"]
+        for trainer in (alone, set_up(copy.deepcopy(together)))
+    ]
+    assert psnr[0] > 15 and abs(psnr[1] - psnr[0]) < 0.5, psnr
+
+
+def train_and_die(shards: Shards, config: SadgsTrainerConfig, doomed: int) -> str:
+    """Train, and let one process be killed in a step; the error by which the others end."""
+    CONSOLE.quiet = True
+    trainer = config.setup(local_rank=shards.rank, world_size=shards.num_ranks)
+    trainer.setup()
+    if shards.rank == doomed:
+        location = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
+        trainer.callbacks.append(TrainingCallback(location, lambda step: step == 4 and os.kill(os.getpid(), 9)))
+    with pytest.raises(RunError) as error:
+        trainer.train()
+    return str(error.value)
+
+
+def test_a_killed_process_ends_the_others_with_a_sentence_that_names_it(scene: Path, tmp_path: Path):
+    config = configure(scene, tmp_path / "runs", 20, save_every=3)
+    start = time.monotonic()
+    messages = run_ranks(train_and_die, 3, tmp_path / "meet", config, 1, doomed=(1,))
+    assert time.monotonic() - start < 60
+    for message in (messages[0], messages[2]):
+        assert (
+            message.startswith("Process 1 of 3 ended (counted from 0)") and str(config.get_checkpoint_dir()) in message
+        )
+    assert saved(config.get_checkpoint_dir())[0] == 3
