@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 import torch.distributed as dist
-from test_sharded_rasterization import GAUSSIANS, HEIGHT, WIDTH, cameras, inputs, splats, weights
+from sharded_scene import GAUSSIANS, HEIGHT, WIDTH, cameras, inputs, splats, weights
 
 from sadgs_ns.distributed.rasterization import rasterize
 from sadgs_ns.distributed.shards import Shards

@@ -458,11 +458,6 @@ def test_bilateral_grids_of_the_seen_views_are_trained(colmap: ColmapDataParserC
     assert is_finite(trainer.pipeline.model)
 
 
-def test_several_devices_are_refused(colmap: ColmapDataParserConfig, tmp_path: Path):
-    with pytest.raises(ValueError, match=r"sadgs trains on one device"):
-        configure(tmp_path, colmap).setup(local_rank=0, world_size=2)
-
-
 # --- checkpoints ---
 
 
