@@ -34,10 +34,11 @@ def inputs(part: slice = slice(None)) -> dict[str, Tensor]:
     return {name: value[part].clone().requires_grad_() for name, value in values.items()}
 
 
-def splats(leaves: dict[str, Tensor]) -> tuple[Any, ...]:
-    """The first arguments of `rasterize`."""
+def splats(leaves: dict[str, Tensor], views: int) -> tuple[Any, ...]:
+    """The arguments of `rasterize` that need no name, with cameras on the Gaussians' device."""
     *others, colors = leaves.values()
-    return *others, (colors[:, 0], colors[:, 1:])
+    placed = (value.to(colors.device) for value in cameras(views))
+    return *others, (colors[:, 0], colors[:, 1:]), *placed, WIDTH, HEIGHT
 
 
 def weights(views: int) -> Tensor:

@@ -141,6 +141,10 @@ class SadgsModelConfig(InstantiateConfig):
             raise InputError(f"pipeline.model.{error}") from error
 
 
+Splats = tuple[Tensor, Tensor, Tensor, Tensor, Tensor | tuple[Tensor, Tensor]]
+"""Centres [N, 3], quaternions [N, 4], standard deviations [N, 3], opacities [N] and colours, as for `rasterize`."""
+
+
 class StepKind(NamedTuple):
     """What the launches of a training step depend on, besides tensors; the views of the step have one size."""
 
@@ -394,16 +398,15 @@ class SadgsModel(SplatfactoModel):
 
     def splats(
         self, opacity_reg: float = 0.0, params: Mapping[str, Tensor] | None = None, sh_degree: int | None = None
-    ) -> tuple[tuple[Any, ...], Tensor | None, dict[str, Any]]:
+    ) -> tuple[Splats, Tensor | None, dict[str, Any]]:
         """Return what the rasterizer takes of the Gaussians; in the viewer, of those inside its crop box.
 
         Args:
             opacity_reg, params, sh_degree: As for `render`.
 
         Returns:
-            Centres [N, 3], quaternions [N, 4], standard deviations [N, 3], opacities [N] and colours, as the first
-            arguments of `rasterize`; numbers [P] whose sum is the mean opacity times `opacity_reg`, or None where that
-            is 0; and further options of `rasterize`.
+            The first arguments of `rasterize`; numbers [P] whose sum is the mean opacity times `opacity_reg`, or None
+            where that is 0; and further options of `rasterize`.
         """
         params = self.cropped(dict(self.gauss_params.items()) if params is None else params)
         if self.config.sh_degree > 0:

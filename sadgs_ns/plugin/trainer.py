@@ -75,7 +75,7 @@ class SadgsTrainer(Trainer):
         self.shards, local_rank = processes.join(config, local_rank)
         """What this process knows of the others; None where it is alone."""
         self._peers = None if self.shards is None else processes.Peers()
-        self._vis = config.vis
+        self._vis: Any = config.vis
         if self.shards is not None and (config.is_viewer_enabled() or config.is_viewer_legacy_enabled()):
             CONSOLE.print("The viewer is off, since no device holds all Gaussians; `ns-viewer` shows the finished run.")
             config.vis = config.vis.removeprefix("viewer_legacy").removeprefix("viewer").removeprefix("+") or "none"  # type: ignore[assignment]

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 import torch.distributed as dist
-from sharded_scene import GAUSSIANS, HEIGHT, WIDTH, cameras, inputs, splats, weights
+from sharded_scene import GAUSSIANS, inputs, splats, weights
 
 from sadgs_ns.distributed.rasterization import rasterize
 from sadgs_ns.distributed.shards import Shards
@@ -34,17 +34,16 @@ def run(command: list[str]) -> subprocess.CompletedProcess[str]:
 def compare_with_one(shards: Shards, views: int) -> None:
     """Compare this process's part of images, gradients and absolute gradients with those of one process."""
     device = shards.device
-    viewmats, Ks = (value.to(device) for value in cameras(views))
     weight = weights(views).to(device)
     alone = {name: value.detach().to(device).requires_grad_() for name, value in inputs().items()}
-    colors, alphas, info = rasterize_alone(*splats(alone), viewmats, Ks, WIDTH, HEIGHT, sh_degree=1, absgrad=True)
+    colors, alphas, info = rasterize_alone(*splats(alone, views), sh_degree=1, absgrad=True)
     expected = torch.cat([colors, alphas], dim=-1)
     info["means2d"].grad2d = None
     (expected * weight).sum().backward()
 
     part = shards.take_even_part(GAUSSIANS)
     mine = {name: value.detach().to(device).requires_grad_() for name, value in inputs(part).items()}
-    rendered, loss, own = rasterize(shards, *splats(mine), viewmats, Ks, WIDTH, HEIGHT, sh_degree=1, absgrad=True)
+    rendered, loss, own = rasterize(shards, *splats(mine, views), sh_degree=1, absgrad=True)
     for band, colors, alphas in rendered:
         image = torch.cat([colors, alphas], dim=-1)[0, band.first - band.top : band.last - band.top]
         rows = slice(band.first, band.last)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 from ranks import run_ranks
-from sharded_scene import GAUSSIANS, HEIGHT, WIDTH, cameras, inputs, splats, weights
+from sharded_scene import GAUSSIANS, HEIGHT, inputs, splats, weights
 from torch import Tensor
 
 from sadgs_ns.distributed.bands import ROWS, share_out
@@ -29,10 +29,9 @@ def draw_together(shards: Shards, views: int, mode: str, uneven: bool, fused: bo
         start = sum(shards.sizes[: shards.rank])
         part = slice(start, start + shards.sizes[shards.rank])
     leaves = inputs(part)
-    viewmats, Ks = cameras(views)
     options: dict[str, Any] = {"sh_degree": 1, "absgrad": True, "rasterize_mode": mode, "max_off_axis": 1.5}
     shards.request = 1 << shards.rank
-    rendered, loss, info = rasterize(shards, *splats(leaves), viewmats, Ks, WIDTH, HEIGHT, **options)
+    rendered, loss, info = rasterize(shards, *splats(leaves, views), **options)
     images = []
     for band, colors, alphas in rendered:
         rows = slice(band.first - band.top, band.last - band.top)
@@ -67,9 +66,8 @@ def test_processes_draw_and_differentiate_what_one_does(
     if fused:
         pytest.importorskip("interpreted", reason="Triton is not installed", exc_type=ImportError)
     leaves = inputs()
-    viewmats, Ks = cameras(views)
     colors, alphas, info = rasterize_alone(
-        *splats(leaves), viewmats, Ks, WIDTH, HEIGHT,
+        *splats(leaves, views),
         sh_degree=1, absgrad=True, rasterize_mode=mode, max_off_axis=1.5,
     )  # fmt: skip
     info["means2d"].retain_grad()
