@@ -23,24 +23,23 @@ class Exchange:
 
     Attributes:
         bands: Those that this process composites.
-        received: What it composites them of, one view each, shifted to the bands' first drawn row.
-        anchor: Zero, which must be added to the loss: where a process composites nothing, its gradients would not come.
+        counts: Rows that each process has for each of these bands.
+        places: Indices in V · N of the rows that this process sends, in the order of all bands. int64 [M]
+        absolute: The centres in which compositing leaves absolute gradients for `backward`, for each of these bands;
+            none where nobody asked for them.
 
     Args:
         shards: The processes.
         projected: The Gaussians of this process in all V views.
         bands: All bands, as `share_out` returns them.
-        absgrad: Whether `backward` also brings the absolute gradients of the centres, as `absgrad` of `means2d`. The
-            gradient of the centres then is `grad2d` of `means2d`.
     """
 
-    def __init__(self, shards: Shards, projected: Projected, bands: Sequence[Band], absgrad: bool) -> None:
-        self._shards, self.absgrad = shards, absgrad
+    def __init__(self, shards: Shards, projected: Projected, bands: Sequence[Band]) -> None:
         reached = _reached(projected, bands)  # [B, N]
         counted = torch.cat([reached.sum(1), torch.tensor([shards.request], device=shards.device)])
         gathered = shards.gather(counted)  # [R, B + 1]
         n = reached.shape[1]
-        self.places = reached.flatten().nonzero()[:, 0]  # [M] indices in B · N
+        self.places = reached.flatten().nonzero()[:, 0]  # [M], in B · N
         if any(band.view != index for index, band in enumerate(bands)):
             views = torch.tensor([band.view for band in bands], device=shards.device)
             self.places = views[self.places // n] * n + self.places % n
@@ -50,18 +49,32 @@ class Exchange:
         mine = [index for index, band in enumerate(bands) if band.rank == shards.rank]
         self.bands = [bands[index] for index in mine]
         self.counts = [[row[index] for index in mine] for row in table]
-        """Rows of each process for each of this one's bands."""
-        self.received_from = [sum(row) for row in self.counts]
-        self.sent_to = [0] * shards.num_ranks
+        self._received = [sum(row) for row in self.counts]
+        self._sent = [0] * shards.num_ranks
         for band, number in zip(bands, table[shards.rank], strict=True):
-            self.sent_to[band.rank] += number
-        self.means2d: list[Tensor] = []
+            self._sent[band.rank] += number
+        self.absolute: list[Tensor] = []
+
+    def send(self, projected: Projected, absgrad: bool) -> tuple[Tensor, list[Projected]]:
+        """Send the Gaussians, differentiably; call once.
+
+        Args:
+            projected: The Gaussians of this process in all V views.
+            absgrad: Whether `backward` also brings the absolute gradients of the centres, as `absgrad` of `means2d`.
+                The gradient of the centres then is `grad2d` of `means2d`.
+
+        Returns:
+            Zero, which must be added to the loss: where a process composites nothing, its gradients would not come. And
+            what each of the bands of this process is composited of, one view each, shifted to the first drawn row.
+        """
         if absgrad:
             projected.means2d.grad2d = None  # type: ignore[attr-defined] # `keep_gradient` looks for it.
-        self.anchor, *flat = _Exchanged.apply(self, *projected)  # type: ignore[misc]
-        self.received = [Projected(*flat[i : i + 6]) for i in range(0, len(flat), 6)]
-        if torch.is_grad_enabled():
-            self.means2d = [part.means2d for part in self.received]  # The compositing leaves absolute gradients there.
+        anchor, *flat = _Exchanged.apply(self, absgrad, *projected)  # type: ignore[misc]
+        received = [Projected(*flat[i : i + 6]) for i in range(0, len(flat), 6)]
+        if absgrad and torch.is_grad_enabled():
+            # These hold the graph, which holds this object, until `backward` lets them go.
+            self.absolute = [part.means2d for part in received]
+        return anchor, received
 
     def forth(self, rows: Tensor) -> list[Tensor]:
         """Send rows to those who composite them, and return those of each of this process's bands.
@@ -69,25 +82,25 @@ class Exchange:
         Args:
             rows: In the order of `places`. [M, K]
         """
-        received = rows.new_empty((sum(self.received_from), rows.shape[1]))
-        dist.all_to_all_single(received, rows, self.received_from, self.sent_to)
+        received = rows.new_empty((sum(self._received), rows.shape[1]))
+        dist.all_to_all_single(received, rows, self._received, self._sent)
         return _transposed(received, self.counts)
 
-    def back(self, parts: Sequence[Tensor], columns: int) -> Tensor:
+    def back(self, parts: Sequence[Tensor], nothing: Tensor) -> Tensor:
         """Send rows of this process's bands back to those who sent these, and return what the others send back.
 
         Args:
             parts: Rows of each band. [·, K] each
-            columns: K.
+            nothing: What is sent where this process composites nothing. [0, K]
 
         Returns:
             In the order of `places`. [M, K]
         """
-        rows = self.anchor.new_empty((0, columns))
+        rows = nothing
         if parts:
             rows = torch.cat(_transposed(torch.cat([*parts]), list(zip(*self.counts, strict=True))))
-        received = rows.new_empty((len(self.places), columns))
-        dist.all_to_all_single(received, rows.contiguous(), self.sent_to, self.received_from)
+        received = rows.new_empty((len(self.places), nothing.shape[1]))
+        dist.all_to_all_single(received, rows.contiguous(), self._sent, self._received)
         return received
 
 
@@ -98,6 +111,7 @@ class _Exchanged(torch.autograd.Function):
     def forward(  # type: ignore[override]
         ctx: Any,
         exchange: Exchange,
+        absgrad: bool,
         radii: Tensor,  # [V, N] or [V, N, 2]
         means2d: Tensor,  # [V, N, 2]
         depths: Tensor,  # [V, N]
@@ -106,7 +120,7 @@ class _Exchanged(torch.autograd.Function):
         colors: Tensor,  # [V, N, D]
     ) -> tuple[Tensor, ...]:
         ctx.set_materialize_grads(False)
-        ctx.exchange, ctx.shape = exchange, opacities.shape
+        ctx.exchange, ctx.absgrad, ctx.shape = exchange, absgrad, opacities.shape
         ctx.save_for_backward(means2d)
         size = opacities.numel()
         values = [
@@ -133,26 +147,26 @@ class _Exchanged(torch.autograd.Function):
     def backward(ctx: Any, _: Tensor | None, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         exchange: Exchange = ctx.exchange
         (means2d,) = ctx.saved_tensors
-        widths = [2, 3, 1, ctx.num_colors, *[2] * exchange.absgrad]
+        widths = [2, 3, 1, ctx.num_colors, *[2] * ctx.absgrad]
         parts = []
-        for i, centres in enumerate(exchange.means2d):
+        for i in range(len(exchange.bands)):
             number = sum(row[i] for row in exchange.counts)
             _, v_means2d, _, v_conics, v_opacities, v_colors = gradients[6 * i : 6 * i + 6]  # Depths decide no colour.
             columns = [v_means2d, v_conics, v_opacities, v_colors]
-            if exchange.absgrad:
-                columns.append(getattr(centres, "absgrad", None))
+            if ctx.absgrad:
+                columns.append(getattr(exchange.absolute[i], "absgrad", None))
             filled = [
-                centres.new_zeros((number, width)) if value is None else value.reshape(-1, width)[:number]
+                means2d.new_zeros((number, width)) if value is None else value.reshape(-1, width)[:number]
                 for value, width in zip(columns, widths, strict=True)
             ]
             parts.append(torch.cat(filled, dim=1))
-        exchange.means2d = []  # They hold the graph, and so this object, which would hold them.
-        rows = exchange.back(parts, sum(widths))
+        exchange.absolute = []
+        rows = exchange.back(parts, means2d.new_empty((0, sum(widths))))
         dense = means2d.new_zeros((ctx.shape.numel(), sum(widths))).index_add_(0, exchange.places, rows)
         v_means2d, v_conics, v_opacities, v_colors, *v_absolute = dense.view(*ctx.shape, -1).split(widths, -1)
-        if exchange.absgrad:
+        if ctx.absgrad:
             means2d.absgrad, means2d.grad2d = v_absolute[0], v_means2d
-        return None, None, v_means2d, None, v_conics, v_opacities[..., 0], v_colors
+        return None, None, None, v_means2d, None, v_conics, v_opacities[..., 0], v_colors
 
 
 @torch.no_grad()

@@ -64,11 +64,12 @@ def rasterize(
         means, quats, scales, opacities, colors, viewmats, Ks, width, height,
         sh_degree=sh_degree, rasterize_mode=rasterize_mode, max_off_axis=max_off_axis, fused=fused,
     )  # fmt: skip
-    exchange = Exchange(shards, projected, share_out(len(viewmats), height, shards.num_ranks), absgrad)
+    exchange = Exchange(shards, projected, share_out(len(viewmats), height, shards.num_ranks))
+    anchor, received = exchange.send(projected, absgrad)
     rendered, num_pairs, num_pixels = [], 0, 0
-    for band, received in zip(exchange.bands, exchange.received, strict=True):
+    for band, splats in zip(exchange.bands, received, strict=True):
         rows = band.bottom - band.top
-        renders, alphas, info = composite(received, width, rows, absgrad=absgrad, fused=fused)
+        renders, alphas, info = composite(splats, width, rows, absgrad=absgrad, fused=fused)
         rendered.append(RenderedBand(band, renders, alphas))
         num_pairs, num_pixels = num_pairs + len(info["flatten_ids"]), num_pixels + rows * width
     radii, means2d, depths, conics, opacities, _ = projected
@@ -84,4 +85,4 @@ def rasterize(
         "num_pairs": num_pairs,
         "num_pixels": num_pixels,
     }
-    return rendered, exchange.anchor, info
+    return rendered, anchor, info

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 import os
 import signal
 import time
@@ -18,7 +19,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from ranks import run_ranks
 
 from sadgs_ns.distributed.shards import Shards
-from sadgs_ns.errors import RunError
+from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 STRUCTURE_EVERY = 6
@@ -85,6 +86,27 @@ def test_the_first_steps_are_those_of_one_process(ranks: int, views: int, scene:
         # A sample that lies at a threshold may fall to either side of it.
         close = torch.isclose(together, value, rtol=1e-3, atol=1e-4 * float(value.abs().max()))
         assert close.float().mean() > 0.995, name
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("pipeline.model.use_bilateral_grid", True),
+        ("pipeline.model.camera_optimizer.mode", "SO3xR3"),
+        ("cuda_graphs", True),
+        ("start_paused", True),
+    ],
+)
+def test_what_needs_one_device_is_refused_by_name(
+    option: str, value: Any, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    config = few_steps(scene, tmp_path, 2)
+    *path, name = option.split(".")
+    setattr(functools.reduce(getattr, path, config), name, value)
+    config.check()
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(InputError, match=f"{option} works on one device only, and this run takes several: "):
+        config.check()
 
 
 def train_until(shards: Shards, config: SadgsTrainerConfig, stop: int | None) -> dict[str, Any]:
