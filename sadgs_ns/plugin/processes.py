@@ -138,3 +138,9 @@ def join(config: CheckedTrainerConfig, local_rank: int) -> tuple[Shards | None, 
     dist.broadcast_object_list(shared, 0)
     config.timestamp = shared[0]
     return Shards(torch.device("cuda", local_rank) if cuda else torch.device("cpu")), local_rank
+
+
+def leave() -> None:
+    """End what `join` began, where torchrun started the processes; nerfstudio does so for those that it starts."""
+    if "WORLD_SIZE" in os.environ and dist.is_initialized():
+        dist.destroy_process_group()

@@ -306,6 +306,7 @@ class SadgsTrainer(Trainer):
             remove_tables()
         if out_of_memory:
             raise RunError(self._rescue(out_of_memory))
+        processes.leave()
 
     def _rescue(self, out_of_memory: str) -> str:
         """Save the state before the present step if it is whole, and return what to tell the user.

@@ -7,19 +7,24 @@ import dataclasses
 import functools
 import os
 import signal
+import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 from kill_and_resume import configure, differences, set_up
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.scripts import train as train_script
 from nerfstudio.utils.rich_utils import CONSOLE
 from ranks import run_ranks
+from torch.multiprocessing.spawn import ProcessExitedException, ProcessRaisedException
 
 from sadgs_ns.distributed.shards import Shards
 from sadgs_ns.errors import InputError, RunError
+from sadgs_ns.plugin.presets import sadgs
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 STRUCTURE_EVERY = 6
@@ -209,17 +214,21 @@ def test_a_whole_run_reaches_the_quality_of_one_process(scene: Path, tmp_path: P
     assert psnr[0] > 15 and abs(psnr[1] - psnr[0]) < 0.5, psnr
 
 
-def train_and_die(shards: Shards, config: SadgsTrainerConfig, doomed: int) -> str:
-    """Train, and let one process be killed in a step; the error by which the others end."""
+def train_and_die(shards: Shards, config: SadgsTrainerConfig, doomed: int, killed: Path) -> tuple[str, float]:
+    """Train, and let one process be killed in a step; by which error the others end, and how many seconds later."""
     CONSOLE.quiet = True
     trainer = config.setup(local_rank=shards.rank, world_size=shards.num_ranks)
     trainer.setup()
-    if shards.rank == doomed:
-        location = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
-        trainer.callbacks.append(TrainingCallback(location, lambda step: step == 4 and os.kill(os.getpid(), 9)))
+
+    def die(step: int) -> None:
+        if step == 4 and shards.rank == doomed:
+            killed.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], die))
     with pytest.raises(RunError) as error:
         trainer.train()
-    return str(error.value)
+    return str(error.value), time.time() - killed.stat().st_mtime
 
 
 def test_a_killed_process_ends_the_others_with_a_sentence_that_names_it(scene: Path, tmp_path: Path):
@@ -232,3 +241,32 @@ def test_a_killed_process_ends_the_others_with_a_sentence_that_names_it(scene: P
             message.startswith("Process 1 of 3 ended (counted from 0)") and str(config.get_checkpoint_dir()) in message
         )
     assert saved(config.get_checkpoint_dir())[0] == 3
+
+
+@pytest.mark.parametrize(
+    ("error", "sentence"),
+    [
+        (
+            ProcessExitedException("process 1 terminated with signal SIGKILL", 1, 7, -9, "SIGKILL"),
+            "A process of the run ended, and the others with it (process 1 terminated with signal SIGKILL): what ",
+        ),
+        (
+            ProcessRaisedException("\n\n-- Process 1 terminated with the following error:\nTraceback …\n"
+                                   "sadgs_ns.errors.InputError: The folder is empty: fill it.\n", 1, 7),
+            "The folder is empty: fill it.",
+        ),
+    ],
+)  # fmt: skip
+def test_what_ended_a_process_of_nerfstudios_is_told_in_a_sentence(
+    error: Exception, sentence: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def fail() -> None:
+        raise error
+
+    context = SimpleNamespace(join=fail)
+    monkeypatch.setattr(train_script, "mp", SimpleNamespace(spawn=lambda *arguments, **options: context))
+    monkeypatch.setattr(train_script.profiler, "flush_profiler", lambda config: None)
+    with pytest.raises(type(error)) as raised:
+        train_script.launch(train_script.train_loop, 2, config=sadgs.config)
+    sys.excepthook(type(error), error, raised.value.__traceback__)
+    assert capsys.readouterr().err.startswith(f"error: {sentence}")
