@@ -176,7 +176,16 @@ class SadgsPipeline(VanillaPipeline):
 
         Args:
             shards: The processes, all of which have the same Gaussians until now.
+
+        Raises:
+            InputError: If the training images have several sizes.
         """
+        cameras = self.datamanager.train_dataset.cameras
+        if len(torch.cat([cameras.height, cameras.width], dim=-1).unique(dim=0)) > 1:
+            raise InputError(
+                "The training images have several sizes, which runs on one device alone can train on: take one device, "
+                "or scale the images to one size."
+            )
         self.shards = shards
         self.model.share_out(shards)
 
