@@ -16,6 +16,7 @@ from sadgs_ns.render import splatter
 from sadgs_ns.render.rasterization import visible
 
 compositing = pytest.importorskip("sadgs_ns.kernels.compositing", reason="Triton is not installed")
+forward = pytest.importorskip("sadgs_ns.kernels.compositing_forward", reason="Triton is not installed")
 rasterization = pytest.importorskip("sadgs_ns.render.fused", reason="Triton is not installed")
 tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not installed")
 
@@ -106,6 +107,7 @@ def reference(scene: dict[str, Any]) -> tuple[dict[str, Tensor], Tensor, Tensor]
     alphas = 1 - behind[:, -1]
     loss = (renders * scene["v_renders"].double().cpu().flatten(1, 2)).sum()
     (loss + (alphas * scene["v_alphas"].double().cpu().flatten(1)).sum()).backward()
+    scene["renders"] = renders.detach().reshape(num_views, height, width, 3)
     gradients: dict[str, Any] = dict(zip(NAMES, (means2d.grad, conics.grad, colors.grad, opacities.grad), strict=False))
     gradients["absgrad"] = delta.grad.abs().sum(dim=2)  # type: ignore[union-attr]
     last_ids = torch.where(weights > 0, place.gather(1, order), 0).amax(dim=1).reshape(num_views, height, width)
@@ -143,6 +145,50 @@ def test_gradients_equal_float64_autograd(kind):
         assert value.abs().max() > 0
         error = (gradients[name] - value).abs().max() / value.abs().max()
         assert error < (5e-4 if name == "absgrad" else TOLERANCES[kind]), (name, float(error))
+
+
+def drawn_by_the_kernel(scene: dict[str, Any]) -> tuple[Tensor, Tensor, Tensor]:
+    height, width = scene["v_renders"].shape[1:3]
+    splats = (scene[name] for name in NAMES[:4])
+    return forward.composite_forward(*splats, width, height, scene["starts"], scene["ids"])
+
+
+@pytest.mark.parametrize("kind", TOLERANCES)
+def test_what_is_drawn_equals_the_plain_formula_in_float64(kind):
+    scene = make_scene(kind, num_views=2 if kind == "usual" else 1)
+    _, alphas, last_ids = reference(scene)
+    renders, found, last = (value.cpu() for value in drawn_by_the_kernel(scene))
+    # Where alpha is within rounding of 1/255, it decides whether a Gaussian is drawn.
+    agrees = last == last_ids
+    assert agrees.float().mean() > 0.98
+    tolerance = 2e-5 if kind in ("long and thin", "huge") else 2e-6
+    torch.testing.assert_close(renders[agrees].double(), scene["renders"][agrees], atol=tolerance, rtol=0)
+    torch.testing.assert_close(found[agrees].double(), alphas[agrees], atol=tolerance, rtol=0)
+    torch.testing.assert_close(found.double(), alphas, atol=1 / 255 + tolerance, rtol=0)
+
+
+def test_a_colour_that_is_not_finite_makes_the_pixels_nan_that_see_it_and_no_others():
+    scene = make_scene("usual")
+    before = drawn_by_the_kernel(scene)
+    scene["colors"][0, 7, 1] = float("nan")
+    scene["colors"][0, 9, 2] = float("inf")
+    after = drawn_by_the_kernel(scene)
+    scene["colors"] = torch.zeros_like(scene["colors"])
+    scene["colors"][0, [7, 9]] = 1.0
+    sees = drawn_by_the_kernel(scene)[0][..., 0] > 0
+    assert 5 < sees.sum() < sees.numel() - 5
+    assert after[0][sees].isnan().all() and torch.equal(after[0][~sees], before[0][~sees])
+    assert torch.equal(after[1], before[1]) and torch.equal(after[2], before[2])
+
+
+def test_places_below_the_image_are_not_drawn_and_nothing_in_sight_is_black():
+    scene = make_scene("usual")
+    expected = drawn_by_the_kernel(scene)
+    scene["starts"], scene["ids"] = scene["pending"].lists(len(scene["ids"]) + 50)
+    for one, other in zip(expected, drawn_by_the_kernel(scene), strict=True):
+        assert torch.equal(one, other)
+    scene["starts"], scene["ids"] = torch.zeros_like(scene["starts"]), scene["ids"][:0]
+    assert all(not value.any() for value in drawn_by_the_kernel(scene))
 
 
 @pytest.mark.parametrize("sigma", [0.05, 0.1, 0.2, 0.55])
