@@ -14,16 +14,17 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from sadgs_ns.kernels.compositing import TILE_SIZE, _load_gaussians, _reciprocal, _row, _split4
+from sadgs_ns.kernels.compositing_blocks import TILE_SIZE, load_gaussians, reciprocal, row, split4
 
-_GAUSSIANS, _WARPS = 16, 1
-"""Gaussians of a batch, and warps of a program."""
+_GAUSSIANS, _WARPS = 8, 1
+"""Gaussians of a batch, and warps of a program. With 16 Gaussians the kernel takes 1.2 times as long, with 32 of them
+1.5 times (docs/measurements.md, "The parts of a step")."""
 
 
 @triton.jit
 def _load_with_flaws(means2d, conics, colors, opacities, g):
-    """Load what `_load_gaussians` loads, with 1 beside a colour that is not finite, else 0."""
-    centres, conic, rgb = _load_gaussians(means2d, conics, colors, opacities, g)
+    """Load what `load_gaussians` loads, with 1 beside a colour that is not finite, else 0."""
+    centres, conic, rgb = load_gaussians(means2d, conics, colors, opacities, g)
     k = tl.arange(0, 4)[None, :]
     value = tl.load(colors + 3 * g + tl.minimum(k, 2))
     flaw = tl.max(tl.where(tl.abs(value) < float("inf"), 0.0, 1.0), axis=1)[:, None]
@@ -42,17 +43,17 @@ def _composite_forward(
     SCALE = tl.constexpr(0.8493218002880191)  # √(log2(e) / 2), of offsets: exp(-σ) is then exp2 of a plain polynomial
     tile = tl.program_id(0)
     view = tile // (tile_height * tile_width)
-    row, column = tile // tile_width % tile_height, tile % tile_width
+    tile_row, column = tile // tile_width % tile_height, tile % tile_width
     pixel = tl.arange(0, PIXELS)
     x, y = pixel % TILE, pixel // TILE
-    inside = (row * TILE + y < height) & (column * TILE + x < width)
-    at = (view * height + row * TILE + y) * width + column * TILE + x
+    inside = (tile_row * TILE + y < height) & (column * TILE + x < width)
+    at = (view * height + tile_row * TILE + y) * width + column * TILE + x
     start = tl.load(starts + tile)
     end = num_pairs
     if tile + 1 < tl.num_programs(0):
         end = tl.load(starts + tile + 1)
     scaled_x, scaled_y = SCALE * (x.to(tl.float32) - (TILE - 1) / 2), SCALE * (y.to(tl.float32) - (TILE - 1) / 2)
-    centre_x, centre_y = column.to(tl.float32) * TILE + TILE / 2, row.to(tl.float32) * TILE + TILE / 2
+    centre_x, centre_y = column.to(tl.float32) * TILE + TILE / 2, tile_row.to(tl.float32) * TILE + TILE / 2
 
     # `passed` is what all Gaussians of the list so far let through. Where it falls to 1e-4 nothing more is drawn, not
     # even what made it fall, and `left` keeps what it was before.
@@ -68,9 +69,9 @@ def _composite_forward(
     done = start
     while (done < end) & (tl.max(passed) > OPAQUE):
         position = done + rows
-        mean_x, mean_y, opacity, _ = _split4(next_centre)
-        a, b, c, _ = _split4(next_conic)
-        r, g, b_, flaw = _split4(next_rgb)
+        mean_x, mean_y, opacity, _ = split4(next_centre)
+        a, b, c, _ = split4(next_conic)
+        r, g, b_, flaw = split4(next_rgb)
         # The next batch is loaded while this one is computed.
         done += GAUSSIANS
         next_g = tl.load(ids + tl.minimum(done + rows, num_pairs - 1))
@@ -91,14 +92,14 @@ def _composite_forward(
         through = 1 - alpha
         behind = tl.cumprod(tl.where(first_row, through * passed[None, :], through), 0)
         drawn = behind > OPAQUE
-        weight = tl.where(drawn, alpha * behind * _reciprocal(through), 0.0)
+        weight = tl.where(drawn, alpha * behind * reciprocal(through), 0.0)
         red += tl.sum(weight * r[:, None], axis=0)
         green += tl.sum(weight * g[:, None], axis=0)
         blue += tl.sum(weight * b_[:, None], axis=0)
         flaws += tl.sum(weight * flaw[:, None], axis=0)
         left = tl.minimum(left, tl.min(tl.where(drawn, behind, 1.0), axis=0))
         last = tl.maximum(last, tl.max(tl.where(weight > 0, position[:, None], 0), axis=0))
-        passed = _row(behind, GAUSSIANS - 1)
+        passed = row(behind, GAUSSIANS - 1)
     nan = tl.where(flaws > 0, float("nan"), 0.0)
     tl.store(renders + 3 * at, red + nan, inside)
     tl.store(renders + 3 * at + 1, green + nan, inside)
