@@ -26,12 +26,20 @@ def test_the_table_has_a_time_for_every_part(
     assert parts.main([str(run)]) == 1
     assert capsys.readouterr().err == "The parts are our Triton kernels, which need a CUDA device.\n"
     use_our_rasterizer(monkeypatch)
-    monkeypatch.setattr(parts, "REPEATS", 1)
+    monkeypatch.setattr(parts, "milliseconds", lambda function, device: 1.5 if function() is not None else 0.0)
     monkeypatch.setattr(parts.kernels, "available", lambda device: True)
     assert parts.main([str(run), "--views", "2"]) == 0
     head, _, _, _, *rows = capsys.readouterr().out.splitlines()
     assert head.startswith(f"{trainer.pipeline.model.num_points:,} Gaussians, 2 views of 48×36, 0.0")
     assert [line.split("|")[1].strip() for line in rows][-2:] == ["loss", "loss, with gradient"]
-    assert len(rows) == 10 and all(float(line.split("|")[2]) > 0 for line in rows)
+    assert len(rows) == 10 and all(float(line.split("|")[2]) == 1.5 for line in rows)
     assert parts.main([str(tmp_path)]) == 2
     assert "holds no checkpoint" in capsys.readouterr().err
+
+
+def test_a_time_is_the_median_of_rounds_after_the_first(monkeypatch: pytest.MonkeyPatch):
+    clock = iter([0.0, 9.0, 10.0, 10.2, 20.0, 20.4, 30.0, 30.6])
+    monkeypatch.setattr(parts.time, "perf_counter", lambda: next(clock))
+    calls: list[int] = []
+    assert parts.milliseconds(lambda: calls.append(1), torch.device("cpu")) == pytest.approx(400 / parts.REPEATS)
+    assert len(calls) == 4 * parts.REPEATS
