@@ -71,7 +71,6 @@ def check(config: CheckedTrainerConfig) -> None:
     for name, given, remedy in (
         ("pipeline.model.use_bilateral_grid", model.use_bilateral_grid, "leave it off"),
         ("pipeline.model.camera_optimizer.mode", model.camera_optimizer.mode != "off", "set it to off"),
-        ("cuda_graphs", config.cuda_graphs, "leave them off"),
         ("start_paused", config.start_paused, "leave it off, since the viewer is off, too"),
         ("pipeline.model.fused", not model.fused and machine.device_type == "cuda", "leave it on"),
     ):

@@ -98,7 +98,6 @@ def test_the_first_steps_are_those_of_one_process(ranks: int, views: int, scene:
     [
         ("pipeline.model.use_bilateral_grid", True),
         ("pipeline.model.camera_optimizer.mode", "SO3xR3"),
-        ("cuda_graphs", True),
         ("start_paused", True),
     ],
 )
