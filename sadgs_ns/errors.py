@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import sys
 import traceback as tracebacks
@@ -36,6 +37,14 @@ _NERFSTUDIOS: tuple[tuple[str, str, type[Exception], str, str], ...] = (
     (
         "nerfstudio.scripts.eval", "main", AssertionError, "",
         "--output-path must end with .json: give the file of results another name.",
+    ),
+    *(
+        (
+            "nerfstudio.scripts.train", "launch", Exception, part,
+            "A process of the run ended, and the others with it ({reason}): what the last checkpoint holds goes on "
+            "with --load-dir and the run's folder.",
+        )
+        for part in ("terminated with signal", "terminated with exit code")
     ),
     (
         "nerfstudio.utils.writer", "__init__", Exception, "",
@@ -107,6 +116,9 @@ def _of_nerfstudio(error: BaseException) -> str | None:
     """Return what to tell the user of an error of nerfstudio's own; None if a traceback tells more."""
     frames = [frame for frame, _ in tracebacks.walk_tb(error.__traceback__)]
     places = [(str(frame.f_globals.get("__name__")), frame.f_code.co_name) for frame in frames]
+    raised = re.findall(r"^sadgs_ns\.errors\.\w+: (.*)", str(error), re.MULTILINE)
+    if raised and type(error).__name__ == "ProcessRaisedException":  # One of several processes told it to the first.
+        return raised[-1]
     last = next((place for place in reversed(places) if place[0].startswith("nerfstudio.")), None)
     for module, function, kind, part, sentence in _NERFSTUDIOS:
         if (module, function) == last and isinstance(error, kind) and part in str(error):

@@ -49,6 +49,7 @@ COMMANDS = {
     "growth": ("growth", "a training step of more and more Gaussians, and of larger images, beside gsplat's (CUDA)"),
     "validation": ("validation", "copies of scenes whose validation views are held out, for choosing constants"),
     "memory": ("memory", "the memory plan beside the real peaks of training steps (CUDA)"),
+    "shards": ("shards", "a training step of Gaussians that are spread over several devices, with torchrun"),
     "formats": ("formats", "what the files that sadgs-export writes take and lose, on a run's held-out views"),
     "rasterizers": ("rasterizers", "how far the CPU splatter and our tile lists are from gsplat (CUDA)"),
 }

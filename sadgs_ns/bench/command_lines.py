@@ -96,6 +96,21 @@ def memory() -> argparse.ArgumentParser:
     return parser
 
 
+def shards() -> argparse.ArgumentParser:
+    """Return the options of `sadgs-bench shards`."""
+    parser = argparse.ArgumentParser(
+        prog="sadgs-bench shards",
+        description="Time training steps of made-up Gaussians that are spread over the devices of the processes that "
+        "torchrun starts; without torchrun, on one device.",
+    )
+    parser.add_argument("--gaussians", type=int, nargs="+", default=[8_000_000], help="of all devices together")
+    parser.add_argument("--megapixels", type=float, nargs="+", default=[2.0, 8.0])
+    parser.add_argument("--views", type=int, nargs="+", default=[2], help="of a step")
+    parser.add_argument("--repeats", type=int, default=10, help="steps in each of three rounds (default %(default)s)")
+    parser.add_argument("--profile", action="store_true", help="also print what takes the first device its time")
+    return parser
+
+
 def parts() -> argparse.ArgumentParser:
     """Return the options of `sadgs-bench parts`."""
     parser = argparse.ArgumentParser(

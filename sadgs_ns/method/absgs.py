@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, MutableMapping
+from collections.abc import Callable, Mapping, MutableMapping
 from typing import Any
 
 import torch
@@ -83,6 +83,7 @@ def grow(
     size_threshold: float,
     budget: float,
     long_axis: bool = False,
+    limit: Callable[[Tensor, Tensor, float], Tensor] = limit_growth,
 ) -> tuple[int, int]:
     """Clone small Gaussians by their mean gradient, split large ones in two by their absolute gradient.
 
@@ -96,6 +97,7 @@ def grow(
         budget: Gaussians that may be added in all, the steepest gradients first.
         long_axis: Halve the longest axis of a large one as `grid_split` does, and take a fifth off the others, instead
             of drawing the places of two that are 1.6 times as small on all axes, as 3DGS does.
+        limit: What chooses those that may grow, as `limit_growth` does.
 
     Returns:
         Numbers of clones and of splits.
@@ -106,7 +108,7 @@ def grow(
     split_ratio = state["absgrad2d"] / count / split_threshold
     steepness = torch.where(is_small, clone_ratio, split_ratio)  # ≥ 1 grows
     grows = (steepness >= 1) & steepness.isfinite()  # a sum that overflowed says nothing
-    chosen = limit_growth(grows.long(), steepness, budget)
+    chosen = limit(grows.long(), steepness, budget)
     is_clone, is_split = chosen & is_small, chosen & ~is_small
     n_clone, n_split = int(is_clone.sum()), int(is_split.sum())
     if n_clone > 0:

@@ -71,3 +71,53 @@ def photometric_loss(
     )
     loss = (1 - ssim_lambda) * l1 + ssim_lambda * (1 - similarity) + l2_lambda * l2
     return loss if parts is None else loss + parts.sum(), -10 * l2.detach().log10()
+
+
+def photometric_part(
+    predicted: Tensor,  # [1, H', W, 3]
+    target: Tensor,  # [1, H', W, 3]
+    *,
+    rows: tuple[int, int],
+    top: int,
+    height: int,
+    ssim_lambda: float = 0.2,
+    l2_lambda: float = 2.0,
+    fused: bool = True,
+) -> tuple[Tensor, Tensor]:
+    """What some rows of a view add to its `photometric_loss`: over rows that cover the view, these parts sum to it.
+
+    SSIM's windows belong to the rows in which they are centred.
+
+    Args:
+        predicted: Rendered rows, from `top` on. Unless the image's border is there, 5 more than `rows` on either side.
+        target: The same rows of the training view.
+        rows: First row that counts and one past the last.
+        top: Which row of the view is the first of `predicted`.
+        height: Of the view in px, at least 11 unless all rows count.
+        ssim_lambda, l2_lambda, fused: As for `photometric_loss`.
+
+    Returns:
+        The part of the loss, and that of the mean square error, without gradient; both are scalars.
+
+    Raises:
+        As `photometric_loss`.
+    """
+    first, last = rows
+    if last - first == height:
+        loss, psnr = photometric_loss(
+            predicted, target, ssim_lambda=ssim_lambda, l2_lambda=l2_lambda, fused=fused
+        )  # fmt: skip
+        return loss, torch.pow(10, -psnr / 10)
+    share, reach = (last - first) / height, len(WINDOW) // 2
+    begin, end = max(first - reach, 0), min(last + reach, height)
+    windows = (end - begin - 2 * reach) / (height - 2 * reach)
+    inside = slice(begin - top, end - top)
+    dissimilarity, _ = photometric_loss(
+        predicted[:, inside], target[:, inside], ssim_lambda=1.0, l2_lambda=0.0, fused=fused
+    )
+    counted = slice(first - top, last - top)
+    values = target[:, counted]
+    difference = predicted[:, counted] - (values / 255.0 if values.dtype == torch.uint8 else values)
+    l1, l2 = difference.abs().mean(), difference.square().mean()
+    loss = share * ((1 - ssim_lambda) * l1 + l2_lambda * l2) + windows * ssim_lambda * dissimilarity
+    return loss, share * l2.detach()

@@ -38,6 +38,9 @@ after 8 the sort, sorted depths 4, the sort's buffers 12."""
 PROJECTION_GRADIENT_BYTES = 84
 """Bytes of a Gaussian and view besides, in the backward pass: a row of 12 gradients 48, and those that the projection
 wants contiguous or that are kept for AbsGS: means2d 8 + 8, conics 12, depths 4, opacities 4."""
+EXCHANGE_BYTES = 200
+"""Bytes of a Gaussian and view besides, in every phase, where several processes composite: its place 8, rows of 12
+numbers that are gathered, sent, received and taken apart 48 each. Every Gaussian counts as seen in each view."""
 PAIR_SORT_BYTES = 40
 """Bytes of a pair of a Gaussian and a tile while pairs are sorted by tile, with tiles of 32 bits: tiles 4, Gaussians 4,
 sorted tiles 4, indices before 8 and after 8 the sort, the sort's buffers 12. With tiles of 16 bits they are 34."""
@@ -67,14 +70,20 @@ class StepSize:
     pairs: float = 0
     """Number of pairs of a Gaussian and a tile that it reaches, in all views, with the places of tile lists that a step
     left unused because their length was foreseen (render/tile_forecast.py)."""
+    exchanged: bool = False
+    """Whether several processes share the step out; pixels and pairs are then those of one of them."""
 
     @classmethod
     def of(cls, infos: Sequence[Mapping[str, Any]]) -> StepSize:
-        """The size of a step that was rendered, from gsplat's `info` of each of its groups of views."""
+        """The size of a step that was rendered, from the `info` of each of its groups of views.
+
+        That is gsplat's, or that of `distributed.rasterization`, which says what this process composited.
+        """
         return cls(
             sum(info["n_cameras"] for info in infos),
-            sum(info["n_cameras"] * info["width"] * info["height"] for info in infos),
-            sum(len(info["flatten_ids"]) for info in infos),
+            sum(info.get("num_pixels", info["n_cameras"] * info["width"] * info["height"]) for info in infos),
+            sum(info["num_pairs"] if "num_pairs" in info else len(info["flatten_ids"]) for info in infos),
+            any("num_pairs" in info for info in infos),
         )
 
 
@@ -199,7 +208,7 @@ def affordable_growth(
 
 def _phases(size: StepSize, fused: bool) -> dict[str, tuple[float, float, float]]:
     """Bytes per Gaussian, bytes besides and bytes per pair, in each phase."""
-    projected = ACTIVATION_BYTES + PROJECTION_BYTES * size.views
+    projected = ACTIVATION_BYTES + (PROJECTION_BYTES + EXCHANGE_BYTES * size.exchanged) * size.views
     loss = LOSS_PIXEL_BYTES if fused else TORCH_LOSS_PIXEL_BYTES
     gradients = ACTIVATION_GRADIENT_BYTES + PROJECTION_GRADIENT_BYTES * size.views
     return {

@@ -50,6 +50,7 @@ def observe(
     info: Mapping[str, Any],
     *,
     generator: torch.Generator | None = None,
+    jitter: Tensor | None = None,  # [C, N, 2]
     fused: bool = True,
 ) -> None:
     """Add one forward pass: one jittered sample per visible Gaussian and view, counted in place.
@@ -63,10 +64,12 @@ def observe(
         info: gsplat's meta, unpacked, of C views of one size, plus `structure_tensors` (S̄, or its codes of
             `codes.encode`) [C, H, W, 3], `viewmats` [C, 4, 4] and `Ks` [C, 3, 3].
         generator: Source of the jitter.
+        jitter: In [0, 1), where it is not to be drawn here. [C, N, 2]
         fused: Use the Triton kernel where it runs: CUDA, float32.
     """
     means2d = info["means2d"]
-    jitter = torch.rand(means2d.shape, generator=generator, device=means2d.device)  # [C, N, 2]
+    if jitter is None:
+        jitter = torch.rand(means2d.shape, generator=generator, device=means2d.device)  # [C, N, 2]
     if fused and kernels.available(means2d.device) and params["means"].dtype == torch.float32:
         from sadgs_ns.kernels.statistics import observe_views
 

@@ -13,6 +13,8 @@ from gsplat.strategy.base import Strategy
 from gsplat.strategy.ops import remove
 from torch import Tensor
 
+from sadgs_ns.distributed import ranking
+from sadgs_ns.distributed.shards import Shards
 from sadgs_ns.gsplat_internals import update_param_with_optimizer
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow, keep_gradient
 from sadgs_ns.method.memory import StepSize, affordable_growth, free_bytes
@@ -98,6 +100,9 @@ class StructureAwareStrategy(Strategy):
     """Measure η, and add up AbsGS's gradients, in one Triton kernel each where these run (CUDA)."""
     run_length: int = field(default=3000, init=False)
     """Iterations of the run, which `fit_to_run` sets: windows that are None follow it."""
+    shards: Shards | None = field(default=None, init=False, repr=False)
+    """The processes among which the Gaussians are shared out; None where one process has all.
+    The cap and the ranking of what may grow are then those of all, and densification ends with equal shards."""
 
     @property
     def windows(self) -> Windows:
@@ -205,7 +210,8 @@ class StructureAwareStrategy(Strategy):
             if self.needs_absgrad(step):
                 keep_gradient(view["means2d"])
             if self.observes(step):
-                observe(state, params, view, fused=self.fused)
+                jitter = None if self.shards is None else self.shards.rand(view["n_cameras"])
+                observe(state, params, view, jitter=jitter, fused=self.fused)
 
     def step_post_backward(
         self,
@@ -246,6 +252,8 @@ class StructureAwareStrategy(Strategy):
                 iteration <= windows.refine_stop_iter - windows.reset_every // 4
             ):
                 self._map_opacities(params, optimizers, lambda opacities: opacities * RESET_FACTOR)
+            if self.shards is not None and self.densifies(step):
+                self._even_out(params, optimizers, state)
 
     def consistently_low(self, statistics: Mapping[str, Tensor]) -> Tensor:
         """Gaussians that answered low on all three axes in more than τ_prune of their observations. bool [N]"""
@@ -268,7 +276,7 @@ class StructureAwareStrategy(Strategy):
         violates &= (self._opacities(params) >= self.split_min_opacity)[:, None]
         counts = children_per_axis(statistics["eta_max"], violates)  # [N, 3]
         worst = torch.where(violates, statistics["eta_max"], 0.0).amax(dim=1)  # [N]
-        return counts, limit_growth(num_children(counts) - 1, worst, budget)
+        return counts, self._limit_growth(num_children(counts) - 1, worst, budget)
 
     def children_now(self, params: Params, statistics: Mapping[str, Tensor]) -> Tensor:
         """n per axis that a structure step would split by now, 1 where whole or over the cap. int64 [N, 3]"""
@@ -288,22 +296,16 @@ class StructureAwareStrategy(Strategy):
         under_cap, in_memory = self._room(params, state, views)
         counts, allowed = self.split_plan(params, state, min(under_cap, in_memory))
         n_parents, n_wanted = int(allowed.sum()), int((counts > 1).any(dim=1).sum())
-        if in_memory < min(int((num_children(counts) - 1).sum()), under_cap):
+        if in_memory < min(self._of_all(int((num_children(counts) - 1).sum()))[0], under_cap):
             _warn_of_memory(iteration, in_memory)
         if n_parents > 0:
             grid_split(params, optimizers, state, torch.where(allowed[:, None], counts, 1), self.child_scale)
         # What was learned about parents says nothing about their children.
         self._clear_statistics(params, state)
+        names = ("before", "violating", "low", "split", "pruned", "after")
+        numbers = self._of_all(n_before, n_wanted, n_low, n_parents, n_pruned, len(params["means"]))
         state.setdefault("structure_steps", []).append(
-            {
-                "iteration": iteration,
-                "before": n_before,
-                "violating": n_wanted,
-                "low": n_low,
-                "split": n_parents,
-                "pruned": n_pruned,
-                "after": len(params["means"]),
-            }
+            {"iteration": iteration, **dict(zip(names, numbers, strict=True))}
         )
 
     def _absgs_step(self, params: Any, optimizers: Any, state: Any, iteration: int, views: Sequence[Info] = ()) -> None:
@@ -317,27 +319,59 @@ class StructureAwareStrategy(Strategy):
             size_threshold=SMALL_SCALE * state["scene_scale"],
             budget=min(under_cap, in_memory),
             long_axis=self.absgs_long_axis,
+            limit=self._limit_growth,
         )
-        if in_memory <= n_clone + n_split < under_cap:
+        if in_memory <= self._of_all(n_clone + n_split)[0] < under_cap:
             _warn_of_memory(iteration, in_memory)
         self._prune(params, optimizers, state, self._opacities(params) < self.min_opacity)
         state.update(empty_gradients(len(params["means"]), params["means"].device))
 
     def _room(self, params: Params, state: Mapping[str, Any], views: Sequence[Info]) -> tuple[int, float]:
-        """How many Gaussians may be added under the cap, and how many fit in the device's memory beside such views."""
+        """How many Gaussians may be added under the cap, and how many fit in the devices' memory beside such views."""
         free = free_bytes(params["means"].device)
         in_memory = affordable_growth(params, state, free, StepSize.of(views), self.fused)
-        return self.max_gaussians - len(params["means"]), in_memory
+        if self.shards is not None:  # The device with the least room bounds all, since shards are evened out.
+            in_memory = self.shards.num_ranks * self.shards.least(in_memory)
+        return self.max_gaussians - self._of_all(len(params["means"]))[0], in_memory
+
+    def _of_all(self, *numbers: int) -> list[int]:
+        """Sums of numbers of Gaussians over the processes, where there are several."""
+        if self.shards is None:
+            return list(numbers)
+        return self.shards.sum(torch.tensor(numbers, device=self.shards.device)).tolist()
+
+    def _limit_growth(self, growth: Tensor, priority: Tensor, budget: float) -> Tensor:
+        """`split.limit_growth` of the Gaussians of all processes."""
+        if self.shards is None:
+            return limit_growth(growth, priority, budget)
+        return ranking.limit_growth(self.shards, growth, priority, budget)
+
+    def _even_out(self, params: Any, optimizers: Any, state: Any) -> None:
+        """Count the Gaussians of the processes, and give each equally many where they differ by more than a tenth."""
+        shards = self.shards
+        assert shards is not None
+        shards.count(len(params["means"]))
+        if not shards.is_uneven():
+            return
+
+        def param_fn(name: str, p: Tensor) -> Tensor:
+            return torch.nn.Parameter(shards.even_out(p.detach()), requires_grad=p.requires_grad)
+
+        update_param_with_optimizer(param_fn, lambda key, v: shards.even_out(v), params, optimizers)
+        for key, value in state.items():
+            if isinstance(value, Tensor):
+                state[key] = shards.even_out(value)
+        shards.count(len(params["means"]))
 
     @staticmethod
     def _opacities(params: Params) -> Tensor:
         return torch.sigmoid(params["opacities"].detach().flatten())  # [N]
 
-    @staticmethod
-    def _prune(params: Any, optimizers: Any, state: Any, mask: Tensor) -> int:
-        """Remove Gaussians, unless none would be left to train."""
+    def _prune(self, params: Any, optimizers: Any, state: Any, mask: Tensor) -> int:
+        """Remove Gaussians, unless none would be left to train; a process may lose all that it has."""
         n_prune = int(mask.sum())
-        if n_prune == len(mask):
+        of_all, total = self._of_all(n_prune, len(mask))
+        if of_all == total:
             return 0
         if n_prune > 0:
             remove(params, optimizers, state, mask)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
 
 from sadgs_ns.errors import InputError, reason
 
@@ -98,6 +100,44 @@ def checkpoint_paths(load_dir: Path | None, load_step: int | None, load_checkpoi
         there = ", ".join(map(str, sorted(steps)))
         raise InputError(f"{load_dir} holds no checkpoint of step {load_step}: give --load-step one of {there}.")
     return [steps[load_step]]
+
+
+def of_gaussians(state: dict[str, Any], change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
+    """Change the tensors of a checkpoint that have a row for each Gaussian, and nothing else.
+
+    These are the parameters, Adam's moments, the statistics and the mean of the parameters.
+
+    Args:
+        state: What the trainer saves, which stays as it is.
+        change: Is called with each of these tensors [N, …], always in the same order.
+
+    Returns:
+        A state that shares what was not changed.
+    """
+    pipeline, optimizers = dict(state["pipeline"]), dict(state["optimizers"])
+    names = sorted(name for name in pipeline if ".gauss_params." in name)
+    for name in names:
+        pipeline[name] = change(pipeline[name])
+    for name in sorted(key for name in names if (key := name.rpartition(".")[2]) in optimizers):
+        moments = {
+            index: {key: _changed(value, change) for key, value in sorted(values.items())}
+            for index, values in sorted(optimizers[name]["state"].items())
+        }
+        optimizers[name] = {**optimizers[name], "state": moments}
+    extra = dict(pipeline.get("_model._extra_state", {}))
+    for part in ("strategy_state", "average"):
+        if part in extra:
+            extra[part] = {key: _changed(value, change) for key, value in sorted(extra[part].items())}
+    if "average" in extra:
+        means = extra["average"]["means"]
+        extra["average"]["means"] = {name: change(mean) for name, mean in sorted(means.items())}
+    pipeline["_model._extra_state"] = extra
+    return {**state, "pipeline": pipeline, "optimizers": optimizers}
+
+
+def _changed(value: Any, change: Callable[[Tensor], Tensor]) -> Any:
+    """Change a tensor that has rows; Adam's number of steps is one without."""
+    return change(value) if isinstance(value, Tensor) and value.dim() > 0 else value
 
 
 def check_chosen(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> None:

@@ -140,7 +140,12 @@ def compile_kernels(
 
     failures: dict[str, BaseException] = {}
     pending: dict[str, Future[None]] = {}
-    with ThreadPoolExecutor() as pool:  # which waits for its threads, whatever happens
+
+    def take_device() -> None:
+        if device.type == "cuda":  # A new thread has the first device, and Triton launches on a thread's own.
+            torch.cuda.set_device(device)
+
+    with ThreadPoolExecutor(initializer=take_device) as pool:  # which waits for its threads, whatever happens
         pending |= {
             "the loss": pool.submit(loss, torch.uint8),
             "S̄": pool.submit(structure),

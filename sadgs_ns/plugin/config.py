@@ -20,28 +20,27 @@ from tyro.conf import Suppress
 from sadgs_ns.atomic import atomic_path
 from sadgs_ns.data.validation.parsers import check_ahead
 from sadgs_ns.errors import InputError, reason
-from sadgs_ns.plugin import checkpoints
+from sadgs_ns.plugin import checkpoints, processes
 from sadgs_ns.plugin.optimizers import RunLengthDecaySchedulerConfig
 from sadgs_ns.plugin.pipeline import SadgsPipelineConfig
 from sadgs_ns.plugin.progress import ProgressTable
 
-ONE_DEVICE = "sadgs trains on one device; set machine.num_devices and machine.num_machines to 1."
-
 
 @dataclass
 class SadgsMachineConfig(MachineConfig):
-    """nerfstudio's options of the machine; those of several machines are not shown."""
+    """nerfstudio's options of the machine; those of several machines are not shown, since torchrun starts these."""
 
     seed: int = 42
     """Seed of everything that is drawn at random."""
     num_devices: int = 1
-    """Number of devices to train on; this method trains on one."""
+    """Number of CUDA devices of this machine to train on, among which the Gaussians are shared out.
+    torchrun can start the processes instead, on several machines, too; this is then 1."""
     device_type: Literal["cpu", "cuda", "mps"] = field(
         default_factory=lambda: "cuda" if torch.cuda.is_available() else "cpu"
     )
     """Kind of device to train on; CUDA where there is one."""
     num_machines: Suppress[int] = 1
-    """Number of machines; this method trains on one."""
+    """Number of machines; torchrun starts runs on several."""
     machine_rank: Suppress[int] = 0
     """Rank of this machine among several."""
     dist_url: Suppress[str] = "auto"
@@ -191,7 +190,7 @@ class CheckedTrainerConfig(TrainerConfig):
 
         Raises:
             InputError: If a number is out of its range, gradients would be scaled or accumulated, or the device is not
-                there; as `SadgsPipelineConfig.check`.
+                there; as `processes.check` and `SadgsPipelineConfig.check`.
         """
         for name, count in (
             ("max_num_iterations", self.max_num_iterations),
@@ -211,8 +210,6 @@ class CheckedTrainerConfig(TrainerConfig):
         port = self.viewer.websocket_port
         if port is not None and not 1 <= port <= 65535:
             raise InputError(f"viewer.websocket_port must be in [1, 65535], got {port}.")
-        if self.machine.num_devices * self.machine.num_machines != 1:
-            raise InputError(ONE_DEVICE)
         device = self.machine.device_type
         available = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
         if not available[device]:
@@ -234,6 +231,7 @@ class CheckedTrainerConfig(TrainerConfig):
                 "sadgs updates every parameter in every iteration, and densification would lose gradients that were "
                 "kept for later: leave gradient_accumulation_steps out, and set pipeline.views_per_iteration instead."
             )
+        processes.check(self)
         self.pipeline.check()
 
     def _check_rates(self) -> None:
@@ -313,6 +311,8 @@ class CheckedTrainerConfig(TrainerConfig):
         self.check()
         checkpoints.check_chosen(self.load_dir, self.load_step, self.load_checkpoint)
         self._check_folder()
+        if not processes.is_first():
+            return  # torchrun's other processes leave the files to the first.
         if self.is_viewer_enabled() or self.is_viewer_legacy_enabled():
             self._check_address()
         check_ahead(self.pipeline.datamanager)

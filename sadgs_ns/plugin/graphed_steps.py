@@ -214,6 +214,9 @@ class GraphedSteps:
         model = pipeline.model
         if not config.cuda_graphs or config.log_gradients or not model.config.fused:
             return None
+        # Several processes send each other Gaussians in a step, whose numbers the host must know.
+        if pipeline.shards is not None:
+            return None
         # Without a forecast the host waits in each step, and what a camera optimizer does is not in the graphs.
         if not kernels.available(model.device) or model.tile_forecast is None:
             return None

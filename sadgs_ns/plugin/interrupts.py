@@ -37,12 +37,20 @@ class Interrupts:
     Args:
         waiting: Returns whether the program only waits for somebody, so that nobody polls. The signal then raises at
             once.
+        started: Whether another process started this one. It sends SIGTERM where it is interrupted itself, as from the
+            keyboard, so that SIGTERM after another signal is left alone.
     """
 
-    def __init__(self, waiting: Callable[[], bool]) -> None:
+    def __init__(self, waiting: Callable[[], bool], started: bool = False) -> None:
         self._waiting = waiting
+        self._repeated = {HANG_UP, signal.SIGTERM} if started else {HANG_UP}
         self._previous: dict[int, Any] = {}
         self._received: int | None = None
+
+    @property
+    def received(self) -> int | None:
+        """The first signal that has come, None where none has."""
+        return self._received
 
     def __enter__(self) -> Interrupts:
         self._received = None
@@ -80,7 +88,7 @@ class Interrupts:
         if self._received is not None:
             return  # Where a connection drops, the shell sends one SIGHUP and the kernel another.
         self._received = number
-        for another in self._previous.keys() - {HANG_UP}:
+        for another in self._previous.keys() - self._repeated:
             signal.signal(another, self._previous[another])
         if number == HANG_UP:
             _drop_lost_output()

@@ -16,6 +16,7 @@ from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.split import Params
 from sadgs_ns.method.statistics import empty_statistics
 from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.plugin.processes import processes_on_this_machine
 from sadgs_ns.plugin.structure_maps import PIXELS_PER_BATCH
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
@@ -59,14 +60,17 @@ class TrainingSize:
     with the initial Gaussians."""
 
 
-def training_size(datamanager: FullImageDatamanager, params: Params, views: int, fused: bool) -> TrainingSize:
+def training_size(
+    datamanager: FullImageDatamanager, params: Params, views: int, fused: bool, processes: int = 1
+) -> TrainingSize:
     """Measure a run before its first step; no image is opened for it.
 
     Args:
         datamanager: Holds the cameras of the training and of the held-out images.
-        params: The initial Gaussians.
+        params: The initial Gaussians of this process.
         views: Views rendered in a step.
         fused: Whether the loss is computed by our kernels.
+        processes: Number of processes among which the step is shared out.
     """
     cameras = datamanager.train_dataset.cameras
     largest = int((cameras.height * cameras.width).max())
@@ -76,9 +80,9 @@ def training_size(datamanager: FullImageDatamanager, params: Params, views: int,
     else:  # The images of the next step are there, too.
         kept = float((3 * _value_bytes(datamanager) + CODE_BYTES) * views * largest)
         structure = float(STRUCTURE_PIXEL_BYTES * max(largest, min(PIXELS_PER_BATCH, views * largest)))
-    return TrainingSize(
-        kept, StepSize(views, views * largest, views * estimate_pairs(params, cameras)), fused, structure
-    )
+    # A process composites its share of the pixels, and as many pairs as its share of the Gaussians has in all views.
+    pixels, pairs = -(-views * largest // processes), views * estimate_pairs(params, cameras)
+    return TrainingSize(kept, StepSize(views, pixels, pairs, processes > 1), fused, structure)
 
 
 def image_bytes(datamanager: FullImageDatamanager) -> float:
@@ -104,7 +108,8 @@ def place_images(datamanager: FullImageDatamanager, device: torch.device) -> str
     Returns:
         A line for the user; None where they are kept on the device.
     """
-    config, size, host = datamanager.config, image_bytes(datamanager), memory.available_host_bytes()
+    config, size = datamanager.config, image_bytes(datamanager)
+    host = memory.available_host_bytes() / processes_on_this_machine()
     many = len(datamanager.train_dataset) > MANY_IMAGES
     free, share, name = host, HOST_SHARE, "the host"
     if device.type == "cuda":
@@ -168,7 +173,11 @@ def _count_pairs(
 
 
 def fit_to_memory(
-    strategy: StructureAwareStrategy, params: Params, size: TrainingSize, budget_gb: float | None = None
+    strategy: StructureAwareStrategy,
+    params: Params,
+    size: TrainingSize,
+    budget_gb: float | None = None,
+    processes: int = 1,
 ) -> tuple[str | None, str | None]:
     """Lower `max_gaussians` to what the budget, or the device's free memory, holds; call before the first step.
 
@@ -177,9 +186,10 @@ def fit_to_memory(
 
     Args:
         strategy: Its `max_gaussians` is lowered.
-        params: The initial Gaussians, on the device of training.
+        params: The initial Gaussians of this process, on the device of training.
         size: What the run keeps and renders besides.
-        budget_gb: Memory that the run may take, in 10⁹ bytes; None is `PLANNED_SHARE` of what is free.
+        budget_gb: Memory that the run may take on each device, in 10⁹ bytes; None is `PLANNED_SHARE` of what is free.
+        processes: Number of processes, each of which holds an equal part of the Gaussians on a device of its own.
 
     Returns:
         A line for the user, and a warning if the first step will probably not fit; both None without CUDA, where
@@ -205,7 +215,7 @@ def fit_to_memory(
         none = {name: value[:0] for name, value in params.items()}
         left = budget - size.image_bytes
         affordable = memory.affordable_growth(none, state, left, replace(size.step, pairs=0), size.fused)  # type: ignore[arg-type]
-        affordable = min(affordable, (left - size.structure_bytes) / each)
+        affordable = processes * min(affordable, (left - size.structure_bytes) / each)
         if budget_gb is not None and affordable < 1:
             fixed = need(0, replace(size.step, pairs=0))
             raise ValueError(
@@ -216,12 +226,13 @@ def fit_to_memory(
         if affordable < strategy.max_gaussians:
             strategy.max_gaussians = max(int(affordable), 1)
             why = f"; {free / 1e9:.1f} GB are free" if budget_gb is None else f"; memory_budget_gb is {budget_gb:g}"
-            if strategy.max_gaussians < n:
-                why += f", which holds no more than the {n:,} at the start: none will be added"
-    most = max(strategy.max_gaussians, n)
+            if strategy.max_gaussians < n * processes:
+                why += f", which holds no more than the {n * processes:,} at the start: none will be added"
+    most = max(-(-strategy.max_gaussians // processes), n)
     at_most = need(most, replace(size.step, pairs=memory.PAIRS_PER_GAUSSIAN * size.step.views * most))
     line = (
-        f"At most {strategy.max_gaussians:,} Gaussians: {at_most / 1e9:.1f} GB of the card's {total / 1e9:.1f} GB{why}."
+        f"At most {strategy.max_gaussians:,} Gaussians: {at_most / 1e9:.1f} GB of "
+        f"{'the card' if processes == 1 else 'each card'}'s {total / 1e9:.1f} GB{why}."
     )
     first = need(n, size.step)
     if first <= free:

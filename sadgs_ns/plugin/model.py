@@ -25,6 +25,7 @@ from rich.markup import escape
 from torch import Tensor
 
 from sadgs_ns.data.cameras import refuse_unsupported_cameras
+from sadgs_ns.distributed.shards import Shards
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.averaging import RunningMean
 from sadgs_ns.method.clearance import clear_of_cameras, limit_scales
@@ -138,6 +139,10 @@ class SadgsModelConfig(InstantiateConfig):
             self.strategy.check()
         except ValueError as error:
             raise InputError(f"pipeline.model.{error}") from error
+
+
+Splats = tuple[Tensor, Tensor, Tensor, Tensor, Tensor | tuple[Tensor, Tensor]]
+"""Centres [N, 3], quaternions [N, 4], standard deviations [N, 3], opacities [N] and colours, as for `rasterize`."""
 
 
 class StepKind(NamedTuple):
@@ -267,6 +272,23 @@ class SadgsModel(SplatfactoModel):
             for parameter in self.gauss_params.values():
                 parameter.data = parameter.data[keep]
 
+    def share_out(self, shards: Shards) -> None:
+        """Keep the part of the Gaussians that is this process's; call before optimizers are made.
+
+        Args:
+            shards: The processes, all of which have the same Gaussians until now.
+        """
+        part = shards.take_even_part(self.num_points)
+        for parameter in self.gauss_params.values():
+            parameter.data = parameter.data[part].clone()
+        self.strategy.shards = shards
+        self.tile_forecast = None  # How many pairs a view has depends on the Gaussians of all.
+
+    @property
+    def num_gaussians(self) -> int:
+        """Number of Gaussians of all processes."""
+        return self.num_points if self.strategy.shards is None else self.strategy.shards.total
+
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
@@ -359,6 +381,33 @@ class SadgsModel(SplatfactoModel):
             Colours, not clamped, and depth [C, H, W, 3 or 4]; accumulated opacity [C, H, W, 1]; gsplat's meta, and in
             it `opacity_reg`, numbers [P] whose sum is the mean opacity times this factor, or None where it is 0.
         """
+        splats, penalty, options = self.splats(opacity_reg, params, sh_degree)
+        render, alpha, info = rasterize(
+            *splats,
+            viewmats,
+            Ks,
+            width,
+            height,
+            render_mode=render_mode,
+            absgrad=absgrad,
+            fused=self.config.fused,
+            tile_capacity=tile_capacity,
+            **options,
+        )
+        return render, alpha, info | {"opacity_reg": penalty}
+
+    def splats(
+        self, opacity_reg: float = 0.0, params: Mapping[str, Tensor] | None = None, sh_degree: int | None = None
+    ) -> tuple[Splats, Tensor | None, dict[str, Any]]:
+        """Return what the rasterizer takes of the Gaussians; in the viewer, of those inside its crop box.
+
+        Args:
+            opacity_reg, params, sh_degree: As for `render`.
+
+        Returns:
+            The first arguments of `rasterize`; numbers [P] whose sum is the mean opacity times `opacity_reg`, or None
+            where that is 0; and further options of `rasterize`.
+        """
         params = self.cropped(dict(self.gauss_params.items()) if params is None else params)
         if self.config.sh_degree > 0:
             colors: Tensor | tuple[Tensor, Tensor] = (params["features_dc"], params["features_rest"])
@@ -367,24 +416,8 @@ class SadgsModel(SplatfactoModel):
             colors, sh_degree = torch.sigmoid(params["features_dc"]), None  # [N, 3]
         fused = self.config.fused
         scales, opacities, penalty = activate(params["scales"], params["opacities"], opacity_reg, fused=fused)
-        render, alpha, info = rasterize(
-            params["means"],
-            params["quats"],
-            scales,
-            opacities,
-            colors,
-            viewmats,
-            Ks,
-            width,
-            height,
-            sh_degree=sh_degree,
-            render_mode=render_mode,
-            absgrad=absgrad,
-            fused=fused,
-            tile_capacity=tile_capacity,
-            **self.drawing,
-        )
-        return render, alpha, info | {"opacity_reg": penalty}
+        splats = (params["means"], params["quats"], scales, opacities, colors)
+        return splats, penalty, {"sh_degree": sh_degree, **self.drawing}
 
     def kind_of_step(self, width: int, height: int, cam_indices: list[int]) -> StepKind:
         """Return what the launches of this step depend on; the length of its tile lists is foreseen.
@@ -420,10 +453,42 @@ class SadgsModel(SplatfactoModel):
             viewmats, Ks, kind.width, kind.height, "RGB", kind.absgrad, kind.tile_capacity, kind.opacity_reg,
             params=params, sh_degree=kind.sh_degree,
         )  # fmt: skip
-        penalty, background = info.pop("opacity_reg"), self._get_background_color()
-        rgb = render[..., :3] if self.config.background_color == "black" else render[..., :3] + (1 - alpha) * background
-        outputs = {"rgb": rgb, "background": background}
+        penalty, background = info.pop("opacity_reg"), self.background_of_step()
+        outputs = {"rgb": self.before_background(render, alpha, background), "background": background}
         return outputs if penalty is None else outputs | {"opacity_reg": penalty}, info
+
+    def background_of_step(self) -> Tensor:
+        """Return the colour behind the Gaussians [3], in training drawn anew where it is random."""
+        return self._get_background_color()
+
+    def before_background(self, render: Tensor, alpha: Tensor, background: Tensor) -> Tensor:
+        """Put renderings before a background.
+
+        Args:
+            render: Colours, and perhaps more. [C, H, W, 3 or 4]
+            alpha: Accumulated opacity. [C, H, W, 1]
+            background: [3]
+
+        Returns:
+            [C, H, W, 3]
+        """
+        if self.config.background_color == "black":
+            return render[..., :3]
+        return render[..., :3] + (1 - alpha) * background
+
+    def show_to_strategy(
+        self, info: dict[str, Any], viewmats: Tensor, Ks: Tensor, structure_tensors: Tensor | None
+    ) -> None:
+        """Let the strategy see a forward pass, as long as densification runs.
+
+        Args:
+            info: gsplat's meta.
+            viewmats, Ks, structure_tensors: As for `get_training_outputs`.
+        """
+        if self.step < self.strategy.windows.refine_stop_iter:
+            info |= {"viewmats": viewmats.detach(), "Ks": Ks, "structure_tensors": structure_tensors}
+            self.strategy.step_pre_backward(self.gauss_params, self.optimizers, self.strategy_state, self.step, info)
+            self.infos.append(info)
 
     def get_training_outputs(
         self,
@@ -455,10 +520,7 @@ class SadgsModel(SplatfactoModel):
         outputs, info = self.render_step(kind, viewmats, Ks, dict(self.gauss_params.items()))
         if forecast is not None and "pair_counts" in info:  # Only our kernels count pairs.
             forecast.rendered(cam_indices, (width, height), kind.tile_capacity, info["pair_counts"])
-        if self.step < self.strategy.windows.refine_stop_iter:
-            info |= {"viewmats": viewmats.detach(), "Ks": Ks, "structure_tensors": structure_tensors}
-            self.strategy.step_pre_backward(self.gauss_params, self.optimizers, self.strategy_state, self.step, info)
-            self.infos.append(info)
+        self.show_to_strategy(info, viewmats, Ks, structure_tensors)
         if self.config.use_bilateral_grid:
             outputs["rgb"] = torch.stack(
                 [
@@ -563,12 +625,7 @@ class SadgsModel(SplatfactoModel):
                 added as `psnr`.
             batch: `image` of the same leading shape and, optionally, a boolean `mask` [..., H, W, 1].
         """
-        target, predicted = batch["image"].to(self.device), outputs["rgb"]
-        if "mask" in batch or target.shape[-1] == 4:  # Otherwise the loss reads bytes as they are.
-            target = self.composite_with_background(self.get_gt_img(target), outputs["background"])
-        if "mask" in batch:
-            mask = batch["mask"].to(self.device)
-            target, predicted = target * mask, predicted * mask
+        predicted, target = self.compared(outputs, batch)
         height, width = target.shape[-3:-1]
         loss, psnr = photometric_loss(
             predicted.reshape(-1, height, width, 3),
@@ -584,6 +641,23 @@ class SadgsModel(SplatfactoModel):
             if self.config.use_bilateral_grid:
                 losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
         return losses
+
+    def compared(self, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
+        """Return a rendering and its photo as the loss compares them: within the mask, before the same background.
+
+        Args:
+            outputs, batch: As for `get_loss_dict`; they may hold some rows of the views only.
+
+        Returns:
+            Both on the model's device, the photo as floats in [0, 1] or as bytes. […, H, W, 3]
+        """
+        target, predicted = batch["image"].to(self.device), outputs["rgb"]
+        if "mask" in batch or target.shape[-1] == 4:  # Otherwise the loss reads bytes as they are.
+            target = self.composite_with_background(self.get_gt_img(target), outputs["background"])
+        if "mask" in batch:
+            mask = batch["mask"].to(self.device)
+            target, predicted = target * mask, predicted * mask
+        return predicted, target
 
     def psnr(self, predicted: Tensor, target: Tensor) -> Tensor:
         """Return PSNR in dB of images in [0, 1], [1, 3, H, W] or [H, W, 3]."""

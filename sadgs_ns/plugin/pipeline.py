@@ -21,6 +21,7 @@ from torch import Tensor
 from sadgs_ns import kernels
 from sadgs_ns.data.cameras import refuse_unsupported_cameras
 from sadgs_ns.data.validation.parsers import findings_of
+from sadgs_ns.distributed.shards import Shards
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.codes import HIGHEST_FREQUENCY
 from sadgs_ns.method.initialization import camera_extent
@@ -34,6 +35,7 @@ from sadgs_ns.plugin.model import SadgsModel, SadgsModelConfig
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
 from sadgs_ns.plugin.optimizers import FusedAdam
 from sadgs_ns.plugin.panel import StructurePanel
+from sadgs_ns.plugin.sharded_steps import losses_of_views
 from sadgs_ns.plugin.structure_maps import StructureMaps
 from sadgs_ns.plugin.views import TrainingViews
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
@@ -151,6 +153,8 @@ class SadgsPipeline(VanillaPipeline):
         strategy, less = self.model.strategy, growth_threshold(config.effort)
         strategy.clone_grad2d, strategy.split_absgrad2d = less * strategy.clone_grad2d, less * strategy.split_absgrad2d
         self.log = NonFiniteLog(self.device)
+        self.shards: Shards | None = None
+        """The processes among which the Gaussians are shared out; None where this one has all."""
         self.put_aside: Drawn | None = None
         """Views that were drawn for the present step and not rendered yet."""
         self._checkpoint_cap: int | None = None
@@ -166,6 +170,24 @@ class SadgsPipeline(VanillaPipeline):
     def model(self) -> SadgsModel:
         """The model, which is never wrapped for several devices."""
         return self._model  # type: ignore[return-value]
+
+    def share_out(self, shards: Shards) -> None:
+        """Keep this process's part of the Gaussians; call before optimizers are made.
+
+        Args:
+            shards: The processes, all of which have the same Gaussians until now.
+
+        Raises:
+            InputError: If the training images have several sizes.
+        """
+        cameras = self.datamanager.train_dataset.cameras
+        if len(torch.cat([cameras.height, cameras.width], dim=-1).unique(dim=0)) > 1:
+            raise InputError(
+                "The training images have several sizes, which runs on one device alone can train on: take one device, "
+                "or scale the images to one size."
+            )
+        self.shards = shards
+        self.model.share_out(shards)
 
     def train(self, mode: bool = True) -> SadgsPipeline:
         """Set the mode of all modules, unless they have it: nerfstudio asks before every step, and torch visits all."""
@@ -187,9 +209,16 @@ class SadgsPipeline(VanillaPipeline):
         self._refuse_empty_views()
         if self.config.model.strategy.refine_stop_iter != 0:
             model, fused = self.model, self.config.model.fused and kernels.available(self.device)
-            size = training_size(self.datamanager, model.gauss_params, self.views_per_iteration, fused)  # type: ignore[arg-type]
+            processes, views = 1 if self.shards is None else self.shards.num_ranks, self.views_per_iteration
+            size = training_size(self.datamanager, model.gauss_params, views, fused, processes)  # type: ignore[arg-type]
             try:
-                line, warning = fit_to_memory(model.strategy, model.gauss_params, size, self.config.memory_budget_gb)  # type: ignore[arg-type]
+                line, warning = fit_to_memory(
+                    model.strategy,
+                    model.gauss_params,
+                    size,
+                    self.config.memory_budget_gb,
+                    processes,  # type: ignore[arg-type]
+                )
             except ValueError as error:
                 raise InputError(f"pipeline.{error}") from error
             if line is None:
@@ -198,6 +227,8 @@ class SadgsPipeline(VanillaPipeline):
             CONSOLE.print(line, highlight=False, soft_wrap=True)
             if warning is not None:
                 CONSOLE.print(f"[yellow]{escape(warning)}[/]", soft_wrap=True)
+            if self.shards is not None:
+                model.strategy.max_gaussians = int(self.shards.least(model.strategy.max_gaussians))
             self._keep_cap()
             self.structure.set_max_gaussians.value = self.model.strategy.max_gaussians
         optimizers = training_callback_attributes.optimizers
@@ -224,7 +255,10 @@ class SadgsPipeline(VanillaPipeline):
         means = means[:: -(-len(means) // _SAMPLED)].to(viewmats)  # [N, 3]
         depths = means @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]  # [N, C]
         drawn = ((depths > NEAR_PLANE) & (depths < _FAR_PLANE)).any(dim=1)
-        if drawn.float().mean() < 0.01:
+        share = drawn.float().mean()
+        if self.shards is not None:
+            share = self.shards.sum(share.to(self.device)) / self.shards.num_ranks
+        if share < 0.01:
             extent = float(self.model.strategy_state["scene_scale"])
             raise InputError(
                 f"The renderings would be empty, since a camera sees from {NEAR_PLANE} to {_FAR_PLANE:g} units and the "
@@ -268,7 +302,8 @@ class SadgsPipeline(VanillaPipeline):
             CONSOLE.print(f"[yellow]The same in {len(wrong) - _NAMED_STEPS} more of the last iterations.[/]")
         enough = nonfinite.HOPELESS_STEPS if not last else min(nonfinite.HOPELESS_STEPS, self.log.steps)
         gradient = self.model.means.grad
-        if wrong and self.log.streak >= enough and gradient is not None and nonfinite.is_useless(gradient):
+        stuck = bool(wrong) and self.log.streak >= enough and gradient is not None and nonfinite.is_useless(gradient)
+        if stuck if self.shards is None else self.shards.all(stuck):
             step, _, what = wrong[-1]
             names = [files[view].name for view in dict.fromkeys(view for _, views, _ in wrong for view in views)]
             more = f" and {len(names) - _NAMED_STEPS} more" if len(names) > _NAMED_STEPS else ""
@@ -314,23 +349,32 @@ class SadgsPipeline(VanillaPipeline):
         outputs: dict[str, Any] = {}
         for (height, width, _), views in groups.items():
             indices = [index for index, _ in views]
-            batch = {"image": _stack([data["image"] for _, data in views])}
-            if any("mask" in data for _, data in views):
-                everything = torch.ones((height, width, 1), dtype=torch.bool, device=self.device)
-                batch["mask"] = _stack(
-                    [data.get("mask", everything).to(self.device, non_blocking=True) for _, data in views]
-                )
             tensors = _stack(self.structure_maps.of_views(views)) if observes else None
             viewmats, Ks = self.views.stacked_cameras(indices)
-            outputs = self.model.get_training_outputs(viewmats, Ks, width, height, indices, tensors)
-            group_losses = self.model.get_loss_dict(outputs, batch)
+            if self.shards is not None:
+                parts = losses_of_views(self.model, self.shards, viewmats, Ks, views, tensors)
+            else:
+                batch = self._batch(views)
+                outputs = self.model.get_training_outputs(viewmats, Ks, width, height, indices, tensors)
+                parts = self.model.get_loss_dict(outputs, batch), self.model.get_metrics_dict(outputs, batch)
             weight = len(views) / self.views_per_iteration
-            for total, part in ((losses, group_losses), (metrics, self.model.get_metrics_dict(outputs, batch))):
+            for total, part in zip((losses, metrics), parts, strict=True):
                 for name, value in part.items():
                     # The mean over one size, the usual case, is no work for the device, here or in the backward pass.
                     total[name] = value if len(groups) == 1 else total.get(name, 0) + weight * value
-        self.log.begin_step(step, [index for views in groups.values() for index, _ in views], losses["main_loss"])
+        loss = metrics.get("loss", losses["main_loss"])  # With several processes each has a part.
+        self.log.begin_step(step, [index for views in groups.values() for index, _ in views], loss)
         return outputs, losses, metrics
+
+    def _batch(self, views: list[tuple[int, dict[str, Any]]]) -> dict[str, Tensor]:
+        """Return the images [C, H, W, 3 or 4] of views of one size and, where one has a mask, masks [C, H, W, 1]."""
+        batch = {"image": _stack([data["image"] for _, data in views])}
+        if any("mask" in data for _, data in views):
+            everything = torch.ones((*batch["image"].shape[1:3], 1), dtype=torch.bool, device=self.device)
+            batch["mask"] = _stack(
+                [data.get("mask", everything).to(self.device, non_blocking=True) for _, data in views]
+            )
+        return batch
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
@@ -411,7 +455,7 @@ class SadgsPipeline(VanillaPipeline):
     def _settings(self) -> dict[str, Any]:
         """Return the options that decide how training goes on from a checkpoint, by their names."""
         strategy = asdict(self.config.model.strategy)
-        hidden = ("fused", "run_length")
+        hidden = ("fused", "run_length", "shards")
         settings = {f"model.strategy.{name}": strategy[name] for name in strategy if name not in hidden}
         own = {name: getattr(self.config, name) for name in ("views_per_iteration", "memory_budget_gb")}
         return {**own, **settings}

@@ -21,11 +21,11 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from sadgs_ns.atomic import atomic_path
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
 from sadgs_ns.method.schedule import between_one_and_four, schedule
-from sadgs_ns.plugin import checkpoints, older_runs
+from sadgs_ns.plugin import checkpoints, older_runs, processes
 from sadgs_ns.plugin.compilation import compile_kernels
-from sadgs_ns.plugin.config import ONE_DEVICE, CheckedTrainerConfig
+from sadgs_ns.plugin.config import CheckedTrainerConfig
 from sadgs_ns.plugin.graphed_steps import GraphedSteps
-from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
+from sadgs_ns.plugin.interrupts import SIGNALS, Interrupted, Interrupts
 from sadgs_ns.plugin.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig, SadgsOptimizers
 from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.plugin.progress import about_cpu, remove_tables, what_next
@@ -58,20 +58,29 @@ older_runs.read_with(SadgsTrainerConfig)
 
 
 class SadgsTrainer(Trainer):
-    """A trainer for one model on one device.
+    """A trainer for one model on one device, or on several, each with a process and a part of the Gaussians.
+
+    Where there are several, all processes call the same methods, and the first one alone prints and writes files.
 
     Raises:
-        InputError: If several devices are asked for; as `SadgsTrainerConfig.check`.
+        InputError: As `SadgsTrainerConfig.check`.
     """
 
     config: SadgsTrainerConfig
     pipeline: SadgsPipeline
 
     def __init__(self, config: SadgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
-        if world_size > 1:
-            raise InputError(ONE_DEVICE)
         config.check()
-        super().__init__(config, local_rank, world_size)
+        config = copy.copy(config)  # Where there are several processes, they agree on what the file does not say.
+        self.shards, local_rank = processes.join(config, local_rank)
+        """What this process knows of the others; None where it is alone."""
+        self._peers = None if self.shards is None else processes.Peers()
+        self._vis: Any = config.vis
+        if self.shards is not None and (config.is_viewer_enabled() or config.is_viewer_legacy_enabled()):
+            CONSOLE.print("The viewer is off, since no device holds all Gaussians; `ns-viewer` shows the finished run.")
+            config.vis = config.vis.removeprefix("viewer_legacy").removeprefix("viewer").removeprefix("+") or "none"  # type: ignore[assignment]
+        # nerfstudio would wrap the pipeline for several devices in its own way.
+        super().__init__(config, local_rank, world_size=1)
         self._stepping = False
         self.graphed: GraphedSteps | None = None
         """What trains steps by CUDA graphs; None where all are launched one by one."""
@@ -80,7 +89,9 @@ class SadgsTrainer(Trainer):
         self._completed_step = self._saved_step = -1
         self._save_due = math.inf
         # A run that is paused or done polls no signal, because nerfstudio waits for the viewer's user.
-        self._interrupts = Interrupts(waiting=lambda: self.training_state != "training" and not self._stepping)
+        self._interrupts = Interrupts(
+            waiting=lambda: self.training_state != "training" and not self._stepping, started=self.shards is not None
+        )
 
     def setup(self, *args: Any, **kwargs: Any) -> None:
         """Load data, model and checkpoint, and compile what the machine has not compiled yet.
@@ -132,7 +143,7 @@ class SadgsTrainer(Trainer):
     def _say_what_is_next(self) -> None:
         """Print the commands for a run that is done, below nerfstudio's box; not where the run ends with an error."""
         if not self.pipeline.stuck:
-            text = what_next(self.base_dir / "config.yml", self.pipeline.model.num_points)
+            text = what_next(self.base_dir / "config.yml", self.pipeline.model.num_gaussians)
             CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
 
     def _load_checkpoint(self) -> None:
@@ -146,6 +157,9 @@ class SadgsTrainer(Trainer):
         config, (path, state), self._checkpoint = self.config, self._checkpoint, None
         try:
             self._start_step = state["step"] + 1
+            if self.shards is not None:
+                part = self.shards.take_even_part(len(state["pipeline"]["_model.gauss_params.means"]))
+                state = checkpoints.of_gaussians(state, lambda rows: rows[part].clone())
             self.pipeline.load_pipeline(state["pipeline"], state["step"])
             self.pipeline.refuse_other_capture()
             if more := sorted(state["optimizers"].keys() - self.optimizers.optimizers.keys()):
@@ -199,6 +213,8 @@ class SadgsTrainer(Trainer):
         config = self.config
         self._checkpoint = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
         self._derive_schedule()
+        if self.shards is not None:
+            self.pipeline.share_out(self.shards)
         optimizers: dict[str, Any] = copy.deepcopy(dict(self.config.optimizers))
         for name, at_four in RATES_OF_FOUR_VIEWS.items() if self.config.rates_follow_views else ():
             start, end = (between_one_and_four(self.pipeline.views_per_iteration, factor) for factor in at_four)
@@ -258,28 +274,39 @@ class SadgsTrainer(Trainer):
                         raise
                     self._stop(interruption, total)
         except InputError as error:
-            if self._completed_step == self._saved_step:
+            if self._completed_step == self._saved_step or self.shards is not None:
                 raise
             # An image that is decoded ahead of its step is gone or damaged, and no step is half done.
             self.save_checkpoint(self._completed_step)
             raise RunError(
                 f"{error} What was trained is saved and goes on with --load-dir {self.checkpoint_dir}."
             ) from error
+        except RunError:
+            raise
         except torch.cuda.OutOfMemoryError as error:
             out_of_memory = _memory(error)  # The RunError is raised below, when the failed step's tensors are gone.
         except OSError as error:
             if error.errno is None:  # It is a WriteError, or it does not come from the disk.
                 raise
             # A logger, such as tensorboard's, could not write; its file may be on another disk, or its folder is gone.
-            if not self._stepping and self._completed_step > self._saved_step:
+            if not self._stepping and self._completed_step > self._saved_step and self.shards is None:
                 self.save_checkpoint(self._completed_step)
             raise WriteError(Path(os.fsdecode(error.filename or self.base_dir)), error) from error
+        except RuntimeError as error:
+            ended = [] if self._peers is None else self._peers.ended()
+            if not ended:
+                raise
+            raise RunError(
+                f"Process {' and '.join(map(str, ended))} of {processes.number_of_processes()} ended (counted from 0), "
+                f"and the others with it: what the last checkpoint holds goes on with --load-dir {self.checkpoint_dir}."
+            ) from error
         finally:
             self.config.max_num_iterations = total
             self.pipeline.views.close()
             remove_tables()
         if out_of_memory:
             raise RunError(self._rescue(out_of_memory))
+        processes.leave()
 
     def _rescue(self, out_of_memory: str) -> str:
         """Save the state before the present step if it is whole, and return what to tell the user.
@@ -297,7 +324,7 @@ class SadgsTrainer(Trainer):
             for state in states.values():
                 lengths |= {len(value) for value in state.values() if isinstance(value, torch.Tensor) and value.dim()}
         lengths |= {len(v) for v in model.strategy_state.values() if isinstance(v, torch.Tensor) and v.dim()}
-        if len(lengths) > 1 or self.step <= self._start_step:
+        if len(lengths) > 1 or self.step <= self._start_step or self.shards is not None:
             kept = "nothing newer than the last checkpoint could be saved"
         else:
             try:
@@ -316,6 +343,12 @@ class SadgsTrainer(Trainer):
         No signal may stop the run from here to `_update_viewer_state`.
         """
         self._stepping = True
+        if (shards := self.shards) is not None:
+            # Processes agree on what to do after a step in the step itself. A signal has the bit of its number.
+            shards.heard, signalled = 0, self._interrupts.received
+            shards.request = int(time.monotonic() >= self._save_due) | (0 if signalled is None else 1 << signalled)
+            _, _, metrics = super().train_iteration(step)
+            return metrics["loss"], {"main_loss": metrics["loss"]}, metrics
         trained = None if self.graphed is None else self.graphed.train(step)
         if trained is None:
             return super().train_iteration(step)
@@ -325,11 +358,23 @@ class SadgsTrainer(Trainer):
     def _update_viewer_state(self, step: int) -> None:
         """Stop or save where that is due; nerfstudio calls this after every step, when densification is done."""
         self._completed_step, self._stepping = step, False
-        self._interrupts.poll()
+        if self.shards is None:
+            self._interrupts.poll()
+            due = time.monotonic() >= self._save_due
+        else:
+            due = bool(self.shards.heard & 1)
+            for number in SIGNALS:
+                if self.shards.heard >> number & 1:
+                    raise Interrupted(number)
         self._stop_if_stuck()
-        if time.monotonic() >= self._save_due:
+        if due:
             self.save_checkpoint(step)
         super()._update_viewer_state(step)
+
+    def eval_iteration(self, step: int) -> None:
+        """Measure held-out views as nerfstudio does, unless no device holds all Gaussians."""
+        if self.shards is None:
+            super().eval_iteration(step)
 
     def _train_complete_viewer(self) -> None:
         """Wait for the viewer's user, as nerfstudio does for ever, unless the run must stop."""
@@ -358,9 +403,13 @@ class SadgsTrainer(Trainer):
             config = copy.copy(self.config)
             config.max_num_iterations = total
             config.load_dir, config.load_step, config.load_checkpoint = self.checkpoint_dir, None, None
-            command = shlex.join(["ns-train", str(config.method_name), "--load-config", str(config.write())])
+            config.vis = self._vis
+            file = config.write() if processes.is_first() else self.base_dir / "config.yml"
+            command = shlex.join(["ns-train", str(config.method_name), "--load-config", str(file)])
             text = f"{interrupted}: stopped and saved after {done} of {total} iterations; resume with: {command}"
         CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
+        if self.shards is not None:
+            self.shards.all(True)  # What starts the processes ends all as soon as one has ended.
         raise SystemExit(128 + interrupted.number)
 
     def _stop_if_stuck(self) -> None:
@@ -372,7 +421,8 @@ class SadgsTrainer(Trainer):
         if not self.pipeline.stuck:
             return
         kept = "the Gaussians themselves are not finite: train anew, or from a checkpoint in which they are"
-        if all(bool(parameter.isfinite().all()) for parameter in self.pipeline.model.gauss_params.values()):
+        finite = all(bool(parameter.isfinite().all()) for parameter in self.pipeline.model.gauss_params.values())
+        if finite if self.shards is None else self.shards.all(finite):
             if self._completed_step > self._saved_step:
                 self.save_checkpoint(self._completed_step)
             kept = f"the Gaussians as they are now are saved and go on with --load-dir {self.checkpoint_dir}"
@@ -385,13 +435,22 @@ class SadgsTrainer(Trainer):
         """Save under a temporary name and rename, so that a killed save leaves the previous checkpoint as it was.
 
         The temporary file lies beside the folder of checkpoints, because nerfstudio takes every file inside for one.
+        Where several processes train, the first one writes what all of them hold, and the others wait.
 
         Raises:
             WriteError: If the disk is full or the folder cannot be written.
         """
         start = time.monotonic()
-        path: Path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
-        others = [other for other in self.checkpoint_dir.glob("*.ckpt") if other != path]
+        state = self._state(step)
+        if processes.is_first():
+            self._write_checkpoint(step, state)
+        if self.shards is not None:
+            self.shards.all(True)
+        self._saved_step = step
+        self._set_clock(time.monotonic() - start)
+
+    def _state(self, step: int) -> dict[str, Any]:
+        """Return what a checkpoint holds; the Gaussians of other processes are gathered by the first."""
         state = {
             "step": step,
             "pipeline": self.pipeline.state_dict(),
@@ -399,6 +458,11 @@ class SadgsTrainer(Trainer):
             "schedulers": {name: s.state_dict() for name, s in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),
         }
+        return state if self.shards is None else checkpoints.of_gaussians(state, self.shards.gather_rows)
+
+    def _write_checkpoint(self, step: int, state: dict[str, Any]) -> None:
+        path: Path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
+        others = [other for other in self.checkpoint_dir.glob("*.ckpt") if other != path]
         with atomic_path(path, beside=self.checkpoint_dir) as partial:
             try:
                 torch.save(state, partial)
@@ -407,8 +471,6 @@ class SadgsTrainer(Trainer):
             if others:  # These are about to be deleted, so the new one must survive a power cut first.
                 with partial.open("rb+") as file:
                     os.fsync(file.fileno())
-        self._saved_step = step
         if self.config.save_only_latest_checkpoint and not self.pipeline.stuck:  # An earlier one may then be better.
             for other in others:
                 other.unlink()
-        self._set_clock(time.monotonic() - start)

@@ -11,6 +11,7 @@ from torch import Tensor
 from sadgs_ns import gsplat_internals, kernels
 from sadgs_ns.render import splatter
 from sadgs_ns.render.off_axis import culling
+from sadgs_ns.render.projected import Projected
 
 
 def rasterize(
@@ -100,6 +101,67 @@ def rasterize(
         rasterize_mode=rasterize_mode,
         **options,
     )
+
+
+def project(
+    means: Tensor,  # [N, 3]
+    quats: Tensor,  # [N, 4]
+    scales: Tensor,  # [N, 3]
+    opacities: Tensor,  # [N]
+    colors: Tensor | tuple[Tensor, Tensor],  # [(C,) N, D], [(C,) N, K, 3] or [N, 3] and [N, K - 1, 3]
+    viewmats: Tensor,  # [C, 4, 4]
+    Ks: Tensor,  # [C, 3, 3]
+    width: int,
+    height: int,
+    *,
+    sh_degree: int | None = None,
+    rasterize_mode: Literal["classic", "antialiased"] = "classic",
+    max_off_axis: float = 0.0,
+    fused: bool = True,
+) -> Projected:
+    """Do the first half of `rasterize`, whose arguments these are: project Gaussians and compute their colours.
+
+    Without our Triton kernels, that is the splatter's, on CUDA, too.
+
+    Raises:
+        InputError: If there are more Gaussians than the Triton kernels can address (kernels/limits.py).
+    """
+    antialiased = rasterize_mode == "antialiased"
+    if fused and kernels.available(means.device):
+        from sadgs_ns.render.fused import project
+
+        return project(
+            means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree,
+            antialiased=antialiased, max_off_axis=max_off_axis,
+        )  # fmt: skip
+    if isinstance(colors, tuple):
+        colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
+    return splatter.project(
+        means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree,
+        antialiased=antialiased, max_off_axis=max_off_axis,
+    )  # fmt: skip
+
+
+def composite(
+    projected: Projected, width: int, height: int, *, absgrad: bool = False, fused: bool = True
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Do the second half of `rasterize`, whose arguments and results these are, for colours alone.
+
+    Args:
+        projected: What `project` returned, or rows of it that cameras of this size draw.
+        width: Image width in pixels.
+        height: Image height in pixels.
+        absgrad: Whether `backward` sets `means2d.absgrad`. [C, N, 2]
+        fused: As for `rasterize`; it must be as it was for `project`.
+
+    Raises:
+        InputError: As `rasterize`.
+    """
+    if fused and kernels.available(projected.means2d.device):
+        from sadgs_ns.render.fused import composite
+
+        return composite(projected, width, height, absgrad=absgrad)
+    return splatter.composite(projected, width, height, absgrad=absgrad)
 
 
 def visible(info: Mapping[str, Any]) -> Tensor:

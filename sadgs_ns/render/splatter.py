@@ -27,6 +27,7 @@ from sadgs_ns.gsplat_internals import (
     torch_world_to_cam,
 )
 from sadgs_ns.render.off_axis import near_axis
+from sadgs_ns.render.projected import Projected
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RasterizeMode = Literal["classic", "antialiased"]
@@ -156,24 +157,73 @@ def rasterization(
         raise ValueError(f"colors has shape {tuple(colors.shape)}, which does not fit {C} cameras and {N} Gaussians")
     if sh_degree is not None and (sh_degree + 1) ** 2 > colors.shape[-2]:
         raise ValueError(f"sh_degree {sh_degree} needs {(sh_degree + 1) ** 2} coefficients, got {colors.shape[-2]}")
+    options = (eps2d, near_plane, far_plane, radius_clip, rasterize_mode == "antialiased", max_off_axis, per_axis_radii)
+    projected = project(
+        means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree, *options
+    )  # fmt: skip
+    return composite(projected, width, height, tile_size, render_mode, backgrounds, absgrad)
+
+
+def project(
+    means: Tensor,  # [N, 3]
+    quats: Tensor,  # [N, 4]
+    scales: Tensor,  # [N, 3]
+    opacities: Tensor,  # [N]
+    colors: Tensor,  # [(C,) N, D] or [(C,) N, K, 3]
+    viewmats: Tensor,  # [C, 4, 4]
+    Ks: Tensor,  # [C, 3, 3]
+    width: int,
+    height: int,
+    sh_degree: int | None,
+    eps2d: float = 0.3,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    antialiased: bool = False,
+    max_off_axis: float = 0.0,
+    per_axis_radii: bool | None = None,
+) -> Projected:
+    """Project Gaussians and compute their colours; arguments are those of `rasterization`, and are not checked."""
+    C, N = viewmats.shape[0], means.shape[0]
     if per_axis_radii is None:
         per_axis_radii = RADII_PER_AXIS
-
     means2d, depths, conics, compensations, covars2d, valid = _project(
         means, quats, scales, viewmats, Ks, width, height, eps2d, near_plane, far_plane
     )
     if max_off_axis > 0:
         valid = valid & near_axis(means2d, width, height, max_off_axis)
     opacities = opacities.expand(C, N)
-    if rasterize_mode == "antialiased":
+    if antialiased:
         opacities = opacities * compensations
     extents = _extents(means2d, covars2d, opacities, valid, width, height, radius_clip, per_axis_radii)
+    radii = extents.int() if per_axis_radii else extents[..., 0].int()
+    if sh_degree is not None:
+        dirs = means - torch.inverse(viewmats)[:, None, :3, 3]  # [C, N, 3]
+        colors = torch_spherical_harmonics(sh_degree, dirs, colors.expand(C, N, -1, 3))
+        colors = (colors + 0.5).clamp_min(0.0)
+    return Projected(radii, means2d, depths, conics, opacities, colors.expand(C, N, -1))
+
+
+def composite(
+    projected: Projected,
+    width: int,
+    height: int,
+    tile_size: int = 16,
+    render_mode: RenderMode = "RGB",
+    backgrounds: Tensor | None = None,  # [C, D]
+    absgrad: bool = False,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Make the tile lists and composite; arguments and results are those of `rasterization`."""
+    radii, means2d, depths, conics, opacities, colors = projected
+    C = len(means2d)
+    per_axis_radii = radii.dim() == means2d.dim()
+    extents = (radii if per_axis_radii else radii[..., None].expand_as(means2d)).to(means2d.dtype)
     tiles_per_gauss, isect_ids, flatten_ids, tiles = _bin_into_tiles(means2d, depths, extents, width, height, tile_size)
     tile_height, tile_width = math.ceil(height / tile_size), math.ceil(width / tile_size)
     info: dict[str, Any] = {
         "camera_ids": None,
         "gaussian_ids": None,
-        "radii": extents.int() if per_axis_radii else extents[..., 0].int(),
+        "radii": radii,
         "means2d": means2d,
         "depths": depths,
         "conics": conics,
@@ -192,11 +242,6 @@ def rasterization(
     if per_axis_radii:
         info |= {"batch_ids": None, "n_batches": 1}
 
-    if sh_degree is not None:
-        dirs = means - torch.inverse(viewmats)[:, None, :3, 3]  # [C, N, 3]
-        colors = torch_spherical_harmonics(sh_degree, dirs, colors.expand(C, N, -1, 3))
-        colors = (colors + 0.5).clamp_min(0.0)
-    colors = colors.expand(C, N, -1)
     if render_mode != "RGB":
         colors = depths[..., None] if render_mode in ("D", "ED") else torch.cat([colors, depths[..., None]], dim=-1)
         if backgrounds is not None:

@@ -42,12 +42,13 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig
     ("option", "value", "sentence"),
     [
         ("gradient_accumulation_steps", {"means": 4}, "sadgs updates every parameter in every iteration, and "),
-        ("machine.num_devices", 2, "sadgs trains on one device; set machine.num_devices and machine.num_machines to 1"),
         (
-            "machine.num_machines",
+            "machine.num_devices",
             2,
-            "sadgs trains on one device; set machine.num_devices and machine.num_machines to 1",
+            "machine.num_devices is 2, and nerfstudio starts several processes with CUDA only",
         ),
+        ("machine.num_devices", 0, "machine.num_devices must be at least 1, got 0."),
+        ("machine.num_machines", 2, "machine.num_machines is 2, and sadgs trains on several machines with torchrun: "),
         ("machine.device_type", "cuda", "machine.device_type is cuda, but torch finds no CUDA device: set it to cpu,"),
         ("machine.device_type", "mps", "machine.device_type is mps, but torch finds no MPS device: set it to cpu, or "),
         ("machine.seed", -1, "machine.seed must be in [0, 2³²), got -1."),

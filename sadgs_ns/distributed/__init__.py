@@ -1,0 +1,1 @@
+"""One splat whose Gaussians are spread over several processes, each with a device of its own."""

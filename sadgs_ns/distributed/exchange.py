@@ -1,0 +1,218 @@
+"""Projected Gaussians on their way to the processes that composite them, and their gradients on the way back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from sadgs_ns.distributed.bands import Band
+from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.gsplat_internals import drawn
+from sadgs_ns.render.projected import Projected
+
+
+class Exchange:
+    """Sends the Gaussians that each band draws to the process that composites it.
+
+    The host waits for the device once, to learn how many these are; what the processes ask of each other comes along.
+
+    Attributes:
+        bands: Those that this process composites.
+        counts: Rows that each process has for each of these bands.
+        places: Indices in V · N of the rows that this process sends, in the order of all bands. int64 [M]
+        absolute: The centres in which compositing leaves absolute gradients for `backward`, for each of these bands;
+            none where nobody asked for them.
+
+    Args:
+        shards: The processes.
+        projected: The Gaussians of this process in all V views.
+        bands: All bands, as `share_out` returns them.
+    """
+
+    def __init__(self, shards: Shards, projected: Projected, bands: Sequence[Band]) -> None:
+        reached = _reached(projected, bands)  # [B, N]
+        counted = torch.cat([reached.sum(1), torch.tensor([shards.request], device=shards.device)])
+        gathered = shards.gather(counted)  # [R, B + 1]
+        n = reached.shape[1]
+        self.places = reached.flatten().nonzero()[:, 0]  # [M], in B · N
+        if any(band.view != index for index, band in enumerate(bands)):
+            views = torch.tensor([band.view for band in bands], device=shards.device)
+            self.places = views[self.places // n] * n + self.places % n
+        table = gathered.tolist()
+        for row in table:
+            shards.heard |= row.pop()
+        mine = [index for index, band in enumerate(bands) if band.rank == shards.rank]
+        self.bands = [bands[index] for index in mine]
+        self.counts = [[row[index] for index in mine] for row in table]
+        self._received = [sum(row) for row in self.counts]
+        self._sent = [0] * shards.num_ranks
+        for band, number in zip(bands, table[shards.rank], strict=True):
+            self._sent[band.rank] += number
+        self.absolute: list[Tensor] = []
+
+    def send(self, projected: Projected, absgrad: bool) -> tuple[Tensor, list[Projected]]:
+        """Send the Gaussians, differentiably; call once.
+
+        Args:
+            projected: The Gaussians of this process in all V views.
+            absgrad: Whether `backward` also brings the absolute gradients of the centres, as `absgrad` of `means2d`.
+                The gradient of the centres then is `grad2d` of `means2d`.
+
+        Returns:
+            Zero, which must be added to the loss: where a process composites nothing, its gradients would not come. And
+            what each of the bands of this process is composited of, one view each, shifted to the first drawn row.
+        """
+        if absgrad:
+            projected.means2d.grad2d = None  # type: ignore[attr-defined] # `keep_gradient` looks for it.
+        anchor, *flat = _Exchanged.apply(self, absgrad, *projected)  # type: ignore[misc]
+        received = [Projected(*flat[i : i + 6]) for i in range(0, len(flat), 6)]
+        if absgrad and torch.is_grad_enabled():
+            # These hold the graph, which holds this object, until `backward` lets them go.
+            self.absolute = [part.means2d for part in received]
+        return anchor, received
+
+    def forth(self, rows: Tensor) -> list[Tensor]:
+        """Send rows to those who composite them, and return those of each of this process's bands.
+
+        Args:
+            rows: In the order of `places`. [M, K]
+        """
+        received = rows.new_empty((sum(self._received), rows.shape[1]))
+        dist.all_to_all_single(received, rows, self._received, self._sent)
+        return _transposed(received, self.counts)
+
+    def back(self, parts: Sequence[Tensor], nothing: Tensor) -> Tensor:
+        """Send rows of this process's bands back to those who sent these, and return what the others send back.
+
+        Args:
+            parts: Rows of each band. [·, K] each
+            nothing: What is sent where this process composites nothing. [0, K]
+
+        Returns:
+            In the order of `places`. [M, K]
+        """
+        rows = nothing
+        if parts:
+            rows = torch.cat(_transposed(torch.cat([*parts]), list(zip(*self.counts, strict=True))))
+        received = rows.new_empty((len(self.places), nothing.shape[1]))
+        dist.all_to_all_single(received, rows.contiguous(), self._sent, self._received)
+        return received
+
+
+class _Exchanged(torch.autograd.Function):
+    """Forward: `Exchange.forth`; backward: `Exchange.back`, with the absolute gradients beside the gradients."""
+
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any,
+        exchange: Exchange,
+        absgrad: bool,
+        radii: Tensor,  # [V, N] or [V, N, 2]
+        means2d: Tensor,  # [V, N, 2]
+        depths: Tensor,  # [V, N]
+        conics: Tensor,  # [V, N, 3]
+        opacities: Tensor,  # [V, N]
+        colors: Tensor,  # [V, N, D]
+    ) -> tuple[Tensor, ...]:
+        ctx.set_materialize_grads(False)
+        ctx.exchange, ctx.absgrad, ctx.shape = exchange, absgrad, opacities.shape
+        ctx.save_for_backward(means2d)
+        size = opacities.numel()
+        values = [
+            value.detach().reshape(size, -1)[exchange.places]
+            for value in (means2d, conics, opacities, colors, depths, radii.to(means2d.dtype))
+        ]
+        ctx.num_colors = values[3].shape[1]
+        widths = [value.shape[1] for value in values]
+        outputs: list[Tensor] = []
+        for band, rows in zip(exchange.bands, exchange.forth(_beside(values)), strict=True):
+            if not len(rows):
+                rows = rows.new_zeros((1, rows.shape[1]))  # A Gaussian whose radius is zero is not drawn.
+            centres, conic, opacity, color, depth, radius = (
+                column.clone(memory_format=torch.contiguous_format) for column in rows[None].split(widths, dim=-1)
+            )
+            centres[..., 1] -= band.top
+            radius = radius.int() if radii.dim() == 3 else radius[..., 0].int()
+            ctx.mark_non_differentiable(radius)
+            outputs += [radius, centres, depth[..., 0], conic, opacity[..., 0], color]
+        return means2d.new_zeros(()), *outputs
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, _: Tensor | None, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        exchange: Exchange = ctx.exchange
+        (means2d,) = ctx.saved_tensors
+        widths = [2, 3, 1, ctx.num_colors, *[2] * ctx.absgrad]
+        parts = []
+        for i in range(len(exchange.bands)):
+            number = sum(row[i] for row in exchange.counts)
+            _, v_means2d, _, v_conics, v_opacities, v_colors = gradients[6 * i : 6 * i + 6]  # Depths decide no colour.
+            columns = [v_means2d, v_conics, v_opacities, v_colors]
+            if ctx.absgrad:
+                columns.append(getattr(exchange.absolute[i], "absgrad", None))
+            filled = [
+                means2d.new_zeros((number, width)) if value is None else value.reshape(-1, width)[:number]
+                for value, width in zip(columns, widths, strict=True)
+            ]
+            parts.append(_beside(filled))
+        exchange.absolute = []
+        rows = exchange.back(parts, means2d.new_empty((0, sum(widths))))
+        dense = means2d.new_zeros((ctx.shape.numel(), sum(widths))).index_add_(0, exchange.places, rows)
+        v_means2d, v_conics, v_opacities, v_colors, *v_absolute = dense.view(*ctx.shape, -1).split(widths, -1)
+        if ctx.absgrad:
+            means2d.absgrad, means2d.grad2d = v_absolute[0], v_means2d
+        return None, None, None, v_means2d, None, v_conics, v_opacities[..., 0], v_colors
+
+
+@torch.no_grad()
+def _reached(projected: Projected, bands: Sequence[Band]) -> Tensor:
+    """Tell which Gaussians each band draws. bool [B, N]"""
+    radii, means2d = projected.radii, projected.means2d
+    visible = drawn(radii, means2d)  # [V, N]
+    if all(band.view == index for index, band in enumerate(bands)) and len(bands) == len(visible):
+        return visible
+    reach = radii[..., 1] if radii.dim() == 3 else radii  # [V, N]
+    y = means2d[..., 1]
+    return torch.stack(
+        [
+            visible[band.view]
+            & (y[band.view] + reach[band.view] > band.top)
+            & (y[band.view] - reach[band.view] < band.bottom)
+            for band in bands
+        ]
+    )
+
+
+def _beside(values: Sequence[Tensor]) -> Tensor:
+    """Put the columns of tensors beside each other; `torch.cat` along them took several times as long on a GPU.
+
+    Args:
+        values: [M, ·] each
+    """
+    widths = [value.shape[1] for value in values]
+    rows = values[0].new_empty((len(values[0]), sum(widths)))
+    for columns, value in zip(rows.split(widths, dim=1), values, strict=True):
+        columns.copy_(value)
+    return rows
+
+
+def _transposed(rows: Tensor, numbers: Sequence[Sequence[int]]) -> list[Tensor]:
+    """Put rows that lie in order of A and then of B in the order of B and then of A.
+
+    Args:
+        rows: [·, K]
+        numbers: How many there are of each A and B.
+
+    Returns:
+        The rows of each B.
+    """
+    groups = len(numbers[0])
+    if groups <= 1:
+        return [rows] * groups
+    pieces = rows.split([number for row in numbers for number in row])
+    return [torch.cat(pieces[group::groups]) for group in range(groups)]

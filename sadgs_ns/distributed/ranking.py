@@ -1,0 +1,60 @@
+"""Which Gaussians of all processes may grow under one cap."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from sadgs_ns.distributed.shards import Shards
+
+_DIGITS = ((20, 11), (10, 10), (0, 10))
+"""Shifts and widths in bits of the parts of a positive float32's 31 bits, the most significant first."""
+
+
+@torch.no_grad()
+def limit_growth(shards: Shards, growth: Tensor, priority: Tensor, budget: float) -> Tensor:
+    """Do what `method.split.limit_growth` does for the Gaussians of all processes, in the order of their ranks.
+
+    Nobody gathers the priorities. Where the budget does not suffice, histograms of them, summed over the processes,
+    find the priority of the first Gaussian that does not fit; that is repeated with smaller ones, as often as there are
+    sizes.
+
+    Args:
+        shards: The processes.
+        growth: Gaussians that each one would add, ≥ 0. int64 [N]
+        priority: Larger comes first, ≥ 0. [N]
+        budget: Gaussians that may be added in all, the same in all processes; ≤ 0 allows none.
+
+    Returns:
+        The chosen ones of this process. bool [N]
+    """
+    # The bits of floats that are not negative have the order of the floats.
+    bits = priority.float().contiguous().view(torch.int32)
+    allowed = torch.zeros_like(growth, dtype=torch.bool)
+    while True:
+        fits = (growth > 0) & (growth <= budget) & ~allowed
+        if int(shards.sum(torch.where(fits, growth, 0).sum())) <= max(budget, 0):
+            return allowed | fits
+        taken = _up_to_first_that_does_not_fit(shards, torch.where(fits, growth, 0), bits, budget)
+        allowed |= taken
+        budget -= int(shards.sum(growth[taken].sum()))
+
+
+def _up_to_first_that_does_not_fit(shards: Shards, growth: Tensor, bits: Tensor, budget: float) -> Tensor:
+    """Choose by priority all Gaussians before the first that does not fit; all together do not. bool [N]"""
+    equal = growth > 0  # These agree in the digits so far with the first that does not fit.
+    before, threshold = 0, 0
+    for shift, width in _DIGITS:
+        digits = ((bits >> shift) & ((1 << width) - 1)).long()
+        histogram = growth.new_zeros(1 << width).scatter_add_(0, digits, torch.where(equal, growth, 0))
+        from_top = shards.sum(histogram).flip(0).cumsum(0)  # It grows as the digit falls.
+        index = int((before + from_top <= budget).sum())
+        before += int(from_top[index - 1]) if index > 0 else 0
+        digit = (1 << width) - 1 - index
+        equal &= digits == digit
+        threshold |= digit << shift
+    # Of equal priorities the first in the order of the ranks come first.
+    ties = torch.where(equal, growth, 0)
+    totals = shards.gather(ties.sum()[None])[:, 0]
+    before += int(totals[: shards.rank].sum())
+    return (growth > 0) & ((bits > threshold) | equal & (before + ties.cumsum(0) <= budget))

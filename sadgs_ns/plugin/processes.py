@@ -1,0 +1,145 @@
+"""The processes of a run on several devices: how they find each other, and what a run on several devices cannot do."""
+
+from __future__ import annotations
+
+import os
+import random
+import socket
+import time
+from datetime import timedelta
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+import torch.distributed as dist
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.errors import InputError
+
+if TYPE_CHECKING:
+    from sadgs_ns.plugin.config import CheckedTrainerConfig
+
+_REAPED_SECONDS = 5.0
+"""Longest time from a message that fails because its process has ended to the operating system's forgetting that."""
+_TIMEOUT = timedelta(minutes=30)
+"""Longest time that one process waits for another, as in nerfstudio: rank 0 may write a large checkpoint meanwhile."""
+
+
+def number_of_processes() -> int:
+    """Return how many processes train together, as torchrun or nerfstudio started them; 1 outside of both."""
+    return dist.get_world_size() if dist.is_initialized() else int(os.environ.get("WORLD_SIZE", "1"))
+
+
+def is_first() -> bool:
+    """Tell whether this process is the one that prints and writes files."""
+    return (dist.get_rank() if dist.is_initialized() else int(os.environ.get("RANK", "0"))) == 0
+
+
+def processes_on_this_machine() -> int:
+    """Return how many of the processes share this machine's memory."""
+    return int(os.environ.get("LOCAL_WORLD_SIZE", number_of_processes()))
+
+
+def check(config: CheckedTrainerConfig) -> None:
+    """Check whether a run on several devices can work with these options.
+
+    Raises:
+        InputError: If it needs what only a run on one device has, or devices that are not there.
+    """
+    machine, model = config.machine, config.pipeline.model
+    if machine.num_machines != 1:
+        raise InputError(
+            f"machine.num_machines is {machine.num_machines}, and sadgs trains on several machines with torchrun: "
+            "start `torchrun --nnodes … --nproc-per-node … -m nerfstudio.scripts.train sadgs …` on each of them."
+        )
+    if machine.num_devices < 1:
+        raise InputError(f"machine.num_devices must be at least 1, got {machine.num_devices}.")
+    if machine.num_devices > 1 and machine.device_type != "cuda":
+        raise InputError(
+            f"machine.num_devices is {machine.num_devices}, and nerfstudio starts several processes with CUDA only: "
+            "set it to 1, or start the run with torchrun."
+        )
+    if machine.num_devices == 1 and number_of_processes() == 1:
+        return
+    here = torch.cuda.device_count()
+    if machine.device_type == "cuda" and max(machine.num_devices, processes_on_this_machine()) > here:
+        raise InputError(
+            f"The run is to take {max(machine.num_devices, processes_on_this_machine())} CUDA devices of this machine, "
+            f"and torch finds {here}: lower machine.num_devices, or torchrun's --nproc-per-node."
+        )
+    for name, given, remedy in (
+        ("pipeline.model.use_bilateral_grid", model.use_bilateral_grid, "leave it off"),
+        ("pipeline.model.camera_optimizer.mode", model.camera_optimizer.mode != "off", "set it to off"),
+        ("start_paused", config.start_paused, "leave it off, since the viewer is off, too"),
+        ("pipeline.model.fused", not model.fused and machine.device_type == "cuda", "leave it on"),
+    ):
+        if given:
+            raise InputError(f"{name} works on one device only, and this run takes several: {remedy}.")
+
+
+class Peers:
+    """The processes of a run, as the operating system knows them."""
+
+    def __init__(self) -> None:
+        mine = (socket.gethostname(), os.getpid())
+        self._places: list[tuple[str, int]] = [mine] * dist.get_world_size()
+        dist.all_gather_object(self._places, mine)
+
+    def ended(self) -> list[int]:
+        """Return the ranks of the processes of this machine that have ended, after waiting some seconds for one."""
+        end, here = time.monotonic() + _REAPED_SECONDS, socket.gethostname()
+        while True:
+            ranks = [rank for rank, (host, pid) in enumerate(self._places) if host == here and not _exists(pid)]
+            if ranks or time.monotonic() > end:
+                return ranks
+            time.sleep(0.1)
+
+
+def _exists(pid: int) -> bool:
+    """Tell whether there is a process of this user, or one that ended and of which its parent has not learned yet."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # The number is another user's process's by now.
+        return False
+    return True
+
+
+def join(config: CheckedTrainerConfig, local_rank: int) -> tuple[Shards | None, int]:
+    """Join the other processes of the run, where there are others.
+
+    All processes draw the same random numbers, where nerfstudio seeds each in its own way. Those after the first print
+    nothing.
+
+    Args:
+        config: Its time stamp becomes that of the first process.
+        local_rank: Number of this process on its machine, as nerfstudio counts it.
+
+    Returns:
+        What this process knows of the others, None where it is alone; and its number on its machine.
+    """
+    if number_of_processes() == 1:
+        return None, local_rank
+    cuda = config.machine.device_type == "cuda"
+    if not dist.is_initialized():
+        local_rank = int(os.environ["LOCAL_RANK"])
+    if cuda:
+        torch.cuda.set_device(local_rank)  # NCCL, and Triton, take the current device.
+    if not dist.is_initialized():
+        dist.init_process_group("nccl" if cuda else "gloo", timeout=_TIMEOUT)
+    random.seed(config.machine.seed)
+    np.random.seed(config.machine.seed)
+    torch.manual_seed(config.machine.seed)
+    CONSOLE.quiet = not is_first()
+    shared = [config.timestamp]
+    dist.broadcast_object_list(shared, 0)
+    config.timestamp = shared[0]
+    return Shards(torch.device("cuda", local_rank) if cuda else torch.device("cpu")), local_rank
+
+
+def leave() -> None:
+    """End what `join` began, where torchrun started the processes; nerfstudio does so for those that it starts."""
+    if "WORLD_SIZE" in os.environ and dist.is_initialized():
+        dist.destroy_process_group()

@@ -1,0 +1,63 @@
+"""Training steps of Gaussians that are spread over several processes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sadgs_ns.distributed.rasterization import rasterize
+from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.method.losses import photometric_part
+from sadgs_ns.plugin.model import SadgsModel
+
+
+def losses_of_views(
+    model: SadgsModel,
+    shards: Shards,
+    viewmats: Tensor,
+    Ks: Tensor,
+    views: Sequence[tuple[int, Mapping[str, Any]]],
+    structure_tensors: Tensor | None,
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Render training views of one size in all processes, and let the strategy see this one's Gaussians.
+
+    Args:
+        model: The model of this process's Gaussians.
+        shards: The processes, all of which call this with the same views.
+        viewmats: World to camera. [V, 4, 4]
+        Ks: Intrinsics in px. [V, 3, 3]
+        views: Index and data of each view; the images are on the training device.
+        structure_tensors: S̄ of the views, or codes of it, [V, H, W, 3]; None where η is not observed.
+
+    Returns:
+        This process's part of the loss, `main_loss`, whose sum over the processes is the loss of one; and the metrics
+        of all: PSNR in dB, the number of Gaussians, and `loss`, that sum.
+    """
+    height, width, _ = views[0][1]["image"].shape
+    kind = model.kind_of_step(width, height, [index for index, _ in views])
+    share = len(model.means) / shards.total
+    splats, penalty, options = model.splats(kind.opacity_reg * share)
+    rendered, loss, info = rasterize(
+        shards, *splats, viewmats, Ks, width, height, absgrad=kind.absgrad, fused=model.config.fused, **options
+    )
+    model.show_to_strategy(info, viewmats, Ks, structure_tensors)
+    background, error = model.background_of_step(), torch.zeros((), device=shards.device)
+    for band, colors, alphas in rendered:
+        rgb = model.before_background(colors, alphas, background)
+        rows = slice(band.top, band.bottom)
+        data = views[band.view][1]
+        batch = {name: data[name][None, rows] for name in ("image", "mask") if name in data}
+        predicted, target = model.compared({"rgb": rgb, "background": background}, batch)
+        part, square = photometric_part(
+            predicted, target, rows=(band.first, band.last), top=band.top, height=height,
+            ssim_lambda=model.config.ssim_lambda, fused=model.config.fused,
+        )  # fmt: skip
+        loss, error = loss + part / len(views), error + square / len(views)
+    if penalty is not None:
+        loss = loss + penalty.sum()
+    of_all = shards.sum(torch.stack([loss.detach(), error]))
+    metrics = {"psnr": -10 * of_all[1].log10(), "gaussian_count": shards.total, "loss": of_all[0]}
+    return {"main_loss": loss}, metrics

@@ -1,0 +1,39 @@
+"""`sadgs-bench shards` as far as it runs without CUDA: its steps, alone and in two processes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from ranks import run_ranks
+
+from sadgs_ns.bench import shards as bench
+from sadgs_ns.distributed.shards import Shards
+
+CPU = torch.device("cpu")
+
+
+def train_together(shards: Shards) -> dict[str, Any]:
+    step = bench.Step(300, 48, 32, 3, CPU, shards)
+    before = step.params["means"].detach().clone()
+    milliseconds, _ = bench.measure(step, CPU, 1)
+    moved = not torch.equal(step.params["means"], before)
+    sums = {name: float(step.state[name].sum()) for name in ("n_total", "absgrad2d", "grad_count")}
+    return {"milliseconds": milliseconds, "moved": moved, **sums}
+
+
+def test_processes_train_what_they_have(tmp_path: Path):
+    results = run_ranks(train_together, 2, tmp_path)
+    for result in results:
+        assert result["moved"] and result["milliseconds"] > 0
+        assert result["n_total"] > 0 and result["absgrad2d"] > 0 and result["grad_count"] > 0
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="here it would measure")
+def test_one_process_prints_a_row_for_each_size(capsys: pytest.CaptureFixture[str]):
+    sizes = ["--gaussians", "200", "--megapixels", "0.001", "0.002", "--views", "1", "--repeats", "1"]
+    assert bench.main(sizes) == 0
+    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| 1 | 200 |")]
+    assert [row.split(" | ")[2] for row in rows] == ["0.001", "0.002"]

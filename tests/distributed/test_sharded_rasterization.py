@@ -1,0 +1,115 @@
+"""Several processes draw and differentiate what one does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from ranks import run_ranks
+from sharded_scene import GAUSSIANS, HEIGHT, inputs, splats, weights
+from torch import Tensor
+
+from sadgs_ns.distributed.bands import ROWS, share_out
+from sadgs_ns.distributed.rasterization import rasterize
+from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.render.rasterization import rasterize as rasterize_alone
+from sadgs_ns.render.rasterization import visible
+
+
+def draw_together(shards: Shards, views: int, mode: str, uneven: bool, fused: bool) -> dict[str, Any]:
+    if fused:
+        from interpreted import use_our_rasterizer
+
+        use_our_rasterizer(pytest.MonkeyPatch())
+    part = shards.take_even_part(GAUSSIANS)
+    if uneven:  # The last process has nothing that anybody sees.
+        shards.sizes = [GAUSSIANS - 3 * (shards.num_ranks - 1), *[3] * (shards.num_ranks - 1)]
+        start = sum(shards.sizes[: shards.rank])
+        part = slice(start, start + shards.sizes[shards.rank])
+    leaves = inputs(part)
+    options: dict[str, Any] = {"sh_degree": 1, "absgrad": True, "rasterize_mode": mode, "max_off_axis": 1.5}
+    shards.request = 1 << shards.rank
+    rendered, loss, info = rasterize(shards, *splats(leaves, views), **options)
+    images = []
+    for band, colors, alphas in rendered:
+        rows = slice(band.first - band.top, band.last - band.top)
+        image = torch.cat([colors, alphas], dim=-1)[0, rows]
+        loss = loss + (image * weights(views)[band.view, band.first : band.last]).sum()
+        images.append((band, image.detach()))
+    loss.backward()
+    return {
+        "images": images,
+        "loss": loss.detach(),
+        "gradients": {name: leaf.grad for name, leaf in leaves.items()},
+        "absgrad": info["means2d"].absgrad,
+        "grad2d": info["means2d"].grad2d,
+        "visible": visible(info),
+        "heard": shards.heard,
+    }
+
+
+@pytest.mark.parametrize(
+    ("ranks", "views", "mode", "uneven", "fused"),
+    [
+        (2, 2, "classic", False, False),
+        (3, 4, "antialiased", False, False),
+        (3, 1, "classic", True, False),
+        (2, 3, "classic", False, True),
+    ],
+)
+def test_processes_draw_and_differentiate_what_one_does(
+    ranks: int, views: int, mode: Any, uneven: bool, fused: bool, tmp_path: Path
+):
+    """With `fused`, the processes draw with our kernels in Triton's interpreter."""
+    if fused:
+        pytest.importorskip("interpreted", reason="Triton is not installed", exc_type=ImportError)
+    leaves = inputs()
+    colors, alphas, info = rasterize_alone(
+        *splats(leaves, views),
+        sh_degree=1, absgrad=True, rasterize_mode=mode, max_off_axis=1.5,
+    )  # fmt: skip
+    info["means2d"].retain_grad()
+    expected = torch.cat([colors, alphas], dim=-1)
+    loss = (expected * weights(views)).sum()
+    loss.backward()
+    assert not visible(info).all(), "some Gaussians should be out of sight"
+
+    results = run_ranks(draw_together, ranks, tmp_path, views, mode, uneven, fused)
+
+    covered = torch.zeros(views, HEIGHT)
+    for result in results:
+        for band, image in result["images"]:
+            covered[band.view, band.first : band.last] += 1
+            torch.testing.assert_close(image, expected[band.view, band.first : band.last], atol=1e-5, rtol=0)
+        assert result["heard"] == (1 << ranks) - 1
+    assert (covered == 1).all()
+    torch.testing.assert_close(sum(result["loss"] for result in results), loss.detach(), rtol=1e-5, atol=0)
+
+    def together(name: str, dim: int) -> Tensor:
+        return torch.cat([result[name] for result in results], dim=dim)
+
+    seen = visible(info)
+    assert torch.equal(together("visible", 1), seen)
+    assert info["means2d"].grad is not None
+    for name, tensor in (("grad2d", info["means2d"].grad), ("absgrad", info["means2d"].absgrad)):
+        scale = float(tensor[seen].abs().max())
+        torch.testing.assert_close(together(name, 1)[seen], tensor[seen], atol=1e-5 * scale, rtol=1e-4)
+    for name, leaf in leaves.items():
+        assert leaf.grad is not None
+        gradient = torch.cat([result["gradients"][name] for result in results])
+        torch.testing.assert_close(gradient, leaf.grad, atol=1e-5 * float(leaf.grad.abs().max()), rtol=1e-4)
+
+
+@pytest.mark.parametrize(("views", "height", "ranks"), [(4, 100, 2), (1, 33, 3), (3, 75, 2), (2, 10, 3), (5, 64, 3)])
+def test_bands_cover_every_row_once_and_evenly(views: int, height: int, ranks: int):
+    bands = share_out(views, height, ranks)
+    assert [(b.view, b.first) for b in bands] == sorted((b.view, b.first) for b in bands)
+    assert [b.rank for b in bands] == sorted(b.rank for b in bands)
+    rows = [(b.view, row) for b in bands for row in range(b.first, b.last)]
+    assert rows == [(view, row) for view in range(views) for row in range(height)]
+    if views % ranks == 0:
+        assert all((b.first, b.last, b.top, b.bottom) == (0, height, 0, height) for b in bands)
+    shares = [sum(b.last - b.first for b in bands if b.rank == rank) for rank in range(ranks)]
+    assert max(shares) - min(shares) <= max(2 * ROWS, height if height < ROWS else 0)

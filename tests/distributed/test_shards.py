@@ -1,0 +1,73 @@
+"""What processes that hold one splat together decide and exchange equals what one process does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from ranks import run_ranks
+
+from sadgs_ns.distributed.ranking import limit_growth
+from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.method.split import limit_growth as limit_growth_alone
+
+BUDGETS = (0, 1, 5, 37, 120, 2000, float("inf"), -3)
+
+
+def growths() -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """Growth and priorities of 90 Gaussians: with ties, with infinities and zeros, and with one that outgrows all."""
+    generator = torch.Generator().manual_seed(0)
+    growth = torch.randint(0, 9, (90,), generator=generator)
+    ties = torch.randint(0, 6, (90,), generator=generator).float()
+    spread = torch.exp(20 * torch.randn(90, generator=generator))
+    spread[7], spread[50] = float("inf"), 0.0
+    outgrown = growth.clone()
+    outgrown[spread.argmax()] = 511
+    return [(growth, ties), (growth, spread), (outgrown, spread), (torch.ones_like(growth), ties), (0 * growth, ties)]
+
+
+def limit_together(shards: Shards) -> list[torch.Tensor]:
+    part = shards.take_even_part(90)
+    return [limit_growth(shards, g[part], p[part], budget) for g, p in growths() for budget in BUDGETS]
+
+
+def test_the_budget_goes_to_the_same_gaussians(tmp_path: Path):
+    results = run_ranks(limit_together, 3, tmp_path)
+    expected = [limit_growth_alone(growth, priority, budget) for growth, priority in growths() for budget in BUDGETS]
+    for i, chosen in enumerate(expected):
+        assert torch.equal(torch.cat([result[i] for result in results]), chosen), i
+
+
+def exchange_rows(shards: Shards) -> dict[str, Any]:
+    sizes = [5, 0, 17]
+    rows = torch.arange(22.0).view(22, 1) + torch.tensor([0.0, 0.5])
+    start = sum(sizes[: shards.rank])
+    mine = rows[start : start + sizes[shards.rank]]
+    shards.count(len(mine))
+    uneven, gathered, evened = shards.is_uneven(), shards.gather_rows(mine), shards.even_out(mine)
+    shards.even_out(mine[:, :0])  # Coefficients of harmonics have no numbers where the degree is 0.
+    shards.count(len(evened))
+    torch.manual_seed(4)
+    drawn = shards.rand(2)
+    after = torch.rand(1)
+    return {
+        "sizes": shards.sizes, "uneven": uneven, "even": not shards.is_uneven(), "gathered": gathered,
+        "evened": evened, "drawn": drawn, "after": after, "least": shards.least(3.0 - shards.rank),
+        "all": (shards.all(True), shards.all(shards.rank > 0)),
+    }  # fmt: skip
+
+
+def test_rows_are_gathered_and_evened_out_in_the_order_of_the_ranks(tmp_path: Path):
+    results = run_ranks(exchange_rows, 3, tmp_path)
+    rows = torch.arange(22.0).view(22, 1) + torch.tensor([0.0, 0.5])
+    assert torch.equal(results[0]["gathered"], rows)
+    assert torch.equal(torch.cat([result["evened"] for result in results]), rows)
+    torch.manual_seed(4)
+    assert torch.equal(torch.cat([result["drawn"] for result in results], dim=1), torch.rand((2, 22, 2)))
+    after = torch.rand(1)
+    for result in results:
+        assert result["sizes"] == [7, 7, 8]
+        assert result["uneven"] and not result["even"]  # 8 is more than 1.1 times 7.
+        assert torch.equal(result["after"], after) and result["least"] == 1.0
+        assert result["all"] == (True, False)

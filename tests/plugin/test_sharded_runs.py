@@ -1,0 +1,268 @@
+"""Runs whose Gaussians are spread over several processes do what a run of one process does."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import functools
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from kill_and_resume import configure, differences, set_up
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.scripts import train as train_script
+from nerfstudio.utils.rich_utils import CONSOLE
+from ranks import run_ranks
+from torch.multiprocessing.spawn import ProcessExitedException, ProcessRaisedException
+
+from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.errors import InputError, RunError
+from sadgs_ns.plugin.presets import sadgs
+from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
+
+STRUCTURE_EVERY = 6
+
+
+def few_steps(scene: Path, output: Path, views: int) -> SadgsTrainerConfig:
+    """A run whose first half ends with a structure step; every step before that is observed by all statistics."""
+    config = configure(scene, output, 2 * STRUCTURE_EVERY, save_every=0)
+    config.pipeline.views_per_iteration = views
+    # Gaussians start as spheres: their rotations have no gradient, and Adam would make steps of what rounding leaves.
+    config.optimizers["quats"]["optimizer"].lr = 0.0
+    config.pipeline.model.strategy = dataclasses.replace(
+        config.pipeline.model.strategy,
+        structure_every=STRUCTURE_EVERY, absgs_every=4, refine_start_iter=1, refine_stop_iter=STRUCTURE_EVERY,
+        eta_every=1, min_observations=1, split_min_opacity=0.0, clone_grad2d=1e3, split_absgrad2d=1e3,
+    )  # fmt: skip
+    return config
+
+
+def record(trainer: SadgsTrainer) -> dict[str, Any]:
+    """Train, and note each step's loss, and the statistics before the structure step."""
+    losses: list[float] = []
+    statistics: dict[str, torch.Tensor] = {}
+    model = trainer.pipeline.model
+
+    def before(step: int) -> None:
+        if step == STRUCTURE_EVERY - 1:
+            state = {key: value for key, value in model.strategy_state.items() if isinstance(value, torch.Tensor)}
+            statistics.update({key: value.clone() for key, value in state.items()})
+
+    iterate = trainer.train_iteration
+
+    def noted(step: int) -> Any:
+        before(step)
+        result = iterate(step)
+        losses.append(float(result[0]))
+        return result
+
+    trainer.train_iteration = noted  # type: ignore[method-assign]
+    trainer.train()
+    steps = model.strategy_state["structure_steps"]
+    return {"losses": losses, "statistics": statistics, "steps": steps, "gaussians": model.num_gaussians}
+
+
+def record_together(shards: Shards, config: SadgsTrainerConfig) -> dict[str, Any]:
+    CONSOLE.quiet = True
+    trainer = config.setup(local_rank=shards.rank, world_size=shards.num_ranks)
+    trainer.setup()
+    return record(trainer)
+
+
+@pytest.mark.parametrize(("ranks", "views"), [(2, 2), (3, 2)])
+def test_the_first_steps_are_those_of_one_process(ranks: int, views: int, scene: Path, tmp_path: Path):
+    torch.manual_seed(0)
+    expected = record(set_up(few_steps(scene, tmp_path / "alone", views)))
+    assert expected["steps"][0]["split"] > 0
+    results = run_ranks(record_together, ranks, tmp_path / "meet", few_steps(scene, tmp_path / "together", views))
+    for result in results:
+        first, alone = (torch.tensor(losses[:STRUCTURE_EVERY]) for losses in (result["losses"], expected["losses"]))
+        torch.testing.assert_close(first, alone, rtol=1e-5, atol=0)
+        assert result["steps"] == expected["steps"] and result["gaussians"] == expected["gaussians"]
+    for name, value in expected["statistics"].items():
+        together = torch.cat([result["statistics"][name] for result in results])
+        # A sample that lies at a threshold may fall to either side of it.
+        close = torch.isclose(together, value, rtol=1e-3, atol=1e-4 * float(value.abs().max()))
+        assert close.float().mean() > 0.995, name
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("pipeline.model.use_bilateral_grid", True),
+        ("pipeline.model.camera_optimizer.mode", "SO3xR3"),
+        ("start_paused", True),
+    ],
+)
+def test_what_needs_one_device_is_refused_by_name(
+    option: str, value: Any, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    config = few_steps(scene, tmp_path, 2)
+    *path, name = option.split(".")
+    setattr(functools.reduce(getattr, path, config), name, value)
+    config.check()
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(InputError, match=f"{option} works on one device only, and this run takes several: "):
+        config.check()
+
+
+def train_until(shards: Shards, config: SadgsTrainerConfig, stop: int | None) -> dict[str, Any]:
+    """Train, until the last process alone is sent SIGTERM in the step `stop`.
+
+    Returns:
+        What the process held at the start and holds at the end, the exit code, and the last step's loss.
+    """
+    CONSOLE.quiet = True
+    trainer = config.setup(local_rank=shards.rank, world_size=shards.num_ranks)
+    trainer.setup()
+    return train_set_up(trainer, stop if shards.rank == shards.num_ranks - 1 else None)
+
+
+def held(trainer: SadgsTrainer) -> dict[str, torch.Tensor]:
+    """The Gaussians of this process, with Adam's moments, by names."""
+    values = {name: value.detach().clone() for name, value in trainer.pipeline.model.gauss_params.items()}
+    for name in list(values):
+        for state in trainer.optimizers.optimizers[name].state.values():
+            values |= {f"{name}.{key}": state[key].clone() for key in ("exp_avg", "exp_avg_sq")}
+    return values
+
+
+def train_set_up(trainer: SadgsTrainer, stop: int | None) -> dict[str, Any]:
+    """`train_until` of a trainer that is set up."""
+    result: dict[str, Any] = {"start": held(trainer), "code": 0}
+    iterate = trainer.train_iteration
+
+    def noted(step: int) -> Any:
+        if step == stop:
+            os.kill(os.getpid(), signal.SIGTERM)
+        outcome = iterate(step)
+        result["loss"] = float(outcome[0])
+        return outcome
+
+    trainer.train_iteration = noted  # type: ignore[method-assign]
+    try:
+        trainer.train()
+    except SystemExit as ending:
+        result["code"] = ending.code
+    return result | {"end": held(trainer), "gaussians": trainer.pipeline.model.num_gaussians}
+
+
+def saved(folder: Path) -> tuple[int, dict[str, torch.Tensor]]:
+    """The step of the only checkpoint, and what `held` returns of a process that has all of it."""
+    (path,) = folder.glob("*.ckpt")
+    state = torch.load(path, weights_only=True)
+    parameters = {
+        name.rpartition(".")[2]: value for name, value in state["pipeline"].items() if ".gauss_params." in name
+    }
+    for name in list(parameters):
+        for moments in state["optimizers"][name]["state"].values():
+            parameters |= {f"{name}.{key}": moments[key] for key in ("exp_avg", "exp_avg_sq")}
+    return state["step"], parameters
+
+
+def test_a_run_goes_on_with_fewer_processes(scene: Path, tmp_path: Path):
+    """With three, then with two, which a signal to one of them ends, then with one."""
+    config = configure(scene, tmp_path / "runs", 20, save_every=0)
+    config.pipeline.views_per_iteration = 2
+    folder = config.get_checkpoint_dir()
+    parameters: dict[str, torch.Tensor] = {}
+    for ranks, stop in ((3, 5), (2, 11)):
+        results = run_ranks(train_until, ranks, tmp_path / str(ranks), copy.deepcopy(config), stop)
+        assert [result["code"] for result in results] == [128 + signal.SIGTERM] * ranks
+        if parameters:
+            together = {name: torch.cat([result["start"][name] for result in results]) for name in parameters}
+            assert not differences(together, parameters), "each process should take its part of the checkpoint"
+        last, parameters = saved(folder)
+        assert last == stop
+        together = {name: torch.cat([result["end"][name] for result in results]) for name in parameters}
+        assert not differences(together, parameters), "the checkpoint should hold what the processes have"
+        sizes = [len(result["end"]["means"]) for result in results]
+        assert max(sizes) <= 1.1 * min(sizes) + 1 and sum(sizes) == results[0]["gaussians"]
+        config.load_dir = folder
+    alone = train_set_up(set_up(copy.deepcopy(config)), None)
+    assert not differences(alone["start"], parameters) and saved(folder)[0] == 19
+    undisturbed = configure(scene, tmp_path / "undisturbed", 20, save_every=0)
+    undisturbed.pipeline.views_per_iteration = 2
+    expected = train_set_up(set_up(undisturbed), None)
+    assert alone["loss"] == pytest.approx(expected["loss"], rel=0.05)
+    assert alone["gaussians"] == pytest.approx(expected["gaussians"], rel=0.1)
+
+
+def test_a_whole_run_reaches_the_quality_of_one_process(scene: Path, tmp_path: Path):
+    def configured(name: str) -> SadgsTrainerConfig:
+        config = configure(scene, tmp_path / name, 80, save_every=0)
+        config.pipeline.views_per_iteration = 2
+        # So short a run has no time to recover from a reset of its opacities.
+        config.pipeline.model.strategy = dataclasses.replace(config.pipeline.model.strategy, reset_every=0)
+        return config
+
+    alone = set_up(configured("alone"))
+    alone.train()
+    together = configured("together")
+    run_ranks(train_until, 2, tmp_path / "meet", copy.deepcopy(together), None)
+    together.load_dir = together.get_checkpoint_dir()
+    trainers = alone, set_up(copy.deepcopy(together))
+    psnr = [trainer.pipeline.get_average_eval_image_metrics()["psnr"] for trainer in trainers]
+    assert psnr[0] > 15 and abs(psnr[1] - psnr[0]) < 0.5, psnr
+
+
+def train_and_die(shards: Shards, config: SadgsTrainerConfig, doomed: int, killed: Path) -> tuple[str, float]:
+    """Train, and let one process be killed in a step; by which error the others end, and how many seconds later."""
+    CONSOLE.quiet = True
+    trainer = config.setup(local_rank=shards.rank, world_size=shards.num_ranks)
+    trainer.setup()
+
+    def die(step: int) -> None:
+        if step == 4 and shards.rank == doomed:
+            killed.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], die))
+    with pytest.raises(RunError) as error:
+        trainer.train()
+    return str(error.value), time.time() - killed.stat().st_mtime
+
+
+def test_a_killed_process_ends_the_others_with_a_sentence_that_names_it(scene: Path, tmp_path: Path):
+    config = configure(scene, tmp_path / "runs", 20, save_every=3)
+    endings = run_ranks(train_and_die, 3, tmp_path / "meet", config, 1, tmp_path / "killed", doomed=(1,))
+    for message, seconds in (endings[0], endings[2]):
+        assert message.startswith("Process 1 of 3 ended (counted from 0)"), message
+        assert str(config.get_checkpoint_dir()) in message and seconds < 60
+    assert saved(config.get_checkpoint_dir())[0] == 3
+
+
+@pytest.mark.parametrize(
+    ("error", "sentence"),
+    [
+        (
+            ProcessExitedException("process 1 terminated with signal SIGKILL", 1, 7, -9, "SIGKILL"),
+            "A process of the run ended, and the others with it (process 1 terminated with signal SIGKILL): what ",
+        ),
+        (
+            ProcessRaisedException("\n\n-- Process 1 terminated with the following error:\nTraceback …\n"
+                                   "sadgs_ns.errors.InputError: The folder is empty: fill it.\n", 1, 7),
+            "The folder is empty: fill it.",
+        ),
+    ],
+)  # fmt: skip
+def test_what_ended_a_process_of_nerfstudios_is_told_in_a_sentence(
+    error: Exception, sentence: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def fail() -> None:
+        raise error
+
+    context = SimpleNamespace(join=fail)
+    monkeypatch.setattr(train_script, "mp", SimpleNamespace(spawn=lambda *arguments, **options: context))
+    monkeypatch.setattr(train_script.profiler, "flush_profiler", lambda config: None)
+    with pytest.raises(type(error)) as raised:
+        train_script.launch(train_script.train_loop, 2, config=sadgs.config)
+    sys.excepthook(type(error), error, raised.value.__traceback__)
+    assert capsys.readouterr().err.startswith(f"error: {sentence}")
