@@ -237,8 +237,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         "name chooses the format: .ply, the largest, which all viewers read; .compressed.ply, .spz and .sog, which are "
         "smaller and lose a little; .glb, which is glTF with KHR_gaussian_splatting; .html, a page that opens in a "
         "browser without a network, for which Node.js must be installed. A name that ends in .mesh.ply is for a mesh "
-        "fused from rendered depth, for measuring and previews; splats keep no surface. A GPU is not needed, and nothing "
-        "of the run's files is executed.",
+        "fused from rendered depth, for measuring and previews; splats keep no surface. A GPU is not needed, and "
+        "nothing of the run's files is executed.",
     )
     parser.add_argument("run", type=Path, help="folder of a run, its config.yml, or one of its checkpoints")
     parser.add_argument(

@@ -1,4 +1,4 @@
-"""`sadgs-export --output ….mesh.ply`: the mesh of Gaussians that lie on the drawn room's surfaces, and what is refused."""
+"""`sadgs-export --output ….mesh.ply`: the mesh of Gaussians on the drawn room's surfaces, and what is refused."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import pytest
 import torch
 import trimesh
 from plyfile import PlyData
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from surfaces import nearest
 
@@ -26,8 +27,8 @@ from sadgs_ns.formats.gaussians import DEGREE_0
 
 ROOM = room_surfaces()
 WIDTH, HEIGHT, VIEWS = 80, 60, 12
-SPACING = 0.05
-"""Between the centres of Gaussians, in the room's units."""
+SPACING = 0.04
+"""Between the centres of Gaussians, in the room's units; their long standard deviations are half of it."""
 MOVED = Similarity(0.4, Rotation.from_euler("xyz", [0.3, -0.5, 1.2]).as_matrix(), np.array([0.1, -0.2, 0.05]))
 """How nerfstudio is said to have moved the room."""
 
@@ -47,7 +48,7 @@ def gaussians_of_the_room(rng: np.random.Generator) -> dict[str, torch.Tensor]:
         parts.append((MOVED.positions(points), Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]],
                       surface.colour(points)))  # fmt: skip
     means, quats, colors = (torch.from_numpy(np.concatenate(part)).float() for part in zip(*parts, strict=True))
-    scales = torch.tensor([SPACING, SPACING, 0.1 * SPACING]) * MOVED.scale
+    scales = SPACING * torch.tensor([0.5, 0.5, 0.05]) * MOVED.scale
     return {
         "means": means,
         "quats": quats,
@@ -83,7 +84,7 @@ def command(run: tuple[Path, Path], output: Path, *options: str) -> int:
 def test_the_mesh_lies_on_the_room_s_surfaces_in_both_frames(
     run: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    voxel = 0.04  # of the room
+    voxel = 0.06  # of the room; what is drawn first of opaque Gaussians lies about a standard deviation before them
     size = ["--voxel-size", str(voxel * MOVED.scale)]
     for frame in ("colmap", "nerfstudio"):
         path = tmp_path / f"{frame}.mesh.ply"
@@ -91,11 +92,14 @@ def test_the_mesh_lies_on_the_room_s_surfaces_in_both_frames(
         found = PlyData.read(str(path))
         said = rf"{path}: {found['face'].count:,} triangles fused from rendered depth, .* in the frame of {frame}\n"
         assert re.fullmatch(said, capsys.readouterr().out)
-    in_room, in_run = (trimesh.load(tmp_path / f"{frame}.mesh.ply", process=False) for frame in ("colmap", "nerfstudio"))
+    paths = (tmp_path / f"{frame}.mesh.ply" for frame in ("colmap", "nerfstudio"))
+    in_room, in_run = (trimesh.load(path, process=False) for path in paths)
     assert isinstance(in_room, trimesh.Trimesh) and isinstance(in_run, trimesh.Trimesh)
-    np.testing.assert_allclose(MOVED.positions(in_room.vertices), in_run.vertices, atol=1e-5)
+    assert len(in_room.vertices) == len(in_run.vertices)
+    apart, _ = KDTree(in_run.vertices).query(MOVED.positions(in_room.vertices))  # Threads decide about their order.
+    assert apart.max() < 1e-5
     distances, which = nearest(ROOM, in_room.vertices)
-    assert np.median(distances) < 0.25 * voxel and np.quantile(distances, 0.9) < voxel
+    assert np.median(distances) < 0.5 * voxel and np.quantile(distances, 0.9) < voxel
     middles = in_room.triangles_center
     distances, which = nearest(ROOM, middles)
     for index, axis in ((0, 2), (1, 1), (2, 0)):  # The room's corner is at the origin.
@@ -117,11 +121,10 @@ def test_without_a_size_voxels_are_two_pixels_wide_or_as_many_as_fit(
     depths = np.median([np.median(view.depth[view.depth > 0]) for view in views])
     size = meshing.derive_voxel_size(views)
     assert size == pytest.approx(2 * depths / (0.8 * WIDTH), rel=1e-4)
-    monkeypatch.setattr(mesh, "MOST_VOXELS", 200 * 16**3)
+    monkeypatch.setattr(mesh, "MOST_VOXELS", 60 * 16**3)
     larger = meshing.derive_voxel_size(views)
     assert larger > size and mesh.Fusion(larger).has_room_for(views)
     assert not mesh.Fusion(larger / 2**0.5).has_room_for(views)
-    assert command(run, tmp_path / "a.mesh.ply") == 0
     monkeypatch.setattr(mesh, "MOST_VOXELS", 16**3)
     with pytest.raises(InputError, match=r"^A mesh of voxels of 0\.02 does not fit in memory: .*--voxel-size 0\.04\.$"):
         meshing.write_mesh(tmp_path / "b.mesh.ply", params, cameras, voxel_size=0.02)
@@ -139,10 +142,10 @@ def test_what_is_cleaned_away_is_not_in_the_mesh(run: tuple[Path, Path], tmp_pat
 
 
 @torch.no_grad()
-def test_depth_is_along_the_axis_and_faint_pixels_and_the_rest_of_the_alpha_are_left_out():
-    """A Gaussian of opacity .8 at a depth of 2: its middle is seen in its own colour, its rim is not."""
+def test_depth_is_along_the_axis_and_pixels_that_are_mostly_empty_are_left_out():
+    """A Gaussian of opacity .8 at a depth of 2: its middle is seen in its own colour, its rim is not seen."""
     params = {
-        "means": torch.tensor([[0.0, 0.0, -2.0], [torch.nan, 0.0, -2.0]])[:1],
+        "means": torch.tensor([[0.0, 0.0, -2.0]]),
         "quats": torch.tensor([[1.0, 0, 0, 0]]),
         "scales": torch.full((1, 3), 0.3).log(),
         "opacities": torch.tensor([[math.log(4)]]),
