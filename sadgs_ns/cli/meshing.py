@@ -48,13 +48,15 @@ def write_mesh(
         The number of triangles.
 
     Raises:
-        InputError: If the views see no surface, voxels do not fit in memory, or open3d cannot be imported.
+        InputError: If no view shows a surface, voxels do not fit in memory, or open3d cannot be imported.
         WriteError: If the file could not be written.
     """
+    number = len(cameras.sizes)
+    if not number:
+        raise InputError("The capture has no training views to fuse the depth of: give another with --data.")
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     sound = torch.stack([value.flatten(1).isfinite().all(dim=1) for value in params.values()]).all(dim=0)  # [N]
     params = {name: value[sound].to(device) for name, value in params.items()}
-    number = len(cameras.sizes)
     if voxel_size is None:
         step = -(-number // _SAMPLED)
         voxel_size = derive_voxel_size(list(look(params, cameras, range(0, number, step), max_off_axis)))

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from sadgs_ns.data.coordinates import Similarity
 from sadgs_ns.errors import InputError, reason
 
-MOST_VOXELS = 100_000_000
-"""A mesh takes at most so many voxels; each takes 20 bytes, and 16 more while triangles are made, 3.6 GB in all."""
+MOST_VOXELS = 60_000_000
+"""A mesh takes at most so many voxels; at the peak, while their number doubles, each takes 71 bytes, 4.3 GB in all."""
 PIXELS_PER_VOXEL = 2.0
 """Edge of a voxel where none is given, in pixels of the median depth."""
 _TRUNCATION = 4.0
@@ -26,6 +26,8 @@ _WIDEST_PIXEL = 4.0
 """Pixels that are wider than this at their depth, in voxels, are left out: they are far behind what the views show."""
 _RESOLUTION = 16
 """Voxels along the edge of a block."""
+_BLOCKS = 1000
+"""Blocks for which there is room at first, 82 MB; Open3D doubles that where it must."""
 _VIEWS = 3
 """A surface needs so many views, or all where there are fewer."""
 _SMALLEST_SHARE = 0.01
@@ -97,9 +99,8 @@ class Fusion:
     def __init__(self, voxel_size: float) -> None:
         open3d = load_open3d()
         self.voxel_size, self._views, self._core, self._image = voxel_size, 0, open3d.core, open3d.t.geometry.Image
-        self._grid = open3d.t.geometry.VoxelBlockGrid(
-            ("tsdf", "weight", "color"), (open3d.core.float32,) * 3, ((1,), (1,), (3,)), voxel_size, _RESOLUTION
-        )  # fmt: skip
+        names, types, shapes = ("tsdf", "weight", "color"), (open3d.core.float32,) * 3, ((1,), (1,), (3,))
+        self._grid = open3d.t.geometry.VoxelBlockGrid(names, types, shapes, voxel_size, _RESOLUTION, _BLOCKS)
 
     def _blocks(self, view: DepthView) -> tuple[Any, dict[str, Any]]:
         """Return the blocks near the surfaces that a view sees, int32 [B, 3], and what Open3D asks of the view.

@@ -182,8 +182,11 @@ def test_what_gives_no_mesh_is_one_sentence_and_leaves_nothing(
 
 
 @pytest.mark.usefixtures("open3d")
-def test_gaussians_that_are_all_faint_have_no_surface(run: tuple[Path, Path], tmp_path: Path):
+def test_no_views_and_gaussians_that_are_all_faint_have_no_surface(run: tuple[Path, Path], tmp_path: Path):
     params = export._read(run[1] / "nerfstudio_models/step-000000007.ckpt", latest=False)
+    nowhere = meshing.RunCameras(torch.zeros(0, 3, 4), torch.zeros(0, 3, 3), [], [])
+    with pytest.raises(InputError, match=r"^The capture has no training views to fuse .* give another with --data\.$"):
+        meshing.write_mesh(tmp_path / "a.mesh.ply", params, nowhere)
     params["opacities"] = torch.full_like(params["opacities"], -6.0)
     with pytest.raises(InputError, match=r"^The training views see no surface that is half opaque: train longer, or "):
         meshing.write_mesh(tmp_path / "a.mesh.ply", params, read_cameras(run[1], run[0]))
