@@ -16,13 +16,14 @@ from sadgs_ns.data.coordinates import Similarity
 from sadgs_ns.data.run_cameras import RunCameras
 from sadgs_ns.errors import InputError
 from sadgs_ns.formats import mesh
+from sadgs_ns.formats.gaussians import DEGREE_0
 from sadgs_ns.formats.mesh import DepthView, Fusion
 from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world
 
 MIN_ALPHA = 0.5
 """Pixels with less accumulated opacity show no surface."""
 _SAMPLED = 16
-"""About so many views decide how large voxels are, where nobody says."""
+"""At most so many views decide how large voxels are, where nobody says."""
 
 
 def write_mesh(
@@ -109,7 +110,9 @@ def look(
     device = params["means"].device
     viewmats, Ks = viewmats_from_camera_to_world(cameras.camera_to_worlds), cameras.Ks
     quats, scales, opacities = params["quats"], params["scales"].exp(), params["opacities"].flatten().sigmoid()
-    degree = round((1 + params["features_rest"].shape[1]) ** 0.5) - 1
+    first, rest = params["features_dc"], params["features_rest"]
+    degree = round((1 + rest.shape[1]) ** 0.5) - 1
+    colors = (first, rest) if degree else (0.5 + DEGREE_0 * first).clamp_min(0.0)
     for index in indices:
         width, height = cameras.sizes[index]
         render, alpha, _ = rasterize(
@@ -117,17 +120,17 @@ def look(
             quats,
             scales,
             opacities,
-            (params["features_dc"], params["features_rest"]),
+            colors,
             viewmats[index : index + 1].to(device),
             Ks[index : index + 1].to(device),
             width,
             height,
-            sh_degree=degree,
+            sh_degree=degree or None,
             render_mode="RGB+ED",
             max_off_axis=max_off_axis,
         )
         seen = alpha >= MIN_ALPHA  # [1, H, W, 1]
-        colors = (render[..., :3] / alpha.clamp_min(MIN_ALPHA)).clamp(0, 1)  # what is before nothing, not before black
+        own = (render[..., :3] / alpha.clamp_min(MIN_ALPHA)).clamp(0, 1)  # The background, black, is taken away.
         depth = torch.where(seen, render[..., 3:], 0.0)
         view = np.asarray(viewmats[index], np.float64), np.asarray(Ks[index], np.float64)
-        yield DepthView(depth[0, ..., 0].cpu().numpy(), colors[0].cpu().numpy(), view[1], view[0])
+        yield DepthView(depth[0, ..., 0].cpu().numpy(), own[0].cpu().numpy(), view[1], view[0])

@@ -17,6 +17,6 @@ class LazyOutputs(UserDict[str, Any]):
 
     def __getitem__(self, name: str) -> Tensor:
         value = self.data[name]
-        if not isinstance(value, Tensor):
+        if callable(value):
             value = self.data[name] = value()
         return value

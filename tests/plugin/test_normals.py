@@ -114,9 +114,9 @@ def test_evaluation_renders_no_normals_and_who_reads_them_gets_pictures(
     view = pipeline.datamanager.train_dataset.cameras[:1]
     outputs = model.get_outputs_for_camera(view)
     assert counted() == 0 and list(outputs)[:3] == ["rgb", "depth", "accumulation"] and NORMALS in outputs
-    normals = outputs[NORMALS]
+    normals = outputs[NORMALS].cpu()
     assert counted() == 1 and normals.shape == (HEIGHT, WIDTH, 3)
-    drawn = outputs["accumulation"][..., 0] > 0
+    drawn = outputs["accumulation"][..., 0].cpu() > 0
     assert (normals[~drawn] == 0).all() and drawn.any()
     torch.testing.assert_close((2 * normals[drawn] - 1).norm(dim=-1), torch.ones(int(drawn.sum())), atol=1e-4, rtol=0)
     towards = view.camera_to_worlds[0, :, 2].to(normals)  # against the direction of view
@@ -127,7 +127,7 @@ def test_normals_are_of_the_gaussians_that_the_crop_box_shows(trainer: SadgsTrai
     model: SadgsModel = trainer.pipeline.model
     trainer.pipeline.eval()
     view = trainer.pipeline.datamanager.train_dataset.cameras[:1]
-    box = OrientedBox(torch.eye(3), model.means.detach().median(dim=0).values, torch.full((3,), 0.4))
+    box = OrientedBox(torch.eye(3), model.means.detach().cpu().median(dim=0).values, torch.full((3,), 0.4))
     cropped, whole = model.get_outputs_for_camera(view, box), model.get_outputs_for_camera(view)
     assert ((cropped[NORMALS] > 0).any(dim=-1) == (cropped["accumulation"][..., 0] > 0)).all()
     assert not torch.equal(cropped[NORMALS], whole[NORMALS])
