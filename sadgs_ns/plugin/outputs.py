@@ -16,7 +16,7 @@ class LazyOutputs(UserDict[str, Any]):
     """
 
     def __getitem__(self, name: str) -> Tensor:
-        value = self.data[name]
+        value: Any = self.data[name]
         if callable(value):
             value = self.data[name] = value()
         return value

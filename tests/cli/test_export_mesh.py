@@ -204,3 +204,17 @@ def test_voxels_are_for_meshes_and_open3d_is_asked_for_first(
     said = r"sadgs-export: A mesh is made by open3d, which cannot be imported \(.*\): install .* libusb-1\.0-0\.\n"
     assert re.fullmatch(said, capsys.readouterr().err)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("bands", [0, 3])
+def test_what_views_see_on_a_gpu_is_what_they_see_on_the_cpu(run: tuple[Path, Path], bands: int):
+    params = gaussians_of_the_room(np.random.default_rng(0))
+    params["features_rest"] = params["features_rest"][:, :bands].contiguous()
+    cameras = read_cameras(run[1], run[0])
+    moved = {name: value.cuda() for name, value in params.items()}
+    for on_cpu, on_gpu in zip(*(meshing.look(p, cameras, range(2), 4.0) for p in (params, moved)), strict=True):
+        seen = (on_cpu.depth > 0) & (on_gpu.depth > 0)
+        assert (seen == (on_cpu.depth > 0)).mean() > 0.99
+        assert np.median(np.abs(on_cpu.depth - on_gpu.depth)[seen]) < 1e-4
+        assert np.median(np.abs(on_cpu.color - on_gpu.color)[seen]) < 1e-3

@@ -169,3 +169,15 @@ def test_ns_render_writes_depth_and_normals(trainer: SadgsTrainer, tmp_path: Pat
     assert counted() == len(pictures) == len(list((output / "test/raw-depth").iterdir())) > 0
     with Image.open(pictures[0]) as picture:
         assert picture.size == (WIDTH, HEIGHT) and np.asarray(picture).max() > 128
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_normals_on_a_gpu_are_those_of_the_cpu():
+    viewmats, Ks = camera(64, 48)
+    params = discs([0.0, 0.4, -0.7], spacing=0.8)
+    on_cpu = normals_map(params, viewmats[0], Ks[0], 64, 48)
+    moved = {name: value.cuda() for name, value in params.items()}
+    on_gpu = normals_map(moved, viewmats[0].cuda(), Ks[0].cuda(), 64, 48).cpu()
+    both = (on_cpu != 0).any(dim=-1) & (on_gpu != 0).any(dim=-1)
+    assert (both == (on_cpu != 0).any(dim=-1)).float().mean() > 0.98  # A rim of 1/255 may round either way.
+    torch.testing.assert_close(on_gpu[both], on_cpu[both], atol=1e-3, rtol=0)
