@@ -102,10 +102,10 @@ class Fusion:
         names, types, shapes = ("tsdf", "weight", "color"), (open3d.core.float32,) * 3, ((1,), (1,), (3,))
         self._grid = open3d.t.geometry.VoxelBlockGrid(names, types, shapes, voxel_size, _RESOLUTION, _BLOCKS)
 
-    def _blocks(self, view: DepthView) -> tuple[Any, dict[str, Any]]:
+    def _blocks(self, view: DepthView) -> tuple[Any, dict[str, Any]] | None:
         """Return the blocks near the surfaces that a view sees, int32 [B, 3], and what Open3D asks of the view.
 
-        Open3D raises an error where there are none.
+        Open3D looks at every fourth pixel of every fourth row; where these show nothing near, the result is None.
         """
         tensor = self._core.Tensor
         camera = {
@@ -116,14 +116,16 @@ class Fusion:
             "trunc_voxel_multiplier": _TRUNCATION,
         }
         depth = self._image(tensor(view.depth[..., None]))
-        return self._grid.compute_unique_block_coordinates(depth, **camera), {"depth": depth, **camera}
-
-    def _sees(self, view: DepthView) -> bool:
-        return bool(((view.depth > 0) & (view.depth < _WIDEST_PIXEL * self.voxel_size * view.focal)).any())
+        try:
+            return self._grid.compute_unique_block_coordinates(depth, **camera), {"depth": depth, **camera}
+        except RuntimeError as error:
+            if "No block is touched" not in str(error):
+                raise
+            return None
 
     def has_room_for(self, views: Sequence[DepthView]) -> bool:
         """Tell whether what these views need is at most a quarter of `MOST_VOXELS`; the rest is for other views."""
-        found = [self._blocks(view)[0].numpy() for view in views if self._sees(view)]
+        found = [blocks[0].numpy() for view in views if (blocks := self._blocks(view)) is not None]
         return not found or 4 * len(np.unique(np.concatenate(found), axis=0)) * _RESOLUTION**3 <= MOST_VOXELS
 
     def add(self, view: DepthView) -> None:
@@ -133,9 +135,9 @@ class Fusion:
             InputError: If that takes more than `MOST_VOXELS`.
         """
         self._views += 1
-        if not self._sees(view):
+        if (found := self._blocks(view)) is None:
             return
-        blocks, camera = self._blocks(view)
+        blocks, camera = found
         voxels = self._grid.hashmap()
         known = voxels.find(blocks)[1].numpy().sum() if voxels.size() else 0
         if (voxels.size() + len(blocks) - known) * _RESOLUTION**3 > MOST_VOXELS:

@@ -89,7 +89,9 @@ def test_a_surface_needs_three_views_or_all_of_fewer(times: int, others: int, sh
 @pytest.mark.usefixtures("open3d")
 def test_nothing_and_what_is_far_behind_make_no_mesh():
     view = depth_view(ROOM, arc_views(1, 80, 60)[0])
-    for depth in (np.zeros_like(view.depth), np.full_like(view.depth, 100.0)):  # pixels of 1.6 world units
+    nothing, far, between = np.zeros_like(view.depth), np.full_like(view.depth, 100.0), np.zeros_like(view.depth)
+    between[31, 41] = 2.0  # Open3D looks at every fourth pixel of every fourth row.
+    for depth in (nothing, far, between):
         fusion = Fusion(VOXEL)
         fusion.add(dataclasses.replace(view, depth=depth))
         assert fusion.mesh().triangles.shape == (0, 3)
