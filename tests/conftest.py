@@ -90,7 +90,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def open3d() -> None:
     """Skip where open3d, which parts of nerfstudio need, cannot be imported: it wants a system library."""
     try:

@@ -24,15 +24,14 @@ VOXEL = 0.04
 
 
 @pytest.fixture(scope="module")
-def room() -> Mesh:
-    """A mesh of 12 views of the room; tests that read it skip where open3d cannot be imported."""
+def room(open3d: None) -> Mesh:
+    """A mesh of 12 views of the room."""
     fusion = Fusion(VOXEL)
     for view in arc_views(12, 160, 120):
         fusion.add(depth_view(ROOM, view))
     return fusion.mesh().without_small_parts()
 
 
-@pytest.mark.usefixtures("open3d")
 def test_the_surface_lies_within_a_tenth_of_a_voxel_in_the_median(room: Mesh):
     distances, which = nearest(ROOM, room.vertices.astype(float))
     assert np.median(distances) < 0.1 * VOXEL and np.quantile(distances, 0.9) < 0.3 * VOXEL
@@ -40,7 +39,6 @@ def test_the_surface_lies_within_a_tenth_of_a_voxel_in_the_median(room: Mesh):
                           surface.name}, "all that the views see has a part"  # fmt: skip
 
 
-@pytest.mark.usefixtures("open3d")
 def test_corners_run_counterclockwise_where_cameras_see_them(room: Mesh):
     """The room's corner is at the origin, so that the floor and the walls are seen from the positive side."""
     normals = face_normals(room)
@@ -55,7 +53,6 @@ def test_corners_run_counterclockwise_where_cameras_see_them(room: Mesh):
     assert ((normals * outward).sum(axis=1)[on] > 0).mean() > 0.99
 
 
-@pytest.mark.usefixtures("open3d")
 def test_vertices_have_the_colours_of_their_surface(room: Mesh):
     points = room.vertices.astype(float)
     distances, which = nearest(ROOM, points)
@@ -65,7 +62,6 @@ def test_vertices_have_the_colours_of_their_surface(room: Mesh):
         assert np.median(errors) < 0.03, "but at edges, over which a voxel averages"
 
 
-@pytest.mark.usefixtures("open3d")
 def test_a_reflection_keeps_the_front(room: Mesh):
     mirror = Similarity(2.0, np.diag([1.0, 1, -1]), np.array([0.0, 0, 5]))
     moved = room.moved(mirror)
