@@ -65,6 +65,8 @@ THIRD_PARTY_WARNINGS = (
     "ignore:To copy construct from a tensor:UserWarning",
     # Triton's interpreter makes Python numbers of arrays with one element.
     "ignore:Conversion of an array with ndim:DeprecationWarning",
+    # numba, which gsply uses, finds the older TBB that open3d has loaded, and takes another of its threading layers.
+    "ignore:The TBB threading layer requires TBB version:Warning",
     # torchmetrics makes AlexNet for LPIPS with torchvision's old arguments.
     "ignore:The parameter 'pretrained' is deprecated:UserWarning",
     "ignore:Arguments other than a weight enum:UserWarning",
@@ -88,7 +90,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def open3d() -> None:
     """Skip where open3d, which parts of nerfstudio need, cannot be imported: it wants a system library."""
     try:

@@ -1,8 +1,9 @@
-"""`sadgs-export RUN --output FILE`: a run's Gaussians as a file for viewers, in the format that its name asks for."""
+"""`sadgs-export RUN --output FILE`: a run's Gaussians, or a mesh, in the format that the file's name asks for."""
 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,8 +15,9 @@ from numpy.typing import NDArray
 from sadgs_ns.data.coordinates import TRANSFORMS_NAME, Similarity, from_data
 from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.formats import files, html
-from sadgs_ns.formats.files import SUFFIXES, Frame, format_of
+from sadgs_ns.formats.files import MESH, SUFFIXES, Frame, format_of
 from sadgs_ns.formats.gaussians import DEGREE_0, of_parameters
+from sadgs_ns.formats.mesh import load_open3d
 
 if TYPE_CHECKING:  # torch takes seconds, which `--help` and a wrong path need not wait for
     from torch import Tensor
@@ -78,15 +80,16 @@ def export(
     max_extent: float | None = None,
     crop: Sequence[float] | None = None,
     dust: float = 0.0,
+    voxel_size: float | None = None,
 ) -> int:
-    """Write the Gaussians of a run of sadgs or splatfacto, and say what was taken away of them.
+    """Write the Gaussians of a run of sadgs or splatfacto, or a mesh, and say what was taken away of the Gaussians.
 
     Nothing in the run's folder is executed, not even its `config.yml`, and the data need not be there any more, except
-    for `min_views` and `dust`, and for the camera with which an HTML page opens.
+    for `min_views` and `dust`, for a mesh, and for the camera with which an HTML page opens.
 
     Args:
         run: The run's folder, its `config.yml`, or one of its checkpoints; without one the latest is taken.
-        output: The file, whose name ends in one of `SUFFIXES`.
+        output: The file, whose name ends in one of `SUFFIXES`, or in `MESH` for a triangle mesh.
         frame: "nerfstudio" is the frame of training: centred, upright, cameras within ±1. "colmap" is that of the
             COLMAP model, or of `transforms.json` where no COLMAP model stands behind it.
         data: The capture's folder, where cameras are needed; None is where the run's `config.yml` says it was.
@@ -94,17 +97,24 @@ def export(
         max_extent: As in `Cleaning`.
         crop: As in `Cleaning`; six numbers.
         dust: As in `Cleaning`.
+        voxel_size: Of a mesh, as for `write_mesh`; None derives it.
 
     Returns:
-        The number of Gaussians written.
+        The number of Gaussians written, or of triangles.
 
     Raises:
         InputError: If the run, the capture, an option or the output cannot be used.
         WriteError: If the file could not be written.
     """
-    as_page = format_of(output) == ".html"
+    as_page, as_mesh = format_of(output) == ".html", format_of(output) == MESH
     if as_page and frame != "nerfstudio":
         raise InputError("--frame colmap is for files that other programs read: leave it out for a page.")
+    if voxel_size is not None and not as_mesh:
+        raise InputError(f"--voxel-size is for meshes: let --output end in {MESH}, or leave it out.")
+    if voxel_size is not None and not 0 < voxel_size < math.inf:
+        raise InputError(f"--voxel-size {voxel_size:g} must be more than 0: leave it out to have it derived.")
+    if as_mesh:
+        load_open3d()  # A machine that lacks it is told before views are rendered.
     checkpoint = _checkpoint_of(run)
     from sadgs_ns.method.cleaning import Cleaning  # It imports torch.
 
@@ -124,13 +134,17 @@ def export(
     if params["features_rest"].shape[1] == 0:  # then training holds colours' logits
         params["features_dc"] = (params["features_dc"].sigmoid() - 0.5) / DEGREE_0
     start, cameras = None, None
-    if as_page or cleaning.needs_views:
+    if as_page or as_mesh or cleaning.needs_views:
         from sadgs_ns.data.run_cameras import read_cameras
 
         cameras = read_cameras(folder, data)
     try:
         of_parameters(_arrays(params))  # It refuses shapes that do not fit.
         params = _cleaned(params, cleaning, cameras)
+        if as_mesh and cameras is not None:
+            from sadgs_ns.cli.meshing import write_mesh
+
+            return write_mesh(output, params, cameras, similarity, voxel_size, max_off_axis=_MAX_OFF_AXIS)
         if as_page and cameras is not None:
             pose, K = cameras.camera_to_worlds[0].double().numpy(), cameras.Ks[0]
             start = html.start_at(pose, max(cameras.sizes[0]), float(K[0, 0]), params["means"].numpy())
@@ -222,13 +236,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         description="Write a trained run's Gaussians as a file for viewers of 3D Gaussian splatting. The end of its "
         "name chooses the format: .ply, the largest, which all viewers read; .compressed.ply, .spz and .sog, which are "
         "smaller and lose a little; .glb, which is glTF with KHR_gaussian_splatting; .html, a page that opens in a "
-        "browser without a network, for which Node.js must be installed. A GPU is not needed, and nothing of the run's "
-        "files is executed.",
+        "browser without a network, for which Node.js must be installed. A name that ends in .mesh.ply is for a mesh "
+        "fused from rendered depth, for measuring and previews; splats keep no surface. A GPU is not needed, and "
+        "nothing of the run's files is executed.",
     )
     parser.add_argument("run", type=Path, help="folder of a run, its config.yml, or one of its checkpoints")
     parser.add_argument(
-        "--output", "-o", type=Path, required=True, metavar="FILE", help=f"the file to write: {', '.join(SUFFIXES)}"
-    )
+        "--output", "-o", type=Path, required=True, metavar="FILE",
+        help=f"the file to write: {', '.join(SUFFIXES)}, or {MESH} for a mesh",
+    )  # fmt: skip
     parser.add_argument(
         "--frame",
         choices=["nerfstudio", "colmap"],
@@ -255,9 +271,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         "others hide",
     )  # fmt: skip
     parser.add_argument(
+        "--voxel-size", type=float, metavar="UNITS",
+        help="edge of a voxel of a mesh, in units of nerfstudio's frame (default: two pixels at the median depth, or "
+        "more where the mesh would not fit in memory)",
+    )  # fmt: skip
+    parser.add_argument(
         "--data",
         type=Path,
-        help="folder of the capture, for .html, --min-views and --dust (default: where it was in training)",
+        help="folder of the capture, for .html, .mesh.ply, --min-views and --dust (default: where it was in training)",
     )
     given = parser.parse_args(argv)
     options = {name: value for name, value in vars(given).items() if name not in ("run", "output", "frame", "data")}
@@ -267,7 +288,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"sadgs-export: {error}", file=sys.stderr)
         return 2
     size = given.output.stat().st_size
-    print(f"{given.output}: {count:,} Gaussians, {size / 1e6:,.1f} MB, in the frame of {given.frame}")
+    what = "triangles fused from rendered depth" if format_of(given.output) == MESH else "Gaussians"
+    print(f"{given.output}: {count:,} {what}, {size / 1e6:,.1f} MB, in the frame of {given.frame}")
     return 0
 
 

@@ -32,7 +32,7 @@ from sadgs_ns.cli.process.photos import find_photos
 from sadgs_ns.cli.process.video import VIDEO_SUFFIXES
 from sadgs_ns.cli.stage import Line, clock, prepared, run_stage
 from sadgs_ns.errors import InputError, RunError, WriteError, free_space, reason
-from sadgs_ns.formats.files import SUFFIXES
+from sadgs_ns.formats.files import MESH, SUFFIXES
 from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
 
 _OURS = ("data", "output-dir", "experiment-name", "timestamp", "vis", "load-dir", "load-checkpoint", "load-config")
@@ -319,7 +319,8 @@ def _shown(value: Any) -> str:
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:
     """Return the options, of which `options` are those for ns-train; exit with code 2 if one is wrong."""
-    known = ", ".join(suffix[1:] for suffix in SUFFIXES)
+    formats = [suffix[1:] for suffix in (*SUFFIXES, MESH)]
+    known = ", ".join(formats)
     parser = argparse.ArgumentParser(
         prog="sadgs",
         description="From photos or a video to a splat that opens in a browser: cameras (sadgs-process), training "
@@ -354,7 +355,7 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
         parser.error(f"--max-size must be at least {MIN_SIZE} px, or 0 to keep the photos' size")
     if given.formats is not None:
         given.formats = list(dict.fromkeys(given.formats.split(",")))
-        if unknown := [name for name in given.formats if f".{name}" not in SUFFIXES]:
+        if unknown := [name for name in given.formats if name not in formats]:
             parser.error(f"--formats knows {known}, and not {unknown[0]!r}")
     return given
 

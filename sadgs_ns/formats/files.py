@@ -14,13 +14,15 @@ Frame = Literal["nerfstudio", "colmap"]
 """Coordinates: nerfstudio's, in which z is up, or those of the COLMAP model, in which y mostly is down."""
 
 SUFFIXES = (".ply", ".compressed.ply", ".spz", ".sog", ".glb", ".html")
-"""Ends of names, one for each format."""
+"""Ends of names, one for each format of Gaussians."""
+MESH = ".mesh.ply"
+"""End of the name of a triangle mesh."""
 _TO_Y_UP = {"nerfstudio": (-(0.5**0.5), 0.0, 0.0, 0.5**0.5), "colmap": (1.0, 0.0, 0.0, 0.0)}
 """Rotations, xyzw, of the frames to one in which y is up."""
 
 
 def format_of(path: Path) -> str:
-    """Return one of `SUFFIXES`.
+    """Return one of `SUFFIXES`, or `MESH`.
 
     Args:
         path: The file that is to be written.
@@ -28,9 +30,9 @@ def format_of(path: Path) -> str:
     Raises:
         InputError: If its name has none of these ends, or it is a folder.
     """
-    found = [suffix for suffix in SUFFIXES if path.name.lower().endswith(suffix)]
+    found = [suffix for suffix in (*SUFFIXES, MESH) if path.name.lower().endswith(suffix)]
     if not found:
-        raise InputError(f"--output {path} must end in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}.")
+        raise InputError(f"--output {path} must end in {', '.join(SUFFIXES)} or {MESH}.")
     if path.is_dir():
         raise InputError(f"--output {path} is a folder: name a file in it.")
     return max(found, key=len)

@@ -1,4 +1,4 @@
-"""Maps of what the Gaussians of each pixel have: their η, their children, or the share of chosen ones."""
+"""Maps of what the Gaussians of each pixel have: their η, children, normals, or the share of chosen ones."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from typing import Literal
 
 import torch
+import torch.nn.functional as F
+from gsplat.utils import normalized_quat_to_rotmat
 from matplotlib.colors import hsv_to_rgb
 from torch import Tensor
 
@@ -109,6 +111,30 @@ def share_map(params: Mapping[str, Tensor], chosen: Tensor, *view, **options) ->
     """
     total, cover = blend(params, chosen[:, None].float(), *view, **options)
     return torch.where(cover > MIN_COVER, total / cover, torch.nan)[..., 0]
+
+
+@torch.no_grad()
+def normals_map(params: Mapping[str, Tensor], viewmat: Tensor, *view, **options) -> Tensor:
+    """Return the normals of the Gaussians that make up each pixel, blended as their colours are.
+
+    A Gaussian's normal is the axis of its smallest scale, turned towards the camera. Training does not flatten
+    Gaussians, so that this is an estimate; normals of the depth map are rougher (docs/guide.md has both measured).
+
+    Args:
+        params: As for `blend`.
+        viewmat: As for `blend`.
+        view: The positional arguments of `blend` after `viewmat`.
+        options: The keyword arguments of `blend`.
+
+    Returns:
+        Vectors of unit length in world axes, and 0 where nothing is drawn. [H, W, 3]
+    """
+    rotmats = normalized_quat_to_rotmat(F.normalize(params["quats"], dim=-1))  # [N, 3, 3]
+    thinnest = params["scales"].argmin(dim=1)[:, None, None].expand(-1, 3, 1)  # [N, 3, 1]
+    normals = rotmats.gather(2, thinnest)[..., 0]  # [N, 3]
+    rays = params["means"] + viewmat[:3, :3].T @ viewmat[:3, 3]  # [N, 3] from the camera's centre, −Rᵀ t
+    away = (rays * normals).sum(dim=1, keepdim=True) > 0
+    return F.normalize(blend(params, torch.where(away, -normals, normals), viewmat, *view, **options)[0], dim=-1)
 
 
 def random_colors(number: int, generator: torch.Generator) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, MutableMapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple
@@ -33,6 +33,8 @@ from sadgs_ns.method.initialization import POINT_OPACITY, camera_extent, plausib
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.outliers import POINT_SHARE, REACH
+from sadgs_ns.plugin import gaussian_maps
+from sadgs_ns.plugin.outputs import LazyOutputs
 from sadgs_ns.render.activations import activate
 from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world
 from sadgs_ns.render.tile_forecast import TileForecast
@@ -40,6 +42,8 @@ from sadgs_ns.render.tile_forecast import TileForecast
 CAMERA_CLEARANCE = 2.0
 """Initial Gaussians nearer to a camera than this many of their standard deviations are dropped. The paper keeps them;
 on the scene `south` dropping them brought 1.7 dB, elsewhere nothing (docs/measurements.md)."""
+NORMALS = "normals"
+"""Name of the output that only its readers pay for."""
 LIMIT_EVERY = 25
 """Iterations between two times that scales are limited; at the presets' rates an axis grows threefold until then."""
 BILATERAL_GRID_SHAPE = (16, 16, 8)
@@ -537,7 +541,8 @@ class SadgsModel(SplatfactoModel):
             camera: One camera, shape [1].
 
         Returns:
-            `rgb` [H, W, 3] in [0, 1], `depth` [H, W, 1], `accumulation` [H, W, 1], `background` [H, W, 3].
+            `rgb` [H, W, 3] in [0, 1]; `depth` [H, W, 1], the mean of the drawn Gaussians' depths along the viewing axis
+            in the run's units, and the largest one where nothing is; `accumulation` [H, W, 1]; `background` [H, W, 3].
 
         Raises:
             ValueError: If the camera is no pinhole.
@@ -558,8 +563,33 @@ class SadgsModel(SplatfactoModel):
             "background": background.expand(height, width, 3),
         }
 
-    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+    @torch.no_grad()
+    def get_normals(self, camera: Cameras, params: Mapping[str, Tensor] | None = None) -> Tensor:
+        """Render the normals of one camera, which takes about as long as its colours.
+
+        Args:
+            camera: One camera, shape [1].
+            params: Parameters by name; None is the model's own, inside the viewer's crop box.
+
+        Returns:
+            0.5 + 0.5 n, n being what `gaussian_maps.normals_map` returns, in the axes of the run's world; black where
+            nothing is. [H, W, 3]
+        """
+        params = self.cropped(dict(self.gauss_params.items())) if params is None else params
+        width, height = int(camera.width.item()), int(camera.height.item())
+        if not len(params["means"]):
+            return torch.zeros((height, width, 3), device=self.device)
+        viewmat = viewmats_from_camera_to_world(camera.camera_to_worlds)[0].to(self.device)
+        K = camera.get_intrinsics_matrices()[0].to(self.device)
+        normals = gaussian_maps.normals_map(params, viewmat, K, width, height, **self.drawing)
+        return torch.where((normals != 0).any(dim=-1, keepdim=True), 0.5 + 0.5 * normals, 0.0)
+
+    def get_outputs_for_camera(  # type: ignore[override]
+        self, camera: Cameras, obb_box: OrientedBox | None = None
+    ) -> MutableMapping[str, Tensor]:
         """Render one camera as `get_outputs` does, inside a crop box, and add the pictures of the viewer's panel.
+
+        Outside the viewer, `get_normals` is added as `normals`, and computed when it is first read.
 
         Args:
             camera: One camera, shape [1].
@@ -576,7 +606,12 @@ class SadgsModel(SplatfactoModel):
             _say_once(str(error))
             width, height = int(camera.width.item()), int(camera.height.item())
             outputs = self.get_empty_outputs(width, height, self._get_background_color())
-        return outputs if self.viewer_outputs is None else outputs | self.viewer_outputs(camera, outputs)
+        if self.viewer_outputs is not None:
+            outputs = outputs | self.viewer_outputs(camera, outputs)
+        if in_viewer():
+            return outputs
+        params = self.cropped(dict(self.gauss_params.items()))
+        return LazyOutputs({**outputs, NORMALS: lambda: self.get_normals(camera, params)})
 
     def get_gt_img(self, image: Tensor) -> Tensor:
         """Return an image as the loss compares it, on the model's device and in [0, 1].

@@ -31,12 +31,13 @@ from sadgs_ns.plugin import nonfinite
 from sadgs_ns.plugin.cleaning_panel import CleaningPanel
 from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig, check_options
 from sadgs_ns.plugin.memory_plan import NEAR_PLANE, fit_to_memory, place_images, training_size
-from sadgs_ns.plugin.model import SadgsModel, SadgsModelConfig
+from sadgs_ns.plugin.model import NORMALS, SadgsModel, SadgsModelConfig, in_viewer
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
 from sadgs_ns.plugin.optimizers import FusedAdam
 from sadgs_ns.plugin.panel import StructurePanel
 from sadgs_ns.plugin.sharded_steps import losses_of_views
 from sadgs_ns.plugin.structure_maps import StructureMaps
+from sadgs_ns.plugin.viewer import shows_output
 from sadgs_ns.plugin.views import TrainingViews
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
@@ -162,9 +163,18 @@ class SadgsPipeline(VanillaPipeline):
         self.stuck = ""  # It says why, where nothing is learned any more.
         self.structure = StructurePanel(self.structure_maps)
         self.cleaning = CleaningPanel(self.views)
-        self.model.viewer_outputs = lambda camera, rendered: (
-            self.structure.outputs(camera, rendered) | self.cleaning.outputs(camera, rendered)
-        )
+        self.model.viewer_outputs = self._viewer_outputs
+
+    def _viewer_outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return what the viewer may show besides the model's own outputs; what it does not show is `rgb`.
+
+        Normals cannot wait until they are read, because the viewer reads them when training goes on.
+        """
+        if not in_viewer():
+            return {}
+        shown = shows_output(self.structure.viewer, NORMALS)
+        normals = {NORMALS: self.model.get_normals(camera) if shown else rendered["rgb"]}
+        return normals | self.structure.outputs(camera, rendered) | self.cleaning.outputs(camera, rendered)
 
     @property
     def model(self) -> SadgsModel:

@@ -51,3 +51,17 @@ def show_output(control: ViewerControl, name: str) -> None:
         output = viewer.control_panel._output_render  # nerfstudio 1.1 has no public way.
         if name in output.options:
             output.value = name
+
+
+def shows_output(control: ViewerControl, name: str) -> bool:
+    """Tell whether the viewer shows one of its output types, in the whole window or in a half of it.
+
+    Args:
+        control: An element of the panel, which the viewer has met if it was made.
+        name: The output type.
+    """
+    viewer = getattr(control, "viewer", None)
+    if viewer is None:
+        return False
+    panel = viewer.control_panel
+    return name == panel.output_render or (panel.split and name == panel.split_output_render)

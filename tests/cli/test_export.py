@@ -434,7 +434,7 @@ def test_a_damaged_latest_checkpoint_is_passed_over_aloud(tmp_path: Path, capsys
         ("shear", r".*transforms\.json does not tell .* \(it is no rotation, scale and translation\): copy .*\."),
         ("not json", r".*transforms\.json does not tell how to return to the data's frame \(.*\): copy it .*\."),
         ("nan", r".*transforms\.json does not tell .*\): copy it from the run again, or export in .*\."),
-        ("suffix", r"--output .*a\.splat must end in \.ply, \.compressed\.ply, .* or \.html\."),
+        ("suffix", r"--output .*a\.splat must end in \.ply, \.compressed\.ply, .* or \.mesh\.ply\."),
         ("folder", r"--output .*a\.ply is a folder: name a file in it\."),
     ],
 )  # fmt: skip

@@ -173,7 +173,7 @@ def test_wrong_input_is_told_in_a_sentence_before_any_work(
     for arguments, told in (
         (
             [source, "--formats", "ply,splat"],
-            "--formats knows ply, compressed.ply, spz, sog, glb, html, and not 'splat'",
+            "--formats knows ply, compressed.ply, spz, sog, glb, html, mesh.ply, and not 'splat'",
         ),
         ([source, "--effort", "0"], "--effort must be more than 0"),
         ([source, "--max-size", "20"], "--max-size must be at least 64 px, or 0 to keep the photos' size"),

@@ -644,7 +644,7 @@ def test_held_out_cameras_render_as_nerfstudio_expects(trained: SadgsTrainer):
     for index in range(VIEWS - TRAIN_VIEWS):
         camera = pipeline.datamanager.eval_dataset.cameras[index : index + 1]
         outputs = pipeline.model.get_outputs_for_camera(camera)
-        channels = {"rgb": 3, "depth": 1, "accumulation": 1, "background": 3}
+        channels = {"rgb": 3, "depth": 1, "accumulation": 1, "background": 3, "normals": 3}
         assert {name: tuple(value.shape) for name, value in outputs.items()} == {
             name: (HEIGHT, WIDTH, count) for name, count in channels.items()
         }

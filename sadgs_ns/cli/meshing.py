@@ -1,0 +1,136 @@
+"""Renders depth and colours of Gaussians from the training views, and fuses them into the mesh of `sadgs-export`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import track
+from torch import Tensor
+
+from sadgs_ns.atomic import atomic_path
+from sadgs_ns.data.coordinates import Similarity
+from sadgs_ns.data.run_cameras import RunCameras
+from sadgs_ns.errors import InputError
+from sadgs_ns.formats import mesh
+from sadgs_ns.formats.gaussians import DEGREE_0
+from sadgs_ns.formats.mesh import DepthView, Fusion
+from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world
+
+MIN_ALPHA = 0.5
+"""Pixels with less accumulated opacity show no surface."""
+_SAMPLED = 16
+"""At most so many views decide how large voxels are, where nobody says."""
+
+
+def write_mesh(
+    path: Path,
+    params: Mapping[str, Tensor],
+    cameras: RunCameras,
+    similarity: Similarity | None = None,
+    voxel_size: float | None = None,
+    max_off_axis: float = 0.0,
+) -> int:
+    """Fuse what the training views see into a mesh, and write it; the file appears complete or not at all.
+
+    Args:
+        path: Created, with its parents, or replaced.
+        params: `means` [N, 3], log `scales` [N, 3], `quats` [N, 4], logit `opacities` [N, 1], `features_dc` [N, 3] and
+            `features_rest` [N, K, 3].
+        cameras: The training views, in the parameters' frame.
+        similarity: From the parameters' frame to the file's; None leaves the mesh as it is.
+        voxel_size: Edge of a voxel in the parameters' frame; None derives it from the median depth.
+        max_off_axis: As for `rasterize`.
+
+    Returns:
+        The number of triangles.
+
+    Raises:
+        InputError: If no view shows a surface, voxels do not fit in memory, or open3d cannot be imported.
+        WriteError: If the file could not be written.
+    """
+    number = len(cameras.sizes)
+    if not number:
+        raise InputError("The capture has no training views to fuse the depth of: give another with --data.")
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    sound = torch.stack([value.flatten(1).isfinite().all(dim=1) for value in params.values()]).all(dim=0)  # [N]
+    params = {name: value[sound].to(device) for name, value in params.items()}
+    if voxel_size is None:
+        step = -(-number // _SAMPLED)
+        voxel_size = derive_voxel_size(list(look(params, cameras, range(0, number, step), max_off_axis)))
+    fusion = Fusion(voxel_size)
+    console = Console(stderr=True)
+    views = look(params, cameras, range(number), max_off_axis)
+    for view in track(views, "Fusing depth", number, console=console, disable=not console.is_terminal):
+        fusion.add(view)
+    found = fusion.mesh().without_small_parts()
+    if not len(found.triangles):
+        raise InputError(
+            f"No surface came out of {number} training views with voxels of {voxel_size:.3g}: take fewer Gaussians "
+            "away, or leave --voxel-size out."
+        )
+    with atomic_path(path) as partial, partial.open("wb") as file:
+        mesh.write(file, found if similarity is None else found.moved(similarity))
+    return len(found.triangles)
+
+
+def derive_voxel_size(views: Sequence[DepthView]) -> float:
+    """Return an edge of two pixels at the median depth, or of as much more as a mesh of these views needs to fit.
+
+    Args:
+        views: Some of the views that will be fused.
+
+    Raises:
+        InputError: If they see no surface, or open3d cannot be imported.
+    """
+    pixels = [np.median(view.depth[view.depth > 0]) / view.focal for view in views if (view.depth > 0).any()]
+    if not pixels:
+        raise InputError("The training views see no surface that is half opaque: train longer, or take less away.")
+    size = mesh.PIXELS_PER_VOXEL * float(np.median(pixels))
+    while not Fusion(size).has_room_for(views):
+        size *= 2**0.5
+    return size
+
+
+@torch.no_grad()
+def look(
+    params: Mapping[str, Tensor], cameras: RunCameras, indices: Sequence[int], max_off_axis: float
+) -> Iterator[DepthView]:
+    """Render depth and colours, one view after the other; depth is the expected one along the viewing axis.
+
+    Args:
+        params: As for `write_mesh`, all finite, on the device that renders.
+        cameras: C views.
+        indices: Which views.
+        max_off_axis: As for `rasterize`.
+    """
+    device = params["means"].device
+    viewmats, Ks = viewmats_from_camera_to_world(cameras.camera_to_worlds), cameras.Ks
+    quats, scales, opacities = params["quats"], params["scales"].exp(), params["opacities"].flatten().sigmoid()
+    first, rest = params["features_dc"], params["features_rest"]
+    degree = round((1 + rest.shape[1]) ** 0.5) - 1
+    colors = (first, rest) if degree else (0.5 + DEGREE_0 * first).clamp_min(0.0)
+    for index in indices:
+        width, height = cameras.sizes[index]
+        render, alpha, _ = rasterize(
+            params["means"],
+            quats,
+            scales,
+            opacities,
+            colors,
+            viewmats[index : index + 1].to(device),
+            Ks[index : index + 1].to(device),
+            width,
+            height,
+            sh_degree=degree or None,
+            render_mode="RGB+ED",
+            max_off_axis=max_off_axis,
+        )
+        seen = alpha >= MIN_ALPHA  # [1, H, W, 1]
+        own = (render[..., :3] / alpha.clamp_min(MIN_ALPHA)).clamp(0, 1)  # The background, black, is taken away.
+        depth = torch.where(seen, render[..., 3:], 0.0)
+        view = np.asarray(viewmats[index], np.float64), np.asarray(Ks[index], np.float64)
+        yield DepthView(depth[0, ..., 0].cpu().numpy(), own[0].cpu().numpy(), view[1], view[0])

@@ -1,0 +1,196 @@
+"""A triangle mesh that is fused from depth maps by Open3D, with truncated signed distances in sparse blocks of voxels.
+
+The fusion is that of Curless and Levoy, "A Volumetric Method for Building Complex Models from Range Images" (1996):
+each voxel keeps the mean of its signed distances to the surfaces that views see, and the mesh is where that mean is 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sadgs_ns.data.coordinates import Similarity
+from sadgs_ns.errors import InputError, reason
+
+MOST_VOXELS = 60_000_000
+"""A mesh takes at most so many voxels; at the peak, while their number doubles, each takes 71 bytes, 4.3 GB in all."""
+PIXELS_PER_VOXEL = 2.0
+"""Edge of a voxel where none is given, in pixels of the median depth."""
+_TRUNCATION = 4.0
+"""Distance behind a surface up to which voxels count as near it, in voxels; thinner walls have no two sides."""
+_WIDEST_PIXEL = 4.0
+"""Pixels that are wider than this at their depth, in voxels, are left out: they are far behind what the views show."""
+_RESOLUTION = 16
+"""Voxels along the edge of a block."""
+_BLOCKS = 1000
+"""Blocks for which there is room at first, 82 MB; Open3D doubles that where it must."""
+_VIEWS = 3
+"""A surface needs so many views, or all where there are fewer."""
+_SMALLEST_SHARE = 0.01
+"""Connected components with fewer triangles than this share of the largest one's are left out."""
+
+
+@dataclass(frozen=True)
+class DepthView:
+    """What a pinhole camera sees."""
+
+    depth: NDArray[np.float32]
+    """Along the viewing axis, in world units; 0 where nothing is. [H, W]"""
+    color: NDArray[np.float32]
+    """In [0, 1]. [H, W, 3]"""
+    K: NDArray[np.float64]
+    """Intrinsics in px; pixel centres lie at half-integers. [3, 3]"""
+    viewmat: NDArray[np.float64]
+    """World to camera, OpenCV axes (x right, y down, z forward). [4, 4]"""
+
+    @property
+    def focal(self) -> float:
+        """Focal length in px, the geometric mean of both axes'."""
+        return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """V vertices and F triangles, whose corners run counterclockwise where a camera sees them."""
+
+    vertices: NDArray[np.float32]
+    """World units. [V, 3]"""
+    colors: NDArray[np.uint8]
+    """Of the vertices. [V, 3]"""
+    triangles: NDArray[np.int32]
+    """Indices of vertices. [F, 3]"""
+
+    def moved(self, similarity: Similarity) -> Mesh:
+        """Return the mesh in another frame; a reflection turns the corners' order round."""
+        mirrored = np.linalg.det(similarity.orthogonal) < 0
+        vertices = similarity.positions(self.vertices.astype(np.float64)).astype(np.float32)
+        return replace(self, vertices=vertices, triangles=self.triangles[:, :: -1 if mirrored else 1])
+
+    def without_small_parts(self) -> Mesh:
+        """Return the connected components that have at least a hundredth of the largest one's triangles."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        number = len(self.vertices)
+        ends = self.triangles[:, [1, 2]].T.ravel()
+        edges = coo_array((np.ones(len(ends), bool), (self.triangles[:, [0, 0]].T.ravel(), ends)), (number, number))
+        _, parts = connected_components(edges, directed=False)
+        sizes = np.bincount(parts[self.triangles[:, 0]], minlength=1)
+        triangles = self.triangles[sizes[parts[self.triangles[:, 0]]] >= _SMALLEST_SHARE * sizes.max()]
+        used, corners = np.unique(triangles, return_inverse=True)
+        corners = corners.reshape(-1, 3).astype(np.int32)
+        return Mesh(self.vertices[used], self.colors[used], corners)
+
+
+class Fusion:
+    """Voxels into which depth maps are fused, on the CPU.
+
+    Args:
+        voxel_size: Edge of a voxel in world units, > 0.
+
+    Raises:
+        InputError: If open3d cannot be imported.
+    """
+
+    def __init__(self, voxel_size: float) -> None:
+        open3d = load_open3d()
+        self.voxel_size, self._views, self._core, self._image = voxel_size, 0, open3d.core, open3d.t.geometry.Image
+        names, types, shapes = ("tsdf", "weight", "color"), (open3d.core.float32,) * 3, ((1,), (1,), (3,))
+        self._grid = open3d.t.geometry.VoxelBlockGrid(names, types, shapes, voxel_size, _RESOLUTION, _BLOCKS)
+
+    def _blocks(self, view: DepthView) -> tuple[Any, dict[str, Any]] | None:
+        """Return the blocks near the surfaces that a view sees, int32 [B, 3], and what Open3D asks of the view.
+
+        Open3D looks at every fourth pixel of every fourth row; where these show nothing near, the result is None.
+        """
+        tensor = self._core.Tensor
+        camera = {
+            "intrinsic": tensor(view.K),
+            "extrinsic": tensor(view.viewmat),
+            "depth_scale": 1.0,
+            "depth_max": _WIDEST_PIXEL * self.voxel_size * view.focal,
+            "trunc_voxel_multiplier": _TRUNCATION,
+        }
+        depth = self._image(tensor(view.depth[..., None]))
+        try:
+            return self._grid.compute_unique_block_coordinates(depth, **camera), {"depth": depth, **camera}
+        except RuntimeError as error:
+            if "No block is touched" not in str(error):
+                raise
+            return None
+
+    def has_room_for(self, views: Sequence[DepthView]) -> bool:
+        """Tell whether what these views need is at most a quarter of `MOST_VOXELS`; the rest is for other views."""
+        found = [blocks[0].numpy() for view in views if (blocks := self._blocks(view)) is not None]
+        return not found or 4 * len(np.unique(np.concatenate(found), axis=0)) * _RESOLUTION**3 <= MOST_VOXELS
+
+    def add(self, view: DepthView) -> None:
+        """Fuse a view.
+
+        Raises:
+            InputError: If that takes more than `MOST_VOXELS`.
+        """
+        self._views += 1
+        if (found := self._blocks(view)) is None:
+            return
+        blocks, camera = found
+        voxels = self._grid.hashmap()
+        known = voxels.find(blocks)[1].numpy().sum() if voxels.size() else 0
+        if (voxels.size() + len(blocks) - known) * _RESOLUTION**3 > MOST_VOXELS:
+            raise InputError(
+                f"A mesh of voxels of {self.voxel_size:.3g} does not fit in memory: give a larger one, such as "
+                f"--voxel-size {2 * self.voxel_size:.2g}."
+            )
+        color = self._image(self._core.Tensor(view.color))
+        self._grid.integrate(blocks, camera.pop("depth"), color, **camera)
+
+    def mesh(self) -> Mesh:
+        """Return the surface, which has no triangles where the views showed none."""
+        if not self._grid.hashmap().size():
+            return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros((0, 3), np.int32))
+        # Open3D wants more views than the threshold says.
+        found = self._grid.extract_triangle_mesh(weight_threshold=min(_VIEWS, self._views) - 0.5)
+        if not len(found.triangle) or not found.triangle.indices.shape[0]:
+            return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros((0, 3), np.int32))
+        colors = np.rint(255 * found.vertex.colors.numpy().clip(0, 1)).astype(np.uint8)
+        return Mesh(found.vertex.positions.numpy(), colors, found.triangle.indices.numpy().astype(np.int32))
+
+
+def load_open3d() -> Any:
+    """Import open3d, which takes a second.
+
+    Raises:
+        InputError: If it cannot be imported.
+    """
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        raise InputError(
+            f"A mesh is made by open3d, which cannot be imported ({reason(error)}): install open3d with pip, and the "
+            "system's package libusb-1.0-0."
+        ) from error
+    return open3d
+
+
+def write(file: IO[bytes], mesh: Mesh) -> None:
+    """Write a mesh as binary little-endian PLY, with colours of vertices.
+
+    Args:
+        file: Open for writing.
+        mesh: What is written.
+    """
+    lines = ["ply", "format binary_little_endian 1.0", "comment sadgs_ns: fused from rendered depth"]
+    lines += [f"element vertex {len(mesh.vertices)}", *(f"property float {axis}" for axis in "xyz")]
+    lines += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
+    lines += [f"element face {len(mesh.triangles)}", "property list uchar int vertex_indices", "end_header"]
+    file.write(("\n".join(lines) + "\n").encode())
+    vertices = np.empty(len(mesh.vertices), [("position", "<f4", 3), ("color", "u1", 3)])
+    vertices["position"], vertices["color"] = mesh.vertices, mesh.colors
+    faces = np.empty(len(mesh.triangles), [("corners", "u1"), ("indices", "<i4", 3)])
+    faces["corners"], faces["indices"] = 3, mesh.triangles
+    file.write(vertices.tobytes())
+    file.write(faces.tobytes())
