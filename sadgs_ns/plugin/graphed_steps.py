@@ -252,7 +252,7 @@ class GraphedSteps:
         sums = {name: value for name, value in model.strategy_state.items() if isinstance(value, Tensor)}
         if kind.tile_capacity is None or not update.in_one_launch or (kind.absgrad and "grad2d" not in sums):
             return None
-        viewmats, Ks = pipeline.views.stacked_cameras(indices)
+        viewmats, Ks = pipeline.views.stacked_cameras(indices, pipeline.resolution.at(step))
         found = self._graph(kind, update, sums, viewmats, Ks, images)
         if found is None:
             return None

@@ -17,6 +17,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 from scipy.spatial import KDTree
 from torch import Tensor
+from tyro.conf import Suppress
 
 from sadgs_ns import kernels
 from sadgs_ns.data.cameras import refuse_unsupported_cameras
@@ -29,6 +30,7 @@ from sadgs_ns.method.structure_tensor import ENERGY_BLUR, FREQUENCY_CONSTANT
 from sadgs_ns.plugin import nonfinite
 from sadgs_ns.plugin.cleaning_panel import CleaningPanel
 from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig, check_options
+from sadgs_ns.plugin.growing_resolution import GrowingResolution
 from sadgs_ns.plugin.memory_plan import NEAR_PLANE, fit_to_memory, place_images, training_size
 from sadgs_ns.plugin.model import SadgsModel, SadgsModelConfig
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
@@ -69,6 +71,11 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     views_per_iteration: int | None = None
     """Training views rendered for one optimizer step, at most as many as there are; the loss is their mean.
     None takes one more for every 2,000 renderings of the run, up to 4. The paper uses 1 outdoors, 2 indoors."""
+    growing_resolution: bool = False
+    """Whether early steps render images of a quarter or half the width and height, as long as the Gaussians are longer
+    than their pixels. Steps that observe η stay full, and so does all that follows densification."""
+    growing_resolution_strength: Suppress[float] = 1.0
+    """Factor on the Gaussians' lengths in that comparison: the larger, the longer images stay small."""
     memory_budget_gb: float | None = None
     """Memory of the GPU, in 10⁹ bytes, that training may take; the cap of Gaussians is lowered to it at the start.
     None is 80 % of what is free, unless `max_gaussians` was changed, which then stays."""
@@ -96,7 +103,7 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
             )
         if not 0 <= self.energy_blur <= _WIDEST_BLUR:
             raise InputError(f"pipeline.energy_blur must be in [0, {_WIDEST_BLUR}], got {self.energy_blur:g}.")
-        for name in ("epsilon", "memory_budget_gb"):
+        for name in ("epsilon", "memory_budget_gb", "growing_resolution_strength"):
             if (value := getattr(self, name)) is not None and not 0 < value < math.inf:
                 raise InputError(f"pipeline.{name} must be positive and finite, got {value:g}.")
         check_options(self.datamanager)
@@ -127,7 +134,7 @@ class SadgsPipeline(VanillaPipeline):
                 # "gpu" is the training device; nerfstudio would pin memory for CUDA with "cpu".
                 self.datamanager.config.cache_images = "gpu"
         elif config.datamanager.cache_images == "gpu" and kwargs.get("test_mode") != "inference":
-            line = place_images(self.datamanager, self.device)
+            line = place_images(self.datamanager, self.device, config.growing_resolution)
             if line is not None:
                 CONSOLE.print(line, highlight=False, soft_wrap=True)
         parsed_on = getattr(self.datamanager.dataparser.config, "alpha_color", None)
@@ -142,6 +149,8 @@ class SadgsPipeline(VanillaPipeline):
             )
         self.model.set_cameras(_positions(self.datamanager.train_dataset.cameras))
         self.views = TrainingViews(self.datamanager, self.model)
+        strength = config.growing_resolution_strength if config.growing_resolution else None
+        self.resolution = GrowingResolution(self.views, self.model, strength)
         self.structure_maps = StructureMaps(
             self.views, config.frequency_constant, energy_blur=config.energy_blur, epsilon=config.epsilon
         )
@@ -187,7 +196,8 @@ class SadgsPipeline(VanillaPipeline):
         self._refuse_empty_views()
         if self.config.model.strategy.refine_stop_iter != 0:
             model, fused = self.model, self.config.model.fused and kernels.available(self.device)
-            size = training_size(self.datamanager, model.gauss_params, self.views_per_iteration, fused)  # type: ignore[arg-type]
+            views, growing = self.views_per_iteration, self.config.growing_resolution
+            size = training_size(self.datamanager, model.gauss_params, views, fused, growing)  # type: ignore[arg-type]
             try:
                 line, warning = fit_to_memory(model.strategy, model.gauss_params, size, self.config.memory_budget_gb)  # type: ignore[arg-type]
             except ValueError as error:
@@ -210,7 +220,11 @@ class SadgsPipeline(VanillaPipeline):
         read = TrainingCallback(after_step, lambda step: self._report_nonfinite() if self.log.full else None)
         last = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self._report_at_the_end())
         # The log is read before densification makes new parameters, which have no gradients.
-        return [read, *super().get_training_callbacks(training_callback_attributes), counts, last]
+        callbacks = [read, *super().get_training_callbacks(training_callback_attributes), counts, last]
+        self.resolution.start()  # The callbacks above have told the strategy how long the run is.
+        if self.resolution.level != 1:
+            callbacks.append(TrainingCallback(after_step, lambda step: self.resolution.grow(step)))
+        return callbacks
 
     def _refuse_empty_views(self) -> None:
         """Check whether training can see anything.
@@ -302,7 +316,8 @@ class SadgsPipeline(VanillaPipeline):
         if drawn is None:
             self._repeat_overflowed()
             drawn, wants = defaultdict(list), self.model.wants_structure_tensors
-            for index, data in self.views.draw(self.views_per_iteration, (wants(step), wants(step + 1))):
+            codes, level = (wants(step), wants(step + 1)), self.resolution.at(step)
+            for index, data in self.views.draw(self.views_per_iteration, codes, level):
                 drawn[data["image"].shape].append((index, data))
         return drawn
 
@@ -321,7 +336,7 @@ class SadgsPipeline(VanillaPipeline):
                     [data.get("mask", everything).to(self.device, non_blocking=True) for _, data in views]
                 )
             tensors = _stack(self.structure_maps.of_views(views)) if observes else None
-            viewmats, Ks = self.views.stacked_cameras(indices)
+            viewmats, Ks = self.views.stacked_cameras(indices, self.resolution.at(step))
             outputs = self.model.get_training_outputs(viewmats, Ks, width, height, indices, tensors)
             group_losses = self.model.get_loss_dict(outputs, batch)
             weight = len(views) / self.views_per_iteration
@@ -413,7 +428,8 @@ class SadgsPipeline(VanillaPipeline):
         strategy = asdict(self.config.model.strategy)
         hidden = ("fused", "run_length")
         settings = {f"model.strategy.{name}": strategy[name] for name in strategy if name not in hidden}
-        own = {name: getattr(self.config, name) for name in ("views_per_iteration", "memory_budget_gb")}
+        resolution = ("growing_resolution", "growing_resolution_strength")
+        own = {name: getattr(self.config, name) for name in ("views_per_iteration", "memory_budget_gb", *resolution)}
         return {**own, **settings}
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -430,6 +446,7 @@ class SadgsPipeline(VanillaPipeline):
             "settings": self._settings(),
             "schedule": {**asdict(self.schedule), "effort": self.config.effort},
             "max_gaussians": self.model.strategy.max_gaussians,  # It may be lower than the setting.
+            "resolution_level": self.resolution.level,
             "images": [path.name for path in self.datamanager.train_dataset.image_filenames],
             "camera_positions": _positions(self.datamanager.train_dataset.cameras),
         }
@@ -456,6 +473,8 @@ class SadgsPipeline(VanillaPipeline):
             self._checkpoint_cap = state.get("max_gaussians")
         if "images" in state:  # Earlier versions did not save it.
             self._checkpoint_views = state["images"], state["camera_positions"]
+        if before.get("growing_resolution"):  # Otherwise the Gaussians decide where it is on now.
+            self.resolution.level = state["resolution_level"]
         torch.set_rng_state(state["torch"].cpu())
         if max(state["view_order"], default=0) < len(self.datamanager.train_dataset):
             self.datamanager.train_unseen_cameras = list(state["view_order"])
