@@ -16,9 +16,9 @@ from sadgs_ns.method.split import Params
 
 LEVELS = (4, 2, 1)
 """From the coarsest to the full image. At 8, an image of 3 megapixels would have 47,000 pixels."""
-LEAST_PIXELS = 100_000
-"""Pixels that a reduced image keeps. The step of a smaller one takes no less time, since launching it takes the host
-longer than the GPU needs for it."""
+LEAST_PIXELS = 300_000
+"""Pixels that the views of a step keep together. A smaller step takes no less time: launching it takes the host 3 ms, in
+which a GPU trains on two megapixels (docs/measurements.md, "How a step grows"). Chosen before reduced steps were timed."""
 FULL_SHARE = 0.4
 """Share of the run, at its end, whose images are full, whatever the Gaussians' lengths."""
 _NEAREST = 0.01
@@ -128,7 +128,7 @@ def coarsest_level(length: float, pixels: int, strength: float = 1.0) -> int:
 
     Args:
         length: Of the Gaussians in full images, px; with NaN the level is 1.
-        pixels: Number of pixels of a full image, of which a reduced one keeps at least `LEAST_PIXELS`.
+        pixels: Number of pixels of a step's full images, of which reduced ones keep at least `LEAST_PIXELS`.
         strength: Factor on the length: the larger, the longer images stay small.
     """
     fits = (level for level in LEVELS if strength * length >= level and pixels >= level**2 * LEAST_PIXELS)

@@ -29,11 +29,17 @@ class GrowingResolution:
 
     def __init__(self, views: TrainingViews, model: SadgsModel, strength: float | None) -> None:
         self._views, self._model, self._strength = views, model, strength
+        self._views_per_step = 1
         self.level: int | None = None
         """Factor by which the sides of images are divided at present; None before `start`."""
 
-    def start(self) -> None:
-        """Choose the first level, unless a checkpoint had one; the strategy must know the length of the run."""
+    def start(self, views_per_step: int) -> None:
+        """Choose the first level, unless a checkpoint had one; the strategy must know the length of the run.
+
+        Args:
+            views_per_step: Number of views that a step renders.
+        """
+        self._views_per_step = views_per_step
         if self._strength is None:
             self.level = 1
         elif self.level is None:
@@ -69,7 +75,7 @@ class GrowingResolution:
         """Return the level that fits the Gaussians as they are; the host waits for their length."""
         assert self._strength is not None
         cameras, params = self._views.datamanager.train_dataset.cameras, self._model.gauss_params
-        pixels = int((cameras.width * cameras.height).min())
+        pixels = self._views_per_step * int((cameras.width * cameras.height).min())
         chosen = torch.linspace(0, len(cameras) - 1, min(_SAMPLED_CAMERAS, len(cameras))).round().long()
         viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds[chosen])
         Ks = cameras.get_intrinsics_matrices()[chosen]

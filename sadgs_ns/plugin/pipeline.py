@@ -221,7 +221,7 @@ class SadgsPipeline(VanillaPipeline):
         last = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self._report_at_the_end())
         # The log is read before densification makes new parameters, which have no gradients.
         callbacks = [read, *super().get_training_callbacks(training_callback_attributes), counts, last]
-        self.resolution.start()  # The callbacks above have told the strategy how long the run is.
+        self.resolution.start(self.views_per_iteration)  # The callbacks above told the strategy the run's length.
         if self.resolution.level != 1:
             callbacks.append(TrainingCallback(after_step, lambda step: self.resolution.grow(step)))
         return callbacks
