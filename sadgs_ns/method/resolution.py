@@ -17,8 +17,8 @@ from sadgs_ns.method.split import Params
 LEVELS = (4, 2, 1)
 """From the coarsest to the full image. At 8, an image of 3 megapixels would have 47,000 pixels."""
 LEAST_PIXELS = 300_000
-"""Pixels that the views of a step keep together. A smaller step takes no less time: launching it takes the host 3 ms, in
-which a GPU trains on two megapixels (docs/measurements.md, "How a step grows"). Chosen before reduced steps were timed."""
+"""Pixels that the views of a step keep together. A smaller step takes no less time: launching it takes the host 3 ms,
+in which a GPU trains on two megapixels (docs/measurements.md, "How a step grows"). No reduced step was timed for it."""
 FULL_SHARE = 0.4
 """Share of the run, at its end, whose images are full, whatever the Gaussians' lengths."""
 _NEAREST = 0.01
@@ -69,7 +69,9 @@ def reduce_intrinsics(Ks: Tensor, level: int) -> Tensor:
         Ks: Intrinsics in px. [..., 3, 3]
         level: As in `reduce_image`.
     """
-    return Ks / Ks.new_tensor([level, level, 1.0])[:, None]
+    reduced = Ks.clone()
+    reduced[..., :2, :] /= level
+    return reduced
 
 
 def footprint_length(axes: Tensor) -> Tensor:
