@@ -71,9 +71,9 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     views_per_iteration: int | None = None
     """Training views rendered for one optimizer step, at most as many as there are; the loss is their mean.
     None takes one more for every 2,000 renderings of the run, up to 4. The paper uses 1 outdoors, 2 indoors."""
-    growing_resolution: bool = False
-    """Whether early steps render images of a quarter or half the width and height, as long as the Gaussians are longer
-    than their pixels. Steps that observe η stay full, and so does all that follows densification."""
+    growing_resolution: Suppress[bool] = False
+    """Whether early steps render a quarter or half the width and height while Gaussians are longer than the pixels.
+    It is not shown until it has been measured on a GPU."""
     growing_resolution_strength: Suppress[float] = 1.0
     """Factor on the Gaussians' lengths in that comparison: the larger, the longer images stay small."""
     memory_budget_gb: float | None = None
