@@ -18,8 +18,9 @@ _SAMPLED_GAUSSIANS = 100_000
 class GrowingResolution:
     """Renders early steps of a run small, by the rule of `method.resolution`, and later ones full.
 
-    Full at any time are steps that observe η, whose structure tensors are those of the full images, and steps that
-    densify, since these look at the memory that a step takes.
+    A run has one level at a time, which its smallest images allow. Full at any time are steps that observe η, whose
+    structure tensors are those of the full images, and steps that densify, since these look at the memory that a step
+    takes.
 
     Args:
         views: The training views, whose reduced images are forgotten where the level changes.

@@ -129,7 +129,7 @@ def assert_equal(one: dict[str, Tensor], other: dict[str, Tensor], what: str = "
 
 
 @on_cpu
-@pytest.mark.parametrize("growing", [False, True])
+@pytest.mark.parametrize("growing", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_run_of_graphs_equals_one_of_launches_bit_for_bit(
     growing: bool, without_cuda: None, short: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch
 ):
