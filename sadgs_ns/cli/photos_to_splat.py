@@ -16,6 +16,7 @@ import re
 import shlex
 import shutil
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -29,7 +30,7 @@ from sadgs_ns.atomic import atomic_path
 from sadgs_ns.cli.process.command import MIN_SIZE
 from sadgs_ns.cli.process.photos import find_photos
 from sadgs_ns.cli.process.video import VIDEO_SUFFIXES
-from sadgs_ns.cli.stage import Line, clock, run_stage
+from sadgs_ns.cli.stage import Line, clock, prepared, run_stage
 from sadgs_ns.errors import InputError, RunError, WriteError, free_space, reason
 from sadgs_ns.formats.files import SUFFIXES
 from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
@@ -154,8 +155,12 @@ class PhotosToSplat:
         with self._alone() as lock:
             self._lock, self._settings = lock, self._read_settings()  # Another run may have gone on meanwhile.
             self._note()
-            self._make_cameras()
-            self._train()
+            with contextlib.ExitStack() as stack:
+                training = None
+                if not self._trained():  # Importing nerfstudio takes some 12 s, in which cameras can be found.
+                    training = stack.enter_context(prepared(_TRAINING, self._log("training"), lock))
+                self._make_cameras()
+                self._train(training)
             return [self._export(name) for name in sorted(self.formats, key=lambda name: name == "html")]
 
     @contextlib.contextmanager
@@ -185,10 +190,21 @@ class PhotosToSplat:
         finally:
             os.close(lock)
 
-    def _stage(self, line: Line, log: str, module: str, arguments: Sequence[str], hear: Callable[[str], None]) -> None:
+    def _log(self, stage: str) -> Path:
+        return self.folder / "log" / f"{stage}.txt"
+
+    def _stage(
+        self,
+        line: Line,
+        log: str,
+        module: str,
+        arguments: Sequence[str],
+        hear: Callable[[str], None],
+        process: subprocess.Popen[bytes] | None = None,
+    ) -> None:
         """Run a stage to its end, and raise as `make` does."""
-        path = self.folder / "log" / f"{log}.txt"
-        code, sentence = run_stage(module, arguments, path, line, hear, self.interrupts, self._lock)
+        path = self._log(log)
+        code, sentence = run_stage(module, arguments, path, line, hear, self.interrupts, self._lock, process)
         if code == 0:
             return
         line.tell("failed")
@@ -236,7 +252,12 @@ class PhotosToSplat:
             f"others, with two thirds of overlap, and begin another --output; {again}or go on with these with --anyway."
         )
 
-    def _train(self) -> None:
+    def _trained(self) -> str | None:
+        """Return what a finished training said of itself."""
+        return self._settings.get("trained") if self._checkpoint() else None
+
+    def _train(self, process: subprocess.Popen[bytes] | None) -> None:
+        """Train in a process that has been prepared for it, if there is one."""
         total, count = "", ""
 
         def hear(printed: str) -> None:
@@ -253,7 +274,7 @@ class PhotosToSplat:
                 count = gaussians[1]
 
         with Line("training", self.console) as line:
-            if (trained := self._settings.get("trained")) and self._checkpoint():
+            if trained := self._trained():
                 line.tell(f"{trained}; done before")
                 return
             line.tell("going on" if self._checkpoint() else "starting")
@@ -261,7 +282,7 @@ class PhotosToSplat:
             arguments += ["--experiment-name", "training", "--timestamp", "run", "--vis", "tensorboard"]
             arguments += ["--steps-per-eval-image", "0", "--pipeline.effort", f"{self.effort:g}"]
             arguments += ["--load-dir", str(self._run.absolute())] if self._checkpoint() else []
-            self._stage(line, "training", _TRAINING, [*arguments, *self.options], hear)
+            self._stage(line, "training", _TRAINING, [*arguments, *self.options], hear, process)
             if not self._checkpoint():
                 raise RunError(f"training ended without a checkpoint; all that it printed is in {self.folder}/log.")
             told = f"{total} iterations, {count} Gaussians"

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import itertools
+import json
 import os
 import re
 import shlex
@@ -11,7 +13,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -86,6 +88,47 @@ def clock(seconds: float) -> str:
     return f"{minutes // 60}:{minutes % 60:02}:{rest:02}" if minutes >= 60 else f"{minutes}:{rest:02}"
 
 
+@contextlib.contextmanager
+def prepared(module: str, log: Path, inherited: int) -> Iterator[subprocess.Popen[bytes]]:
+    """Start a process that imports a module, for a `run_stage` that comes later.
+
+    Where it has got no command line until the context ends, it is ended.
+
+    Args:
+        module: What will be run as by `python -m`.
+        log: All that it prints is added to this file.
+        inherited: A file descriptor that the process keeps open.
+
+    Raises:
+        OSError: If the log cannot be written.
+    """
+    process = _start(["sadgs_ns.cli.ready", module], log, inherited, subprocess.PIPE)
+    try:
+        yield process
+    finally:
+        assert process.stdin is not None
+        if not process.stdin.closed:
+            process.terminate()
+            process.stdin.close()
+        process.wait()
+
+
+def _start(words: Sequence[str], log: Path, inherited: int, stdin: int) -> subprocess.Popen[bytes]:
+    """Start Python with a module and its arguments, which prints to a log, in a process group of its own."""
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("ab") as written:
+        return subprocess.Popen(
+            [sys.executable, "-m", *words],
+            stdin=stdin,
+            stdout=written,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+            pass_fds=[inherited],
+            env=os.environ | {"PYTHONUNBUFFERED": "1"},
+            preexec_fn=_end_with_parent,
+        )
+
+
 def run_stage(
     module: str,
     arguments: Sequence[str],
@@ -94,6 +137,7 @@ def run_stage(
     hear: Callable[[str], None],
     interrupts: Interrupts,
     inherited: int,
+    process: subprocess.Popen[bytes] | None = None,
 ) -> tuple[int, str]:
     """Run a module's command line in a process of its own, and wait for its end.
 
@@ -108,6 +152,7 @@ def run_stage(
         hear: Called with every line that it prints.
         interrupts: Where they say that a signal came, it is passed on, and the process may end as it likes.
         inherited: A file descriptor that the process keeps open.
+        process: What `prepared` has started for this module and log; None starts another.
 
     Returns:
         Its exit code, and the sentence with which it ended.
@@ -137,16 +182,12 @@ def run_stage(
             line.refresh()
 
         unfinished: list[str] = []
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=written,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-            pass_fds=[inherited],
-            env=os.environ | {"PYTHONUNBUFFERED": "1"},
-            preexec_fn=_end_with_parent,
-        )
+        if process is None or process.poll() is not None:  # One whose import failed fails again, and is heard.
+            process = _start(command[2:], log, inherited, subprocess.DEVNULL)
+        else:
+            assert process.stdin is not None
+            with suppress(BrokenPipeError), process.stdin:
+                process.stdin.write(json.dumps(list(arguments)).encode() + b"\n")
         try:
             while process.poll() is None:
                 interrupts.poll()

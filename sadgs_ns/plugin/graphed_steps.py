@@ -120,6 +120,11 @@ class CudaGraphs:
         generator.graphsafe_set_state(generator.clone_state())
 
 
+def has_room(device: torch.device) -> bool:
+    """Tell whether the memory for a graph's step is free, which is at most what the process has reserved."""
+    return device.type != "cuda" or torch.cuda.mem_get_info(device)[0] >= torch.cuda.memory_reserved(device)
+
+
 @dataclass(frozen=True)
 class _Inputs:
     """What a graph reads that changes from step to step."""
@@ -240,6 +245,9 @@ class GraphedSteps:
         if (forecast := model.tile_forecast) is None:
             return None
         forecast.coarse = few
+        if not few:
+            self._drop_graphs()
+            self._recorder = None  # Its memory is for the Gaussians that are too many.
         if not few or model.strategy.observes(step) or model.strategy.densifies(step):
             return None
         pipeline.put_aside = drawn = pipeline.draw(step)
@@ -282,7 +290,10 @@ class GraphedSteps:
         Ks: Tensor,
         images: Sequence[Tensor],
     ) -> tuple[Graph, _Inputs] | None:
-        """Return the graph of such a step, captured now if it was launched one by one before; None if there is none."""
+        """Return the graph of such a step; None if there is none.
+
+        One is captured if such a step was launched one by one before, and memory is not short.
+        """
         changed = (*update.parameters.values(), *update.exp_avgs, *update.exp_avg_sqs, *sums.values())
         # Tensors of other lengths may lie where those before did.
         addresses = (len(update.parameters["means"]), *[tensor.data_ptr() for tensor in changed])
@@ -290,7 +301,8 @@ class GraphedSteps:
             self._drop_graphs()
             self._addresses = addresses
         key = kind, images[0].dtype, len(images)
-        if key in self._launched and key not in self._graphs and len(self._graphs) < MOST_GRAPHS:
+        wanted = key in self._launched and key not in self._graphs and len(self._graphs) < MOST_GRAPHS
+        if wanted and has_room(viewmats.device):
             try:
                 factors = viewmats.new_zeros((2, len(update.parameters)))
                 inputs = _Inputs(viewmats.clone(), Ks.clone(), torch.stack(list(images)), factors)

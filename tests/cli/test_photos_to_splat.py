@@ -204,11 +204,13 @@ class Program:
         (folder / "program.py").write_text(code)
         self.log, self.heard = folder / "log.txt", []
 
-    def run(self, arguments: list[str], interrupts: Interrupts) -> tuple[int, str]:
+    def run(
+        self, arguments: list[str], interrupts: Interrupts, process: subprocess.Popen[bytes] | None = None
+    ) -> tuple[int, str]:
         lock = os.open(self.log.parent, os.O_RDONLY)
         try:
             with stage.Line("stage", Console(quiet=True)) as line:
-                return stage.run_stage("program", arguments, self.log, line, self.hear, interrupts, lock)
+                return stage.run_stage("program", arguments, self.log, line, self.hear, interrupts, lock, process)
         finally:
             os.close(lock)
 
@@ -240,6 +242,30 @@ def test_a_stage_ends_with_its_code_and_its_last_sentence(program, code: str, ex
     ran = program(code)
     assert ran.run(["a b"], Interrupts(waiting=lambda: False)) == expected
     assert re.search(r"^\$ .* -m program 'a b'\n", ran.log.read_text("utf8"))
+
+
+def test_a_prepared_stage_has_imported_before_its_command_line_comes(program, tmp_path: Path):
+    ran = program(
+        "import heavy, sys\n"
+        "if __name__ == '__main__': print('ran with', *sys.argv[1:]); print('error: Wrong.'); raise SystemExit(3)"
+    )
+    (tmp_path / "heavy.py").write_text("print('imported')")
+    with stage.prepared("program", ran.log, 0) as process:
+        while "imported" not in ran.log.read_text("utf8"):
+            assert process.poll() is None
+            time.sleep(0.05)
+        assert ran.run(["a b", "ü"], Interrupts(waiting=lambda: False), process) == (3, "Wrong")
+    assert ran.log.read_text("utf8").count("imported") == 1 and ran.heard[0] == "ran with a b ü"
+    with stage.prepared("program", ran.log, 0) as unused:
+        pass
+    assert unused.returncode is not None and ran.log.read_text("utf8").count("ran with") == 1
+
+
+def test_a_prepared_stage_whose_import_failed_tells_why(program):
+    ran = program("raise SystemExit('error: Without numpy nothing works.')")
+    with stage.prepared("program", ran.log, 0) as process:
+        process.wait(30)
+        assert ran.run([], Interrupts(waiting=lambda: False), process) == (1, "Without numpy nothing works")
 
 
 def test_a_signal_is_passed_on_once_and_the_stage_may_save(program):

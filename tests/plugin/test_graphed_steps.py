@@ -283,6 +283,7 @@ def test_steps_of_many_gaussians_or_of_masked_views_or_that_are_taken_apart_are_
         lambda patch: patch.setitem(image, "mask", mask),
         lambda patch: patch.setitem(image, "image", transparent),
         lambda patch: patch.setattr(graphed_steps, "MOST_GRAPHS", 0),
+        lambda patch: patch.setattr(graphed_steps, "has_room", lambda device: False),
     ):
         with monkeypatch.context() as patch:
             graphed._drop_graphs()
