@@ -17,8 +17,8 @@ from sadgs_ns.method.split import Params
 LEVELS = (4, 2, 1)
 """From the coarsest to the full image. At 8, an image of 3 megapixels would have 47,000 pixels."""
 LEAST_PIXELS = 300_000
-"""Pixels that the views of a step keep together. Below that the work for each Gaussian, and launching it, should decide
-how long a step takes, so that smaller images would cost quality and save nothing. It was chosen without measurements."""
+"""Pixels that the views of a step keep together. Below that the work for each Gaussian, and launching it, should
+decide how long a step takes, so that smaller images would cost quality and save nothing. It was not measured."""
 FULL_SHARE = 0.4
 """Share of the run, at its end, whose images are full, whatever the Gaussians' lengths."""
 _NEAREST = 0.01
