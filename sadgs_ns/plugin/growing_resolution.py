@@ -41,7 +41,7 @@ class GrowingResolution:
             views_per_step: Number of views that a step renders.
         """
         self._views_per_step = views_per_step
-        if self._strength is None:
+        if self._strength is None or self._model.step >= self._end:
             self.level = 1
         elif self.level is None:
             self.level = self._measured()
