@@ -21,6 +21,13 @@ LEAST_PIXELS = 300_000
 decide how long a step takes, so that smaller images would cost quality and save nothing. It was not measured."""
 FULL_SHARE = 0.4
 """Share of the run, at its end, whose images are full, whatever the Gaussians' lengths."""
+GRADIENTS_SHARE = 0.25
+"""Share of the iterations between two AbsGS steps, at their end, in which images are full.
+
+AbsGS reads only full images, since the gradients of reduced ones miss detail. The steps that are full anyway would show
+it half of 20 views and a twelfth of 500, and many Gaussians in none of them. With this share it reads half as many
+visits as there are views where these are 500, and more where they are fewer. Steps in a row draw views in rounds, and
+so about equally often, and at the end Gaussians are nearly those that the AbsGS step changes."""
 _NEAREST = 0.01
 """Depth in world units from which Gaussians are drawn."""
 

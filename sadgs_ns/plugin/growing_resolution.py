@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from sadgs_ns.method.resolution import FULL_SHARE, coarsest_level, typical_length
+from sadgs_ns.method.resolution import FULL_SHARE, GRADIENTS_SHARE, coarsest_level, typical_length
 from sadgs_ns.plugin.model import SadgsModel
 from sadgs_ns.plugin.views import TrainingViews
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
@@ -19,8 +19,8 @@ class GrowingResolution:
     """Renders early steps of a run small, by the rule of `method.resolution`, and later ones full.
 
     A run has one level at a time, which its smallest images allow. Full at any time are steps that observe η, whose
-    structure tensors are those of the full images, and steps that densify, since these look at the memory that a step
-    takes.
+    structure tensors are those of the full images, steps that densify, since these look at the memory that a step
+    takes, and the last share of the steps up to each one of AbsGS, which reads only gradients of full images.
 
     Args:
         views: The training views, whose reduced images are forgotten where the level changes.
@@ -50,8 +50,8 @@ class GrowingResolution:
         """Return the level of a step, counted from 0."""
         if self.level is None or self.level == 1:
             return 1
-        model = self._model
-        full = step >= self._end or model.wants_structure_tensors(step) or model.strategy.densifies(step)
+        strategy = self._model.strategy
+        full = step >= self._end or strategy.observes(step) or strategy.densifies(step) or self._is_for_absgs(step)
         return 1 if full else self.level
 
     def grow(self, step: int) -> None:
@@ -64,6 +64,12 @@ class GrowingResolution:
         if level != self.level:
             self.level = level
             self._views.forget_reduced()
+
+    def _is_for_absgs(self, step: int) -> bool:
+        """Tell whether a step is full for its gradients, which the next AbsGS step reads."""
+        strategy = self._model.strategy
+        every = strategy.windows.absgs_every
+        return strategy.needs_absgrad(step) and -(step + 1) % every < GRADIENTS_SHARE * every
 
     @property
     def _end(self) -> int:

@@ -324,6 +324,7 @@ class SadgsPipeline(VanillaPipeline):
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
         """Render the iteration's views and return the outputs of the last size, mean losses and mean metrics."""
         groups, observes = self.draw(step), self.model.wants_structure_tensors(step)
+        level = self.resolution.at(step)
         losses: dict[str, Tensor] = {}
         metrics: dict[str, Any] = {}
         outputs: dict[str, Any] = {}
@@ -336,8 +337,8 @@ class SadgsPipeline(VanillaPipeline):
                     [data.get("mask", everything).to(self.device, non_blocking=True) for _, data in views]
                 )
             tensors = _stack(self.structure_maps.of_views(views)) if observes else None
-            viewmats, Ks = self.views.stacked_cameras(indices, self.resolution.at(step))
-            outputs = self.model.get_training_outputs(viewmats, Ks, width, height, indices, tensors)
+            viewmats, Ks = self.views.stacked_cameras(indices, level)
+            outputs = self.model.get_training_outputs(viewmats, Ks, width, height, indices, tensors, level > 1)
             group_losses = self.model.get_loss_dict(outputs, batch)
             weight = len(views) / self.views_per_iteration
             for total, part in ((losses, group_losses), (metrics, self.model.get_metrics_dict(outputs, batch))):

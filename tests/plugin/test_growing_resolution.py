@@ -18,12 +18,14 @@ from torch import Tensor
 
 from sadgs_ns.errors import InputError
 from sadgs_ns.method import resolution
+from sadgs_ns.method import strategy as strategy_module
 from sadgs_ns.method.resolution import FULL_SHARE, reduce_image, reduce_intrinsics, reduce_mask
 from sadgs_ns.plugin import growing_resolution, views
 from sadgs_ns.plugin.growing_resolution import GrowingResolution
 from sadgs_ns.plugin.memory_plan import image_bytes
 from sadgs_ns.plugin.pipeline import SadgsPipelineConfig
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
+from sadgs_ns.render.rasterization import visible
 
 WIDTH, HEIGHT = 64, 48
 """px; a quarter of it is as large as the window of SSIM asks for."""
@@ -64,9 +66,11 @@ def follow(trainer: SadgsTrainer) -> list[dict[str, Any]]:
     render, compare = model.get_training_outputs, model.get_loss_dict
     update = trainer._update_viewer_state
 
-    def rendering(viewmats: Tensor, Ks: Tensor, width: int, height: int, indices: list[int], tensors: Any) -> Any:
+    def rendering(
+        viewmats: Tensor, Ks: Tensor, width: int, height: int, indices: list[int], tensors: Any, reduced: bool
+    ) -> Any:
         steps.append({"step": model.step, "size": (width, height), "views": indices, "Ks": Ks, "tensors": tensors})
-        return render(viewmats, Ks, width, height, indices, tensors)
+        return render(viewmats, Ks, width, height, indices, tensors, reduced)
 
     def comparing(outputs: Any, batch: Any, *more: Any) -> Any:
         steps[-1] |= batch
@@ -140,6 +144,35 @@ def test_a_run_grows_through_the_levels_and_its_images_and_cameras_with_it(
     visits = Counter(view for step in steps for view in step["views"])
     assert len(visits) == TRAIN_VIEWS and max(visits.values()) - min(visits.values()) <= 1
     assert is_finite(pipeline.model)
+
+
+def test_absgs_reads_the_full_steps_and_no_others(
+    data: DataParserConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    scripted(monkeypatch, 4.0)
+    trainer = set_up(configured(tmp_path, data, absgs_every=8, structure_every=24, refine_stop_iter=24, eta_every=5))
+    steps, strategy = follow(trainer), trainer.pipeline.model.strategy
+    after_backward, grow = strategy.step_post_backward, strategy_module.grow
+    seen: dict[int, Tensor] = {}
+    counts: list[Tensor] = []
+
+    def noting_gradients(params: Any, optimizers: Any, state: Any, step: int, infos: list[dict[str, Any]]) -> None:
+        if hasattr(infos[0]["means2d"], "absgrad"):
+            seen[step] = visible(infos[0]).sum(dim=0).float()
+        after_backward(params, optimizers, state, step, infos)
+
+    def noting_counts(params: Any, optimizers: Any, state: Any, **options: Any) -> tuple[int, int]:
+        counts.append(state["grad_count"].clone())
+        return grow(params, optimizers, state, **options)
+
+    monkeypatch.setattr(strategy, "step_post_backward", noting_gradients)
+    monkeypatch.setattr(strategy_module, "grow", noting_counts)
+    trainer.train()
+    # η is observed at every fifth step; the last quarter before the AbsGS steps 7 and 15 is two steps.
+    assert list(seen) == [0, 5, 6, 7, 10, 14, 15]
+    assert [step["step"] for step in steps if step["size"] == (WIDTH, HEIGHT)] == [*seen, 20, *range(23, ITERATIONS)]
+    for counted, read in zip(counts, ([0, 5, 6, 7], [10, 14, 15]), strict=True):
+        assert torch.equal(counted, torch.stack([seen[step] for step in read]).sum(dim=0)) and counted.max() > 2
 
 
 def test_the_gaussians_themselves_decide_and_strength_keeps_images_small_longer(data: DataParserConfig, tmp_path: Path):
