@@ -16,7 +16,7 @@ from types import FunctionType
 from typing import Any
 
 import gsplat
-from gsplat.cuda import _torch_impl, _wrapper
+from gsplat.cuda import _torch_impl
 from gsplat.strategy import ops
 from torch import Tensor
 
@@ -145,48 +145,6 @@ def rasterize_to_pixels(
     """
     return gsplat.rasterize_to_pixels(
         means2d, conics, colors, opacities, width, height, tile_size, isect_offsets, flatten_ids, absgrad=absgrad
-    )
-
-
-def composite(
-    means2d: Tensor,  # [C, N, 2]
-    conics: Tensor,  # [C, N, 3]
-    colors: Tensor,  # [C, N, D]
-    opacities: Tensor,  # [C, N]
-    width: int,
-    height: int,
-    tile_size: int,
-    isect_offsets: Tensor,  # [C, tile rows, tile columns]
-    flatten_ids: Tensor,  # [number of pairs]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Run the CUDA kernel of `rasterize_to_pixels` alone, which tells a backward pass where each pixel stopped.
-
-    The kernel is called `rasterize_to_pixels_fwd` in 1.4 and `rasterize_to_pixels_3dgs_fwd` in 1.5; both take the same
-    arguments. It is reached through gsplat's private `_make_lazy_cuda_func`, which is the same in 1.4 and 1.5.
-
-    The lists may have a row of tiles below the image, as those of a given length have (kernels/tiles.py): in 1.4 and
-    1.5 the kernel takes the numbers of tiles from the shape of `isect_offsets`, the end of the last list from the
-    length of `flatten_ids`, and the block of a tile all of whose pixels are outside the image ends before it reads its
-    list.
-
-    Args:
-        means2d: px; this and all other tensors must be contiguous. [C, N, 2]
-        conics: In 1/px². [C, N, 3]
-        colors: Of D channels, a number that gsplat's kernel was compiled for, such as 3 or 4. [C, N, D]
-        opacities: In [0, 1]. [C, N]
-        width: px.
-        height: px.
-        tile_size: px.
-        isect_offsets: Where each tile's list starts, int32 [C, tile rows, tile columns]; the rows may be too many.
-        flatten_ids: Indices in C · N, int32 [number of pairs].
-
-    Returns:
-        Colours [C, height, width, D]; alphas [C, height, width, 1]; and the place in the lists of the last Gaussian
-        that a pixel drew, int32 [C, height, width].
-    """
-    name = "rasterize_to_pixels_3dgs_fwd" if RADII_PER_AXIS else "rasterize_to_pixels_fwd"
-    return _wrapper._make_lazy_cuda_func(name)(
-        means2d, conics, colors, opacities, None, None, width, height, tile_size, isect_offsets, flatten_ids
     )
 
 

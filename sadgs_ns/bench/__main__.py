@@ -45,6 +45,7 @@ COMMANDS = {
     "report": ("report", "the plots and the page of a results file"),
     "kernels": ("approximations", "what each shortcut in the frequency analysis gets wrong, beside what it costs"),
     "step": ("step", "the parts of a training step, with and without our Triton kernels (CUDA)"),
+    "parts": ("parts", "the parts of a training step of a finished run, each by itself (CUDA)"),
     "growth": ("growth", "a training step of more and more Gaussians, and of larger images, beside gsplat's (CUDA)"),
     "validation": ("validation", "copies of scenes whose validation views are held out, for choosing constants"),
     "memory": ("memory", "the memory plan beside the real peaks of training steps (CUDA)"),

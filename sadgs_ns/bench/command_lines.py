@@ -96,6 +96,18 @@ def memory() -> argparse.ArgumentParser:
     return parser
 
 
+def parts() -> argparse.ArgumentParser:
+    """Return the options of `sadgs-bench parts`."""
+    parser = argparse.ArgumentParser(
+        prog="sadgs-bench parts", description="Time the parts of a training step of a finished run (CUDA)."
+    )
+    parser.add_argument("run", type=Path, help="folder of a run, or its config.yml")
+    parser.add_argument("--data", type=Path, help="folder of the capture (default: where it was in training)")
+    parser.add_argument("--views", type=int, default=1, help="training views of a step (default %(default)s)")
+    parser.add_argument("--max-off-axis", type=float, default=4.0, help="as pipeline.model.max-off-axis")
+    return parser
+
+
 def rasterizers() -> argparse.ArgumentParser:
     """Return the options of `sadgs-bench rasterizers`."""
     parser = argparse.ArgumentParser(

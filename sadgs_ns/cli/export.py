@@ -120,7 +120,7 @@ def export(
                 "where it was made, or export in nerfstudio's frame."
             )
         similarity = from_data(folder / TRANSFORMS_NAME).inverse()
-    params = _read(checkpoint, latest=checkpoint != run)
+    params = read_gaussians(run)
     if params["features_rest"].shape[1] == 0:  # then training holds colours' logits
         params["features_dc"] = (params["features_dc"].sigmoid() - 0.5) / DEGREE_0
     start, cameras = None, None
@@ -182,14 +182,26 @@ def _checkpoint_of(run: Path) -> Path:
     return max(found, key=lambda path: int(path.stem[5:]))
 
 
-def _read(checkpoint: Path, latest: bool) -> dict[str, Tensor]:
-    """Return the Gaussians' parameters, mapped from the file, so that what is not written takes no memory."""
+def read_gaussians(run: Path) -> dict[str, Tensor]:
+    """Return the Gaussians' parameters, mapped from the file, so that what is not read takes no memory.
+
+    Args:
+        run: As of `export`.
+
+    Returns:
+        `means` [N, 3], log `scales` [N, 3], `quats` [N, 4], logit `opacities` [N, 1] and coefficients of harmonics,
+        `features_dc` [N, 3] and `features_rest` [N, K − 1, 3], on the CPU.
+
+    Raises:
+        InputError: If there is no checkpoint of this method or of splatfacto.
+    """
     # torch, which both import, takes seconds, and `--help` and a wrong path need not wait for it.
     from torch import Tensor
 
     from sadgs_ns.plugin import checkpoints
 
-    folder, single = (checkpoint.parent, None) if latest else (None, checkpoint)
+    checkpoint = _checkpoint_of(run)
+    folder, single = (None, checkpoint) if checkpoint == run else (checkpoint.parent, None)
     chosen = checkpoints.read_chosen(folder, None, single, _REMEDY, mmap=True)
     assert chosen is not None
     checkpoint, state = chosen

@@ -1,4 +1,4 @@
-"""gsplat's alpha compositing with a backward pass of our own, in which tensor cores sum over the pixels.
+"""gsplat's alpha compositing in kernels of our own; in the backward pass tensor cores sum over the pixels.
 
 gsplat's backward pass sums nine quantities per Gaussian over the lanes of a warp, which takes most of its instructions.
 All nine are linear in two numbers per Gaussian and pixel: the weight of the Gaussian's colour, and the gradient of its
@@ -25,10 +25,9 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sadgs_ns import gsplat_internals
+from sadgs_ns.kernels.compositing_blocks import TILE_SIZE, load_gaussians, reciprocal, row, split4
+from sadgs_ns.kernels.compositing_forward import composite_forward
 
-TILE_SIZE = 8
-"""px. Each lane of the one warp that a tile gets has two pixels."""
 PRECISION = "tf32x3"
 """How Triton multiplies float32 on tensor cores. "tf32x3" makes three products of the two parts of 11 bits that each
 factor is cut into. "tf32" makes one, takes a fifth less time and errs by 4e-4 instead of 2e-5; "ieee" takes twice the
@@ -40,48 +39,17 @@ _STRIDE = 12
 
 
 @triton.jit
-def _row(values, ROW: tl.constexpr):
-    """Return one row of a block. Adding −0.0 changes nothing, so that the compiler removes the sum."""
-    rows = tl.arange(0, values.shape[0])[:, None]
-    return tl.sum(tl.where(rows == ROW, values, -0.0), axis=0)
-
-
-if isinstance(_row, triton.JITFunction):
-
-    @triton.jit
-    def _reciprocal(value):
-        """Return 1 / value in one instruction; Triton's division spends four more on denormals."""
-        return tl.inline_asm_elementwise(
-            "rcp.approx.ftz.f32 $0, $1;", "=r,r", [value], tl.float32, is_pure=True, pack=1
-        )  # fmt: skip
-else:  # Triton's interpreter, which knows no PTX
-
-    @triton.jit
-    def _reciprocal(value):
-        return 1 / value
-
-
-@triton.jit
 def _rounded(values):
     """Round values to the nearest that tensor cores read, which cut the rest off: errors then average out."""
     return ((values.to(tl.int32, bitcast=True) + 4096) & -8192).to(tl.float32, bitcast=True)
 
 
 @triton.jit
-def _split4(values):
-    """Return the columns of a block [N, 4]."""
-    even, odd = tl.split(tl.reshape(values, [values.shape[0], 2, 2]))
-    c0, c2 = tl.split(even)
-    c1, c3 = tl.split(odd)
-    return c0, c1, c2, c3
-
-
-@triton.jit
 def _split8(values):
     """Return the columns of a block [N, 8]."""
     even, odd = tl.split(tl.reshape(values, [values.shape[0], 4, 2]))
-    c0, c2, c4, c6 = _split4(even)
-    c1, c3, c5, c7 = _split4(odd)
+    c0, c2, c4, c6 = split4(even)
+    c1, c3, c5, c7 = split4(odd)
     return c0, c1, c2, c3, c4, c5, c6, c7
 
 
@@ -89,22 +57,6 @@ def _split8(values):
 def _join4(c0, c1, c2, c3):
     """Make a block [N, 4] of its columns."""
     return tl.reshape(tl.join(tl.join(c0, c2), tl.join(c1, c3)), [c0.shape[0], 4])
-
-
-@triton.jit
-def _load_gaussians(means2d, conics, colors, opacities, g):
-    """Load centre and opacity, conic, and colour of the Gaussians with indices g [N, 1] into three blocks [N, 4].
-
-    Triton spreads a block over the threads if it has at least as many values; of a smaller one every thread would load
-    everything.
-    """
-    k = tl.arange(0, 4)[None, :]
-    centres = tl.load(tl.where(k < 2, means2d + 2 * g + k, opacities + g))
-    k = tl.minimum(k, 2)
-    rgb = tl.load(colors + 3 * g + k)
-    # A colour that is not finite makes the pixels that see it NaN. Elsewhere its weight is 0, but 0 · NaN would reach
-    # the gradients of the Gaussians in front of it: here it counts as 0.
-    return centres, tl.load(conics + 3 * g + k), tl.where(tl.abs(rgb) < float("inf"), rgb, 0.0)
 
 
 @triton.jit(do_not_specialize=["num_pairs", "height", "width", "tile_width", "tile_height"])
@@ -124,11 +76,11 @@ def _composite_backward(
     SCALE = tl.constexpr(0.8493218002880191)  # √(log2(e) / 2), of offsets: exp(-σ) is then exp2 of a plain polynomial
     tile = tl.program_id(0)
     view = tile // (tile_height * tile_width)
-    row, column = tile // tile_width % tile_height, tile % tile_width
+    tile_row, column = tile // tile_width % tile_height, tile % tile_width
     pixel = tl.arange(0, PIXELS)
     x, y = pixel % TILE, pixel // TILE
-    inside = (row * TILE + y < height) & (column * TILE + x < width)
-    at = (view * height + row * TILE + y) * width + column * TILE + x
+    inside = (tile_row * TILE + y < height) & (column * TILE + x < width)
+    at = (view * height + tile_row * TILE + y) * width + column * TILE + x
     last = tl.load(last_ids + at, inside, -1)
     start = tl.load(starts + tile)
     end = num_pairs
@@ -138,7 +90,7 @@ def _composite_backward(
     # Pixels are counted from the tile's centre: these offsets are small, and exact in 11 bits.
     x, y = x.to(tl.float32) - (TILE - 1) / 2, y.to(tl.float32) - (TILE - 1) / 2
     scaled_x, scaled_y = SCALE * x, SCALE * y
-    centre_x, centre_y = column.to(tl.float32) * TILE + TILE / 2, row.to(tl.float32) * TILE + TILE / 2
+    centre_x, centre_y = column.to(tl.float32) * TILE + TILE / 2, tile_row.to(tl.float32) * TILE + TILE / 2
 
     red = tl.load(v_renders + 3 * at, inside, 0.0)
     green = tl.load(v_renders + 3 * at + 1, inside, 0.0)
@@ -167,16 +119,16 @@ def _composite_backward(
     rows = tl.arange(0, GAUSSIANS)
     first_row = rows[:, None] == 0
     next_g = tl.load(ids + tl.minimum(tl.maximum(end - 1 - rows, start), num_pairs - 1))
-    next_centre, next_conic, next_rgb = _load_gaussians(means2d, conics, colors, opacities, next_g[:, None])
+    next_centre, next_conic, next_rgb = load_gaussians(means2d, conics, colors, opacities, next_g[:, None])
     for done in range(0, end - start, GAUSSIANS):
         position = end - 1 - done - rows
         g = next_g
-        mean_x, mean_y, opacity, _ = _split4(next_centre)
-        a, b, c, _ = _split4(next_conic)
-        r, g_, b_, _ = _split4(next_rgb)
+        mean_x, mean_y, opacity, _ = split4(next_centre)
+        a, b, c, _ = split4(next_conic)
+        r, g_, b_, _ = split4(next_rgb)
         # The next batch is loaded while this one is computed.
         next_g = tl.load(ids + tl.maximum(position - GAUSSIANS, start))
-        next_centre, next_conic, next_rgb = _load_gaussians(means2d, conics, colors, opacities, next_g[:, None])
+        next_centre, next_conic, next_rgb = load_gaussians(means2d, conics, colors, opacities, next_g[:, None])
         mean_x -= centre_x
         mean_y -= centre_y
 
@@ -192,14 +144,14 @@ def _composite_backward(
         seen = above.to(tl.uint32, bitcast=True) < limit.to(tl.uint32, bitcast=True)
         alpha = tl.where(seen, tl.minimum(alpha, 0.999), 0.0)
 
-        ratio = _reciprocal(1 - alpha)
+        ratio = reciprocal(1 - alpha)
         front = tl.cumprod(tl.where(first_row, ratio * transmittance[None, :], ratio), 0)
-        transmittance = _row(front, GAUSSIANS - 1)
+        transmittance = row(front, GAUSSIANS - 1)
         weight = alpha * front
         color = r[:, None] * red[None, :] + g_[:, None] * green[None, :] + b_[:, None] * blue[None, :]
         share = weight * color
         share = tl.cumsum(tl.where(first_row, share + behind[None, :], share), 0)
-        behind = _row(share, GAUSSIANS - 1)
+        behind = row(share, GAUSSIANS - 1)
         by_color = tl.dot(weight, v_rgb, input_precision=PRECISION)
         # This is front · color − behind / (1 − alpha), where `share` includes the Gaussian's own share in `behind`.
         v_sigma = tl.where(alpha < 0.999, alpha * ratio * (share - color * front), 0.0)
@@ -282,7 +234,7 @@ def composite_backward(
 
 
 class _RasterizeToPixels(torch.autograd.Function):
-    """gsplat's forward pass and `composite_backward`."""
+    """`composite_forward` and `composite_backward`."""
 
     @staticmethod
     def forward(  # type: ignore[override]
@@ -298,8 +250,8 @@ class _RasterizeToPixels(torch.autograd.Function):
         absgrad: bool,
     ) -> tuple[Tensor, Tensor]:
         ctx.set_materialize_grads(False)  # torch would fill an image with zeros where nothing depends on alphas
-        renders, alphas, last_ids = gsplat_internals.composite(
-            means2d, conics, colors, opacities, width, height, TILE_SIZE, isect_offsets, flatten_ids
+        renders, alphas, last_ids = composite_forward(
+            means2d, conics, colors, opacities, width, height, isect_offsets, flatten_ids
         )
         ctx.save_for_backward(means2d, conics, colors, opacities, isect_offsets, flatten_ids, alphas, last_ids)
         ctx.absgrad = absgrad
@@ -333,8 +285,7 @@ def rasterize_to_pixels(
     flatten_ids: Tensor,
     absgrad: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Do what gsplat's `rasterize_to_pixels` does with three channels in tiles of TILE_SIZE, but differentiate it with
-    `composite_backward`.
+    """Do what gsplat's `rasterize_to_pixels` does with three channels in tiles of TILE_SIZE.
 
     With `absgrad`, `means2d` gets an attribute `grad2d`, which `backward` sets to its gradient, and which is None until
     then: `retain_grad` would copy the gradient.

@@ -3,7 +3,7 @@
 gsplat lists a Gaussian in every tile that its 3σ square (1.4) or rectangle (1.5) touches. Most of a long, thin or faint
 Gaussian's square lies outside the ellipse in which it is at least 1/255 opaque, and there the rasterizer skips it pixel
 by pixel, forward and backward. Here a tile is listed only if the ellipse meets the rectangle of its pixel centres. What
-is drawn stays the same, bit for bit.
+is drawn stays the same.
 """
 
 # pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false
@@ -23,6 +23,10 @@ from sadgs_ns.kernels.limits import check_pairs
 
 _LANES = 32
 """Gaussians that one program handles: one warp of them, so that a large Gaussian holds up only 31 others."""
+_FEW_TILES = 64
+"""Largest number of tiles in a Gaussian's rectangle of tiles that a lane lists alone. All lanes of a program list the
+rows of a larger one together: a Gaussian may reach all of an image's tiles, which would take a lane longer than the
+whole rest of a step."""
 _ORDER_LANES = 512
 """Pairs or tiles that one program handles where the lists are put in order."""
 
@@ -117,15 +121,23 @@ def _count(
     tl.store(counts + g, count, g < n)
 
 
+@triton.jit
+def _pick(values, this):
+    """Return the one value where `this` is true."""
+    return tl.sum(tl.where(this, values, 0))
+
+
 @triton.jit(
     do_not_specialize=["n", "num_gaussians", "num_pairs", "num_tiles", "tile_width", "tile_height", "rows_per_view"]
 )
 def _list(
     means2d, radii, conics, opacities, order, ends, tiles, ids,
     n, num_gaussians, num_pairs, num_tiles, tile_width, tile_height, rows_per_view,
-    PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr, LANES: tl.constexpr,
+    PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr, LANES: tl.constexpr, FEW: tl.constexpr,
 ):  # fmt: skip
     """Write the tile and the Gaussian of each pair, the nearest Gaussians first.
+
+    A Gaussian whose rectangle has more than FEW tiles is listed by all lanes, of which each takes a row.
 
     The rest of the `num_pairs` places is given to the last tile. If there are more pairs than places, this tile gets
     all places, and all radii become 0: nothing is drawn, and nobody counts the views.
@@ -142,19 +154,50 @@ def _list(
     for i in tl.static_range(PER_GAUSSIAN):
         tl.store(radii + PER_GAUSSIAN * g + i, 0, exists & (needed > num_pairs))
     last_row = tl.where(fits, last_row, first_row)
-    view = g // num_gaussians * rows_per_view
-    for i in range(tl.max(last_row - first_row)):
+    row_of_view = g // num_gaussians * rows_per_view
+    many = (last_row - first_row).to(tl.int64) * (last_column - first_column) > FEW
+    small_end = tl.where(many, first_row, last_row)
+    place = at
+    for i in range(tl.max(small_end - first_row)):
         row = first_row + i
         first, last = _columns_of_row(
             row, x, y, a, b, c, level, determinant, proper, first_column, last_column, TILE
         )  # fmt: skip
-        last = tl.where(row < last_row, last, first)
+        last = tl.where(row < small_end, last, first)
         for j in range(tl.max(last - first)):
             listed = first + j < last
-            tile = (view + row) * tile_width + first + j
-            tl.store(tiles + at, (tile - 32768).to(tiles.dtype.element_ty), listed)
-            tl.store(ids + at, g, listed)
-            at += listed.to(at.dtype)
+            tile = (row_of_view + row) * tile_width + first + j
+            tl.store(tiles + place, (tile - 32768).to(tiles.dtype.element_ty), listed)
+            tl.store(ids + place, g, listed)
+            place += listed.to(place.dtype)
+    index = tl.arange(0, LANES)
+    chosen = tl.min(tl.where(many, index, LANES))
+    while chosen < LANES:
+        this = index == chosen
+        gaussian, begin, one_place = _pick(g, this), _pick(first_row, this), _pick(at, this)
+        end, above = _pick(last_row, this), _pick(row_of_view, this)
+        one_x, one_y, one_a, one_b, one_c = (
+            _pick(x, this), _pick(y, this), _pick(a, this), _pick(b, this), _pick(c, this)
+        )  # fmt: skip
+        one_level, one_determinant = _pick(level, this), _pick(determinant, this)
+        one_proper = _pick(proper.to(tl.int32), this) > 0
+        one_first, one_last = _pick(first_column, this), _pick(last_column, this)
+        while begin < end:
+            row = begin + index
+            first, last = _columns_of_row(
+                row, one_x, one_y, one_a, one_b, one_c, one_level, one_determinant, one_proper, one_first, one_last,
+                TILE,
+            )  # fmt: skip
+            count = tl.where(row < end, tl.maximum(last - first, 0), 0)
+            place = one_place + tl.cumsum(count, 0) - count
+            tile = (above + row) * tile_width + first - 32768
+            for j in range(tl.max(count)):
+                listed = j < count
+                tl.store(tiles + place + j, (tile + j).to(tiles.dtype.element_ty), listed)
+                tl.store(ids + place + j, gaussian + 0 * index, listed)
+            one_place += tl.sum(count)
+            begin += LANES
+        chosen = tl.min(tl.where(many & (index > chosen), index, LANES))
     stride = tl.num_programs(0) * LANES
     used = tl.where(fits, needed, 0)
     for i in range(tl.cdiv(num_pairs - used, stride)):
@@ -274,7 +317,7 @@ class PendingTiles:
         _list[cdiv(n, _LANES),](
             *self.ellipses, self.order, self.ends, tiles, ids,
             n, n // views, num_pairs, num_tiles, columns, rows, rows_per_view,
-            self.ellipses[1].dim() - 1, self.tile_size, _LANES, num_warps=1,
+            self.ellipses[1].dim() - 1, self.tile_size, _LANES, _FEW_TILES, num_warps=1,
         )  # fmt: skip
         tiles, by_tile = tiles.sort(stable=True)
         starts, ordered = ids.new_empty((views, rows_per_view, columns)), torch.empty_like(ids)

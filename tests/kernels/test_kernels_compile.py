@@ -20,7 +20,7 @@ CONSTANTS = {
     "VERTICAL": False, "MAX": 1e18, "PIXELS": 1024, "TINY": 1e-38, "HIGHEST": 4.0,
     "OCTAVES": 12.0, "MASKED": 255, "WIDTHS": (3, 45, 1), "PER_GAUSSIAN": 2, "GAUSSIANS": 16, "STRIDE": 12,
     "ALPHAS": True, "ABSGRAD": True, "PRECISION": "tf32x3", "PENALTY": True, "CULL": True,
-    "DEPTHS": True, "COMPENSATIONS": True, "PASSED": True, "ON_DEVICE": False,
+    "DEPTHS": True, "COMPENSATIONS": True, "PASSED": True, "ON_DEVICE": False, "FEW": 64,
 }
 INTEGERS = "n row height width taps num_gaussians num_views tile_width tile_height used stride start".split()
 INTEGERS += "channels weight_stride num_pairs rows view absolute_view absolute_row num_strips num_tiles".split()
@@ -72,7 +72,7 @@ def test_every_kernel_compiles_for_an_a100_and_an_h200(tmp_path):
     assert run.returncode == 0, run.stderr[-3000:]
     expected = {"_blur_along_rows", "_similarity", "_spread_along_rows", "_gradient", "_count", "_list", "_observe"}
     expected |= {"_forward", "_backward", "_update", "_correlate", "_differentiate", "_aggregate", "_write_one"}
-    expected |= {"_composite_backward", "_encode", "_accumulate_gradients", "_finish", "_order"}
+    expected |= {"_composite_backward", "_composite_forward", "_encode", "_accumulate_gradients", "_finish", "_order"}
     expected |= {"_activate", "_activate_backward", "_project_backward"}
     assert set(run.stdout.split()) == expected
 

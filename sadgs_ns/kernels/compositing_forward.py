@@ -1,0 +1,154 @@
+"""gsplat's alpha compositing of three channels, forward: a warp draws a tile of 64 pixels.
+
+gsplat's kernel gives each pixel a thread, which goes through the tile's list Gaussian by Gaussian. Here a thread holds
+batches of Gaussians of two pixels, as in the backward pass (compositing.py), so that the arithmetic of a batch does not
+wait for one another. What is drawn is the same but for rounding: a weight errs by some 1e-7 of itself.
+"""
+
+# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false
+# (Triton's launch syntax, kernel[grid](...), and its functions are not in its types.)
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from sadgs_ns.kernels.compositing_blocks import TILE_SIZE, load_gaussians, reciprocal, row, split4
+
+_GAUSSIANS, _WARPS = 8, 1
+"""Gaussians of a batch, and warps of a program. With 16 Gaussians the kernel takes 1.2 times as long, with 32 of them
+1.5 times (docs/measurements.md, "The parts of a step")."""
+
+
+@triton.jit
+def _load_with_flaws(means2d, conics, colors, opacities, g):
+    """Load what `load_gaussians` loads, with 1 beside a colour that is not finite, else 0."""
+    centres, conic, rgb = load_gaussians(means2d, conics, colors, opacities, g)
+    k = tl.arange(0, 4)[None, :]
+    value = tl.load(colors + 3 * g + tl.minimum(k, 2))
+    flaw = tl.max(tl.where(tl.abs(value) < float("inf"), 0.0, 1.0), axis=1)[:, None]
+    return centres, conic, tl.where(k == 3, flaw, rgb)
+
+
+@triton.jit(do_not_specialize=["num_pairs", "height", "width", "tile_width", "tile_height"])
+def _composite_forward(
+    means2d, conics, colors, opacities, starts, ids, renders, alphas, last_ids,
+    num_pairs, height, width, tile_width, tile_height, TILE: tl.constexpr, GAUSSIANS: tl.constexpr,
+):  # fmt: skip
+    """Draw one tile, from front to back, in blocks [Gaussians, pixels]."""
+    PIXELS: tl.constexpr = TILE * TILE
+    FAINTEST = tl.constexpr(0x3B808081)  # bits of 1/255
+    OPAQUE = tl.constexpr(1e-4)
+    SCALE = tl.constexpr(0.8493218002880191)  # √(log2(e) / 2), of offsets: exp(-σ) is then exp2 of a plain polynomial
+    tile = tl.program_id(0)
+    view = tile // (tile_height * tile_width)
+    tile_row, column = tile // tile_width % tile_height, tile % tile_width
+    pixel = tl.arange(0, PIXELS)
+    x, y = pixel % TILE, pixel // TILE
+    inside = (tile_row * TILE + y < height) & (column * TILE + x < width)
+    at = (view * height + tile_row * TILE + y) * width + column * TILE + x
+    start = tl.load(starts + tile)
+    end = num_pairs
+    if tile + 1 < tl.num_programs(0):
+        end = tl.load(starts + tile + 1)
+    scaled_x, scaled_y = SCALE * (x.to(tl.float32) - (TILE - 1) / 2), SCALE * (y.to(tl.float32) - (TILE - 1) / 2)
+    centre_x, centre_y = column.to(tl.float32) * TILE + TILE / 2, tile_row.to(tl.float32) * TILE + TILE / 2
+
+    # `passed` is what all Gaussians of the list so far let through. Where it falls to 1e-4 nothing more is drawn, not
+    # even what made it fall, and `left` keeps what it was before.
+    left = tl.where(inside, 1.0, 0.0)
+    passed = left
+    red, green, blue = tl.zeros([PIXELS], tl.float32), tl.zeros([PIXELS], tl.float32), tl.zeros([PIXELS], tl.float32)
+    flaws = tl.zeros([PIXELS], tl.float32)
+    last = tl.zeros([PIXELS], tl.int32)
+    rows = tl.arange(0, GAUSSIANS)
+    first_row = rows[:, None] == 0
+    next_g = tl.load(ids + tl.minimum(start + rows, num_pairs - 1))
+    next_centre, next_conic, next_rgb = _load_with_flaws(means2d, conics, colors, opacities, next_g[:, None])
+    done = start
+    while (done < end) & (tl.max(passed) > OPAQUE):
+        position = done + rows
+        mean_x, mean_y, opacity, _ = split4(next_centre)
+        a, b, c, _ = split4(next_conic)
+        r, g, b_, flaw = split4(next_rgb)
+        # The next batch is loaded while this one is computed.
+        done += GAUSSIANS
+        next_g = tl.load(ids + tl.minimum(done + rows, num_pairs - 1))
+        next_centre, next_conic, next_rgb = _load_with_flaws(means2d, conics, colors, opacities, next_g[:, None])
+
+        # Bits of positive floats are ordered as these: one unsigned comparison finds 1/255 <= alpha <= opacity, the
+        # latter being σ >= 0, with some units in the last place for rounding.
+        reach = tl.where(position < end, opacity, 0.0).to(tl.int32, bitcast=True) - FAINTEST + 4
+        limit = tl.maximum(reach, 0)[:, None]
+        dx = SCALE * (mean_x - centre_x)[:, None] - scaled_x[None, :]
+        dy = SCALE * (mean_y - centre_y)[:, None] - scaled_y[None, :]
+        exponent = dx * (a[:, None] * dx) + dy * (b[:, None] * (dx + dx) + c[:, None] * dy)
+        alpha = opacity[:, None] * tl.exp2(-exponent)
+        above = alpha.to(tl.int32, bitcast=True) - FAINTEST
+        seen = above.to(tl.uint32, bitcast=True) < limit.to(tl.uint32, bitcast=True)
+        alpha = tl.where(seen, tl.minimum(alpha, 0.999), 0.0)
+
+        through = 1 - alpha
+        behind = tl.cumprod(tl.where(first_row, through * passed[None, :], through), 0)
+        drawn = behind > OPAQUE
+        weight = tl.where(drawn, alpha * behind * reciprocal(through), 0.0)
+        red += tl.sum(weight * r[:, None], axis=0)
+        green += tl.sum(weight * g[:, None], axis=0)
+        blue += tl.sum(weight * b_[:, None], axis=0)
+        flaws += tl.sum(weight * flaw[:, None], axis=0)
+        left = tl.minimum(left, tl.min(tl.where(drawn, behind, 1.0), axis=0))
+        last = tl.maximum(last, tl.max(tl.where(weight > 0, position[:, None], 0), axis=0))
+        passed = row(behind, GAUSSIANS - 1)
+    nan = tl.where(flaws > 0, float("nan"), 0.0)
+    tl.store(renders + 3 * at, red + nan, inside)
+    tl.store(renders + 3 * at + 1, green + nan, inside)
+    tl.store(renders + 3 * at + 2, blue + nan, inside)
+    tl.store(alphas + at, 1 - left, inside)
+    tl.store(last_ids + at, last, inside)
+
+
+def composite_forward(
+    means2d: Tensor,
+    conics: Tensor,
+    colors: Tensor,
+    opacities: Tensor,
+    width: int,
+    height: int,
+    isect_offsets: Tensor,
+    flatten_ids: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Do what `gsplat_internals.composite` does, for three channels in tiles of TILE_SIZE.
+
+    A colour that is not finite makes the pixels that see it NaN, and no others.
+
+    Args:
+        means2d: px; this and all other tensors must be contiguous. [C, N, 2]
+        conics: In 1/px². [C, N, 3]
+        colors: [C, N, 3]
+        opacities: In [0, 1]. [C, N]
+        width: px.
+        height: px.
+        isect_offsets: Where each tile's list starts, int32 [C, tile rows, tile columns]. A list of a tile below the
+            image is passed over.
+        flatten_ids: Indices in C·N, int32 [number of pairs].
+
+    Returns:
+        Colours [C, height, width, 3]; alphas [C, height, width, 1]; and the place in the lists of the last Gaussian
+        that a pixel drew, int32 [C, height, width].
+    """
+    views, tile_height, tile_width = isect_offsets.shape
+    if not len(flatten_ids):
+        return (
+            means2d.new_zeros((views, height, width, 3)),
+            means2d.new_zeros((views, height, width, 1)),
+            flatten_ids.new_zeros((views, height, width)),
+        )
+    renders, alphas = means2d.new_empty((views, height, width, 3)), means2d.new_empty((views, height, width, 1))
+    last_ids = flatten_ids.new_empty((views, height, width))
+    _composite_forward[(isect_offsets.numel(),)](
+        means2d, conics, colors, opacities, isect_offsets, flatten_ids, renders, alphas, last_ids,
+        len(flatten_ids), height, width, tile_width, tile_height, TILE_SIZE, _GAUSSIANS,
+        num_warps=_WARPS, num_stages=1,
+    )  # fmt: skip
+    return renders, alphas, last_ids
