@@ -136,7 +136,7 @@ def test_a_run_of_graphs_equals_one_of_launches_bit_for_bit(
 ):
     monkeypatch.setattr(resolution, "LEAST_PIXELS", WIDTH * HEIGHT // 4)  # Half the width and height are enough.
     short.pipeline.growing_resolution, short.pipeline.growing_resolution_strength = growing, 100.0
-    short.max_num_iterations += 10 * growing  # Steps of more kinds, the first of each of which is no graph's.
+    short.max_num_iterations = iterations = ITERATIONS + 10 * growing  # It has more kinds of steps to capture.
     short.pipeline.views_per_iteration = 2
     kinds, launch = set(), graphed_steps.launch_step
 
@@ -147,7 +147,7 @@ def test_a_run_of_graphs_equals_one_of_launches_bit_for_bit(
     monkeypatch.setattr(graphed_steps, "launch_step", noted)
     (launched, expected), (replayed, found) = run(short, False), run(short, True)
     assert launched.graphed is None and replayed.graphed is not None and not replayed.graphed.failure
-    assert replayed.graphed.replayed > short.max_num_iterations / 3
+    assert replayed.graphed.replayed > iterations / 3
     assert replayed.pipeline.views._reduced_Ks.keys() == ({2} if growing else set())
     assert (True, True) not in kinds and ((True, False) in kinds) == growing
     assert expected == found
