@@ -14,7 +14,7 @@ from processes import start
 
 from sadgs_ns.distributed.shards import Shards
 
-TIMEOUT = 150.0
+TIMEOUT = 400.0
 """Seconds after which processes are killed, so that no test waits for ever for a message that does not come."""
 
 

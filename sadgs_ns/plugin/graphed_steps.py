@@ -259,11 +259,12 @@ class GraphedSteps:
         height, width, channels = images[0].shape
         if len(drawn) > 1 or channels != 3 or any("mask" in data for _, data in views):
             return None
-        kind, update = model.kind_of_step(width, height, indices), RepeatedUpdate(self._optimizers)
+        level, update = pipeline.resolution.at(step), RepeatedUpdate(self._optimizers)
+        kind = model.kind_of_step(width, height, indices, reduced=level > 1)
         sums = {name: value for name, value in model.strategy_state.items() if isinstance(value, Tensor)}
         if kind.tile_capacity is None or not update.in_one_launch or (kind.absgrad and "grad2d" not in sums):
             return None
-        viewmats, Ks = pipeline.views.stacked_cameras(indices)
+        viewmats, Ks = pipeline.views.stacked_cameras(indices, level)
         found = self._graph(kind, update, sums, viewmats, Ks, images)
         if found is None:
             return None

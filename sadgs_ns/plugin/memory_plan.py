@@ -61,7 +61,12 @@ class TrainingSize:
 
 
 def training_size(
-    datamanager: FullImageDatamanager, params: Params, views: int, fused: bool, processes: int = 1
+    datamanager: FullImageDatamanager,
+    params: Params,
+    views: int,
+    fused: bool,
+    growing: bool = False,
+    processes: int = 1,
 ) -> TrainingSize:
     """Measure a run before its first step; no image is opened for it.
 
@@ -70,13 +75,14 @@ def training_size(
         params: The initial Gaussians of this process.
         views: Views rendered in a step.
         fused: Whether the loss is computed by our kernels.
+        growing: Whether reduced images are kept, too, as `pipeline.growing_resolution` does.
         processes: Number of processes among which the step is shared out.
     """
     cameras = datamanager.train_dataset.cameras
     largest = int((cameras.height * cameras.width).max())
     structure = 0.0
     if datamanager.config.cache_images == "gpu":
-        kept = image_bytes(datamanager)
+        kept = image_bytes(datamanager, growing)
     else:  # The images of the next step are there, too.
         kept = float((3 * _value_bytes(datamanager) + CODE_BYTES) * views * largest)
         structure = float(STRUCTURE_PIXEL_BYTES * max(largest, min(PIXELS_PER_BATCH, views * largest)))
@@ -85,30 +91,37 @@ def training_size(
     return TrainingSize(kept, StepSize(views, pixels, pairs, processes > 1), fused, structure)
 
 
-def image_bytes(datamanager: FullImageDatamanager) -> float:
-    """Bytes of all images, held-out ones too, and of the codes of S̄ of the training images."""
+def image_bytes(datamanager: FullImageDatamanager, growing: bool = False) -> float:
+    """Bytes of all images, held-out ones too, and of the codes of S̄ of the training images.
+
+    Args:
+        datamanager: Holds the cameras.
+        growing: Whether training images of half the width and height are kept, too.
+    """
     train, held_out = (
         float((cameras.height * cameras.width).sum())
         for cameras in (datamanager.train_dataset.cameras, datamanager.eval_dataset.cameras)
     )  # px
-    return 3 * _value_bytes(datamanager) * (train + held_out) + CODE_BYTES * train
+    images = train + held_out + (0.25 * train if growing else 0.0)  # px
+    return 3 * _value_bytes(datamanager) * images + CODE_BYTES * train
 
 
 def _value_bytes(datamanager: FullImageDatamanager) -> int:
     return 1 if datamanager.config.cache_images_type == "uint8" else 4
 
 
-def place_images(datamanager: FullImageDatamanager, device: torch.device) -> str | None:
+def place_images(datamanager: FullImageDatamanager, device: torch.device, growing: bool = False) -> str | None:
     """Decide where the images are kept, from the memory that is there.
 
     Args:
         datamanager: Its images have not been loaded yet; its configuration is changed.
         device: The device of training.
+        growing: As in `image_bytes`.
 
     Returns:
         A line for the user; None where they are kept on the device.
     """
-    config, size = datamanager.config, image_bytes(datamanager)
+    config, size = datamanager.config, image_bytes(datamanager, growing)
     host = memory.available_host_bytes() / processes_on_this_machine()
     many = len(datamanager.train_dataset) > MANY_IMAGES
     free, share, name = host, HOST_SHARE, "the host"

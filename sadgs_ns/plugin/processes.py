@@ -71,6 +71,7 @@ def check(config: CheckedTrainerConfig) -> None:
     for name, given, remedy in (
         ("pipeline.model.use_bilateral_grid", model.use_bilateral_grid, "leave it off"),
         ("pipeline.model.camera_optimizer.mode", model.camera_optimizer.mode != "off", "set it to off"),
+        ("pipeline.growing_resolution", config.pipeline.growing_resolution, "leave it off"),
         ("start_paused", config.start_paused, "leave it off, since the viewer is off, too"),
         ("pipeline.model.fused", not model.fused and machine.device_type == "cuda", "leave it on"),
     ):

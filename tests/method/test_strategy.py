@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from scenes import adam, camera, random_params, training_step
+from scenes import adam, camera, random_params, splat, training_step
 
 from sadgs_ns.method import strategy as strategy_module
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow
@@ -170,6 +170,27 @@ def test_keeping_all_gradients_changes_nothing():
         assert torch.equal(parameter, hoarded[name])
 
 
+@pytest.mark.parametrize("levels", [(1, 2), (2,)], ids=["beside full ones", "alone"])
+def test_gradients_of_reduced_views_are_neither_kept_nor_counted(levels: tuple[int, ...]):
+    params, strategy, step = random_params(40), short(eta_every=10), 1
+    state, optimizers, infos, losses = strategy.initialize_state(), adam(params), [], []
+    for level in levels:
+        width, height = WIDTH // level, HEIGHT // level
+        renders, _, info = splat(params, *camera(width, height), width, height, absgrad=level == 1)
+        infos.append(info | {"reduced": level > 1})
+        losses.append(renders.square().mean())
+    strategy.step_pre_backward(params, optimizers, state, step, infos)
+    torch.stack(losses).mean().backward()
+    strategy.step_post_backward(params, optimizers, state, step, infos)
+    expected = empty_gradients(40, torch.device("cpu"))
+    for info in infos:
+        assert info["means2d"].retains_grad == (not info["reduced"])
+        if not info["reduced"]:
+            accumulate_gradients(expected, info, len(levels))
+    assert (expected["grad_count"].sum() > 20) == (1 in levels)
+    assert all(torch.equal(state[name], value) for name, value in expected.items())
+
+
 def test_opacity_schedule(monkeypatch: pytest.MonkeyPatch):
     def opacities(**changes: Any) -> torch.Tensor:
         params, _, _ = train(short(absgs_every=0, structure_every=0, **changes), 20)
@@ -241,7 +262,7 @@ def test_low_eta_and_low_opacity_together_prune(monkeypatch: pytest.MonkeyPatch)
 
 def test_pruning_never_leaves_nothing():
     params = random_params(5)
-    n = StructureAwareStrategy._prune(params, adam(params), {}, torch.ones(5, dtype=torch.bool))
+    n = short()._prune(params, adam(params), {}, torch.ones(5, dtype=torch.bool))
     assert n == 0 and len(params["means"]) == 5
 
 
@@ -249,7 +270,7 @@ def gradient_state(grad: list[float], absgrad: list[float]) -> dict[str, torch.T
     return {"grad2d": torch.tensor(grad), "absgrad2d": torch.tensor(absgrad), "grad_count": torch.ones(len(grad))}
 
 
-def grow_with(params, state, budget: int = 1000, **options: bool) -> tuple[int, int]:
+def grow_with(params, state, budget: int = 1000, **options: Any) -> tuple[int, int]:
     return grow(
         params,
         adam(params, lr=0.0),

@@ -261,7 +261,7 @@ def test_what_ended_a_process_of_nerfstudios_is_told_in_a_sentence(
 
     context = SimpleNamespace(join=fail)
     monkeypatch.setattr(train_script, "mp", SimpleNamespace(spawn=lambda *arguments, **options: context))
-    monkeypatch.setattr(train_script.profiler, "flush_profiler", lambda config: None)
+    monkeypatch.setattr("nerfstudio.utils.profiler.flush_profiler", lambda config: None)
     with pytest.raises(type(error)) as raised:
         train_script.launch(train_script.train_loop, 2, config=sadgs.config)
     sys.excepthook(type(error), error, raised.value.__traceback__)
