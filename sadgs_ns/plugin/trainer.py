@@ -265,6 +265,8 @@ class SadgsTrainer(Trainer):
         try:
             with self._interrupts:
                 try:
+                    if self.shards is not None:  # nerfstudio's way to make it fails where another process is as fast.
+                        self.base_dir.mkdir(parents=True, exist_ok=True)
                     super().train()
                     self._stop_if_stuck()
                 except Interrupted as interrupted:

@@ -85,7 +85,7 @@ def test_what_cannot_be_compiled_leaves_the_run_as_it_was(
     monkeypatch.setattr(compilation, "_SIZE", 12)  # the interpreter is slow, and would take half a minute for S̄
     monkeypatch.setattr(trainer.pipeline.structure_maps, "of_images", lambda image: image)
     monkeypatch.setattr(
-        compilation, "ThreadPoolExecutor", lambda: ThreadPoolExecutor(1)
+        compilation, "ThreadPoolExecutor", lambda **options: ThreadPoolExecutor(1, **options)
     )  # the interpreter knows one thread
     monkeypatch.setattr(kernels, "available", lambda device: True)
     for name in ("encode", "photometric_loss", "step_together", "rasterize", "observe", "activate"):
