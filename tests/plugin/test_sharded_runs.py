@@ -98,6 +98,7 @@ def test_the_first_steps_are_those_of_one_process(ranks: int, views: int, scene:
     [
         ("pipeline.model.use_bilateral_grid", True),
         ("pipeline.model.camera_optimizer.mode", "SO3xR3"),
+        ("pipeline.growing_resolution", True),
         ("start_paused", True),
     ],
 )
