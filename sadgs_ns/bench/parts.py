@@ -7,9 +7,7 @@ GPU's.
 
 from __future__ import annotations
 
-import statistics
 import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
@@ -18,30 +16,17 @@ from torch import Tensor
 
 from sadgs_ns import kernels
 from sadgs_ns.bench import command_lines
+from sadgs_ns.bench.step import milliseconds
 from sadgs_ns.cli.export import read_gaussians
 from sadgs_ns.data.run_cameras import read_cameras
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
-REPEATS = 20
+ROUNDS = 3
+"""Rounds of calls, of which the median counts."""
 ROOM = 1.25
 """Places in the tile lists, relative to the pairs, about as many as in training."""
-
-
-def milliseconds(function: Callable[[], object], device: torch.device) -> float:
-    """Return the time of a call among `REPEATS` that follow each other: the median of three rounds, after one."""
-    times = []
-    for _ in range(4):
-        if device.type == "cuda":
-            torch.cuda.synchronize(device)
-        start = time.perf_counter()
-        for _ in range(REPEATS):
-            function()
-        if device.type == "cuda":
-            torch.cuda.synchronize(device)
-        times.append(1e3 * (time.perf_counter() - start) / REPEATS)
-    return statistics.median(times[1:])
 
 
 def parts(
@@ -85,14 +70,9 @@ def parts(
     def colored() -> Tensor:
         return colors_from_harmonics(degree, leaves[0].detach(), first, rest, viewmats, radii)
 
-    def counted() -> object:
-        return intersect_tiles(
-            means2d, radii, depths, conics, each, width, height, compositing.TILE_SIZE, max_off_axis
-        )  # fmt: skip
-
-    pending = intersect_tiles(
-        means2d, radii, depths, conics, each, width, height, compositing.TILE_SIZE, max_off_axis
-    )  # fmt: skip
+    ellipses = means2d, radii, depths, conics, each
+    counted = partial(intersect_tiles, *ellipses, width, height, compositing.TILE_SIZE, max_off_axis)
+    pending = counted()
     pairs = sum(pending.pair_counts.wait())
     capacity = int(ROOM * pairs) + 1
     starts, ids = pending.lists(capacity)
@@ -139,7 +119,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     print("| part | ms |\n| --- | ---: |")
     for name, function in timed.items():
-        print(f"| {name} | {milliseconds(function, device):.3f} |", flush=True)
+        print(f"| {name} | {milliseconds(function, ROUNDS):.3f} |", flush=True)
     return 0
 
 

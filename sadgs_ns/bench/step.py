@@ -7,7 +7,6 @@ Adam with its moments. Each part is timed by itself, then the whole step, a spli
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -16,6 +15,7 @@ import torch
 from torch import Tensor
 
 from sadgs_ns.bench import command_lines
+from sadgs_ns.bench.evaluate import now
 from sadgs_ns.method.codes import encode
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.split import grid_split
@@ -30,16 +30,14 @@ ETA_EVERY = 10
 """What `StructureAwareStrategy.eta_every` is in a run of 3,000 iterations."""
 
 
-def milliseconds(function: Callable[[], object]) -> float:
-    """Time of a call among calls that follow each other, as in training: the median of five rounds, after one."""
+def milliseconds(function: Callable[[], object], rounds: int = 5) -> float:
+    """Time of a call among calls that follow each other, as in training: the median of some rounds, after one."""
     times = []
-    for _ in range(6):
-        torch.cuda.synchronize()
-        start = time.perf_counter()
+    for _ in range(1 + rounds):
+        start = now()
         for _ in range(REPEATS):
             function()
-        torch.cuda.synchronize()
-        times.append((time.perf_counter() - start) / REPEATS * 1e3)
+        times.append((now() - start) / REPEATS * 1e3)
     return statistics.median(times[1:])
 
 

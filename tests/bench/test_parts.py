@@ -9,7 +9,7 @@ import torch
 from interpreted import use_our_rasterizer
 from kill_and_resume import configure, set_up
 
-from sadgs_ns.bench import parts
+from sadgs_ns.bench import parts, step
 from sadgs_ns.demo.scene import write_scene
 
 
@@ -26,7 +26,7 @@ def test_the_table_has_a_time_for_every_part(
     assert parts.main([str(run)]) == 1
     assert capsys.readouterr().err == "The parts are our Triton kernels, which need a CUDA device.\n"
     use_our_rasterizer(monkeypatch)
-    monkeypatch.setattr(parts, "milliseconds", lambda function, device: 1.5 if function() is not None else 0.0)
+    monkeypatch.setattr(parts, "milliseconds", lambda function, rounds: 1.5 if function() is not None else 0.0)
     monkeypatch.setattr(parts.kernels, "available", lambda device: True)
     assert parts.main([str(run), "--views", "2"]) == 0
     head, _, _, _, *rows = capsys.readouterr().out.splitlines()
@@ -39,7 +39,7 @@ def test_the_table_has_a_time_for_every_part(
 
 def test_a_time_is_the_median_of_rounds_after_the_first(monkeypatch: pytest.MonkeyPatch):
     clock = iter([0.0, 9.0, 10.0, 10.2, 20.0, 20.4, 30.0, 30.6])
-    monkeypatch.setattr(parts.time, "perf_counter", lambda: next(clock))
+    monkeypatch.setattr("time.perf_counter", lambda: next(clock))
     calls: list[int] = []
-    assert parts.milliseconds(lambda: calls.append(1), torch.device("cpu")) == pytest.approx(400 / parts.REPEATS)
-    assert len(calls) == 4 * parts.REPEATS
+    assert parts.milliseconds(lambda: calls.append(1), parts.ROUNDS) == pytest.approx(400 / step.REPEATS)
+    assert len(calls) == 4 * step.REPEATS
