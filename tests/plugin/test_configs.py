@@ -330,7 +330,7 @@ def test_options_that_this_version_lacks_are_named_where_they_changed_the_run(ca
 # --- the package ---
 
 
-def test_an_installation_holds_the_protocols_of_the_benchmarks(tmp_path: Path):
+def test_an_installation_holds_every_module_and_the_protocols_of_the_benchmarks(tmp_path: Path):
     source, installed = tmp_path / "source", tmp_path / "installed"
     source.mkdir()
     for name in ("sadgs_ns", "configs", "README.md", "LICENSE"):
@@ -345,6 +345,8 @@ def test_an_installation_holds_the_protocols_of_the_benchmarks(tmp_path: Path):
     for path in shipped:
         assert (installed / "sadgs_ns" / path.relative_to(CHECKOUT)).read_bytes() == path.read_bytes()
     assert (installed / "sadgs_ns" / "py.typed").is_file()
+    modules = {path.relative_to(CHECKOUT) for path in CHECKOUT.glob("sadgs_ns/**/*.py")}
+    assert {path.relative_to(installed) for path in installed.glob("sadgs_ns/**/*.py")} == modules
 
 
 def requirements(lines: list[str]) -> set[str]:
