@@ -10,7 +10,7 @@ JOBS ?= 2
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-portable gate lint clean
+.PHONY: demo test test-portable gate lint docs clean
 
 demo: $(STAMP)
 	$(BIN)/python -m sadgs_ns.demo
@@ -35,6 +35,11 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check sadgs_ns tests
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+# The site, in `site/`. mkdocs ends with an error at every warning, such as a link to nowhere.
+docs: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
+
 # The stamp is written last, so an interrupted installation is taken up again.
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 12))' || { \
@@ -45,5 +50,5 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) demo-output gate-output outputs build *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) demo-output gate-output outputs build site *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find sadgs_ns tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -103,7 +103,7 @@ def starting_points(
         opacity: Opacity of the points that are given, in [0, 1].
 
     Returns:
-        Points in world units [N, 3], colours in [0, 1] [N, 3], scales in world units, > 0 [N], opacities in [0, 1] [N].
+        Points in world units, [N, 3]; colours in [0, 1], [N, 3]; scales in world units, > 0, [N]; opacities, [N].
 
     Raises:
         ValueError: If there is no point.

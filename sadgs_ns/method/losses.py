@@ -94,13 +94,15 @@ def photometric_part(
         rows: First row that counts and one past the last.
         top: Which row of the view is the first of `predicted`.
         height: Of the view in px, at least 11 unless all rows count.
-        ssim_lambda, l2_lambda, fused: As for `photometric_loss`.
+        ssim_lambda: As for `photometric_loss`.
+        l2_lambda: As for `photometric_loss`.
+        fused: As for `photometric_loss`.
 
     Returns:
         The part of the loss, and that of the mean square error, without gradient; both are scalars.
 
     Raises:
-        As `photometric_loss`.
+        ValueError: As `photometric_loss`.
     """
     first, last = rows
     if last - first == height:

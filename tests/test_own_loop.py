@@ -1,4 +1,4 @@
-"""The README's training loop, run as it is printed there, with the torch splatter in the place of gsplat's kernels."""
+"""The documents' training loop, run as it is printed there, with the torch splatter in the place of gsplat's kernels."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sadgs_ns.method import strategy as strategy_module
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.render.rasterization import rasterize
 
-README = Path(__file__).parents[1] / "README.md"
+DOCUMENT = Path(__file__).parents[1] / "docs" / "strategy.md"
 WIDTH, HEIGHT, VIEWS, START = 64, 48, 3, 60
 
 
@@ -36,13 +36,12 @@ class Short(StructureAwareStrategy):
 
 
 def block() -> str:
-    """The only Python in the section."""
-    section = README.read_text("utf8").partition("\n## In your own gsplat loop\n")[2].partition("\n## ")[0]
-    (code,) = re.findall(r"```python\n(.*?)```", section, re.S)
+    """The only Python in the document."""
+    (code,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text("utf8"), re.S)
     return code
 
 
-def test_the_loop_of_the_readme_runs_and_splits(monkeypatch: pytest.MonkeyPatch):
+def test_the_loop_of_the_document_runs_and_splits(monkeypatch: pytest.MonkeyPatch):
     calls = 0
     signature = inspect.signature(gsplat.rasterization)
 
