@@ -1,4 +1,4 @@
-"""The documents' training loop, run as it is printed there, with the torch splatter in the place of gsplat's kernels."""
+"""The documents' training loop, run as it is printed there, with the torch splatter instead of gsplat's kernels."""
 
 from __future__ import annotations
 

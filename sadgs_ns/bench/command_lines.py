@@ -82,6 +82,7 @@ def validation() -> argparse.ArgumentParser:
     parser.add_argument("root", type=Path, help="folder that holds the scenes")
     parser.add_argument("out", type=Path, help="folder for the copies")
     parser.add_argument("--masked", nargs="*", default=[], metavar="SCENE", help="also write NAME-masked of these")
+    parser.add_argument("--noisy", nargs="*", default=[], metavar="SCENE", help="also write NAME-noisy of these")
     return parser
 
 

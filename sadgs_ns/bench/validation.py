@@ -4,6 +4,7 @@ Test views are for tables alone. This writes a copy of each scene of a folder (i
 from 0, a test view, is gone, and every 8th from 4 is held out. Where the scene names its own test views (a
 `transforms.json` with lists of file names), every 8th training view from 4 is held out instead. With `--masked`, a
 rectangle in each training view, somewhere else in each and a quarter of it in all, is masked; held-out views are whole.
+With `--noisy`, the camera of each training view is turned by a random angle, and those of held-out views are true.
 """
 
 from __future__ import annotations
@@ -14,8 +15,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from sadgs_ns.bench import command_lines
 from sadgs_ns.bench.datasets import image_names
@@ -26,6 +29,9 @@ INTERVAL, TEST, VALIDATION = 8, 0, 4
 """Every 8th view from 0 is a test view, every 8th from 4 a validation view."""
 MASKED_SHARE = 0.25
 """Share of a training view's pixels that `--masked` masks."""
+NOISY_DEGREES = 0.1
+"""Standard deviation of the angle by which `--noisy` turns a camera about each of its axes: 2 px at a focal length of
+1,150 px."""
 
 
 def write_colmap(scene: Path, out: Path, masked: bool = False) -> tuple[int, int]:
@@ -65,6 +71,26 @@ def write_colmap(scene: Path, out: Path, masked: bool = False) -> tuple[int, int
     return len(train), len(held_out)
 
 
+def turn_cameras(out: Path) -> None:
+    """Turn the training cameras of a copy about their centres, by NOISY_DEGREES, the same at each call.
+
+    Args:
+        out: Folder that `write_colmap` wrote.
+    """
+    model = pycolmap.Reconstruction(out / SPARSE)
+    train = set((out / "train_list.txt").read_text().splitlines())
+    generator = np.random.default_rng(0)
+    for image in sorted(model.images.values(), key=lambda image: image.name):
+        turn = Rotation.from_rotvec(generator.normal(0, NOISY_DEGREES, 3), degrees=True)
+        if image.name in train:
+            pose = image.cam_from_world()
+            matrix = turn.as_matrix() @ pose.matrix()
+            image.frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(matrix))
+    (out / "sparse").unlink()  # It was a link.
+    (out / SPARSE).mkdir(parents=True)
+    model.write(out / SPARSE)
+
+
 def write_transforms(scene: Path, out: Path) -> tuple[int, int]:
     """Write one scene of a `transforms.json` that lists its splits, with every 8th training view from 4 held out.
 
@@ -100,6 +126,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             train, held_out = write_colmap(scene, arguments.out / scene.name)
             if scene.name in arguments.masked:
                 write_colmap(scene, arguments.out / f"{scene.name}-masked", masked=True)
+            if scene.name in arguments.noisy:
+                write_colmap(scene, arguments.out / f"{scene.name}-noisy")
+                turn_cameras(arguments.out / f"{scene.name}-noisy")
         else:
             train, held_out = write_transforms(scene, arguments.out / scene.name)
         print(f"{scene.name}: {train} training views, {held_out} validation views")

@@ -32,6 +32,21 @@ def test_a_colmap_scene_is_split_as_nerfstudio_then_reads_it(scene: Path, tmp_pa
         assert read["train"] == [name for i, name in enumerate(names) if i % 8 not in (0, 4)]
 
 
+def test_noise_turns_training_cameras_about_their_centres_and_leaves_the_others(scene: Path, tmp_path: Path):
+    assert main([str(scene.parent), str(tmp_path), "--noisy", scene.name]) == 0
+    outputs = {}
+    for name in (scene.name, f"{scene.name}-noisy"):
+        parser = ColmapDataParserConfig(data=tmp_path / name, colmap_path=SPARSE, downscale_factor=1)
+        parser.orientation_method, parser.center_method, parser.auto_scale_poses = "none", "none", False
+        for split in ("train", "test"):
+            outputs[name, split] = parser.setup().get_dataparser_outputs(split).cameras.camera_to_worlds
+    for split, turned in (("train", True), ("test", False)):
+        true, noisy = outputs[scene.name, split], outputs[f"{scene.name}-noisy", split]
+        np.testing.assert_allclose(noisy[..., 3], true[..., 3], atol=1e-5)
+        angles = np.degrees((noisy - true)[:, :, :3].square().sum(dim=(1, 2)).div(2).sqrt().numpy())  # of small turns
+        assert 0.05 < np.sqrt((angles**2).mean() / 3) < 0.15 if turned else angles.max() < 1e-3
+
+
 def test_a_scene_that_lists_its_views_keeps_its_test_views_out(tmp_path: Path):
     scene = tmp_path / "scenes" / "listed"
     scene.mkdir(parents=True)
