@@ -15,9 +15,11 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+import torch
 
 from sadgs_ns.cli.process.apart import Report
 from sadgs_ns.cli.process.features import extract
+from sadgs_ns.cli.process.matching import write_matches
 from sadgs_ns.cli.process.photos import empty_folder, in_order
 from sadgs_ns.cli.process.plan import Matching, Summary
 from sadgs_ns.errors import InputError
@@ -27,6 +29,9 @@ _SEED = 0
 _TRIALS = 2000
 """Random samples after which COLMAP gives a pair of photos up. Its own 10,000 take three times as long, for pairs that
 have hardly anything in common, and find no more matches in the others."""
+_PAIRS, _PAIRS_ON_GPU = 50, 400
+"""Pairs of photos after which the progress is told, and what was matched is not lost. Each time COLMAP starts its
+threads anew, and the descriptors travel to the GPU."""
 FEW_FEATURES = 500
 """Keypoints under which a photo counts as blurred or empty."""
 
@@ -104,6 +109,8 @@ def sequential_pairs(names: Sequence[str], overlap: int = 10) -> list[tuple[str,
 def match(names: Sequence[str], database: Path, pair_list: Path, matching: Matching, report: Report) -> None:
     """Match features between photos; pairs that an earlier run matched are skipped.
 
+    Where there is a CUDA device, it compares the features, unless COLMAP chooses the pairs.
+
     Args:
         names: All photos.
         database: COLMAP's database, which holds their features.
@@ -130,8 +137,11 @@ def match(names: Sequence[str], database: Path, pair_list: Path, matching: Match
         return
     pairs = sequential_pairs(in_order(names)) if matching == "sequential" else list(itertools.combinations(names, 2))
     report(stage, 0, len(pairs))
-    for start in range(0, len(pairs), 50):
-        chunk = pairs[start : start + 50]
+    at_once = _PAIRS_ON_GPU if torch.cuda.is_available() else _PAIRS
+    for start in range(0, len(pairs), at_once):
+        chunk = pairs[start : start + at_once]
+        if torch.cuda.is_available():
+            write_matches(database, chunk, torch.device("cuda"))  # COLMAP then only verifies these.
         pair_list.write_text("".join(f"{a} {b}\n" for a, b in chunk), "utf8")
         pairing = pycolmap.ImportedPairingOptions(match_list_path=pair_list)
         pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
