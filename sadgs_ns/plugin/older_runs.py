@@ -68,6 +68,10 @@ BEFORE: dict[str, Any] = {
 """New options whose default changes a run, at the value that runs of earlier versions had."""
 
 
+REPLACED = {("use_bilateral_grid", True): ("color_model", "bilateral_grid")}
+"""Removed options with a value that another option now has a value for."""
+
+
 def read_with(trainer_config: type[TrainerConfig]) -> None:
     """Let `yaml.Loader` read earlier versions' names of our classes, and bring what it reads up to date.
 
@@ -118,6 +122,10 @@ def _bring_up_to_date(config: Any, path: str) -> list[str]:
     if not dataclasses.is_dataclass(config) or not type(config).__module__.startswith("sadgs_ns."):
         return []
     options = {option.name: option for option in dataclasses.fields(config)}
+    for (name, value), (now, means) in REPLACED.items():
+        if now in options and vars(config).get(name) is value:
+            delattr(config, name)
+            setattr(config, now, means)
     for name, option in options.items():
         if option.init and name not in vars(config):
             made = option.default_factory is not dataclasses.MISSING
