@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -94,7 +95,8 @@ def exposures(views: PinholeViews, points: Array, colors: NDArray[np.uint8]) -> 
     every = -(-len(points) // _MOST_POINTS) or 1
     points, colors = points[::every], colors[::every]
     observed = np.arange(0, len(points), -(-len(points) // _MOST_OBSERVED) or 1)
-    columns = [_light_of_points(views, int(view), points, colors, observed) for view in chosen]
+    with ThreadPoolExecutor() as pool:  # Most of the time images are decoded, for which Python does not wait.
+        columns = list(pool.map(lambda view: _light_of_points(views, int(view), points, colors, observed), chosen))
     found = relative_stops(np.stack(columns, axis=1)) if columns else None
     return None if found is None else Exposures(*found, "pixels")
 

@@ -64,6 +64,7 @@ BEFORE: dict[str, Any] = {
     "averaged_share": 0.0,
     "max_off_axis": 0.0,
     "max_angular_scale": 0.0,
+    "color_model": "none",
 }
 """New options whose default changes a run, at the value that runs of earlier versions had."""
 
