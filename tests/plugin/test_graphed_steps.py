@@ -346,12 +346,13 @@ def test_there_are_no_graphs_on_a_cpu(short: SadgsTrainerConfig):
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="graphs are CUDA's")
-@pytest.mark.parametrize("views", [1, 2])
-def test_a_gpu_trains_alike_with_graphs(colmap: ColmapDataParserConfig, tmp_path: Path, views: int):
+@pytest.mark.parametrize(("views", "color_model"), [(1, "none"), (2, "none"), (2, "affine")])
+def test_a_gpu_trains_alike_with_graphs(colmap: ColmapDataParserConfig, tmp_path: Path, views: int, color_model: Any):
     """Atomic additions come in any order, so that two runs differ by rounding, and grow apart once they densify."""
     schedule = {"absgs_every": 60, "structure_every": 120, "reset_every": 0, "refine_stop_iter": 180, "eta_every": 10}
     config = configure(tmp_path, colmap, 300, **schedule, refine_start_iter=60)
     config.pipeline.views_per_iteration = views
+    config.pipeline.model.color_model = color_model
     (_, expected), (replayed, found) = run(config, False), run(config, True)
     if not kernels.available(replayed.pipeline.model.device):
         pytest.skip("Triton does not run here")
