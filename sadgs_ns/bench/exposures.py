@@ -69,7 +69,7 @@ def with_gains(image: NDArray[np.uint8], gains: NDArray[np.float64]) -> NDArray[
 def write_scene(
     scene: Path, out: Path, spread: float, white_balance: float, mean: float, seed: int
 ) -> dict[str, dict[str, Any]]:
-    """Write the copy; a folder that is there is replaced.
+    """Write the copy; an earlier one is replaced.
 
     Returns:
         What the file of gains holds: gain and channels' factors of each photo by its name, and whether it is held out.
@@ -105,8 +105,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     problem = None
     if not (given.scene / SPARSE).is_dir():
         problem = f"{given.scene} holds no {SPARSE}; give the folder of a COLMAP scene."
-    elif given.out.resolve() == given.scene.resolve():
-        problem = "the copy would take the scene's place; give it another folder."
+    elif given.out.exists() and not (given.out / FILE).exists():
+        problem = f"{given.out} is there and holds no {FILE}, so that it is no earlier copy; give another folder."
     elif not (given.spread >= 1 and 0 <= given.white_balance < 1 and 0 < mean <= 1):
         problem = "--spread must be at least 1, --white-balance in [0, 1), and --mean in (0, 1]."
     if problem is not None:

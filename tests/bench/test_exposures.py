@@ -69,10 +69,11 @@ def test_wrong_input_is_one_sentence_and_leaves_all_as_it_was(
     (tmp_path / "copy" / "kept").touch()
     for arguments, said in (
         ([str(tmp_path), str(tmp_path / "copy")], "holds no sparse/0"),
-        ([str(scene), str(scene)], "would take the scene's place"),
-        ([str(scene), str(tmp_path / "copy"), "--spread", "0.5"], "--spread must be at least 1"),
+        ([str(scene), str(scene)], "is there and holds no exposures.json"),
+        ([str(scene), str(tmp_path / "copy")], "is there and holds no exposures.json"),
+        ([str(scene), str(tmp_path / "new"), "--spread", "0.5"], "--spread must be at least 1"),
     ):
         assert main(arguments) == 2
         error = capsys.readouterr().err
         assert said in error and error.count("\n") == 1
-    assert (tmp_path / "copy" / "kept").exists() and (scene / "images").is_dir()
+    assert (tmp_path / "copy" / "kept").exists() and (scene / "images").is_dir() and not (tmp_path / "new").exists()
