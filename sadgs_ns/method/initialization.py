@@ -120,6 +120,21 @@ def starting_points(
     )
 
 
+def uncovered_points(points: Tensor, scales: Tensor, means: Tensor) -> Tensor:
+    """Which points lie where no Gaussian is: the nearest one's centre is further away than the point's scale.
+
+    Args:
+        points: World units. [P, 3]
+        scales: Initial scales of the points, as `starting_points` gives them, world units. [P]
+        means: Centres of the Gaussians, world units. [N, 3]
+
+    Returns:
+        bool [P]
+    """
+    distances, _ = KDTree(means.detach().cpu().numpy()).query(points.detach().cpu().numpy(), workers=-1)
+    return torch.from_numpy(distances).to(scales) > scales
+
+
 def camera_extent(positions: Tensor) -> float:
     """The extent of the cameras, which is 1.1 times the largest distance from their centre (3DGS).
 

@@ -29,7 +29,13 @@ from sadgs_ns.distributed.shards import Shards
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.averaging import RunningMean
 from sadgs_ns.method.clearance import clear_of_cameras, limit_scales
-from sadgs_ns.method.initialization import POINT_OPACITY, camera_extent, plausible_points, starting_points
+from sadgs_ns.method.initialization import (
+    POINT_OPACITY,
+    camera_extent,
+    plausible_points,
+    starting_points,
+    uncovered_points,
+)
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.outliers import POINT_SHARE, REACH
@@ -275,6 +281,23 @@ class SadgsModel(SplatfactoModel):
         if keep.any():
             for parameter in self.gauss_params.values():
                 parameter.data = parameter.data[keep]
+
+    def start_from(self, params: Mapping[str, Tensor]) -> int:
+        """Start from the Gaussians of an earlier run, and where none of them is, from the initial ones.
+
+        Call it after `set_cameras` and before optimizers are made.
+
+        Args:
+            params: Parameters by name, in this run's frame, all of which are finite. [N, …]
+
+        Returns:
+            Number of initial Gaussians that stay.
+        """
+        scales = self.scales.detach().exp().amax(dim=1)  # [P]
+        keep = uncovered_points(self.means.detach(), scales, params["means"])  # [P]
+        for name, parameter in self.gauss_params.items():
+            parameter.data = torch.cat([params[name].to(parameter), parameter.data[keep]])
+        return int(keep.sum())
 
     def share_out(self, shards: Shards) -> None:
         """Keep the part of the Gaussians that is this process's; call before optimizers are made.

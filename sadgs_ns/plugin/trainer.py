@@ -162,7 +162,8 @@ class SadgsTrainer(Trainer):
                 part = self.shards.take_even_part(len(state["pipeline"]["_model.gauss_params.means"]))
                 state = checkpoints.of_gaussians(state, lambda rows: rows[part].clone())
             self.pipeline.load_pipeline(state["pipeline"], state["step"])
-            self.pipeline.refuse_other_capture()
+            if self.pipeline.checkpoint_views is not None:
+                self.pipeline.refuse_other_capture(*self.pipeline.checkpoint_views)
             if more := sorted(state["optimizers"].keys() - self.optimizers.optimizers.keys()):
                 raise InputError(
                     f"It optimized {' and '.join(more)}, too: set pipeline.model.use-bilateral-grid and "
@@ -201,6 +202,7 @@ class SadgsTrainer(Trainer):
             effort=config.pipeline.effort,
             iterations=before.get("iterations") if self._derived else config.max_num_iterations,
             views_per_iteration=before.get("views_per_iteration") if asked is None else asked,
+            continued=config.pipeline.start_from is not None,
         )
         config.max_num_iterations = pipeline.schedule.iterations
         self.config = config
@@ -209,10 +211,13 @@ class SadgsTrainer(Trainer):
         """Derive the run's length and build the optimizers with schedules as long as that, fused where the model is.
 
         Raises:
-            InputError: As `checkpoints.read_chosen`, since a run that goes on keeps its length.
+            InputError: As `checkpoints.read_chosen`, since a run that goes on keeps its length, and
+                `SadgsPipeline.start_from`.
         """
         config = self.config
         self._checkpoint = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
+        if self._checkpoint is None and config.pipeline.start_from is not None:
+            self.pipeline.start_from(config.pipeline.start_from)
         self._derive_schedule()
         if self.shards is not None:
             self.pipeline.share_out(self.shards)

@@ -469,7 +469,7 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
             return Summary(12, count, 100, 0.5, {}, arguments[2])
 
         monkeypatch.setattr(program, "run_apart", stand_in)
-        monkeypatch.setattr(program, "_publish", lambda undistorted, out: None)
+        monkeypatch.setattr(program, "_publish", lambda *others: None)
 
     return register
 
@@ -654,7 +654,7 @@ def test_added_and_removed_photos_make_another_scene(tmp_path: Path, taken: list
     capsys.readouterr()
     assert main(command) == 2 and len(taken) == 2
     changes = "photos added: 2, such as day/b.png; photos removed: 1, such as b.png"
-    assert f"settings ({changes}); give another folder or delete it." in capsys.readouterr().err
+    assert f"settings ({changes}); put these photos back, give another folder or delete it." in capsys.readouterr().err
     other = black(tmp_path / "other", "a.png", "b.png", "c.png")
     assert main([str(other), str(tmp_path / "out")]) == 2
     assert f"(source was {photos.resolve()}, is {other.resolve()})" in capsys.readouterr().err

@@ -41,6 +41,7 @@ from sadgs_ns.cli.process.photos import (
 )
 from sadgs_ns.cli.process.plan import Matching, Summary, choose_matching, expected_work
 from sadgs_ns.cli.process.video import video_frames, write_frames
+from sadgs_ns.data.coordinates import FRAME_KEYS
 from sadgs_ns.errors import InputError, RunError, WriteError, free_space, reason
 from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
 
@@ -49,10 +50,8 @@ MIN_SIZE = 64
 _SECONDS_PER_LINE = 1.0
 """Least time between two lines of a stage's progress in a file."""
 _STAGES = "sadgs_ns.cli.process.stages"
-FRAME_KEYS = ("dataparser_transform", "dataparser_scale")
-"""Keys of a scene's `transforms.json` for how a run moved the data: `datamanager` has later runs move it so, too."""
-SPLIT_KEYS = ("train_filenames", "val_filenames", "test_filenames")
-"""Keys there of lists of images, by which nerfstudio chooses the views that it holds out."""
+_KEPT_KEYS = (*FRAME_KEYS, "train_filenames", "val_filenames", "test_filenames")
+"""Keys that a scene's `transforms.json` keeps when photos are added."""
 _MODEL = "model"
 """Name of the model's folder in `work`; where photos were added, their number follows it."""
 _UNFINISHED = (
@@ -220,7 +219,7 @@ def process(
             shutil.rmtree(work / model, ignore_errors=True)
         arguments = (folder, groups, chosen_matching, max_size, work / "alpha", work, model, base)
         summary = run_apart(f"{_STAGES}:make_model", *arguments, folder=work, report=report)
-        _publish(work / "undistorted", out, grown=bool(added))
+        _publish(work / "undistorted", out, bool(added))
         if summary.is_poor and not added:  # the features serve another way of matching
             shutil.rmtree(work / model)
         else:
@@ -292,7 +291,7 @@ def _reporter(progress: Progress) -> Report:
     return report
 
 
-def _publish(undistorted: Path, out: Path, grown: bool) -> None:
+def _publish(undistorted: Path, out: Path, grown: bool = False) -> None:
     """Add what nerfstudio reads to undistorted photos and their model, and move everything to the scene's folder.
 
     Args:
@@ -315,7 +314,7 @@ def _publish(undistorted: Path, out: Path, grown: bool) -> None:
         poses = {frame["file_path"]: frame["transform_matrix"] for frame in before["frames"]}
         for frame in described["frames"]:  # Computing a pose again rounds it.
             frame["transform_matrix"] = poses.get(frame["file_path"], frame["transform_matrix"])
-        kept = {name: before[name] for name in (*FRAME_KEYS, *SPLIT_KEYS) if name in before}
+        kept = {name: before[name] for name in _KEPT_KEYS if name in before}
         (undistorted / "transforms.json").write_text(json.dumps(described | kept))
         written = [name for name in written if (undistorted / name).exists() or name not in poses]
     try:
