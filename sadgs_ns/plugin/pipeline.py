@@ -22,16 +22,14 @@ from tyro.conf import Suppress
 
 from sadgs_ns import kernels
 from sadgs_ns.data.cameras import refuse_unsupported_cameras
-from sadgs_ns.data.coordinates import TRANSFORMS_NAME, Similarity, from_data
 from sadgs_ns.data.validation.parsers import findings_of
 from sadgs_ns.distributed.shards import Shards
 from sadgs_ns.errors import InputError
-from sadgs_ns.formats.gaussians import of_parameters
 from sadgs_ns.method.codes import HIGHEST_FREQUENCY
 from sadgs_ns.method.initialization import camera_extent
 from sadgs_ns.method.schedule import growth_threshold, schedule
 from sadgs_ns.method.structure_tensor import ENERGY_BLUR, FREQUENCY_CONSTANT
-from sadgs_ns.plugin import checkpoints, nonfinite
+from sadgs_ns.plugin import nonfinite
 from sadgs_ns.plugin.cleaning_panel import CleaningPanel
 from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig, check_options
 from sadgs_ns.plugin.growing_resolution import GrowingResolution
@@ -54,8 +52,6 @@ _WIDEST_BLUR = 100
 """Largest window of `energy_blur`, which makes kernels of thousands of pixels."""
 _SAMPLED = 1000
 """About so many cameras, and Gaussians, are enough to find out whether training can see anything."""
-_START_REMEDY = "give --pipeline.start-from the folder of a finished run of sadgs on this capture, or leave it out"
-"""What errors advise about a run that cannot be started from."""
 _FAR_PLANE = 1e10
 """Depth in world units up to which gsplat and our splatter draw Gaussians."""
 Drawn = dict[torch.Size, list[tuple[int, dict[str, Any]]]]
@@ -438,7 +434,7 @@ class SadgsPipeline(VanillaPipeline):
             InputError: If the checkpoint is of another method, or of other settings of the model.
         """
         loaded = {key.removeprefix("module."): value for key, value in loaded_state.items()}
-        self._gaussians_of(loaded)
+        self.gaussians_of(loaded)
         if not {"_extra_state", "_model._extra_state"} <= loaded.keys():
             raise InputError("The checkpoint lacks the state of structure-aware densification, so splatfacto made it.")
         for name, parameter in self.named_parameters():
@@ -450,7 +446,7 @@ class SadgsPipeline(VanillaPipeline):
                 )
         super().load_pipeline(loaded_state, step)
 
-    def _gaussians_of(self, loaded: dict[str, Any]) -> dict[str, Tensor]:
+    def gaussians_of(self, loaded: dict[str, Any]) -> dict[str, Tensor]:
         """Return the Gaussians of a checkpoint's pipeline by their parameters' names. [N, …]
 
         Raises:
@@ -468,53 +464,6 @@ class SadgsPipeline(VanillaPipeline):
                 )
             found[name] = value
         return found
-
-    def start_from(self, run: Path) -> None:
-        """Start from the Gaussians of an earlier run, in the place of those that the model starts from otherwise.
-
-        They are moved to this run's frame, which nerfstudio's parsers derive from all cameras. Call this before
-        optimizers are made.
-
-        Args:
-            run: The run's folder.
-
-        Raises:
-            InputError: If it holds no checkpoint of this method, was trained on another capture, or does not tell how
-                it moved the data.
-        """
-        found = checkpoints.read_chosen(run, None, None, _START_REMEDY)
-        assert found is not None
-        (path, state), parsed = found, self.datamanager.train_dataparser_outputs
-        if not (run / TRANSFORMS_NAME).is_file():
-            raise InputError(f"{run} holds no {TRANSFORMS_NAME}, which tells how it moved the data: {_START_REMEDY}.")
-        now = Similarity.of(parsed.dataparser_scale * parsed.dataparser_transform.double().numpy())
-        change = now.after(from_data(run / TRANSFORMS_NAME).inverse())
-        try:
-            loaded = state["pipeline"] if isinstance(state["pipeline"], dict) else {}
-            gaussians, views = self._gaussians_of(loaded), loaded.get("_extra_state", {})
-            if not {"images", "camera_positions"} <= views.keys():
-                raise InputError("It does not tell of which views it is, so an earlier version or method made it.")
-            positions = torch.from_numpy(change.positions(views["camera_positions"].double().numpy()))
-            self.refuse_other_capture(views["images"], positions.float())
-            if not change.keeps_all():
-                gaussians = _moved(gaussians, change)
-        except ValueError as error:  # An InputError is one, too.
-            raise InputError(f"{path} cannot be started from: {str(error).rstrip('.')}; {_START_REMEDY}.") from error
-        added = self.model.start_from(gaussians)
-        CONSOLE.print(
-            f"Starting from the {len(gaussians['means']):,} Gaussians of {path}, and from {added:,} points where it "
-            "has none.",
-            markup=False,
-            highlight=False,
-            soft_wrap=True,
-        )
-        held_out = {file.name for file in self.datamanager.eval_dataset.image_filenames}
-        if seen := len(held_out.intersection(views["images"])):
-            CONSOLE.print(
-                f"[yellow]{seen} of the {len(held_out)} views that are held out were trained on by {escape(str(run))}: "
-                "what is measured on them says little of views that nobody saw.[/]",
-                soft_wrap=True,
-            )
 
     def refuse_other_capture(self, before: Sequence[str], positions_before: Tensor) -> None:
         """Check whether a checkpoint is of the data that training is about to go on with.
@@ -611,19 +560,6 @@ class SadgsPipeline(VanillaPipeline):
 def _positions(cameras: Cameras) -> Tensor:
     """Return the centres of cameras in world units. [C, 3]"""
     return cameras.camera_to_worlds[:, :3, 3].cpu()
-
-
-def _moved(params: dict[str, Tensor], change: Similarity) -> dict[str, Tensor]:
-    """Return parameters of Gaussians in another frame, without those that are not finite there. [N, …]
-
-    Raises:
-        ValueError: If the harmonics have a degree above 3.
-    """
-    arrays = {name: value.detach().cpu().numpy() for name, value in params.items()}
-    moved = {
-        name: torch.from_numpy(value) for name, value in vars(of_parameters(arrays).moved(change).finite()).items()
-    }
-    return moved | {"opacities": moved["opacities"][:, None]}
 
 
 def _stack(tensors: list[Tensor]) -> Tensor:

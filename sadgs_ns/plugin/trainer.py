@@ -24,6 +24,7 @@ from sadgs_ns.method.schedule import between_one_and_four, schedule
 from sadgs_ns.plugin import checkpoints, older_runs, processes
 from sadgs_ns.plugin.compilation import compile_kernels
 from sadgs_ns.plugin.config import CheckedTrainerConfig
+from sadgs_ns.plugin.earlier_run import start_from
 from sadgs_ns.plugin.graphed_steps import GraphedSteps
 from sadgs_ns.plugin.interrupts import SIGNALS, Interrupted, Interrupts
 from sadgs_ns.plugin.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig, SadgsOptimizers
@@ -212,12 +213,12 @@ class SadgsTrainer(Trainer):
 
         Raises:
             InputError: As `checkpoints.read_chosen`, since a run that goes on keeps its length, and
-                `SadgsPipeline.start_from`.
+                `start_from`.
         """
         config = self.config
         self._checkpoint = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
         if self._checkpoint is None and config.pipeline.start_from is not None:
-            self.pipeline.start_from(config.pipeline.start_from)
+            start_from(self.pipeline, config.pipeline.start_from)
         self._derive_schedule()
         if self.shards is not None:
             self.pipeline.share_out(self.shards)
