@@ -89,17 +89,17 @@ def schedule(
         effort: How much training, relative to what the number of views asks for, > 0.
         iterations: Optimizer steps, if they are given; else they are as many as the visits take.
         views_per_iteration: Views of a step, if they are given; never more than there are.
-        continued: Whether the run starts from the Gaussians of an earlier one; it then has `CONTINUED_SHARE` of the
-            steps.
+        continued: Whether the run starts from the Gaussians of an earlier one, and so has `CONTINUED_SHARE` of the
+            visits.
     """
     few, many = MORE_VISITS_FROM
     power = 1.0 if effort <= 1 else min(max((num_views - few) / (many - few), 0.0), 1.0)
-    visits = effort**power * (BASE_VISITS + VISITS_PER_VIEW * num_views)
+    visits = effort**power * (BASE_VISITS + VISITS_PER_VIEW * num_views) * (CONTINUED_SHARE if continued else 1.0)
     if views_per_iteration is None:
         views_per_iteration = min(max(int(visits) // STEPS_BEFORE_VIEWS, 1), MOST_VIEWS)
     views_per_iteration = min(views_per_iteration, num_views)
     if iterations is None:
-        iterations = math.ceil((CONTINUED_SHARE if continued else 1.0) * visits / views_per_iteration)
+        iterations = math.ceil(visits / views_per_iteration)
     return Schedule(iterations, views_per_iteration)
 
 

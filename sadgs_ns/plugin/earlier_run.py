@@ -14,6 +14,7 @@ from torch import Tensor
 from sadgs_ns.data.coordinates import TRANSFORMS_NAME, Similarity, from_data
 from sadgs_ns.errors import InputError
 from sadgs_ns.plugin import checkpoints
+from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 if TYPE_CHECKING:
     from sadgs_ns.plugin.pipeline import SadgsPipeline
@@ -54,7 +55,15 @@ def start_from(pipeline: SadgsPipeline, run: Path) -> None:
     except ValueError as error:  # An InputError is one, too.
         raise InputError(f"{path} cannot be started from: {str(error).rstrip('.')}; {_REMEDY}.") from error
     finite = torch.stack([value.flatten(1).isfinite().all(dim=1) for value in gaussians.values()]).all(dim=0)  # [N]
-    added = pipeline.model.start_from({name: value[finite] for name, value in gaussians.items()})
+    dataset = pipeline.datamanager.train_dataset
+    known = [index for index, file in enumerate(dataset.image_filenames) if file.name in views["images"]]
+    cameras = dataset.cameras[torch.tensor(known, dtype=torch.long)]
+    added = pipeline.model.start_from(
+        {name: value[finite] for name, value in gaussians.items()},
+        viewmats_from_camera_to_world(cameras.camera_to_worlds),
+        cameras.get_intrinsics_matrices(),
+        torch.cat([cameras.width, cameras.height], dim=-1),
+    )
     CONSOLE.print(
         f"Starting from {int(finite.sum()):,} Gaussians of {path}, and from {added:,} points where it has none.",
         markup=False,
