@@ -154,6 +154,8 @@ class SadgsPipeline(VanillaPipeline):
             CONSOLE.print(
                 "[yellow]Triton does not run here: without its kernels training takes about twice as long.[/]"
             )
+        if config.start_from is not None and self.model.strategy.reset_every is None:
+            self.model.strategy.reset_every = 0  # What was learned is not to be learned again.
         self.model.set_cameras(_positions(self.datamanager.train_dataset.cameras))
         self.views = TrainingViews(self.datamanager, self.model)
         strength = config.growing_resolution_strength if config.growing_resolution else None
