@@ -169,10 +169,10 @@ class PhotosToSplat:
             self._note()
             with contextlib.ExitStack() as stack:
                 training = None
-                if self._checkpoint() and "views" not in self._settings:  # An earlier version trained it.
-                    self._note(views=self._views())
+                if self._trained() and "views" not in self._settings and (self._scene / "transforms.json").exists():
+                    self._note(views=self._views())  # An earlier version trained it.
                 # Importing nerfstudio takes some 12 s, in which cameras can be found.
-                if not self._trained() or photos_added(self.source, self._scene):
+                if not self._trained() or self._photos_added():
                     training = stack.enter_context(prepared(_TRAINING, self._log("training"), lock))
                 self._make_cameras()
                 self._choose_run()
@@ -182,6 +182,10 @@ class PhotosToSplat:
                 if other != self._run and re.fullmatch(r"run(-\d+)?", other.name):
                     shutil.rmtree(other)
             return made
+
+    def _photos_added(self) -> bool:
+        """Whether photos were added since the cameras were found."""
+        return bool(photos_added(self.source, self._scene))
 
     def _views(self) -> list[str]:
         """Return the scene's images, in the order in which nerfstudio chooses those that it holds out."""
@@ -298,7 +302,8 @@ class PhotosToSplat:
             more_pairs |= printed.startswith("warning: ") and " --matching exhaustive" in printed
 
         with Line("cameras", self.console) as line:
-            if self._settings.get("few") and (self.anyway or self._checkpoint()):
+            done = self.anyway or self._checkpoint()
+            if self._settings.get("few") and done and not self._photos_added():
                 line.tell(f"{self._settings['few']}; done before")
                 return
             arguments = [os.path.abspath(self.source), str(self._scene), "--max-size", str(self.max_size)]

@@ -118,7 +118,8 @@ def photos_added(source: Path, out: Path) -> list[str]:
     """
     noted = out / "work" / "settings.json"
     begun = _read_settings(noted) if noted.exists() and source.is_dir() else {}
-    return sorted(set(find_photos(source, out)) - set(begun["photos"])) if "finished" in begun else []
+    known = begun.get("photos") if "finished" in begun else None
+    return [] if known is None else sorted(set(find_photos(source, out)) - set(known))
 
 
 def process(
