@@ -2,6 +2,9 @@
 
 Its folder holds the cameras in `scene`, the run in `training`, all that was printed in `log`, the splats, and
 `settings.json`, by which the command knows the folder again and what of it is done.
+
+Where photos were added since, their cameras are added to the scene, whose other cameras stay, and another run starts
+from the Gaussians of the finished one, which is removed when the splats of the new one are written.
 """
 
 from __future__ import annotations
@@ -27,10 +30,11 @@ from typing import Any
 from rich.console import Console
 
 from sadgs_ns.atomic import atomic_path
-from sadgs_ns.cli.process.command import MIN_SIZE
+from sadgs_ns.cli.process.command import MIN_SIZE, photos_added
 from sadgs_ns.cli.process.photos import find_photos
 from sadgs_ns.cli.process.video import VIDEO_SUFFIXES
 from sadgs_ns.cli.stage import Line, clock, prepared, run_stage
+from sadgs_ns.data.coordinates import FRAME_KEYS, TRANSFORMS_NAME
 from sadgs_ns.errors import InputError, RunError, WriteError, free_space, reason
 from sadgs_ns.formats.files import MESH, SUFFIXES
 from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
@@ -43,6 +47,7 @@ _LOCK_SECONDS = 10.0
 """Time that a killed run's last stage is given to save."""
 _STEP = re.compile(r"^(\S.*) (\d+)/(\d+)$")
 _ROUGHLY = re.compile(r" pairs to match: (roughly .*) on \d+ processor")
+_ADDED = re.compile(r"^(\d+ photos? added to \d+)\.$")
 _REGISTERED = re.compile(r"^(\d+) of (\d+) photos registered")
 _CHOSEN = re.compile(r" training views of .*: ([\d,]+) iterations of \d+ view")
 _ROW = re.compile(r"^(\d+) \(\d+\.\d+%\)")
@@ -84,7 +89,8 @@ class PhotosToSplat:
 
     def __post_init__(self) -> None:
         self._scene, self._settings_file = self.folder / "scene", self.folder / "settings.json"
-        self._run = self.folder / "training" / "sadgs" / "run"
+        self._runs = self.folder / "training" / "sadgs"
+        self._settings: dict[str, Any] = {}
         self._asked: dict[str, Any] = {"source": os.path.realpath(self.source), "--max-size": self.max_size}
         self._asked |= {"--effort": self.effort, "options of ns-train": list(self.options)}
         for option in self.options:
@@ -120,6 +126,7 @@ class PhotosToSplat:
             begun = dict(json.loads(file.read_text("utf8")))
         except ValueError as error:
             raise InputError(f"{file} is damaged ({reason(error)}): delete {folder} and begin again.") from error
+        self._settings = begun
         decided = ["source"]
         decided += ["--max-size"] if (self._scene / "transforms.json").exists() else []
         decided += ["--effort", "options of ns-train"] if self._checkpoint() else []
@@ -139,6 +146,11 @@ class PhotosToSplat:
         with atomic_path(self._settings_file) as partial:
             partial.write_text(json.dumps(self._settings), "utf8")
 
+    @property
+    def _run(self) -> Path:
+        """The present run's folder."""
+        return self._runs / self._settings.get("run", "run")
+
     def _checkpoint(self) -> Path | None:
         """Return the run's latest checkpoint, if it has any."""
         return max(self._run.glob("nerfstudio_models/step-*.ckpt"), default=None)
@@ -157,11 +169,72 @@ class PhotosToSplat:
             self._note()
             with contextlib.ExitStack() as stack:
                 training = None
-                if not self._trained():  # Importing nerfstudio takes some 12 s, in which cameras can be found.
+                if self._trained() and "views" not in self._settings and (self._scene / "transforms.json").exists():
+                    self._note(views=self._views())  # An earlier version trained it.
+                # Importing nerfstudio takes some 12 s, in which cameras can be found.
+                if not self._trained() or self._photos_added():
                     training = stack.enter_context(prepared(_TRAINING, self._log("training"), lock))
                 self._make_cameras()
+                self._choose_run()
                 self._train(training)
-            return [self._export(name) for name in sorted(self.formats, key=lambda name: name == "html")]
+            made = [self._export(name) for name in sorted(self.formats, key=lambda name: name == "html")]
+            for other in self._runs.glob("run*"):
+                if other != self._run and re.fullmatch(r"run(-\d+)?", other.name):
+                    shutil.rmtree(other)
+            return made
+
+    def _photos_added(self) -> bool:
+        """Whether photos were added since the cameras were found."""
+        return bool(photos_added(self.source, self._scene))
+
+    def _views(self) -> list[str]:
+        """Return the scene's images, in the order in which nerfstudio chooses those that it holds out."""
+        described = json.loads((self._scene / "transforms.json").read_bytes())
+        return sorted((frame["file_path"] for frame in described["frames"]), key=Path)
+
+    def _choose_run(self) -> None:
+        """Begin another run where photos were added since the present one began.
+
+        It starts from the Gaussians of the last run that was finished, if there is one.
+        """
+        views, before = self._views(), self._settings.get("views")
+        if views == before:
+            return
+        chosen: dict[str, Any] = {"views": views}
+        if before and self._checkpoint():
+            if self._trained():
+                chosen |= {"start": self._run.name, "start_views": len(before)}
+            chosen |= {"run": f"run-{len(views)}", "trained": None}
+            if start := (self._settings | chosen).get("start"):
+                self._keep_frame_and_split(self._runs / start, before)
+        self._note(**chosen)
+
+    def _keep_frame_and_split(self, run: Path, before: Sequence[str]) -> None:
+        """Note in the scene how an earlier run moved the data, and that what it held out is held out again.
+
+        Of the photos that were added as many are held out as nerfstudio would. Where an option says which views are
+        held out, that option decides.
+
+        Args:
+            run: The earlier run.
+            before: The images that the scene had then.
+        """
+        from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fraction
+
+        file, moved = self._scene / "transforms.json", json.loads((run / TRANSFORMS_NAME).read_bytes())
+        described = json.loads(file.read_bytes())
+        described |= dict(zip(FRAME_KEYS, (moved["transform"], moved["scale"]), strict=True))
+        if not any(re.match("--(eval|train|test)", option) for option in self.options):
+            trained, held_out = described.get("train_filenames", []), described.get("test_filenames", [])
+            known = {*trained, *held_out}
+            for names in (before, self._views()):
+                new = [name for name in names if name not in known]
+                for_training, for_tests = get_train_eval_split_fraction(new, 0.9)
+                trained, held_out = trained + [new[i] for i in for_training], held_out + [new[i] for i in for_tests]
+                known.update(new)
+            described |= {"train_filenames": trained, "val_filenames": held_out, "test_filenames": held_out}
+        with atomic_path(file) as partial:
+            partial.write_text(json.dumps(described), "utf8")
 
     @contextlib.contextmanager
     def _alone(self) -> Iterator[int]:
@@ -212,22 +285,25 @@ class PhotosToSplat:
         raise InputError(f"{told}.") if code == 2 else RunError(f"{told}, and the same command goes on.")
 
     def _make_cameras(self) -> None:
-        found, others, roughly, finished, more_pairs = "", "", "", False, False
+        added, found, others, roughly, finished, more_pairs = "", "", "", "", False, False
 
         def hear(printed: str) -> None:
-            nonlocal found, others, roughly, finished, more_pairs
-            if step := _STEP.match(printed):
-                line.tell(f"{step[1]} {step[2]} of {step[3]}{roughly}")
+            nonlocal added, found, others, roughly, finished, more_pairs
+            if more := _ADDED.match(printed):
+                added = f"{more[1]}: "
+            elif step := _STEP.match(printed):
+                line.tell(f"{added}{step[1]} {step[2]} of {step[3]}{roughly}")
             elif duration := _ROUGHLY.search(printed):
                 roughly = f" ({duration[1]} in all)"
             elif registered := _REGISTERED.match(printed):
-                found = registered[0]
+                found = added + registered[0]
                 others = "" if registered[1] == registered[2] else ", log/cameras.txt tells of the others"
             finished |= printed.endswith(" is finished; delete it to make it again.")
             more_pairs |= printed.startswith("warning: ") and " --matching exhaustive" in printed
 
         with Line("cameras", self.console) as line:
-            if self._settings.get("few") and (self.anyway or self._checkpoint()):
+            done = self.anyway or self._checkpoint()
+            if self._settings.get("few") and done and not self._photos_added():
                 line.tell(f"{self._settings['few']}; done before")
                 return
             arguments = [os.path.abspath(self.source), str(self._scene), "--max-size", str(self.max_size)]
@@ -277,11 +353,14 @@ class PhotosToSplat:
             if trained := self._trained():
                 line.tell(f"{trained}; done before")
                 return
-            line.tell("going on" if self._checkpoint() else "starting")
+            start, begun = self._settings.get("start"), bool(self._checkpoint())
+            first = f"starting from the splat of {self._settings.get('start_views')} photos" if start else "starting"
+            line.tell("going on" if begun else first)
             arguments = ["sadgs", "--data", str(self._scene.absolute()), "--output-dir", str(self.folder.absolute())]
-            arguments += ["--experiment-name", "training", "--timestamp", "run", "--vis", "tensorboard"]
+            arguments += ["--experiment-name", "training", "--timestamp", self._run.name, "--vis", "tensorboard"]
             arguments += ["--steps-per-eval-image", "0", "--pipeline.effort", f"{self.effort:g}"]
-            arguments += ["--load-dir", str(self._run.absolute())] if self._checkpoint() else []
+            arguments += ["--pipeline.start-from", str((self._runs / start).absolute())] if start else []
+            arguments += ["--load-dir", str(self._run.absolute())] if begun else []
             self._stage(line, "training", _TRAINING, [*arguments, *self.options], hear, process)
             if not self._checkpoint():
                 raise RunError(f"training ended without a checkpoint; all that it printed is in {self.folder}/log.")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,9 @@ Array = NDArray[np.float64]
 
 TRANSFORMS_NAME = "dataparser_transforms.json"
 """Name of the file in which nerfstudio's trainer writes, beside `config.yml`, how it moved cameras and points."""
+FRAME_KEYS = ("dataparser_transform", "dataparser_scale")
+"""Keys of a `transforms.json` that fix how its data is moved, as that file has it, so that photos may be added and the
+frame of training stays."""
 _TOLERANCE = 1e-4
 """Largest deviation from a similarity of a transform that was written in float32, relative to its scale."""
 
@@ -55,9 +60,23 @@ class Similarity:
         back = self.orthogonal.T
         return Similarity(1 / self.scale, back, -back @ self.translation / self.scale)
 
+    def after(self, first: Similarity) -> Similarity:
+        """Return the map that is this one after another."""
+        translation = self.positions(first.translation[None])[0]
+        return Similarity(self.scale * first.scale, self.orthogonal @ first.orthogonal, translation)
+
+    def keeps_all(self) -> bool:
+        """Whether everything stays where it is, up to rounding in float32."""
+        moved = np.concatenate([self.scale * self.orthogonal - np.eye(3), self.translation[:, None]], axis=1)
+        return bool(np.abs(moved).max() < 1e-6)
+
     def positions(self, means: Array) -> Array:
         """Return positions in the new frame. [N, 3] → [N, 3]"""
         return self.scale * (means @ self.orthogonal.T) + self.translation
+
+    def poses(self, poses: Array) -> Array:
+        """Return camera-to-world poses in the new frame. [C, 3, 4] → [C, 3, 4]"""
+        return np.concatenate([self.orthogonal @ poses[:, :, :3], self.positions(poses[:, :, 3])[:, :, None]], axis=2)
 
     def log_scales(self, scales: Array) -> Array:
         """Return logarithms of standard deviations in the new frame. [N, 3] → [N, 3]"""
@@ -157,12 +176,37 @@ def from_data(path: Path) -> Similarity:
     """
     try:
         content = json.loads(path.read_bytes())
-        transform, scale = np.array(content["transform"], dtype=np.float64), float(content["scale"])
-        if transform.shape != (3, 4) or not scale > 0:
-            raise ValueError("it has no transform of 3 rows and 4 columns and a scale above 0")
-        return Similarity.of(scale * transform)
+        return _moved_by(content["transform"], content["scale"])
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"{path} does not tell how to return to the data's frame ({reason(error)}): copy it from the run again, or "
             "export in nerfstudio's frame."
         ) from error
+
+
+def fixed_frame(meta: Mapping[str, Any], path: Path) -> Similarity | None:
+    """Return how the data of a `transforms.json` is to be moved, or None where nerfstudio's parser decides it.
+
+    Args:
+        meta: What the file holds.
+        path: The file.
+
+    Raises:
+        InputError: If it holds anything but a similarity there.
+    """
+    if not any(name in meta for name in FRAME_KEYS):
+        return None
+    try:
+        return _moved_by(*(meta[name] for name in FRAME_KEYS))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path} does not tell with {' and '.join(FRAME_KEYS)} how its data is to be moved ({reason(error)}): "
+            "remove both, or copy them from the dataparser_transforms.json of a run."
+        ) from error
+
+
+def _moved_by(transform: Any, scale: Any) -> Similarity:
+    transform, scale = np.array(transform, dtype=np.float64), float(scale)
+    if transform.shape != (3, 4) or not scale > 0:
+        raise ValueError("it has no transform of 3 rows and 4 columns and a scale above 0")
+    return Similarity.of(scale * transform)

@@ -93,8 +93,7 @@ def read_cameras(run: Path, data: Path | None = None, split: str = "train") -> R
     if (run / TRANSFORMS_NAME).is_file():  # The run's own options may have moved the capture otherwise.
         transform = outputs.dataparser_scale * outputs.dataparser_transform.double().numpy()
         for similarity in (Similarity.of(transform).inverse(), from_data(run / TRANSFORMS_NAME)):
-            poses[:, :, :3] = similarity.orthogonal @ poses[:, :, :3]
-            poses[:, :, 3] = similarity.positions(poses[:, :, 3])
+            poses = similarity.poses(poses)
     sizes = torch.cat([cameras.width, cameras.height], dim=1).tolist()
     return RunCameras(
         torch.from_numpy(poses).float(),

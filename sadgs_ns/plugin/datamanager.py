@@ -30,6 +30,7 @@ from tyro.conf import Suppress
 
 from sadgs_ns.data import colmap, ply
 from sadgs_ns.data.automatic import AnyParserConfig, AutomaticDataParserConfig, choose_parser
+from sadgs_ns.data.coordinates import FRAME_KEYS, Similarity, fixed_frame
 from sadgs_ns.data.validation import names
 from sadgs_ns.data.validation.layouts import COLMAP_FOLDERS
 from sadgs_ns.data.validation.transforms import read_json
@@ -232,7 +233,10 @@ def _check_sizes(dataset: InputDataset) -> None:
 
 
 class _Nerfstudio(Nerfstudio):
-    """nerfstudio's parser of transforms.json, which alone reads points with open3d and asks whether to make a PLY."""
+    """nerfstudio's parser of transforms.json, which alone reads points with open3d and asks whether to make a PLY.
+
+    Where the file fixes the frame (`coordinates.FRAME_KEYS`), this parser moves cameras and points there.
+    """
 
     def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
         model = self.config.data / COLMAP_FOLDERS[0]
@@ -240,6 +244,8 @@ class _Nerfstudio(Nerfstudio):
             self.prompted_user, self.create_pc = True, False  # The answer no; the points are read below.
         with _reading_byte_order_marks(nerfstudio_dataparser):
             outputs = super()._generate_dataparser_outputs(split)
+        path = self.config.data if self.config.data.suffix == ".json" else self.config.data / "transforms.json"
+        _move_to_fixed_frame(outputs, read_json(path), path)
         source = colmap.points_file(model)
         if self.config.load_3D_points and "points3D_xyz" not in outputs.metadata and source is not None:
             points = colmap.read_points(source)
@@ -251,6 +257,25 @@ class _Nerfstudio(Nerfstudio):
     ) -> dict[str, Tensor] | None:
         positions, colors = ply.read_points(ply_file_path)
         return _points_in_the_run(positions, colors, transform_matrix, scale_factor) if len(positions) else None
+
+
+def _move_to_fixed_frame(outputs: DataparserOutputs, meta: dict[str, Any], path: Path) -> None:
+    """Move cameras and points of a parser from the frame that it chose to the one that `transforms.json` fixes.
+
+    Raises:
+        InputError: As `fixed_frame`.
+    """
+    if (fixed := fixed_frame(meta, path)) is None:
+        return
+    chosen = Similarity.of(outputs.dataparser_scale * outputs.dataparser_transform.double().numpy())
+    cameras, metadata = outputs.cameras, outputs.metadata
+    poses = fixed.poses(chosen.inverse().poses(cameras.camera_to_worlds.double().numpy()))
+    cameras.camera_to_worlds = torch.from_numpy(poses).float()
+    if "points3D_xyz" in metadata:
+        points = metadata["points3D_xyz"].double().numpy()
+        metadata["points3D_xyz"] = torch.from_numpy(fixed.positions(chosen.inverse().positions(points))).float()
+    transform, scale = (meta[name] for name in FRAME_KEYS)
+    outputs.dataparser_transform, outputs.dataparser_scale = torch.tensor(transform), float(scale)
 
 
 class _Blender(Blender):

@@ -30,7 +30,14 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.method.averaging import RunningMean
 from sadgs_ns.method.clearance import clear_of_cameras, limit_scales
 from sadgs_ns.method.color_matrices import anchored, correct_colors, identities
-from sadgs_ns.method.initialization import POINT_OPACITY, camera_extent, plausible_points, starting_points
+from sadgs_ns.method.initialization import (
+    POINT_OPACITY,
+    camera_extent,
+    plausible_points,
+    seen_points,
+    starting_points,
+    uncovered_points,
+)
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.outliers import POINT_SHARE, REACH
@@ -204,6 +211,8 @@ class SadgsModel(SplatfactoModel):
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
         self._lpips: list[torch.nn.Module | None] = []  # In a list its weights stay out of the checkpoint.
         self.step = 0
+        self.first_sh_degree = 0
+        """Degree of the harmonics that the first step draws; each step adds one."""
         self.average = RunningMean()
         self.camera_positions: Tensor | None = None  # [C, 3]
         self.infos: list[dict[str, Any]] = []
@@ -240,6 +249,7 @@ class SadgsModel(SplatfactoModel):
                 )
             points = (torch.rand((config.num_random, 3)) - 0.5) * config.random_scale  # [P, 3]
             means, colors, scales, opacities = starting_points(points, torch.rand((len(points), 3)), faces=False)
+            sfm = 0
         else:
             points, colors = self.seed_points[0].float(), self.seed_points[1].float() / 255.0
             plausible = plausible_points(points)  # [P]
@@ -252,11 +262,15 @@ class SadgsModel(SplatfactoModel):
             means, colors, scales, opacities = starting_points(
                 points, colors, faces=config.bounding_box_points, opacity=config.initial_opacity
             )
-        cap = self.strategy.max_gaussians
+            sfm = len(points)
+        cap, guessed = self.strategy.max_gaussians, torch.arange(len(means)) >= sfm
         if len(means) > cap:
             CONSOLE.print(f"[yellow]Keeping a random {cap} of {len(means)} initial points: max_gaussians is {cap}.[/]")
             keep = torch.randperm(len(means))[:cap]
             means, colors, scales, opacities = means[keep], colors[keep], scales[keep], opacities[keep]
+            guessed = guessed[keep]
+        self.guessed = guessed
+        """Which of the initial Gaussians stand for no SfM point, but are random or on their bounding box. bool [N]"""
         sh_degree = config.sh_degree
         return {
             "means": means,
@@ -282,6 +296,30 @@ class SadgsModel(SplatfactoModel):
         if keep.any():
             for parameter in self.gauss_params.values():
                 parameter.data = parameter.data[keep]
+            self.guessed = self.guessed[keep.cpu()]
+
+    def start_from(self, params: Mapping[str, Tensor], viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> int:
+        """Start from the Gaussians of an earlier run, and from the initial ones where it knows nothing.
+
+        These are the SfM points near which it has no Gaussian, and of those on the faces of their bounding box, or of
+        the random ones, those that none of its views saw. Call it after `set_cameras` and before optimizers are made.
+
+        Args:
+            params: Parameters by name, in this run's frame, all of which are finite. [N, …]
+            viewmats: Of the earlier run's views, world to camera. [C, 4, 4]
+            Ks: Intrinsics in px. [C, 3, 3]
+            sizes: Width and height in px. [C, 2]
+
+        Returns:
+            Number of initial Gaussians that stay.
+        """
+        means, scales = self.means.detach(), self.scales.detach().exp().amax(dim=1)  # [P, 3], [P]
+        seen = seen_points(means.cpu(), viewmats, Ks, sizes)
+        keep = uncovered_points(means.cpu(), scales.cpu(), params["means"]) & ~(seen & self.guessed)  # [P]
+        for name, parameter in self.gauss_params.items():
+            parameter.data = torch.cat([params[name].to(parameter), parameter.data[keep.to(means.device)]])
+        self.first_sh_degree = self.config.sh_degree
+        return int(keep.sum())
 
     def learn_color_matrices(self) -> None:
         """Learn a matrix of colours for each training view; call before optimizers are made."""
@@ -385,7 +423,7 @@ class SadgsModel(SplatfactoModel):
     def sh_degree_now(self) -> int | None:
         """Degree of the harmonics that are drawn at this step; None where colours do not depend on the direction."""
         # Each iteration adds a degree: 3DGS's 1,000 iterations between them leave too few of so short a run.
-        return min(self.step, self.config.sh_degree) if self.config.sh_degree > 0 else None
+        return min(self.first_sh_degree + self.step, self.config.sh_degree) if self.config.sh_degree > 0 else None
 
     @property
     def drawing(self) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -71,6 +72,9 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     effort: float = 1.0
     """How much training the capture is given, relative to what its number of views asks for.
     0.5 is a draft of half as many renderings. 2 adds more Gaussians; 2 and 4 render more where views are many."""
+    start_from: Suppress[Path | None] = None
+    """Folder of a finished run of the same capture, before photos were added, from whose Gaussians this run starts.
+    SfM points are added where it has none. The length that is derived is half of a run's that starts anew."""
     views_per_iteration: int | None = None
     """Training views rendered for one optimizer step, at most as many as there are; the loss is their mean.
     None takes one more for every 2,000 renderings of the run, up to 4. The paper uses 1 outdoors, 2 indoors."""
@@ -150,6 +154,8 @@ class SadgsPipeline(VanillaPipeline):
             CONSOLE.print(
                 "[yellow]Triton does not run here: without its kernels training takes about twice as long.[/]"
             )
+        if config.start_from is not None and self.model.strategy.reset_every is None:
+            self.model.strategy.reset_every = 0  # What was learned is not to be learned again.
         self.model.set_cameras(_positions(self.datamanager.train_dataset.cameras))
         self.views = TrainingViews(self.datamanager, self.model)
         strength = config.growing_resolution_strength if config.growing_resolution else None
@@ -168,7 +174,8 @@ class SadgsPipeline(VanillaPipeline):
         self.put_aside: Drawn | None = None
         """Views that were drawn for the present step and not rendered yet."""
         self._checkpoint_cap: int | None = None
-        self._checkpoint_views: tuple[list[str], Tensor] | None = None  # These are names and positions [C, 3].
+        self.checkpoint_views: tuple[list[str], Tensor] | None = None
+        """What `refuse_other_capture` takes of the checkpoint that was loaded, if there is one."""
         self.stuck = ""  # It says why, where nothing is learned any more.
         self.structure = StructurePanel(self.structure_maps)
         self.cleaning = CleaningPanel(self.views)
@@ -429,15 +436,7 @@ class SadgsPipeline(VanillaPipeline):
             InputError: If the checkpoint is of another method, or of other settings of the model.
         """
         loaded = {key.removeprefix("module."): value for key, value in loaded_state.items()}
-        for name, parameter in self.model.gauss_params.items():
-            value = loaded.get(f"_model.gauss_params.{name}")
-            if value is None:
-                raise InputError(f"The checkpoint has no {name} of Gaussians, so another method made it.")
-            if value.shape[1:] != parameter.shape[1:]:
-                raise InputError(
-                    f"The checkpoint's {name} have the shape {list(value.shape[1:])}, the model's "
-                    f"{list(parameter.shape[1:])}: set pipeline.model.sh-degree as it was."
-                )
+        self.gaussians_of(loaded)
         if not {"_extra_state", "_model._extra_state"} <= loaded.keys():
             raise InputError("The checkpoint lacks the state of structure-aware densification, so splatfacto made it.")
         for name, parameter in self.named_parameters():
@@ -449,18 +448,39 @@ class SadgsPipeline(VanillaPipeline):
                 )
         super().load_pipeline(loaded_state, step)
 
-    def refuse_other_capture(self) -> None:
-        """Check whether the loaded checkpoint is of the data that training is about to go on with.
+    def gaussians_of(self, loaded: dict[str, Any]) -> dict[str, Tensor]:
+        """Return the Gaussians of a checkpoint's pipeline by their parameters' names. [N, …]
+
+        Raises:
+            InputError: If the checkpoint is of another method, or of other settings of the model.
+        """
+        found = {}
+        for name, parameter in self.model.gauss_params.items():
+            value = loaded.get(f"_model.gauss_params.{name}")
+            if value is None:
+                raise InputError(f"The checkpoint has no {name} of Gaussians, so another method made it.")
+            if value.shape[1:] != parameter.shape[1:]:
+                raise InputError(
+                    f"The checkpoint's {name} have the shape {list(value.shape[1:])}, the model's "
+                    f"{list(parameter.shape[1:])}: set pipeline.model.sh-degree as it was."
+                )
+            found[name] = value
+        return found
+
+    def refuse_other_capture(self, before: Sequence[str], positions_before: Tensor) -> None:
+        """Check whether a checkpoint is of the data that training is about to go on with.
 
         Images may have been added or taken away since, if the others' poses stayed where they were. A warning is
         printed where the cameras are the same and no image has its old name.
 
+        Args:
+            before: Names of the images that the checkpoint's run was trained on.
+            positions_before: Centres of their cameras in world units. [C, 3]
+
         Raises:
             InputError: If more than half of the cameras of either are where the other has none.
         """
-        if self._checkpoint_views is None:
-            return
-        (before, positions_before), dataset = self._checkpoint_views, self.datamanager.train_dataset
+        dataset = self.datamanager.train_dataset
         now, positions = [path.name for path in dataset.image_filenames], _positions(dataset.cameras)
         distances, _ = KDTree(positions).query(positions_before)  # [C]
         same = int((distances < _SAME_PLACE * camera_extent(positions)).sum())
@@ -527,7 +547,7 @@ class SadgsPipeline(VanillaPipeline):
         if not any(name.endswith(("max_gaussians", "memory_budget_gb")) for name in changed):
             self._checkpoint_cap = state.get("max_gaussians")
         if "images" in state:  # Earlier versions did not save it.
-            self._checkpoint_views = state["images"], state["camera_positions"]
+            self.checkpoint_views = state["images"], state["camera_positions"]
         if before.get("growing_resolution"):  # Otherwise the Gaussians decide where it is on now.
             self.resolution.level = state["resolution_level"]
         torch.set_rng_state(state["torch"].cpu())

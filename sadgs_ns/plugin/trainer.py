@@ -24,6 +24,7 @@ from sadgs_ns.method.schedule import between_one_and_four, schedule
 from sadgs_ns.plugin import checkpoints, older_runs, processes
 from sadgs_ns.plugin.compilation import compile_kernels
 from sadgs_ns.plugin.config import CheckedTrainerConfig
+from sadgs_ns.plugin.earlier_run import start_from
 from sadgs_ns.plugin.exposure import choose_color_model
 from sadgs_ns.plugin.graphed_steps import GraphedSteps
 from sadgs_ns.plugin.interrupts import SIGNALS, Interrupted, Interrupts
@@ -163,7 +164,8 @@ class SadgsTrainer(Trainer):
                 part = self.shards.take_even_part(len(state["pipeline"]["_model.gauss_params.means"]))
                 state = checkpoints.of_gaussians(state, lambda rows: rows[part].clone())
             self.pipeline.load_pipeline(state["pipeline"], state["step"])
-            self.pipeline.refuse_other_capture()
+            if self.pipeline.checkpoint_views is not None:
+                self.pipeline.refuse_other_capture(*self.pipeline.checkpoint_views)
             if more := sorted(state["optimizers"].keys() - self.optimizers.optimizers.keys()):
                 raise InputError(
                     f"It optimized {' and '.join(more)}, too: set pipeline.model.color-model and "
@@ -202,6 +204,7 @@ class SadgsTrainer(Trainer):
             effort=config.pipeline.effort,
             iterations=before.get("iterations") if self._derived else config.max_num_iterations,
             views_per_iteration=before.get("views_per_iteration") if asked is None else asked,
+            continued=config.pipeline.start_from is not None,
         )
         config.max_num_iterations = pipeline.schedule.iterations
         self.config = config
@@ -210,10 +213,13 @@ class SadgsTrainer(Trainer):
         """Derive the run's length and build the optimizers with schedules as long as that, fused where the model is.
 
         Raises:
-            InputError: As `checkpoints.read_chosen`, since a run that goes on keeps its length.
+            InputError: As `checkpoints.read_chosen`, since a run that goes on keeps its length, and
+                `start_from`.
         """
         config = self.config
         self._checkpoint = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
+        if self._checkpoint is None and config.pipeline.start_from is not None:
+            start_from(self.pipeline, config.pipeline.start_from)
         self._derive_schedule()
         if self.shards is not None:
             self.pipeline.share_out(self.shards)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,6 +14,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fraction
 from PIL import Image
 from rich.console import Console
 from room import draw_photos
@@ -115,6 +118,62 @@ def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothin
     ):
         assert main([*command[:5], *changed, *TRAINING]) == 2
         assert f"({told}); give another --output or delete it." in capsys.readouterr().err
+
+
+def test_photos_that_are_added_are_registered_and_trained_from_the_splat_that_is_there(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], stop
+):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    source, folder = tmp_path / "photos", tmp_path / "out"
+    source.mkdir()
+    names, later = sorted(path.name for path in photos.iterdir()), ["03.png", "08.png", "09.png"]
+    for name in set(names) - set(later):
+        shutil.copy2(photos / name, source)
+    command = [str(source), "--output", str(folder), "--formats", "ply", "--max-size", "120", *TRAINING]
+    command += ["--pipeline.model.strategy.max-gaussians", "3000"]  # More take a second a step.
+    assert main(command) == 0
+    first, splat = folder / "training" / "sadgs" / "run", folder / "splat.ply"
+    moved, written = (first / "dataparser_transforms.json").read_bytes(), splat.read_bytes()
+    for name in later:
+        shutil.copy2(photos / name, source)
+    capsys.readouterr()
+
+    stop("^3 photos added to 7: matches")
+    assert main(command) == 130
+    assert lines_of(capsys.readouterr().out) == {"cameras": "stopping"}
+
+    stop("^iteration 10 of 15, about .* left")
+    assert main(command) == 130
+    assert lines_of(capsys.readouterr().out)["cameras"] == "3 photos added to 7: 10 of 10 photos registered"
+    second = folder / "training" / "sadgs" / "run-10"
+    (checkpoint,) = second.glob("nerfstudio_models/step-*.ckpt")
+    assert list(first.glob("nerfstudio_models/step-*.ckpt")) and splat.read_bytes() == written
+    begun = (folder / "log" / "training.txt").read_text("utf8").rpartition("\n$ ")[2]
+    assert f"Gaussians of {first}" in begun and "were trained on by" not in re.sub(r"\s+", " ", begun)
+
+    stop("nothing")
+    assert main(command) == 0
+    lines = lines_of(capsys.readouterr().out)
+    assert lines["cameras"] == "10 of 10 photos registered; done before"
+    assert re.fullmatch(r"15 iterations, [\d,]+ Gaussians", lines["training"]) and lines["export"].endswith(" MB")
+    resumed = (folder / "log" / "training.txt").read_text("utf8").rpartition("\n$ ")[2]
+    assert f"Resuming after step {int(checkpoint.stem[5:])} of {checkpoint}" in resumed
+    assert not first.exists() and splat.read_bytes() != written
+    assert (second / "dataparser_transforms.json").read_bytes() == moved, "the splat stays where it was"
+    described = json.loads((folder / "scene" / "transforms.json").read_text())
+    held_out = get_train_eval_split_fraction(sorted(set(names) - set(later)), 0.9)[1]
+    assert described["test_filenames"] == [f"images/{sorted(set(names) - set(later))[i]}" for i in held_out]
+    assert len(described["train_filenames"]) == 10 - len(held_out)
+
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.suffix not in (".json", ".txt")}
+    assert main(command) == 0
+    lines = lines_of(capsys.readouterr().out)
+    assert all(lines[name].endswith("; done before") for name in ("cameras", "training", "export"))
+    assert before == {path: path.stat().st_mtime_ns for path in before}
+    (source / "03.png").unlink()
+    assert main(command) == 2
+    told = "(photos removed: 1, such as 03.png); put these photos back, give another folder or delete it."
+    assert told in capsys.readouterr().err and splat.exists()
 
 
 def test_few_registered_photos_end_it_until_it_shall_go_on_anyway(

@@ -1,7 +1,8 @@
 """`sadgs-process PHOTOS_OR_VIDEO OUT`: from photos to a scene that `ns-train sadgs --data OUT` reads, with pycolmap.
 
 OUT holds `images/`, `transforms.json`, `sparse_pc.ply` and COLMAP's model in `sparse/0`. What an interrupted run needs
-to go on lies in `OUT/work`; of a finished scene only `settings.json` stays there, by which the command knows it again.
+to go on lies in `OUT/work`. Of a finished scene `settings.json` stays there, by which the command knows it again, and
+what photos that come later are added to: the features and matches in `database.db`, and the model before undistortion.
 """
 
 from __future__ import annotations
@@ -27,9 +28,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from sadgs_ns.atomic import atomic_path
 from sadgs_ns.cli.process.apart import Report, run_apart
 from sadgs_ns.cli.process.photos import (
+    changed_photos,
     convert_photos,
     empty_folder,
     find_photos,
+    photo_stamps,
     photos_by_camera,
     photos_not_read,
     read_photos,
@@ -38,6 +41,7 @@ from sadgs_ns.cli.process.photos import (
 )
 from sadgs_ns.cli.process.plan import Matching, Summary, choose_matching, expected_work
 from sadgs_ns.cli.process.video import video_frames, write_frames
+from sadgs_ns.data.coordinates import FRAME_KEYS
 from sadgs_ns.errors import InputError, RunError, WriteError, free_space, reason
 from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
 
@@ -46,6 +50,10 @@ MIN_SIZE = 64
 _SECONDS_PER_LINE = 1.0
 """Least time between two lines of a stage's progress in a file."""
 _STAGES = "sadgs_ns.cli.process.stages"
+_KEPT_KEYS = (*FRAME_KEYS, "train_filenames", "val_filenames", "test_filenames")
+"""Keys that a scene's `transforms.json` keeps when photos are added."""
+_MODEL = "model"
+"""Name of the model's folder in `work`; where photos were added, their number follows it."""
 _UNFINISHED = (
     "frames.partial",
     "photos.partial",
@@ -64,23 +72,54 @@ def _note(settings: dict, noted: Path) -> None:
             partial.write_text(json.dumps(settings))
 
 
-def _changes(begun: dict, asked: dict) -> str:
-    """Say what differs between the settings that a scene was begun with and those asked for now, if anything does."""
-    changed = [name for name in asked if begun.get(name) != asked[name]]
-    if "source" in changed:  # the rest follows from it
-        changed = ["source"]
-    told = []
-    for name in changed:
+def _refuse_changes(out: Path, begun: dict, asked: dict, grows: bool) -> None:
+    """Compare the settings and photos that a scene was begun with to those of now.
+
+    Args:
+        out: The scene.
+        begun: The settings with which it was begun.
+        asked: Those of now.
+        grows: Whether photos may have been added.
+
+    Raises:
+        InputError: If they differ.
+    """
+    differing = [name for name in asked if begun.get(name) != asked[name]]
+    if "source" in differing:  # the rest follows from it
+        differing = ["source"]
+    told, photos, back = [], [], ""
+    if "source" not in differing and "photos" in asked:
+        photos += [("changed", changed_photos(Path(asked["source"]), begun.get("files", {})))]
+    for name in differing:
         if name not in begun:
             told.append(f"an earlier version began it and did not compare its {name}")
         elif name == "photos":
             before, now = set(begun[name]), set(asked[name])
-            for verb, names in (("added", now - before), ("removed", before - now)):
-                told += [f"photos {verb}: {len(names)}, such as {min(names)}"] if names else []
+            photos += [("added", set() if grows else now - before), ("removed", before - now)]
         else:
             option = name if name == "source" else "--" + name.replace("_", "-")
             told.append(f"{option} was {begun[name]}, is {asked[name]}")
-    return "; ".join(told)
+    for verb, names in photos:
+        if names:
+            told.append(f"photos {verb}: {len(names)}, such as {min(names)}")
+            back = back if verb == "added" else "put these photos back, "
+    if told:
+        raise InputError(
+            f"{out} was begun with other photos or settings ({'; '.join(told)}); {back}give another folder or delete "
+            "it."
+        )
+
+
+def photos_added(source: Path, out: Path) -> list[str]:
+    """Return the names of the photos that a folder holds more than those that its finished scene was made of.
+
+    Raises:
+        InputError: As `find_photos`, or if the scene's settings are damaged.
+    """
+    noted = out / "work" / "settings.json"
+    begun = _read_settings(noted) if noted.exists() and source.is_dir() else {}
+    known = begun.get("photos") if "finished" in begun else None
+    return [] if known is None else sorted(set(find_photos(source, out)) - set(known))
 
 
 def process(
@@ -97,8 +136,9 @@ def process(
 
     Args:
         source: A folder of photos, searched with its subfolders, or a video.
-        out: Folder for the scene. It is made if it does not exist, and an interrupted run in it goes on. A finished
-            scene is left as it is.
+        out: Folder for the scene. It is made if it does not exist, and an interrupted run in it goes on. To a finished
+            scene photos are added that have come since, while its other cameras stay as they are; without any it is
+            left as it is.
         matching: Which pairs are matched; "auto" is sequential for videos, exhaustive for at most
             `plan.EXHAUSTIVE_LIMIT` photos, and by GPS positions or a vocabulary for more. Where there is no vocabulary,
             it is sequential for numbered photos and exhaustive for others.
@@ -126,12 +166,18 @@ def process(
     begun = _read_settings(noted) if noted.exists() else {}
     finished = begun.get("finished") if (out / "transforms.json").exists() else None
     asked = settings | ({"max_size": max_size} if finished else {})
-    if begun and (changes := _changes(begun, asked)):
+    if begun:
+        _refuse_changes(out, begun, asked, grows=bool(finished))
+    added = [] if is_video or not finished else sorted(set(settings["photos"]) - set(begun["photos"]))
+    base: str | None = begun.get("model", _MODEL) if added else None
+    if base is not None and not ((work / base).exists() and (work / "database.db").exists()):
         raise InputError(
-            f"{out} was begun with other photos or settings ({changes}); give another folder or delete it."
+            f"{out} was made by an earlier version, which kept nothing that photos could be added to: give another "
+            "folder or delete it."
         )
-    if finished:
-        _remove_intermediate_files(work)
+    model = f"{_MODEL}-{len(settings['photos'])}" if added else _MODEL
+    if finished and not added:
+        _remove_intermediate_files(work, begun)
         tell(f"{out} is finished; delete it to make it again.")
         return Summary(**finished)
     columns = (TextColumn("{task.description:>24}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -150,6 +196,9 @@ def process(
         else:
             folder, names = source, settings["photos"]
         photos = read_photos(folder, names, report)
+        if not is_video:
+            settings["files"] = begun.get("files") or {}
+            settings["files"] |= photo_stamps(folder, [name for name in names if name not in settings["files"]])
 
         def fetch_vocabulary() -> None:
             with tempfile.TemporaryDirectory() as scratch:
@@ -159,21 +208,26 @@ def process(
         if not is_video:
             _note(settings, noted)  # only now, when the photos are known to be readable
             alone.enter_context(_alone(work))
-        tell(f"{notice} {expected_work(photos, chosen_matching)}".lstrip())
+        known = len(photos) - len(added) if added else 0
+        if added:
+            tell(f"{len(added)} photo{'s' * (len(added) > 1)} added to {known}.")
+        tell(f"{notice} {expected_work(photos, chosen_matching, known)}".lstrip())
         folder, photos = convert_photos(folder, photos, work / "photos")
         if transparent := write_alpha(folder, photos, work / "alpha"):
             tell(f"{transparent} photos are partly transparent; their images in the scene are, too.")
         groups = [[photo.name] for photo in photos] if camera_per_photo else photos_by_camera(photos)
-        arguments = (folder, groups, chosen_matching, max_size, work / "alpha", work)
+        if added:  # An interrupted run may have made a model without some of them.
+            shutil.rmtree(work / model, ignore_errors=True)
+        arguments = (folder, groups, chosen_matching, max_size, work / "alpha", work, model, base)
         summary = run_apart(f"{_STAGES}:make_model", *arguments, folder=work, report=report)
-        _publish(work / "undistorted", out)
-        if summary.is_poor:  # the features serve another way of matching
-            shutil.rmtree(work / "model")
+        _publish(work / "undistorted", out, bool(added))
+        if summary.is_poor and not added:  # the features serve another way of matching
+            shutil.rmtree(work / model)
         else:
+            settings |= {"max_size": max_size, "finished": dataclasses.asdict(summary), "model": model}
             with atomic_path(noted) as partial:
-                ending = {"max_size": max_size, "finished": dataclasses.asdict(summary)}
-                partial.write_text(json.dumps(settings | ending))
-            _remove_intermediate_files(work)
+                partial.write_text(json.dumps(settings))
+            _remove_intermediate_files(work, settings)
     return summary
 
 
@@ -200,12 +254,14 @@ def _alone(work: Path) -> Iterator[None]:
         os.close(lock)
 
 
-def _remove_intermediate_files(work: Path) -> None:
-    """Remove what a finished scene does not need from its work folder."""
+def _remove_intermediate_files(work: Path, settings: dict) -> None:
+    """Remove from a finished scene's work folder what no photo that is added later needs."""
     for path in work.iterdir():
+        if path.name in (settings.get("model", _MODEL), "database.db", "settings.json"):
+            continue
         if path.is_dir():
             shutil.rmtree(path)
-        elif path.name != "settings.json":
+        else:
             path.unlink()
 
 
@@ -236,8 +292,13 @@ def _reporter(progress: Progress) -> Report:
     return report
 
 
-def _publish(undistorted: Path, out: Path) -> None:
+def _publish(undistorted: Path, out: Path, grown: bool = False) -> None:
     """Add what nerfstudio reads to undistorted photos and their model, and move everything to the scene's folder.
+
+    Args:
+        undistorted: The folder of photos and model.
+        out: The scene's folder.
+        grown: Whether the photos are added to those of a finished scene, which stays one until all are there.
 
     Raises:
         OSError: If a file cannot be written, or COLMAP could not write one.
@@ -247,16 +308,31 @@ def _publish(undistorted: Path, out: Path) -> None:
     with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio prints all cameras where there are several
         colmap_to_json(undistorted / "sparse" / "0", undistorted)
     images = undistorted / "images"
-    written = [frame["file_path"] for frame in json.loads((undistorted / "transforms.json").read_text())["frames"]]
+    described = json.loads((undistorted / "transforms.json").read_text())
+    written = [frame["file_path"] for frame in described["frames"]]
+    if grown:
+        before = json.loads((out / "transforms.json").read_text())
+        poses = {frame["file_path"]: frame["transform_matrix"] for frame in before["frames"]}
+        for frame in described["frames"]:  # Computing a pose again rounds it.
+            frame["transform_matrix"] = poses.get(frame["file_path"], frame["transform_matrix"])
+        kept = {name: before[name] for name in _KEPT_KEYS if name in before}
+        (undistorted / "transforms.json").write_text(json.dumps(described | kept))
+        written = [name for name in written if (undistorted / name).exists() or name not in poses]
     try:
         read_photos(undistorted, written, lambda *step: None)
     except InputError as error:  # COLMAP does not say when a disk is full
         raise WriteError(images, OSError("the disk is full")) from error
     restore_alpha(images, undistorted / "alpha")
-    (out / "transforms.json").unlink(missing_ok=True)  # its presence says that all the others are there
-    for name in ("images", "sparse"):
-        shutil.rmtree(out / name, ignore_errors=True)
-    for name in ("images", "sparse", "sparse_pc.ply", "transforms.json"):
+    if grown:
+        for name in written:
+            (out / name).parent.mkdir(parents=True, exist_ok=True)
+            (undistorted / name).replace(out / name)
+    else:
+        (out / "transforms.json").unlink(missing_ok=True)  # its presence says that all the others are there
+        shutil.rmtree(out / "images", ignore_errors=True)
+        images.rename(out / "images")
+    shutil.rmtree(out / "sparse", ignore_errors=True)
+    for name in ("sparse", "sparse_pc.ply", "transforms.json"):
         (undistorted / name).rename(out / name)
 
 

@@ -7,8 +7,9 @@ import dataclasses
 import os
 import re
 import shutil
+import zlib
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -75,6 +76,41 @@ def find_photos(source: Path, out: Path) -> list[str]:
         if not name.isprintable():
             raise InputError(f"{source} holds a photo with unprintable characters in its name, {name!a}: rename it.")
     return names
+
+
+def photo_stamps(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
+    """Return size in bytes, time of the last change in ns and checksum of photos, by which they are known again."""
+    with _threads() as pool:
+        return dict(zip(names, pool.map(lambda name: _stamp(folder / name), names), strict=True))
+
+
+def changed_photos(folder: Path, stamps: Mapping[str, Sequence[int]]) -> list[str]:
+    """Return the names of the photos that are there and hold something else than when they were stamped.
+
+    Only those of another time are read: copying a photo changes its time and nothing else.
+    """
+
+    def differs(name: str) -> bool:
+        size, time, checksum = stamps[name]
+        try:
+            status = (folder / name).stat()
+        except OSError:
+            return False  # It was removed, which others tell of.
+        if (status.st_size, status.st_mtime_ns) == (size, time):
+            return False
+        return status.st_size != size or _checksum(folder / name) != checksum
+
+    with _threads() as pool:
+        return [name for name, changed in zip(stamps, pool.map(differs, stamps), strict=True) if changed]
+
+
+def _stamp(path: Path) -> list[int]:
+    status = path.stat()
+    return [status.st_size, status.st_mtime_ns, _checksum(path)]
+
+
+def _checksum(path: Path) -> int:
+    return zlib.crc32(path.read_bytes())
 
 
 def read_photos(folder: Path, names: Sequence[str], report: Callable[[str, int, int], None]) -> list[Photo]:

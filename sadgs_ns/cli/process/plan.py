@@ -110,14 +110,26 @@ def searched_pixels(size: tuple[int, int]) -> float:
     return width * height * min(1.0, MAX_SIDE / max(width, height)) ** 2
 
 
-def expected_work(photos: Sequence[Photo], matching: str) -> str:
-    """Return a sentence on how much there is to do, and roughly how long it takes on this machine."""
+def expected_work(photos: Sequence[Photo], matching: str, known: int = 0) -> str:
+    """Return a sentence on how much there is to do, and roughly how long it takes on this machine.
+
+    Args:
+        photos: All photos.
+        matching: Which pairs are matched.
+        known: How many of the photos an earlier run has matched with each other.
+    """
     megapixels = sum(searched_pixels(photo.size) for photo in photos) / 1e6
-    pairs = min(len(photos) * _PAIRS_PER_PHOTO.get(matching, len(photos)), len(photos) * (len(photos) - 1) // 2)
+    new = len(photos) - known
+
+    def all_pairs(count: int) -> int:
+        return min(count * _PAIRS_PER_PHOTO.get(matching, count), count * (count - 1) // 2)
+
+    pairs = all_pairs(len(photos)) - all_pairs(known)
     per_pair = min(_PAIR_PER_MEGAPIXEL * megapixels / len(photos), _LONGEST_PAIR)
     cores = os.cpu_count() or 1
-    minutes = (megapixels * _FEATURES_PER_MEGAPIXEL + pairs * per_pair + len(photos) * _POSE) / cores / 60
+    features = megapixels * new / len(photos) * _FEATURES_PER_MEGAPIXEL
+    minutes = (features + pairs * per_pair + new * _POSE) / cores / 60
     duration = (
         f"{minutes / 60:.1f} hours" if minutes >= 60 else f"{minutes:.0f} minutes" if minutes >= 2 else "a minute"
     )
-    return f"{len(photos)} photos, up to {pairs:,} pairs to match: roughly {duration} on {cores} processor cores."
+    return f"{new} photos, up to {pairs:,} pairs to match: roughly {duration} on {cores} processor cores."

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import shutil
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 
@@ -43,9 +43,13 @@ def make_model(
     max_size: int,
     alphas: Path,
     work: Path,
+    model: str,
+    base: str | None,
     report: Report,
 ) -> Summary:
     """Make a model of photos, and from it the undistorted scene in `work/undistorted`.
+
+    Where an earlier model is given, the photos that are not in it are added to it, and they alone are undistorted.
 
     Args:
         photos: The folder of the photos.
@@ -55,20 +59,26 @@ def make_model(
         alphas: Folder of the photos' opacities as `write_alpha` writes it; they are undistorted into
             `work/undistorted/alpha`.
         work: Folder for all files; what an interrupted run left there is used again.
+        model: Name of the model's folder in `work`.
+        base: Name of the earlier model's folder in `work`, whose cameras stay as they are; None begins anew.
         report: Called as the work goes on.
 
     Raises:
-        InputError: If no two photos could be related.
+        InputError: If no two photos could be related, or none could be added.
     """
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
     names = sorted(itertools.chain(*groups))
-    database, model = work / "database.db", work / "model"
-    if not model.exists():
+    database, made, models = work / "database.db", work / model, work / "models"
+    if not made.exists():
         extract(photos, groups, database, report)
         match(names, database, work / "pairs.txt", matching, report)
-        reconstruct(photos, len(names), database, work / "models", model, report)
-    undistort(photos, alphas, model, work / "undistorted", max_size, report)
-    return dataclasses.replace(summarize(names, model, database), matching=matching)
+        if base is None:
+            reconstruct(photos, len(names), database, models, made, report)
+        else:
+            register(photos, names, database, work / base, models, made, report)
+    known = set() if base is None else registered_photos(pycolmap.Reconstruction(work / base))
+    undistort(photos, alphas, made, work / "undistorted", max_size, report, known)
+    return dataclasses.replace(summarize(names, made, database), matching=matching)
 
 
 def fetch_vocabulary(folder: Path, report: Report) -> None:
@@ -186,12 +196,73 @@ def reconstruct(photos: Path, count: int, database: Path, attempts: Path, model:
             f"no two photos could be related to each other ({poor} of {count} have fewer than {FEW_FEATURES} "
             "features); take more of them, with at least two thirds of overlap, sharp, and of a scene with texture."
         )
-    best = max(models.values(), key=lambda candidate: candidate.num_reg_images())
-    partial = empty_folder(model.with_name("model.partial"))
-    best.write(partial)
-    check_written(partial, best)
-    partial.rename(model)
+    _write(max(models.values(), key=lambda candidate: candidate.num_reg_images()), model)
     report("cameras", count, count)
+
+
+def register(
+    photos: Path, names: Sequence[str], database: Path, base: Path, attempts: Path, model: Path, report: Report
+) -> None:
+    """Add photos to a model, in which poses and intrinsics of the cameras that it has stay as they are.
+
+    Points are triangulated with the new photos, and moved by bundle adjustment as in any other model. Photos that could
+    not be registered before are tried again.
+
+    Args:
+        photos: The folder of the photos.
+        names: All photos.
+        database: COLMAP's database, which holds features and matches of all photos.
+        base: The folder of the model to add to.
+        attempts: A folder for COLMAP's own output.
+        model: The folder to make of the larger model; it appears when it is complete.
+        report: Called as the work goes on.
+
+    Raises:
+        InputError: If no photo could be added.
+    """
+    before = pycolmap.Reconstruction(base)
+    registered = before.num_reg_images()
+
+    def advance() -> None:
+        nonlocal registered
+        registered = min(registered + 1, len(names))
+        report("cameras", registered, len(names))
+
+    report("cameras", registered, len(names))
+    options = pycolmap.IncrementalPipelineOptions(
+        random_seed=_SEED,
+        multiple_models=False,
+        fix_existing_frames=True,
+        constant_cameras=set(before.cameras),
+        image_names=list(names),
+    )
+    models = pycolmap.incremental_mapping(
+        database, photos, empty_folder(attempts), options, input_path=base, next_image_callback=advance
+    )
+    grown = next(iter(models.values()), before)
+    if grown.num_reg_images() <= before.num_reg_images():
+        raise InputError(
+            "none of the photos that were added could be related to the others: take some that share two thirds of "
+            "what they show with each other and with those that are there, or take these out of the folder again."
+        )
+    for frame_id, frame in before.frames.items():  # COLMAP rounds poses that it holds fixed.
+        if frame.has_pose:
+            grown.frames[frame_id].rig_from_world = frame.rig_from_world
+    _write(grown, model)
+    report("cameras", len(names), len(names))
+
+
+def registered_photos(model: pycolmap.Reconstruction) -> set[str]:
+    """Return the names of the photos whose poses a model has."""
+    return {image.name for image in model.images.values() if image.has_pose}
+
+
+def _write(reconstruction: pycolmap.Reconstruction, model: Path) -> None:
+    """Write a model to a folder, which appears when it is complete."""
+    partial = empty_folder(model.with_name("model.partial"))
+    reconstruction.write(partial)
+    check_written(partial, reconstruction)
+    partial.rename(model)
 
 
 def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
@@ -211,8 +282,10 @@ def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
         raise OSError(f"{folder} was not written completely: the disk is full")
 
 
-def undistort(photos: Path, alphas: Path, model: Path, folder: Path, max_size: int, report: Report) -> None:
-    """Write undistorted photos, their opacity and the model that fits them.
+def undistort(
+    photos: Path, alphas: Path, model: Path, folder: Path, max_size: int, report: Report, known: Collection[str] = ()
+) -> None:
+    """Write undistorted photos, their opacity and the model that fits them and those that are known.
 
     Args:
         photos: The folder of the photos.
@@ -221,19 +294,21 @@ def undistort(photos: Path, alphas: Path, model: Path, folder: Path, max_size: i
         folder: The folder to write `images`, `alpha` and `sparse/0` to; what is in it is removed before.
         max_size: Longest side of the undistorted photos in px; 0 keeps them as they are.
         report: Called as the work goes on.
+        known: Names of photos that were undistorted before, by the same cameras.
 
     Raises:
         OSError: If the model could not be written.
     """
     reconstruction = pycolmap.Reconstruction(model)
-    registered = [image for image in reconstruction.images.values() if image.has_pose]
+    registered = [image for image in reconstruction.images.values() if image.has_pose and image.name not in known]
     report("undistorted photos", 0, len(registered))
     shutil.rmtree(folder, ignore_errors=True)
     options = pycolmap.UndistortCameraOptions(max_image_size=max_size or -1)
     with ThreadPoolExecutor(1) as pool:
         undistortion = pool.submit(
-            pycolmap.undistort_images, folder, model, photos, undistort_options=options, jpeg_quality=95
-        )
+            pycolmap.undistort_images, folder, model, photos, image_names=[image.name for image in registered],
+            undistort_options=options, jpeg_quality=95,
+        )  # fmt: skip
         while not undistortion.done():
             wait([undistortion], timeout=0.5)
             written = sum(path.is_file() for path in (folder / "images").rglob("*"))
@@ -258,7 +333,7 @@ def undistort(photos: Path, alphas: Path, model: Path, folder: Path, max_size: i
 def summarize(names: Sequence[str], model: Path, database: Path) -> Summary:
     """Count what was registered, and find out why the rest was not."""
     reconstruction = pycolmap.Reconstruction(model)
-    registered = {image.name for image in reconstruction.images.values() if image.has_pose}
+    registered = registered_photos(reconstruction)
     left_out = {}
     with pycolmap.Database.open(database) as opened:
         identities = {image.name: image.image_id for image in opened.read_all_images()}

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sadgs_ns.data import colmap
+from sadgs_ns.data.coordinates import fixed_frame
 from sadgs_ns.data.validation.findings import Finding, collect_findings
 from sadgs_ns.data.validation.geometry import (
     UNDISTORTED_FISHEYE,
@@ -133,6 +134,7 @@ def _check_transform(meta: dict[str, Any], path: Path) -> None:
         raise InputError(f"{path} has an applied_transform that is not 3 × 4 finite numbers: correct or remove it.")
     if finite(meta.get("applied_scale", 1), "applied_scale", str(path)) <= 0:
         raise InputError(f"{path} has applied_scale = {meta['applied_scale']}, which must be positive: correct it.")
+    fixed_frame(meta, path)
     if meta.get("fisheye_crop_radius") is not None:
         finite(meta["fisheye_crop_radius"], "fisheye_crop_radius", str(path))
     methods = ("pca", "up", "vertical", "none")
