@@ -78,6 +78,7 @@ def as_saved_before_the_folders(config: str) -> str:
     """What a config.yml said when all files of the package lay in one folder."""
     text = config.replace("sadgs_ns.plugin.progress.ProgressTable", "nerfstudio.utils.writer.LocalWriter")
     text = text.replace("sadgs_ns.plugin.", "sadgs_ns.").replace("sadgs_ns.method.", "sadgs_ns.")
+    text = text.replace("UnlistedAdam", "FusedAdam").replace("UnlistedDecay", "RunLengthDecay")
     for name in ("MachineConfig", "ViewerConfig"):
         text = text.replace(f"sadgs_ns.config.Sadgs{name}", f"nerfstudio.configs.base_config.{name}")
     assert "sadgs_ns.model.SadgsModelConfig" in text and "sadgs_ns.strategy.StructureAwareStrategy" in text

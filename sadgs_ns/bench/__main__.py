@@ -48,6 +48,7 @@ COMMANDS = {
     "parts": ("parts", "the parts of a training step of a finished run, each by itself (CUDA)"),
     "growth": ("growth", "a training step of more and more Gaussians, and of larger images, beside gsplat's (CUDA)"),
     "validation": ("validation", "copies of scenes whose validation views are held out, for choosing constants"),
+    "exposures": ("exposures", "a copy of a scene whose photos have known exposures, for measuring models of colours"),
     "memory": ("memory", "the memory plan beside the real peaks of training steps (CUDA)"),
     "shards": ("shards", "a training step of Gaussians that are spread over several devices, with torchrun"),
     "formats": ("formats", "what the files that sadgs-export writes take and lose, on a run's held-out views"),

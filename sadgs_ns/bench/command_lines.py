@@ -85,6 +85,26 @@ def validation() -> argparse.ArgumentParser:
     return parser
 
 
+def exposures() -> argparse.ArgumentParser:
+    """Return the options of `sadgs-bench exposures`."""
+    parser = argparse.ArgumentParser(
+        prog="sadgs-bench exposures", description="Copy a COLMAP scene, with known exposures of its training photos."
+    )
+    parser.add_argument("scene", type=Path, help="folder of a COLMAP scene")
+    parser.add_argument("out", type=Path, help="folder for the copy")
+    parser.add_argument(
+        "--spread", type=float, default=4.0, help="largest gain over the smallest (default %(default)s)"
+    )
+    parser.add_argument(
+        "--white-balance", type=float, default=0.1, metavar="SHARE", help="change of a channel (default %(default)s)"
+    )
+    parser.add_argument(
+        "--mean", type=float, help="geometric mean of the gains (default: the largest at which nothing saturates)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="which photo gets which gain (default %(default)s)")
+    return parser
+
+
 def memory() -> argparse.ArgumentParser:
     """Return the options of `sadgs-bench memory`."""
     parser = argparse.ArgumentParser(

@@ -89,12 +89,16 @@ def render(model: Any, view: View) -> tuple[Tensor, Tensor]:
 def quality(model: Any, views: Iterable[View], networks: Networks) -> dict[str, Any]:
     """Means over views of `psnr` in dB, `ssim`, `ssim_padded`, and the LPIPS of each network (None without one).
 
+    Where the model's configuration asks for `color_corrected_metrics`, each is there a second time, as `cc_psnr` and so
+    on, nerfstudio's names, of renderings whose colours were fitted to the photograph by quadratic least squares.
     `view_psnr` lists the PSNR of each view in their order: a mean over few views can be the work of one. The
     networks are on the model's device during the call only, so that they take no memory from training.
     """
     from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
-    values: dict[str, list[float]] = {name: [] for name in ("psnr", "ssim", "ssim_padded", *networks)}
+    fits = getattr(model.config, "color_corrected_metrics", False)
+    names = ["psnr", "ssim", "ssim_padded", *networks]
+    values: dict[str, list[float]] = {name: [] for name in [*names, *(f"cc_{name}" for name in names if fits)]}
     for network in networks.values():
         if network is not None:
             network.to(model.device)
@@ -103,21 +107,29 @@ def quality(model: Any, views: Iterable[View], networks: Networks) -> dict[str, 
     cudnn = torch.backends.cudnn
     with cudnn.flags(enabled=True, benchmark=False, deterministic=False, allow_tf32=cudnn.allow_tf32):
         for view in views:
-            image, truth = render(model, view)
-            values["psnr"].append(float(peak_signal_noise_ratio(image, truth, data_range=1.0)))
-            similarity = structural_similarity_index_measure(
-                image, truth, gaussian_kernel=True, sigma=1.5, kernel_size=_WINDOW, data_range=1.0
-            )
-            values["ssim"].append(float(similarity))  # type: ignore[arg-type]
-            values["ssim_padded"].append(float(ssim_padded(image, truth)))
-            for name, network in networks.items():
-                if network is not None:
-                    values[name].append(float(network(image, truth)))
+            rendered, truth = render(model, view)
+            for prefix, image in (("", rendered), *([("cc_", fitted(rendered, truth))] if fits else [])):
+                values[f"{prefix}psnr"].append(float(peak_signal_noise_ratio(image, truth, data_range=1.0)))
+                similarity = structural_similarity_index_measure(
+                    image, truth, gaussian_kernel=True, sigma=1.5, kernel_size=_WINDOW, data_range=1.0
+                )
+                values[f"{prefix}ssim"].append(float(similarity))  # type: ignore[arg-type]
+                values[f"{prefix}ssim_padded"].append(float(ssim_padded(image, truth)))
+                for name, network in networks.items():
+                    if network is not None:
+                        values[f"{prefix}{name}"].append(float(network(image, truth)))
     for network in networks.values():
         if network is not None:
             network.cpu()
     means = {name: statistics.fmean(of_views) if of_views else None for name, of_views in values.items()}
     return means | {"view_psnr": [round(psnr, 2) for psnr in values["psnr"]]}
+
+
+def fitted(image: Tensor, truth: Tensor) -> Tensor:
+    """The rendering with its colours fitted to the photograph. [1, 3, H, W] both, in [0, 1]"""
+    from nerfstudio.model_components.lib_bilagrid import color_correct
+
+    return color_correct(image[0].movedim(0, -1), truth[0].movedim(0, -1)).movedim(-1, 0)[None]
 
 
 def ssim_padded(image: Tensor, truth: Tensor) -> Tensor:

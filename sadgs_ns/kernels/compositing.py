@@ -25,7 +25,17 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sadgs_ns.kernels.compositing_blocks import TILE_SIZE, load_gaussians, reciprocal, row, split4
+from sadgs_ns.kernels.compositing_blocks import (
+    SCALE,
+    TILE_SIZE,
+    alphas,
+    highest_alpha,
+    load_gaussians,
+    load_tile,
+    reciprocal,
+    row,
+    split4,
+)
 from sadgs_ns.kernels.compositing_forward import composite_forward
 
 PRECISION = "tf32x3"
@@ -61,7 +71,7 @@ def _join4(c0, c1, c2, c3):
 
 @triton.jit(do_not_specialize=["num_pairs", "height", "width", "tile_width", "tile_height"])
 def _composite_backward(
-    means2d, conics, colors, opacities, starts, ids, alphas, last_ids, v_renders, v_alphas, gradients,
+    means2d, conics, colors, opacities, starts, ids, drawn_alphas, last_ids, v_renders, v_alphas, gradients,
     num_pairs, height, width, tile_width, tile_height,
     TILE: tl.constexpr, GAUSSIANS: tl.constexpr, STRIDE: tl.constexpr, ALPHAS: tl.constexpr,
     ABSGRAD: tl.constexpr, PRECISION: tl.constexpr,
@@ -72,25 +82,14 @@ def _composite_backward(
     Gaussians of its two pixels, and what accumulates from Gaussian to Gaussian stays in its registers.
     """
     PIXELS: tl.constexpr = TILE * TILE
-    FAINTEST = tl.constexpr(0x3B808081)  # bits of 1/255
-    SCALE = tl.constexpr(0.8493218002880191)  # √(log2(e) / 2), of offsets: exp(-σ) is then exp2 of a plain polynomial
-    tile = tl.program_id(0)
-    view = tile // (tile_height * tile_width)
-    tile_row, column = tile // tile_width % tile_height, tile % tile_width
-    pixel = tl.arange(0, PIXELS)
-    x, y = pixel % TILE, pixel // TILE
-    inside = (tile_row * TILE + y < height) & (column * TILE + x < width)
-    at = (view * height + tile_row * TILE + y) * width + column * TILE + x
+    x, y, inside, at, centre_x, centre_y, start, end = load_tile(
+        tl.program_id(0), starts, num_pairs, height, width, tile_width, tile_height, TILE
+    )  # fmt: skip
     last = tl.load(last_ids + at, inside, -1)
-    start = tl.load(starts + tile)
-    end = num_pairs
-    if tile + 1 < tl.num_programs(0):
-        end = tl.load(starts + tile + 1)
     end = tl.minimum(end, tl.max(last) + 1)
     # Pixels are counted from the tile's centre: these offsets are small, and exact in 11 bits.
     x, y = x.to(tl.float32) - (TILE - 1) / 2, y.to(tl.float32) - (TILE - 1) / 2
-    scaled_x, scaled_y = SCALE * x, SCALE * y
-    centre_x, centre_y = column.to(tl.float32) * TILE + TILE / 2, tile_row.to(tl.float32) * TILE + TILE / 2
+    scaled_x, scaled_y = x * SCALE, y * SCALE
 
     red = tl.load(v_renders + 3 * at, inside, 0.0)
     green = tl.load(v_renders + 3 * at + 1, inside, 0.0)
@@ -103,7 +102,7 @@ def _composite_backward(
     finite = tl.maximum(tl.maximum(tl.abs(red), tl.abs(green)), tl.maximum(tl.abs(blue), tl.abs(v_alpha))) < 1e18
     finite = finite & (red == red) & (green == green) & (blue == blue) & (v_alpha == v_alpha)
     red, green, blue = tl.where(finite, red, 0.0), tl.where(finite, green, 0.0), tl.where(finite, blue, 0.0)
-    transmittance = 1 - tl.load(alphas + at, inside, 0.0)
+    transmittance = 1 - tl.load(drawn_alphas + at, inside, 0.0)
     # The colour behind the present Gaussian times the pixel's gradient; alpha counts as minus a background of one.
     behind = tl.where(finite, -v_alpha, 0.0) * transmittance
 
@@ -132,17 +131,11 @@ def _composite_backward(
         mean_x -= centre_x
         mean_y -= centre_y
 
-        # Bits of positive floats are ordered as these: one unsigned comparison finds 1/255 <= alpha <= opacity, the
-        # latter being σ >= 0, with some units in the last place for rounding.
-        reach = tl.where(position >= start, opacity, 0.0).to(tl.int32, bitcast=True) - FAINTEST + 4
-        limit = tl.where(position[:, None] <= last[None, :], tl.maximum(reach, 0)[:, None], 0)
-        dx = SCALE * mean_x[:, None] - scaled_x[None, :]
-        dy = SCALE * mean_y[:, None] - scaled_y[None, :]
-        exponent = dx * (a[:, None] * dx) + dy * (b[:, None] * (dx + dx) + c[:, None] * dy)
-        alpha = opacity[:, None] * tl.exp2(-exponent)
-        above = alpha.to(tl.int32, bitcast=True) - FAINTEST
-        seen = above.to(tl.uint32, bitcast=True) < limit.to(tl.uint32, bitcast=True)
-        alpha = tl.where(seen, tl.minimum(alpha, 0.999), 0.0)
+        limit = highest_alpha(position >= start, opacity)[:, None]
+        limit = tl.where(position[:, None] <= last[None, :], limit, 0)
+        dx = mean_x[:, None] * SCALE - scaled_x[None, :]
+        dy = mean_y[:, None] * SCALE - scaled_y[None, :]
+        alpha = alphas(dx, dy, a, b, c, opacity, limit)
 
         ratio = reciprocal(1 - alpha)
         front = tl.cumprod(tl.where(first_row, ratio * transmittance[None, :], ratio), 0)

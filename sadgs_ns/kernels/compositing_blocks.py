@@ -13,6 +13,11 @@ import triton.language as tl
 
 TILE_SIZE = 8
 """px. Each lane of the one warp that a tile gets has two pixels."""
+SCALE = tl.constexpr(0.8493218002880191)
+"""√(log2(e) / 2), of offsets in px: exp(-σ) is then exp2 of a plain polynomial. It stands
+on the right of products, as Triton's interpreter needs it."""
+_FAINTEST = tl.constexpr(0x3B808081)
+"""Bits of 1/255."""
 
 
 @triton.jit
@@ -60,3 +65,55 @@ def load_gaussians(means2d, conics, colors, opacities, g):
     # A colour that is not finite makes the pixels that see it NaN. Elsewhere its weight is 0, but 0 · NaN would reach
     # the gradients of the Gaussians in front of it: here it counts as 0.
     return centres, tl.load(conics + 3 * g + k), tl.where(tl.abs(rgb) < float("inf"), rgb, 0.0)
+
+
+@triton.jit
+def load_tile(tile, starts, num_pairs, height, width, tile_width, tile_height, TILE: tl.constexpr):
+    """Find what the program of a tile draws; there is one for each tile of all views.
+
+    Returns:
+        Column and row of its pixels in the tile, int32 [TILE²]; which of them are in the image, and their indices in
+        C · height · width; the tile's centre in px; and where its list of Gaussians starts and ends.
+    """
+    view = tile // (tile_height * tile_width)
+    tile_row, column = tile // tile_width % tile_height, tile % tile_width
+    pixel = tl.arange(0, TILE * TILE)
+    x, y = pixel % TILE, pixel // TILE
+    inside = (tile_row * TILE + y < height) & (column * TILE + x < width)
+    at = (view * height + tile_row * TILE + y) * width + column * TILE + x
+    start = tl.load(starts + tile)
+    end = num_pairs
+    if tile + 1 < tl.num_programs(0):
+        end = tl.load(starts + tile + 1)
+    centre_x, centre_y = column.to(tl.float32) * TILE + TILE / 2, tile_row.to(tl.float32) * TILE + TILE / 2
+    return x, y, inside, at, centre_x, centre_y, start, end
+
+
+@triton.jit
+def highest_alpha(listed, opacity):
+    """Return what `alphas` compares with, from 0 where a Gaussian is not listed: 1/255 <= alpha <= opacity.
+
+    The latter is σ >= 0, with some units in the last place for rounding. Bits of positive floats are ordered as these,
+    so that one unsigned comparison finds both.
+    """
+    return tl.maximum(tl.where(listed, opacity, 0.0).to(tl.int32, bitcast=True) - _FAINTEST + 4, 0)
+
+
+@triton.jit
+def alphas(dx, dy, a, b, c, opacity, limit):
+    """Return the opacity of each Gaussian at each pixel, 0 where it is not drawn.
+
+    Args:
+        dx: SCALE times the offset from the pixel to the centre. [Gaussians, pixels]
+        dy: Along y.
+        a: Conic, in 1/px². [Gaussians]
+        b: Its second number.
+        c: Its third number.
+        opacity: In [0, 1]. [Gaussians]
+        limit: Of `highest_alpha`, or 0 where a Gaussian is not drawn. [Gaussians, 1 or pixels]
+    """
+    exponent = dx * (a[:, None] * dx) + dy * (b[:, None] * (dx + dx) + c[:, None] * dy)
+    alpha = opacity[:, None] * tl.exp2(-exponent)
+    above = alpha.to(tl.int32, bitcast=True) - _FAINTEST
+    seen = above.to(tl.uint32, bitcast=True) < limit.to(tl.uint32, bitcast=True)
+    return tl.where(seen, tl.minimum(alpha, 0.999), 0.0)

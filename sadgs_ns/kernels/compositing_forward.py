@@ -14,7 +14,17 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from sadgs_ns.kernels.compositing_blocks import TILE_SIZE, load_gaussians, reciprocal, row, split4
+from sadgs_ns.kernels.compositing_blocks import (
+    SCALE,
+    TILE_SIZE,
+    alphas,
+    highest_alpha,
+    load_gaussians,
+    load_tile,
+    reciprocal,
+    row,
+    split4,
+)
 
 _GAUSSIANS, _WARPS = 8, 1
 """Gaussians of a batch, and warps of a program. With 16 Gaussians the kernel takes 1.2 times as long, with 32 of them
@@ -33,27 +43,16 @@ def _load_with_flaws(means2d, conics, colors, opacities, g):
 
 @triton.jit(do_not_specialize=["num_pairs", "height", "width", "tile_width", "tile_height"])
 def _composite_forward(
-    means2d, conics, colors, opacities, starts, ids, renders, alphas, last_ids,
+    means2d, conics, colors, opacities, starts, ids, renders, drawn_alphas, last_ids,
     num_pairs, height, width, tile_width, tile_height, TILE: tl.constexpr, GAUSSIANS: tl.constexpr,
 ):  # fmt: skip
     """Draw one tile, from front to back, in blocks [Gaussians, pixels]."""
     PIXELS: tl.constexpr = TILE * TILE
-    FAINTEST = tl.constexpr(0x3B808081)  # bits of 1/255
     OPAQUE = tl.constexpr(1e-4)
-    SCALE = tl.constexpr(0.8493218002880191)  # √(log2(e) / 2), of offsets: exp(-σ) is then exp2 of a plain polynomial
-    tile = tl.program_id(0)
-    view = tile // (tile_height * tile_width)
-    tile_row, column = tile // tile_width % tile_height, tile % tile_width
-    pixel = tl.arange(0, PIXELS)
-    x, y = pixel % TILE, pixel // TILE
-    inside = (tile_row * TILE + y < height) & (column * TILE + x < width)
-    at = (view * height + tile_row * TILE + y) * width + column * TILE + x
-    start = tl.load(starts + tile)
-    end = num_pairs
-    if tile + 1 < tl.num_programs(0):
-        end = tl.load(starts + tile + 1)
-    scaled_x, scaled_y = SCALE * (x.to(tl.float32) - (TILE - 1) / 2), SCALE * (y.to(tl.float32) - (TILE - 1) / 2)
-    centre_x, centre_y = column.to(tl.float32) * TILE + TILE / 2, tile_row.to(tl.float32) * TILE + TILE / 2
+    x, y, inside, at, centre_x, centre_y, start, end = load_tile(
+        tl.program_id(0), starts, num_pairs, height, width, tile_width, tile_height, TILE
+    )  # fmt: skip
+    scaled_x, scaled_y = (x.to(tl.float32) - (TILE - 1) / 2) * SCALE, (y.to(tl.float32) - (TILE - 1) / 2) * SCALE
 
     # `passed` is what all Gaussians of the list so far let through. Where it falls to 1e-4 nothing more is drawn, not
     # even what made it fall, and `left` keeps what it was before.
@@ -77,17 +76,10 @@ def _composite_forward(
         next_g = tl.load(ids + tl.minimum(done + rows, num_pairs - 1))
         next_centre, next_conic, next_rgb = _load_with_flaws(means2d, conics, colors, opacities, next_g[:, None])
 
-        # Bits of positive floats are ordered as these: one unsigned comparison finds 1/255 <= alpha <= opacity, the
-        # latter being σ >= 0, with some units in the last place for rounding.
-        reach = tl.where(position < end, opacity, 0.0).to(tl.int32, bitcast=True) - FAINTEST + 4
-        limit = tl.maximum(reach, 0)[:, None]
-        dx = SCALE * (mean_x - centre_x)[:, None] - scaled_x[None, :]
-        dy = SCALE * (mean_y - centre_y)[:, None] - scaled_y[None, :]
-        exponent = dx * (a[:, None] * dx) + dy * (b[:, None] * (dx + dx) + c[:, None] * dy)
-        alpha = opacity[:, None] * tl.exp2(-exponent)
-        above = alpha.to(tl.int32, bitcast=True) - FAINTEST
-        seen = above.to(tl.uint32, bitcast=True) < limit.to(tl.uint32, bitcast=True)
-        alpha = tl.where(seen, tl.minimum(alpha, 0.999), 0.0)
+        limit = highest_alpha(position < end, opacity)[:, None]
+        dx = (mean_x - centre_x)[:, None] * SCALE - scaled_x[None, :]
+        dy = (mean_y - centre_y)[:, None] * SCALE - scaled_y[None, :]
+        alpha = alphas(dx, dy, a, b, c, opacity, limit)
 
         through = 1 - alpha
         behind = tl.cumprod(tl.where(first_row, through * passed[None, :], through), 0)
@@ -104,7 +96,7 @@ def _composite_forward(
     tl.store(renders + 3 * at, red + nan, inside)
     tl.store(renders + 3 * at + 1, green + nan, inside)
     tl.store(renders + 3 * at + 2, blue + nan, inside)
-    tl.store(alphas + at, 1 - left, inside)
+    tl.store(drawn_alphas + at, 1 - left, inside)
     tl.store(last_ids + at, last, inside)
 
 

@@ -16,6 +16,7 @@ from sadgs_ns import kernels
 from sadgs_ns.errors import reason
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients
 from sadgs_ns.method.codes import encode
+from sadgs_ns.method.color_matrices import correct_colors, identities
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
@@ -84,16 +85,22 @@ def compile_kernels(
         predicted = image.repeat(views, 1, 1, 1).requires_grad_()
         photometric_loss(predicted, torch.zeros_like(predicted, dtype=dtype))[0].backward()
 
+    def colors() -> None:
+        renders, alphas = (torch.zeros((views, _SIZE, _SIZE, k), device=device, requires_grad=True) for k in (3, 1))
+        correct_colors(renders, alphas, identities(views).to(device).requires_grad_()).sum().backward()
+
     def update() -> None:
         log, twins = NonFiniteLog(device, capacity=1), {}
         for name, optimizer in optimizers.items():
-            if name in model.gauss_params and isinstance(optimizer, FusedAdam) and optimizer.triton:
-                parameter = torch.nn.Parameter(blank(name))
+            if name in model.trained_params and isinstance(optimizer, FusedAdam) and optimizer.triton:
+                # Matrices of colours are fewer than the Gaussians, and so updated in a launch of their own.
+                of_gaussians = name in model.gauss_params
+                parameter = torch.nn.Parameter(blank(name) if of_gaussians else torch.zeros((1, 3, 4), device=device))
                 parameter.grad = torch.zeros_like(parameter)
                 twins[name] = FusedAdam([parameter], **{key: optimizer.defaults[key] for key in ("betas", "eps")})
                 twins[name].log = log  # all share one log, like the run's, and are stepped in one launch
         step_together(twins.values())
-        if cuda_graphs and twins and (repeated := RepeatedUpdate(twins)).in_one_launch:
+        if cuda_graphs and twins and (repeated := RepeatedUpdate(twins)).begun:
             gradients = {name: torch.zeros_like(parameter) for name, parameter in repeated.parameters.items()}
             repeated.launch(gradients, log.gradients, repeated.factors().to(device))
 
@@ -102,7 +109,8 @@ def compile_kernels(
         renders, alphas, info = rasterize(
             centres, quats, scales, opacities, means, *camera, absgrad=absgrad, **model.drawing
         )  # fmt: skip
-        result = renders.sum() if config.background_color == "black" else renders.sum() + alphas.sum()
+        black = config.background_color == "black" and model.color_matrices is None
+        result = renders.sum() if black else renders.sum() + alphas.sum()
         # The projection is differentiated elsewhere.
         (info["means2d"].grad2d,) = torch.autograd.grad(result, info["means2d"])
         if absgrad:
@@ -154,6 +162,8 @@ def compile_kernels(
             "the loss of masked images": pool.submit(loss, torch.float32),
             "activations": pool.submit(activations),
         }
+        if model.color_matrices is not None:
+            pending["colour matrices"] = pool.submit(colors)
         try:  # the other stages read this projection
             _, _, info = rasterize(means, quats, scales, opacities, means, *camera, max_off_axis=config.max_off_axis)
         except Exception as error:

@@ -133,15 +133,21 @@ class _Inputs:
     """World to camera. [V, 4, 4]"""
     Ks: Tensor
     """Intrinsics in px. [V, 3, 3]"""
+    numbers: Tensor | None
+    """As `SadgsModel.numbers_of` returns them. int64 [V]"""
     images: Tensor
     """uint8, or floats in [0, 1]. [V, H, W, 3]"""
     factors: Tensor
     """Of Adam, as `RepeatedUpdate.factors` returns them. [2, P]"""
 
-    def write(self, viewmats: Tensor, Ks: Tensor, images: Sequence[Tensor], factors: Tensor) -> None:
+    def write(
+        self, viewmats: Tensor, Ks: Tensor, numbers: Tensor | None, images: Sequence[Tensor], factors: Tensor
+    ) -> None:
         """Put a step's values in the place of those before, without waiting for the device."""
         self.viewmats.copy_(viewmats)
         self.Ks.copy_(Ks)
+        if self.numbers is not None and numbers is not None:
+            self.numbers.copy_(numbers)
         torch.stack(list(images), out=self.images)
         self.factors.copy_(factors, non_blocking=True)
 
@@ -161,7 +167,7 @@ def launch_step(
     # Gradients of the parameters themselves would be added up on the stream on which these were first used, which is
     # not the one that is captured.
     leaves = {name: parameter.detach().requires_grad_() for name, parameter in update.parameters.items()}
-    outputs, info = model.render_step(kind, inputs.viewmats, inputs.Ks, leaves)
+    outputs, info = model.render_step(kind, inputs.viewmats, inputs.Ks, leaves, inputs.numbers)
     if kind.absgrad:
         keep_gradient(info["means2d"])
     loss = model.get_loss_dict(outputs, {"image": inputs.images})["main_loss"]
@@ -190,7 +196,7 @@ class GraphedSteps:
 
     Args:
         pipeline: The pipeline, after its setup.
-        optimizers: The optimizers of all Gaussians' parameters, by the parameters' names.
+        optimizers: The optimizers of all that a step trains, by the names of `SadgsModel.trained_params`.
         zero_gradients: Forgets the gradients of the parameters.
     """
 
@@ -199,7 +205,7 @@ class GraphedSteps:
     ) -> None:
         self._pipeline, self._zero_gradients = pipeline, zero_gradients
         # What has no numbers, as the harmonics of degree 0 alone have no others, has no gradient.
-        self._optimizers = {name: o for name, o in optimizers.items() if pipeline.model.gauss_params[name].numel()}
+        self._optimizers = {name: o for name, o in optimizers.items() if pipeline.model.trained_params[name].numel()}
         self._recorder: CudaGraphs | None = None
         self._addresses: tuple[int, ...] = ()
         self._launched: set[Any] = set()  # These are keys of steps that were launched one by one at these addresses.
@@ -220,7 +226,7 @@ class GraphedSteps:
         # Without a forecast the host waits in each step, and what a camera optimizer does is not in the graphs.
         if not kernels.available(model.device) or model.tile_forecast is None:
             return None
-        if model.camera_optimizer.config.mode != "off" or optimizers.optimizers.keys() != model.gauss_params.keys():
+        if model.camera_optimizer.config.mode != "off" or optimizers.optimizers.keys() != model.trained_params.keys():
             return None
         together: dict[str, FusedAdam] = {}
         for name, optimizer in optimizers.optimizers.items():
@@ -262,15 +268,16 @@ class GraphedSteps:
         level, update = pipeline.resolution.at(step), RepeatedUpdate(self._optimizers)
         kind = model.kind_of_step(width, height, indices, reduced=level > 1)
         sums = {name: value for name, value in model.strategy_state.items() if isinstance(value, Tensor)}
-        if kind.tile_capacity is None or not update.in_one_launch or (kind.absgrad and "grad2d" not in sums):
+        if kind.tile_capacity is None or not update.begun or (kind.absgrad and "grad2d" not in sums):
             return None
         viewmats, Ks = pipeline.views.stacked_cameras(indices, level)
-        found = self._graph(kind, update, sums, viewmats, Ks, images)
+        numbers = model.numbers_of(indices)
+        found = self._graph(kind, update, sums, viewmats, Ks, numbers, images)
         if found is None:
             return None
         graph, inputs = found
         pipeline.put_aside = None
-        inputs.write(viewmats, Ks, images, update.factors())
+        inputs.write(viewmats, Ks, numbers, images, update.factors())
         self._zero_gradients()
         results = graph.replay()
         self.replayed += 1
@@ -292,6 +299,7 @@ class GraphedSteps:
         sums: Mapping[str, Tensor],
         viewmats: Tensor,
         Ks: Tensor,
+        numbers: Tensor | None,
         images: Sequence[Tensor],
     ) -> tuple[Graph, _Inputs] | None:
         """Return the graph of such a step; None if there is none.
@@ -309,7 +317,8 @@ class GraphedSteps:
         if wanted and has_room(viewmats.device):
             try:
                 factors = viewmats.new_zeros((2, len(update.parameters)))
-                inputs = _Inputs(viewmats.clone(), Ks.clone(), torch.stack(list(images)), factors)
+                kept = None if numbers is None else numbers.clone()
+                inputs = _Inputs(viewmats.clone(), Ks.clone(), kept, torch.stack(list(images)), factors)
                 self._recorder = self._recorder or CudaGraphs(viewmats.device)
                 step = partial(launch_step, self._pipeline.model, kind, inputs, update, sums)
                 self._graphs[key] = self._recorder.capture(step), inputs

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import threading
-from collections.abc import Callable, Mapping, MutableMapping
+from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple
@@ -29,6 +29,7 @@ from sadgs_ns.distributed.shards import Shards
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.averaging import RunningMean
 from sadgs_ns.method.clearance import clear_of_cameras, limit_scales
+from sadgs_ns.method.color_matrices import anchored, correct_colors, identities
 from sadgs_ns.method.initialization import (
     POINT_OPACITY,
     camera_extent,
@@ -105,10 +106,12 @@ class SadgsModelConfig(InstantiateConfig):
     max_angular_scale: float = 0.3
     """Longest standard deviation of a Gaussian as a share of its distance from the nearest training camera.
     A longer one can cover a view beside which it lies with haze; 0 sets no limit."""
-    use_bilateral_grid: bool = False
-    """Learn a colour correction for each training image (bilateral grids), for photos with changing exposure."""
+    color_model: Literal["none", "auto", "affine", "bilateral_grid"] = "none"
+    """What is learned of each training photo's exposure and white balance, which held-out views are rendered without.
+    "affine" is a colour matrix, "bilateral_grid" a grid of them over the image and its brightness.
+    "auto" is "affine" where the photos' EXIF, or else their pixels, say that exposure varies."""
     color_corrected_metrics: bool = False
-    """Also report metrics after fitting the colours of each rendering to its photo, as suits a bilateral grid."""
+    """Also report metrics after fitting the colours of each rendering to its photo, as suits changing exposure."""
     fused: bool = True
     """Train with Triton kernels where they run (CUDA): tile lists, compositing, harmonics, loss, S̄, η, AbsGS and Adam.
     Without, torch and gsplat compute the same, more slowly."""
@@ -185,6 +188,7 @@ class SadgsModel(SplatfactoModel):
 
     config: SadgsModelConfig
     strategy: StructureAwareStrategy
+    view_numbers: Tensor
 
     def populate_modules(self) -> None:
         """Make parameters, metrics and the strategy.
@@ -213,7 +217,8 @@ class SadgsModel(SplatfactoModel):
         self.camera_positions: Tensor | None = None  # [C, 3]
         self.infos: list[dict[str, Any]] = []
         # A bilateral grid would learn to brighten what a step without enough places in its tile lists leaves black.
-        self.tile_forecast = None if config.use_bilateral_grid else TileForecast()
+        self.tile_forecast = None if config.color_model == "bilateral_grid" else TileForecast()
+        self.color_matrices: torch.nn.Parameter | None = None  # [V, 3, 4]
         self.crop_box: OrientedBox | None = None
         self.viewer_outputs: Callable[[Cameras, dict[str, Tensor]], dict[str, Tensor]] | None = None
         # A random background is for training; viewers show viser's own instead.
@@ -223,9 +228,11 @@ class SadgsModel(SplatfactoModel):
             else get_color(config.background_color)
         )
         self.photo_background = self.background_color  # The viewer exchanges the other one while it draws.
-        if config.use_bilateral_grid:
+        if config.color_model == "bilateral_grid":
             x, y, w = BILATERAL_GRID_SHAPE
             self.bil_grids = BilateralGrid(num=self.num_train_data, grid_X=x, grid_Y=y, grid_W=w)
+        if config.color_model == "affine":
+            self.learn_color_matrices()
 
     def _initial_gaussians(self) -> dict[str, Tensor]:
         """Return the initial parameters by name.
@@ -314,6 +321,14 @@ class SadgsModel(SplatfactoModel):
         self.first_sh_degree = self.config.sh_degree
         return int(keep.sum())
 
+    def learn_color_matrices(self) -> None:
+        """Learn a matrix of colours for each training view; call before optimizers are made."""
+        matrices = identities(self.num_train_data).to(self.means.device)
+        self.color_matrices = torch.nn.Parameter(matrices)
+        # An index that is made in a step would have to be copied to the device there.
+        numbers = torch.arange(len(matrices), device=matrices.device)  # [V]
+        self.register_buffer("view_numbers", numbers, persistent=False)
+
     def share_out(self, shards: Shards) -> None:
         """Keep the part of the Gaussians that is this process's; call before optimizers are made.
 
@@ -364,6 +379,30 @@ class SadgsModel(SplatfactoModel):
         share, positions = self.config.max_angular_scale, self.camera_positions
         if share > 0 and positions is not None and (done % LIMIT_EVERY == 0 or done >= iterations):
             limit_scales(self.scales, self.means, positions, share)
+
+    @property
+    def trained_params(self) -> dict[str, Tensor]:
+        """Parameters by name that a training step reads: the Gaussians', and matrices of colours where there are."""
+        learned = {} if self.color_matrices is None else {"color_matrices": self.color_matrices}
+        return {**dict(self.gauss_params.items()), **learned}
+
+    def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
+        """Return what is optimized, by the names of the optimizers."""
+        groups = {name: [parameter] for name, parameter in self.trained_params.items()}
+        if self.config.color_model == "bilateral_grid":
+            groups["bilateral_grid"] = list(self.bil_grids.parameters())
+        self.camera_optimizer.get_param_groups(param_groups=groups)  # type: ignore[arg-type]
+        return groups  # type: ignore[return-value]
+
+    def numbers_of(self, cam_indices: Sequence[int]) -> Tensor | None:
+        """Return indices of training views as a tensor on the model's device, without waiting for it.
+
+        Returns:
+            int64 [C]; None where a step does not read matrices of colours.
+        """
+        if self.color_matrices is None:
+            return None
+        return torch.cat([self.view_numbers[index : index + 1] for index in cam_indices])
 
     def wants_structure_tensors(self, step: int) -> bool:
         """Tell whether the strategy will observe η at this step."""
@@ -478,7 +517,7 @@ class SadgsModel(SplatfactoModel):
         return StepKind(width, height, self.sh_degree_now, absgrad, opacity_reg, capacity)
 
     def render_step(
-        self, kind: StepKind, viewmats: Tensor, Ks: Tensor, params: Mapping[str, Tensor]
+        self, kind: StepKind, viewmats: Tensor, Ks: Tensor, params: Mapping[str, Tensor], view_numbers: Tensor | None
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Render training views, and change nothing of the model.
 
@@ -486,7 +525,8 @@ class SadgsModel(SplatfactoModel):
             kind: What `kind_of_step` returned.
             viewmats: World to camera. [C, 4, 4]
             Ks: Intrinsics in px. [C, 3, 3]
-            params: Parameters by name.
+            params: As `trained_params`.
+            view_numbers: What `numbers_of` returned. int64 [C]
 
         Returns:
             `rgb` [C, H, W, 3], not clamped, `background` [3] and, where the loss has that part, `opacity_reg`, numbers
@@ -496,6 +536,9 @@ class SadgsModel(SplatfactoModel):
             viewmats, Ks, kind.width, kind.height, "RGB", kind.absgrad, kind.tile_capacity, kind.opacity_reg,
             params=params, sh_degree=kind.sh_degree,
         )  # fmt: skip
+        if view_numbers is not None:
+            matrices = anchored(params["color_matrices"], view_numbers)
+            render = correct_colors(render, alpha, matrices, fused=self.config.fused)
         penalty, background = info.pop("opacity_reg"), self.background_of_step()
         outputs = {"rgb": self.before_background(render, alpha, background), "background": background}
         return outputs if penalty is None else outputs | {"opacity_reg": penalty}, info
@@ -562,12 +605,12 @@ class SadgsModel(SplatfactoModel):
             part, `opacity_reg`, numbers [P] whose sum is that part.
         """
         kind, forecast = self.kind_of_step(width, height, cam_indices, reduced), self.tile_forecast
-        outputs, info = self.render_step(kind, viewmats, Ks, dict(self.gauss_params.items()))
+        outputs, info = self.render_step(kind, viewmats, Ks, self.trained_params, self.numbers_of(cam_indices))
         if forecast is not None and "pair_counts" in info:  # Only our kernels count pairs.
             forecast.rendered(cam_indices, (width, height), kind.tile_capacity, info["pair_counts"])
         info["reduced"] = reduced
         self.show_to_strategy(info, viewmats, Ks, structure_tensors)
-        if self.config.use_bilateral_grid:
+        if self.config.color_model == "bilateral_grid":
             outputs["rgb"] = torch.stack(
                 [
                     self._apply_bilateral_grid(view[None], i, height, width)[0]
@@ -715,7 +758,7 @@ class SadgsModel(SplatfactoModel):
         if self.training:
             outputs["psnr"] = psnr
             self.camera_optimizer.get_loss_dict(losses)
-            if self.config.use_bilateral_grid:
+            if self.config.color_model == "bilateral_grid":
                 losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
         return losses
 
@@ -781,8 +824,11 @@ class SadgsModel(SplatfactoModel):
     def load_state_dict(self, dict: dict[str, Any], **kwargs: Any) -> Any:  # type: ignore[override]
         """Load a checkpoint of any number of Gaussians.
 
-        The parameters are resized in place: the optimizers were built on these very tensors.
+        The parameters are resized in place: the optimizers were built on these very tensors. Where no matrices of
+        colours are learned, those of the checkpoint are left out, since nothing else reads them.
         """
+        if self.color_matrices is None:
+            dict = {name: value for name, value in dict.items() if name != "color_matrices"}
         for name, parameter in self.gauss_params.items():
             parameter.data = torch.empty_like(dict[f"gauss_params.{name}"], device=self.device)
         return super(SplatfactoModel, self).load_state_dict(dict, **kwargs)

@@ -64,8 +64,13 @@ BEFORE: dict[str, Any] = {
     "averaged_share": 0.0,
     "max_off_axis": 0.0,
     "max_angular_scale": 0.0,
+    "color_model": "none",
 }
 """New options whose default changes a run, at the value that runs of earlier versions had."""
+
+
+REPLACED = {("use_bilateral_grid", True): ("color_model", "bilateral_grid")}
+"""Removed options with a value that another option now has a value for."""
 
 
 def read_with(trainer_config: type[TrainerConfig]) -> None:
@@ -118,6 +123,10 @@ def _bring_up_to_date(config: Any, path: str) -> list[str]:
     if not dataclasses.is_dataclass(config) or not type(config).__module__.startswith("sadgs_ns."):
         return []
     options = {option.name: option for option in dataclasses.fields(config)}
+    for (name, value), (now, means) in REPLACED.items():
+        if now in options and vars(config).get(name) is value:
+            delattr(config, name)
+            setattr(config, now, means)
     for name, option in options.items():
         if option.init and name not in vars(config):
             made = option.default_factory is not dataclasses.MISSING

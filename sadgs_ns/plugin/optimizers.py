@@ -105,32 +105,32 @@ def _count(state: dict[str, Any]) -> int:
 class RepeatedUpdate:
     """An update of the same parameters that a CUDA graph repeats, with rates that are read from the device.
 
-    It equals `step_together` to the bit.
+    It equals `step_together` to the bit. Those that do not differ in length, betas or eps are updated in one launch.
 
     Attributes:
         parameters: By names, as they are now.
         exp_avgs: Their first moments.
         exp_avg_sqs: Their second moments.
-        in_one_launch: Whether one launch can update them: each has been updated before, and they do not differ in
-            length, betas or eps.
+        begun: Whether each of them has been updated before.
 
     Args:
         optimizers: Optimizers that use the Triton kernel, of one parameter each, by names.
     """
 
     def __init__(self, optimizers: Mapping[str, FusedAdam]) -> None:
-        self._groups = [optimizer.param_groups[0] for optimizer in optimizers.values()]
+        alike: dict[Any, dict[str, FusedAdam]] = {}
+        for name, optimizer in optimizers.items():
+            group = optimizer.param_groups[0]
+            alike.setdefault((len(group["params"][0]), group["betas"], group["eps"]), {})[name] = optimizer
+        self._launches: list[tuple[Any, list[str]]] = [(key, list(chosen)) for key, chosen in alike.items()]
+        in_order = {name: optimizer for chosen in alike.values() for name, optimizer in chosen.items()}
+        self._groups = [optimizer.param_groups[0] for optimizer in in_order.values()]
         self.parameters: dict[str, Tensor] = {}
         self._states: list[dict[str, Any]] = []
-        for (name, optimizer), group in zip(optimizers.items(), self._groups, strict=True):
+        for (name, optimizer), group in zip(in_order.items(), self._groups, strict=True):
             self.parameters[name] = parameter = group["params"][0]
             self._states.append(optimizer.state.get(parameter) or {})
-        self._betas, self._eps = self._groups[0]["betas"], self._groups[0]["eps"]
-        alike = {len(parameter) for parameter in self.parameters.values()}
-        self.in_one_launch = len(alike) == 1 and all(
-            state and group["betas"] == self._betas and group["eps"] == self._eps
-            for state, group in zip(self._states, self._groups, strict=True)
-        )
+        self.begun = all(self._states)
         self.exp_avgs, self.exp_avg_sqs = (
             tuple(state[key] for state in self._states if state) for key in ("exp_avg", "exp_avg_sq")
         )
@@ -142,9 +142,12 @@ class RepeatedUpdate:
         """
         from sadgs_ns.kernels.adam import rates_and_scales
 
-        steps, lrs = [_count(state) for state in self._states], [group["lr"] for group in self._groups]
+        columns = [
+            rates_and_scales([_count(state)], [group["lr"]], group["betas"])
+            for state, group in zip(self._states, self._groups, strict=True)
+        ]
         on_cuda = next(iter(self.parameters.values())).is_cuda
-        return torch.tensor(rates_and_scales(steps, lrs, self._betas), pin_memory=on_cuda)
+        return torch.tensor([[rate for (rate,), _ in columns], [scale for _, (scale,) in columns]], pin_memory=on_cuda)
 
     @torch.no_grad()
     def launch(self, gradients: Mapping[str, Tensor], noted: Tensor, factors: Tensor) -> None:
@@ -157,11 +160,15 @@ class RepeatedUpdate:
         """
         from sadgs_ns.kernels.adam import adam_step_with_factors
 
-        in_order = tuple(gradients[name].contiguous() for name in self.parameters)
-        adam_step_with_factors(
-            tuple(self.parameters.values()), in_order, self.exp_avgs, self.exp_avg_sqs, noted, factors,
-            betas=self._betas, eps=self._eps, max_gradient=MAX_GRADIENT,
-        )  # fmt: skip
+        begin = 0
+        for (_, betas, eps), names in self._launches:
+            these, begin = slice(begin, begin + len(names)), begin + len(names)
+            parameters = tuple(self.parameters[name] for name in names)
+            in_order = tuple(gradients[name].contiguous() for name in names)
+            adam_step_with_factors(
+                parameters, in_order, self.exp_avgs[these], self.exp_avg_sqs[these], noted, factors[:, these],
+                betas=betas, eps=eps, max_gradient=MAX_GRADIENT,
+            )  # fmt: skip
 
 
 class SadgsOptimizers(Optimizers):
@@ -229,6 +236,22 @@ class RunLengthDecaySchedulerConfig(SchedulerConfig):
     """Share of the run in [0, 1) in which the learning rate stays as at the first iteration."""
     max_steps: Suppress[int | None] = None
     """Iterations until `final_factor`; None is the length of the run."""
+
+
+@dataclass
+class UnlistedAdamOptimizerConfig(FusedAdamOptimizerConfig):
+    """Adam whose rate `--help` does not list; a config.yml, or a benchmark's protocol, can set it."""
+
+    lr: Suppress[float] = 1e-3
+    """Learning rate; where there is a schedule, its factors multiply it."""
+
+
+@dataclass
+class UnlistedDecaySchedulerConfig(RunLengthDecaySchedulerConfig):
+    """Exponential decay as above, whose factors `--help` does not list."""
+
+    final_factor: Suppress[float] = 1.0
+    """Learning rate at the last iteration, relative to the optimizer's."""
 
 
 class RunLengthDecayScheduler(Scheduler):

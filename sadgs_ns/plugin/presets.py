@@ -9,7 +9,12 @@ from nerfstudio.plugins.types import MethodSpecification
 from sadgs_ns.method.schedule import DENSIFICATION_SHARE
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin.model import SadgsModelConfig
-from sadgs_ns.plugin.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
+from sadgs_ns.plugin.optimizers import (
+    FusedAdamOptimizerConfig,
+    RunLengthDecaySchedulerConfig,
+    UnlistedAdamOptimizerConfig,
+    UnlistedDecaySchedulerConfig,
+)
 from sadgs_ns.plugin.pipeline import SadgsPipelineConfig
 from sadgs_ns.plugin.trainer import SadgsTrainerConfig
 
@@ -22,12 +27,15 @@ RATES: dict[str, tuple[float, float, float]] = {
     "quats": (0.002, 1.0, 1.0),
     "camera_opt": (1e-4, 1.0, 0.005),
     "bilateral_grid": (2e-3, 1.0, 0.05),
+    "color_matrices": (3e-3, 1.0, 0.1),
 }
 """Learning rate of each group of parameters, and the factors on it at the first and at the last iteration.
 
 The rates of positions, colours and opacities are 3DGS's at the start; the scales' is four times 3DGS's, the rotations'
 twice. They are those of a step of one view; `trainer.RATES_OF_FOUR_VIEWS` says how they change with more.
 """
+UNLISTED = ("color_matrices",)
+"""Groups whose rates `--help` does not list, since what they learn hardly depends on the capture."""
 HELD = ("features_dc", "features_rest", "opacities")
 """Groups whose rate stays as it is until densification ends, and falls then."""
 CONSTANT = {name: (RATES[name][0], 1.0, 1.0) for name in HELD}
@@ -42,9 +50,12 @@ def optimizers(**rates: tuple[float, float, float]) -> dict[str, dict[str, Any]]
     """
     groups: dict[str, dict[str, Any]] = {}
     for name, (lr, initial_factor, final_factor) in (RATES | rates).items():
-        groups[name] = {"optimizer": FusedAdamOptimizerConfig(lr=lr)}
+        adam, decay = FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
+        if name in UNLISTED:
+            adam, decay = UnlistedAdamOptimizerConfig, UnlistedDecaySchedulerConfig
+        groups[name] = {"optimizer": adam(lr=lr)}
         if (initial_factor, final_factor) != (1.0, 1.0):
-            groups[name]["scheduler"] = RunLengthDecaySchedulerConfig(
+            groups[name]["scheduler"] = decay(
                 initial_factor=initial_factor,
                 final_factor=final_factor,
                 hold_share=DENSIFICATION_SHARE if name in HELD else 0.0,
@@ -70,6 +81,7 @@ def paper_pipeline(views_per_iteration: int) -> SadgsPipelineConfig:
             averaged_share=0.0,
             max_off_axis=0.0,
             max_angular_scale=0.0,
+            color_model="none",
             strategy=StructureAwareStrategy(
                 eta_every=1,
                 min_observations=1,

@@ -69,7 +69,7 @@ def check(config: CheckedTrainerConfig) -> None:
             f"and torch finds {here}: lower machine.num_devices, or torchrun's --nproc-per-node."
         )
     for name, given, remedy in (
-        ("pipeline.model.use_bilateral_grid", model.use_bilateral_grid, "leave it off"),
+        ("pipeline.model.color_model", model.color_model not in ("none", "auto"), "set it to none"),
         ("pipeline.model.camera_optimizer.mode", model.camera_optimizer.mode != "off", "set it to off"),
         ("pipeline.growing_resolution", config.pipeline.growing_resolution, "leave it off"),
         ("start_paused", config.start_paused, "leave it off, since the viewer is off, too"),

@@ -25,6 +25,7 @@ from sadgs_ns.plugin import checkpoints, older_runs, processes
 from sadgs_ns.plugin.compilation import compile_kernels
 from sadgs_ns.plugin.config import CheckedTrainerConfig
 from sadgs_ns.plugin.earlier_run import start_from
+from sadgs_ns.plugin.exposure import choose_color_model
 from sadgs_ns.plugin.graphed_steps import GraphedSteps
 from sadgs_ns.plugin.interrupts import SIGNALS, Interrupted, Interrupts
 from sadgs_ns.plugin.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig, SadgsOptimizers
@@ -167,7 +168,7 @@ class SadgsTrainer(Trainer):
                 self.pipeline.refuse_other_capture(*self.pipeline.checkpoint_views)
             if more := sorted(state["optimizers"].keys() - self.optimizers.optimizers.keys()):
                 raise InputError(
-                    f"It optimized {' and '.join(more)}, too: set pipeline.model.use-bilateral-grid and "
+                    f"It optimized {' and '.join(more)}, too: set pipeline.model.color-model and "
                     "pipeline.model.camera-optimizer.mode as they were."
                 )
             self.optimizers.load_optimizers(state["optimizers"])
@@ -222,6 +223,8 @@ class SadgsTrainer(Trainer):
         self._derive_schedule()
         if self.shards is not None:
             self.pipeline.share_out(self.shards)
+        elif line := choose_color_model(self.pipeline.model, self.pipeline.datamanager.train_dataset):
+            CONSOLE.print(line, highlight=False, soft_wrap=True)
         optimizers: dict[str, Any] = copy.deepcopy(dict(self.config.optimizers))
         for name, at_four in RATES_OF_FOUR_VIEWS.items() if self.config.rates_follow_views else ():
             start, end = (between_one_and_four(self.pipeline.views_per_iteration, factor) for factor in at_four)

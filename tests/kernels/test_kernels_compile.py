@@ -73,7 +73,7 @@ def test_every_kernel_compiles_for_an_a100_and_an_h200(tmp_path):
     expected = {"_blur_along_rows", "_similarity", "_spread_along_rows", "_gradient", "_count", "_list", "_observe"}
     expected |= {"_forward", "_backward", "_update", "_correlate", "_differentiate", "_aggregate", "_write_one"}
     expected |= {"_composite_backward", "_composite_forward", "_encode", "_accumulate_gradients", "_finish", "_order"}
-    expected |= {"_activate", "_activate_backward", "_project_backward"}
+    expected |= {"_activate", "_activate_backward", "_project_backward", "_correct", "_correct_backward"}
     assert set(run.stdout.split()) == expected
 
 

@@ -133,8 +133,8 @@ def test_presets_have_their_own_names_and_every_optimizer(name: str):
     method = getattr(presets, name.replace("-", "_"))
     assert method.config.method_name == name
     assert method.description.startswith("Structure-aware densification")
-    groups = set(model(dataclasses.replace(SadgsModelConfig(), num_random=10, use_bilateral_grid=True)).gauss_params)
-    assert set(method.config.optimizers) == groups | {"camera_opt", "bilateral_grid"}
+    groups = set(model(dataclasses.replace(SadgsModelConfig(), num_random=10)).gauss_params)
+    assert set(method.config.optimizers) == groups | {"camera_opt", "bilateral_grid", "color_matrices"}
 
 
 def test_presets_differ_where_their_comments_say():
@@ -187,7 +187,7 @@ def test_the_help_shows_what_users_of_splatfacto_look_for_and_of_optimizers_only
     expected = """
         data output-dir experiment-name vis viewer.websocket-port viewer.websocket-host max-num-iterations
         steps-per-save load-dir load-checkpoint load-config machine.seed machine.device-type machine.num-devices
-        pipeline.model.camera-optimizer.mode pipeline.model.use-bilateral-grid pipeline.model.rasterize-mode
+        pipeline.model.camera-optimizer.mode pipeline.model.color-model pipeline.model.rasterize-mode
         pipeline.model.background-color pipeline.model.sh-degree pipeline.model.random-init pipeline.model.num-random
     """
     assert {f"--{name}" for name in expected.split()} <= set(options)
@@ -287,12 +287,26 @@ def test_the_config_of_a_run_made_before_the_folders_is_read_as_it_would_be_writ
     name: str, capsys: pytest.CaptureFixture[str]
 ):
     options = ("densify: true", "num_downscales: 0", "warmup_length: 500", "eval_num_rays_per_chunk: 4096")
-    text = with_options(as_saved_before_the_folders(yaml.dump(preset(name))), *options)
+    now = preset(name)
+    del now.optimizers["color_matrices"]  # Those runs learned none.
+    text = with_options(as_saved_before_the_folders(yaml.dump(now)), *options)
     config = yaml.load(text, Loader=yaml.Loader)
     assert isinstance(config, SadgsTrainerConfig)
-    assert yaml.dump(config.pipeline) == yaml.dump(preset(name).pipeline)
-    assert yaml.dump(config.optimizers) == yaml.dump(preset(name).optimizers)
+    assert yaml.dump(config.pipeline) == yaml.dump(now.pipeline)
+    assert yaml.dump(config.optimizers) == yaml.dump(now.optimizers)
     config.check()
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(("grid", "color_model"), [("true", "bilateral_grid"), ("false", "none")])
+def test_the_switch_of_bilateral_grids_is_read_as_the_option_that_took_its_place(
+    grid: str, color_model: str, capsys: pytest.CaptureFixture[str]
+):
+    text = yaml.dump(preset("sadgs"))
+    assert "    color_model: none\n" in text
+    text = with_options(text.replace("    color_model: none\n", ""), f"use_bilateral_grid: {grid}")
+    model = yaml.load(text, Loader=yaml.Loader).pipeline.model
+    assert model.color_model == color_model and not hasattr(model, "use_bilateral_grid")
     assert capsys.readouterr().out == ""
 
 
@@ -330,7 +344,7 @@ def test_options_that_this_version_lacks_are_named_where_they_changed_the_run(ca
 # --- the package ---
 
 
-def test_an_installation_holds_the_protocols_of_the_benchmarks(tmp_path: Path):
+def test_an_installation_holds_every_module_and_the_protocols_of_the_benchmarks(tmp_path: Path):
     source, installed = tmp_path / "source", tmp_path / "installed"
     source.mkdir()
     for name in ("sadgs_ns", "configs", "README.md", "LICENSE"):
@@ -345,6 +359,8 @@ def test_an_installation_holds_the_protocols_of_the_benchmarks(tmp_path: Path):
     for path in shipped:
         assert (installed / "sadgs_ns" / path.relative_to(CHECKOUT)).read_bytes() == path.read_bytes()
     assert (installed / "sadgs_ns" / "py.typed").is_file()
+    modules = {path.relative_to(CHECKOUT) for path in CHECKOUT.glob("sadgs_ns/**/*.py")}
+    assert {path.relative_to(installed) for path in installed.glob("sadgs_ns/**/*.py")} == modules
 
 
 def requirements(lines: list[str]) -> set[str]:

@@ -109,7 +109,7 @@ def run(config: SadgsTrainerConfig, graphed: bool) -> tuple[SadgsTrainer, list[A
 def live(trainer: SadgsTrainer) -> dict[str, Tensor]:
     """Parameters, moments, counts of updates, statistics, the mean of the parameters, and the log of gradients."""
     model = trainer.pipeline.model
-    values: dict[str, Any] = {**model.gauss_params, **model.strategy_state}
+    values: dict[str, Any] = {**model.trained_params, **model.strategy_state}
     values |= {f"mean of {name}": mean for name, mean in model.average.means.items()}
     for name, optimizer in trainer.optimizers.optimizers.items():
         for state in optimizer.state.values():
@@ -131,9 +131,11 @@ def assert_equal(one: dict[str, Tensor], other: dict[str, Tensor], what: str = "
 
 @on_cpu
 @pytest.mark.parametrize("growing", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("color_model", ["none", "affine"])
 def test_a_run_of_graphs_equals_one_of_launches_bit_for_bit(
-    growing: bool, without_cuda: None, short: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch
+    color_model: Any, growing: bool, without_cuda: None, short: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch
 ):
+    short.pipeline.model.color_model = color_model
     monkeypatch.setattr(resolution, "LEAST_PIXELS", WIDTH * HEIGHT // 4)  # Half the width and height are enough.
     short.pipeline.growing_resolution, short.pipeline.growing_resolution_strength = growing, 100.0
     short.max_num_iterations = iterations = ITERATIONS + 10 * growing  # It has more kinds of steps to capture.
@@ -315,7 +317,7 @@ def test_steps_of_many_gaussians_or_of_masked_views_or_that_are_taken_apart_are_
         lambda config: setattr(config, "cuda_graphs", False),
         lambda config: setattr(config, "log_gradients", True),
         lambda config: setattr(config.pipeline.model, "fused", False),
-        lambda config: setattr(config.pipeline.model, "use_bilateral_grid", True),
+        lambda config: setattr(config.pipeline.model, "color_model", "bilateral_grid"),
         lambda config: setattr(config.pipeline.model.camera_optimizer, "mode", "SO3xR3"),
         lambda config: setattr(config.optimizers["means"]["optimizer"], "max_norm", 1.0),
     ],
@@ -344,12 +346,13 @@ def test_there_are_no_graphs_on_a_cpu(short: SadgsTrainerConfig):
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="graphs are CUDA's")
-@pytest.mark.parametrize("views", [1, 2])
-def test_a_gpu_trains_alike_with_graphs(colmap: ColmapDataParserConfig, tmp_path: Path, views: int):
+@pytest.mark.parametrize(("views", "color_model"), [(1, "none"), (2, "none"), (2, "affine")])
+def test_a_gpu_trains_alike_with_graphs(colmap: ColmapDataParserConfig, tmp_path: Path, views: int, color_model: Any):
     """Atomic additions come in any order, so that two runs differ by rounding, and grow apart once they densify."""
     schedule = {"absgs_every": 60, "structure_every": 120, "reset_every": 0, "refine_stop_iter": 180, "eta_every": 10}
     config = configure(tmp_path, colmap, 300, **schedule, refine_start_iter=60)
     config.pipeline.views_per_iteration = views
+    config.pipeline.model.color_model = color_model
     (_, expected), (replayed, found) = run(config, False), run(config, True)
     if not kernels.available(replayed.pipeline.model.device):
         pytest.skip("Triton does not run here")

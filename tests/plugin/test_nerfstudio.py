@@ -448,7 +448,7 @@ def test_optimized_camera_poses_move(colmap: ColmapDataParserConfig, tmp_path: P
 def test_bilateral_grids_of_the_seen_views_are_trained(colmap: ColmapDataParserConfig, tmp_path: Path):
     config = configure(tmp_path, colmap, iterations=2)
     config.pipeline.views_per_iteration = 2
-    config.pipeline.model.use_bilateral_grid = True
+    config.pipeline.model.color_model = "bilateral_grid"
     trainer = set_up(config)
     seen = trainer.pipeline.datamanager.train_unseen_cameras[:4]
     before = trainer.pipeline.model.bil_grids.grids.detach().clone()

@@ -130,7 +130,7 @@ def test_a_checkpoint_after_an_overflow_has_the_views_that_must_be_drawn_again(
 
 def test_a_bilateral_grid_never_sees_a_black_rendering(short: SadgsTrainerConfig):
     """It would learn to brighten it: such a run waits for the exact lists."""
-    short.pipeline.model.use_bilateral_grid = True
+    short.pipeline.model.color_model = "bilateral_grid"
     trainer = set_up(short)
     assert trainer.pipeline.model.tile_forecast is None
     trainer.shutdown()

@@ -96,7 +96,8 @@ def test_the_first_steps_are_those_of_one_process(ranks: int, views: int, scene:
 @pytest.mark.parametrize(
     ("option", "value"),
     [
-        ("pipeline.model.use_bilateral_grid", True),
+        ("pipeline.model.color_model", "affine"),
+        ("pipeline.model.color_model", "bilateral_grid"),
         ("pipeline.model.camera_optimizer.mode", "SO3xR3"),
         ("pipeline.growing_resolution", True),
         ("start_paused", True),

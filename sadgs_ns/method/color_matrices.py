@@ -1,0 +1,69 @@
+"""A colour matrix for each training view, which takes the exposure and white balance of its photo from the Gaussians.
+
+A gain in linear light is an affine map of sRGB's values, but for the darkest: the matrices can express every exposure.
+3DGS learns such matrices, too (its option `exposure`), of all training views and without an anchor.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from sadgs_ns import kernels
+
+
+def identities(views: int) -> Tensor:
+    """Return matrices that change nothing. [V, 3, 4]"""
+    return torch.eye(3, 4).repeat(views, 1, 1)
+
+
+def anchored(
+    matrices: Tensor,  # [V, 3, 4]
+    views: Tensor,  # [C]
+) -> Tensor:
+    """Return the matrices of some views, moved so that the mean over all views is the identity.
+
+    Otherwise the Gaussians and all matrices could change together, and held-out views, which have no matrix, would be
+    rendered in colours that no photo has. No gradient flows through the mean, so that a view moves its own matrix only.
+
+    Args:
+        matrices: The parameters, of all training views. [V, 3, 4]
+        views: Indices of the views that are wanted, on the matrices' device. int64 [C]
+
+    Returns:
+        [C, 3, 4]
+    """
+    with torch.no_grad():
+        shift = torch.eye(3, 4, dtype=matrices.dtype, device=matrices.device) - matrices.mean(dim=0)
+    return matrices.index_select(0, views) + shift
+
+
+def correct_colors(
+    render: Tensor,  # [C, H, W, 3]
+    alpha: Tensor,  # [C, H, W, 1]
+    matrices: Tensor,  # [C, 3, 4]
+    *,
+    fused: bool = True,
+) -> Tensor:
+    """Apply an affine map to the colours of the Gaussians that a rendering shows: M c + α b.
+
+    The offset b counts as much as the Gaussians cover, as if each Gaussian's own colour had been changed. What nothing
+    covers stays black, and teaches the matrices nothing.
+
+    Args:
+        render: Renderings before a black background, not clamped. [C, H, W, 3]
+        alpha: Accumulated opacity in [0, 1]. [C, H, W, 1]
+        matrices: (M | b) of each view. [C, 3, 4]
+        fused: Use the Triton kernels where they run: CUDA, float32.
+
+    Returns:
+        [C, H, W, 3]
+
+    Raises:
+        InputError: If the views have more pixels than the Triton kernels can address (kernels/limits.py).
+    """
+    if fused and render.dtype == torch.float32 and kernels.available(render.device):
+        from sadgs_ns.kernels.color_matrices import correct_colors as fused_correct_colors
+
+        return fused_correct_colors(render, alpha, matrices)
+    return render @ matrices[:, None, :, :3].mT + alpha * matrices[:, None, None, :, 3]
