@@ -72,7 +72,7 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     effort: float = 1.0
     """How much training the capture is given, relative to what its number of views asks for.
     0.5 is a draft of half as many renderings. 2 adds more Gaussians; 2 and 4 render more where views are many."""
-    start_from: Suppress[Path | None] = None
+    start_from: Path | None = None
     """Folder of a finished run of the same capture, before photos were added, from whose Gaussians this run starts.
     SfM points are added where it has none. The length that is derived is half of a run's that starts anew."""
     views_per_iteration: int | None = None
