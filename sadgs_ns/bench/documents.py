@@ -30,7 +30,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import yaml
 
@@ -108,7 +108,6 @@ COLUMNS: dict[str, tuple[str, Callable[[Run], str]]] = {
     "scene": ("Scene", lambda run: run.scene),
     "photos": ("Scene: training views", Run.photos),
     "method": ("Method", lambda run: run.name),
-    "steps": ("Steps × views", lambda run: f"{run.mean('iterations'):,.0f} × {run.mean('views_per_iteration'):.0f}"),
     "loop": ("Loop s", lambda run: run.with_spread("loop_seconds", 1)),
     "ratio": ("Ratio", Run.ratio),
     "psnr": ("PSNR", lambda run: run.with_spread("psnr", 2)),
@@ -118,7 +117,7 @@ COLUMNS: dict[str, tuple[str, Callable[[Run], str]]] = {
     "peak": ("Peak GB", lambda run: run.with_spread("peak_gb", 1)),
 }
 """Header and cell of each column of a table of runs."""
-_WORDS = ("scene", "photos", "method", "steps")
+_WORDS = ("scene", "photos", "method")
 
 
 @dataclass(frozen=True)
@@ -247,15 +246,13 @@ class Growth:
 
 
 Table = Runs | Sweep | Approximations | Growth
+KINDS: dict[str, type] = {"runs": Runs, "sweep": Sweep, "approximations": Approximations, "growth": Growth}
 
 
 @dataclass(frozen=True)
 class Catalogue:
     """What tables.yaml holds."""
 
-    KINDS: ClassVar[dict[str, type]] = {
-        "runs": Runs, "sweep": Sweep, "approximations": Approximations, "growth": Growth,
-    }  # fmt: skip
     megapixels: Mapping[str, float]
     """Of an image of each scene."""
     tables: Mapping[str, Table]
@@ -285,12 +282,14 @@ def read_catalogue(path: Path) -> Catalogue:
         tables = {}
         for name, table in described(Catalogue, content).tables.items():
             kind = table.pop("kind", None)
-            if kind not in Catalogue.KINDS:
-                raise ValueError(f"table {name}: kind is {kind!r}; give one of {', '.join(Catalogue.KINDS)}.")
-            tables[name] = described(Catalogue.KINDS[kind], table)
+            if kind not in KINDS:
+                raise ValueError(f"table {name}: kind is {kind!r}; give one of {', '.join(KINDS)}.")
+            tables[name] = described(KINDS[kind], table)
         return Catalogue(content["megapixels"], tables)
     except OSError as error:
         raise ValueError(f"{path} cannot be read ({error.strerror}); give the folder of a checkout.") from error
+    except (AttributeError, TypeError) as error:
+        raise ValueError(f"{path}: tables must be a mapping of names to mappings.") from error
     except yaml.YAMLError as error:
         raise ValueError(f"{path} is not YAML: {' '.join(str(error).split())}.") from error
     except ValueError as error:
@@ -362,7 +361,7 @@ def _difference(cell: Sequence[list[Result]], base: Sequence[list[Result]]) -> s
 
 
 def write(checkout: Path, check: bool = False) -> list[str]:
-    """Write the tables of a checkout's documents, all of them or on an error none.
+    """Write the tables of a checkout's documents, none where one of them is described wrongly.
 
     Args:
         checkout: Folder of README.md and docs.
@@ -393,6 +392,10 @@ def write(checkout: Path, check: bool = False) -> list[str]:
                 new = catalogue.tables[name].text(folder, catalogue.megapixels) + "\n"
             except ValueError as error:
                 raise ValueError(f"{path}: table {name}: {error}") from error
+            except (AttributeError, KeyError, TypeError) as error:
+                raise ValueError(
+                    f"{path}: table {name}: its description or rows are not as expected ({error!r})."
+                ) from error
             if new != match[2]:
                 changed.append(f"{path}: table {name}")
             return f"<!-- table: {name} -->\n{new}<!-- end -->"

@@ -20,7 +20,7 @@ SWEEP = {
 }
 RUNS = {
     "kind": "runs",
-    "columns": ["photos", "method", "steps", "loop", "ratio", "psnr", "gaussians"],
+    "columns": ["photos", "method", "loop", "ratio", "psnr", "gaussians"],
     "lines": [
         {"rows": "runs.jsonl", "scenes": ["fox"], "labels": {"slow": "slow", "ours": "ours"}, "reference": "slow"},
         {"rows": "runs.jsonl", "scenes": ["tree"], "labels": {"ours": "ours, elsewhere"}},
@@ -31,7 +31,7 @@ RUNS = {
 def row(scene: str, label: str, seed: int = 0, **changes: Any) -> dict[str, Any]:
     return {
         "key": f"{scene}/{label}/{seed}", "scene": scene, "label": label, "seed": seed, "status": "ok",
-        "iterations": 2075, "views_per_iteration": 2, "train_views": 43, "loop_seconds": 10.0, "psnr": 30.0,
+        "train_views": 43, "loop_seconds": 10.0, "psnr": 30.0,
         "ssim": 0.9, "lpips": 0.1, "gaussians": 200_000, "peak_gb": 1.0, **changes,
     }  # fmt: skip
 
@@ -53,7 +53,7 @@ ROWS = {
 }  # fmt: skip
 
 
-def checkout(folder: Path, tables: dict[str, Any], rows: dict[str, list[dict[str, Any]]], **texts: str) -> Path:
+def checkout(folder: Path, tables: Any, rows: dict[str, list[dict[str, Any]]], **texts: str) -> Path:
     """A checkout whose README holds all tables, still empty."""
     results = folder / documents.RESULTS
     results.mkdir(parents=True)
@@ -76,11 +76,11 @@ def test_runs_are_a_line_each(tmp_path: Path):
         == """# Title
 
 <!-- table: main -->
-| Scene: training views | Method | Steps × views | Loop s | Ratio | PSNR | Gaussians |
-| --- | --- | --- | ---: | ---: | ---: | ---: |
-| fox: 43 of 0.68 MP | slow | 2,075 × 2 | 250.0 | 1 | 29.00 | 9,999 |
-| fox: 43 of 0.68 MP | ours | 2,075 × 2 | 10.5 ± 0.5 | 1/24 | 30.50 ± 0.50 | 200k |
-| tree: 43 | ours, elsewhere | 2,075 × 2 | 10.0 | – | 30.00 | 200k |
+| Scene: training views | Method | Loop s | Ratio | PSNR | Gaussians |
+| --- | --- | ---: | ---: | ---: | ---: |
+| fox: 43 of 0.68 MP | slow | 250.0 | 1 | 29.00 | 9,999 |
+| fox: 43 of 0.68 MP | ours | 10.5 ± 0.5 | 1/24 | 30.50 ± 0.50 | 200k |
+| tree: 43 | ours, elsewhere | 10.0 | – | 30.00 | 200k |
 <!-- end -->
 
 After.
@@ -139,7 +139,7 @@ def test_check_finds_what_changed_and_writes_nothing(tmp_path: Path, capsys: pyt
     assert readme.read_text("utf8") == wrong
 
 
-WRONG: dict[str, tuple[dict[str, Any], str, str]] = {
+WRONG: dict[str, tuple[Any, str, str]] = {
     "no table of that name": ({"main": RUNS}, "<!-- table: other -->\n<!-- end -->\n", "table other is not in"),
     "a table without end": ({"main": RUNS}, "<!-- table: main -->\n\n", "needs one `<!-- end -->`"),
     "an end alone": ({"main": RUNS}, "<!-- end -->\n", "needs one `<!-- end -->`"),
@@ -158,6 +158,8 @@ WRONG: dict[str, tuple[dict[str, Any], str, str]] = {
         "",
         "there is no row 'ours' of site",
     ),
+    "tables that are a list": ([RUNS], "", "tables must be a mapping"),
+    "scenes that are no mapping": ({"main": {**SWEEP, "scenes": ["fox"]}}, "", "table main: "),
     "no such rows": ({"main": {**SWEEP, "rows": ["none.jsonl"]}}, "", "none.jsonl is not there"),
 }
 
