@@ -297,10 +297,11 @@ def read_catalogue(path: Path) -> Catalogue:
 
 
 def grouped(folder: Path, files: Iterable[str]) -> dict[tuple[str, str], list[Result]]:
-    """The results of several files by scene and label. All rows count, also those of one seed."""
+    """The results of several files that are ok, by scene and label. All of them count, also several of one seed."""
     found: dict[tuple[str, str], list[Result]] = {}
     for row in (row for file in files for row in read_rows(folder / file)):
-        found.setdefault((row["scene"], row["label"]), []).append(row)
+        if row["status"] == "ok":
+            found.setdefault((row["scene"], row["label"]), []).append(row)
     return found
 
 

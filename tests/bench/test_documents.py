@@ -42,6 +42,7 @@ ROWS = {
         row("fox", "ours", 0, psnr=30.0),
         row("fox", "ours", 1, psnr=31.0, loop_seconds=11.0),
         row("tree", "ours"),
+        row("tree", "ours", 1, status="failed", psnr=None),
         row("tree", "bare", train_views=None),
     ],
     "sweep.jsonl": [
