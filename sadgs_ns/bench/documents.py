@@ -390,7 +390,7 @@ def write(checkout: Path, check: bool = False) -> list[str]:
                 raise ValueError(f"{path}: table {name} is not in {folder / TABLES}.")
             used.add(name)
             try:
-                new = catalogue.tables[name].text(folder, catalogue.megapixels) + "\n"
+                new = f"\n{catalogue.tables[name].text(folder, catalogue.megapixels)}\n\n"
             except ValueError as error:
                 raise ValueError(f"{path}: table {name}: {error}") from error
             except (AttributeError, KeyError, TypeError) as error:

@@ -77,11 +77,13 @@ def test_runs_are_a_line_each(tmp_path: Path):
         == """# Title
 
 <!-- table: main -->
+
 | Scene: training views | Method | Loop s | Ratio | PSNR | Gaussians |
 | --- | --- | ---: | ---: | ---: | ---: |
 | fox: 43 of 0.68 MP | slow | 250.0 | 1 | 29.00 | 9,999 |
 | fox: 43 of 0.68 MP | ours | 10.5 ± 0.5 | 1/24 | 30.50 ± 0.50 | 200k |
 | tree: 43 | ours, elsewhere | 10.0 | – | 30.00 | 200k |
+
 <!-- end -->
 
 After.
@@ -92,7 +94,7 @@ After.
 def test_a_sweep_is_differences_from_its_first_setting(tmp_path: Path):
     folder = checkout(tmp_path, {"sweep": SWEEP}, {"sweep.jsonl": ROWS["sweep.jsonl"]})
     assert documents.main([str(folder)]) == 0
-    lines = (folder / "README.md").read_text("utf8").splitlines()[5:9]
+    lines = (folder / "README.md").read_text("utf8").splitlines()[6:10]
     # Castle is the mean of its two scenes; its second setting lacks one of them.
     assert lines[0] == "| × 1 | 30.25 / .9000 / .1000 / 200k | 29.00 / .9000 / .1000 / 200k |"
     assert lines[1] == "| half the range of its runs | 0.25 / .0000 / .0000 | – |"
