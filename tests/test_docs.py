@@ -1,13 +1,18 @@
-"""Every row of the tables of hard cases names tests that there are."""
+"""Hard cases name tests that there are, links lead somewhere, and tables are what their rows give."""
 
 from __future__ import annotations
 
 import ast
 import re
+import unicodedata
+from collections import Counter
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
 import pytest
+
+from sadgs_ns.bench import documents
 
 CHECKOUT = Path(__file__).parents[1]
 
@@ -51,3 +56,66 @@ def test_every_hard_case_names_a_test_that_there_is(document: str, at_least: int
                 assert found[3] in cases, name
             else:
                 assert found[2] in tests, name
+
+
+def test_tables_are_what_their_rows_give(capsys: pytest.CaptureFixture[str]):
+    assert documents.main([str(CHECKOUT), "--check"]) == 0, "".join(capsys.readouterr())
+
+
+DOCUMENTS = [CHECKOUT / "README.md", CHECKOUT / "CHANGELOG.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
+
+
+def without_code(text: str) -> str:
+    """A document's lines that are no code."""
+    text = re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+    return "\n".join(line for line in text.splitlines() if not line.startswith("    "))
+
+
+def anchors(path: Path) -> set[str]:
+    """What a document's headings are called in links, as GitHub does."""
+    found, names = set[str](), Counter[str]()
+    for heading in re.findall(r"^#+ +(.+)$", without_code(path.read_text("utf8")), re.MULTILINE):
+        text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).strip().lower()
+        kept = "".join(c for c in text if c in "-_ " or unicodedata.category(c)[0] in "LMN")
+        name = kept.replace(" ", "-")
+        found.add(f"{name}-{names[name]}" if names[name] else name)
+        names[name] += 1
+    return found
+
+
+def links(path: Path) -> list[str]:
+    """Where a document's links and images lead."""
+    text = re.sub(r"`[^`\n]*`", "", without_code(path.read_text("utf8")))
+    return re.findall(r"\]\(([^)\s]+)\)", text)
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+def test_links_between_documents_lead_somewhere(path: Path):
+    for link in links(path):
+        if re.match(r"[a-z]+:", link):
+            continue
+        file, _, anchor = link.partition("#")
+        target = (path.parent / file).resolve() if file else path
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+def texts_of_the_code() -> Iterator[tuple[str, str]]:
+    """Files that may name documents, and what they hold."""
+    for folder, pattern in (("sadgs_ns", "*.py"), ("tests", "*.py"), ("configs", "*.yaml")):
+        for path in sorted((CHECKOUT / folder).rglob(pattern)):
+            yield str(path.relative_to(CHECKOUT)), path.read_text("utf8")
+
+
+def test_documents_that_the_code_names_are_there():
+    reference = r"\b(docs/[\w-]+\.md)(?:#([\w-]+))?"
+    named = [(file, *found) for file, text in texts_of_the_code() for found in re.findall(reference, text)]
+    assert len(named) > 10
+    for file, document, anchor in named:
+        assert (CHECKOUT / document).exists(), (file, document)
+        assert not anchor or anchor in anchors(CHECKOUT / document), (file, anchor)
+
+
+def test_every_figure_is_shown():
+    shown = {(path.parent / link).resolve() for path in DOCUMENTS for link in links(path)}
+    assert {path for path in (CHECKOUT / "docs" / "figures").iterdir()} <= shown

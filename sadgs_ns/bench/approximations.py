@@ -20,6 +20,7 @@ import torch
 
 from sadgs_ns.bench import command_lines, results
 from sadgs_ns.bench.eta_errors import RUNS, demo_training_set, footprint_rows, interval_rows, random_footprints
+from sadgs_ns.bench.table import grid
 from sadgs_ns.bench.tensor_errors import AXIS_LENGTHS, Image, Row, batch, robustness_rows, structure_tensor_rows
 from sadgs_ns.demo.scene import describe_scene, render
 from sadgs_ns.method.strategy import StructureAwareStrategy
@@ -104,12 +105,18 @@ TABLES = {
 def markdown(rows: Sequence[Row]) -> str:
     """One table's rows as a titled Markdown table; what is None is a dash."""
     table = TABLES[rows[0]["table"]]
-    lines = [("Variant", *(header for header, _ in table.columns.values())), ("---", *["---:"] * len(table.columns))]
-    for row in rows:
-        cells = ["–" if row[name] is None else form(row[name]) for name, (_, form) in table.columns.items()]
-        lines.append((row["variant"], *cells))
-    body = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-    return f"### {table.title}\n\n{table.note}\n\n{body}"
+    return f"### {table.title}\n\n{table.note}\n\n{body(rows)}"
+
+
+def body(rows: Sequence[Row]) -> str:
+    """As `markdown`, without title and note."""
+    columns = TABLES[rows[0]["table"]].columns
+    header = ("Variant", *(header for header, _ in columns.values()))
+    lines = (
+        (row["variant"], *("–" if row[name] is None else form(row[name]) for name, (_, form) in columns.items()))
+        for row in rows
+    )
+    return grid(header, lines)
 
 
 @dataclass(frozen=True)

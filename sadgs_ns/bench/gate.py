@@ -25,7 +25,7 @@ from sadgs_ns.bench.results import Result
 DIRECTIONS = ("higher", "lower", "near")
 NEW_METRICS = {"psnr": ("higher", 0.4), "ssim": ("higher", 0.01), "lpips": ("lower", 0.01), "gaussians": ("near", 0.04)}
 """Direction and tolerance of metrics in a row that the baseline lacks; that of the count is relative to it. About the
-largest half-range between two seeds in docs/measurements.md: a start, to be set from one's own seeds."""
+largest half-range between two seeds in docs/results.md: a start, to be set from one's own seeds."""
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from sadgs_ns.bench import results
@@ -24,9 +24,21 @@ def markdown(rows: Iterable[Result], reference: str | None = None) -> str:
         The table, and under it what is wrong with it, if anything.
     """
     rows = list(rows)
-    lines = [HEADER, ("---", "---", *["---:"] * (len(HEADER) - 2)), *cells(rows, reference)]
-    text = "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+    text = grid(HEADER, cells(rows, reference), names=2)
     return "\n".join([text, *([""] if notes(rows) else []), *(f"- {note}" for note in notes(rows))])
+
+
+def grid(header: Sequence[str], lines: Iterable[Sequence[str]], names: int = 1) -> str:
+    """Cells as a Markdown table.
+
+    Args:
+        header: The columns' names.
+        lines: Of as many cells as the header.
+        names: So many columns, the first ones, are to the left; the others, which hold numbers, are to the right.
+    """
+    rule = ["---"] * names + ["---:"] * (len(header) - names)
+    cells = ([cell.replace("|", "\\|") for cell in line] for line in (header, rule, *lines))
+    return "\n".join("| " + " | ".join(line) + " |" for line in cells)
 
 
 def latest(rows: Iterable[Result]) -> list[Result]:
@@ -94,11 +106,17 @@ def mean(group: Iterable[Result], name: str) -> float | None:
     return sum(values) / len(values) if values else None
 
 
+def half_range(group: Iterable[Result], name: str) -> float:
+    """Half the range of a field over the results that have it, of which there must be one."""
+    values = _values(group, name)
+    return (max(values) - min(values)) / 2
+
+
 def _cell(group: list[Result], name: str, form: str) -> str:
     values, average = _values(group, name), mean(group, name)
     if average is None:
         return _NOTHING
-    spread = f" ± {(max(values) - min(values)) / 2:{form}}" if len(values) > 1 else ""
+    spread = f" ± {half_range(group, name):{form}}" if len(values) > 1 else ""
     return f"{average:{form}}{spread}"
 
 

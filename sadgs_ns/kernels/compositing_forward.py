@@ -28,7 +28,7 @@ from sadgs_ns.kernels.compositing_blocks import (
 
 _GAUSSIANS, _WARPS = 8, 1
 """Gaussians of a batch, and warps of a program. With 16 Gaussians the kernel takes 1.2 times as long, with 32 of them
-1.5 times (docs/measurements.md, "The parts of a step")."""
+1.5 times (docs/results.md#parts-of-a-step)."""
 
 
 @triton.jit

@@ -16,7 +16,7 @@ from sadgs_ns.method.split import Params, grid_split, limit_growth
 from sadgs_ns.render.rasterization import visible
 
 _OTHER_AXES = 0.8
-"""Of a Gaussian whose longest axis is halved: how long the others stay (docs/measurements.md)."""
+"""Of a Gaussian whose longest axis is halved: how long the others stay (docs/results.md#splits-and-rates)."""
 
 
 def empty_gradients(num_gaussians: int, device: torch.device) -> dict[str, Tensor]:

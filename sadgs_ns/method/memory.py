@@ -55,8 +55,8 @@ Gaussians 4, image 12, five blurred maps 60, three slopes 36, image in bytes 3, 
 TORCH_LOSS_PIXEL_BYTES = 300
 """The same without our kernels, where torch keeps about twenty maps for the loss; measured, not counted."""
 PAIRS_PER_GAUSSIAN = 12
-"""Pairs, of tiles of 8 px, that a trained Gaussian has in a view. docs/measurements.md has 10.5 (fox, 8.3 million pairs
-of 397,000 Gaussians in two views) and 11 (300,000 Gaussians of 2 to 5 px at 1920×1080)."""
+"""Pairs, of tiles of 8 px, that a trained Gaussian has in a view: 10.5 were counted on fox (8.3 million of 397,000
+Gaussians in two views), and 11 with 300,000 made-up Gaussians of 2 to 5 px at 1920×1080."""
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,7 @@
 """How long a run is, how many views a step takes, and when densification does what; derived from the capture.
 
 A *view visit* is one rendering of one training view with its gradients. Many visits to few views overfit, and few
-visits to many underfit, so that the number of visits follows the number of views (docs/measurements.md, "The schedule
-that a capture needs").
+visits to many underfit, so that the number of visits follows the number of views (docs/results.md#schedule).
 """
 
 from __future__ import annotations

@@ -97,7 +97,7 @@ class CheckedTrainerConfig(TrainerConfig):
     The mean over more views is less noisy, so that they may be higher, and fall further."""
     cuda_graphs: bool = True
     """Whether the host launches steps of few Gaussians at once, as CUDA graphs, instead of kernel by kernel.
-    Only where there is CUDA, and up to a million Gaussians, counted in each view (docs/measurements.md)."""
+    Only where there is CUDA, and up to a million Gaussians, counted in each view (docs/results.md)."""
     steps_per_save: int = 0
     """Steps between checkpoints; 0 leaves them to the clock. One is always made at the end."""
     seconds_per_save: float = 60.0

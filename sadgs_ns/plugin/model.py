@@ -49,7 +49,7 @@ from sadgs_ns.render.tile_forecast import TileForecast
 
 CAMERA_CLEARANCE = 2.0
 """Initial Gaussians nearer to a camera than this many of their standard deviations are dropped. The paper keeps them;
-on the scene `south` dropping them brought 1.7 dB, elsewhere nothing (docs/measurements.md)."""
+on the scene `south` dropping them brought 1.7 dB, elsewhere nothing (docs/results.md#other-constants)."""
 NORMALS = "normals"
 """Name of the output that only its readers pay for."""
 LIMIT_EVERY = 25
@@ -86,7 +86,7 @@ class SadgsModelConfig(InstantiateConfig):
     """Also start from points on the faces of the SfM points' bounding box, which become sky and far background."""
     initial_opacity: float = POINT_OPACITY
     """Opacity at which SfM points start, in (0, 1); random ones start at 0.1.
-    Half opaque ones mostly have a lower LPIPS and make more Gaussians (docs/measurements.md)."""
+    Half opaque ones mostly have a lower LPIPS and make more Gaussians (docs/results.md)."""
     sh_degree: int = 3
     """Degree of the spherical harmonics that make colours depend on the direction of view, 0 to 4."""
     rasterize_mode: Literal["classic", "antialiased"] = "classic"

@@ -38,7 +38,8 @@ _LESS_MEMORY = (
 )
 _NOTHING_DONE = "stopped before an iteration was done; the same command starts again."
 RATES_OF_FOUR_VIEWS = {"means": (3.0, 3.0), "opacities": (1.5, 1.5), "scales": (2.25, 0.375), "quats": (2.25, 0.375)}
-"""Factors on learning rates at the first and at the last iteration in steps of four views (docs/measurements.md).
+"""Factors on learning rates at the first and at the last iteration in steps of four views
+(docs/results.md#splits-and-rates).
 Rates that fall once densification has ended fall less in steps of several views, and not at all in steps of four."""
 _SAVING_SHARE = 0.01
 """Largest share of the time between two checkpoints by the clock that saving may take."""

@@ -20,7 +20,8 @@ BACKWARD: Literal["moments", "gsplat"] = "moments"
 """Whose kernels differentiate the projection and the compositing of three channels: ours (projection.py,
 compositing.py), or gsplat's as a reference."""
 TILE_SIZE = compositing.TILE_SIZE
-"""px. gsplat's default of 16 saves list entries; with exact lists, saved pixels matter more (docs/measurements.md)."""
+"""px. gsplat's default of 16 saves list entries; with exact lists, saved pixels matter more
+(docs/results.md#parts-of-a-step)."""
 
 
 def rasterization(

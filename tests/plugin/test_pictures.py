@@ -51,7 +51,7 @@ def view(width: int = 64, height: int = 48) -> tuple[torch.Tensor, torch.Tensor,
 @pytest.mark.parametrize("constant", [0.2, 0.4])
 @pytest.mark.parametrize(("period", "read_off"), [(8.0, 1.13), (12.0, 1.27), (24.0, 1.11)])
 def test_the_wavelength_map_of_a_grating_has_the_color_of_its_period(period: float, read_off: float, constant: float):
-    """Up to what S̄ itself reads off a grating: the table of that name in docs/measurements.md."""
+    """Up to what S̄ itself reads off a grating: docs/results.md#gratings."""
     found = texture.texture_period(structure_tensor(grating(period), constant), constant)[32:64, 32:96]
     assert float(found.median()) == pytest.approx(read_off * period, rel=0.05)
     position = math.log(read_off * period / 3) / math.log(60 / 3)
