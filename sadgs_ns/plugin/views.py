@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any
@@ -37,6 +38,10 @@ class TrainingViews:
         self._next_round: tuple[Any, list[int]] = None, []  # It is drawn from this state of the random generator.
         self._reduced: dict[tuple[int, int], dict[str, Any]] = {}
         """Data of views with reduced images, by index and level, where the full images are on the device."""
+        self._foreseen: deque[tuple[list[int], list[int]]] = deque()
+        """Views of the next steps, and which of them this process composites."""
+        self._steps: Iterator[list[int]] = iter(())
+        """Yields the steps after these."""
         self._reduced_Ks: dict[int, Sequence[Tensor]] = {}
         """Intrinsics of all reduced images, by level."""
 
@@ -93,7 +98,7 @@ class TrainingViews:
             composited = self._composited(indices)
             # This does not change from step to step, so that no view is forgotten that was on its way.
             share = -(-number // (1 if self.shards is None else self.shards.num_ranks))
-            upcoming, following = self._upcoming(number, ahead.threads + 2 * share)
+            upcoming, following = self._upcoming(indices, ahead.threads + 2 * share)
             ahead.load([*composited, *upcoming])
             drawn = {index: {} for index in indices} | {i: ahead.take(i, codes[0]) for i in composited}
             ahead.load(upcoming)  # A view that was just taken may come again soon.
@@ -127,21 +132,38 @@ class TrainingViews:
         """Free the memory of reduced images, which are made again where they are drawn."""
         self._reduced.clear()
 
-    def _upcoming(self, number: int, most: int) -> tuple[list[int], list[int]]:
+    def _upcoming(self, drawn: list[int], most: int) -> tuple[list[int], list[int]]:
         """Return the views that this process will composite next, as far as they are known.
 
+        Steps that were foreseen stay so, as long as those that are drawn are among them; looking for all of them anew
+        in each step would take longer the more processes there are.
+
         Args:
-            number: Views that a step takes.
+            drawn: Views of the step that has been drawn.
             most: Number of views that are enough, unless the next step has more.
 
         Returns:
             The views of several steps, each once, and those among them of the next step.
         """
-        steps = (self._composited(step) for step in self._next_steps(number))
-        following = next(steps, [])
-        upcoming = dict.fromkeys(following)
-        while len(upcoming) < most and (step := next(steps, None)) is not None:
-            upcoming |= dict.fromkeys(step)
+        foreseen = self._foreseen
+        anew = not foreseen or foreseen.popleft()[0] != drawn
+        if anew:
+            foreseen.clear()
+            self._steps = self._next_steps(len(drawn))
+        upcoming = dict.fromkeys(index for _, composited in foreseen for index in composited)
+        # What is foreseen is always ahead of what is drawn, so that a round that begins is the one that was foreseen.
+        while len(upcoming) < most or len(foreseen) < 2:
+            step = next(self._steps, None)
+            if step is not None:
+                foreseen.append((step, self._composited(step)))
+                upcoming |= dict.fromkeys(foreseen[-1][1])
+            elif anew:
+                break
+            else:  # Another round may be known by now.
+                foreseen.clear()
+                upcoming.clear()
+                self._steps, anew = self._next_steps(len(drawn)), True
+        following = foreseen[0][1] if foreseen else []
         return list(upcoming)[: max(most, len(following))], following
 
     def _next_steps(self, number: int) -> Iterator[list[int]]:
