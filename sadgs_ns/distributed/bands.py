@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Sequence
 from typing import NamedTuple
 
 ROWS = 16
@@ -50,3 +52,30 @@ def share_out(num_views: int, height: int, num_ranks: int) -> list[Band]:
                 top, bottom = max(first - MARGIN, 0), min(last + MARGIN, height)
                 bands.append(Band(view, rank, first, last, top, bottom))
     return bands
+
+
+def first_ranks(bands: Sequence[Band]) -> dict[int, int]:
+    """Return, by the numbers of the views, the processes that composite their first rows.
+
+    Args:
+        bands: All bands, as `share_out` returns them.
+    """
+    return {band.view: band.rank for band in reversed(bands)}
+
+
+def views_of_rank(sizes: Sequence[tuple[int, int]], num_ranks: int, rank: int) -> list[int]:
+    """Return of which views of a step a process composites rows.
+
+    Args:
+        sizes: Height and width of each view in px; views of one size are shared out together.
+        num_ranks: Number of processes.
+        rank: The process.
+
+    Returns:
+        Numbers of the views in the step, in the order in which it composites them.
+    """
+    groups: dict[tuple[int, int], list[int]] = defaultdict(list)
+    for view, size in enumerate(sizes):
+        groups[size].append(view)
+    bands = ((share_out(len(views), height, num_ranks), views) for (height, _), views in groups.items())
+    return [views[band.view] for shared, views in bands for band in shared if band.rank == rank]

@@ -86,6 +86,15 @@ class Shards:
         dist.all_reduce(values)
         return values
 
+    def broadcast(self, values: Tensor, rank: int) -> None:
+        """Overwrite a tensor, in place, with what one process passes.
+
+        Args:
+            values: Contiguous, and of one shape everywhere.
+            rank: That process.
+        """
+        dist.broadcast(values, rank)
+
     def least(self, number: float) -> float:
         """Return the least of the numbers that the processes pass, of which any may be infinite."""
         return float(self.gather(torch.tensor([number], dtype=torch.float64, device=self.device)).min())

@@ -37,6 +37,7 @@ from sadgs_ns.data.validation.transforms import read_json
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.memory import available_host_bytes
 from sadgs_ns.plugin.image_source import ImagesOnDemand, thread_count
+from sadgs_ns.plugin.processes import processes_on_this_machine
 
 
 @dataclass
@@ -76,7 +77,8 @@ class SadgsDatamanagerConfig(FullImageDatamanagerConfig):
 
 
 KEPT_FILES_SHARE = 0.25
-"""Share of the host's free memory up to which the files of compressed images are kept in it."""
+"""Share of the host's free memory up to which the files of compressed images are kept in it, by all processes of the
+machine together; each may keep all of them in the course of a run."""
 
 
 def check_options(config: FullImageDatamanagerConfig) -> None:
@@ -164,9 +166,8 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         """
         device, dataset = torch.device(self.device), self.train_dataset if split == "train" else self.eval_dataset
         on_demand = cache_images_device == "compressed"
-        keep = on_demand and (
-            sum(path.stat().st_size for path in dataset.image_filenames) <= KEPT_FILES_SHARE * available_host_bytes()
-        )
+        room = KEPT_FILES_SHARE * available_host_bytes() / processes_on_this_machine()
+        keep = on_demand and sum(path.stat().st_size for path in dataset.image_filenames) <= room
         images = ImagesOnDemand(dataset, self.config.cache_images_type, keep)
         self.train_cameras = self.train_dataset.cameras
         if on_demand:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sadgs_ns.errors import InputError, reason
+from sadgs_ns.plugin.processes import processes_on_this_machine
 
 ImageType = Literal["uint8", "float32"]
 _MOST_THREADS = 16
@@ -29,9 +30,12 @@ _MOST_THREADS = 16
 
 
 def thread_count(asked: int | None) -> int:
-    """Return the number of threads that decode images: what was asked for, or one for each core, up to 16."""
+    """Return the number of threads that decode images in this process.
+
+    It is what was asked for, or one for each core, up to 16; several processes of a machine share its cores.
+    """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return asked or min(cores, _MOST_THREADS)
+    return asked or min(max(cores // processes_on_this_machine(), 1), _MOST_THREADS)
 
 
 @dataclass(frozen=True)
@@ -313,6 +317,11 @@ class ImagesAhead:
             written = torch.cuda.Event()
             written.record(torch.cuda.current_stream(self.device))
         self._kept[index] = written
+
+    def kept_codes(self, index: int) -> Tensor | None:
+        """Return the codes of S̄ of a view on the device, if they are kept. uint8 [H, W, 3]"""
+        # They were written by the stream that now reads them.
+        return self._codes[index].to(self.device, non_blocking=True) if index in self._kept else None
 
     def close(self) -> None:
         """End the threads; they start again where another image is asked for."""

@@ -10,13 +10,14 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
 from torch import Tensor
 
+from sadgs_ns.distributed.bands import views_of_rank
 from sadgs_ns.method import memory
 from sadgs_ns.method.absgs import empty_gradients
 from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.split import Params
 from sadgs_ns.method.statistics import empty_statistics
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.plugin.processes import processes_on_this_machine
+from sadgs_ns.plugin.processes import least, number_of_processes, processes_on_this_machine
 from sadgs_ns.plugin.structure_maps import PIXELS_PER_BATCH
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
@@ -83,9 +84,13 @@ def training_size(
     structure = 0.0
     if datamanager.config.cache_images == "gpu":
         kept = image_bytes(datamanager, growing)
-    else:  # The images of the next step are there, too.
-        kept = float((3 * _value_bytes(datamanager) + CODE_BYTES) * views * largest)
-        structure = float(STRUCTURE_PIXEL_BYTES * max(largest, min(PIXELS_PER_BATCH, views * largest)))
+    else:  # The images of the next step are there, too; a process has those that it composites, and codes of all.
+        sizes = torch.cat([cameras.height, cameras.width], dim=-1).unique(dim=0).tolist()
+        here = views  # Views of several sizes are shared out size by size, and a process may have a part of each.
+        if len(sizes) == 1:
+            here = max(len(views_of_rank([*map(tuple, sizes)] * views, processes, r)) for r in range(processes))
+        kept = float((3 * _value_bytes(datamanager) * here + CODE_BYTES * views) * largest)
+        structure = float(STRUCTURE_PIXEL_BYTES * max(largest, min(PIXELS_PER_BATCH, here * largest)))
     # A process composites its share of the pixels, and as many pairs as its share of the Gaussians has in all views.
     pixels, pairs = -(-views * largest // processes), views * estimate_pairs(params, cameras)
     return TrainingSize(kept, StepSize(views, pixels, pairs, processes > 1), fused, structure)
@@ -111,7 +116,10 @@ def _value_bytes(datamanager: FullImageDatamanager) -> int:
 
 
 def place_images(datamanager: FullImageDatamanager, device: torch.device, growing: bool = False) -> str | None:
-    """Decide where the images are kept, from the memory that is there.
+    """Decide where the images are kept, from the memory that is there: alike in all processes of the run.
+
+    Images that are asked for on the host stay compressed where each of several processes would decode all of them, and
+    there is no room for that.
 
     Args:
         datamanager: Its images have not been loaded yet; its configuration is changed.
@@ -119,14 +127,23 @@ def place_images(datamanager: FullImageDatamanager, device: torch.device, growin
         growing: As in `image_bytes`.
 
     Returns:
-        A line for the user; None where they are kept on the device.
+        A line for the user; None where they are kept on the device, or where the user asked for.
     """
-    config, size = datamanager.config, image_bytes(datamanager, growing)
-    host = memory.available_host_bytes() / processes_on_this_machine()
+    config, size, sharing = datamanager.config, image_bytes(datamanager, growing), processes_on_this_machine()
+    host = least(memory.available_host_bytes() / sharing, device)
+    if config.cache_images == "cpu":
+        if number_of_processes() == 1 or size <= HOST_SHARE * host:
+            return None
+        config.cache_images = "compressed"  # type: ignore[assignment]
+        return (
+            f"The images stay compressed and are decoded ahead of the steps: decoded they take {size / 1e9:.2g} GB in "
+            f"each process, and the host has {host / 1e9:.2g} GB free for each of its {sharing}."
+        )
     many = len(datamanager.train_dataset) > MANY_IMAGES
     free, share, name = host, HOST_SHARE, "the host"
     if device.type == "cuda":
-        free, share, name = memory.available_bytes(device)[0], IMAGE_SHARE if many else FEW_IMAGES_SHARE, "the GPU"
+        share, name = IMAGE_SHARE if many else FEW_IMAGES_SHARE, "the GPU"
+        free = least(memory.available_bytes(device)[0], device)
     if size <= share * free:
         config.cache_images = "gpu"
         return None

@@ -54,8 +54,9 @@ _SAMPLED = 1000
 """About so many cameras, and Gaussians, are enough to find out whether training can see anything."""
 _FAR_PLANE = 1e10
 """Depth in world units up to which gsplat and our splatter draw Gaussians."""
-Drawn = dict[torch.Size, list[tuple[int, dict[str, Any]]]]
-"""Indices and data of a step's views by the shapes of their images, [H, W, 3 or 4]."""
+Drawn = dict[tuple[int, ...], list[tuple[int, dict[str, Any]]]]
+"""Indices and data of a step's views by the shapes of their images, [H, W, 3 or 4], or by height and width alone where
+several processes train, since one does not have the images that only others composite."""
 _SAME_PLACE = 1e-3
 """Share of the cameras' extent up to which two cameras are taken for one."""
 
@@ -140,7 +141,7 @@ class SadgsPipeline(VanillaPipeline):
             if self.device.type == "cpu":
                 # "gpu" is the training device; nerfstudio would pin memory for CUDA with "cpu".
                 self.datamanager.config.cache_images = "gpu"
-        elif config.datamanager.cache_images == "gpu" and kwargs.get("test_mode") != "inference":
+        elif config.datamanager.cache_images != "compressed" and kwargs.get("test_mode") != "inference":
             line = place_images(self.datamanager, self.device, config.growing_resolution)
             if line is not None:
                 CONSOLE.print(line, highlight=False, soft_wrap=True)
@@ -202,17 +203,8 @@ class SadgsPipeline(VanillaPipeline):
 
         Args:
             shards: The processes, all of which have the same Gaussians until now.
-
-        Raises:
-            InputError: If the training images have several sizes.
         """
-        cameras = self.datamanager.train_dataset.cameras
-        if len(torch.cat([cameras.height, cameras.width], dim=-1).unique(dim=0)) > 1:
-            raise InputError(
-                "The training images have several sizes, which runs on one device alone can train on: take one device, "
-                "or scale the images to one size."
-            )
-        self.shards = shards
+        self.shards = self.views.shards = shards
         self.model.share_out(shards)
 
     def train(self, mode: bool = True) -> SadgsPipeline:
@@ -370,7 +362,8 @@ class SadgsPipeline(VanillaPipeline):
             drawn, wants = defaultdict(list), self.model.wants_structure_tensors
             codes, level = (wants(step), wants(step + 1)), self.resolution.at(step)
             for index, data in self.views.draw(self.views_per_iteration, codes, level):
-                drawn[data["image"].shape].append((index, data))
+                shape = data["image"].shape if self.shards is None else self.views.sizes[index]
+                drawn[shape].append((index, data))
         return drawn
 
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
@@ -380,12 +373,13 @@ class SadgsPipeline(VanillaPipeline):
         losses: dict[str, Tensor] = {}
         metrics: dict[str, Any] = {}
         outputs: dict[str, Any] = {}
-        for (height, width, _), views in groups.items():
+        # Several processes have the same groups, and autograd goes back through them in the reverse order in each.
+        for (height, width, *_), views in groups.items():
             indices = [index for index, _ in views]
-            tensors = _stack(self.structure_maps.of_views(views)) if observes else None
+            tensors = _stack(self.structure_maps.of_views(views, self.shards)) if observes else None
             viewmats, Ks = self.views.stacked_cameras(indices, level)
             if self.shards is not None:
-                parts = losses_of_views(self.model, self.shards, viewmats, Ks, views, tensors)
+                parts = losses_of_views(self.model, self.shards, viewmats, Ks, width, height, views, tensors)
             else:
                 batch = self._batch(views)
                 outputs = self.model.get_training_outputs(viewmats, Ks, width, height, indices, tensors, level > 1)

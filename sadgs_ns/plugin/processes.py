@@ -41,6 +41,16 @@ def processes_on_this_machine() -> int:
     return int(os.environ.get("LOCAL_WORLD_SIZE", number_of_processes()))
 
 
+def least(number: float, device: torch.device) -> float:
+    """Return the least of the numbers that the processes of the run pass, so that all decide alike.
+
+    Args:
+        number: Any, also infinite.
+        device: Where this process trains.
+    """
+    return Shards(device).least(number) if dist.is_initialized() else number
+
+
 def check(config: CheckedTrainerConfig) -> None:
     """Check whether a run on several devices can work with these options.
 

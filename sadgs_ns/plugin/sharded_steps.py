@@ -19,6 +19,8 @@ def losses_of_views(
     shards: Shards,
     viewmats: Tensor,
     Ks: Tensor,
+    width: int,
+    height: int,
     views: Sequence[tuple[int, Mapping[str, Any]]],
     structure_tensors: Tensor | None,
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -29,14 +31,16 @@ def losses_of_views(
         shards: The processes, all of which call this with the same views.
         viewmats: World to camera. [V, 4, 4]
         Ks: Intrinsics in px. [V, 3, 3]
-        views: Index and data of each view; the images are on the training device.
+        width: px.
+        height: px.
+        views: Index and data of each view; the images of those of which this process composites rows are on the
+            training device.
         structure_tensors: S̄ of the views, or codes of it, [V, H, W, 3]; None where η is not observed.
 
     Returns:
         This process's part of the loss, `main_loss`, whose sum over the processes is the loss of one; and the metrics
         of all: PSNR in dB, the number of Gaussians, and `loss`, that sum.
     """
-    height, width, _ = views[0][1]["image"].shape
     kind = model.kind_of_step(width, height, [index for index, _ in views])
     share = len(model.means) / shards.total
     splats, penalty, options = model.splats(kind.opacity_reg * share)

@@ -11,6 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sadgs_ns.distributed.bands import first_ranks, share_out
+from sadgs_ns.distributed.shards import Shards
 from sadgs_ns.method.codes import encode
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
@@ -54,21 +56,38 @@ class StructureMaps:
                 codes[index] = code
         return codes
 
-    def of_views(self, views: Sequence[tuple[int, dict[str, Any]]]) -> list[Tensor]:
+    def of_views(self, views: Sequence[tuple[int, dict[str, Any]]], shards: Shards | None = None) -> list[Tensor]:
         """Codes of S̄ of a step's views, which have one size. uint8 [H, W, 3] each
 
-        Where images are on the host, codes that did not come with a view are computed, and kept where there is room.
+        Where images are on the host, codes that are not known yet are computed, and kept where there is room. All of
+        several processes observe η, and the one that composites a view's first rows computes its codes for the others.
 
         Args:
             views: Number and data of each, as drawn.
+            shards: The processes of the run, all of which call this with the same views; None where there is one.
         """
         ahead = self.views.ahead
         if ahead is None:
             return [self.codes[index] for index, _ in views]
-        missing = [(index, data) for index, data in views if "codes" not in data]
-        for (index, data), codes in zip(missing, self._in_batches([data for _, data in missing]), strict=True):
+        for index, data in views:
+            # All processes keep the same codes, while those that came with a view may have missed the last step's.
+            if "codes" not in data and (kept := ahead.kept_codes(index)) is not None:
+                data["codes"] = kept
+        missing = [position for position, (_, data) in enumerate(views) if "codes" not in data]
+        ranks: dict[int, int] = {}
+        if shards is not None:
+            height, width = self.views.sizes[views[0][0]]
+            ranks = first_ranks(share_out(len(views), height, shards.num_ranks))
+        own = [views[p][1] for p in missing if shards is None or ranks[p] == shards.rank]
+        for data, codes in zip(own, self._in_batches(own), strict=True):
             data["codes"] = codes
-            ahead.keep_codes(index, codes)
+        for position in missing:
+            index, data = views[position]
+            if shards is not None:
+                if ranks[position] != shards.rank:
+                    data["codes"] = torch.empty((height, width, 3), dtype=torch.uint8, device=shards.device)
+                shards.broadcast(data["codes"], ranks[position])
+            ahead.keep_codes(index, data["codes"])
         return [data["codes"] for _, data in views]
 
     def _in_batches(self, data: Sequence[Mapping[str, Any]]) -> Iterator[Tensor]:

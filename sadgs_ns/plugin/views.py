@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -11,6 +12,8 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from torch import Tensor
 
 from sadgs_ns.data.cameras import refuse_failed_undistortion
+from sadgs_ns.distributed.bands import views_of_rank
+from sadgs_ns.distributed.shards import Shards
 from sadgs_ns.method.resolution import reduce_image, reduce_intrinsics, reduce_mask
 from sadgs_ns.plugin.image_source import ImagesAhead, refuse_non_finite, thread_count
 from sadgs_ns.plugin.model import SadgsModel
@@ -23,14 +26,22 @@ class TrainingViews:
     Args:
         datamanager: Holds the images, the cameras, and the order in which views are drawn.
         model: Its camera optimizer corrects the cameras, and its device is the training device.
+
+    Attributes:
+        shards: The processes of the run, of which each composites its share of a step; None where there is one.
     """
 
     def __init__(self, datamanager: FullImageDatamanager, model: SadgsModel) -> None:
         self.datamanager = datamanager
         self.model = model
+        self.shards: Shards | None = None
         self._next_round: tuple[Any, list[int]] = None, []  # It is drawn from this state of the random generator.
         self._reduced: dict[tuple[int, int], dict[str, Any]] = {}
         """Data of views with reduced images, by index and level, where the full images are on the device."""
+        self._foreseen: deque[tuple[list[int], list[int]]] = deque()
+        """Views of the next steps, and which of them this process composites."""
+        self._steps: Iterator[list[int]] = iter(())
+        """Yields the steps after these."""
         self._reduced_Ks: dict[int, Sequence[Tensor]] = {}
         """Intrinsics of all reduced images, by level."""
 
@@ -45,6 +56,13 @@ class TrainingViews:
         if config.cache_images == "gpu":
             return None
         return ImagesAhead(self.datamanager.cached_train, self.model.device, thread_count(config.max_thread_workers))
+
+    @cached_property
+    def sizes(self) -> list[tuple[int, int]]:
+        """Height and width in px of all training images."""
+        _ = self.datamanager.cached_train  # Undistorting the images has changed their sizes.
+        cameras = self.datamanager.train_dataset.cameras
+        return list(zip(cameras.height.flatten().tolist(), cameras.width.flatten().tolist(), strict=True))
 
     def draw(
         self, number: int, codes: tuple[bool, bool] = (False, False), level: int = 1
@@ -62,6 +80,7 @@ class TrainingViews:
 
         Returns:
             Index and data of each view; the image is on the training device, and where images travel so is the mask.
+            Where they travel, and there are several processes, views that only others composite come without data.
 
         Raises:
             InputError: As `ImagesAhead.take`.
@@ -69,21 +88,29 @@ class TrainingViews:
         datamanager, device, ahead = self.datamanager, self.model.device, self.ahead
         indices: list[int] = []
         for _ in range(number):
-            order = datamanager.train_unseen_cameras
-            position = next((position for position, index in enumerate(order) if index not in indices), 0)
-            indices.append(order.pop(position))
-            if not order:
+            _take(datamanager.train_unseen_cameras, indices)
+            if not datamanager.train_unseen_cameras:
                 datamanager.train_unseen_cameras = datamanager.sample_train_cameras()
         if ahead is None:
             data = {index: datamanager.cached_train[index] for index in indices}
             drawn = {i: {**its, "image": its["image"].to(device, non_blocking=True)} for i, its in data.items()}
         else:
-            upcoming = self._upcoming(ahead.threads + 2 * number)
-            ahead.load([*indices, *upcoming])
-            drawn = {index: ahead.take(index, codes[0]) for index in dict.fromkeys(indices)}
+            composited = self._composited(indices)
+            # This does not change from step to step, so that no view is forgotten that was on its way.
+            share = -(-number // (1 if self.shards is None else self.shards.num_ranks))
+            upcoming, following = self._upcoming(indices, ahead.threads + 2 * share)
+            ahead.load([*composited, *upcoming])
+            drawn = {index: {} for index in indices} | {i: ahead.take(i, codes[0]) for i in composited}
             ahead.load(upcoming)  # A view that was just taken may come again soon.
-            ahead.send(upcoming[:number], codes[1])
+            ahead.send(following, codes[1])
         return [(index, self._at_level(index, drawn[index], level)) for index in indices]
+
+    def _composited(self, indices: Sequence[int]) -> list[int]:
+        """Return those of a step's views, each once, of which this process composites rows."""
+        if self.shards is not None:
+            of_step = views_of_rank([self.sizes[i] for i in indices], self.shards.num_ranks, self.shards.rank)
+            indices = [indices[position] for position in of_step]
+        return list(dict.fromkeys(indices))
 
     def _at_level(self, index: int, data: dict[str, Any], level: int) -> dict[str, Any]:
         """Return a view's data with a reduced image, and its mask if there is one.
@@ -105,18 +132,61 @@ class TrainingViews:
         """Free the memory of reduced images, which are made again where they are drawn."""
         self._reduced.clear()
 
-    def _upcoming(self, number: int) -> list[int]:
-        """Return the views that will be drawn next, as far as they are known without changing what will be drawn."""
+    def _upcoming(self, drawn: list[int], most: int) -> tuple[list[int], list[int]]:
+        """Return the views that this process will composite next, as far as they are known.
+
+        Steps that were foreseen stay so, as long as those that are drawn are among them; looking for all of them anew
+        in each step would take longer the more processes there are.
+
+        Args:
+            drawn: Views of the step that has been drawn.
+            most: Number of views that are enough, unless the next step has more.
+
+        Returns:
+            The views of several steps, each once, and those among them of the next step.
+        """
+        foreseen = self._foreseen
+        anew = not foreseen or foreseen.popleft()[0] != drawn
+        if anew:
+            foreseen.clear()
+            self._steps = self._next_steps(len(drawn))
+        upcoming = dict.fromkeys(index for _, composited in foreseen for index in composited)
+        # What is foreseen is always ahead of what is drawn, so that a round that begins is the one that was foreseen.
+        while len(upcoming) < most or len(foreseen) < 2:
+            step = next(self._steps, None)
+            if step is not None:
+                foreseen.append((step, self._composited(step)))
+                upcoming |= dict.fromkeys(foreseen[-1][1])
+            elif anew:
+                break
+            else:  # Another round may be known by now.
+                foreseen.clear()
+                upcoming.clear()
+                self._steps, anew = self._next_steps(len(drawn)), True
+        following = foreseen[0][1] if foreseen else []
+        return list(upcoming)[: max(most, len(following))], following
+
+    def _next_steps(self, number: int) -> Iterator[list[int]]:
+        """Yield the views of the next steps, as far as they are known without changing what will be drawn."""
         datamanager = self.datamanager
-        order = datamanager.train_unseen_cameras
-        generator = getattr(datamanager, "random_generator", None)  # Farthest-point sampling has none.
-        if len(order) < number and generator is not None:
-            state = generator.getstate()
-            if self._next_round[0] != state:
-                self._next_round = state, datamanager.sample_train_cameras()
-                generator.setstate(state)
-            order = order + self._next_round[1]
-        return order[:number]
+        generator: Any = getattr(datamanager, "random_generator", None)  # Farthest-point sampling has none.
+        order, more = [*datamanager.train_unseen_cameras], generator is not None
+        while True:
+            step: list[int] = []
+            while len(step) < number:
+                if not order and not more:
+                    # Which part of a step this process composites depends on the views of all of it.
+                    if step and self.shards is None:
+                        yield step
+                    return
+                if not order:
+                    state, more = generator.getstate(), False
+                    if self._next_round[0] != state:
+                        self._next_round = state, datamanager.sample_train_cameras()
+                        generator.setstate(state)
+                    order = [*self._next_round[1]]
+                _take(order, step)
+            yield step
 
     def close(self) -> None:
         """End the threads that decode images; they start again if another view is drawn."""
@@ -184,3 +254,9 @@ class TrainingViews:
         # This takes one copy on the device instead of two; both results are contiguous, as gsplat wants them.
         flat_viewmats, flat_Ks = torch.cat([matrix.flatten() for matrix in viewmats + Ks]).split([16 * n, 9 * n])
         return flat_viewmats.view(n, 4, 4), flat_Ks.view(n, 3, 3).detach()
+
+
+def _take(order: list[int], step: list[int]) -> None:
+    """Move a view from the order of those to come to a step: the first that the step does not have, if there is one."""
+    position = next((position for position, index in enumerate(order) if index not in step), 0)
+    step.append(order.pop(position))

@@ -90,6 +90,21 @@ def test_a_run_on_two_gpus_ends_with_one_checkpoint(start: str, scene: Path, tmp
     assert len(re.findall("Training Finished", result.stdout)) == 1
 
 
+@GPUS
+@pytest.mark.parametrize("tier", ["compressed", "cpu"])
+def test_two_gpus_train_on_images_of_several_sizes_that_are_on_the_host(tier: str, tmp_path: Path):
+    from runs import nerfstudio_data  # It imports nerfstudio, which the program below does without.
+
+    parser = nerfstudio_data(tmp_path / "data", [(48, 36), (40, 30)], masks=True)
+    result = run([
+        *TORCHRUN, "-m", "nerfstudio.scripts.train", "sadgs", "--data", str(parser.data),
+        "--output-dir", str(tmp_path), "--max-num-iterations", "60", "--pipeline.views-per-iteration", "3",
+        "--pipeline.datamanager.cache-images", tier, "--pipeline.model.num-random", "300",
+    ])  # fmt: skip
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert len(list(tmp_path.rglob("*.ckpt"))) == 1 and len(re.findall("Training Finished", result.stdout)) == 1
+
+
 def main() -> None:
     local = int(os.environ["LOCAL_RANK"])
     torch.cuda.set_device(local)

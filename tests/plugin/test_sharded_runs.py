@@ -20,60 +20,15 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from nerfstudio.scripts import train as train_script
 from nerfstudio.utils.rich_utils import CONSOLE
 from ranks import run_ranks
+from runs import nerfstudio_data
+from scenes import HEIGHT, POINTS, WIDTH
+from sharded_runs import STRUCTURE_EVERY, few_steps, record, record_together
 from torch.multiprocessing.spawn import ProcessExitedException, ProcessRaisedException
 
 from sadgs_ns.distributed.shards import Shards
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.plugin.presets import sadgs
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
-
-STRUCTURE_EVERY = 6
-
-
-def few_steps(scene: Path, output: Path, views: int) -> SadgsTrainerConfig:
-    """A run whose first half ends with a structure step; every step before that is observed by all statistics."""
-    config = configure(scene, output, 2 * STRUCTURE_EVERY, save_every=0)
-    config.pipeline.views_per_iteration = views
-    # Gaussians start as spheres: their rotations have no gradient, and Adam would make steps of what rounding leaves.
-    config.optimizers["quats"]["optimizer"].lr = 0.0
-    config.pipeline.model.strategy = dataclasses.replace(
-        config.pipeline.model.strategy,
-        structure_every=STRUCTURE_EVERY, absgs_every=4, refine_start_iter=1, refine_stop_iter=STRUCTURE_EVERY,
-        eta_every=1, min_observations=1, split_min_opacity=0.0, clone_grad2d=1e3, split_absgrad2d=1e3,
-    )  # fmt: skip
-    return config
-
-
-def record(trainer: SadgsTrainer) -> dict[str, Any]:
-    """Train, and note each step's loss, and the statistics before the structure step."""
-    losses: list[float] = []
-    statistics: dict[str, torch.Tensor] = {}
-    model = trainer.pipeline.model
-
-    def before(step: int) -> None:
-        if step == STRUCTURE_EVERY - 1:
-            state = {key: value for key, value in model.strategy_state.items() if isinstance(value, torch.Tensor)}
-            statistics.update({key: value.clone() for key, value in state.items()})
-
-    iterate = trainer.train_iteration
-
-    def noted(step: int) -> Any:
-        before(step)
-        result = iterate(step)
-        losses.append(float(result[0]))
-        return result
-
-    trainer.train_iteration = noted  # type: ignore[method-assign]
-    trainer.train()
-    steps = model.strategy_state["structure_steps"]
-    return {"losses": losses, "statistics": statistics, "steps": steps, "gaussians": model.num_gaussians}
-
-
-def record_together(shards: Shards, config: SadgsTrainerConfig) -> dict[str, Any]:
-    CONSOLE.quiet = True
-    trainer = config.setup(local_rank=shards.rank, world_size=shards.num_ranks)
-    trainer.setup()
-    return record(trainer)
 
 
 @pytest.mark.parametrize(("ranks", "views"), [(2, 2), (3, 2)])
@@ -82,6 +37,29 @@ def test_the_first_steps_are_those_of_one_process(ranks: int, views: int, scene:
     expected = record(set_up(few_steps(scene, tmp_path / "alone", views)))
     assert expected["steps"][0]["split"] > 0
     results = run_ranks(record_together, ranks, tmp_path / "meet", few_steps(scene, tmp_path / "together", views))
+    assert_same_first_steps(results, expected)
+
+
+@pytest.mark.parametrize("tier", ["gpu", "compressed"])
+def test_images_of_several_sizes_train_as_in_one_process(tier: Any, tmp_path: Path):
+    """Each step has one view of one size and two of another, or three of one; the small views are one process's."""
+    parser = nerfstudio_data(tmp_path / "data", [(WIDTH, HEIGHT), (40, 30)], masks=True)
+
+    def configured(name: str, tier: Any) -> SadgsTrainerConfig:
+        config = few_steps(parser.data, tmp_path / name, views=3)
+        config.pipeline.datamanager.dataparser, config.pipeline.datamanager.cache_images = parser, tier
+        config.pipeline.model.num_random = POINTS
+        return config
+
+    torch.manual_seed(0)
+    expected = record(set_up(configured("alone", "gpu")))
+    assert expected["steps"][0]["split"] > 0
+    results = run_ranks(record_together, 2, tmp_path / "meet", configured("together", tier))
+    assert_same_first_steps(results, expected)
+
+
+def assert_same_first_steps(results: list[dict[str, Any]], expected: dict[str, Any]) -> None:
+    """Compare what `record_together` returned in all processes with what `record` returned in one."""
     for result in results:
         first, alone = (torch.tensor(losses[:STRUCTURE_EVERY]) for losses in (result["losses"], expected["losses"]))
         torch.testing.assert_close(first, alone, rtol=1e-5, atol=0)

@@ -12,6 +12,7 @@ import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 
 from sadgs_ns.method.schedule import Schedule
+from sadgs_ns.plugin.image_source import ImagesAhead
 from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.plugin.views import TrainingViews
 
@@ -23,7 +24,10 @@ class Datamanager:
 
     def __init__(self, total: int, **options: Any) -> None:
         self.config = FullImageDatamanagerConfig(**options)
-        cameras = SimpleNamespace(camera_to_worlds=torch.rand((total, 3, 4), generator=torch.manual_seed(0)))
+        heights = torch.tensor([48, 30, 48, 16]).repeat(total)[:total, None]
+        cameras = SimpleNamespace(
+            camera_to_worlds=torch.rand((total, 3, 4), generator=torch.manual_seed(0)), height=heights, width=heights
+        )
         self.cached_train = [{"image": torch.zeros(1, 1, 3)} for _ in range(total)]
         files = [Path(f"{index}.png") for index in range(total)]
         self.train_dataset: Any = type(
@@ -34,8 +38,10 @@ class Datamanager:
     sample_train_cameras = FullImageDatamanager.sample_train_cameras
 
 
-def views_of(datamanager: Any) -> TrainingViews:
-    return TrainingViews(datamanager, SimpleNamespace(device=torch.device("cpu")))  # type: ignore[arg-type]
+def views_of(datamanager: Any, shards: Any = None) -> TrainingViews:
+    views = TrainingViews(datamanager, SimpleNamespace(device=torch.device("cpu")))  # type: ignore[arg-type]
+    views.shards = shards
+    return views
 
 
 def steps_of(views: TrainingViews, number: int, steps: int = STEPS) -> list[list[int]]:
@@ -76,6 +82,43 @@ def test_images_that_are_decoded_ahead_change_no_order_and_are_awaited_once(tota
     rounds = 100 * number // total
     assert awaited == 1 or (strategy == "fps" and awaited <= rounds + 1)  # fps draws a round when it begins.
     views.close()
+
+
+@pytest.mark.parametrize(
+    ("total", "number", "ranks", "strategy"),
+    [(60, 4, 2, "random"), (60, 4, 3, "random"), (10, 3, 2, "random"), (5, 4, 8, "random"), (60, 4, 2, "fps")],
+)
+def test_each_process_prepares_what_it_composites_and_nothing_else(
+    total: int, number: int, ranks: int, strategy: Any, monkeypatch: pytest.MonkeyPatch
+):
+    options = {"train_cameras_sampling_strategy": strategy, "max_thread_workers": 2}
+    expected = steps_of(views_of(Datamanager(total, **options)), number, steps=100)
+    loaded: list[int] = []
+    load = ImagesAhead._load
+    monkeypatch.setattr(ImagesAhead, "_load", lambda ahead, index: loaded.append(index) or load(ahead, index))
+    composited: list[set[int]] = [set() for _ in expected]
+    for rank in range(ranks):
+        datamanager = Datamanager(total, cache_images="cpu", **options)
+        datamanager.cached_train = tuple(datamanager.cached_train)  # type: ignore[assignment]
+        views = views_of(datamanager, SimpleNamespace(rank=rank, num_ranks=ranks))
+        loaded.clear()
+        awaited, taken = 0, Counter[int]()
+        assert views.ahead is not None
+        for step, of_all in zip(expected, composited, strict=True):
+            known = views.ahead._loading.keys() | views.ahead._sent.keys()
+            drawn = views.draw(number)
+            assert [index for index, _ in drawn] == step
+            own = {index for index, data in drawn if "image" in data}
+            taken.update(own)
+            of_all |= own
+            awaited += not known.issuperset(own)
+        under_way = Counter(views.ahead._loading.keys() | views.ahead._sent.keys())
+        assert under_way.total() <= 2 + 2 * number
+        views.close()
+        assert taken <= Counter(loaded) <= taken + under_way
+        rounds = 100 * number // total
+        assert awaited <= 1 or (strategy == "fps" and awaited <= rounds + 1)
+    assert composited == [set(step) for step in expected]
 
 
 @pytest.mark.parametrize(("total", "number"), [(10, 5), (10, 1), (4, 4)])
