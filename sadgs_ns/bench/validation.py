@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -77,6 +76,8 @@ def turn_cameras(out: Path) -> None:
     Args:
         out: Folder that `write_colmap` wrote.
     """
+    import pycolmap  # Pillow cannot write PNGs if it is loaded after this.
+
     model = pycolmap.Reconstruction(out / SPARSE)
     train = set((out / "train_list.txt").read_text().splitlines())
     generator = np.random.default_rng(0)

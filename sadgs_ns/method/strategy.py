@@ -55,9 +55,8 @@ class StructureAwareStrategy(Strategy):
         ...                                                              # the optimizers step
         strategy.step_post_backward(params, optimizers, state, step, info)
 
-    The README holds the whole loop. Views of different sizes are rendered one by one; `info` is then the list of their
-    infos. Where a view was rendered smaller than its image, `info["reduced"] = True` says so: AbsGS then does not read
-    its gradients, and it needs no absolute ones.
+    `docs/strategy.md` holds the whole loop. Views of different sizes are rendered one by one; `info` is then the list
+    of their infos.
     """
 
     max_gaussians: int = 4_000_000
@@ -208,7 +207,7 @@ class StructureAwareStrategy(Strategy):
             return
         self._ensure_statistics(params, state)
         for view in _views(info):
-            if self.needs_absgrad(step) and not view.get("reduced", False):
+            if self.needs_absgrad(step):
                 keep_gradient(view["means2d"])
             if self.observes(step):
                 jitter = None if self.shards is None else self.shards.rand(view["n_cameras"])
@@ -236,7 +235,7 @@ class StructureAwareStrategy(Strategy):
         views = _views(info)
         if self.needs_absgrad(step):
             num_views = sum(view["n_cameras"] for view in views)
-            for view in (view for view in views if not view.get("reduced", False)):
+            for view in views:
                 accumulate_gradients(state, view, num_views, fused=self.fused)
         if iteration >= windows.refine_start_iter:
             if _due(iteration, windows.structure_every):

@@ -265,12 +265,12 @@ class GraphedSteps:
         height, width, channels = images[0].shape
         if len(drawn) > 1 or channels != 3 or any("mask" in data for _, data in views):
             return None
-        level, update = pipeline.resolution.at(step), RepeatedUpdate(self._optimizers)
-        kind = model.kind_of_step(width, height, indices, reduced=level > 1)
+        update = RepeatedUpdate(self._optimizers)
+        kind = model.kind_of_step(width, height, indices)
         sums = {name: value for name, value in model.strategy_state.items() if isinstance(value, Tensor)}
         if kind.tile_capacity is None or not update.begun or (kind.absgrad and "grad2d" not in sums):
             return None
-        viewmats, Ks = pipeline.views.stacked_cameras(indices, level)
+        viewmats, Ks = pipeline.views.stacked_cameras(indices)
         numbers = model.numbers_of(indices)
         found = self._graph(kind, update, sums, viewmats, Ks, numbers, images)
         if found is None:

@@ -66,7 +66,6 @@ def training_size(
     params: Params,
     views: int,
     fused: bool,
-    growing: bool = False,
     processes: int = 1,
 ) -> TrainingSize:
     """Measure a run before its first step; no image is opened for it.
@@ -76,14 +75,13 @@ def training_size(
         params: The initial Gaussians of this process.
         views: Views rendered in a step.
         fused: Whether the loss is computed by our kernels.
-        growing: Whether reduced images are kept, too, as `pipeline.growing_resolution` does.
         processes: Number of processes among which the step is shared out.
     """
     cameras = datamanager.train_dataset.cameras
     largest = int((cameras.height * cameras.width).max())
     structure = 0.0
     if datamanager.config.cache_images == "gpu":
-        kept = image_bytes(datamanager, growing)
+        kept = image_bytes(datamanager)
     else:  # The images of the next step are there, too; a process has those that it composites, and codes of all.
         sizes = torch.cat([cameras.height, cameras.width], dim=-1).unique(dim=0).tolist()
         here = views  # Views of several sizes are shared out size by size, and a process may have a part of each.
@@ -96,26 +94,24 @@ def training_size(
     return TrainingSize(kept, StepSize(views, pixels, pairs, processes > 1), fused, structure)
 
 
-def image_bytes(datamanager: FullImageDatamanager, growing: bool = False) -> float:
+def image_bytes(datamanager: FullImageDatamanager) -> float:
     """Bytes of all images, held-out ones too, and of the codes of S̄ of the training images.
 
     Args:
         datamanager: Holds the cameras.
-        growing: Whether training images of half the width and height are kept, too.
     """
     train, held_out = (
         float((cameras.height * cameras.width).sum())
         for cameras in (datamanager.train_dataset.cameras, datamanager.eval_dataset.cameras)
     )  # px
-    images = train + held_out + (0.25 * train if growing else 0.0)  # px
-    return 3 * _value_bytes(datamanager) * images + CODE_BYTES * train
+    return 3 * _value_bytes(datamanager) * (train + held_out) + CODE_BYTES * train
 
 
 def _value_bytes(datamanager: FullImageDatamanager) -> int:
     return 1 if datamanager.config.cache_images_type == "uint8" else 4
 
 
-def place_images(datamanager: FullImageDatamanager, device: torch.device, growing: bool = False) -> str | None:
+def place_images(datamanager: FullImageDatamanager, device: torch.device) -> str | None:
     """Decide where the images are kept, from the memory that is there: alike in all processes of the run.
 
     Images that are asked for on the host stay compressed where each of several processes would decode all of them, and
@@ -124,12 +120,11 @@ def place_images(datamanager: FullImageDatamanager, device: torch.device, growin
     Args:
         datamanager: Its images have not been loaded yet; its configuration is changed.
         device: The device of training.
-        growing: As in `image_bytes`.
 
     Returns:
         A line for the user; None where they are kept on the device, or where the user asked for.
     """
-    config, size, sharing = datamanager.config, image_bytes(datamanager, growing), processes_on_this_machine()
+    config, size, sharing = datamanager.config, image_bytes(datamanager), processes_on_this_machine()
     host = least(memory.available_host_bytes() / sharing, device)
     if config.cache_images == "cpu":
         if number_of_processes() == 1 or size <= HOST_SHARE * host:

@@ -500,20 +500,19 @@ class SadgsModel(SplatfactoModel):
         splats = (params["means"], params["quats"], scales, opacities, colors)
         return splats, penalty, {"sh_degree": sh_degree, **self.drawing}
 
-    def kind_of_step(self, width: int, height: int, cam_indices: list[int], reduced: bool = False) -> StepKind:
+    def kind_of_step(self, width: int, height: int, cam_indices: list[int]) -> StepKind:
         """Return what the launches of this step depend on; the length of its tile lists is foreseen.
 
         Args:
             width: px.
             height: px.
             cam_indices: The views' indices among the training cameras.
-            reduced: Whether the views are smaller than their images, so that AbsGS does not read their gradients.
         """
         forecast, capacity = self.tile_forecast, None
         if forecast is not None:
             capacity = forecast.capacity(cam_indices, (width, height), self.num_points)
         opacity_reg = self.config.opacity_reg if self.step < self.strategy.windows.refine_stop_iter else 0.0
-        absgrad = not reduced and self.strategy.needs_absgrad(self.step)
+        absgrad = self.strategy.needs_absgrad(self.step)
         return StepKind(width, height, self.sh_degree_now, absgrad, opacity_reg, capacity)
 
     def render_step(
@@ -584,7 +583,6 @@ class SadgsModel(SplatfactoModel):
         height: int,
         cam_indices: list[int],
         structure_tensors: Tensor | None,
-        reduced: bool = False,
     ) -> dict[str, Tensor]:
         """Render training views of one size and let the strategy see the forward pass.
 
@@ -598,17 +596,15 @@ class SadgsModel(SplatfactoModel):
             height: px.
             cam_indices: The views' indices among the training cameras, C of them.
             structure_tensors: S̄ of the views, or codes of it, [C, H, W, 3]; None where η is not observed.
-            reduced: As in `kind_of_step`.
 
         Returns:
             `rgb` [C, H, W, 3], not clamped, and `background` [3]; while densification runs, and where the loss has that
             part, `opacity_reg`, numbers [P] whose sum is that part.
         """
-        kind, forecast = self.kind_of_step(width, height, cam_indices, reduced), self.tile_forecast
+        kind, forecast = self.kind_of_step(width, height, cam_indices), self.tile_forecast
         outputs, info = self.render_step(kind, viewmats, Ks, self.trained_params, self.numbers_of(cam_indices))
         if forecast is not None and "pair_counts" in info:  # Only our kernels count pairs.
             forecast.rendered(cam_indices, (width, height), kind.tile_capacity, info["pair_counts"])
-        info["reduced"] = reduced
         self.show_to_strategy(info, viewmats, Ks, structure_tensors)
         if self.config.color_model == "bilateral_grid":
             outputs["rgb"] = torch.stack(

@@ -18,7 +18,6 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 from scipy.spatial import KDTree
 from torch import Tensor
-from tyro.conf import Suppress
 
 from sadgs_ns import kernels
 from sadgs_ns.data.cameras import refuse_unsupported_cameras
@@ -32,7 +31,6 @@ from sadgs_ns.method.structure_tensor import ENERGY_BLUR, FREQUENCY_CONSTANT
 from sadgs_ns.plugin import nonfinite
 from sadgs_ns.plugin.cleaning_panel import CleaningPanel
 from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig, check_options
-from sadgs_ns.plugin.growing_resolution import GrowingResolution
 from sadgs_ns.plugin.memory_plan import NEAR_PLANE, fit_to_memory, place_images, training_size
 from sadgs_ns.plugin.model import NORMALS, SadgsModel, SadgsModelConfig, in_viewer
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
@@ -79,11 +77,6 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     views_per_iteration: int | None = None
     """Training views rendered for one optimizer step, at most as many as there are; the loss is their mean.
     None takes one more for every 2,000 renderings of the run, up to 4. The paper uses 1 outdoors, 2 indoors."""
-    growing_resolution: Suppress[bool] = False
-    """Whether early steps render a quarter or half the width and height while Gaussians are longer than the pixels.
-    It is not shown until it has been measured on a GPU."""
-    growing_resolution_strength: Suppress[float] = 1.0
-    """Factor on the Gaussians' lengths in that comparison: the larger, the longer images stay small."""
     memory_budget_gb: float | None = None
     """Memory of the GPU, in 10⁹ bytes, that training may take; the cap of Gaussians is lowered to it at the start.
     None is 80 % of what is free, unless `max_gaussians` was changed, which then stays."""
@@ -111,7 +104,7 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
             )
         if not 0 <= self.energy_blur <= _WIDEST_BLUR:
             raise InputError(f"pipeline.energy_blur must be in [0, {_WIDEST_BLUR}], got {self.energy_blur:g}.")
-        for name in ("epsilon", "memory_budget_gb", "growing_resolution_strength"):
+        for name in ("epsilon", "memory_budget_gb"):
             if (value := getattr(self, name)) is not None and not 0 < value < math.inf:
                 raise InputError(f"pipeline.{name} must be positive and finite, got {value:g}.")
         check_options(self.datamanager)
@@ -142,7 +135,7 @@ class SadgsPipeline(VanillaPipeline):
                 # "gpu" is the training device; nerfstudio would pin memory for CUDA with "cpu".
                 self.datamanager.config.cache_images = "gpu"
         elif config.datamanager.cache_images != "compressed" and kwargs.get("test_mode") != "inference":
-            line = place_images(self.datamanager, self.device, config.growing_resolution)
+            line = place_images(self.datamanager, self.device)
             if line is not None:
                 CONSOLE.print(line, highlight=False, soft_wrap=True)
         parsed_on = getattr(self.datamanager.dataparser.config, "alpha_color", None)
@@ -159,8 +152,6 @@ class SadgsPipeline(VanillaPipeline):
             self.model.strategy.reset_every = 0  # What was learned is not to be learned again.
         self.model.set_cameras(_positions(self.datamanager.train_dataset.cameras))
         self.views = TrainingViews(self.datamanager, self.model)
-        strength = config.growing_resolution_strength if config.growing_resolution else None
-        self.resolution = GrowingResolution(self.views, self.model, strength)
         self.structure_maps = StructureMaps(
             self.views, config.frequency_constant, energy_blur=config.energy_blur, epsilon=config.epsilon
         )
@@ -228,8 +219,7 @@ class SadgsPipeline(VanillaPipeline):
         if self.config.model.strategy.refine_stop_iter != 0:
             model, fused = self.model, self.config.model.fused and kernels.available(self.device)
             processes, views = 1 if self.shards is None else self.shards.num_ranks, self.views_per_iteration
-            growing = self.config.growing_resolution
-            size = training_size(self.datamanager, model.gauss_params, views, fused, growing, processes)  # type: ignore[arg-type]
+            size = training_size(self.datamanager, model.gauss_params, views, fused, processes)  # type: ignore[arg-type]
             try:
                 line, warning = fit_to_memory(
                     model.strategy,
@@ -260,11 +250,7 @@ class SadgsPipeline(VanillaPipeline):
         read = TrainingCallback(after_step, lambda step: self._report_nonfinite() if self.log.full else None)
         last = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self._report_at_the_end())
         # The log is read before densification makes new parameters, which have no gradients.
-        callbacks = [read, *super().get_training_callbacks(training_callback_attributes), counts, last]
-        self.resolution.start(self.views_per_iteration)  # The callbacks above told the strategy the run's length.
-        if self.resolution.level != 1:
-            callbacks.append(TrainingCallback(after_step, lambda step: self.resolution.grow(step)))
-        return callbacks
+        return [read, *super().get_training_callbacks(training_callback_attributes), counts, last]
 
     def _refuse_empty_views(self) -> None:
         """Check whether training can see anything.
@@ -360,8 +346,7 @@ class SadgsPipeline(VanillaPipeline):
         if drawn is None:
             self._repeat_overflowed()
             drawn, wants = defaultdict(list), self.model.wants_structure_tensors
-            codes, level = (wants(step), wants(step + 1)), self.resolution.at(step)
-            for index, data in self.views.draw(self.views_per_iteration, codes, level):
+            for index, data in self.views.draw(self.views_per_iteration, (wants(step), wants(step + 1))):
                 shape = data["image"].shape if self.shards is None else self.views.sizes[index]
                 drawn[shape].append((index, data))
         return drawn
@@ -369,7 +354,6 @@ class SadgsPipeline(VanillaPipeline):
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
         """Render the iteration's views and return the outputs of the last size, mean losses and mean metrics."""
         groups, observes = self.draw(step), self.model.wants_structure_tensors(step)
-        level = self.resolution.at(step)
         losses: dict[str, Tensor] = {}
         metrics: dict[str, Any] = {}
         outputs: dict[str, Any] = {}
@@ -377,12 +361,12 @@ class SadgsPipeline(VanillaPipeline):
         for (height, width, *_), views in groups.items():
             indices = [index for index, _ in views]
             tensors = _stack(self.structure_maps.of_views(views, self.shards)) if observes else None
-            viewmats, Ks = self.views.stacked_cameras(indices, level)
+            viewmats, Ks = self.views.stacked_cameras(indices)
             if self.shards is not None:
                 parts = losses_of_views(self.model, self.shards, viewmats, Ks, width, height, views, tensors)
             else:
                 batch = self._batch(views)
-                outputs = self.model.get_training_outputs(viewmats, Ks, width, height, indices, tensors, level > 1)
+                outputs = self.model.get_training_outputs(viewmats, Ks, width, height, indices, tensors)
                 parts = self.model.get_loss_dict(outputs, batch), self.model.get_metrics_dict(outputs, batch)
             weight = len(views) / self.views_per_iteration
             for total, part in zip((losses, metrics), parts, strict=True):
@@ -497,8 +481,7 @@ class SadgsPipeline(VanillaPipeline):
         strategy = asdict(self.config.model.strategy)
         hidden = ("fused", "run_length", "shards")
         settings = {f"model.strategy.{name}": strategy[name] for name in strategy if name not in hidden}
-        resolution = ("growing_resolution", "growing_resolution_strength")
-        own = {name: getattr(self.config, name) for name in ("views_per_iteration", "memory_budget_gb", *resolution)}
+        own = {name: getattr(self.config, name) for name in ("views_per_iteration", "memory_budget_gb")}
         return {**own, **settings}
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -515,7 +498,6 @@ class SadgsPipeline(VanillaPipeline):
             "settings": self._settings(),
             "schedule": {**asdict(self.schedule), "effort": self.config.effort},
             "max_gaussians": self.model.strategy.max_gaussians,  # It may be lower than the setting.
-            "resolution_level": self.resolution.level,
             "images": [path.name for path in self.datamanager.train_dataset.image_filenames],
             "camera_positions": _positions(self.datamanager.train_dataset.cameras),
         }
@@ -542,8 +524,6 @@ class SadgsPipeline(VanillaPipeline):
             self._checkpoint_cap = state.get("max_gaussians")
         if "images" in state:  # Earlier versions did not save it.
             self.checkpoint_views = state["images"], state["camera_positions"]
-        if before.get("growing_resolution"):  # Otherwise the Gaussians decide where it is on now.
-            self.resolution.level = state["resolution_level"]
         torch.set_rng_state(state["torch"].cpu())
         if max(state["view_order"], default=0) < len(self.datamanager.train_dataset):
             self.datamanager.train_unseen_cameras = list(state["view_order"])

@@ -81,7 +81,6 @@ def check(config: CheckedTrainerConfig) -> None:
     for name, given, remedy in (
         ("pipeline.model.color_model", model.color_model not in ("none", "auto"), "set it to none"),
         ("pipeline.model.camera_optimizer.mode", model.camera_optimizer.mode != "off", "set it to off"),
-        ("pipeline.growing_resolution", config.pipeline.growing_resolution, "leave it off"),
         ("start_paused", config.start_paused, "leave it off, since the viewer is off, too"),
         ("pipeline.model.fused", not model.fused and machine.device_type == "cuda", "leave it on"),
     ):

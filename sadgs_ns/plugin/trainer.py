@@ -123,12 +123,11 @@ class SadgsTrainer(Trainer):
         views, asked, taken = len(cameras), config.pipeline.views_per_iteration, schedule.views_per_iteration
         megapixels = float((cameras.height * cameras.width).double().mean()) / 1e6
         done = f", of which {self._start_step:,} are done" if self._start_step else ""
-        times, level = round(schedule.iterations * taken / views), self.pipeline.resolution.level or 1
-        reduced = f", at first in images of 1/{level} of the width and height" if level > 1 else ""
+        times = round(schedule.iterations * taken / views)
         lines = [
             f"{config.method_name} on {views:,} training views of {megapixels:.2g} megapixels: "
             f"{schedule.iterations:,} iterations of {taken} view{'s' * (taken > 1)}{done}, so that each view is "
-            f"rendered about {times:,} time{'s' * (times != 1)}{reduced}."
+            f"rendered about {times:,} time{'s' * (times != 1)}."
         ]
         if self._derived:
             lines.append(

@@ -14,7 +14,6 @@ from torch import Tensor
 from sadgs_ns.data.cameras import refuse_failed_undistortion
 from sadgs_ns.distributed.bands import views_of_rank
 from sadgs_ns.distributed.shards import Shards
-from sadgs_ns.method.resolution import reduce_image, reduce_intrinsics, reduce_mask
 from sadgs_ns.plugin.image_source import ImagesAhead, refuse_non_finite, thread_count
 from sadgs_ns.plugin.model import SadgsModel
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
@@ -36,14 +35,10 @@ class TrainingViews:
         self.model = model
         self.shards: Shards | None = None
         self._next_round: tuple[Any, list[int]] = None, []  # It is drawn from this state of the random generator.
-        self._reduced: dict[tuple[int, int], dict[str, Any]] = {}
-        """Data of views with reduced images, by index and level, where the full images are on the device."""
         self._foreseen: deque[tuple[list[int], list[int]]] = deque()
         """Views of the next steps, and which of them this process composites."""
         self._steps: Iterator[list[int]] = iter(())
         """Yields the steps after these."""
-        self._reduced_Ks: dict[int, Sequence[Tensor]] = {}
-        """Intrinsics of all reduced images, by level."""
 
     def __len__(self) -> int:
         """Number of training views."""
@@ -64,9 +59,7 @@ class TrainingViews:
         cameras = self.datamanager.train_dataset.cameras
         return list(zip(cameras.height.flatten().tolist(), cameras.width.flatten().tolist(), strict=True))
 
-    def draw(
-        self, number: int, codes: tuple[bool, bool] = (False, False), level: int = 1
-    ) -> list[tuple[int, dict[str, Any]]]:
+    def draw(self, number: int, codes: tuple[bool, bool] = (False, False)) -> list[tuple[int, dict[str, Any]]]:
         """Draw the views of one step in nerfstudio's order, which is a sequence of rounds through all views.
 
         Where a round ends inside the step, the next one begins with those of its views that the step does not have yet;
@@ -76,7 +69,6 @@ class TrainingViews:
         Args:
             number: Views to draw, at least 1 and at most as many as there are.
             codes: Whether this step, and whether the next one, needs the codes of S̄.
-            level: Factor by which the sides of image and mask are divided (`method.resolution`).
 
         Returns:
             Index and data of each view; the image is on the training device, and where images travel so is the mask.
@@ -103,7 +95,7 @@ class TrainingViews:
             drawn = {index: {} for index in indices} | {i: ahead.take(i, codes[0]) for i in composited}
             ahead.load(upcoming)  # A view that was just taken may come again soon.
             ahead.send(following, codes[1])
-        return [(index, self._at_level(index, drawn[index], level)) for index in indices]
+        return [(index, drawn[index]) for index in indices]
 
     def _composited(self, indices: Sequence[int]) -> list[int]:
         """Return those of a step's views, each once, of which this process composites rows."""
@@ -111,26 +103,6 @@ class TrainingViews:
             of_step = views_of_rank([self.sizes[i] for i in indices], self.shards.num_ranks, self.shards.rank)
             indices = [indices[position] for position in of_step]
         return list(dict.fromkeys(indices))
-
-    def _at_level(self, index: int, data: dict[str, Any], level: int) -> dict[str, Any]:
-        """Return a view's data with a reduced image, and its mask if there is one.
-
-        It is kept where the full image lies on the device, so that a later visit launches nothing for it.
-        """
-        if level == 1:
-            return data
-        reduced = self._reduced.get((index, level))
-        if reduced is None:
-            reduced = {**data, "image": reduce_image(data["image"], level)}
-            if "mask" in data:
-                reduced["mask"] = reduce_mask(data["mask"].to(self.model.device), level)
-            if self.ahead is None:
-                self._reduced[index, level] = reduced
-        return reduced
-
-    def forget_reduced(self) -> None:
-        """Free the memory of reduced images, which are made again where they are drawn."""
-        self._reduced.clear()
 
     def _upcoming(self, drawn: list[int], most: int) -> tuple[list[int], list[int]]:
         """Return the views that this process will composite next, as far as they are known.
@@ -231,22 +203,13 @@ class TrainingViews:
         camera.metadata = {"cam_idx": index}
         return viewmats_from_camera_to_world(optimizer.apply_to_camera(camera))[0]
 
-    def _Ks(self, level: int) -> Sequence[Tensor]:
-        """Intrinsics in px of all training views at a level, each a tensor of its own. [3, 3]"""
-        if level == 1:
-            return self.cameras[1]
-        if level not in self._reduced_Ks:
-            self._reduced_Ks[level] = reduce_intrinsics(torch.stack(list(self.cameras[1])), level).unbind()
-        return self._reduced_Ks[level]
-
-    def stacked_cameras(self, indices: Sequence[int], level: int = 1) -> tuple[Tensor, Tensor]:
+    def stacked_cameras(self, indices: Sequence[int]) -> tuple[Tensor, Tensor]:
         """World-to-camera matrices [V, 4, 4] and intrinsics in px [V, 3, 3] of V training views.
 
         Args:
             indices: The views.
-            level: Factor by which the sides of their images are divided.
         """
-        every_K = self._Ks(level)
+        _, every_K = self.cameras
         viewmats, Ks = [self.viewmat(index) for index in indices], [every_K[index] for index in indices]
         n = len(indices)
         if n == 1:

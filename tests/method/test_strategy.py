@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from scenes import adam, camera, random_params, splat, training_step
+from scenes import adam, camera, random_params, training_step
 
 from sadgs_ns.method import strategy as strategy_module
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow
@@ -168,27 +168,6 @@ def test_keeping_all_gradients_changes_nothing():
     assert counts == same and counts[3] > 60 and counts[9] > counts[8]
     for name, parameter in plain.items():
         assert torch.equal(parameter, hoarded[name])
-
-
-@pytest.mark.parametrize("levels", [(1, 2), (2,)], ids=["beside full ones", "alone"])
-def test_gradients_of_reduced_views_are_neither_kept_nor_counted(levels: tuple[int, ...]):
-    params, strategy, step = random_params(40), short(eta_every=10), 1
-    state, optimizers, infos, losses = strategy.initialize_state(), adam(params), [], []
-    for level in levels:
-        width, height = WIDTH // level, HEIGHT // level
-        renders, _, info = splat(params, *camera(width, height), width, height, absgrad=level == 1)
-        infos.append(info | {"reduced": level > 1})
-        losses.append(renders.square().mean())
-    strategy.step_pre_backward(params, optimizers, state, step, infos)
-    torch.stack(losses).mean().backward()
-    strategy.step_post_backward(params, optimizers, state, step, infos)
-    expected = empty_gradients(40, torch.device("cpu"))
-    for info in infos:
-        assert info["means2d"].retains_grad == (not info["reduced"])
-        if not info["reduced"]:
-            accumulate_gradients(expected, info, len(levels))
-    assert (expected["grad_count"].sum() > 20) == (1 in levels)
-    assert all(torch.equal(state[name], value) for name, value in expected.items())
 
 
 def test_opacity_schedule(monkeypatch: pytest.MonkeyPatch):

@@ -271,7 +271,7 @@ def test_the_size_of_a_run_is_that_of_its_images_and_largest_step():
     size = training_size(datamanager, drawn, views=2, fused=True, processes=2)
     assert size.image_bytes == (3 + 2 * 3) * 64 * 48  # Each process has one of the images, and the codes of both.
     assert size.structure_bytes == 300 * 64 * 48
-    train.height[0] = 30  # Of two sizes each process may have a part of either.
+    train.height = torch.tensor([[30], [48], [48]])  # Of two sizes each process may have a part of either.
     assert training_size(datamanager, drawn, views=2, fused=True, processes=2).image_bytes == 2 * 6 * 64 * 48
 
 

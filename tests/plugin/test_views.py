@@ -178,7 +178,6 @@ def test_a_resumed_run_goes_on_with_the_views_of_the_run_that_was_never_stopped(
             schedule=Schedule(iterations=10, views_per_iteration=number),
             config=SimpleNamespace(effort=1.0),
             _repeat_overflowed=lambda wait: None,
-            resolution=SimpleNamespace(level=1),
         )
         state = SadgsPipeline.get_extra_state(pipeline)
         datamanager = pipeline.datamanager = Datamanager(total)
