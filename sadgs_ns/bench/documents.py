@@ -113,6 +113,9 @@ COLUMNS: dict[str, tuple[str, Callable[[Run], str]]] = {
     "psnr": ("PSNR", lambda run: run.with_spread("psnr", 2)),
     "ssim": ("SSIM", lambda run: run.with_spread("ssim", 4)),
     "lpips": ("LPIPS", lambda run: run.with_spread("lpips", 4)),
+    "cc_psnr": ("PSNR, colours fitted", lambda run: run.with_spread("cc_psnr", 2)),
+    "cc_ssim": ("SSIM, fitted", lambda run: run.with_spread("cc_ssim", 4)),
+    "cc_lpips": ("LPIPS, fitted", lambda run: run.with_spread("cc_lpips", 4)),
     "gaussians": ("Gaussians", lambda run: count(run.mean("gaussians"))),
     "peak": ("Peak GB", lambda run: run.with_spread("peak_gb", 1)),
 }

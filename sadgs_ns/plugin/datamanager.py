@@ -166,8 +166,15 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         """
         device, dataset = torch.device(self.device), self.train_dataset if split == "train" else self.eval_dataset
         on_demand = cache_images_device == "compressed"
-        room = KEPT_FILES_SHARE * available_host_bytes() / processes_on_this_machine()
-        keep = on_demand and sum(path.stat().st_size for path in dataset.image_filenames) <= room
+        # Of several processes each would come to hold all files, which the system's cache of files holds once.
+        keep = (
+            on_demand
+            and processes_on_this_machine() == 1
+            and (
+                sum(path.stat().st_size for path in dataset.image_filenames)
+                <= KEPT_FILES_SHARE * available_host_bytes()
+            )
+        )
         images = ImagesOnDemand(dataset, self.config.cache_images_type, keep)
         self.train_cameras = self.train_dataset.cameras
         if on_demand:
