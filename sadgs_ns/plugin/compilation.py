@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import TYPE_CHECKING
@@ -67,11 +66,11 @@ def compile_kernels(
 
     def tile_lists() -> None:
         # The size is the run's: whether tiles are numbered in 16 or in 32 bits depends on how many there are, and lists
-        # of a given length have one more row of them. Reduced images may have few tiles where full ones have many.
+        # of a given length have one more row of them.
         width, height = int(cameras.width.max()), int(cameras.height.max())
-        for level, capacity in itertools.product({1, pipeline.resolution.level or 1}, (None, 2**20)):
+        for capacity in (None, 2**20):
             rasterize(
-                means, quats, scales, opacities, means, viewmats, Ks, width // level, height // level,
+                means, quats, scales, opacities, means, viewmats, Ks, width, height,
                 tile_capacity=capacity, max_off_axis=config.max_off_axis,
             )  # fmt: skip
 

@@ -533,16 +533,18 @@ def test_images_with_other_names_at_the_same_cameras_are_told_of(
 ):
     config.load_dir = finished
     trainer = set_up(config)
+    known = trainer.pipeline.checkpoint_views
+    assert known is not None
     assert "same cameras" not in capsys.readouterr().out
     files: Any = trainer.pipeline.datamanager.train_dataset.image_filenames
     files[:] = [path.with_name(f"of_another_{path.name}") for path in files]
-    trainer.pipeline.refuse_other_capture(*trainer.pipeline.checkpoint_views)
+    trainer.pipeline.refuse_other_capture(*known)
     line = one_line(capsys.readouterr().out, "The checkpoint's run")
     assert line.endswith(
         "(001.png and of_another_001.png are the first): the Gaussians fit only if the images were renamed."
     )
     files[:] = [path.with_name(path.name.removeprefix("of_another_")).with_suffix(".jpg") for path in files]
-    trainer.pipeline.refuse_other_capture(*trainer.pipeline.checkpoint_views)
+    trainer.pipeline.refuse_other_capture(*known)
     assert "same cameras" not in capsys.readouterr().out
 
 
