@@ -91,12 +91,12 @@ class Interrupts:
         for another in self._previous.keys() - self._repeated:
             signal.signal(another, self._previous[another])
         if number == HANG_UP:
-            _drop_lost_output()
+            drop_lost_output()
         if self._waiting():
             self.poll()
 
 
-def _drop_lost_output() -> None:
+def drop_lost_output() -> None:
     """Discard output to a terminal or pipe that is gone, since printing there would raise before the run is saved."""
     for descriptor in (1, 2):
         if not os.isatty(descriptor) and not stat.S_ISREG(os.fstat(descriptor).st_mode):

@@ -27,7 +27,7 @@ from sadgs_ns.plugin.config import CheckedTrainerConfig
 from sadgs_ns.plugin.earlier_run import start_from
 from sadgs_ns.plugin.exposure import choose_color_model
 from sadgs_ns.plugin.graphed_steps import GraphedSteps
-from sadgs_ns.plugin.interrupts import SIGNALS, Interrupted, Interrupts
+from sadgs_ns.plugin.interrupts import HANG_UP, SIGNALS, Interrupted, Interrupts, drop_lost_output
 from sadgs_ns.plugin.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig, SadgsOptimizers
 from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.plugin.progress import about_cpu, remove_tables, what_next
@@ -419,6 +419,8 @@ class SadgsTrainer(Trainer):
             file = config.write() if processes.is_first() else self.base_dir / "config.yml"
             command = shlex.join(["ns-train", str(config.method_name), "--load-config", str(file)])
             text = f"{interrupted}: stopped and saved after {done} of {total} iterations; resume with: {command}"
+        if interrupted.number == HANG_UP:  # Some systems send it before they take the terminal away.
+            drop_lost_output()
         CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
         if self.shards is not None:
             self.shards.all(True)  # What starts the processes ends all as soon as one has ended.
