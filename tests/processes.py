@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -76,6 +77,7 @@ def in_terminal(terminal: str, code: str, environment: Mapping[str, str]) -> Non
         code: The program.
         environment: Its environment, but for the GPUs.
     """
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # Where the tests run under nohup, it is ignored, and would be here.
     os.setsid()
     descriptor = os.open(terminal, os.O_RDWR)  # It becomes the controlling one, since the process has none.
     for standard in (0, 1, 2):

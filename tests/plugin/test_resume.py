@@ -285,6 +285,12 @@ def test_a_write_that_fails_before_the_hang_up_comes_does_not_hide_it(
     assert checkpoints(trainer) == ["step-000000003.ckpt"]
 
 
+def in_terminal_under_nohup(*arguments: Any) -> None:
+    """Force what the tests' processes inherit where pytest runs under nohup; for `processes.start`."""
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    processes.in_terminal(*arguments)
+
+
 def test_a_terminal_that_is_gone_costs_nothing_that_was_trained(scene: Path, tmp_path: Path):
     """As where ssh is cut off: the run loses the terminal that it prints to, and is sent SIGHUP."""
     ours, theirs = os.openpty()
@@ -292,7 +298,7 @@ def test_a_terminal_that_is_gone_costs_nothing_that_was_trained(scene: Path, tmp
     script += f"config = configure(Path({str(scene)!r}), Path({str(tmp_path)!r}), 5000, save_every=0)\n"
     script += "config.logging.local_writer.enable, config.pipeline.model.strategy.refine_stop_iter = True, 0\n"
     script += "trainer = set_up(config); trainer.train()\n"
-    process = processes.start(processes.in_terminal, os.ttyname(theirs), script, dict(os.environ))
+    process = processes.start(in_terminal_under_nohup, os.ttyname(theirs), script, dict(os.environ))
     try:
         printed = b""
         while b"10 (0.20%)" not in printed:  # a line of the table of progress
