@@ -43,7 +43,7 @@ KILL_SECONDS = 10.0
 
 COMMANDS = {
     "report": ("report", "the plots and the page of a results file"),
-    "documents": ("documents", "the tables of README and docs, from the rows of docs/results"),
+    "documents": ("documents", "the tables of README and docs, and some figures, from the rows of docs/results"),
     "kernels": ("approximations", "what each shortcut in the frequency analysis gets wrong, beside what it costs"),
     "step": ("step", "the parts of a training step, with and without our Triton kernels (CUDA)"),
     "parts": ("parts", "the parts of a training step of a finished run, each by itself (CUDA)"),

@@ -33,12 +33,12 @@ def documents() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="sadgs-bench documents",
         description="Write the tables that stand between `<!-- table: NAME -->` and `<!-- end -->` in README.md and "
-        "docs/*.md, as docs/results/tables.yaml describes them, from the rows in docs/results.",
+        "docs/*.md, and figures, as docs/results/tables.yaml describes them, from the rows in docs/results.",
     )
     parser.add_argument(
         "checkout", type=Path, nargs="?", default=Path(), help="folder of README.md and docs (default: this one)"
     )
-    parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 if a table is not as its rows")
+    parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 if one is not as its rows")
     return parser
 
 

@@ -1,4 +1,4 @@
-"""`sadgs-bench documents`: the tables of README.md and docs/*.md, from the rows in docs/results.
+"""`sadgs-bench documents`: the tables of README.md and docs/*.md, and some figures, from the rows in docs/results.
 
 A table stands between `<!-- table: NAME -->` and `<!-- end -->`. What it is made of is in docs/results/tables.yaml:
 
@@ -16,8 +16,15 @@ A table stands between `<!-- table: NAME -->` and `<!-- end -->`. What it is mad
         scenes: {fox: [fox], castle: [castle, castle-2]}   # a column each, of the mean of these scenes
       storage: {kind: approximations, rows: approximations.jsonl, table: structure_tensor, input: demo}
       growth: {kind: growth, rows: growth.csv}
+    figures:
+      peers-time:               # docs/figures/peers-time.png, quality against the field `cost`, a run a point
+        cost: loop_seconds
+        parts: [{rows: peers.jsonl, scenes: [fox], labels: {splatfacto: splatfacto}}]
+        elsewhere: [{rows: ours.jsonl, scenes: [fox], labels: {ours: sadgs}}]
 
-Labels are those of the rows, with the name that the table gives them.
+Labels are those of the rows, with the name that the table gives them, or the figure, where names of one method begin
+with the same word. A figure holds the points that it was drawn from, which are compared, since pixels depend on
+matplotlib's version.
 """
 
 from __future__ import annotations
@@ -35,12 +42,14 @@ from typing import Any
 import yaml
 
 from sadgs_ns.atomic import atomic_path
-from sadgs_ns.bench import approximations, command_lines
+from sadgs_ns.bench import approximations, command_lines, plots
 from sadgs_ns.bench.results import Result
 from sadgs_ns.bench.table import grid, half_range, mean
 
 RESULTS = Path("docs", "results")
 """Folder of the rows, in a checkout."""
+FIGURES = Path("docs", "figures")
+"""Folder of the figures, in a checkout."""
 TABLES = "tables.yaml"
 NOTHING = "–"
 _MARKED = re.compile(r"^<!-- table: (\S+) -->\n(.*?)^<!-- end -->$", re.MULTILINE | re.DOTALL)
@@ -109,6 +118,8 @@ COLUMNS: dict[str, tuple[str, Callable[[Run], str]]] = {
     "photos": ("Scene: training views", Run.photos),
     "method": ("Method", lambda run: run.name),
     "loop": ("Loop s", lambda run: run.with_spread("loop_seconds", 1)),
+    "seconds": ("Loop s", lambda run: number(run.mean("loop_seconds"), 0 if run.mean("loop_seconds") >= 100 else 1)),
+    "date": ("Date", lambda run: run.group[0]["date"].split("T")[0]),
     "ratio": ("Ratio", Run.ratio),
     "psnr": ("PSNR", lambda run: run.with_spread("psnr", 2)),
     "ssim": ("SSIM", lambda run: run.with_spread("ssim", 4)),
@@ -120,7 +131,7 @@ COLUMNS: dict[str, tuple[str, Callable[[Run], str]]] = {
     "peak": ("Peak GB", lambda run: run.with_spread("peak_gb", 1)),
 }
 """Header and cell of each column of a table of runs."""
-_WORDS = ("scene", "photos", "method")
+_WORDS = ("scene", "photos", "method", "date")
 
 
 @dataclass(frozen=True)
@@ -149,21 +160,51 @@ class Runs:
 
     def text(self, folder: Path, megapixels: Mapping[str, float]) -> str:
         """The table as Markdown, from the rows in a folder."""
-        runs = []
-        for part in (described(Part, line) for line in self.lines):
-            found = grouped(folder, [part.rows])
-            for scene in part.scenes:
-                base = [] if part.reference is None else group_of(found, scene, part.reference)
-                runs += [
-                    Run(scene, megapixels.get(scene), name, group_of(found, scene, label), base)
-                    for label, name in part.labels.items()
-                ]
+        runs = [run for line in self.lines for run in runs_of(line, folder, megapixels)]
         for name in self.columns:
             if name not in COLUMNS:
                 raise ValueError(f"there is no column {name!r}; there are {', '.join(COLUMNS)}.")
         lines = ([COLUMNS[name][1](run) for name in self.columns] for run in runs)
         words = sum(name in _WORDS for name in self.columns)
         return grid([COLUMNS[name][0] for name in self.columns], lines, words)
+
+
+def runs_of(line: Mapping[str, Any], folder: Path, megapixels: Mapping[str, float]) -> list[Run]:
+    """The runs of a `Part`."""
+    part = described(Part, line)
+    found, runs = grouped(folder, [part.rows]), []
+    for scene in part.scenes:
+        base = [] if part.reference is None else group_of(found, scene, part.reference)
+        runs += [
+            Run(scene, megapixels.get(scene), name, group_of(found, scene, label), base)
+            for label, name in part.labels.items()
+        ]
+    return runs
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A plot of the ends of runs: quality against a cost."""
+
+    cost: str
+    """The field on the horizontal axis, one of `plots.COSTS`."""
+    parts: Sequence[Mapping[str, Any]]
+    """Of `Part`: runs on one machine."""
+    elsewhere: Sequence[Mapping[str, Any]] = ()
+    """Of `Part`: runs on others, drawn hollow."""
+
+    def files(self) -> list[str]:
+        """Names of the files that the figure is made of."""
+        return [line["rows"] for line in (*self.parts, *self.elsewhere)]
+
+    def points(self, folder: Path) -> list[plots.Point]:
+        """What is drawn, from the rows in a folder."""
+        runs = [(run, here) for here in (True, False) for line in (self.parts if here else self.elsewhere)
+                for run in runs_of(line, folder, {})]  # fmt: skip
+        return [
+            plots.Point(run.name, here, *(run.mean(field) for field in (self.cost, *plots.PEER_METRICS)))
+            for run, here in runs
+        ]
 
 
 @dataclass(frozen=True)
@@ -259,6 +300,7 @@ class Catalogue:
     megapixels: Mapping[str, float]
     """Of an image of each scene."""
     tables: Mapping[str, Table]
+    figures: Mapping[str, Figure] = dataclasses.field(default_factory=dict)
 
 
 def described(kind: type, content: Any) -> Any:
@@ -268,7 +310,7 @@ def described(kind: type, content: Any) -> Any:
         ValueError: It is no mapping of them.
     """
     fields = [field.name for field in dataclasses.fields(kind)]
-    needed = {field.name for field in dataclasses.fields(kind) if field.default is dataclasses.MISSING}
+    needed = {f.name for f in dataclasses.fields(kind) if f.default is f.default_factory is dataclasses.MISSING}
     if not isinstance(content, dict) or not needed <= content.keys() <= set(fields):
         raise ValueError(f"{content!r} must be a mapping of {', '.join(fields)}.")
     return kind(**content)
@@ -288,7 +330,8 @@ def read_catalogue(path: Path) -> Catalogue:
             if kind not in KINDS:
                 raise ValueError(f"table {name}: kind is {kind!r}; give one of {', '.join(KINDS)}.")
             tables[name] = described(KINDS[kind], table)
-        return Catalogue(content["megapixels"], tables)
+        figures = {name: described(Figure, figure) for name, figure in content.get("figures", {}).items()}
+        return Catalogue(content["megapixels"], tables, figures)
     except OSError as error:
         raise ValueError(f"{path} cannot be read ({error.strerror}); give the folder of a checkout.") from error
     except (AttributeError, TypeError) as error:
@@ -365,14 +408,14 @@ def _difference(cell: Sequence[list[Result]], base: Sequence[list[Result]]) -> s
 
 
 def write(checkout: Path, check: bool = False) -> list[str]:
-    """Write the tables of a checkout's documents, none where one of them is described wrongly.
+    """Write the tables and figures of a checkout's documents, none where one of them is described wrongly.
 
     Args:
         checkout: Folder of README.md and docs.
         check: Write nothing.
 
     Returns:
-        `DOCUMENT: table NAME` of each table that is not what its rows give, or was not.
+        `DOCUMENT: table NAME` of each table that is not what its rows give, or was not, and files of such figures.
 
     Raises:
         ValueError: A table without description, rows or end, a description without a table, or rows that no table has.
@@ -407,14 +450,27 @@ def write(checkout: Path, check: bool = False) -> list[str]:
         texts[path] = _MARKED.sub(replaced, text)
     if spare := catalogue.tables.keys() - used:
         raise ValueError(f"{folder / TABLES}: no document holds {', '.join(sorted(spare))}; delete what none needs.")
-    cited = {TABLES, *(file for table in catalogue.tables.values() for file in table.files())}
+    drawn = {}
+    for name, figure in catalogue.figures.items():
+        path = checkout / FIGURES / f"{name}.png"
+        try:
+            points = figure.points(folder)
+            if plots.drawn_points(path) != plots.as_text(figure.cost, points):
+                drawn[path] = (figure.cost, points)
+        except (ValueError, AttributeError, KeyError, TypeError) as error:
+            raise ValueError(f"{folder / TABLES}: figure {name}: {error}") from error
+    made = (*catalogue.tables.values(), *catalogue.figures.values())
+    cited = {TABLES, *(file for one in made for file in one.files())}
     if spare := {path.name for path in folder.iterdir()} - cited:
         raise ValueError(f"{folder}: no table is made of {', '.join(sorted(spare))}; delete what none needs.")
     for path, text in {} if check else texts.items():
         if text != path.read_text("utf-8"):
             with atomic_path(path) as partial:
                 partial.write_text(text, "utf-8")
-    return changed
+    for path, (cost, points) in {} if check else drawn.items():
+        with atomic_path(path) as partial:
+            plots.save_peers(cost, points, partial)
+    return [*changed, *map(str, drawn)]
 
 
 def main(argv: Sequence[str] | None = None) -> int:

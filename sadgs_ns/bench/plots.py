@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import itertools
+import json
 import math
 import textwrap
 from collections.abc import Iterable, Sequence
@@ -21,7 +22,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.text import Annotation
 from matplotlib.ticker import EngFormatter, Formatter, FuncFormatter, LogLocator, MaxNLocator, NullLocator
+from matplotlib.transforms import Bbox
+from PIL import Image
 
 from sadgs_ns.bench.results import Result
 from sadgs_ns.bench.table import mean
@@ -31,6 +35,10 @@ Groups = dict[tuple[str, str], list[Result]]
 
 METRICS = {"psnr": ("PSNR [dB]", True), "ssim": ("SSIM", True), "lpips": ("LPIPS", False)}
 """Axis title, and whether higher is better."""
+COSTS = {"loop_seconds": "Training loop [s]   (← less is better)", "gaussians": "Gaussians   (← fewer is better)"}
+"""Fields that quality is drawn against, with the title of their axis."""
+PEER_METRICS = ("psnr", "lpips")
+"""The fields of METRICS that `peers` draws, in the order of `Point`."""
 STAGES = {
     "import_seconds": "import",
     "setup_seconds": "setup",
@@ -99,6 +107,23 @@ class Style:
         """Arguments of `Axes.plot`."""
         looks = {"color": self.color, "marker": self.marker, "fillstyle": self.fill, "linestyle": self.line}
         return {**looks, "markerfacecoloralt": "white", **changes}
+
+
+class Point(NamedTuple):
+    """The end of a run, as `peers` draws it."""
+
+    name: str
+    """Its first word is that of the method."""
+    here: bool
+    """Whether it ran on the machine that most points share."""
+    cost: float
+    psnr: float
+    lpips: float
+
+    @property
+    def method(self) -> str:
+        """What points of one look have in common."""
+        return self.name.split()[0].rstrip(",")
 
 
 class Growth(NamedTuple):
@@ -260,6 +285,76 @@ def growth(rows: Sequence[Growth]) -> Figure:
     right.set_xlabel("Pixels")
     left.legend()
     return figure
+
+
+@_styled
+def peers(cost: str, points: Sequence[Point]) -> Figure:
+    """PSNR and LPIPS against a cost on a logarithmic axis, each point with its name; those of other machines hollow.
+
+    Args:
+        cost: Field that the points' cost is, of COSTS.
+    """
+    figure = Figure(figsize=(_WIDTH, 3.0))
+    panels = {("", metric): axes for metric, axes in zip(PEER_METRICS, figure.subplots(1, 2), strict=True)}
+    looks = styles(point.method for point in points)
+    for (_, metric), axes in panels.items():
+        for point in points:
+            look = looks[point.method].line2d(linestyle="", fillstyle="full" if point.here else "none")
+            axes.plot(point.cost, getattr(point, metric), **look)
+    _finish(panels, EngFormatter(sep=""))
+    grey: dict[str, Any] = {"color": _GREY, "marker": "o", "linestyle": ""}
+    handles = [Line2D([], [], **grey, label="on one machine")]
+    if not all(point.here for point in points):
+        handles.append(Line2D([], [], **grey, fillstyle="none", label="on other machines"))
+    _finish_figure(figure, COSTS[cost], handles, lines=False)
+    figure.draw_without_rendering()  # The panels then have their places, which names must not change.
+    for (_, metric), axes in panels.items():
+        _name_points(axes, [(point.name, point.cost, getattr(point, metric)) for point in points])
+    return figure
+
+
+def _name_points(axes: Axes, named: Sequence[tuple[str, float, float]]) -> None:
+    """Write each point's name beside it, where it covers least of other points, names and what is outside the panel."""
+    centres = (axes.transData.transform((x, y)).tolist() for _, x, y in named)
+    taken = [Bbox.from_bounds(x - 6, y - 6, 12, 12) for x, y in centres]
+    for name, x, y in named:
+        places: list[tuple[float, int, Annotation, Bbox]] = []
+        for number, (right, up) in enumerate(((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))):
+            aligned: Any = {"ha": ("center", "left", "right")[right], "va": ("center", "bottom", "top")[up]}
+            # Diagonally as far as the point's edge; in 1/72 in.
+            offset = (right * (6 if not up else 4), up * (6 if not right else 4))
+            text = axes.annotate(name, (x, y), offset, textcoords="offset points", in_layout=False, **aligned)
+            box = text.get_window_extent()
+            covered = sum(_area(Bbox.intersection(box, other)) for other in taken)
+            places.append((covered + _area(box) - _area(Bbox.intersection(box, axes.bbox)), number, text, box))
+        places.sort(key=lambda place: place[:2])
+        taken.append(places[0][3])
+        for _, _, text, _ in places[1:]:
+            text.remove()
+
+
+def _area(box: Bbox | None) -> float:
+    return 0.0 if box is None else box.width * box.height
+
+
+def as_text(cost: str, points: Sequence[Point]) -> str:
+    """What `peers` draws, for a file to say of what it was drawn."""
+    return json.dumps([cost, *points])
+
+
+def drawn_points(path: Path) -> str | None:
+    """What `as_text` gave when a file was drawn; None if there is no such file, or it does not say."""
+    if not path.exists():
+        return None
+    with Image.open(path) as image:
+        return image.info.get("Description")
+
+
+@_styled
+def save_peers(cost: str, points: Sequence[Point], path: Path) -> None:
+    """Write `peers` as PNG (200 dpi), which holds `as_text`."""
+    metadata = {"Software": None, "Description": as_text(cost, points)}
+    peers(cost, points).savefig(path, format="png", dpi=200, metadata=metadata)
 
 
 @_styled

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
-from sadgs_ns.bench import documents
+from sadgs_ns.bench import documents, plots
 
 OPENING, CLOSING = "<!-- table: {} -->", "<!-- end -->"
 SWEEP = {
@@ -126,6 +126,63 @@ def test_approximations_and_growth_are_printed_as_their_commands_do(tmp_path: Pa
     assert text.count("| 1 sample | 10 % | 20 % | 30 % | 0 % | 1,234 |") == 2
     assert text.count("| 4 samples | 10 % | 20 % | 30 % | 0 % | – |") == 1
     assert "| 100,000 | 2 | 2.00 | 5.00 | 2.5 |\n| 1,000,000 | 2 | 3.00 | 9.00 | 3.0 |\n| 1,000,000 | 0.3 |" in text
+
+
+FIGURE = {
+    "cost": "loop_seconds",
+    "parts": [{"rows": "runs.jsonl", "scenes": ["fox"], "labels": {"slow": "theirs 30k", "ours": "ours"}}],
+    "elsewhere": [{"rows": "runs.jsonl", "scenes": ["tree"], "labels": {"ours": "ours"}}],
+}
+
+
+def test_a_figure_is_drawn_from_its_rows_and_drawn_anew_only_when_they_change(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    folder = checkout(tmp_path, {"main": RUNS}, {"runs.jsonl": ROWS["runs.jsonl"]})
+    described = folder / documents.RESULTS / documents.TABLES
+    described.write_text(
+        described.read_text("utf8") + yaml.safe_dump({"figures": {"peers": FIGURE}}, sort_keys=False), "utf8"
+    )
+    path = folder / documents.FIGURES / "peers.png"
+    assert documents.main([str(folder), "--check"]) == 1 and not path.exists()
+    assert documents.main([str(folder)]) == 0
+    points = [["theirs 30k", True, 250.0, 29.0, 0.1], ["ours", True, 10.5, 30.5, 0.1], ["ours", False, 10.0, 30.0, 0.1]]
+    assert json.loads(plots.drawn_points(path) or "") == ["loop_seconds", *points]
+    assert documents.main([str(folder), "--check"]) == 0
+    rows = folder / documents.RESULTS / "runs.jsonl"
+    rows.write_text(rows.read_text("utf8").replace("250.0", "251.0"), "utf8")
+    written = path.read_bytes()
+    capsys.readouterr()
+    assert documents.main([str(folder), "--check"]) == 1 and path.read_bytes() == written
+    assert f"{path} is not what its rows give; run sadgs-bench documents." in capsys.readouterr().out
+    assert documents.main([str(folder)]) == 0 and path.read_bytes() != written
+
+
+WRONG_FIGURES: dict[str, tuple[Any, str]] = {
+    "an unknown cost": ({**FIGURE, "cost": "price"}, "fox/slow/0 has no price"),
+    "an unknown label": (
+        {**FIGURE, "elsewhere": [{**FIGURE["parts"][0], "labels": {"none": "none"}}]},
+        "no row 'none'",
+    ),
+    "a missing key": ({"cost": "loop_seconds"}, "must be a mapping of cost, parts, elsewhere"),
+    "a list": ([FIGURE], "must be a mapping"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_FIGURES)
+def test_a_figure_that_is_described_wrongly_is_one_sentence(
+    case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    figure, sentence = WRONG_FIGURES[case]
+    folder = checkout(tmp_path, {"main": RUNS}, {"runs.jsonl": ROWS["runs.jsonl"]})
+    described = folder / documents.RESULTS / documents.TABLES
+    described.write_text(
+        described.read_text("utf8") + yaml.safe_dump({"figures": {"peers": figure}}, sort_keys=False), "utf8"
+    )
+    assert documents.main([str(folder)]) == 2
+    error = capsys.readouterr().err
+    assert sentence in error and error.count("\n") == 1
+    assert not (folder / documents.FIGURES).exists() and "fox" not in (folder / "README.md").read_text("utf8")
 
 
 def test_check_finds_what_changed_and_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

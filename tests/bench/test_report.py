@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.text import Annotation
 from PIL import Image
 
 from sadgs_ns.bench import plots, report, table, views
@@ -374,3 +375,27 @@ def test_images_that_cannot_be_compared_are_named(tmp_path: Path):
     (tmp_path / faithful[0]).write_text("no image")
     with pytest.raises(ValueError, match=r"a\.png is not an image that can be read"):
         views.compare(groups, tmp_path, tmp_path / "out", count=2)
+
+
+def test_names_of_points_stand_inside_beside_their_points_and_apart():
+    points = [
+        plots.Point("theirs 30k", True, 300, 30.0, 0.2),
+        plots.Point("theirs, faster", True, 12, 31.8, 0.196),
+        plots.Point("ours", False, 11, 31.9, 0.185),
+        plots.Point("ours, earlier", True, 30, 31.9, 0.19),
+    ]
+    figure = plots.peers("loop_seconds", points)
+    assert [axes.get_ylabel()[:4] for axes in figure.axes] == ["PSNR", "LPIP"]
+    for axes in figure.axes:
+        texts = [text for text in axes.texts if isinstance(text, Annotation)]
+        assert [text.get_text() for text in texts] == [point.name for point in points]
+        boxes = [text.get_window_extent() for text in texts]
+        centres = axes.transData.transform([text.xy for text in texts])
+        for number, box in enumerate(boxes):
+            assert axes.bbox.containsx(box.x0) and axes.bbox.containsx(box.x1)
+            assert not any(box.contains(*centre) for centre in centres)
+            assert not any(box.overlaps(other) for other in boxes[:number])
+            assert np.abs(np.clip(centres[number], box.min, box.max) - centres[number]).max() < 20
+    lines = figure.axes[0].lines
+    assert [line.get_fillstyle() for line in lines] == ["full", "full", "none", "full"]
+    assert lines[0].get_marker() == lines[1].get_marker() != lines[2].get_marker() == lines[3].get_marker()
