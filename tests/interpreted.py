@@ -72,9 +72,6 @@ def use_our_rasterizer(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rasterization, "kernels", SimpleNamespace(available=lambda device: True))
     monkeypatch.setattr(gsplat_internals, "project", project)
     monkeypatch.setattr(compositing, "rasterize_to_pixels", composite)
-    of_tiles, of_harmonics = (
-        ((tiles, "_LANES"), (tiles, "_PAIR_LANES")),
-        ((harmonics, "_LANES"), (harmonics, "_BACKWARD_LANES")),
-    )
-    for module, name in (*of_tiles, *of_harmonics, (projection, "_LANES")):
+    lanes = [(tiles, "_LANES"), (harmonics, "_LANES"), (harmonics, "_BACKWARD_LANES"), (projection, "_LANES")]
+    for module, name in lanes:
         monkeypatch.setattr(module, name, 1024)  # The interpreter runs one program after the other.

@@ -22,9 +22,11 @@ from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.limits import check_pairs
 
 _LANES = 32
-"""Gaussians whose tiles one program counts: one warp of them, so that a large Gaussian holds up only 31 others."""
-_PAIR_LANES = 64
-"""Pairs that one program lists, which is one warp."""
+"""Gaussians that one program handles: one warp of them, so that a large Gaussian holds up only 31 others."""
+_FEW_TILES = 64
+"""Largest number of tiles in a Gaussian's rectangle of tiles that a lane lists alone. All lanes of a program list the
+rows of a larger one together: a Gaussian may reach all of an image's tiles, which would take a lane longer than the
+whole rest of a step."""
 _ORDER_LANES = 512
 """Pairs or tiles that one program handles where the lists are put in order."""
 
@@ -119,61 +121,89 @@ def _count(
     tl.store(counts + g, count, g < n)
 
 
+@triton.jit
+def _pick(values, this):
+    """Return the one value where `this` is true."""
+    return tl.sum(tl.where(this, values, 0))
+
+
 @triton.jit(
-    do_not_specialize=[
-        "n", "num_gaussians", "num_pairs", "num_tiles", "tile_width", "tile_height", "rows_per_view", "halvings"
-    ]
-)  # fmt: skip
+    do_not_specialize=["n", "num_gaussians", "num_pairs", "num_tiles", "tile_width", "tile_height", "rows_per_view"]
+)
 def _list(
     means2d, radii, conics, opacities, order, ends, tiles, ids,
-    n, num_gaussians, num_pairs, num_tiles, tile_width, tile_height, rows_per_view, halvings,
-    PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr, LANES: tl.constexpr,
+    n, num_gaussians, num_pairs, num_tiles, tile_width, tile_height, rows_per_view,
+    PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr, LANES: tl.constexpr, FEW: tl.constexpr,
 ):  # fmt: skip
-    """Write the tile and the Gaussian of LANES pairs, the nearest Gaussians first.
+    """Write the tile and the Gaussian of each pair, the nearest Gaussians first.
 
-    Each lane finds the Gaussian of its pair by bisection of `ends`, and the pair's tile by counting that Gaussian's
-    rows of tiles. So lanes have equally much to do however the Gaussians differ in size, and write side by side.
+    A Gaussian whose rectangle has more than FEW tiles is listed by all lanes, of which each takes a row.
 
     The rest of the `num_pairs` places is given to the last tile. If there are more pairs than places, this tile gets
     all places, and all radii become 0: nothing is drawn, and nobody counts the views.
     """
-    at = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
+    lane = tl.program_id(0) * LANES + tl.arange(0, LANES)
+    exists = lane < n
     needed = tl.load(ends + n - 1)
     fits = needed <= num_pairs
-    listed = (at < needed) & fits
-    low = tl.zeros([LANES], tl.int32)
-    high = low + n
-    for _ in range(tl.where(fits, halvings, 0)):
-        middle = low + (high - low) // 2
-        searching = listed & (low < high)
-        before = tl.load(ends + middle, searching, 0) <= at
-        low = tl.where(searching & before, middle + 1, low)
-        high = tl.where(searching & ~before, middle, high)
-    g = tl.load(order + low, listed, 0).to(tl.int32)
-    left = (at - tl.load(ends + low - 1, listed & (low > 0), 0)).to(tl.int32)
-    x, y, a, b, c, level, determinant, proper, first_column, last_column, row, last_row = _load_ellipse(
-        means2d, radii, conics, opacities, g, listed, tile_width, tile_height, PER_GAUSSIAN, TILE
+    g = tl.load(order + lane, exists, 0).to(tl.int32)
+    at = tl.load(ends + lane - 1, exists & (lane > 0), 0)
+    x, y, a, b, c, level, determinant, proper, first_column, last_column, first_row, last_row = _load_ellipse(
+        means2d, radii, conics, opacities, g, exists, tile_width, tile_height, PER_GAUSSIAN, TILE
     )
-    column = first_column
-    searching = listed
-    while tl.max(searching.to(tl.int32)) > 0:
+    for i in tl.static_range(PER_GAUSSIAN):
+        tl.store(radii + PER_GAUSSIAN * g + i, 0, exists & (needed > num_pairs))
+    last_row = tl.where(fits, last_row, first_row)
+    row_of_view = g // num_gaussians * rows_per_view
+    many = (last_row - first_row).to(tl.int64) * (last_column - first_column) > FEW
+    small_end = tl.where(many, first_row, last_row)
+    place = at
+    for i in range(tl.max(small_end - first_row)):
+        row = first_row + i
         first, last = _columns_of_row(
             row, x, y, a, b, c, level, determinant, proper, first_column, last_column, TILE
         )  # fmt: skip
-        count = tl.maximum(last - first, 0)
-        column = tl.where(searching, first + tl.minimum(left, tl.maximum(count - 1, 0)), column)
-        searching = searching & (left >= count) & (row + 1 < last_row)
-        left = tl.where(searching, left - count, left)
-        row = tl.where(searching, row + 1, row)
-    tile = (g // num_gaussians * rows_per_view + row) * tile_width + column
-    tile = tl.where(listed, tile, num_tiles - 1) - 32768
-    tl.store(tiles + at, tile.to(tiles.dtype.element_ty), at < num_pairs)
-    tl.store(ids + at, g, at < num_pairs)
+        last = tl.where(row < small_end, last, first)
+        for j in range(tl.max(last - first)):
+            listed = first + j < last
+            tile = (row_of_view + row) * tile_width + first + j
+            tl.store(tiles + place, (tile - 32768).to(tiles.dtype.element_ty), listed)
+            tl.store(ids + place, g, listed)
+            place += listed.to(place.dtype)
+    index = tl.arange(0, LANES)
+    chosen = tl.min(tl.where(many, index, LANES))
+    while chosen < LANES:
+        this = index == chosen
+        gaussian, begin, one_place = _pick(g, this), _pick(first_row, this), _pick(at, this)
+        end, above = _pick(last_row, this), _pick(row_of_view, this)
+        one_x, one_y, one_a, one_b, one_c = (
+            _pick(x, this), _pick(y, this), _pick(a, this), _pick(b, this), _pick(c, this)
+        )  # fmt: skip
+        one_level, one_determinant = _pick(level, this), _pick(determinant, this)
+        one_proper = _pick(proper.to(tl.int32), this) > 0
+        one_first, one_last = _pick(first_column, this), _pick(last_column, this)
+        while begin < end:
+            row = begin + index
+            first, last = _columns_of_row(
+                row, one_x, one_y, one_a, one_b, one_c, one_level, one_determinant, one_proper, one_first, one_last,
+                TILE,
+            )  # fmt: skip
+            count = tl.where(row < end, tl.maximum(last - first, 0), 0)
+            place = one_place + tl.cumsum(count, 0) - count
+            tile = (above + row) * tile_width + first - 32768
+            for j in range(tl.max(count)):
+                listed = j < count
+                tl.store(tiles + place + j, (tile + j).to(tiles.dtype.element_ty), listed)
+                tl.store(ids + place + j, gaussian + 0 * index, listed)
+            one_place += tl.sum(count)
+            begin += LANES
+        chosen = tl.min(tl.where(many & (index > chosen), index, LANES))
     stride = tl.num_programs(0) * LANES
-    for i in range(tl.where(fits, 0, tl.cdiv(n, stride))):
-        lane = i * stride + at
-        for j in tl.static_range(PER_GAUSSIAN):
-            tl.store(radii + PER_GAUSSIAN * lane + j, 0, lane < n)
+    used = tl.where(fits, needed, 0)
+    for i in range(tl.cdiv(num_pairs - used, stride)):
+        unused = used + i * stride + lane
+        tl.store(tiles + unused, (num_tiles - 32769 + lane * 0).to(tiles.dtype.element_ty), unused < num_pairs)
+        tl.store(ids + unused, lane * 0, unused < num_pairs)
 
 
 @triton.jit(do_not_specialize=["num_pairs", "num_tiles", "of_pairs", "halvings"])
@@ -284,10 +314,10 @@ class PendingTiles:
         tiles = torch.empty(num_pairs, dtype=torch.int16 if num_tiles <= 2**16 else torch.int32, device=device)
         ids = torch.empty(num_pairs, dtype=torch.int32, device=device)
         n = len(self.order)
-        _list[cdiv(num_pairs, _PAIR_LANES),](
+        _list[cdiv(n, _LANES),](
             *self.ellipses, self.order, self.ends, tiles, ids,
-            n, n // views, num_pairs, num_tiles, columns, rows, rows_per_view, n.bit_length(),
-            self.ellipses[1].dim() - 1, self.tile_size, _PAIR_LANES, num_warps=1,
+            n, n // views, num_pairs, num_tiles, columns, rows, rows_per_view,
+            self.ellipses[1].dim() - 1, self.tile_size, _LANES, _FEW_TILES, num_warps=1,
         )  # fmt: skip
         tiles, by_tile = tiles.sort(stable=True)
         starts, ordered = ids.new_empty((views, rows_per_view, columns)), torch.empty_like(ids)

@@ -569,12 +569,12 @@ def test_more_tiles_than_16_bits_number_are_listed_as_view_by_view():
     assert torch.equal(ids, torch.cat([listed for _, listed in parts])) and len(ids) > 500
 
 
-def test_gaussians_of_any_size_are_listed_alike_however_many_pairs_a_program_has(monkeypatch):
+def test_a_gaussian_that_all_lanes_list_together_is_listed_as_by_one(monkeypatch):
     gaussians = {name: value.to(DEVICE) for name, value in projected_gaussians(2, 60, 640, 480).items()}
     gaussians["radii"][:, 1], gaussians["conics"][:, 1] = 2000, torch.tensor([1e-6, 0.0, 1e-6])  # It covers all tiles.
     found = []
-    for lanes in (32, 64, 1024):
-        monkeypatch.setattr(tiles, "_PAIR_LANES", lanes)
+    for few in (0, 64, 10**9):
+        monkeypatch.setattr(tiles, "_FEW_TILES", few)
         found.append(tiles.intersect_tiles(**gaussians, width=640, height=480, tile_size=8).lists())
     assert all(torch.equal(one, other) for lists in found[1:] for one, other in zip(found[0], lists, strict=True))
     assert all((found[0][1] == g).sum() == 80 * 60 for g in (1, 61)) and len(found[0][1]) > 2 * 80 * 60 + 500
@@ -594,7 +594,6 @@ def few_programs(monkeypatch):
     """Each program handles more Gaussians than on a GPU, since the interpreter runs one program after the other."""
     if DEVICE.type == "cpu":
         monkeypatch.setattr(tiles, "_LANES", 128)
-        monkeypatch.setattr(tiles, "_PAIR_LANES", 1024)
 
 
 @pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
