@@ -198,7 +198,7 @@ def test_a_command_in_a_block_is_understood_and_the_test_that_runs_it_is_there(c
 
 def test_the_protocol_that_is_shown_is_one():
     (shown,) = re.findall(r"^```yaml\n(.*?)^```$", (CHECKOUT / "docs/develop.md").read_text("utf8"), re.M | re.S)
-    assert len(protocol.parse(yaml.safe_load(shown)).jobs()) == 8
+    assert len(protocol.parse(yaml.safe_load(shown)).jobs()) == 12
 
 
 RUN_HERE = [command for command in COMMANDS if not (command.run_by or command.needs_gpu or command.is_foreign)]
