@@ -125,6 +125,17 @@ def test_every_test_that_a_document_names_is_there():
     assert len(named) > 100 and named <= known, named - known
 
 
+def test_the_version_and_its_date_are_the_same_wherever_they_stand():
+    patterns = {
+        "pyproject.toml": r'^version = "(.+)"$',
+        "CITATION.cff": r"^version: (.+)\ndate-released: (.+)$",
+        "CHANGELOG.md": r"^## \[Unreleased\]$(?s:.*?)^## \[(.+?)\] - (\d{4}-\d\d-\d\d)$",
+    }
+    found = {file: re.search(at, (CHECKOUT / file).read_text("utf8"), re.MULTILINE) for file, at in patterns.items()}
+    package, citation, changelog = [match.groups() for match in found.values() if match]
+    assert citation == changelog and package == changelog[:1]
+
+
 def test_the_readme_is_read_in_two_minutes():
     lines = (CHECKOUT / "README.md").read_text("utf8").splitlines()
     assert len(lines) <= 120 and max(map(len, lines)) <= 120

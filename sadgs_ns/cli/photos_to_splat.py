@@ -38,6 +38,7 @@ from sadgs_ns.data.coordinates import FRAME_KEYS, TRANSFORMS_NAME
 from sadgs_ns.errors import InputError, RunError, WriteError, free_space, reason
 from sadgs_ns.formats.files import MESH, SUFFIXES
 from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
+from sadgs_ns.plugin.lost_output import print_elsewhere_once_unread
 
 _OURS = ("data", "output-dir", "experiment-name", "timestamp", "vis", "load-dir", "load-checkpoint", "load-config")
 """Options of ns-train that this command sets."""
@@ -462,6 +463,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     written, 2 if the input is wrong, and 130, 143 or 129 after SIGINT, SIGTERM or SIGHUP.
     """
     given, console, start = _parse(sys.argv[1:] if argv is None else argv), Console(highlight=False), time.monotonic()
+    print_elsewhere_once_unread(console)
     folder: Path | None = given.output
     try:
         folder = folder or _default_folder(given.source)

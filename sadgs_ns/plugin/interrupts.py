@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import errno
-import os
 import signal
-import stat
 import threading
 import time
 from collections.abc import Callable
 from types import TracebackType
 from typing import Any
+
+from sadgs_ns.plugin.lost_output import drop_lost_output
 
 HANG_UP: int | None = getattr(signal, "SIGHUP", None)
 """The signal that says that the terminal is gone, as of an ssh that was cut off; Windows has none."""
@@ -94,12 +94,3 @@ class Interrupts:
             drop_lost_output()
         if self._waiting():
             self.poll()
-
-
-def drop_lost_output() -> None:
-    """Discard output to a terminal or pipe that is gone, since printing there would raise before the run is saved."""
-    for descriptor in (1, 2):
-        if not os.isatty(descriptor) and not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, descriptor)
-            os.close(nowhere)

@@ -27,7 +27,8 @@ from sadgs_ns.plugin.config import CheckedTrainerConfig
 from sadgs_ns.plugin.earlier_run import start_from
 from sadgs_ns.plugin.exposure import choose_color_model
 from sadgs_ns.plugin.graphed_steps import GraphedSteps
-from sadgs_ns.plugin.interrupts import HANG_UP, SIGNALS, Interrupted, Interrupts, drop_lost_output
+from sadgs_ns.plugin.interrupts import HANG_UP, SIGNALS, Interrupted, Interrupts
+from sadgs_ns.plugin.lost_output import drop_lost_output, print_elsewhere_once_unread
 from sadgs_ns.plugin.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig, SadgsOptimizers
 from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.plugin.progress import about_cpu, remove_tables, what_next
@@ -73,6 +74,7 @@ class SadgsTrainer(Trainer):
     pipeline: SadgsPipeline
 
     def __init__(self, config: SadgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
+        print_elsewhere_once_unread(CONSOLE)
         config.check()
         config = copy.copy(config)  # Where there are several processes, they agree on what the file does not say.
         self.shards, local_rank = processes.join(config, local_rank)

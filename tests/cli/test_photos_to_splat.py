@@ -112,6 +112,12 @@ def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothin
     lines = lines_of(capsys.readouterr().out)
     assert all(lines[name].endswith("; done before") for name in ("cameras", "training", "export"))
     assert before == {path: path.stat().st_mtime_ns for path in before}
+    read, written = os.pipe()
+    os.close(read)  # as of `| head` that has read enough
+    words = [sys.executable, "-W", "ignore", "-m", photos_to_splat.__name__, *command]
+    unread = subprocess.run(words, stdout=written, stderr=subprocess.PIPE, text=True)
+    os.close(written)
+    assert (unread.returncode, lines_of(unread.stderr).keys()) == (0, lines.keys()), unread.stderr
     for changed, told in (
         (["--effort", "2"], "--effort was 1.0, is 2.0"),
         (["--max-size", "160"], "--max-size was 120, is 160"),

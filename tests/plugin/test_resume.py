@@ -291,13 +291,20 @@ def in_terminal_under_nohup(*arguments: Any) -> None:
     processes.in_terminal(*arguments)
 
 
+def printing_run(scene: Path, output: Path, iterations: int) -> str:
+    """A program that trains and prints a row of the table of progress every tenth iteration."""
+    return (
+        "import sys; from pathlib import Path; from kill_and_resume import configure, set_up\n"
+        f"config = configure(Path({str(scene)!r}), Path({str(output)!r}), {iterations}, save_every=0)\n"
+        "config.logging.local_writer.enable, config.pipeline.model.strategy.refine_stop_iter = True, 0\n"
+        "trainer = set_up(config); trainer.train()\n"
+    )
+
+
 def test_a_terminal_that_is_gone_costs_nothing_that_was_trained(scene: Path, tmp_path: Path):
     """As where ssh is cut off: the run loses the terminal that it prints to, and is sent SIGHUP."""
     ours, theirs = os.openpty()
-    script = "import sys; from pathlib import Path; from kill_and_resume import configure, set_up\n"
-    script += f"config = configure(Path({str(scene)!r}), Path({str(tmp_path)!r}), 5000, save_every=0)\n"
-    script += "config.logging.local_writer.enable, config.pipeline.model.strategy.refine_stop_iter = True, 0\n"
-    script += "trainer = set_up(config); trainer.train()\n"
+    script = printing_run(scene, tmp_path, 5000)
     process = processes.start(in_terminal_under_nohup, os.ttyname(theirs), script, dict(os.environ))
     try:
         printed = b""
@@ -311,6 +318,89 @@ def test_a_terminal_that_is_gone_costs_nothing_that_was_trained(scene: Path, tmp
         process.kill()
     (path,) = tmp_path.rglob("*.ckpt")
     assert torch.load(path, weights_only=True)["step"] > 0
+
+
+def test_a_terminal_that_goes_while_the_hung_up_run_saves_hides_nothing(scene: Path, tmp_path: Path):
+    """As where the system sends SIGHUP before it takes the terminal away."""
+    ours, theirs = os.openpty()
+    saving, gone = tmp_path / "saving", tmp_path / "gone"
+    script = "import time, torch; save = torch.save\n"
+    script += f"from pathlib import Path; saving, gone = Path({str(saving)!r}), Path({str(gone)!r})\n"
+    script += "def wait_and_save(*arguments):\n"
+    script += "    saving.touch()\n    while not gone.exists(): time.sleep(0.01)\n    save(*arguments)\n"
+    script += "torch.save = wait_and_save\n" + printing_run(scene, tmp_path, 5000)
+    process = processes.start(in_terminal_under_nohup, os.ttyname(theirs), script, dict(os.environ))
+    try:
+        printed = b""
+        while b"10 (0.20%)" not in printed:
+            printed += os.read(ours, 4096)
+        os.kill(process.pid, signal.SIGHUP)
+        deadline = time.monotonic() + 60
+        while not saving.exists() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        os.close(theirs)
+        os.close(ours)
+        gone.touch()
+        process.join(60)
+        assert process.exitcode == 128 + signal.SIGHUP, printed.decode()
+    finally:
+        process.kill()
+    (path,) = tmp_path.rglob("*.ckpt")
+    config = yaml.load(path.parent.with_name("config.yml").read_text(), Loader=yaml.Loader)
+    assert config.load_dir == path.parent
+
+
+@pytest.mark.parametrize("errors", ["elsewhere", "to the same reader", "closed"])
+def test_a_run_whose_output_nobody_reads_any_more_trains_on(errors: str, scene: Path, tmp_path: Path):
+    """As with `| head`, or with `| tee log` where tee is killed."""
+    output, iterations = tmp_path / "output", 40
+    files = output, output if errors == "to the same reader" else tmp_path / "errors"
+    os.mkfifo(output)
+    script = "import os, sys; os.close(2); sys.stderr = None\n" if errors == "closed" else ""
+    script += printing_run(scene, tmp_path, iterations)
+    process = processes.start(processes.into_files, files, script, dict(os.environ))
+    try:
+        read = read_until("10 (25.00%)", output)
+        process.join(300)
+        assert process.exitcode == 0, read
+    finally:
+        process.kill()
+    (path,) = tmp_path.rglob("*.ckpt")
+    assert torch.load(path, weights_only=True)["step"] == iterations - 1
+    if errors == "elsewhere":
+        printed = files[1].read_text()
+        rows = re.findall(r"^(\d+) \(\d", printed, re.MULTILINE)
+        assert rows and rows == [str(step) for step in range(40 - 10 * len(rows), 40, 10)]
+        assert printed.count("What can be done with these") == 1
+
+
+def test_ctrl_c_that_ends_tee_as_well_costs_nothing_that_was_trained(scene: Path, tmp_path: Path):
+    """`ns-train | tee log`: both get the signal, and tee ends first."""
+    files = output, errors = tmp_path / "output", tmp_path / "errors"
+    os.mkfifo(output)
+    script = printing_run(scene, tmp_path, 5000)
+    process = processes.start(processes.into_files, files, script, dict(os.environ))
+    try:
+        read = read_until("10 (0.20%)", output)
+        os.kill(process.pid, signal.SIGINT)
+        process.join(60)
+        assert process.exitcode == 128 + signal.SIGINT, read
+    finally:
+        process.kill()
+    (path,) = tmp_path.rglob("*.ckpt")
+    assert torch.load(path, weights_only=True)["step"] > 0
+    assert "resume with: ns-train sadgs" in one_line(errors.read_text(), "SIGINT: stopped and saved after")
+
+
+def read_until(start: str, pipe: Path) -> str:
+    """Read what a process writes to a named pipe until a line begins so, or it ends, and close the pipe."""
+    lines: list[str] = []
+    with pipe.open() as file:
+        for line in file:
+            lines.append(line)
+            if line.startswith(start):
+                break
+    return "".join(lines)
 
 
 def test_ctrl_c_while_the_data_are_loaded_ends_without_a_traceback(
