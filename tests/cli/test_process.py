@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 from rich.progress import Progress
@@ -336,14 +337,14 @@ def test_names_with_spaces_and_webp_and_transparent_photos(tmp_path: Path, capsy
 def test_names_with_spaces_are_matched_by_colmap_s_own_function(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     neighbours: list[Path] = []  # of a film: these photos' neighbours stand apart
     monkeypatch.setattr(pycolmap, "match_sequential", lambda database, **options: neighbours.append(database))
-    match(["a 1.png", "a 2.png"], tmp_path / "db", tmp_path / "pairs.txt", "sequential", lambda *step: None)
+    match(["a 1.png", "a 2.png"], tmp_path / "db", tmp_path / "pairs.txt", "sequential", None, lambda *step: None)
     assert neighbours == [tmp_path / "db"]
 
 
 def test_numbered_photos_are_neighbours_in_the_order_of_their_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(pycolmap, "match_image_pairs", lambda database, **options: None)
     names = [f"{i}.png" for i in sorted(range(13), key=str)]
-    match(names, tmp_path / "db", tmp_path / "pairs.txt", "sequential", lambda *step: None)
+    match(names, tmp_path / "db", tmp_path / "pairs.txt", "sequential", None, lambda *step: None)
     assert "9.png 10.png\n" in (tmp_path / "pairs.txt").read_text()
 
 
@@ -497,11 +498,10 @@ def test_a_scene_of_few_of_the_photos_is_warned_of(tmp_path: Path, registered: C
     assert f"Train:  ns-train sadgs --data {tmp_path / 'out'}\n" in capsys.readouterr().out
 
 
-def test_photos_that_colmap_could_not_write_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_photos_that_colmap_could_not_write_are_told(tmp_path: Path):
     """COLMAP says nothing where the disk is full."""
     folder = black(tmp_path / "undistorted", "images/a.png", "images/b.png")
     (folder / "transforms.json").write_text(json.dumps({"frames": [{"file_path": f"images/{n}.png"} for n in "ab"]}))
-    monkeypatch.setattr("nerfstudio.process_data.colmap_utils.colmap_to_json", lambda *others: None)
     (folder / "images" / "b.png").write_bytes((folder / "images" / "b.png").read_bytes()[:30])
     with pytest.raises(OSError, match=r"images could not be written \(the disk is full; .* free there"):
         program._publish(folder, tmp_path)
@@ -552,6 +552,23 @@ def test_the_command_starts_without_slow_or_harmful_imports():
     imports = "import sys; from sadgs_ns.cli.process import command"
     code = f"{imports}; assert not {{'pycolmap', 'scipy', 'torch'}} & {{*sys.modules}}"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_features_are_found_while_torch_is_imported():
+    imports = "import sys; from sadgs_ns.cli.process import stages"
+    subprocess.run([sys.executable, "-c", f"{imports}; assert 'torch' not in sys.modules"], check=True)
+
+
+def test_a_gpu_matches_the_pairs_that_colmap_verifies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The device is the CPU here, which goes the GPU's way."""
+    calls: list[tuple] = []
+    monkeypatch.setattr(
+        "sadgs_ns.cli.process.matching.write_matches", lambda database, pairs, device: calls.append((*pairs, device))
+    )
+    monkeypatch.setattr(pycolmap, "match_image_pairs", lambda database, **options: calls.append(("verified",)))
+    device = torch.device("cpu")
+    match(["a.png", "b.png"], tmp_path / "db", tmp_path / "pairs.txt", "exhaustive", device, lambda *step: None)
+    assert calls == [(("a.png", "b.png"), device), ("verified",)]
 
 
 def test_photos_without_texture_are_told_in_a_sentence(tmp_path: Path, capsys):

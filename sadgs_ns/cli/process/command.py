@@ -11,7 +11,6 @@ import argparse
 import contextlib
 import dataclasses
 import fcntl
-import io
 import json
 import os
 import shlex
@@ -293,20 +292,16 @@ def _reporter(progress: Progress) -> Report:
 
 
 def _publish(undistorted: Path, out: Path, grown: bool = False) -> None:
-    """Add what nerfstudio reads to undistorted photos and their model, and move everything to the scene's folder.
+    """Move undistorted photos, their model and what nerfstudio reads of it to the scene's folder.
 
     Args:
-        undistorted: The folder of photos and model.
+        undistorted: The folder of all that.
         out: The scene's folder.
         grown: Whether the photos are added to those of a finished scene, which stays one until all are there.
 
     Raises:
         OSError: If a file cannot be written, or COLMAP could not write one.
     """
-    from nerfstudio.process_data.colmap_utils import colmap_to_json
-
-    with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio prints all cameras where there are several
-        colmap_to_json(undistorted / "sparse" / "0", undistorted)
     images = undistorted / "images"
     described = json.loads((undistorted / "transforms.json").read_text())
     written = [frame["file_path"] for frame in described["frames"]]

@@ -14,7 +14,7 @@ import pycolmap
 
 from sadgs_ns.cli.process.apart import Report
 from sadgs_ns.cli.process.plan import MAX_SIDE, searched_pixels
-from sadgs_ns.method.memory import available_host_bytes
+from sadgs_ns.method.host_memory import available_host_bytes
 
 MOST_FEATURES = 8192
 """Features of a photo, of which the most contrasted are taken; COLMAP's own limit."""

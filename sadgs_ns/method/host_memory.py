@@ -1,0 +1,40 @@
+"""How much of the host's memory is left, read without torch, whose import takes seconds."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from pathlib import Path
+
+_CONTROL_GROUPS = (
+    ("memory.max", "memory.current", "memory.stat", "inactive_file"),
+    ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "memory/memory.stat", "total_inactive_file"),
+)
+"""Files of a container's memory below the root of control groups, of their versions 2 and 1: the limit, what is in use,
+and statistics, with the line that tells how much of that are files that the system can forget."""
+
+
+def available_host_bytes(root: Path = Path("/")) -> float:
+    """Bytes of the host's memory that this process may take, as Linux and a container's limit tell.
+
+    Args:
+        root: Folder in which the folders `proc` and `sys` lie.
+
+    Returns:
+        Infinity where nothing tells, as on other systems.
+    """
+    available = math.inf
+    with contextlib.suppress(OSError):
+        available = 1024.0 * _numbers(root / "proc/meminfo").get("MemAvailable", math.inf)
+    for limit, used, statistics, forgettable in _CONTROL_GROUPS:
+        folder = root / "sys/fs/cgroup"
+        with contextlib.suppress(OSError, ValueError):  # There is no such group, or its limit is "max".
+            left = int((folder / limit).read_text()) - int((folder / used).read_text())
+            available = min(available, left + _numbers(folder / statistics)[forgettable])
+    return available
+
+
+def _numbers(path: Path) -> dict[str, int]:
+    """Return the numbers that a file of the kernel's lists, each behind its name."""
+    rows = (line.replace(":", " ").split() for line in path.read_text().splitlines())
+    return {row[0]: int(row[1]) for row in rows if len(row) > 1}
