@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import socket
+import tempfile
 import time
 from datetime import timedelta
 from typing import TYPE_CHECKING
@@ -89,18 +90,31 @@ def check(config: CheckedTrainerConfig) -> None:
 
 
 class Peers:
-    """The processes of a run, as the operating system knows them."""
+    """The processes of a run, as the operating system of this machine knows them."""
 
     def __init__(self) -> None:
-        mine = (socket.gethostname(), os.getpid())
-        self._places: list[tuple[str, int]] = [mine] * dist.get_world_size()
-        dist.all_gather_object(self._places, mine)
+        number = dist.get_world_size()
+        with tempfile.NamedTemporaryFile() as file:
+            mine = (socket.gethostname(), os.getpid(), file.name)
+            self._places = [mine] * number
+            dist.all_gather_object(self._places, mine)
+            shared = next(path for host, _, path in self._places if host == mine[0])
+            # The first process's file is memory that all processes of this machine share, with a byte for each.
+            self._followed = torch.from_file(shared, shared=True, size=number, dtype=torch.uint8)
+            """1 for each process that ends because another has ended. uint8 [number of processes]"""
+            dist.barrier()  # The files go, and the memory stays as long as a process has it.
 
     def ended(self) -> list[int]:
-        """Return the ranks of the processes of this machine that have ended, after waiting some seconds for one."""
+        """Return the ranks of this machine's processes that ended by themselves, after waiting some seconds for one.
+
+        Those that end because this method named others to them are none of these.
+        """
         end, here = time.monotonic() + _REAPED_SECONDS, socket.gethostname()
         while True:
-            ranks = [rank for rank, (host, pid) in enumerate(self._places) if host == here and not _exists(pid)]
+            ranks = [rank for rank, (host, pid, _) in enumerate(self._places) if host == here and not _exists(pid)]
+            ranks = [rank for rank in ranks if not self._followed[rank]]
+            if ranks:
+                self._followed[dist.get_rank()] = 1
             if ranks or time.monotonic() > end:
                 return ranks
             time.sleep(0.1)

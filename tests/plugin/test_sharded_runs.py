@@ -28,6 +28,7 @@ from torch.multiprocessing.spawn import ProcessExitedException, ProcessRaisedExc
 from sadgs_ns.distributed.shards import Shards
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.plugin.presets import sadgs
+from sadgs_ns.plugin.processes import Peers
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 
@@ -216,6 +217,23 @@ def test_a_killed_process_ends_the_others_with_a_sentence_that_names_it(scene: P
         assert message.startswith("Process 1 of 3 ended (counted from 0)"), message
         assert str(config.get_checkpoint_dir()) in message and seconds < 60
     assert saved(config.get_checkpoint_dir())[0] == 3
+
+
+def look_after_another_has_left(shards: Shards) -> list[int]:
+    """Kill process 1; process 0 looks for it and ends, and only then process 2 looks, too."""
+    peers = Peers()
+    pids: list[Any] = [None] * shards.num_ranks
+    torch.distributed.all_gather_object(pids, os.getpid())
+    if shards.rank == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    while shards.rank == 2 and Path(f"/proc/{pids[0]}").exists():
+        time.sleep(0.1)
+    return peers.ended()
+
+
+def test_a_process_that_left_because_of_another_is_not_named(tmp_path: Path):
+    first, _, last = run_ranks(look_after_another_has_left, 3, tmp_path, doomed=(1,))
+    assert first == last == [1]
 
 
 @pytest.mark.parametrize(
