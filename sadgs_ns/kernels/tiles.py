@@ -23,10 +23,15 @@ from sadgs_ns.kernels.limits import check_pairs
 
 _LANES = 32
 """Gaussians that one program handles: one warp of them, so that a large Gaussian holds up only 31 others."""
-_FEW_TILES = 64
-"""Largest number of tiles in a Gaussian's rectangle of tiles that a lane lists alone. All lanes of a program list the
-rows of a larger one together: a Gaussian may reach all of an image's tiles, which would take a lane longer than the
-whole rest of a step."""
+_FEW_PAIRS, _PART_PAIRS = 64, 256
+"""Largest number of tiles of a Gaussian that one lane lists, and how many tiles a part has on average into which a
+larger Gaussian is cut. A Gaussian may reach all of an image's tiles, which would take a lane, or a program, longer than
+the whole rest of a step."""
+_PART_ROWS, _PART_COLUMNS = 4, 8
+"""Rows and columns of tiles that a program writes at once, of a part."""
+_PROGRAMS = 4096
+"""Largest number of programs that share out the parts, whose number the host does not know: as many as an H100 runs at
+once, of one warp each."""
 _ORDER_LANES = 512
 """Pairs or tiles that one program handles where the lists are put in order."""
 
@@ -121,23 +126,18 @@ def _count(
     tl.store(counts + g, count, g < n)
 
 
-@triton.jit
-def _pick(values, this):
-    """Return the one value where `this` is true."""
-    return tl.sum(tl.where(this, values, 0))
-
-
 @triton.jit(
     do_not_specialize=["n", "num_gaussians", "num_pairs", "num_tiles", "tile_width", "tile_height", "rows_per_view"]
 )
 def _list(
-    means2d, radii, conics, opacities, order, ends, tiles, ids,
+    means2d, radii, conics, opacities, order, ends, tiles, ids, parts, part_count,
     n, num_gaussians, num_pairs, num_tiles, tile_width, tile_height, rows_per_view,
-    PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr, LANES: tl.constexpr, FEW: tl.constexpr,
+    PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr, LANES: tl.constexpr, FEW: tl.constexpr, PART: tl.constexpr,
 ):  # fmt: skip
     """Write the tile and the Gaussian of each pair, the nearest Gaussians first.
 
-    A Gaussian whose rectangle has more than FEW tiles is listed by all lanes, of which each takes a row.
+    A Gaussian of more than FEW pairs is left to `_list_parts`: each of its parts is noted in `parts`, as 2^24 times its
+    place in the order plus the part's number, and counted in `part_count`.
 
     The rest of the `num_pairs` places is given to the last tile. If there are more pairs than places, this tile gets
     all places, and all radii become 0: nothing is drawn, and nobody counts the views.
@@ -148,62 +148,88 @@ def _list(
     fits = needed <= num_pairs
     g = tl.load(order + lane, exists, 0).to(tl.int32)
     at = tl.load(ends + lane - 1, exists & (lane > 0), 0)
+    pairs = tl.load(ends + lane, exists & fits, 0) - at
+    cut = tl.where(pairs > FEW, (pairs + PART - 1) // PART, 0).to(tl.int32)
+    total = tl.sum(cut)
+    if total > 0:
+        noted = tl.atomic_add(part_count, total) + tl.cumsum(cut, 0) - cut
+        for i in range(tl.max(cut)):
+            tl.store(parts + noted + i, lane.to(tl.int64) * 16777216 + i, i < cut)
     x, y, a, b, c, level, determinant, proper, first_column, last_column, first_row, last_row = _load_ellipse(
         means2d, radii, conics, opacities, g, exists, tile_width, tile_height, PER_GAUSSIAN, TILE
     )
     for i in tl.static_range(PER_GAUSSIAN):
         tl.store(radii + PER_GAUSSIAN * g + i, 0, exists & (needed > num_pairs))
-    last_row = tl.where(fits, last_row, first_row)
+    last_row = tl.where(fits & (cut == 0), last_row, first_row)
     row_of_view = g // num_gaussians * rows_per_view
-    many = (last_row - first_row).to(tl.int64) * (last_column - first_column) > FEW
-    small_end = tl.where(many, first_row, last_row)
     place = at
-    for i in range(tl.max(small_end - first_row)):
+    for i in range(tl.max(last_row - first_row)):
         row = first_row + i
         first, last = _columns_of_row(
             row, x, y, a, b, c, level, determinant, proper, first_column, last_column, TILE
         )  # fmt: skip
-        last = tl.where(row < small_end, last, first)
+        last = tl.where(row < last_row, last, first)
         for j in range(tl.max(last - first)):
             listed = first + j < last
             tile = (row_of_view + row) * tile_width + first + j
             tl.store(tiles + place, (tile - 32768).to(tiles.dtype.element_ty), listed)
             tl.store(ids + place, g, listed)
             place += listed.to(place.dtype)
-    index = tl.arange(0, LANES)
-    chosen = tl.min(tl.where(many, index, LANES))
-    while chosen < LANES:
-        this = index == chosen
-        gaussian, begin, one_place = _pick(g, this), _pick(first_row, this), _pick(at, this)
-        end, above = _pick(last_row, this), _pick(row_of_view, this)
-        one_x, one_y, one_a, one_b, one_c = (
-            _pick(x, this), _pick(y, this), _pick(a, this), _pick(b, this), _pick(c, this)
-        )  # fmt: skip
-        one_level, one_determinant = _pick(level, this), _pick(determinant, this)
-        one_proper = _pick(proper.to(tl.int32), this) > 0
-        one_first, one_last = _pick(first_column, this), _pick(last_column, this)
-        while begin < end:
-            row = begin + index
-            first, last = _columns_of_row(
-                row, one_x, one_y, one_a, one_b, one_c, one_level, one_determinant, one_proper, one_first, one_last,
-                TILE,
-            )  # fmt: skip
-            count = tl.where(row < end, tl.maximum(last - first, 0), 0)
-            place = one_place + tl.cumsum(count, 0) - count
-            tile = (above + row) * tile_width + first - 32768
-            for j in range(tl.max(count)):
-                listed = j < count
-                tl.store(tiles + place + j, (tile + j).to(tiles.dtype.element_ty), listed)
-                tl.store(ids + place + j, gaussian + 0 * index, listed)
-            one_place += tl.sum(count)
-            begin += LANES
-        chosen = tl.min(tl.where(many & (index > chosen), index, LANES))
     stride = tl.num_programs(0) * LANES
     used = tl.where(fits, needed, 0)
     for i in range(tl.cdiv(num_pairs - used, stride)):
         unused = used + i * stride + lane
         tl.store(tiles + unused, (num_tiles - 32769 + lane * 0).to(tiles.dtype.element_ty), unused < num_pairs)
         tl.store(ids + unused, lane * 0, unused < num_pairs)
+
+
+@triton.jit(do_not_specialize=["num_gaussians", "tile_width", "tile_height", "rows_per_view"])
+def _list_parts(
+    means2d, radii, conics, opacities, order, ends, tiles, ids, parts, part_count,
+    num_gaussians, tile_width, tile_height, rows_per_view,
+    PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr, PART: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr,
+):  # fmt: skip
+    """Write the pairs of the parts that `_list` noted. A part is a share of the rows of a Gaussian's tiles."""
+    index, column = tl.arange(0, ROWS), tl.arange(0, COLUMNS)[None, :]
+    every = tl.arange(0, 32)
+    end = tl.load(part_count)
+    which = tl.program_id(0)
+    while which < end:
+        part = tl.load(parts + which)
+        position = part // 16777216
+        g = tl.load(order + position).to(tl.int32)
+        place = tl.load(ends + position - 1, position > 0, 0)
+        cut = (tl.load(ends + position) - place + PART - 1) // PART
+        x, y, a, b, c, level, determinant, proper, first_column, last_column, first_row, last_row = _load_ellipse(
+            means2d, radii, conics, opacities, g, True, tile_width, tile_height, PER_GAUSSIAN, TILE
+        )
+        number, rows = part % 16777216, last_row - first_row
+        begin = first_row + (rows * number // cut).to(tl.int32)
+        last_row = first_row + (rows * (number + 1) // cut).to(tl.int32)
+        while first_row < begin:  # Parts before this one take the places before this one's.
+            row = first_row + every
+            first, last = _columns_of_row(
+                row, x, y, a, b, c, level, determinant, proper, first_column, last_column, TILE
+            )  # fmt: skip
+            place += tl.sum(tl.where(row < begin, tl.maximum(last - first, 0), 0))
+            first_row += 32
+        above = g // num_gaussians * rows_per_view
+        while begin < last_row:
+            row = begin + index
+            first, last = _columns_of_row(
+                row, x, y, a, b, c, level, determinant, proper, first_column, last_column, TILE
+            )  # fmt: skip
+            count = tl.where(row < last_row, tl.maximum(last - first, 0), 0)
+            places = place + tl.cumsum(count, 0) - count
+            numbers = (above + row) * tile_width + first - 32768
+            for j in range(0, tl.max(count), COLUMNS):
+                listed = j + column < count[:, None]
+                at = places[:, None] + j + column
+                tl.store(tiles + at, (numbers[:, None] + j + column).to(tiles.dtype.element_ty), listed)
+                tl.store(ids + at, g + column * 0 + index[:, None] * 0, listed)
+            place += tl.sum(count)
+            begin += ROWS
+        which += tl.num_programs(0)
 
 
 @triton.jit(do_not_specialize=["num_pairs", "num_tiles", "of_pairs", "halvings"])
@@ -313,11 +339,18 @@ class PendingTiles:
         # Tiles are numbered from −2^15, so that 16 bits tell 65,536 of them apart.
         tiles = torch.empty(num_pairs, dtype=torch.int16 if num_tiles <= 2**16 else torch.int32, device=device)
         ids = torch.empty(num_pairs, dtype=torch.int32, device=device)
-        n = len(self.order)
+        n, per_gaussian = len(self.order), self.ellipses[1].dim() - 1
+        # A Gaussian of p > _FEW_PAIRS pairs has at most p / _PART_PAIRS + 1 parts.
+        most_parts = num_pairs // _PART_PAIRS + num_pairs // (_FEW_PAIRS + 1) + 1
+        parts, part_count = self.order.new_empty(most_parts), self.order.new_zeros(())
+        listed = (*self.ellipses, self.order, self.ends, tiles, ids, parts, part_count)
         _list[cdiv(n, _LANES),](
-            *self.ellipses, self.order, self.ends, tiles, ids,
-            n, n // views, num_pairs, num_tiles, columns, rows, rows_per_view,
-            self.ellipses[1].dim() - 1, self.tile_size, _LANES, _FEW_TILES, num_warps=1,
+            *listed, n, n // views, num_pairs, num_tiles, columns, rows, rows_per_view,
+            per_gaussian, self.tile_size, _LANES, _FEW_PAIRS, _PART_PAIRS, num_warps=1,
+        )  # fmt: skip
+        _list_parts[min(most_parts, _PROGRAMS),](
+            *listed, n // views, columns, rows, rows_per_view,
+            per_gaussian, self.tile_size, _PART_PAIRS, _PART_ROWS, _PART_COLUMNS, num_warps=1,
         )  # fmt: skip
         tiles, by_tile = tiles.sort(stable=True)
         starts, ordered = ids.new_empty((views, rows_per_view, columns)), torch.empty_like(ids)

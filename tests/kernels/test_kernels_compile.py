@@ -21,6 +21,7 @@ CONSTANTS = {
     "OCTAVES": 12.0, "MASKED": 255, "WIDTHS": (3, 45, 1), "PER_GAUSSIAN": 2, "GAUSSIANS": 16, "STRIDE": 12,
     "ALPHAS": True, "ABSGRAD": True, "PRECISION": "tf32x3", "PENALTY": True, "CULL": True,
     "DEPTHS": True, "COMPENSATIONS": True, "PASSED": True, "ON_DEVICE": False, "FEW": 64,
+    "PART": 256,
 }
 INTEGERS = "n row height width taps num_gaussians num_views tile_width tile_height used stride start".split()
 INTEGERS += "channels weight_stride num_pairs rows view absolute_view absolute_row num_strips num_tiles".split()
@@ -29,7 +30,7 @@ FLOATS = "exponent frequency beta1 beta2 eps l1_weight ssim_weight l2_weight".sp
 FLOATS += "scale_x scale_y ssim_lambda half_width half_height reach_x reach_y penalty".split()
 POINTERS = {
     "radii": "*i32", "counts": "*i64", "order": "*i64", "ends": "*i64", "tiles": "*i16", "ids": "*i32",
-    "by_tile": "*i64", "ordered": "*i32",
+    "by_tile": "*i64", "ordered": "*i32", "parts": "*i64", "part_count": "*i64",
     "structure_tensors": "*u8", "starts": "*i32", "last_ids": "*i32",
 }
 TUPLES = {  # of Adam's kernel; the names mean single tensors elsewhere
@@ -56,7 +57,7 @@ for module in pkgutil.iter_modules(package.__path__):
                 signature[parameter.name] = "fp32"
             else:
                 signature[parameter.name] = POINTERS.get(parameter.name, "*fp32")
-        others = dict.fromkeys(["_list", "_order"], {"tiles": "*i32"})
+        others = dict.fromkeys(["_list", "_list_parts", "_order"], {"tiles": "*i32"})
         others |= dict.fromkeys(["_blur_along_rows", "_gradient"], {"y": "*u8"})
         signatures = [signature, *([signature | others[name]] if name in others else [])]
         for signature in signatures:
@@ -73,7 +74,7 @@ def test_every_kernel_compiles_for_an_a100_and_an_h200(tmp_path):
     expected = {"_blur_along_rows", "_similarity", "_spread_along_rows", "_gradient", "_count", "_list", "_observe"}
     expected |= {"_forward", "_backward", "_update", "_correlate", "_differentiate", "_aggregate", "_write_one"}
     expected |= {"_composite_backward", "_composite_forward", "_encode", "_accumulate_gradients", "_finish", "_order"}
-    expected |= {"_activate", "_activate_backward", "_project_backward", "_correct", "_correct_backward"}
+    expected |= {"_list_parts", "_activate", "_activate_backward", "_project_backward", "_correct", "_correct_backward"}
     assert set(run.stdout.split()) == expected
 
 
