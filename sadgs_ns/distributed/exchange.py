@@ -10,10 +10,15 @@ import torch.distributed as dist
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from sadgs_ns import kernels
 from sadgs_ns.distributed.bands import Band
 from sadgs_ns.distributed.shards import Shards
 from sadgs_ns.gsplat_internals import drawn
 from sadgs_ns.render.projected import Projected
+
+_GRADIENTS = (2, 3, 1, 3, 2, 1)
+"""Widths of the columns in the rows of gradients that our compositing makes: of centre, conic, opacity, colour and the
+centre's absolute gradient, and one that nobody uses."""
 
 
 class Exchange:
@@ -32,9 +37,14 @@ class Exchange:
         shards: The processes.
         projected: The Gaussians of this process in all V views.
         bands: All bands, as `share_out` returns them.
+        fused: Whether rows are written and read by Triton kernels, where these run, and gradients travel in the rows of
+            our compositing; the same in all processes.
     """
 
-    def __init__(self, shards: Shards, projected: Projected, bands: Sequence[Band]) -> None:
+    def __init__(self, shards: Shards, projected: Projected, bands: Sequence[Band], *, fused: bool = True) -> None:
+        self.fused = fused and projected.colors.shape[-1] == 3 and kernels.available(shards.device)
+        self.whole_views = len(bands) == len(projected.opacities)
+        """Whether each view is one band, so that no row is sent twice."""
         reached = _reached(projected, bands)  # [B, N]
         counted = torch.cat([reached.sum(1), torch.tensor([shards.request], device=shards.device)])
         gathered = shards.gather(counted)  # [R, B + 1]
@@ -122,24 +132,15 @@ class _Exchanged(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         ctx.exchange, ctx.absgrad, ctx.shape = exchange, absgrad, opacities.shape
         ctx.save_for_backward(means2d)
-        size = opacities.numel()
-        values = [
-            value.detach().reshape(size, -1)[exchange.places]
-            for value in (means2d, conics, opacities, colors, depths, radii.to(means2d.dtype))
-        ]
-        ctx.num_colors = values[3].shape[1]
-        widths = [value.shape[1] for value in values]
-        outputs: list[Tensor] = []
-        for band, rows in zip(exchange.bands, exchange.forth(_beside(values)), strict=True):
-            if not len(rows):
-                rows = rows.new_zeros((1, rows.shape[1]))  # A Gaussian whose radius is zero is not drawn.
-            centres, conic, opacity, color, depth, radius = (
-                column.clone(memory_format=torch.contiguous_format) for column in rows[None].split(widths, dim=-1)
-            )
-            centres[..., 1] -= band.top
-            radius = radius.int() if radii.dim() == 3 else radius[..., 0].int()
-            ctx.mark_non_differentiable(radius)
-            outputs += [radius, centres, depth[..., 0], conic, opacity[..., 0], color]
+        projected = Projected(radii, means2d, depths, conics, opacities, colors)
+        ctx.num_colors = colors.shape[-1]
+        rows, outputs = _rows_of(projected, exchange), []
+        for band, received in zip(exchange.bands, exchange.forth(rows), strict=True):
+            if not len(received):
+                received = received.new_zeros((1, received.shape[1]))  # A Gaussian whose radius is 0 is not drawn.
+            part = _splats_of(received, ctx.num_colors, band.top, exchange)
+            ctx.mark_non_differentiable(part.radii)
+            outputs += part
         return means2d.new_zeros(()), *outputs
 
     @staticmethod
@@ -147,26 +148,99 @@ class _Exchanged(torch.autograd.Function):
     def backward(ctx: Any, _: Tensor | None, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         exchange: Exchange = ctx.exchange
         (means2d,) = ctx.saved_tensors
-        widths = [2, 3, 1, ctx.num_colors, *[2] * ctx.absgrad]
+        widths = list(_GRADIENTS) if exchange.fused else [2, 3, 1, ctx.num_colors, *[2] * ctx.absgrad]
         parts = []
         for i in range(len(exchange.bands)):
             number = sum(row[i] for row in exchange.counts)
             _, v_means2d, _, v_conics, v_opacities, v_colors = gradients[6 * i : 6 * i + 6]  # Depths decide no colour.
-            columns = [v_means2d, v_conics, v_opacities, v_colors]
-            if ctx.absgrad:
-                columns.append(getattr(exchange.absolute[i], "absgrad", None))
-            filled = [
-                means2d.new_zeros((number, width)) if value is None else value.reshape(-1, width)[:number]
-                for value, width in zip(columns, widths, strict=True)
-            ]
-            parts.append(_beside(filled))
+            v_absolute = getattr(exchange.absolute[i], "absgrad", None) if ctx.absgrad else None
+            columns = [v_means2d, v_conics, v_opacities, v_colors, v_absolute, None][: len(widths)]
+            parts.append(_gradient_rows(columns, widths, number, like=means2d))
         exchange.absolute = []
         rows = exchange.back(parts, means2d.new_empty((0, sum(widths))))
-        dense = means2d.new_zeros((ctx.shape.numel(), sum(widths))).index_add_(0, exchange.places, rows)
+        dense = means2d.new_zeros((ctx.shape.numel(), sum(widths)))
+        if exchange.whole_views:
+            dense.index_copy_(0, exchange.places, rows)
+        else:
+            dense.index_add_(0, exchange.places, rows)
         v_means2d, v_conics, v_opacities, v_colors, *v_absolute = dense.view(*ctx.shape, -1).split(widths, -1)
         if ctx.absgrad:
             means2d.absgrad, means2d.grad2d = v_absolute[0], v_means2d
         return None, None, None, v_means2d, None, v_conics, v_opacities[..., 0], v_colors
+
+
+def pack(projected: Projected, places: Tensor) -> Tensor:
+    """Put what compositing reads of the Gaussians at some places into rows.
+
+    Args:
+        projected: Gaussians in V views.
+        places: Indices in V · N. int64 [M]
+
+    Returns:
+        Columns of centre, conic, opacity, colour, depth and radius. [M, 7 + D + 1 or 2]
+    """
+    radii, means2d, depths, conics, opacities, colors = projected
+    size = opacities.numel()
+    taken = [value.reshape(size, -1)[places] for value in (means2d, conics, opacities, colors, depths, radii)]
+    return _beside([*taken[:-1], taken[-1].to(means2d.dtype)])
+
+
+def unpack(rows: Tensor, num_colors: int, top: int) -> Projected:
+    """Take the Gaussians of one view out of rows.
+
+    Args:
+        rows: As `pack` makes them. [M, K]
+        num_colors: Number D of the colours' channels.
+        top: Image row from which centres are counted, px.
+    """
+    per_gaussian = rows.shape[1] - 7 - num_colors
+    means2d, conics, opacities, colors, depths, radii = (
+        column.clone(memory_format=torch.contiguous_format)
+        for column in rows[None].split([2, 3, 1, num_colors, 1, per_gaussian], dim=-1)
+    )
+    means2d[..., 1] -= top
+    radii = radii.int() if per_gaussian == 2 else radii[..., 0].int()
+    return Projected(radii, means2d, depths[..., 0], conics, opacities[..., 0], colors)
+
+
+def _rows_of(projected: Projected, exchange: Exchange) -> Tensor:
+    """Call `pack`, or its kernel."""
+    projected = Projected(*(value.detach() for value in projected))
+    if not exchange.fused:
+        return pack(projected, exchange.places)
+    from sadgs_ns.kernels.exchange import pack as pack_fused  # Triton need not be installed.
+
+    return pack_fused(*(value.contiguous() for value in projected), places=exchange.places)
+
+
+def _splats_of(rows: Tensor, num_colors: int, top: int, exchange: Exchange) -> Projected:
+    """Call `unpack`, or its kernel."""
+    if not exchange.fused:
+        return unpack(rows, num_colors, top)
+    from sadgs_ns.kernels.exchange import unpack as unpack_fused
+
+    return Projected(*unpack_fused(rows.contiguous(), top))
+
+
+def _gradient_rows(columns: Sequence[Tensor | None], widths: Sequence[int], number: int, like: Tensor) -> Tensor:
+    """Put gradients into rows, unless they are parts of such rows already, as those of our compositing are.
+
+    Args:
+        columns: Gradients of one view; None stands for zeros. [1, at least M, ·] each, or [1, at least M]
+        widths: Number of columns of each.
+        number: M.
+        like: A tensor of their type and device.
+    """
+    width, first = sum(widths), columns[0]
+    if first is not None and first.dim() == 3 and first.stride()[1:] == (width, 1):
+        starts = [first.data_ptr() + first.element_size() * sum(widths[:i]) for i in range(len(widths))]
+        if all(value is None or value.data_ptr() == start for value, start in zip(columns, starts, strict=True)):
+            return first.as_strided((number, width), (width, 1))
+    filled = [
+        like.new_zeros((number, width)) if value is None else value.reshape(-1, width)[:number]
+        for value, width in zip(columns, widths, strict=True)
+    ]
+    return _beside(filled)
 
 
 @torch.no_grad()

@@ -64,7 +64,7 @@ def rasterize(
         means, quats, scales, opacities, colors, viewmats, Ks, width, height,
         sh_degree=sh_degree, rasterize_mode=rasterize_mode, max_off_axis=max_off_axis, fused=fused,
     )  # fmt: skip
-    exchange = Exchange(shards, projected, share_out(len(viewmats), height, shards.num_ranks))
+    exchange = Exchange(shards, projected, share_out(len(viewmats), height, shards.num_ranks), fused=fused)
     anchor, received = exchange.send(projected, absgrad)
     rendered, num_pairs, num_pixels = [], 0, 0
     for band, splats in zip(exchange.bands, received, strict=True):

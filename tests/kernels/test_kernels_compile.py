@@ -27,10 +27,11 @@ INTEGERS = "n row height width taps num_gaussians num_views tile_width tile_heig
 INTEGERS += "channels weight_stride num_pairs rows view absolute_view absolute_row num_strips num_tiles".split()
 INTEGERS += ["rows_per_view", "halvings", "of_pairs", "num_parts", "row2d", "row_conic"]
 FLOATS = "exponent frequency beta1 beta2 eps l1_weight ssim_weight l2_weight".split()
-FLOATS += "scale_x scale_y ssim_lambda half_width half_height reach_x reach_y penalty".split()
+FLOATS += "scale_x scale_y ssim_lambda half_width half_height reach_x reach_y penalty top".split()
 POINTERS = {
     "radii": "*i32", "counts": "*i64", "order": "*i64", "ends": "*i64", "tiles": "*i16", "ids": "*i32",
     "by_tile": "*i64", "ordered": "*i32", "parts": "*i64", "part_count": "*i64",
+    "places": "*i64",
     "structure_tensors": "*u8", "starts": "*i32", "last_ids": "*i32",
 }
 TUPLES = {  # of Adam's kernel; the names mean single tensors elsewhere
@@ -74,7 +75,16 @@ def test_every_kernel_compiles_for_an_a100_and_an_h200(tmp_path):
     expected = {"_blur_along_rows", "_similarity", "_spread_along_rows", "_gradient", "_count", "_list", "_observe"}
     expected |= {"_forward", "_backward", "_update", "_correlate", "_differentiate", "_aggregate", "_write_one"}
     expected |= {"_composite_backward", "_composite_forward", "_encode", "_accumulate_gradients", "_finish", "_order"}
-    expected |= {"_list_parts", "_activate", "_activate_backward", "_project_backward", "_correct", "_correct_backward"}
+    expected |= {
+        "_list_parts",
+        "_pack",
+        "_unpack",
+        "_activate",
+        "_activate_backward",
+        "_project_backward",
+        "_correct",
+        "_correct_backward",
+    }
     assert set(run.stdout.split()) == expected
 
 
