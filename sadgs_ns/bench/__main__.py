@@ -58,7 +58,7 @@ COMMANDS = {
 """What `sadgs-bench` does besides running a protocol, and the module that does it."""
 
 Launch = Callable[[Job, "str | None", Path], "subprocess.Popen[bytes]"]
-"""Starts a job on a GPU (None: whatever is visible) in a folder: `result.json` and `log` appear there."""
+"""Starts a job on a GPU (None: any; "0+1": on both) in a folder, where `result.json` and `log` appear."""
 
 
 @dataclasses.dataclass
@@ -102,8 +102,13 @@ def launcher(root: Path, images: Path | None = None) -> Launch:
     def launch(job: Job, gpu: str | None, folder: Path) -> subprocess.Popen[bytes]:
         folders = {"root": str(root), "images": None if images is None else str(images)}
         spec = json.dumps({**dataclasses.asdict(job), **folders}, default=str)
-        command = [sys.executable, "-m", "sadgs_ns.bench.run", "--spec", spec, "--out", str(folder / "result.json")]
-        environment = dict(os.environ) if gpu is None else {**os.environ, "CUDA_VISIBLE_DEVICES": gpu}
+        command = ["-m", "sadgs_ns.bench.run", "--spec", spec, "--out", str(folder / "result.json")]
+        devices = [] if gpu is None else gpu.split("+")
+        if len(devices) > 1:
+            torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(len(devices))]
+            command = [*torchrun, *command]
+        command = [sys.executable, *command]
+        environment = dict(os.environ) if gpu is None else {**os.environ, "CUDA_VISIBLE_DEVICES": ",".join(devices)}
         with (folder / "log").open("wb") as log:
             # A session of its own, so that a compiler the run started can be ended with it.
             return subprocess.Popen(
@@ -248,7 +253,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("protocol", type=Path, help="YAML file of scenes, rows and seeds")
     parser.add_argument("--scenes", type=Path, required=True, metavar="ROOT", help="folder that holds the scenes")
     parser.add_argument("--output", type=Path, required=True, help="JSON-lines file; runs already in it are skipped")
-    parser.add_argument("--gpus", metavar="0,1", help="GPUs to use (default: the first visible one)")
+    parser.add_argument(
+        "--gpus", metavar="0,1", help="GPUs to use (default: the first visible one); 0+1 trains one splat on both"
+    )
     parser.add_argument("--jobs-per-gpu", type=int, default=1, help="times are only comparable with 1, the default")
     parser.add_argument("--only", default="", metavar="REGEX", help="only runs whose scene/label/seed match")
     parser.add_argument("--time-limit", type=float, default=float("inf"), metavar="SECONDS", help="then start no run")

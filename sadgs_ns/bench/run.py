@@ -13,6 +13,7 @@ import copy
 import datetime
 import importlib.metadata
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -127,6 +128,9 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
             curve: Only if the job asks for it: the points of `curve.Curve`, the last one being the finished run.
                 None of the times above contains its evaluations.
             images: Only with `images`: the renderings' paths in that folder.
+        Where torchrun started several processes, which train one splat on `devices` of them, the first measures all
+        but `phases`, `launches` and `curve`: its checkpoint is evaluated on one device, S̄ is computed in the loop, and
+        `peak_gb` is the first device's. The others return nothing.
 
     Raises:
         ValueError: As `build_config`.
@@ -134,6 +138,7 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
     """
     seconds: dict[str, float] = {}
     start = time.perf_counter()
+    devices = int(os.environ.get("WORLD_SIZE", "1"))
     import torch
 
     # ns-train's own module: importing it also sets cuDNN as in a user's run.
@@ -163,29 +168,30 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
     with timed("setup"), compiling:
         config = build_config(job.scene, job.row, job.seed, root, work)
         _set_random_seed(job.seed)
-        trainer: Any = config.setup(local_rank=0, world_size=1)
+        trainer: Any = config.setup(local_rank=int(os.environ.get("LOCAL_RANK", "0")), world_size=devices)
         with phases.replaced(config.pipeline.model._target, "populate_modules", timed_initialization):
             trainer.setup(test_mode="test")  # "val" would evaluate on blender's validation views
     seconds["setup_seconds"] -= seconds["initialization_seconds"]
     pipeline, datamanager, model = trainer.pipeline, trainer.pipeline.datamanager, trainer.pipeline.model
     with timed("load"):  # else the first iteration decodes all images
         train_images, _ = datamanager.cached_train, datamanager.cached_eval
-    # gsplat's, Triton's and torch.compile's kernels build at the first call, once per machine.
-    with timed("warmup"), compiling:
-        camera = datamanager.train_dataset.cameras[:1].to(trainer.device)
-        pipeline.eval()
-        outputs = model.get_outputs(camera)
-        losses = model.get_loss_dict(outputs, train_images[0]).values()
-        torch.stack(list(losses)).sum().backward()  # the first step forgets the gradients
-        with torch.no_grad():
-            model.get_outputs(camera)
-        pipeline.train()
-    if hasattr(pipeline, "structure_maps"):  # splatfacto's pipeline has none
-        with timed("structure_tensor"), compiling:
-            _ = pipeline.structure_maps.codes
+    if devices == 1:  # A model that several processes share draws nothing alone, and compiles in the setup.
+        # gsplat's, Triton's and torch.compile's kernels build at the first call, once per machine.
+        with timed("warmup"), compiling:
+            camera = datamanager.train_dataset.cameras[:1].to(trainer.device)
+            pipeline.eval()
+            outputs = model.get_outputs(camera)
+            losses = model.get_loss_dict(outputs, train_images[0]).values()
+            torch.stack(list(losses)).sum().backward()  # the first step forgets the gradients
+            with torch.no_grad():
+                model.get_outputs(camera)
+            pipeline.train()
+        if hasattr(pipeline, "structure_maps"):  # splatfacto's pipeline has none
+            with timed("structure_tensor"), compiling:
+                _ = pipeline.structure_maps.codes
 
     timer, curve = LoopTimer(), None
-    if job.row.curve_every is not None:
+    if job.row.curve_every is not None and devices == 1:
         curve = Curve(job.row.curve_every, timer)
         curve.attach(trainer)
     timer.attach(trainer)
@@ -196,6 +202,12 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
     wall = time.perf_counter() - start - timer.stopped_seconds
     if not timer.finished:
         raise RuntimeError("the training loop stopped before its last iteration.")
+    if devices > 1:
+        if os.environ["RANK"] != "0":
+            return {}
+        trainer = alone(job, root, work, trainer.checkpoint_dir)
+        pipeline, datamanager, model = trainer.pipeline, trainer.pipeline.datamanager, trainer.pipeline.model
+        train_images = datamanager.cached_train
 
     pipeline.eval()
     views = datamanager.fixed_indices_eval_dataloader
@@ -208,6 +220,7 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
         train_psnr = evaluate.quality(model, train_views, {})["psnr"]
         fps = evaluate.frames_per_second(model, [camera for camera, _ in views])
     record = {
+        "devices": devices,
         "iterations": trainer.config.max_num_iterations,
         "views_per_iteration": getattr(pipeline, "views_per_iteration", 1),
         "loop_seconds": timer.seconds,
@@ -231,9 +244,27 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
         names = [Path(path).stem for path in datamanager.eval_dataset.image_filenames]
         where = (images, job.scene.name, job.row.label, job.seed)
         record["images"] = pictures.save(model, views, names, *where)
-    record["phases"] = phases.measure(trainer)  # from here on the model is trained further
-    record["launches"] = launches.measure(trainer)
+    if devices == 1:
+        record["phases"] = phases.measure(trainer)  # from here on the model is trained further
+        record["launches"] = launches.measure(trainer)
     return record
+
+
+def alone(job: Job, root: Path, work: Path, checkpoint: Path) -> Any:
+    """Return a trainer in which this process has all of what several have trained and have left by now.
+
+    Args:
+        checkpoint: Folder of the checkpoint that they wrote.
+    """
+    for name in [
+        name for name in os.environ if name in ("RANK", "WORLD_SIZE") or name.startswith(("LOCAL_", "GROUP_"))
+    ]:
+        del os.environ[name]
+    config = build_config(job.scene, job.row, job.seed, root, work)
+    config.load_dir = checkpoint
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup(test_mode="test")
+    return trainer
 
 
 def software() -> dict[str, str | None]:
@@ -279,7 +310,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m sadgs_ns.bench.run", description="Measure one training run.")
     parser.add_argument("--spec", required=True, help="JSON of a job, with the root of the scenes")
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
-    arguments = parser.parse_args()
+    arguments, rank = parser.parse_args(), os.environ.get("RANK", "0")
     spec = json.loads(arguments.spec)
     job = Job(Scene(**spec["scene"]), Row(**spec["row"]), spec["seed"])
     images = None if spec["images"] is None else Path(spec["images"])
@@ -295,7 +326,8 @@ def main() -> None:
             traceback.print_exc()
             record |= {"status": "failed", "error": describe(error)}
     record["versions"] = software()
-    arguments.out.write_text(json.dumps(record))
+    if rank == "0":
+        arguments.out.write_text(json.dumps(record))
 
 
 if __name__ == "__main__":

@@ -390,6 +390,22 @@ def test_images_lie_beside_the_photographs(written: tuple[dict[str, Any], Path],
         assert 0 < error < np.abs(rendering.astype(float).mean() - photograph).mean(), "it shows this view"
 
 
+def test_two_processes_train_one_splat_whose_row_the_first_writes(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """They start as on two GPUs, `--gpus 0+1`, and find none. LPIPS is left out, since its weights are missing."""
+    monkeypatch.setenv("TORCH_HOME", "/dev/null")
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    overrides = {**SADGS.overrides, "machine.device_type": "cpu", "pipeline.views_per_iteration": 2}
+    assert isinstance(overrides.pop("pipeline.model.background_color"), str)
+    with bench.launcher(root)(Job(SCENE, Row("ours", "sadgs", overrides), 0), "0+1", tmp_path) as process:
+        assert process.wait(200) == 0, (tmp_path / "log").read_text()
+    record = json.loads((tmp_path / "result.json").read_text())
+    assert record["status"] == "ok" and record["devices"] == 2 and record["iterations"] == ITERATIONS
+    assert record["psnr"] > 10 and record["gaussians"] > 100 and record["loop_seconds"] > 0
+    assert "phases" not in record
+
+
 def test_names_of_files_are_safe_and_differ():
     assert [images.file_name(name) for name in ("sadgs-3k", "v1.5_b")] == ["sadgs-3k", "v1.5_b"]
     unsafe = ["a b", "a_b", "a/b", "a\\b", "..", ".", "", "η", "a[b=1,c=2]"]
