@@ -72,7 +72,7 @@ def configure(scene: Path, output: Path, iterations: int, save_every: int, seed:
     config.vis = "tensorboard"
     config.machine.device_type, config.machine.seed = "cpu", seed
     config.max_num_iterations, config.steps_per_save = iterations, save_every
-    config.steps_per_eval_image = 0
+    config.steps_per_eval_image, config.share_always = 0, True
     config.logging.local_writer.enable, config.logging.profiler = False, "none"
     config.pipeline.datamanager.dataparser = parser_of(scene)
     config.pipeline.model.strategy = dataclasses.replace(config.pipeline.model.strategy)

@@ -52,6 +52,8 @@ def _run(function: Callable[..., Any], rank: int, number: int, folder: str, argu
     dist.init_process_group("gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=number)
     result = function(Shards(torch.device("cpu")), *arguments)
     torch.save(result, Path(folder, f"{rank}.pt"))
+    if not dist.is_initialized():  # The function has left the others.
+        return
     with contextlib.suppress(RuntimeError):  # It waits for the others, unless one was killed.
         dist.barrier()
     dist.destroy_process_group()

@@ -163,6 +163,24 @@ def join(config: CheckedTrainerConfig, local_rank: int) -> tuple[Shards | None, 
     return Shards(torch.device("cuda", local_rank) if cuda else torch.device("cpu")), local_rank
 
 
+def leave_the_rest_to_the_first(shards: Shards) -> None:
+    """Let the run go on in the first process, as if it were alone; the others end.
+
+    Args:
+        shards: What this process knows of the others, which nobody may use any more.
+
+    Raises:
+        SystemExit: In the other processes, with exit code 0.
+    """
+    shards.all(True)
+    dist.destroy_process_group()
+    if shards.rank > 0:
+        raise SystemExit(0)
+    os.environ.pop("LOCAL_WORLD_SIZE", None)  # torchrun's; nobody shares the host's memory any more.
+    # nerfstudio takes leave of the others at the end, and a group of one process has none.
+    dist.init_process_group("gloo", store=dist.HashStore(), rank=0, world_size=1)
+
+
 def leave() -> None:
     """End what `join` began, where torchrun started the processes; nerfstudio does so for those that it starts."""
     if "WORLD_SIZE" in os.environ and dist.is_initialized():

@@ -42,6 +42,9 @@ RATES_OF_FOUR_VIEWS = {"means": (3.0, 3.0), "opacities": (1.5, 1.5), "scales": (
 """Factors on learning rates at the first and at the last iteration in steps of four views
 (docs/results.md#splits-and-rates).
 Rates that fall once densification has ended fall less in steps of several views, and not at all in steps of four."""
+LEAST_PIXELS = 1.5e6
+"""Pixels that a step must draw on each of several devices. On two, runs of 1.9 and 3 million each took 1/1.1 and 1/1.3
+of the time on one, and one of .3 million 2.3 times as long (docs/results.md#several-devices)."""
 _SAVING_SHARE = 0.01
 """Largest share of the time between two checkpoints by the clock that saving may take."""
 
@@ -211,6 +214,28 @@ class SadgsTrainer(Trainer):
         config.max_num_iterations = pipeline.schedule.iterations
         self.config = config
 
+    def _take_one_device_if_quicker(self) -> None:
+        """Train on the first device alone, and say so, where a step has too few pixels for several.
+
+        Raises:
+            SystemExit: In the other processes, whose work is done.
+        """
+        if self.shards is None or self.config.share_always:
+            return
+        cameras, devices = self.pipeline.datamanager.train_dataset.cameras, self.shards.num_ranks
+        pixels = self.pipeline.views_per_iteration * float((cameras.height * cameras.width).double().mean())
+        if pixels >= LEAST_PIXELS * devices:
+            return
+        CONSOLE.print(
+            f"Training on one device: a step draws {pixels / 1e6:.1f} megapixels, and {devices} devices are quicker "
+            f"from about {LEAST_PIXELS * devices / 1e6:.0f} on (docs/results.md). If one device does not hold the "
+            "Gaussians, set --share-always True.",
+            highlight=False,
+            soft_wrap=True,
+        )
+        processes.leave_the_rest_to_the_first(self.shards)
+        self.shards = self._peers = None
+
     def setup_optimizers(self) -> SadgsOptimizers:
         """Derive the run's length and build the optimizers with schedules as long as that, fused where the model is.
 
@@ -223,6 +248,7 @@ class SadgsTrainer(Trainer):
         if self._checkpoint is None and config.pipeline.start_from is not None:
             start_from(self.pipeline, config.pipeline.start_from)
         self._derive_schedule()
+        self._take_one_device_if_quicker()
         if self.shards is not None:
             self.pipeline.share_out(self.shards)
         elif line := choose_color_model(self.pipeline.model, self.pipeline.datamanager.train_dataset):

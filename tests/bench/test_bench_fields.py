@@ -396,7 +396,12 @@ def test_two_processes_train_one_splat_whose_row_the_first_writes(
     """They start as on two GPUs, `--gpus 0+1`, and find none. LPIPS is left out, since its weights are missing."""
     monkeypatch.setenv("TORCH_HOME", "/dev/null")
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    overrides = {**SADGS.overrides, "machine.device_type": "cpu", "pipeline.views_per_iteration": 2}
+    overrides = {
+        **SADGS.overrides,
+        "machine.device_type": "cpu",
+        "pipeline.views_per_iteration": 2,
+        "share_always": True,
+    }
     assert isinstance(overrides.pop("pipeline.model.background_color"), str)
     with bench.launcher(root)(Job(SCENE, Row("ours", "sadgs", overrides), 0), "0+1", tmp_path) as process:
         assert process.wait(200) == 0, (tmp_path / "log").read_text()

@@ -75,7 +75,7 @@ def test_a_run_on_two_gpus_ends_with_one_checkpoint(start: str, scene: Path, tmp
     options = [
         "sadgs", "--data", str(scene), "--output-dir", str(tmp_path), "--experiment-name", "test",
         "--max-num-iterations", "60", "--pipeline.views-per-iteration", "2",
-        "--pipeline.model.strategy.max-gaussians", "5000",
+        "--pipeline.model.strategy.max-gaussians", "5000", "--share-always", "True",
     ]  # fmt: skip
     if start == "nerfstudio":
         command = [sys.executable, "-m", "nerfstudio.scripts.train", *options, "--machine.num-devices", "2"]
@@ -99,7 +99,7 @@ def test_two_gpus_train_on_images_of_several_sizes_that_are_on_the_host(tier: st
     result = run([
         *TORCHRUN, "-m", "nerfstudio.scripts.train", "sadgs", "--data", str(parser.data),
         "--output-dir", str(tmp_path), "--max-num-iterations", "60", "--pipeline.views-per-iteration", "3",
-        "--pipeline.datamanager.cache-images", tier, "--pipeline.model.num-random", "300",
+        "--pipeline.datamanager.cache-images", tier, "--pipeline.model.num-random", "300", "--share-always", "True",
     ])  # fmt: skip
     assert result.returncode == 0, result.stdout + result.stderr
     assert len(list(tmp_path.rglob("*.ckpt"))) == 1 and len(re.findall("Training Finished", result.stdout)) == 1
