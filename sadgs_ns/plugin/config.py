@@ -106,7 +106,7 @@ class CheckedTrainerConfig(TrainerConfig):
     seconds_per_save: float = 60.0
     """Seconds from one checkpoint to the next where steps_per_save is 0; 0 makes none before the end.
     If 100 times what the last one took is longer, that is waited."""
-    steps_per_eval_batch: int = 0
+    steps_per_eval_batch: Suppress[int] = 0
     """Steps between losses on a held-out view; 0 is never."""
     steps_per_eval_image: int = 500
     """Steps between metrics of one held-out view, where a logger such as tensorboard is on."""
