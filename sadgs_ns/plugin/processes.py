@@ -178,7 +178,8 @@ def leave_the_rest_to_the_first(shards: Shards) -> None:
         raise SystemExit(0)
     os.environ.pop("LOCAL_WORLD_SIZE", None)  # torchrun's; nobody shares the host's memory any more.
     # nerfstudio takes leave of the others at the end, and a group of one process has none.
-    dist.init_process_group("gloo", store=dist.HashStore(), rank=0, world_size=1)
+    store = dist.HashStore()  # pyright: ignore[reportPrivateImportUsage]
+    dist.init_process_group("gloo", store=store, rank=0, world_size=1)
 
 
 def leave() -> None:
