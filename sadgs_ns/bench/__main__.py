@@ -40,6 +40,8 @@ from sadgs_ns.bench.table import markdown
 POLL_SECONDS = 0.2
 KILL_SECONDS = 10.0
 """How long a run may take to end when it is asked to, before it is killed."""
+TORCHRUN_SECONDS = 40.0
+"""The same of a run on several GPUs: torchrun kills its processes, which have sessions of their own, after 30 s."""
 
 COMMANDS = {
     "report": ("report", "the plots and the page of a results file"),
@@ -58,7 +60,7 @@ COMMANDS = {
 """What `sadgs-bench` does besides running a protocol, and the module that does it."""
 
 Launch = Callable[[Job, "str | None", Path], "subprocess.Popen[bytes]"]
-"""Starts a job on a GPU (None: any; "0+1": on both) in a folder, where `result.json` and `log` appear."""
+"""Starts a job on a GPU (None: any; "0+1": two) in a folder, where `result.json` and `log` appear."""
 
 
 @dataclasses.dataclass
@@ -88,7 +90,7 @@ class _Run:
         """End the process and what it started."""
         try:
             os.killpg(self.process.pid, signal.SIGTERM)
-            self.process.wait(KILL_SECONDS)
+            self.process.wait(KILL_SECONDS if "+" not in (self.gpu or "") else TORCHRUN_SECONDS)
         except ProcessLookupError:
             pass
         except subprocess.TimeoutExpired:
@@ -275,7 +277,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"sadgs-bench: {error}", file=sys.stderr)
         return 2
 
+    gpus = arguments.gpus.split(",") if arguments.gpus else (None,)
+    devices = {1 if gpu is None else gpu.count("+") + 1 for gpu in gpus}
     done = results.read(arguments.output)
+    devices |= {result["devices"] for result in done if result.get("devices") is not None}
+    if len(devices) > 1:
+        print(
+            "sadgs-bench: a file holds runs on equally many devices: give --gpus as many for each run, and another "
+            f"--output than {arguments.output} if that has runs on others.",
+            file=sys.stderr,
+        )
+        return 2
     todo = unfinished(jobs, done)
     if arguments.images is not None:
         keys = {job.key for job in jobs} - {job.key for job in todo}
@@ -292,7 +304,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             progress.advance(task)
 
         arguments.output.parent.mkdir(parents=True, exist_ok=True)
-        gpus = arguments.gpus.split(",") if arguments.gpus else (None,)
         images = None if arguments.images is None else arguments.images.resolve()
         launch = launcher(arguments.scenes.resolve(), images)
         try:

@@ -172,6 +172,11 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
         with phases.replaced(config.pipeline.model._target, "populate_modules", timed_initialization):
             trainer.setup(test_mode="test")  # "val" would evaluate on blender's validation views
     seconds["setup_seconds"] -= seconds["initialization_seconds"]
+    if devices > 1 and getattr(trainer, "shards", None) is None:
+        raise ValueError(
+            f"row {job.row.label!r} on {job.scene.name!r} trains on one device, since its steps have few pixels or its "
+            "method knows one only: measure it with one GPU, or set share_always to true."
+        )
     pipeline, datamanager, model = trainer.pipeline, trainer.pipeline.datamanager, trainer.pipeline.model
     with timed("load"):  # else the first iteration decodes all images
         train_images, _ = datamanager.cached_train, datamanager.cached_eval
@@ -328,6 +333,8 @@ def main() -> None:
     record["versions"] = software()
     if rank == "0":
         arguments.out.write_text(json.dumps(record))
+    if record["status"] == "failed" and "WORLD_SIZE" in os.environ:
+        raise SystemExit(1)  # The other processes would wait for this one.
 
 
 if __name__ == "__main__":

@@ -30,6 +30,9 @@ class Exchange:
         bands: Those that this process composites.
         counts: Rows that each process has for each of these bands.
         places: Indices in V · N of the rows that this process sends, in the order of all bands. int64 [M]
+        fused: Whether rows are written and read by kernels, and gradients have the columns of `_GRADIENTS`; the same in
+            all processes.
+        whole_views: Whether each view is one band, so that no row is sent twice.
         absolute: The centres in which compositing leaves absolute gradients for `backward`, for each of these bands;
             none where nobody asked for them.
 
@@ -42,9 +45,12 @@ class Exchange:
     """
 
     def __init__(self, shards: Shards, projected: Projected, bands: Sequence[Band], *, fused: bool = True) -> None:
-        self.fused = fused and projected.colors.shape[-1] == 3 and kernels.available(shards.device)
+        self.fused = (
+            fused
+            and projected.colors.shape[-1] == 3
+            and shards.agree_once("kernels", lambda: kernels.available(shards.device))
+        )
         self.whole_views = len(bands) == len(projected.opacities)
-        """Whether each view is one band, so that no row is sent twice."""
         reached = _reached(projected, bands)  # [B, N]
         counted = torch.cat([reached.sum(1), torch.tensor([shards.request], device=shards.device)])
         gathered = shards.gather(counted)  # [R, B + 1]
@@ -107,7 +113,9 @@ class Exchange:
             In the order of `places`. [M, K]
         """
         rows = nothing
-        if parts:
+        if len(parts) == 1:
+            rows = parts[0]  # They came in the order of the processes.
+        elif parts:
             rows = torch.cat(_transposed(torch.cat([*parts]), list(zip(*self.counts, strict=True))))
         received = rows.new_empty((len(self.places), nothing.shape[1]))
         dist.all_to_all_single(received, rows.contiguous(), self._sent, self._received)
@@ -232,7 +240,8 @@ def _gradient_rows(columns: Sequence[Tensor | None], widths: Sequence[int], numb
         like: A tensor of their type and device.
     """
     width, first = sum(widths), columns[0]
-    if first is not None and first.dim() == 3 and first.stride()[1:] == (width, 1):
+    whole = all(value is not None for value in columns[:4])
+    if whole and first is not None and first.dim() == 3 and first.stride()[1:] == (width, 1):
         starts = [first.data_ptr() + first.element_size() * sum(widths[:i]) for i in range(len(widths))]
         if all(value is None or value.data_ptr() == start for value, start in zip(columns, starts, strict=True)):
             return first.as_strided((number, width), (width, 1))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 import torch.distributed as dist
@@ -36,6 +36,18 @@ class Shards:
         self.rank, self.num_ranks, self.device = dist.get_rank(), dist.get_world_size(), device
         self.sizes: list[int] = [0] * self.num_ranks
         self.request = self.heard = 0
+        self._agreed: dict[str, bool] = {}
+
+    def agree_once(self, question: str, answer: Callable[[], bool]) -> bool:
+        """Return whether all processes answered yes when they were first asked a question.
+
+        Args:
+            question: Its name.
+            answer: Called the first time.
+        """
+        if question not in self._agreed:
+            self._agreed[question] = self.all(answer())
+        return self._agreed[question]
 
     @property
     def total(self) -> int:

@@ -99,8 +99,8 @@ class CheckedTrainerConfig(TrainerConfig):
     """Whether the host launches steps of few Gaussians at once, as CUDA graphs, instead of kernel by kernel.
     Only where there is CUDA, and up to a million Gaussians, counted in each view (docs/results.md)."""
     share_always: bool = False
-    """Share the Gaussians out over all devices, also where a step is so short that one device alone is quicker.
-    Several devices then help only where one does not hold the Gaussians."""
+    """Share the Gaussians out over all devices, also where steps are so short that one device alone is quicker.
+    There, several devices help only if one does not hold the Gaussians."""
     steps_per_save: int = 0
     """Steps between checkpoints; 0 leaves them to the clock. One is always made at the end."""
     seconds_per_save: float = 60.0

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import random
+import signal
 import socket
 import tempfile
 import time
 from datetime import timedelta
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 import torch
@@ -49,7 +50,7 @@ def least(number: float, device: torch.device) -> float:
         number: Any, also infinite.
         device: Where this process trains.
     """
-    return Shards(device).least(number) if dist.is_initialized() else number
+    return Shards(device).least(number) if number_of_processes() > 1 else number
 
 
 def check(config: CheckedTrainerConfig) -> None:
@@ -90,19 +91,47 @@ def check(config: CheckedTrainerConfig) -> None:
 
 
 class Peers:
-    """The processes of a run, as the operating system of this machine knows them."""
+    """The processes of a run, as the operating system of this machine knows them.
 
-    def __init__(self) -> None:
-        number = dist.get_world_size()
+    Args:
+        shards: The processes.
+    """
+
+    def __init__(self, shards: Shards) -> None:
+        self._rank, number = shards.rank, shards.num_ranks
         with tempfile.NamedTemporaryFile() as file:
+            file.write(bytes(number))
+            file.flush()
             mine = (socket.gethostname(), os.getpid(), file.name)
             self._places = [mine] * number
             dist.all_gather_object(self._places, mine)
             shared = next(path for host, _, path in self._places if host == mine[0])
-            # The first process's file is memory that all processes of this machine share, with a byte for each.
-            self._followed = torch.from_file(shared, shared=True, size=number, dtype=torch.uint8)
-            """1 for each process that ends because another has ended. uint8 [number of processes]"""
-            dist.barrier()  # The files go, and the memory stays as long as a process has it.
+            try:
+                # The first process's file is memory that all processes of this machine share, with a byte for each.
+                self._followed = torch.from_file(shared, shared=True, size=number, dtype=torch.uint8)
+                """1 for each process that ends because another has ended. uint8 [number of processes]"""
+            except RuntimeError:  # This process has another folder of temporary files.
+                self._followed = torch.zeros(number, dtype=torch.uint8)
+            shards.all(True)  # The files go, and the memory stays as long as a process has it.
+
+    def all_here(self) -> bool:
+        """Tell whether all processes run on this machine."""
+        return len({host for host, _, _ in self._places}) == 1
+
+    def wait_for_the_first(self) -> NoReturn:
+        """Do nothing until the first process has ended, which must run on this machine; then end this process.
+
+        What starts the processes would take the end of one for the end of all.
+
+        Raises:
+            SystemExit: With exit code 0.
+        """
+        for number, handler in ((signal.SIGINT, signal.SIG_IGN), (signal.SIGHUP, signal.SIG_IGN)):
+            signal.signal(number, handler)  # The first process saves, and ends.
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        while _exists(self._places[0][1]):
+            time.sleep(0.2)
+        raise SystemExit(0)
 
     def ended(self) -> list[int]:
         """Return the ranks of this machine's processes that ended by themselves, after waiting some seconds for one.
@@ -114,7 +143,7 @@ class Peers:
             ranks = [rank for rank, (host, pid, _) in enumerate(self._places) if host == here and not _exists(pid)]
             ranks = [rank for rank in ranks if not self._followed[rank]]
             if ranks:
-                self._followed[dist.get_rank()] = 1
+                self._followed[self._rank] = 1
             if ranks or time.monotonic() > end:
                 return ranks
             time.sleep(0.1)
@@ -163,11 +192,12 @@ def join(config: CheckedTrainerConfig, local_rank: int) -> tuple[Shards | None, 
     return Shards(torch.device("cuda", local_rank) if cuda else torch.device("cpu")), local_rank
 
 
-def leave_the_rest_to_the_first(shards: Shards) -> None:
-    """Let the run go on in the first process, as if it were alone; the others end.
+def leave_the_rest_to_the_first(shards: Shards, peers: Peers) -> None:
+    """Let the run go on in the first process, as if it were alone; the others wait for its end, and end.
 
     Args:
         shards: What this process knows of the others, which nobody may use any more.
+        peers: The processes, all of which run on this machine.
 
     Raises:
         SystemExit: In the other processes, with exit code 0.
@@ -175,7 +205,7 @@ def leave_the_rest_to_the_first(shards: Shards) -> None:
     shards.all(True)
     dist.destroy_process_group()
     if shards.rank > 0:
-        raise SystemExit(0)
+        peers.wait_for_the_first()
     os.environ.pop("LOCAL_WORLD_SIZE", None)  # torchrun's; nobody shares the host's memory any more.
     # nerfstudio takes leave of the others at the end, and a group of one process has none.
     store = dist.HashStore()  # pyright: ignore[reportPrivateImportUsage]

@@ -35,7 +35,7 @@ from sadgs_ns.plugin.progress import about_cpu, remove_tables, what_next
 
 _LESS_MEMORY = (
     "lower --pipeline.model.strategy.max-gaussians or --pipeline.views-per-iteration, or take smaller images "
-    "(`--downscale-factor 2` after `nerfstudio-data` or `colmap`)"
+    "(`--downscale-factor 2` after `nerfstudio-data` or `colmap`), or several devices (`--share-always True`)"
 )
 _NOTHING_DONE = "stopped before an iteration was done; the same command starts again."
 RATES_OF_FOUR_VIEWS = {"means": (3.0, 3.0), "opacities": (1.5, 1.5), "scales": (2.25, 0.375), "quats": (2.25, 0.375)}
@@ -43,8 +43,9 @@ RATES_OF_FOUR_VIEWS = {"means": (3.0, 3.0), "opacities": (1.5, 1.5), "scales": (
 (docs/results.md#splits-and-rates).
 Rates that fall once densification has ended fall less in steps of several views, and not at all in steps of four."""
 LEAST_PIXELS = 1.5e6
-"""Pixels that a step must draw on each of several devices. On two, runs of 1.9 and 3 million each took 1/1.1 and 1/1.3
-of the time on one, and one of .3 million 2.3 times as long (docs/results.md#several-devices)."""
+"""Pixels that a step must draw on each of several devices. Runs whose steps drew 1.9 and 3 million pixels on each of
+two took 1/1.1 and 1/1.3 of the time on one, and a run of .7 million took 2.3 times as long
+(docs/results.md#several-devices)."""
 _SAVING_SHARE = 0.01
 """Largest share of the time between two checkpoints by the clock that saving may take."""
 
@@ -82,7 +83,7 @@ class SadgsTrainer(Trainer):
         config = copy.copy(config)  # Where there are several processes, they agree on what the file does not say.
         self.shards, local_rank = processes.join(config, local_rank)
         """What this process knows of the others; None where it is alone."""
-        self._peers = None if self.shards is None else processes.Peers()
+        self._peers = None if self.shards is None else processes.Peers(self.shards)
         self._vis: Any = config.vis
         if self.shards is not None and (config.is_viewer_enabled() or config.is_viewer_legacy_enabled()):
             CONSOLE.print("The viewer is off, since no device holds all Gaussians; `ns-viewer` shows the finished run.")
@@ -217,23 +218,25 @@ class SadgsTrainer(Trainer):
     def _take_one_device_if_quicker(self) -> None:
         """Train on the first device alone, and say so, where a step has too few pixels for several.
 
+        On several machines all devices are kept.
+
         Raises:
-            SystemExit: In the other processes, whose work is done.
+            SystemExit: In the other processes, once the first has ended.
         """
-        if self.shards is None or self.config.share_always:
+        if self.shards is None or self._peers is None or self.config.share_always or not self._peers.all_here():
             return
         cameras, devices = self.pipeline.datamanager.train_dataset.cameras, self.shards.num_ranks
         pixels = self.pipeline.views_per_iteration * float((cameras.height * cameras.width).double().mean())
         if pixels >= LEAST_PIXELS * devices:
             return
         CONSOLE.print(
-            f"Training on one device: a step draws {pixels / 1e6:.1f} megapixels, and {devices} devices are quicker "
-            f"from about {LEAST_PIXELS * devices / 1e6:.0f} on (docs/results.md). If one device does not hold the "
-            "Gaussians, set --share-always True.",
+            f"Training on one device: a step draws {pixels / 1e6:.2f} megapixels, and {devices} devices are expected "
+            f"to be quicker from {LEAST_PIXELS * devices / 1e6:.1f} on (docs/results.md). If one device does not hold "
+            "the Gaussians, set --share-always True; for the viewer start the run on one device.",
             highlight=False,
             soft_wrap=True,
         )
-        processes.leave_the_rest_to_the_first(self.shards)
+        processes.leave_the_rest_to_the_first(self.shards, self._peers)
         self.shards = self._peers = None
 
     def setup_optimizers(self) -> SadgsOptimizers:
