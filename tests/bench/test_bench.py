@@ -351,6 +351,23 @@ def test_sigterm_ends_the_runs_and_its_handler_is_the_program_s_again(tmp_path: 
     assert signal.getsignal(signal.SIGTERM) == before
 
 
+@pytest.mark.parametrize(("gpus", "there"), [("0,0+1", None), ("0+1", 1), ("0", 2), ("0+1+2", 2)])
+def test_runs_on_other_numbers_of_devices_are_not_mixed(
+    gpus: str, there: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    (tmp_path / "p.yaml").write_text(
+        json.dumps(content(scenes={"fox": {"data": "fox", "dataparser": "nerfstudio-data"}}))
+    )
+    (tmp_path / "fox").mkdir()
+    monkeypatch.setattr(bench, "launcher", lambda root, images: pytest.fail("nothing may start"))
+    output = tmp_path / "r.jsonl"
+    results.append(output, result(devices=there))
+    arguments = ["p.yaml", "--scenes", ".", "--output", str(output), "--gpus", gpus]
+    monkeypatch.chdir(tmp_path)
+    assert bench.main(arguments) == 2
+    assert f"and another --output than {output} if that has runs on others" in capsys.readouterr().err
+
+
 def test_a_half_written_line_is_ignored_and_swallows_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     path = tmp_path / "results.jsonl"
     assert results.read(path) == []
