@@ -50,7 +50,7 @@ def least(number: float, device: torch.device) -> float:
         number: Any, also infinite.
         device: Where this process trains.
     """
-    return Shards(device).least(number) if number_of_processes() > 1 else number
+    return Shards(device).least(number) if dist.is_initialized() and dist.get_world_size() > 1 else number
 
 
 def check(config: CheckedTrainerConfig) -> None:
