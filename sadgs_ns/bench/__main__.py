@@ -63,6 +63,11 @@ Launch = Callable[[Job, "str | None", Path], "subprocess.Popen[bytes]"]
 """Starts a job on a GPU (None: any; "0+1": two) in a folder, where `result.json` and `log` appear."""
 
 
+def devices_of(gpu: str | None) -> list[str]:
+    """The GPUs that a run takes together, "0+1" being two; none are named where any will do."""
+    return [] if gpu is None else gpu.split("+")
+
+
 @dataclasses.dataclass
 class _Run:
     job: Job
@@ -90,7 +95,7 @@ class _Run:
         """End the process and what it started."""
         try:
             os.killpg(self.process.pid, signal.SIGTERM)
-            self.process.wait(KILL_SECONDS if "+" not in (self.gpu or "") else TORCHRUN_SECONDS)
+            self.process.wait(TORCHRUN_SECONDS if len(devices_of(self.gpu)) > 1 else KILL_SECONDS)
         except ProcessLookupError:
             pass
         except subprocess.TimeoutExpired:
@@ -105,7 +110,7 @@ def launcher(root: Path, images: Path | None = None) -> Launch:
         folders = {"root": str(root), "images": None if images is None else str(images)}
         spec = json.dumps({**dataclasses.asdict(job), **folders}, default=str)
         command = ["-m", "sadgs_ns.bench.run", "--spec", spec, "--out", str(folder / "result.json")]
-        devices = [] if gpu is None else gpu.split("+")
+        devices = devices_of(gpu)
         if len(devices) > 1:
             torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(len(devices))]
             command = [*torchrun, *command]
@@ -278,7 +283,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
 
     gpus = arguments.gpus.split(",") if arguments.gpus else (None,)
-    devices = {1 if gpu is None else gpu.count("+") + 1 for gpu in gpus}
+    devices = {max(len(devices_of(gpu)), 1) for gpu in gpus}
     done = results.read(arguments.output)
     devices |= {result["devices"] for result in done if result.get("devices") is not None}
     if len(devices) > 1:

@@ -138,7 +138,6 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
     """
     seconds: dict[str, float] = {}
     start = time.perf_counter()
-    devices = int(os.environ.get("WORLD_SIZE", "1"))
     import torch
 
     # ns-train's own module: importing it also sets cuDNN as in a user's run.
@@ -148,7 +147,9 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
     from sadgs_ns.bench import images as pictures
     from sadgs_ns.bench.curve import Curve, point
     from sadgs_ns.bench.timer import CompileTimer, LoopTimer
+    from sadgs_ns.plugin import processes
 
+    devices = processes.number_of_processes()
     seconds["import_seconds"] = time.perf_counter() - start
 
     @contextlib.contextmanager
@@ -208,7 +209,7 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
     if not timer.finished:
         raise RuntimeError("the training loop stopped before its last iteration.")
     if devices > 1:
-        if os.environ["RANK"] != "0":
+        if not processes.is_first():
             return {}
         trainer = alone(job, root, work, trainer.checkpoint_dir)
         pipeline, datamanager, model = trainer.pipeline, trainer.pipeline.datamanager, trainer.pipeline.model

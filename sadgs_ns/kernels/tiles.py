@@ -32,6 +32,9 @@ _PART_ROWS, _PART_COLUMNS = 4, 8
 _PROGRAMS = 4096
 """Largest number of programs that share out the parts, whose number the host does not know: as many as an H100 runs at
 once, of one warp each."""
+_PLACE = tl.constexpr(2**24)
+"""Factor on a Gaussian's place in the order by depth, where it is noted with the number of one of its parts. It stands
+on the right of products, as Triton's interpreter needs it."""
 _ORDER_LANES = 512
 """Pairs or tiles that one program handles where the lists are put in order."""
 
@@ -136,8 +139,8 @@ def _list(
 ):  # fmt: skip
     """Write the tile and the Gaussian of each pair, the nearest Gaussians first.
 
-    A Gaussian of more than FEW pairs is left to `_list_parts`: each of its parts is noted in `parts`, as 2^24 times its
-    place in the order plus the part's number, and counted in `part_count`.
+    A Gaussian of more than FEW pairs is left to `_list_parts`: each of its parts is noted in `parts`, as _PLACE times
+    its place in the order plus the part's number, and counted in `part_count`.
 
     The rest of the `num_pairs` places is given to the last tile. If there are more pairs than places, this tile gets
     all places, and all radii become 0: nothing is drawn, and nobody counts the views.
@@ -154,7 +157,7 @@ def _list(
     if total > 0:
         noted = tl.atomic_add(part_count, total) + tl.cumsum(cut, 0) - cut
         for i in range(tl.max(cut)):
-            tl.store(parts + noted + i, lane.to(tl.int64) * 16777216 + i, i < cut)
+            tl.store(parts + noted + i, lane.to(tl.int64) * _PLACE + i, i < cut)
     x, y, a, b, c, level, determinant, proper, first_column, last_column, first_row, last_row = _load_ellipse(
         means2d, radii, conics, opacities, g, exists, tile_width, tile_height, PER_GAUSSIAN, TILE
     )
@@ -196,14 +199,14 @@ def _list_parts(
     which = tl.program_id(0)
     while which < end:
         part = tl.load(parts + which)
-        position = part // 16777216
+        position = part // _PLACE
         g = tl.load(order + position).to(tl.int32)
         place = tl.load(ends + position - 1, position > 0, 0)
         cut = (tl.load(ends + position) - place + PART - 1) // PART
         x, y, a, b, c, level, determinant, proper, first_column, last_column, first_row, last_row = _load_ellipse(
             means2d, radii, conics, opacities, g, True, tile_width, tile_height, PER_GAUSSIAN, TILE
         )
-        number, rows = part % 16777216, last_row - first_row
+        number, rows = part % _PLACE, last_row - first_row
         begin = first_row + (rows * number // cut).to(tl.int32)
         last_row = first_row + (rows * (number + 1) // cut).to(tl.int32)
         while first_row < begin:  # Parts before this one take the places before this one's.

@@ -126,8 +126,8 @@ class Peers:
         Raises:
             SystemExit: With exit code 0.
         """
-        for number, handler in ((signal.SIGINT, signal.SIG_IGN), (signal.SIGHUP, signal.SIG_IGN)):
-            signal.signal(number, handler)  # The first process saves, and ends.
+        for number in (signal.SIGINT, signal.SIGHUP):
+            signal.signal(number, signal.SIG_IGN)  # The first process saves, and ends.
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         while _exists(self._places[0][1]):
             time.sleep(0.2)
@@ -140,8 +140,11 @@ class Peers:
         """
         end, here = time.monotonic() + _REAPED_SECONDS, socket.gethostname()
         while True:
-            ranks = [rank for rank, (host, pid, _) in enumerate(self._places) if host == here and not _exists(pid)]
-            ranks = [rank for rank in ranks if not self._followed[rank]]
+            ranks = [
+                rank
+                for rank, (host, pid, _) in enumerate(self._places)
+                if host == here and not _exists(pid) and not self._followed[rank]
+            ]
             if ranks:
                 self._followed[self._rank] = 1
             if ranks or time.monotonic() > end:

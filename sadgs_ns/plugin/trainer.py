@@ -127,7 +127,7 @@ class SadgsTrainer(Trainer):
         """Print the run's size after the memory plan's line, and what decided it."""
         cameras, config, schedule = self.pipeline.datamanager.train_dataset.cameras, self.config, self.pipeline.schedule
         views, asked, taken = len(cameras), config.pipeline.views_per_iteration, schedule.views_per_iteration
-        megapixels = float((cameras.height * cameras.width).double().mean()) / 1e6
+        megapixels = self._pixels_of_a_view() / 1e6
         done = f", of which {self._start_step:,} are done" if self._start_step else ""
         times = round(schedule.iterations * taken / views)
         lines = [
@@ -148,6 +148,11 @@ class SadgsTrainer(Trainer):
         if self.device == "cpu":
             lines.append(f"[yellow]{about_cpu(torch.get_num_threads())}[/]")
         CONSOLE.print("\n".join(lines), highlight=False, soft_wrap=True)
+
+    def _pixels_of_a_view(self) -> float:
+        """Return the mean number of pixels of the training views."""
+        cameras = self.pipeline.datamanager.train_dataset.cameras
+        return float((cameras.height * cameras.width).double().mean())
 
     def _say_what_is_next(self) -> None:
         """Print the commands for a run that is done, below nerfstudio's box; not where the run ends with an error."""
@@ -225,8 +230,7 @@ class SadgsTrainer(Trainer):
         """
         if self.shards is None or self._peers is None or self.config.share_always or not self._peers.all_here():
             return
-        cameras, devices = self.pipeline.datamanager.train_dataset.cameras, self.shards.num_ranks
-        pixels = self.pipeline.views_per_iteration * float((cameras.height * cameras.width).double().mean())
+        devices, pixels = self.shards.num_ranks, self.pipeline.views_per_iteration * self._pixels_of_a_view()
         if pixels >= LEAST_PIXELS * devices:
             return
         CONSOLE.print(

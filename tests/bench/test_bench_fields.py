@@ -399,10 +399,10 @@ def test_two_processes_train_one_splat_whose_row_the_first_writes(
     overrides = {
         **SADGS.overrides,
         "machine.device_type": "cpu",
+        "pipeline.model.background_color": "black",
         "pipeline.views_per_iteration": 2,
         "share_always": True,
     }
-    assert isinstance(overrides.pop("pipeline.model.background_color"), str)
     with bench.launcher(root)(Job(SCENE, Row("ours", "sadgs", overrides), 0), "0+1", tmp_path) as process:
         assert process.wait(200) == 0, (tmp_path / "log").read_text()
     record = json.loads((tmp_path / "result.json").read_text())
