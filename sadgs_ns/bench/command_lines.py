@@ -141,6 +141,7 @@ def shards() -> argparse.ArgumentParser:
     parser.add_argument("--gaussians", type=int, nargs="+", default=[8_000_000], help="of all devices together")
     parser.add_argument("--megapixels", type=float, nargs="+", default=[2.0, 8.0])
     parser.add_argument("--views", type=int, nargs="+", default=[2], help="of a step")
+    parser.add_argument("--blocks", type=int, default=1, help="parts of the scene, of which a view sees one")
     parser.add_argument("--repeats", type=int, default=10, help="steps in each of three rounds (default %(default)s)")
     parser.add_argument("--profile", action="store_true", help="also print what takes the first device its time")
     return parser

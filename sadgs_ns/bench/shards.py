@@ -3,7 +3,8 @@
     torchrun --nproc-per-node 2 -m sadgs_ns.bench.shards --gaussians 8000000 --megapixels 2 8
 
 One process, which needs no torchrun, is timed as it trains alone. The Gaussians are made up: a spherical shell, which
-cameras around it look at.
+cameras around it look at, or several that no camera sees two of, as a view of a city sees a part of it. Scenes of one
+block a device, with one view of each, tell how much longer a step takes where the scene grows with the devices.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ ASPECT = 1.5
 """Width of the images, relative to their height."""
 ETA_EVERY = 10
 """Steps between two that observe η, about as many as in a run of 3,000 iterations."""
+BLOCKS_APART = 10.0
+"""Distance between the centres of two blocks, in radii of one."""
 ROOM = 1.2
 """Places in one process's tile lists, relative to the pairs of its first step: as in training, it does not wait."""
 
@@ -47,10 +50,19 @@ class Step:
         views: Number V of views of a step.
         device: Where this process computes.
         shards: The processes; None for one process.
+        blocks: Number of shells, of which each has as many Gaussians and views as another. Each process has as many
+            Gaussians of a block as another process.
     """
 
     def __init__(
-        self, gaussians: int, width: int, height: int, views: int, device: torch.device, shards: Shards | None
+        self,
+        gaussians: int,
+        width: int,
+        height: int,
+        views: int,
+        device: torch.device,
+        shards: Shards | None,
+        blocks: int = 1,
     ) -> None:
         self.shards, self.width, self.height, self.views = shards, width, height, views
         part = slice(0, gaussians) if shards is None else shards.take_even_part(gaussians)
@@ -63,9 +75,11 @@ class Step:
         directions = torch.nn.functional.normalize(
             torch.empty((number, 3), device=device).normal_(generator=generator), dim=-1
         )
-        spacing = math.sqrt(4 * math.pi / gaussians)  # of points on the unit sphere
+        spacing = math.sqrt(4 * math.pi * blocks / gaussians)  # of points on the unit sphere
+        means = directions * uniform(0.95, 1.05, number, 1)
+        means[:, 1] += BLOCKS_APART * (torch.arange(number, device=device) % blocks)
         values = {
-            "means": directions * uniform(0.95, 1.05, number, 1),
+            "means": means,
             "scales": torch.log(spacing * uniform(0.3, 1.2, number, 3)),
             "quats": uniform(-1.0, 1.0, number, 4),
             "features_dc": uniform(-1.0, 1.0, number, 3),
@@ -78,11 +92,13 @@ class Step:
         for optimizer in self.optimizers:
             optimizer.log = log  # What shares it is updated in one launch.
         self.state: dict[str, Any] = empty_statistics(number, device) | empty_gradients(number, device)
-        angles = torch.arange(views, device=device) * (2 * math.pi / views)
+        numbers = torch.arange(views, device=device)
+        angles = (numbers // blocks) * (2 * math.pi * blocks / views)
         self.viewmats = torch.eye(4, device=device).repeat(views, 1, 1)
         self.viewmats[:, 0, 0] = self.viewmats[:, 2, 2] = angles.cos()
         self.viewmats[:, 0, 2] = angles.sin()
         self.viewmats[:, 2, 0] = -angles.sin()
+        self.viewmats[:, 1, 3] = -BLOCKS_APART * (numbers % blocks)
         self.viewmats[:, 2, 3] = 1.6
         focal = 0.8 * width
         K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], device=device)
@@ -183,7 +199,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for megapixels in options.megapixels:
             for views in options.views:
                 height = round((megapixels * 1e6 / ASPECT) ** 0.5)
-                step = Step(gaussians, round(ASPECT * height), height, views, device, shards)
+                step = Step(gaussians, round(ASPECT * height), height, views, device, shards, options.blocks)
                 milliseconds, peak = measure(step, device, options.repeats)
                 peaks = torch.tensor([peak], device=device)
                 peaks = peaks if shards is None else shards.gather(peaks)[:, 0]

@@ -11,6 +11,7 @@ from ranks import run_ranks
 
 from sadgs_ns.bench import shards as bench
 from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.render.rasterization import visible
 
 CPU = torch.device("cpu")
 
@@ -29,6 +30,15 @@ def test_processes_train_what_they_have(tmp_path: Path):
     for result in results:
         assert result["moved"] and result["milliseconds"] > 0
         assert result["n_total"] > 0 and result["absgrad2d"] > 0 and result["grad_count"] > 0
+
+
+def test_a_view_sees_one_block(monkeypatch: pytest.MonkeyPatch):
+    seen = []
+    monkeypatch.setattr(bench, "accumulate_gradients", lambda state, info, views: seen.append(visible(info)))
+    bench.Step(300, 48, 32, 4, CPU, None, blocks=2)()
+    for view, gaussians in enumerate(seen[0]):
+        blocks = gaussians.nonzero()[:, 0] % 2
+        assert len(blocks) > 50 and bool((blocks == view % 2).all())
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="here it would measure")
