@@ -368,10 +368,13 @@ class StructureAwareStrategy(Strategy):
         return torch.sigmoid(params["opacities"].detach().flatten())  # [N]
 
     def _prune(self, params: Any, optimizers: Any, state: Any, mask: Tensor) -> int:
-        """Remove Gaussians, unless none would be left to train; a process may lose all that it has."""
+        """Remove Gaussians, unless fewer than one for each process would be left to train.
+
+        A process may lose all that it has until the shards are evened out.
+        """
         n_prune = int(mask.sum())
         of_all, total = self._of_all(n_prune, len(mask))
-        if of_all == total:
+        if total - of_all < (1 if self.shards is None else self.shards.num_ranks):
             return 0
         if n_prune > 0:
             remove(params, optimizers, state, mask)

@@ -11,6 +11,7 @@ from ranks import run_ranks
 from sadgs_ns.distributed.ranking import limit_growth
 from sadgs_ns.distributed.shards import Shards
 from sadgs_ns.method.split import limit_growth as limit_growth_alone
+from sadgs_ns.method.strategy import StructureAwareStrategy
 
 BUDGETS = (0, 1, 5, 37, 120, 2000, float("inf"), -3)
 
@@ -71,3 +72,24 @@ def test_rows_are_gathered_and_evened_out_in_the_order_of_the_ranks(tmp_path: Pa
         assert result["uneven"] and not result["even"]  # 8 is more than 1.1 times 7.
         assert torch.equal(result["after"], after) and result["least"] == 1.0
         assert result["all"] == (True, False)
+
+
+def prune_together(shards: Shards) -> list[int]:
+    """Numbers of Gaussians of this process after each of two prunings, and after the shards were evened out."""
+    strategy = StructureAwareStrategy()
+    strategy.shards = shards
+    params = {"means": torch.nn.Parameter(torch.arange(12.0).view(4, 3) + 12 * shards.rank)}
+    optimizers = {"means": torch.optim.Adam(params.values())}
+    faint = torch.ones(4, dtype=torch.bool)
+    faint[3:] = shards.rank == 0
+    numbers = []
+    for mask in (faint, faint if shards.rank == 0 else ~faint):
+        strategy._prune(params, optimizers, {}, mask)
+        numbers.append(len(params["means"]))
+    strategy._even_out(params, optimizers, {})
+    return [*numbers, len(params["means"])]
+
+
+def test_each_process_keeps_a_gaussian(tmp_path: Path):
+    """Two processes cannot train the one Gaussian that the first pruning would leave them."""
+    assert run_ranks(prune_together, 2, tmp_path) == [[4, 0, 1], [4, 3, 2]]
