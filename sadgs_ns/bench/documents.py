@@ -117,6 +117,7 @@ COLUMNS: dict[str, tuple[str, Callable[[Run], str]]] = {
     "scene": ("Scene", lambda run: run.scene),
     "photos": ("Scene: training views", Run.photos),
     "method": ("Method", lambda run: run.name),
+    "iterations": ("Iterations", lambda run: f"{run.mean('iterations'):,.0f}"),
     "loop": ("Loop s", lambda run: run.with_spread("loop_seconds", 1)),
     "seconds": ("Loop s", lambda run: number(run.mean("loop_seconds"), 0 if run.mean("loop_seconds") >= 100 else 1)),
     "date": ("Date", lambda run: run.group[0]["date"].split("T")[0]),

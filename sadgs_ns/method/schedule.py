@@ -27,6 +27,9 @@ GROWTH_WITH_EFFORT = (-0.32, 0.8)
 """Power of effort that multiplies the thresholds of growth, and the least factor: effort 2 and more is 0.8."""
 DENSIFICATION_SHARE = 16 / 30
 """Share of a run in which Gaussians are added and removed."""
+RESETS_FROM = 600
+"""Iterations of the shortest run that resets opacities. In shorter ones Gaussians would not recover before the next
+prune: runs of 114 to 385 iterations lost 2.7 to 11 dB by the reset (docs/results.md#short-runs)."""
 _PARTS = 30
 """A run is divided into so many parts of as many whole iterations."""
 _WINDOWS = {
@@ -107,8 +110,8 @@ def windows(iterations: int, **given: int | None) -> Windows:
     """Derive when densification does what from the length of the run; what is given stays.
 
     In the proportions of the released code: of thirty parts of the run, an AbsGS step ends each from the first to the
-    sixteenth, a structure step takes the place of every fifth, and opacities are reset once after twelve. η is observed
-    ten times in a part.
+    sixteenth, a structure step takes the place of every fifth, and opacities are reset once after twelve, but not in
+    runs of fewer than `RESETS_FROM` iterations. η is observed ten times in a part.
 
     Densification ends after at most 19/30 of the run (released code). Where that is before `refine_start_iter`, there
     is none, and nothing that prepares it.
@@ -122,6 +125,8 @@ def windows(iterations: int, **given: int | None) -> Windows:
     """
     part = max(round(iterations / _PARTS), 1)
     derived = {name: max(round(parts * part), 1) for name, parts in _WINDOWS.items()}
+    if iterations < RESETS_FROM:
+        derived["reset_every"] = 0
     chosen = Windows(**derived | {name: value for name, value in given.items() if value is not None})
     stop = min(chosen.refine_stop_iter, iterations * 19 // 30)
     return replace(chosen, refine_stop_iter=stop if stop >= chosen.refine_start_iter else 0)

@@ -95,7 +95,8 @@ class StructureAwareStrategy(Strategy):
     min_opacity: float = 0.02
     """Opacity under which every densification step prunes; AbsGS's own is 0.005."""
     reset_every: int | None = None
-    """Iterations between opacity resets inside the densification window; None is 12/30 of the run, 0 turns them off."""
+    """Iterations between opacity resets inside the densification window; 0 turns them off.
+    None is 12/30 of the run, and 0 in runs of fewer than 600 iterations, which would not recover."""
     fused: bool = True
     """Measure η, and add up AbsGS's gradients, in one Triton kernel each where these run (CUDA)."""
     run_length: int = field(default=3000, init=False)

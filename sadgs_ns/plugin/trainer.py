@@ -115,13 +115,25 @@ class SadgsTrainer(Trainer):
             self._say_what_was_chosen()
             last = [TrainingCallbackLocation.AFTER_TRAIN]
             self.callbacks.append(TrainingCallback(last, lambda step: self._say_what_is_next()))
-            compile_kernels(self.pipeline, self.optimizers.optimizers, self.config.cuda_graphs)
+            self._compile_kernels()
             self.graphed = GraphedSteps.of(self)
         except torch.cuda.OutOfMemoryError as error:
             raise RunError(f"The GPU's memory is too small to start ({_memory(error)}): {_LESS_MEMORY}.") from error
         except KeyboardInterrupt:
             CONSOLE.print(f"SIGINT: {_NOTHING_DONE}", soft_wrap=True)
             raise SystemExit(128 + signal.SIGINT) from None
+
+    def _compile_kernels(self) -> None:
+        """Compile what the machine has not compiled yet; of its processes the first does so before the others.
+
+        They then find it on the disk. Where 24 processes compiled the same kernels at once, Triton gave a kernel the
+        launcher of another in two of them, which ended with a TypeError.
+        """
+        if self.shards is not None and self.local_rank > 0:
+            self.shards.all(True)
+        compile_kernels(self.pipeline, self.optimizers.optimizers, self.config.cuda_graphs)
+        if self.shards is not None and self.local_rank == 0:
+            self.shards.all(True)
 
     def _say_what_was_chosen(self) -> None:
         """Print the run's size after the memory plan's line, and what decided it."""

@@ -69,6 +69,16 @@ def test_two_gpus_draw_and_differentiate_what_one_does():
     assert result.stdout.count("as one GPU does") == 2
 
 
+def assert_finished(result: subprocess.CompletedProcess[str], folder: Path) -> None:
+    """Compare what a run printed and saved with what a run of one process does."""
+    assert result.returncode == 0, result.stdout + result.stderr
+    (checkpoint,) = folder.rglob("*.ckpt")
+    state = torch.load(checkpoint, weights_only=True)
+    number = len(state["pipeline"]["_model.gauss_params.means"])
+    assert number > 100 and len(state["optimizers"]["means"]["state"][0]["exp_avg"]) == number
+    assert len(re.findall("Training Finished", result.stdout)) == 1
+
+
 @GPUS
 @pytest.mark.parametrize("start", ["nerfstudio", "torchrun"])
 def test_a_run_on_two_gpus_ends_with_one_checkpoint(start: str, scene: Path, tmp_path: Path):
@@ -82,12 +92,7 @@ def test_a_run_on_two_gpus_ends_with_one_checkpoint(start: str, scene: Path, tmp
     else:
         command = [*TORCHRUN, "-m", "nerfstudio.scripts.train", *options]
     result = run(command)
-    assert result.returncode == 0, result.stdout + result.stderr
-    (checkpoint,) = tmp_path.rglob("*.ckpt")
-    state = torch.load(checkpoint, weights_only=True)
-    number = len(state["pipeline"]["_model.gauss_params.means"])
-    assert number > 100 and len(state["optimizers"]["means"]["state"][0]["exp_avg"]) == number
-    assert len(re.findall("Training Finished", result.stdout)) == 1
+    assert_finished(result, tmp_path)
 
 
 @GPUS
@@ -101,8 +106,7 @@ def test_two_gpus_train_on_images_of_several_sizes_that_are_on_the_host(tier: st
         "--output-dir", str(tmp_path), "--max-num-iterations", "60", "--pipeline.views-per-iteration", "3",
         "--pipeline.datamanager.cache-images", tier, "--pipeline.model.num-random", "300", "--share-always", "True",
     ])  # fmt: skip
-    assert result.returncode == 0, result.stdout + result.stderr
-    assert len(list(tmp_path.rglob("*.ckpt"))) == 1 and len(re.findall("Training Finished", result.stdout)) == 1
+    assert_finished(result, tmp_path)
 
 
 def main() -> None:

@@ -77,12 +77,13 @@ def test_what_is_set_by_hand_stays():
 
 def test_windows_are_the_released_codes_at_3000_iterations_and_in_proportion_elsewhere():
     assert windows(3000) == Windows(500, 100, 100, 1600, 1200, 10)
-    for iterations in (60, 712, 2000, 7063, 30_000):
+    for iterations in (60, 599, 600, 712, 2000, 7063, 30_000):
         derived = windows(iterations)
         part = derived.absgs_every
         assert part == pytest.approx(iterations / 30, abs=0.5)
-        multiples = (derived.structure_every, derived.refine_start_iter, derived.refine_stop_iter, derived.reset_every)
-        assert multiples == (5 * part, part, 16 * part, 12 * part)
+        multiples = (derived.structure_every, derived.refine_start_iter, derived.refine_stop_iter)
+        assert multiples == (5 * part, part, 16 * part)
+        assert derived.reset_every == (12 * part if iterations >= 600 else 0)
         assert derived.eta_every == max(round(0.1 * part), 1)
         assert derived.refine_stop_iter == pytest.approx(DENSIFICATION_SHARE * iterations, rel=0.1)
 

@@ -60,7 +60,6 @@ def of_room(data: Path, output: Path, iterations: int) -> SadgsTrainerConfig:
     config.pipeline.datamanager.dataparser = NerfstudioDataParserConfig(
         data=data, load_3D_points=True, downscale_factor=1, eval_mode="interval", eval_interval=4
     )
-    config.pipeline.model.strategy.reset_every = 0  # So few iterations do not recover from it.
     return config
 
 

@@ -168,7 +168,7 @@ def test_no_view_at_all_per_iteration_is_refused(colmap: ColmapDataParserConfig,
 def test_training_makes_the_training_views_more_alike(colmap: ColmapDataParserConfig, tmp_path: Path):
     psnr: list[float] = []
     config = configure(tmp_path, colmap, iterations=ITERATIONS)
-    config.pipeline.model.strategy.refine_stop_iter = 0  # opacity resets set back so short a run
+    config.pipeline.model.strategy.refine_stop_iter = 0  # So few iterations do not make up for the final prune.
 
     def measure(trainer: SadgsTrainer) -> None:
         if trainer.step in (0, ITERATIONS - 1):

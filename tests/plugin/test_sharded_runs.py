@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import functools
 import os
 import signal
@@ -27,6 +26,7 @@ from torch.multiprocessing.spawn import ProcessExitedException, ProcessRaisedExc
 
 from sadgs_ns.distributed.shards import Shards
 from sadgs_ns.errors import InputError, RunError
+from sadgs_ns.plugin import trainer as trainer_module
 from sadgs_ns.plugin.presets import sadgs
 from sadgs_ns.plugin.processes import Peers
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
@@ -179,8 +179,6 @@ def test_a_whole_run_reaches_the_quality_of_one_process(scene: Path, tmp_path: P
     def configured(name: str) -> SadgsTrainerConfig:
         config = configure(scene, tmp_path / name, 80, save_every=0)
         config.pipeline.views_per_iteration = 2
-        # So short a run has no time to recover from a reset of its opacities.
-        config.pipeline.model.strategy = dataclasses.replace(config.pipeline.model.strategy, reset_every=0)
         return config
 
     alone = set_up(configured("alone"))
@@ -191,6 +189,29 @@ def test_a_whole_run_reaches_the_quality_of_one_process(scene: Path, tmp_path: P
     trainers = alone, set_up(copy.deepcopy(together))
     psnr = [trainer.pipeline.get_average_eval_image_metrics()["psnr"] for trainer in trainers]
     assert psnr[0] > 15 and abs(psnr[1] - psnr[0]) < 0.5, psnr
+
+
+def compile_together(shards: Shards, config: SadgsTrainerConfig) -> tuple[float, float]:
+    """When this process began and ended to compile kernels, which takes the first one half a second."""
+    CONSOLE.quiet = True
+    times: list[float] = []
+
+    def compile_kernels(*_: Any) -> None:
+        times.append(time.time())
+        time.sleep(0.5 if shards.rank == 0 else 0)
+        times.append(time.time())
+
+    trainer = config.setup(local_rank=shards.rank, world_size=shards.num_ranks)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trainer_module, "compile_kernels", compile_kernels)
+        trainer.setup()
+    return times[0], times[1]
+
+
+def test_the_first_process_compiles_before_the_others(scene: Path, tmp_path: Path):
+    config = configure(scene, tmp_path / "runs", 20, save_every=0)
+    (_, first_end), *others = run_ranks(compile_together, 3, tmp_path / "meet", config)
+    assert all(start >= first_end for start, _ in others)
 
 
 def train_and_die(shards: Shards, config: SadgsTrainerConfig, doomed: int, killed: Path) -> tuple[str, float]:
