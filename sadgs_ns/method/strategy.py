@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, MutableMapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, cast
 
 import torch
 from gsplat.strategy.base import Strategy
@@ -99,9 +99,10 @@ class StructureAwareStrategy(Strategy):
     None is 12/30 of the run, and 0 in runs of fewer than 600 iterations, which would not recover."""
     fused: bool = True
     """Measure η, and add up AbsGS's gradients, in one Triton kernel each where these run (CUDA)."""
-    run_length: int = field(default=3000, init=False)
+    # These two are no options, so that they have no annotation, which would make them fields.
+    run_length = 3000
     """Iterations of the run, which `fit_to_run` sets: windows that are None follow it."""
-    shards: Shards | None = field(default=None, init=False, repr=False)
+    shards = cast("Shards | None", None)
     """The processes among which the Gaussians are shared out; None where one process has all.
     The cap and the ranking of what may grow are then those of all, and densification ends with equal shards."""
 

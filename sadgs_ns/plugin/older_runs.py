@@ -69,6 +69,10 @@ BEFORE: dict[str, Any] = {
 """New options whose default changes a run, at the value that runs of earlier versions had."""
 
 
+NO_OPTIONS = ("run_length", "shards")
+"""What earlier versions wrote among the options and is decided in each run."""
+
+
 REPLACED = {("use_bilateral_grid", True): ("color_model", "bilateral_grid")}
 """Removed options with a value that another option now has a value for."""
 
@@ -139,6 +143,6 @@ def _bring_up_to_date(config: Any, path: str) -> list[str]:
             left_out += _bring_up_to_date(value, f"{path}{name}.")
         else:
             delattr(config, name)
-            if name not in harmless or harmless[name] != value:
+            if name not in NO_OPTIONS and (name not in harmless or harmless[name] != value):
                 left_out.append(f"{path}{name}={value!r}")
     return left_out

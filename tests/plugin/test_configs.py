@@ -31,6 +31,7 @@ from sadgs_ns.plugin import presets
 from sadgs_ns.plugin.config import CheckedTrainerConfig, SadgsMachineConfig, SadgsViewerConfig
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
 from sadgs_ns.plugin.model import SadgsModel, SadgsModelConfig
+from sadgs_ns.plugin.older_runs import NO_OPTIONS
 from sadgs_ns.plugin.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
 from sadgs_ns.plugin.pipeline import SadgsPipelineConfig
 from sadgs_ns.plugin.trainer import SadgsTrainerConfig
@@ -114,7 +115,8 @@ def test_every_public_field_is_followed_by_a_docstring(cls: type):
 @pytest.mark.parametrize("cls", CONFIG_CLASSES)
 def test_every_class_attribute_is_a_dataclass_field(cls: type):
     body = body_of(cls)
-    assert not [ast.unparse(statement) for statement in body if isinstance(statement, ast.Assign)]
+    assigned = {ast.unparse(target) for each in body if isinstance(each, ast.Assign) for target in each.targets}
+    assert assigned <= set(NO_OPTIONS)
     annotated = {ast.unparse(statement.target) for statement in body if isinstance(statement, ast.AnnAssign)}
     assert annotated and annotated <= {field.name for field in dataclasses.fields(cls)}
 
@@ -316,6 +318,18 @@ def test_options_that_are_missing_in_an_older_config_get_their_defaults():
         assert line in text
         text = text.replace(line, "")
     assert yaml.dump(yaml.load(text, Loader=yaml.Loader)) == yaml.dump(preset("sadgs"))
+
+
+def test_what_is_decided_in_a_run_is_no_option_and_older_files_that_have_it_are_read(
+    capsys: pytest.CaptureFixture[str],
+):
+    assert not set(NO_OPTIONS) & {option.name for option in dataclasses.fields(StructureAwareStrategy)}
+    text, line = yaml.dump(preset("sadgs")), "      min_opacity: 0.02\n"
+    assert line in text
+    text = text.replace(line, f"{line}      run_length: 712\n      shards: null\n")
+    strategy = yaml.load(text, Loader=yaml.Loader).pipeline.model.strategy
+    assert (strategy.run_length, strategy.shards) == (3000, None)
+    assert capsys.readouterr().out == ""
 
 
 def test_a_run_of_before_an_option_that_changes_training_goes_on_without_it():
