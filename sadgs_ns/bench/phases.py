@@ -171,6 +171,7 @@ def within_densification(strategy: Any) -> Iterator[None]:
                 setattr(strategy, name, _FAR.get(name, sys.maxsize // 4))
         yield
     finally:
+        vars(strategy).clear()
         vars(strategy).update(before)
 
 

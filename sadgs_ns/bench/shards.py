@@ -50,8 +50,8 @@ class Step:
         views: Number V of views of a step.
         device: Where this process computes.
         shards: The processes; None for one process.
-        blocks: Number of shells, of which each has as many Gaussians and views as another. Each process has as many
-            Gaussians of a block as another process.
+        blocks: Number of shells, at least 1, of which each has as many Gaussians and views as another where it divides
+            their numbers. Each process has as many Gaussians of a block as another process.
     """
 
     def __init__(
@@ -180,7 +180,10 @@ def measure(step: Step, device: torch.device, repeats: int) -> tuple[float, floa
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Print a row of a table for each number of Gaussians and size, in all processes together; returns 0."""
-    options = command_lines.shards().parse_args(argv)
+    parser = command_lines.shards()
+    options = parser.parse_args(argv)
+    if options.blocks < 1:
+        parser.error(f"--blocks must be at least 1, got {options.blocks}.")
     number, local = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("LOCAL_RANK", "0"))
     device = torch.device("cuda", local) if torch.cuda.is_available() else torch.device("cpu")
     if device.type == "cuda":
@@ -193,8 +196,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if first:
         name = torch.cuda.get_device_name() if device.type == "cuda" else "CPU"
         print(f"{number} × {name}, torch {torch.__version__}\n", flush=True)
-        print("| devices | Gaussians | megapixels | views | ms a step | peak GB of each device |")
-        print("| ---: | ---: | ---: | ---: | ---: | :--- |", flush=True)
+        print("| devices | Gaussians | megapixels | views | blocks | ms a step | peak GB of each device |")
+        print("| ---: | ---: | ---: | ---: | ---: | ---: | :--- |", flush=True)
     for gaussians in options.gaussians:
         for megapixels in options.megapixels:
             for views in options.views:
@@ -205,7 +208,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 peaks = peaks if shards is None else shards.gather(peaks)[:, 0]
                 if first:
                     each = ", ".join(f"{peak:.2f}" for peak in peaks.tolist())
-                    size = f"| {number} | {gaussians:,} | {megapixels:g} | {views} |"
+                    size = f"| {number} | {gaussians:,} | {megapixels:g} | {views} | {options.blocks} |"
                     print(f"{size} {milliseconds:.2f} | {each} |", flush=True)
                 if options.profile:
                     profile(step, first)

@@ -9,6 +9,8 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
+from sadgs_ns.errors import InputError
+
 REBALANCED_BEYOND = 1.1
 """Shards are made equal when the largest has more than this many times the Gaussians of the smallest."""
 _ROWS_AT_ONCE = 1 << 20
@@ -63,7 +65,12 @@ class Shards:
 
         Args:
             total: Number of the Gaussians.
+
+        Raises:
+            InputError: If they are fewer than the processes.
         """
+        if total < self.num_ranks:
+            raise InputError(f"{self.num_ranks} processes cannot share out {total} Gaussians: start fewer processes.")
         self.sizes = self.even_sizes(total)
         start = sum(self.sizes[: self.rank])
         return slice(start, start + self.sizes[self.rank])

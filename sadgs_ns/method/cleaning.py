@@ -133,5 +133,6 @@ def find(params: Mapping[str, Tensor], cleaning: Cleaning, seen: Seen | None = N
     for taken, which in goes:
         number = int((stays & taken).sum())
         stays &= ~taken
-        sentences.append(f"{number:,} Gaussians {which} are taken away.")
+        noun, verb = ("Gaussian", "is") if number == 1 else ("Gaussians", "are")
+        sentences.append(f"{number:,} {noun} {which} {verb} taken away.")
     return stays, sentences

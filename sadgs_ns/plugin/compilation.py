@@ -146,6 +146,13 @@ def compile_kernels(
             fused=strategy.fused,
         )
 
+    def exchange() -> None:
+        from sadgs_ns.kernels.exchange import pack, unpack
+
+        seen = [info[name].detach() for name in ("radii", "means2d", "depths", "conics", "opacities")]
+        places = torch.arange(views * n, device=device)
+        unpack(pack(*(value.contiguous() for value in (*seen, means.expand(views, n, 3))), places=places), 0)
+
     failures: dict[str, BaseException] = {}
     pending: dict[str, Future[None]] = {}
 
@@ -175,6 +182,8 @@ def compile_kernels(
                 "compositing with AbsGS": pool.submit(composite, True),
                 "compositing": pool.submit(composite, False),
             }
+            if pipeline.shards is not None:
+                pending["what travels between devices"] = pool.submit(exchange)
         if wait(pending.values(), timeout=_PATIENCE).not_done:
             CONSOLE.print("Compiling kernels for this GPU, once …")
     failures |= {name: error for name, future in pending.items() if (error := future.exception()) is not None}

@@ -479,8 +479,7 @@ class SadgsPipeline(VanillaPipeline):
     def _settings(self) -> dict[str, Any]:
         """Return the options that decide how training goes on from a checkpoint, by their names."""
         strategy = asdict(self.config.model.strategy)
-        hidden = ("fused", "run_length", "shards")
-        settings = {f"model.strategy.{name}": strategy[name] for name in strategy if name not in hidden}
+        settings = {f"model.strategy.{name}": strategy[name] for name in strategy if name != "fused"}
         own = {name: getattr(self.config, name) for name in ("views_per_iteration", "memory_budget_gb")}
         return {**own, **settings}
 

@@ -8,6 +8,8 @@ import signal
 import socket
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import timedelta
 from typing import TYPE_CHECKING, NoReturn
 
@@ -193,6 +195,24 @@ def join(config: CheckedTrainerConfig, local_rank: int) -> tuple[Shards | None, 
     dist.broadcast_object_list(shared, 0)
     config.timestamp = shared[0]
     return Shards(torch.device("cuda", local_rank) if cuda else torch.device("cpu")), local_rank
+
+
+@contextmanager
+def first_of_each_machine_before_others(shards: Shards | None, local_rank: int) -> Iterator[None]:
+    """Let the first process of each machine do something, such as compiling, before its others.
+
+    Triton keeps what it compiles on the disk, where the others find it. Of 24 processes that compiled the same kernels
+    at once two ended with a TypeError (docs/results.md#several-devices).
+
+    Args:
+        shards: What this process knows of the others, all of which call this; None where it is alone.
+        local_rank: Number of this process on its machine.
+    """
+    if shards is not None and local_rank > 0:
+        shards.all(True)
+    yield
+    if shards is not None and local_rank == 0:
+        shards.all(True)
 
 
 def leave_the_rest_to_the_first(shards: Shards, peers: Peers) -> None:

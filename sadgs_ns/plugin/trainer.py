@@ -18,6 +18,7 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from sadgs_ns import kernels
 from sadgs_ns.atomic import atomic_path
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
 from sadgs_ns.method.schedule import between_one_and_four, schedule
@@ -44,7 +45,7 @@ RATES_OF_FOUR_VIEWS = {"means": (3.0, 3.0), "opacities": (1.5, 1.5), "scales": (
 Rates that fall once densification has ended fall less in steps of several views, and not at all in steps of four."""
 LEAST_PIXELS = 1.5e6
 """Pixels that a step must draw on each of several devices. Runs whose steps drew 1.9 and 3 million pixels on each of
-two took 1/1.1 and 1/1.3 of the time on one, and a run of .7 million took 2.3 times as long
+two took 1/1.1 of the time on one (one run of the latter 1/1.3), and a run of .7 million took 2.3 times as long
 (docs/results.md#several-devices)."""
 _SAVING_SHARE = 0.01
 """Largest share of the time between two checkpoints by the clock that saving may take."""
@@ -84,6 +85,9 @@ class SadgsTrainer(Trainer):
         self.shards, local_rank = processes.join(config, local_rank)
         """What this process knows of the others; None where it is alone."""
         self._peers = None if self.shards is None else processes.Peers(self.shards)
+        if self.shards is not None:
+            with processes.first_of_each_machine_before_others(self.shards, local_rank):
+                kernels.available(self.shards.device)  # This compiles a kernel, and is asked for again below.
         self._vis: Any = config.vis
         if self.shards is not None and (config.is_viewer_enabled() or config.is_viewer_legacy_enabled()):
             CONSOLE.print("The viewer is off, since no device holds all Gaussians; `ns-viewer` shows the finished run.")
@@ -115,25 +119,18 @@ class SadgsTrainer(Trainer):
             self._say_what_was_chosen()
             last = [TrainingCallbackLocation.AFTER_TRAIN]
             self.callbacks.append(TrainingCallback(last, lambda step: self._say_what_is_next()))
-            self._compile_kernels()
+            with processes.first_of_each_machine_before_others(self.shards, self.local_rank):
+                compile_kernels(self.pipeline, self.optimizers.optimizers, self.config.cuda_graphs)
             self.graphed = GraphedSteps.of(self)
         except torch.cuda.OutOfMemoryError as error:
             raise RunError(f"The GPU's memory is too small to start ({_memory(error)}): {_LESS_MEMORY}.") from error
+        except RuntimeError as error:
+            if (ended := self._ended()) is None:
+                raise
+            raise RunError(f"{ended}: {_NOTHING_DONE}") from error
         except KeyboardInterrupt:
             CONSOLE.print(f"SIGINT: {_NOTHING_DONE}", soft_wrap=True)
             raise SystemExit(128 + signal.SIGINT) from None
-
-    def _compile_kernels(self) -> None:
-        """Compile what the machine has not compiled yet; of its processes the first does so before the others.
-
-        They then find it on the disk. Where 24 processes compiled the same kernels at once, Triton gave a kernel the
-        launcher of another in two of them, which ended with a TypeError.
-        """
-        if self.shards is not None and self.local_rank > 0:
-            self.shards.all(True)
-        compile_kernels(self.pipeline, self.optimizers.optimizers, self.config.cuda_graphs)
-        if self.shards is not None and self.local_rank == 0:
-            self.shards.all(True)
 
     def _say_what_was_chosen(self) -> None:
         """Print the run's size after the memory plan's line, and what decided it."""
@@ -352,13 +349,10 @@ class SadgsTrainer(Trainer):
                 self.save_checkpoint(self._completed_step)
             raise WriteError(Path(os.fsdecode(error.filename or self.base_dir)), error) from error
         except RuntimeError as error:
-            ended = [] if self._peers is None else self._peers.ended()
-            if not ended:
+            if (ended := self._ended()) is None:
                 raise
-            raise RunError(
-                f"Process {' and '.join(map(str, ended))} of {processes.number_of_processes()} ended (counted from 0), "
-                f"and the others with it: what the last checkpoint holds goes on with --load-dir {self.checkpoint_dir}."
-            ) from error
+            resume = f"what the last checkpoint holds goes on with --load-dir {self.checkpoint_dir}"
+            raise RunError(f"{ended}: {resume}.") from error
         finally:
             self.config.max_num_iterations = total
             self.pipeline.views.close()
@@ -366,6 +360,14 @@ class SadgsTrainer(Trainer):
         if out_of_memory:
             raise RunError(self._rescue(out_of_memory))
         processes.leave()
+
+    def _ended(self) -> str | None:
+        """Say which other processes ended by themselves, and with them this one; None where none did."""
+        ended = [] if self._peers is None else self._peers.ended()
+        if not ended:
+            return None
+        number = processes.number_of_processes()
+        return f"Process {' and '.join(map(str, ended))} of {number} ended (counted from 0), and the others with it"
 
     def _rescue(self, out_of_memory: str) -> str:
         """Save the state before the present step if it is whole, and return what to tell the user.

@@ -29,6 +29,7 @@ from sadgs_ns.bench.curve import undisturbed
 from sadgs_ns.bench.phases import PHASES, Stopwatch
 from sadgs_ns.bench.protocol import Job, Row, Scene
 from sadgs_ns.demo.scene import SPARSE_FOLDER, write_scene
+from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.render import splatter
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
@@ -584,3 +585,11 @@ def test_a_continued_benchmark_says_which_runs_have_no_images(
     assert ["images" in row for row in results.read(tmp_path / "r.jsonl")] == [False, True]
     assert command("--images", str(tmp_path / "p.yaml")) == 2
     assert "p.yaml is a file; give a folder." in capsys.readouterr().err
+
+
+def test_a_strategy_that_was_never_fitted_to_a_run_is_left_as_it_was():
+    strategy = StructureAwareStrategy()
+    before = vars(strategy).copy()
+    with phases.within_densification(strategy):
+        assert strategy.run_length > 3000
+    assert vars(strategy) == before and strategy.run_length == 3000

@@ -47,3 +47,9 @@ def test_one_process_prints_a_row_for_each_size(capsys: pytest.CaptureFixture[st
     assert bench.main(sizes) == 0
     rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| 1 | 200 |")]
     assert [row.split(" | ")[2] for row in rows] == ["0.001", "0.002"]
+
+
+def test_no_block_at_all_is_refused(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit):
+        bench.main(["--blocks", "0"])
+    assert "--blocks must be at least 1, got 0." in capsys.readouterr().err

@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from ranks import run_ranks
 
 from sadgs_ns.distributed.ranking import limit_growth
 from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.errors import InputError
 from sadgs_ns.method.split import limit_growth as limit_growth_alone
 from sadgs_ns.method.strategy import StructureAwareStrategy
 
@@ -93,3 +95,14 @@ def prune_together(shards: Shards) -> list[int]:
 def test_each_process_keeps_a_gaussian(tmp_path: Path):
     """Two processes cannot train the one Gaussian that the first pruning would leave them."""
     assert run_ranks(prune_together, 2, tmp_path) == [[4, 0, 1], [4, 3, 2]]
+
+
+def share_out_too_few(shards: Shards) -> str:
+    with pytest.raises(InputError) as error:
+        shards.take_even_part(1)
+    return str(error.value)
+
+
+def test_fewer_gaussians_than_processes_are_refused(tmp_path: Path):
+    for message in run_ranks(share_out_too_few, 2, tmp_path):
+        assert message == "2 processes cannot share out 1 Gaussians: start fewer processes."

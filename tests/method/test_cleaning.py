@@ -91,7 +91,7 @@ def test_each_option_takes_what_it_says_and_tells_how_many():
             Cleaning(max_extent=1.0, dust=0.5),
             [0, 1, 0, 0],
             ["2 Gaussians longer than 1 are taken away.",
-             "1 Gaussians of less than 0.5 px in every training view are taken away."],
+             "1 Gaussian of less than 0.5 px in every training view is taken away."],
         ),
     ):  # fmt: skip
         kept, sentences = find(params, cleaning, seen)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import math
 import os
 import signal
 import sys
@@ -191,6 +192,27 @@ def test_a_whole_run_reaches_the_quality_of_one_process(scene: Path, tmp_path: P
     assert psnr[0] > 15 and abs(psnr[1] - psnr[0]) < 0.5, psnr
 
 
+def fade_and_train(shards: Shards, config: SadgsTrainerConfig, faint: tuple[int, ...]) -> dict[str, Any]:
+    """Train, where at first all Gaussians of some processes are too faint to outlive the first pruning."""
+    CONSOLE.quiet = True
+    trainer = config.setup(local_rank=shards.rank, world_size=shards.num_ranks)
+    trainer.setup()
+    if shards.rank in faint:
+        trainer.pipeline.model.gauss_params["opacities"].data[:] = -6.0
+    return train_set_up(trainer, None)
+
+
+@pytest.mark.parametrize("faint", [(0,), (0, 1, 2)])
+def test_a_process_that_loses_all_its_gaussians_gets_others(faint: tuple[int, ...], scene: Path, tmp_path: Path):
+    """Where none would be left in any process, none is pruned."""
+    config = configure(scene, tmp_path / "runs", 10, save_every=0)
+    config.pipeline.model.strategy.structure_every = 0
+    results = run_ranks(fade_and_train, 3, tmp_path / "meet", config, faint)
+    sizes = [len(result["end"]["means"]) for result in results]
+    assert min(sizes) > 50 and max(sizes) <= 1.1 * min(sizes) + 1 and sum(sizes) == results[0]["gaussians"]
+    assert all(math.isfinite(result["loss"]) for result in results)
+
+
 def compile_together(shards: Shards, config: SadgsTrainerConfig) -> tuple[float, float]:
     """When this process began and ended to compile kernels, which takes the first one half a second."""
     CONSOLE.quiet = True
@@ -212,6 +234,26 @@ def test_the_first_process_compiles_before_the_others(scene: Path, tmp_path: Pat
     config = configure(scene, tmp_path / "runs", 20, save_every=0)
     (_, first_end), *others = run_ranks(compile_together, 3, tmp_path / "meet", config)
     assert all(start >= first_end for start, _ in others)
+
+
+def die_in_setup(shards: Shards, config: SadgsTrainerConfig) -> str:
+    """Be killed while compiling, or say by which error another process's end ends this one."""
+    CONSOLE.quiet = True
+    trainer = config.setup(local_rank=shards.rank, world_size=shards.num_ranks)
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(RunError) as error:
+        patch.setattr(trainer_module, "compile_kernels", lambda *_: os.kill(os.getpid(), signal.SIGKILL))
+        trainer.setup()
+    return str(error.value)
+
+
+def test_a_process_that_is_killed_before_the_first_step_is_named(scene: Path, tmp_path: Path):
+    config = configure(scene, tmp_path / "runs", 20, save_every=0)
+    _, *messages = run_ranks(die_in_setup, 3, tmp_path / "meet", config, doomed=(0,))
+    for message in messages:
+        assert message == (
+            "Process 0 of 3 ended (counted from 0), and the others with it: stopped before an iteration was done; "
+            "the same command starts again."
+        )
 
 
 def train_and_die(shards: Shards, config: SadgsTrainerConfig, doomed: int, killed: Path) -> tuple[str, float]:
