@@ -111,7 +111,7 @@ class SadgsTrainer(Trainer):
 
         Raises:
             InputError: If one of them cannot be used.
-            RunError: If they do not fit the GPU's memory.
+            RunError: If they do not fit the GPU's memory, or another process ended.
             SystemExit: If SIGINT came; nerfstudio would print a traceback.
         """
         try:
@@ -124,6 +124,8 @@ class SadgsTrainer(Trainer):
             self.graphed = GraphedSteps.of(self)
         except torch.cuda.OutOfMemoryError as error:
             raise RunError(f"The GPU's memory is too small to start ({_memory(error)}): {_LESS_MEMORY}.") from error
+        except RunError:
+            raise
         except RuntimeError as error:
             if (ended := self._ended()) is None:
                 raise
