@@ -17,6 +17,7 @@ from scenes import camera, random_params, splat
 from sadgs_ns.demo.scene import write_scene
 from sadgs_ns.errors import InputError
 from sadgs_ns.method import memory
+from sadgs_ns.method import strategy as strategy_module
 from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin import memory_plan
@@ -288,6 +289,8 @@ def test_tiles_are_those_of_the_kernels():
 def test_ns_train_says_the_cap_at_the_start_and_keeps_it(
     card: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
+    # The final prune would leave fewer than the cap.
+    monkeypatch.setattr(strategy_module, "FINAL_PRUNE_OPACITY", 0.0)
     write_scene(tmp_path / "scene", WIDTH, HEIGHT, VIEWS, points=100)
     config = configure(tmp_path / "scene", tmp_path, iterations=24, save_every=0)
     config.pipeline.model.bounding_box_points = False
