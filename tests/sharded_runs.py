@@ -55,8 +55,13 @@ def record(trainer: SadgsTrainer) -> dict[str, Any]:
     return {"losses": losses, "statistics": statistics, "steps": steps, "gaussians": model.num_gaussians}
 
 
-def record_together(shards: Shards, config: SadgsTrainerConfig) -> dict[str, Any]:
+def set_up_together(shards: Shards, config: SadgsTrainerConfig) -> SadgsTrainer:
+    """The trainer of this process, which prints nothing."""
     CONSOLE.quiet = True
     trainer = config.setup(local_rank=shards.rank, world_size=shards.num_ranks)
     trainer.setup()
-    return record(trainer)
+    return trainer
+
+
+def record_together(shards: Shards, config: SadgsTrainerConfig) -> dict[str, Any]:
+    return record(set_up_together(shards, config))

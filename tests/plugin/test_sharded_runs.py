@@ -22,7 +22,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from ranks import run_ranks
 from runs import nerfstudio_data
 from scenes import HEIGHT, POINTS, WIDTH
-from sharded_runs import STRUCTURE_EVERY, few_steps, record, record_together
+from sharded_runs import STRUCTURE_EVERY, few_steps, record, record_together, set_up_together
 from torch.multiprocessing.spawn import ProcessExitedException, ProcessRaisedException
 
 from sadgs_ns.distributed.shards import Shards
@@ -100,9 +100,7 @@ def train_until(shards: Shards, config: SadgsTrainerConfig, stop: int | None) ->
     Returns:
         What the process held at the start and holds at the end, the exit code, and the last step's loss.
     """
-    CONSOLE.quiet = True
-    trainer = config.setup(local_rank=shards.rank, world_size=shards.num_ranks)
-    trainer.setup()
+    trainer = set_up_together(shards, config)
     return train_set_up(trainer, stop if shards.rank == shards.num_ranks - 1 else None)
 
 
@@ -194,9 +192,7 @@ def test_a_whole_run_reaches_the_quality_of_one_process(scene: Path, tmp_path: P
 
 def fade_and_train(shards: Shards, config: SadgsTrainerConfig, faint: tuple[int, ...]) -> dict[str, Any]:
     """Train, where at first all Gaussians of some processes are too faint to outlive the first pruning."""
-    CONSOLE.quiet = True
-    trainer = config.setup(local_rank=shards.rank, world_size=shards.num_ranks)
-    trainer.setup()
+    trainer = set_up_together(shards, config)
     if shards.rank in faint:
         trainer.pipeline.model.gauss_params["opacities"].data[:] = -6.0
     return train_set_up(trainer, None)
@@ -215,7 +211,6 @@ def test_a_process_that_loses_all_its_gaussians_gets_others(faint: tuple[int, ..
 
 def compile_together(shards: Shards, config: SadgsTrainerConfig) -> tuple[float, float]:
     """When this process began and ended to compile kernels, which takes the first one half a second."""
-    CONSOLE.quiet = True
     times: list[float] = []
 
     def compile_kernels(*_: Any) -> None:
@@ -223,10 +218,9 @@ def compile_together(shards: Shards, config: SadgsTrainerConfig) -> tuple[float,
         time.sleep(0.5 if shards.rank == 0 else 0)
         times.append(time.time())
 
-    trainer = config.setup(local_rank=shards.rank, world_size=shards.num_ranks)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(trainer_module, "compile_kernels", compile_kernels)
-        trainer.setup()
+        set_up_together(shards, config)
     return times[0], times[1]
 
 
@@ -238,11 +232,9 @@ def test_the_first_process_compiles_before_the_others(scene: Path, tmp_path: Pat
 
 def die_in_setup(shards: Shards, config: SadgsTrainerConfig) -> str:
     """Be killed while compiling, or say by which error another process's end ends this one."""
-    CONSOLE.quiet = True
-    trainer = config.setup(local_rank=shards.rank, world_size=shards.num_ranks)
     with pytest.MonkeyPatch.context() as patch, pytest.raises(RunError) as error:
         patch.setattr(trainer_module, "compile_kernels", lambda *_: os.kill(os.getpid(), signal.SIGKILL))
-        trainer.setup()
+        set_up_together(shards, config)
     return str(error.value)
 
 
@@ -258,9 +250,7 @@ def test_a_process_that_is_killed_before_the_first_step_is_named(scene: Path, tm
 
 def train_and_die(shards: Shards, config: SadgsTrainerConfig, doomed: int, killed: Path) -> tuple[str, float]:
     """Train, and let one process be killed in a step; by which error the others end, and how many seconds later."""
-    CONSOLE.quiet = True
-    trainer = config.setup(local_rank=shards.rank, world_size=shards.num_ranks)
-    trainer.setup()
+    trainer = set_up_together(shards, config)
 
     def die(step: int) -> None:
         if step == 4 and shards.rank == doomed:

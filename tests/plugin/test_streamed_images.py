@@ -12,11 +12,10 @@ from typing import Any
 
 import pytest
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
 from ranks import run_ranks
 from runs import nerfstudio_data
 from scenes import HEIGHT, POINTS, VIEWS, WIDTH
-from sharded_runs import STRUCTURE_EVERY, few_steps, record
+from sharded_runs import STRUCTURE_EVERY, few_steps, record, set_up_together
 
 from sadgs_ns.distributed.shards import Shards
 from sadgs_ns.errors import InputError, RunError
@@ -25,7 +24,7 @@ from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
 from sadgs_ns.plugin.image_source import ImagesAhead, ImagesOnDemand, thread_count
 from sadgs_ns.plugin.memory_plan import image_bytes, place_images
 from sadgs_ns.plugin.structure_maps import StructureMaps
-from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
+from sadgs_ns.plugin.trainer import SadgsTrainerConfig
 from sadgs_ns.plugin.views import TrainingViews
 
 TRAINING = VIEWS - 1
@@ -38,13 +37,6 @@ def configured(folder: Path, parser: Any, tier: Any, views: int) -> SadgsTrainer
     config.pipeline.datamanager.max_thread_workers = 2
     config.pipeline.model.num_random = POINTS
     return config
-
-
-def set_up_together(shards: Shards, config: SadgsTrainerConfig) -> SadgsTrainer:
-    CONSOLE.quiet = True
-    trainer = config.setup(local_rank=shards.rank, world_size=shards.num_ranks)
-    trainer.setup()
-    return trainer
 
 
 def record_images(shards: Shards, config: SadgsTrainerConfig) -> dict[str, Any]:

@@ -46,7 +46,8 @@ _ADJUSTMENT = {
 adjustment ends. COLMAP's own are 1.1 and 0 (docs/results.md#finding-cameras)."""
 _ADJUSTED_PHOTOS = 2
 """Photos that are adjusted after each that is placed; COLMAP's own are 6. With these numbers placing cameras takes
-about half of the time that it takes with COLMAP's, and puts them within .3 % of where it puts them."""
+.32 to .41 of the time that it takes with COLMAP's on three captures, .74 to .81 where photos are added to a model, and
+puts them within .3 % of where it puts them."""
 FEW_FEATURES = 500
 """Keypoints under which a photo counts as blurred or empty."""
 
