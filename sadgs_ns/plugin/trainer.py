@@ -89,9 +89,6 @@ class SadgsTrainer(Trainer):
             with processes.first_of_each_machine_before_others(self.shards, local_rank):
                 kernels.available(self.shards.device)  # This compiles a kernel, and is asked for again below.
         self._vis: Any = config.vis
-        if self.shards is not None and (config.is_viewer_enabled() or config.is_viewer_legacy_enabled()):
-            CONSOLE.print("The viewer is off, since no device holds all Gaussians; `ns-viewer` shows the finished run.")
-            config.vis = config.vis.removeprefix("viewer_legacy").removeprefix("viewer").removeprefix("+") or "none"  # type: ignore[assignment]
         # nerfstudio would wrap the pipeline for several devices in its own way.
         super().__init__(config, local_rank, world_size=1)
         self._stepping = False
@@ -247,12 +244,19 @@ class SadgsTrainer(Trainer):
         CONSOLE.print(
             f"Training on one device: a step draws {pixels / 1e6:.2f} megapixels, and {devices} devices are expected "
             f"to be quicker from {LEAST_PIXELS * devices / 1e6:.1f} on (docs/results.md). If one device does not hold "
-            "the Gaussians, set --share-always True; for the viewer start the run on one device.",
+            "the Gaussians, set --share-always True.",
             highlight=False,
             soft_wrap=True,
         )
         processes.leave_the_rest_to_the_first(self.shards, self._peers)
         self.shards = self._peers = None
+
+    def _turn_viewer_off(self) -> None:
+        """Keep nerfstudio from starting a viewer, and say so where one was asked for."""
+        if self.config.is_viewer_enabled() or self.config.is_viewer_legacy_enabled():
+            CONSOLE.print("The viewer is off, since no device holds all Gaussians; `ns-viewer` shows the finished run.")
+            others = self._vis.removeprefix("viewer_legacy").removeprefix("viewer").removeprefix("+")
+            self.config.vis = others or "none"  # type: ignore[assignment]
 
     def setup_optimizers(self) -> SadgsOptimizers:
         """Derive the run's length and build the optimizers with schedules as long as that, fused where the model is.
@@ -268,6 +272,7 @@ class SadgsTrainer(Trainer):
         self._derive_schedule()
         self._take_one_device_if_quicker()
         if self.shards is not None:
+            self._turn_viewer_off()
             self.pipeline.share_out(self.shards)
         elif line := choose_color_model(self.pipeline.model, self.pipeline.datamanager.train_dataset):
             CONSOLE.print(line, highlight=False, soft_wrap=True)

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 import torch
 from kill_and_resume import configure, differences, set_up
+from nerfstudio.engine import trainer as nerfstudio_trainer
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.scripts import train as train_script
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -297,6 +298,27 @@ def test_steps_of_few_pixels_train_on_one_device(scene: Path, tmp_path: Path):
     assert "Training on one device: a step draws 0.00 megapixels, and 3 devices are expected" in first["printed"]
     assert first["loss"] == alone["loss"] and not differences(first["end"], alone["end"])
     assert saved(configured("together").get_checkpoint_dir())[0] == 5
+
+
+def ask_for_a_viewer(shards: Shards, config: SadgsTrainerConfig) -> tuple[bool, str]:
+    """Set a run up, in place of whose viewer stands another object; whether it was made, and what was printed."""
+    with pytest.MonkeyPatch.context() as patch, CONSOLE.capture() as printed:
+        patch.setattr(nerfstudio_trainer, "ViewerState", lambda *_, **__: SimpleNamespace(viewer_info=[]))
+        try:
+            trainer = config.setup(local_rank=shards.rank, world_size=shards.num_ranks)
+            trainer.setup()
+        except SystemExit:  # It has waited for the first process, which goes on alone.
+            return False, ""
+    return trainer.viewer_state is not None, printed.get()
+
+
+@pytest.mark.parametrize("share", [True, False])
+def test_a_run_has_its_viewer_where_it_goes_on_with_one_device(share: bool, scene: Path, tmp_path: Path):
+    config = configure(scene, tmp_path / "runs", 6, save_every=0)
+    config.share_always, config.vis = share, "viewer+tensorboard"
+    first, second = run_ranks(ask_for_a_viewer, 2, tmp_path / "meet", config)
+    assert first[0] is not share and ("The viewer is off" in first[1]) is share
+    assert not second[0]
 
 
 def look_after_another_has_left(shards: Shards) -> list[int]:
