@@ -20,7 +20,8 @@ from matplotlib.patches import Ellipse
 from torch import Tensor
 
 from sadgs_ns.atomic import atomic_path
-from sadgs_ns.demo.scene import arc_views, render, room_surfaces
+from sadgs_ns.demo.drawing import render
+from sadgs_ns.demo.scene import arc_views, room_surfaces
 from sadgs_ns.errors import WriteError
 from sadgs_ns.method.eta import eta, projected_axes, wavelength
 from sadgs_ns.method.split import children_per_axis, grid_split

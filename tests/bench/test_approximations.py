@@ -42,7 +42,8 @@ from sadgs_ns.bench.tensor_errors import (
     structure_tensor_rows,
     timed,
 )
-from sadgs_ns.demo.scene import describe_scene, render
+from sadgs_ns.demo.drawing import render
+from sadgs_ns.demo.scene import describe_scene
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 
 CPU = torch.device("cpu")

@@ -19,7 +19,8 @@ from sadgs_ns.data.exposure import (
     relative_stops,
     srgb_values,
 )
-from sadgs_ns.demo.scene import describe_scene, render
+from sadgs_ns.demo.drawing import render
+from sadgs_ns.demo.scene import describe_scene
 
 GAINS = np.exp2([-1.0, 0.6, -0.4, 1.0, 0.2, -0.8, 0.9, -0.1, 0.3, -0.7])
 """Of ten photos."""

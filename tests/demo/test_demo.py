@@ -19,17 +19,13 @@ from plyfile import PlyData
 from sadgs_ns.atomic import atomic_path
 from sadgs_ns.cli.export import write_gaussians
 from sadgs_ns.demo import scene as demo_scene
+from sadgs_ns.demo.drawing import Rectangle, Sphere, View, expected_wavelength_map, render, trace
 from sadgs_ns.demo.scene import (
     EVAL_INTERVAL,
     SPARSE_FOLDER,
-    Rectangle,
     SceneDescription,
-    Sphere,
-    View,
     arc_views,
     describe_scene,
-    expected_wavelength_map,
-    render,
     room_surfaces,
     write_scene,
 )
@@ -116,7 +112,7 @@ def test_every_point_is_seen_twice(written: tuple[Path, SceneDescription]) -> No
 def test_every_texture_is_in_sight() -> None:
     shown = np.zeros(len(room_surfaces()), dtype=int)
     for view in arc_views(VIEWS, WIDTH, HEIGHT):
-        index, _ = demo_scene.trace(room_surfaces(), view.position, view.rays())
+        index, _ = trace(room_surfaces(), view.position, view.rays())
         shown += np.bincount(index[index >= 0], minlength=len(shown))
     hidden = {surface.name for surface, count in zip(room_surfaces(), shown, strict=True) if count == 0}
     assert not hidden & {"floor", "fine wall", "coarse wall", "tall box top", "faint box top", "sphere"}

@@ -1,0 +1,256 @@
+"""Surfaces whose textures have a known wavelength, pinhole views, and images of these by tracing rays.
+
+Every surface carries one texture whose wavelength is known in world units, so the wavelength that a view should show at
+each pixel follows from geometry alone (`expected_wavelength_map`). The world is z-up, cameras follow OpenCV (x right,
+y down, z forward), pixel centres lie at half-integers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """A textured rectangle, two-sided."""
+
+    name: str
+    """Unique in the scene."""
+    corner: Array
+    """World position of one corner. [3]"""
+    edge_u: Array
+    """From the corner along one side. [3]"""
+    edge_v: Array
+    """From the corner along the other side, orthogonal to `edge_u`. [3]"""
+    dark: tuple[float, float, float]
+    """Colour of the texture's troughs, in [0, 1]."""
+    bright: tuple[float, float, float]
+    """Colour of the texture's crests, in [0, 1]."""
+    texture: Literal["grating", "checker", "plain"] = "plain"
+    """A sine along one direction, hard-edged squares, or the mean colour."""
+    wavelength: float = float("nan")
+    """Period of the sine, or of the checker's fundamental (√2 times a square's side), in world units."""
+    angle: float = 0.0
+    """Of the grating's direction, or a row of squares, from `edge_u` towards `edge_v`, in rad."""
+
+    @property
+    def normal(self) -> Array:
+        """Unit normal. [3]"""
+        normal = np.cross(self.edge_u, self.edge_v)
+        return normal / np.linalg.norm(normal)
+
+    @property
+    def area(self) -> float:
+        """World units²."""
+        return float(np.linalg.norm(self.edge_u) * np.linalg.norm(self.edge_v))
+
+    @property
+    def _directions(self) -> tuple[Array, Array]:
+        """The texture's own orthonormal axes in the plane. [3] each"""
+        u, v = self.edge_u / np.linalg.norm(self.edge_u), self.edge_v / np.linalg.norm(self.edge_v)
+        return np.cos(self.angle) * u + np.sin(self.angle) * v, np.cos(self.angle) * v - np.sin(self.angle) * u
+
+    @property
+    def frequencies(self) -> Array:
+        """The texture's fundamental waves as vectors in the plane, cycles per world unit. [F, 3], F = 0 if plain."""
+        a, b = self._directions
+        if self.texture == "grating":
+            return a[None] / self.wavelength
+        if self.texture == "checker":
+            return np.stack([a + b, a - b]) / (np.sqrt(2.0) * self.wavelength)
+        return np.zeros((0, 3))
+
+    def depth(self, origin: Array, directions: Array) -> Array:
+        """Ray parameter of the hit, inf where there is none. [R]
+
+        Args:
+            origin: [3]
+            directions: [R, 3]
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = self.normal @ (self.corner - origin) / (directions @ self.normal)  # [R]
+            local = origin + t[:, None] * directions - self.corner  # [R, 3]
+            u, v = local @ self.edge_u / (self.edge_u @ self.edge_u), local @ self.edge_v / (self.edge_v @ self.edge_v)
+            hit = (t > 0) & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
+        return np.where(hit, t, np.inf)
+
+    def colour(self, points: Array) -> Array:
+        """Colour in [0, 1] at points on the surface. [P, 3] → [P, 3]"""
+        a, b = ((points - self.corner) @ direction for direction in self._directions)  # [P] each
+        wave = np.zeros(len(points))
+        if self.texture == "grating":
+            wave = np.sin(2 * np.pi * a / self.wavelength)
+        elif self.texture == "checker":
+            side = self.wavelength / np.sqrt(2.0)
+            wave = np.where((np.floor(a / side) + np.floor(b / side)) % 2 == 0, 1.0, -1.0)
+        dark, bright = np.array(self.dark), np.array(self.bright)
+        return dark + (bright - dark) * (0.5 + 0.5 * wave[:, None])
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Uniform points on the surface. [count, 3]"""
+        u, v = rng.random((2, count, 1))
+        return self.corner + u * self.edge_u + v * self.edge_v
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """An untextured sphere with fixed, view-independent shading from above."""
+
+    name: str
+    """Unique in the scene."""
+    centre: Array
+    """[3]"""
+    radius: float
+    """World units."""
+    albedo: tuple[float, float, float]
+    """In [0, 1]."""
+    wavelength: float = float("nan")
+    """There is none."""
+
+    @property
+    def area(self) -> float:
+        """World units²."""
+        return 4 * np.pi * self.radius**2
+
+    @property
+    def frequencies(self) -> Array:
+        """None. [0, 3]"""
+        return np.zeros((0, 3))
+
+    def depth(self, origin: Array, directions: Array) -> Array:
+        """Ray parameter of the nearest hit, inf where there is none. origin [3], directions [R, 3] → [R]"""
+        offset = origin - self.centre
+        a, b = (directions**2).sum(1), directions @ offset  # [R] each
+        discriminant = b**2 - a * (offset @ offset - self.radius**2)
+        t = (-b - np.sqrt(np.maximum(discriminant, 0))) / a
+        return np.where((discriminant > 0) & (t > 0), t, np.inf)
+
+    def colour(self, points: Array) -> Array:
+        """Colour in [0, 1] at points on the surface. [P, 3] → [P, 3]"""
+        upward = (points - self.centre)[:, 2:] / self.radius  # [P, 1]
+        return np.array(self.albedo) * (0.7 + 0.3 * upward)
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Uniform points on the surface. [count, 3]"""
+        directions = rng.normal(size=(count, 3))
+        return self.centre + self.radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+Surface = Rectangle | Sphere
+
+
+@dataclass(frozen=True)
+class View:
+    """One posed pinhole image."""
+
+    name: str
+    """File name in the folder `images`."""
+    rotation: Array
+    """World to camera. [3, 3]"""
+    translation: Array
+    """World to camera. [3]"""
+    focal: float
+    """px, the same for x and y."""
+    width: int
+    """px"""
+    height: int
+    """px"""
+
+    @property
+    def position(self) -> Array:
+        """Camera centre in the world. [3]"""
+        return -self.rotation.T @ self.translation
+
+    def rays(self, supersampling: int = 1) -> Array:
+        """Ray directions in the world, scaled so that the ray parameter is the depth.
+
+        Args:
+            supersampling: Samples per pixel and axis.
+
+        Returns:
+            Row by row over the image enlarged `supersampling` times. [H·s·W·s, 3]
+        """
+        x = (np.arange(self.width * supersampling) + 0.5) / supersampling - 0.5 * self.width
+        y = (np.arange(self.height * supersampling) + 0.5) / supersampling - 0.5 * self.height
+        x, y = np.meshgrid(x / self.focal, y / self.focal)
+        return np.stack([x.ravel(), y.ravel(), np.ones(x.size)], -1) @ self.rotation
+
+    def project(self, points: Array) -> tuple[Array, Array]:
+        """World points → pixel positions [P, 2] and depths [P]."""
+        camera = points @ self.rotation.T + self.translation  # [P, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            pixels = self.focal * camera[:, :2] / camera[:, 2:] + 0.5 * np.array([self.width, self.height])
+        return pixels, camera[:, 2]
+
+
+def trace(surfaces: Sequence[Surface], origin: Array, directions: Array) -> tuple[NDArray[np.intp], Array]:
+    """First surface that each ray meets.
+
+    Args:
+        origin: [3]
+        directions: [R, 3]
+
+    Returns:
+        Index of the surface, −1 where there is none [R], and the ray parameter, inf where there is none [R].
+    """
+    nearest = np.full(len(directions), np.inf)
+    index = np.full(len(directions), -1)
+    for i, surface in enumerate(surfaces):
+        depth = surface.depth(origin, directions)
+        index = np.where(depth < nearest, i, index)
+        nearest = np.minimum(depth, nearest)
+    return index, nearest
+
+
+def render(surfaces: Sequence[Surface], view: View, supersampling: int = 4) -> NDArray[np.uint8]:
+    """Antialiased image of one view, black where nothing is. [H, W, 3]"""
+    directions = view.rays(supersampling)
+    index, depth = trace(surfaces, view.position, directions)
+    samples = np.zeros((len(directions), 3))
+    for i, surface in enumerate(surfaces):
+        on = index == i
+        samples[on] = surface.colour(view.position + depth[on, None] * directions[on])
+    samples = samples.reshape(view.height, supersampling, view.width, supersampling, 3)
+    return np.rint(255 * samples.mean(axis=(1, 3))).astype(np.uint8)
+
+
+def expected_wavelength_map(surfaces: Sequence[Surface], view: View) -> NDArray[np.float32]:
+    """The wavelength that the view shows at each pixel, from geometry alone.
+
+    A texture's phase is φ(X) = f·X with X = o + t(p) d(p) on the surface, and t = nᵀ(q − o) / nᵀd. Its gradient over
+    the pixel, t (fᵀd' − fᵀd · nᵀd' / nᵀd), is the frequency in cycles per px: world wavelength times focal length over
+    depth, foreshortened along the grating. Of a checker's two waves the shorter counts.
+
+    Returns:
+        Wavelength in px, NaN where there is no texture. [H, W]
+    """
+    directions = view.rays()
+    index, depth = trace(surfaces, view.position, directions)
+    per_pixel = view.rotation[:2] / view.focal  # derivative of the direction over x and over y. [2, 3]
+    frequency = np.zeros(len(directions))
+    for i, surface in enumerate(surfaces):
+        if not isinstance(surface, Rectangle):
+            continue
+        on = index == i
+        slant = (per_pixel @ surface.normal) / (directions[on] @ surface.normal)[:, None]  # [R, 2]
+        for wave in surface.frequencies:  # [3]
+            gradient = depth[on, None] * (per_pixel @ wave - (directions[on] @ wave)[:, None] * slant)  # [R, 2]
+            frequency[on] = np.maximum(frequency[on], np.hypot(gradient[:, 0], gradient[:, 1]))
+    with np.errstate(divide="ignore"):
+        wavelength = np.where(frequency > 0, 1.0 / frequency, np.nan)
+    return wavelength.reshape(view.height, view.width).astype(np.float32)
+
+
+def visible(surfaces: Sequence[Surface], view: View, points: Array) -> NDArray[np.bool_]:
+    """Which points [P, 3] on the surfaces the view sees. [P]"""
+    pixels, depth = view.project(points)
+    inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < [view.width, view.height]).all(1)
+    _, nearest = trace(surfaces, view.position, points - view.position)
+    return inside & (nearest > 1 - 1e-4)  # the ray's parameter is 1 at the point itself
