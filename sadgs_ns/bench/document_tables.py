@@ -14,6 +14,8 @@ from sadgs_ns.bench import approximations, plots
 from sadgs_ns.bench.results import Result
 from sadgs_ns.bench.table import grid, half_range, mean
 
+RESULTS = Path("docs", "results")
+"""Folder of the rows, in a checkout."""
 NOTHING = "–"
 _DIGITS = {"psnr": 2, "ssim": 4, "lpips": 4}
 
@@ -284,7 +286,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
         ValueError: There is no such file, or a line of it is not JSON.
     """
     if not path.is_file():
-        raise ValueError(f"{path} is not there; rows lie in docs/results.")
+        raise ValueError(f"{path} is not there; rows lie in {RESULTS}.")
     try:
         return [json.loads(line) for line in path.read_text("utf-8").splitlines()]
     except ValueError as error:

@@ -40,10 +40,8 @@ import yaml
 
 from sadgs_ns.atomic import atomic_path
 from sadgs_ns.bench import command_lines, plots
-from sadgs_ns.bench.document_tables import KINDS, Figure, Table, described
+from sadgs_ns.bench.document_tables import KINDS, RESULTS, Figure, Table, described
 
-RESULTS = Path("docs", "results")
-"""Folder of the rows, in a checkout."""
 FIGURES = Path("docs", "figures")
 """Folder of the figures, in a checkout."""
 TABLES = "tables.yaml"
