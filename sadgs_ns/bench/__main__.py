@@ -45,6 +45,7 @@ TORCHRUN_SECONDS = 40.0
 
 COMMANDS = {
     "report": ("report", "the plots and the page of a results file"),
+    "views": ("view_table", "the PSNR of each held-out view, how far it is from others, and where it collapses"),
     "documents": ("documents", "the tables of README and docs, and some figures, from the rows of docs/results"),
     "kernels": ("approximations", "what each shortcut in the frequency analysis gets wrong, beside what it costs"),
     "step": ("step", "the parts of a training step, with and without our Triton kernels (CUDA)"),

@@ -95,8 +95,23 @@ def validation() -> argparse.ArgumentParser:
     )
     parser.add_argument("root", type=Path, help="folder that holds the scenes")
     parser.add_argument("out", type=Path, help="folder for the copies")
+    parser.add_argument(
+        "--folds", metavar="2,4,6", help="write NAME-2, … with every 8th view from 2, … held out (default: 4, as NAME)"
+    )
     parser.add_argument("--masked", nargs="*", default=[], metavar="SCENE", help="also write NAME-masked of these")
     parser.add_argument("--noisy", nargs="*", default=[], metavar="SCENE", help="also write NAME-noisy of these")
+    return parser
+
+
+def views() -> argparse.ArgumentParser:
+    """Return the options of `sadgs-bench views`."""
+    parser = argparse.ArgumentParser(
+        prog="sadgs-bench views",
+        description="Print the PSNR of held-out views, and which lie 3 dB or more under the best label's median.",
+    )
+    parser.add_argument("results", type=Path, nargs="+", metavar="RESULTS.jsonl", help="file that sadgs-bench wrote")
+    of_references = "files whose runs alone are that reference (default: the results)"
+    parser.add_argument("--references", type=Path, nargs="+", metavar="REF.jsonl", help=of_references)
     return parser
 
 

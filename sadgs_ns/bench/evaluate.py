@@ -32,6 +32,8 @@ View = tuple[Any, dict[str, Any]]
 Networks = Mapping[str, "LearnedPerceptualImagePatchSimilarity | None"]
 """LPIPS networks by the names of their results; None where there are no weights."""
 
+VIEWERS_NEAR_PLANE = 0.01
+"""Depth in world units from which other programs, which read a PLY file, draw Gaussians."""
 _WINDOW = 11
 """Width of SSIM's window in px."""
 
@@ -123,6 +125,22 @@ def quality(model: Any, views: Iterable[View], networks: Networks) -> dict[str, 
             network.cpu()
     means = {name: statistics.fmean(of_views) if of_views else None for name, of_views in values.items()}
     return means | {"view_psnr": [round(psnr, 2) for psnr in values["psnr"]]}
+
+
+def view_psnr_in_viewers(model: Any, views: Iterable[View], view_psnr: list[float]) -> list[float]:
+    """Return the PSNR of each view in dB as other programs' viewers show the model: from VIEWERS_NEAR_PLANE on.
+
+    Args:
+        view_psnr: What `quality` measured; returned unless the model has a `near_plane` that lies beyond theirs.
+    """
+    near_plane = getattr(model, "near_plane", 0.0)
+    if near_plane <= VIEWERS_NEAR_PLANE:
+        return view_psnr
+    model.near_plane = VIEWERS_NEAR_PLANE
+    try:
+        return quality(model, views, {})["view_psnr"]
+    finally:
+        model.near_plane = near_plane
 
 
 def fitted(image: Tensor, truth: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ import copy
 import datetime
 import importlib.metadata
 import json
+import math
 import os
 import subprocess
 import sys
@@ -123,6 +124,8 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
         Over the held-out views: `psnr` in dB, `ssim`, `ssim_padded`, `lpips`, `lpips_vgg` (None without weights; see
         `evaluate`); and `train_psnr` over some training views, `fps`, `gaussians`, `peak_gb`, how many views there
         were, the machine's `gpu`.
+            view_psnr, ply_view_psnr: PSNR of each held-out view, and with the near plane of other programs' viewers.
+            view_names, view_angles, view_uncovered: Of each; see `coverage_of_views`.
             phases: Milliseconds a step, by phase; see `phases.measure`.
             launches: Launches, waits and the device's load in a step; see `launches.measure`. None without CUDA.
             curve: Only if the job asks for it: the points of `curve.Curve`, the last one being the finished run.
@@ -225,6 +228,7 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
         train_views = [(train_cameras[i : i + 1].to(trainer.device), train_images[i]) for i in indices]
         train_psnr = evaluate.quality(model, train_views, {})["psnr"]
         fps = evaluate.frames_per_second(model, [camera for camera, _ in views])
+        held_out["ply_view_psnr"] = evaluate.view_psnr_in_viewers(model, views, held_out["view_psnr"])
     record = {
         "devices": devices,
         "iterations": trainer.config.max_num_iterations,
@@ -235,6 +239,7 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
         "compile_seconds": compiling.seconds,
         "loop_compile_seconds": compiling.seconds - before_loop,
         **held_out,
+        **coverage_of_views(datamanager, model),
         "train_psnr": train_psnr,
         "fps": fps,
         "gaussians": int(model.num_points),
@@ -247,13 +252,38 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
         end = point(trainer.config.max_num_iterations, timer.seconds, held_out, int(model.num_points))
         record["curve"] = [*curve.points, end]
     if images is not None:
-        names = [Path(path).stem for path in datamanager.eval_dataset.image_filenames]
         where = (images, job.scene.name, job.row.label, job.seed)
-        record["images"] = pictures.save(model, views, names, *where)
+        record["images"] = pictures.save(model, views, record["view_names"], *where)
     if devices == 1:
         record["phases"] = phases.measure(trainer)  # from here on the model is trained further
         record["launches"] = launches.measure(trainer)
     return record
+
+
+def coverage_of_views(datamanager: Any, model: Any) -> dict[str, list[Any]]:
+    """Tell how far the held-out views are from the training views, in the order in which they are evaluated.
+
+    Without SfM points, the centres of the model's Gaussians are the points. The images must be loaded, because that
+    takes the distortion from the cameras.
+
+    Returns:
+        The images' names without suffix, and what `coverage` measures: degrees and shares, None in place of NaN.
+    """
+    from sadgs_ns.bench.coverage import Views, nearest_angles, uncovered_shares
+
+    training, held_out = datamanager.train_dataset, datamanager.eval_dataset
+    points = training.metadata.get("points3D_xyz")
+    points = (model.means.detach() if points is None or not len(points) else points).to(model.device)
+    there, known = (Views.of(dataset.cameras.to(model.device)) for dataset in (held_out, training))
+
+    def rounded(values: Any, digits: int) -> list[float | None]:
+        return [None if math.isnan(value) else round(value, digits) for value in values.tolist()]
+
+    return {
+        "view_names": [Path(path).stem for path in held_out.image_filenames],
+        "view_angles": rounded(nearest_angles(there, known, points), 1),
+        "view_uncovered": rounded(uncovered_shares(there, known, points), 3),
+    }
 
 
 def alone(job: Job, root: Path, work: Path, checkpoint: Path) -> Any:

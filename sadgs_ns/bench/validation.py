@@ -2,15 +2,18 @@
 
 Test views are for tables alone. This writes a copy of each scene of a folder (images are links) in which every 8th view
 from 0, a test view, is gone, and every 8th from 4 is held out. Where the scene names its own test views (a
-`transforms.json` with lists of file names), every 8th training view from 4 is held out instead. With `--masked`, a
-rectangle in each training view, somewhere else in each and a quarter of it in all, is masked; held-out views are whole.
-With `--noisy`, the camera of each training view is turned by a random angle, and those of held-out views are true.
+`transforms.json` with lists of file names), every 8th training view from 4 is held out instead. With `--folds 2,4,6`,
+there are copies NAME-2, NAME-4 and NAME-6, in each of which every 8th view from that number is held out. Fold 0 holds
+out the test views and trains on all others, as the tables do. With `--masked`, a rectangle in each training view,
+somewhere else in each and a quarter of it in all, is masked; held-out views are whole. With `--noisy`, the camera of
+each training view is turned by a random angle, and those of held-out views are true.
 """
 
 from __future__ import annotations
 
 import json
 import shutil
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -33,13 +36,14 @@ NOISY_DEGREES = 0.1
 1,150 px."""
 
 
-def write_colmap(scene: Path, out: Path, masked: bool = False) -> tuple[int, int]:
+def write_colmap(scene: Path, out: Path, masked: bool = False, fold: int = VALIDATION) -> tuple[int, int]:
     """Write one COLMAP scene with the lists that nerfstudio's parser reads.
 
     Args:
         scene: Folder with `images` and `sparse/0`.
         out: Folder to write; one that is there is replaced.
         masked: Whether to write `masks`, too.
+        fold: Number of the first view that is held out, in [0, 7]. Test views are in the training views of no fold.
 
     Returns:
         Numbers of training and of held-out views.
@@ -52,8 +56,8 @@ def write_colmap(scene: Path, out: Path, masked: bool = False) -> tuple[int, int
     out.mkdir(parents=True)
     for name in ("images", "sparse"):
         (out / name).symlink_to((scene / name).resolve())
-    held_out = names[VALIDATION::INTERVAL]
-    train = [name for i, name in enumerate(names) if i % INTERVAL not in (TEST, VALIDATION)]
+    held_out = names[fold::INTERVAL]
+    train = [name for i, name in enumerate(names) if i % INTERVAL not in (TEST, fold)]
     for split, chosen in {"train": train, "test": held_out, "val": held_out}.items():
         (out / f"{split}_list.txt").write_text("\n".join(chosen))
     for i, name in enumerate(names if masked else ()):
@@ -92,8 +96,12 @@ def turn_cameras(out: Path) -> None:
     model.write(out / SPARSE)
 
 
-def write_transforms(scene: Path, out: Path) -> tuple[int, int]:
-    """Write one scene of a `transforms.json` that lists its splits, with every 8th training view from 4 held out.
+def write_transforms(scene: Path, out: Path, fold: int = VALIDATION) -> tuple[int, int]:
+    """Write one scene of a `transforms.json` that lists its splits, with every 8th training view held out.
+
+    Args:
+        scene, out: As for `write_colmap`.
+        fold: Number of the first training view that is held out, in [1, 7]; 0 holds out the listed test views.
 
     Returns:
         Numbers of training and of held-out views.
@@ -105,7 +113,7 @@ def write_transforms(scene: Path, out: Path) -> tuple[int, int]:
             (out / path.name).symlink_to(path.resolve())
     content = json.loads((scene / "transforms.json").read_text())
     names = content["train_filenames"]
-    held_out = names[VALIDATION::INTERVAL]
+    held_out = content["test_filenames"] if fold == TEST else names[fold::INTERVAL]
     train = [name for name in names if name not in held_out]
     listed = {*train, *held_out}
     content["frames"] = [frame for frame in content["frames"] if frame["file_path"] in listed]
@@ -115,22 +123,28 @@ def write_transforms(scene: Path, out: Path) -> tuple[int, int]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Write the scenes and print how many views each has; returns the exit code, 2 where there is no scene."""
+    """Write the scenes and print how many views each has; returns the exit code, 2 where the input is wrong."""
     arguments = command_lines.validation().parse_args(argv)
+    folds = [str(VALIDATION)] if arguments.folds is None else arguments.folds.split(",")
+    if not {*folds} <= {str(fold) for fold in range(INTERVAL)}:
+        problem = f"--folds must be whole numbers from 0 to {INTERVAL - 1}, such as 2,4,6, not {arguments.folds!r}."
+        print(f"sadgs-bench validation: {problem}", file=sys.stderr)
+        return 2
     folders = sorted(path for path in arguments.root.iterdir() if path.is_dir()) if arguments.root.is_dir() else []
     scenes = [path for path in folders if (path / SPARSE).is_dir() or (path / "transforms.json").exists()]
     if not scenes:
         print(f"{arguments.root} holds no folder with {SPARSE} or transforms.json: give the folder of the scenes.")
         return 2
-    for scene in scenes:
+    for scene, fold in ((scene, int(fold)) for scene in scenes for fold in folds):
+        name = scene.name if arguments.folds is None else f"{scene.name}-{fold}"
         if (scene / SPARSE).is_dir():
-            train, held_out = write_colmap(scene, arguments.out / scene.name)
+            train, held_out = write_colmap(scene, arguments.out / name, fold=fold)
             if scene.name in arguments.masked:
-                write_colmap(scene, arguments.out / f"{scene.name}-masked", masked=True)
+                write_colmap(scene, arguments.out / f"{name}-masked", masked=True, fold=fold)
             if scene.name in arguments.noisy:
-                write_colmap(scene, arguments.out / f"{scene.name}-noisy")
-                turn_cameras(arguments.out / f"{scene.name}-noisy")
+                write_colmap(scene, arguments.out / f"{name}-noisy", fold=fold)
+                turn_cameras(arguments.out / f"{name}-noisy")
         else:
-            train, held_out = write_transforms(scene, arguments.out / scene.name)
-        print(f"{scene.name}: {train} training views, {held_out} validation views")
+            train, held_out = write_transforms(scene, arguments.out / name, fold)
+        print(f"{name}: {train} training views, {held_out} held-out views")
     return 0

@@ -367,6 +367,25 @@ def test_a_record_holds_all_fields(written: tuple[dict[str, Any], Path]):
     assert sum(record["view_psnr"]) / record["eval_views"] == pytest.approx(record["psnr"], abs=0.005)
 
 
+def test_each_held_out_view_is_told_in_the_order_of_its_psnr(runs: Runs, root: Path, tmp_path: Path):
+    record, _ = runs["with"]
+    assert record["view_names"] == ["000", "004", "008"] and len(record["ply_view_psnr"]) == 3
+    assert max(map(abs, record["view_angles"])) < 90 and max(record["view_uncovered"]) < 0.5
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    for row in (SPLATFACTO, SADGS):  # The order is that of the loader whose views are evaluated.
+        datamanager: Any = run.build_config(SCENE, row, 0, root, tmp_path).pipeline.datamanager.setup(test_mode="test")
+        for name, (_, batch) in zip(record["view_names"], datamanager.fixed_indices_eval_dataloader, strict=True):
+            photograph = np.asarray(Image.open(root / "demo" / "images" / f"{name}.png").convert("RGB"))
+            image = batch["image"].cpu().numpy()
+            assert np.array_equal(image if image.dtype == np.uint8 else np.rint(image * 255), photograph)
+        # Without SfM points the Gaussians' centres stand for them.
+        points = datamanager.train_dataset.metadata.pop("points3D_xyz")
+        told = run.coverage_of_views(datamanager, SimpleNamespace(means=points, device=device))
+        assert told == {name: record[name] for name in told}
+        told = run.coverage_of_views(datamanager, SimpleNamespace(means=points * torch.nan, device=device))
+        assert told["view_angles"] == told["view_uncovered"] == [None] * 3
+
+
 def test_the_times_add_up(written: tuple[dict[str, Any], Path]):
     record, _ = written
     names = ("import", "setup", "initialization", "load", "warmup", "structure_tensor", "train")
@@ -452,6 +471,24 @@ def test_photographs_keep_their_alpha_and_names_that_repeat_are_told_apart(tmp_p
         truth = np.asarray(Image.open(tmp_path / Path(path).parts[0] / "truth" / Path(path).name))
         assert np.array_equal(truth, photograph.numpy())
         assert np.unique(np.asarray(Image.open(tmp_path / path))).tolist() == [128]
+
+
+@pytest.mark.parametrize(("near_plane", "planes"), [(0.01, []), (0.3, [0.01])])
+def test_the_near_plane_of_other_viewers_is_measured_and_put_back(near_plane: float, planes: list[float]):
+    model: Any = FlatModel()
+    model.config, model.device, model.near_plane, drawn = SimpleNamespace(), "cpu", near_plane, []
+
+    def draw(camera: Any) -> dict[str, Tensor]:
+        drawn.append(model.near_plane)
+        return {"rgb": torch.full((12, 12, 3), camera), "background": torch.zeros(3)}
+
+    model.get_outputs_for_camera = draw
+    view = (0.5, {"image": torch.zeros(12, 12, 3)})
+    assert evaluate.view_psnr_in_viewers(model, [view], [1.0]) == ([6.02] if planes else [1.0])
+    if planes:
+        with pytest.raises(TypeError):  # of a camera that cannot be drawn
+            evaluate.view_psnr_in_viewers(model, [(None, {})], [])
+    assert drawn == 2 * planes and model.near_plane == near_plane
 
 
 # Metrics

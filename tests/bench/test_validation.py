@@ -32,6 +32,23 @@ def test_a_colmap_scene_is_split_as_nerfstudio_then_reads_it(scene: Path, tmp_pa
         assert read["train"] == [name for i, name in enumerate(names) if i % 8 not in (0, 4)]
 
 
+def test_each_fold_holds_out_its_views_and_only_fold_0_holds_out_test_views(scene: Path, tmp_path: Path):
+    assert main([str(scene.parent), str(tmp_path), "--folds", "1,4,0", "--noisy", scene.name]) == 0
+    names = image_names(ColmapDataParserConfig(colmap_path=SPARSE, downscale_factor=1), scene)
+    for fold in (0, 1, 4):
+        for path in (tmp_path / f"{scene.name}-{fold}", tmp_path / f"{scene.name}-{fold}-noisy"):
+            lists = {split: (path / f"{split}_list.txt").read_text().split() for split in ("train", "val", "test")}
+            assert lists["val"] == lists["test"] == names[fold::8]
+            assert lists["train"] == [name for i, name in enumerate(names) if i % 8 not in (0, fold)]
+
+
+@pytest.mark.parametrize("folds", ["8", "-1", "2,x", ""])
+def test_a_fold_that_there_is_not_is_refused(folds: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main([str(tmp_path), str(tmp_path), f"--folds={folds}"]) == 2
+    told = f"sadgs-bench validation: --folds must be whole numbers from 0 to 7, such as 2,4,6, not {folds!r}.\n"
+    assert capsys.readouterr().err == told
+
+
 def test_noise_turns_training_cameras_about_their_centres_and_leaves_the_others(scene: Path, tmp_path: Path):
     assert main([str(scene.parent), str(tmp_path), "--noisy", scene.name]) == 0
     outputs = {}
@@ -62,11 +79,12 @@ def test_a_scene_that_lists_its_views_keeps_its_test_views_out(tmp_path: Path):
     }  # fmt: skip
     (scene / "transforms.json").write_text(json.dumps(content))
     assert main([str(scene.parent), str(tmp_path / "out")]) == 0
-    parser = NerfstudioDataParserConfig(data=tmp_path / "out" / "listed", downscale_factor=1).setup()
-    held_out = [names[i] for i in range(4, 20, 8)]
-    expected = {"train": [name for name in names[:20] if name not in held_out], "val": held_out, "test": held_out}
-    for split, chosen in expected.items():
-        assert [path.name for path in parser.get_dataparser_outputs(split).image_filenames] == chosen
+    assert main([str(scene.parent), str(tmp_path / "out"), "--folds", "0,2"]) == 0
+    for copy, held_out in (("listed", names[4:20:8]), ("listed-0", names[20:]), ("listed-2", names[2:20:8])):
+        parser = NerfstudioDataParserConfig(data=tmp_path / "out" / copy, downscale_factor=1).setup()
+        expected = {"train": [name for name in names[:20] if name not in held_out], "val": held_out, "test": held_out}
+        for split, chosen in expected.items():
+            assert [path.name for path in parser.get_dataparser_outputs(split).image_filenames] == chosen
 
 
 def test_a_folder_without_scenes_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
