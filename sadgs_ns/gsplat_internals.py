@@ -52,6 +52,9 @@ def drawn(
 
 # The parts of `gsplat.rasterization`: CUDA kernels.
 
+NEAR_PLANE = 0.01
+"""Depth in world units from which gsplat 1.4 and 1.5, and most viewers of exported files, draw Gaussians."""
+
 
 def project(
     means: Tensor,  # [N, 3]
@@ -63,6 +66,7 @@ def project(
     width: int,
     height: int,
     calc_compensations: bool,
+    near_plane: float = NEAR_PLANE,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]:
     """Project Gaussians into pinhole cameras with a blur of 0.3 px², differentiably, as `gsplat.rasterization` does.
 
@@ -78,6 +82,7 @@ def project(
         width: px.
         height: px.
         calc_compensations: Whether to compute how much the blur must lower the opacities.
+        near_plane: Depth in world units from which Gaussians are drawn.
 
     Returns:
         radii, int32 px in the layout that RADII_PER_AXIS tells; means2d in px [C, N, 2]; depths in world units [C, N];
@@ -86,8 +91,9 @@ def project(
     """
     bound: dict[str, Any] = {"opacities": opacities} if RADII_PER_AXIS else {}
     return gsplat.fully_fused_projection(  # type: ignore[return-value]
-        means, None, quats, scales, viewmats, Ks, width, height, calc_compensations=calc_compensations, **bound
-    )
+        means, None, quats, scales, viewmats, Ks, width, height,
+        near_plane=near_plane, calc_compensations=calc_compensations, **bound,
+    )  # fmt: skip
 
 
 def spherical_harmonics(

@@ -29,6 +29,7 @@ def project(
     width: int,
     height: int,
     calc_compensations: bool,
+    near_plane: float = 0.01,
 ) -> tuple[Tensor, ...]:
     """`gsplat_internals.project` in torch."""
     covariances = gsplat_internals.torch_quat_scale_to_covar_preci(quats, scales, True, False)[0]
@@ -40,6 +41,7 @@ def project(
         width,
         height,
         calc_compensations=calc_compensations,
+        near_plane=near_plane,
     )
 
 

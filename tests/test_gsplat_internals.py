@@ -103,9 +103,9 @@ def test_the_projection_gets_what_gsplats_rasterization_gives_it(monkeypatch: py
         first_call(monkeypatch, signature, call)
         for call in (
             lambda: gsplat.rasterization(
-                *geometry, torch.ones(N, 3), viewmats, Ks, 40, 30, packed=False, rasterize_mode=mode
+                *geometry, torch.ones(N, 3), viewmats, Ks, 40, 30, near_plane=0.7, packed=False, rasterize_mode=mode
             ),
-            lambda: gsplat_internals.project(*geometry, viewmats, Ks, 40, 30, mode == "antialiased"),
+            lambda: gsplat_internals.project(*geometry, viewmats, Ks, 40, 30, mode == "antialiased", 0.7),
         )
     )
     assert found.keys() == expected.keys()

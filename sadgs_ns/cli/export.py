@@ -7,7 +7,7 @@ import math
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,6 +131,7 @@ def export(
             )
         similarity = from_data(folder / TRANSFORMS_NAME).inverse()
     params = read_gaussians(run)
+    drawing = {"max_off_axis": _MAX_OFF_AXIS, "near_plane": read_near_plane(run)}
     if params["features_rest"].shape[1] == 0:  # then training holds colours' logits
         params["features_dc"] = (params["features_dc"].sigmoid() - 0.5) / DEGREE_0
     start, cameras = None, None
@@ -140,11 +141,11 @@ def export(
         cameras = read_cameras(folder, data)
     try:
         of_parameters(_arrays(params))  # It refuses shapes that do not fit.
-        params = _cleaned(params, cleaning, cameras)
+        params = _cleaned(params, cleaning, cameras, drawing)
         if as_mesh and cameras is not None:
             from sadgs_ns.cli.meshing import write_mesh
 
-            return write_mesh(output, params, cameras, similarity, voxel_size, max_off_axis=_MAX_OFF_AXIS)
+            return write_mesh(output, params, cameras, similarity, voxel_size, **drawing)
         if as_page and cameras is not None:
             pose, K = cameras.camera_to_worlds[0].double().numpy(), cameras.Ks[0]
             start = html.start_at(pose, max(cameras.sizes[0]), float(K[0, 0]), params["means"].numpy())
@@ -155,7 +156,9 @@ def export(
         raise InputError(f"{checkpoint} holds no Gaussians that can be exported ({error}): {_REMEDY}.") from error
 
 
-def _cleaned(params: dict[str, Tensor], cleaning: Cleaning, cameras: RunCameras | None) -> dict[str, Tensor]:
+def _cleaned(
+    params: dict[str, Tensor], cleaning: Cleaning, cameras: RunCameras | None, drawing: Mapping[str, float]
+) -> dict[str, Tensor]:
     """Return the parameters of the Gaussians that stay, and print how many each option takes away."""
     import torch
     from rich.console import Console
@@ -173,7 +176,7 @@ def _cleaned(params: dict[str, Tensor], cleaning: Cleaning, cameras: RunCameras 
         views = [(viewmat, K, *size) for viewmat, K, size in zip(viewmats, Ks, cameras.sizes, strict=True)]
         console = Console(stderr=True)
         shown = track(views, "Looking from the training views", console=console, disable=not console.is_terminal)
-        seen = see(shapes, shown, max_off_axis=_MAX_OFF_AXIS)
+        seen = see(shapes, shown, **drawing)
     stays, sentences = find(shapes, cleaning, seen)
     print("\n".join(sentences))
     if not stays.any():
@@ -209,17 +212,9 @@ def read_gaussians(run: Path) -> dict[str, Tensor]:
     Raises:
         InputError: If there is no checkpoint of this method or of splatfacto.
     """
-    # torch, which both import, takes seconds, and `--help` and a wrong path need not wait for it.
-    from torch import Tensor
+    from torch import Tensor  # It takes seconds, and `--help` and a wrong path need not wait for it.
 
-    from sadgs_ns.plugin import checkpoints
-
-    checkpoint = _checkpoint_of(run)
-    folder, single = (None, checkpoint) if checkpoint == run else (checkpoint.parent, None)
-    chosen = checkpoints.read_chosen(folder, None, single, _REMEDY, mmap=True)
-    assert chosen is not None
-    checkpoint, state = chosen
-    loaded = state["pipeline"] if isinstance(state["pipeline"], dict) else {}
+    checkpoint, loaded = _read_pipeline(run)
     params = {}
     for name in ("means", "scales", "quats", "opacities", "features_dc", "features_rest"):
         value = loaded.get(_PREFIX + name)
@@ -227,6 +222,33 @@ def read_gaussians(run: Path) -> dict[str, Tensor]:
             raise InputError(f"{checkpoint} holds no {name} of Gaussians, so another method made it: {_REMEDY}.")
         params[name] = value
     return params
+
+
+def read_near_plane(run: Path) -> float:
+    """Return the depth from which a run's Gaussians are drawn, in world units; gsplat's where splatfacto made it.
+
+    Args:
+        run: As of `export`.
+
+    Raises:
+        InputError: As `read_gaussians`.
+    """
+    from sadgs_ns.gsplat_internals import NEAR_PLANE
+
+    state = _read_pipeline(run)[1].get("_model._extra_state")
+    return state.get("near_plane", NEAR_PLANE) if isinstance(state, dict) else NEAR_PLANE
+
+
+def _read_pipeline(run: Path) -> tuple[Path, dict[str, Any]]:
+    """Return the checkpoint that `export`'s `run` names, and its pipeline's state, mapped from the file."""
+    from sadgs_ns.plugin import checkpoints  # It imports torch.
+
+    checkpoint = _checkpoint_of(run)
+    folder, single = (None, checkpoint) if checkpoint == run else (checkpoint.parent, None)
+    chosen = checkpoints.read_chosen(folder, None, single, _REMEDY, mmap=True)
+    assert chosen is not None
+    checkpoint, state = chosen
+    return checkpoint, state["pipeline"] if isinstance(state["pipeline"], dict) else {}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,7 +33,7 @@ def write_mesh(
     cameras: RunCameras,
     similarity: Similarity | None = None,
     voxel_size: float | None = None,
-    max_off_axis: float = 0.0,
+    **drawing: float,
 ) -> int:
     """Fuse what the training views see into a mesh, and write it; the file appears complete or not at all.
 
@@ -43,7 +44,7 @@ def write_mesh(
         cameras: The training views, in the parameters' frame.
         similarity: From the parameters' frame to the file's; None leaves the mesh as it is.
         voxel_size: Edge of a voxel in the parameters' frame; None derives it from the median depth.
-        max_off_axis: As for `rasterize`.
+        drawing: `max_off_axis` and `near_plane`, as for `rasterize`.
 
     Returns:
         The number of triangles.
@@ -60,10 +61,10 @@ def write_mesh(
     params = {name: value[sound].to(device) for name, value in params.items()}
     if voxel_size is None:
         step = -(-number // _SAMPLED)
-        voxel_size = derive_voxel_size(list(look(params, cameras, range(0, number, step), max_off_axis)))
+        voxel_size = derive_voxel_size(list(look(params, cameras, range(0, number, step), **drawing)))
     fusion = Fusion(voxel_size)
     console = Console(stderr=True)
-    views = look(params, cameras, range(number), max_off_axis)
+    views = look(params, cameras, range(number), **drawing)
     for view in track(views, "Fusing depth", number, console=console, disable=not console.is_terminal):
         fusion.add(view)
     found = fusion.mesh().without_small_parts()
@@ -97,7 +98,7 @@ def derive_voxel_size(views: Sequence[DepthView]) -> float:
 
 @torch.no_grad()
 def look(
-    params: Mapping[str, Tensor], cameras: RunCameras, indices: Sequence[int], max_off_axis: float
+    params: Mapping[str, Tensor], cameras: RunCameras, indices: Sequence[int], **drawing: Any
 ) -> Iterator[DepthView]:
     """Render depth and colours, one view after the other; depth is the expected one along the viewing axis.
 
@@ -105,7 +106,7 @@ def look(
         params: As for `write_mesh`, all finite, on the device that renders.
         cameras: C views.
         indices: Which views.
-        max_off_axis: As for `rasterize`.
+        drawing: As for `write_mesh`.
     """
     device = params["means"].device
     viewmats, Ks = viewmats_from_camera_to_world(cameras.camera_to_worlds), cameras.Ks
@@ -127,7 +128,7 @@ def look(
             height,
             sh_degree=degree or None,
             render_mode="RGB+ED",
-            max_off_axis=max_off_axis,
+            **drawing,
         )
         seen = alpha >= MIN_ALPHA  # [1, H, W, 1]
         own = (render[..., :3] / alpha.clamp_min(MIN_ALPHA)).clamp(0, 1)  # The background, black, is taken away.

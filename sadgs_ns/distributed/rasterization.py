@@ -9,6 +9,7 @@ from torch import Tensor
 from sadgs_ns.distributed.bands import Band, share_out
 from sadgs_ns.distributed.exchange import Exchange
 from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.gsplat_internals import NEAR_PLANE
 from sadgs_ns.render.rasterization import composite, project
 
 
@@ -39,6 +40,7 @@ def rasterize(
     absgrad: bool = False,
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
     max_off_axis: float = 0.0,
+    near_plane: float = NEAR_PLANE,
     fused: bool = True,
 ) -> tuple[list[RenderedBand], Tensor, dict[str, Any]]:
     """Render the Gaussians of all processes into V pinhole cameras, of which each process composites its share.
@@ -49,8 +51,8 @@ def rasterize(
         shards: The processes, whose `sizes` are right.
         means, quats, scales, opacities, colors: The Gaussians of this process, as for `render.rasterization.rasterize`.
         viewmats, Ks, width, height: The same cameras in all processes; `viewmats` gets no gradient.
-        sh_degree, absgrad, rasterize_mode, max_off_axis, fused: As for `render.rasterization.rasterize`, the same in
-            all processes.
+        sh_degree, absgrad, rasterize_mode, max_off_axis, near_plane, fused: As for `render.rasterization.rasterize`,
+            the same in all processes.
 
     Returns:
         The bands of this process; the anchor, a zero that must be added to the loss; and gsplat's `info` of this
@@ -62,7 +64,8 @@ def rasterize(
     """
     projected = project(
         means, quats, scales, opacities, colors, viewmats, Ks, width, height,
-        sh_degree=sh_degree, rasterize_mode=rasterize_mode, max_off_axis=max_off_axis, fused=fused,
+        sh_degree=sh_degree, rasterize_mode=rasterize_mode, max_off_axis=max_off_axis, near_plane=near_plane,
+        fused=fused,
     )  # fmt: skip
     exchange = Exchange(shards, projected, share_out(len(viewmats), height, shards.num_ranks), fused=fused)
     anchor, received = exchange.send(projected, absgrad)

@@ -20,6 +20,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sadgs_ns import gsplat_internals
+from sadgs_ns.gsplat_internals import NEAR_PLANE
 from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.visibility import drawn
 
@@ -243,9 +244,10 @@ class _Project(torch.autograd.Function):
         width: int,
         height: int,
         calc_compensations: bool,
+        near_plane: float,
     ) -> tuple[Tensor | None, ...]:
         radii, means2d, depths, conics, compensations = gsplat_internals.project(
-            means, quats, scales, opacities, viewmats, Ks, width, height, calc_compensations
+            means, quats, scales, opacities, viewmats, Ks, width, height, calc_compensations, near_plane
         )
         radii = radii.contiguous()
         ctx.mark_non_differentiable(radii)
@@ -279,7 +281,7 @@ class _Project(torch.autograd.Function):
             n, len(viewmats), *ctx.size, row2d, row_conic,
             v_depths is not None, v_compensations is not None, v_passed is not None, radii.dim() - 1, BLUR, _LANES,
         )  # fmt: skip
-        return v_means, v_quats, v_scales, *[None] * 6
+        return v_means, v_quats, v_scales, *[None] * 7
 
 
 def project(
@@ -292,6 +294,7 @@ def project(
     width: int,
     height: int,
     calc_compensations: bool,
+    near_plane: float = NEAR_PLANE,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None, Tensor]:
     """Do what `gsplat_internals.project` does, but differentiate it with one kernel.
 
@@ -305,10 +308,11 @@ def project(
         width: px.
         height: px.
         calc_compensations: Whether to compute how much the blur must lower the opacities.
+        near_plane: Depth in world units from which Gaussians are drawn.
 
     Returns:
         What `gsplat_internals.project` returns, whose radii may be set to 0 in place until the backward pass; and
         `means`. If what else depends on the centres takes this tensor, the backward kernel adds its gradient to theirs.
     """
     tensors = (value.contiguous() for value in (means, quats, scales, opacities, viewmats, Ks))
-    return _Project.apply(*tensors, width, height, calc_compensations)  # type: ignore[return-value]
+    return _Project.apply(*tensors, width, height, calc_compensations, near_plane)  # type: ignore[return-value]

@@ -11,6 +11,7 @@ from gsplat.utils import normalized_quat_to_rotmat
 from matplotlib.colors import hsv_to_rgb
 from torch import Tensor
 
+from sadgs_ns.gsplat_internals import NEAR_PLANE
 from sadgs_ns.method.split import num_children
 from sadgs_ns.render.rasterization import rasterize
 
@@ -28,6 +29,7 @@ def blend(
     height: int,
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
     max_off_axis: float = 0.0,
+    near_plane: float = NEAR_PLANE,
 ) -> tuple[Tensor, Tensor]:
     """Blend values of Gaussians as their colours are blended, front to back.
 
@@ -39,7 +41,7 @@ def blend(
         width: Width of the image in px.
         height: Height of the image in px.
         rasterize_mode: As for `rasterize`.
-        max_off_axis: As for `rasterize`.
+        max_off_axis, near_plane: As for `rasterize`.
 
     Returns:
         The blended values [H, W, D], and how much of each pixel is covered, in [0, 1] [H, W, 1].
@@ -56,6 +58,7 @@ def blend(
         height,
         rasterize_mode=rasterize_mode,
         max_off_axis=max_off_axis,
+        near_plane=near_plane,
     )
     return render[0], alpha[0]
 

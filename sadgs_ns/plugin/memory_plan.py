@@ -11,6 +11,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from torch import Tensor
 
 from sadgs_ns.distributed.bands import views_of_rank
+from sadgs_ns.gsplat_internals import NEAR_PLANE
 from sadgs_ns.method import memory
 from sadgs_ns.method.absgs import empty_gradients
 from sadgs_ns.method.memory import StepSize
@@ -31,8 +32,6 @@ SAMPLED_CAMERAS = 8
 """Training cameras in which the pairs of the initial Gaussians are counted."""
 TILE_SIZE = 8
 """Size of a tile in px, as `kernels.compositing.TILE_SIZE`, which cannot be imported without Triton."""
-NEAR_PLANE = 0.01
-"""Depth in world units from which gsplat and our splatter draw Gaussians."""
 MANY_IMAGES = 500
 """Number of training images up to which nerfstudio would keep them on the device, whatever their size."""
 IMAGE_SHARE = 0.25
@@ -67,6 +66,7 @@ def training_size(
     views: int,
     fused: bool,
     processes: int = 1,
+    near_plane: float = NEAR_PLANE,
 ) -> TrainingSize:
     """Measure a run before its first step; no image is opened for it.
 
@@ -76,6 +76,7 @@ def training_size(
         views: Views rendered in a step.
         fused: Whether the loss is computed by our kernels.
         processes: Number of processes among which the step is shared out.
+        near_plane: Depth in world units from which Gaussians are drawn.
     """
     cameras = datamanager.train_dataset.cameras
     largest = int((cameras.height * cameras.width).max())
@@ -90,7 +91,7 @@ def training_size(
         kept = float((3 * _value_bytes(datamanager) * here + CODE_BYTES * views) * largest)
         structure = float(STRUCTURE_PIXEL_BYTES * max(largest, min(PIXELS_PER_BATCH, here * largest)))
     # A process composites its share of the pixels, and as many pairs as its share of the Gaussians has in all views.
-    pixels, pairs = -(-views * largest // processes), views * estimate_pairs(params, cameras)
+    pixels, pairs = -(-views * largest // processes), views * estimate_pairs(params, cameras, near_plane)
     return TrainingSize(kept, StepSize(views, pixels, pairs, processes > 1), fused, structure)
 
 
@@ -151,7 +152,7 @@ def place_images(datamanager: FullImageDatamanager, device: torch.device) -> str
 
 
 @torch.no_grad()
-def estimate_pairs(params: Params, cameras: Cameras) -> int:
+def estimate_pairs(params: Params, cameras: Cameras, near_plane: float = NEAR_PLANE) -> int:
     """Pairs of a Gaussian and a tile in the view that has most of them, of a few training cameras.
 
     Each Gaussian counts as a sphere of its largest scale and in all tiles of the square around its projection: the
@@ -160,6 +161,7 @@ def estimate_pairs(params: Params, cameras: Cameras) -> int:
     Args:
         params: `means` [N, 3], log `scales` [N, 3], logit `opacities` [N] or [N, 1].
         cameras: Training cameras. [C]
+        near_plane: Depth in world units from which Gaussians are drawn.
     """
     means, device = params["means"], params["means"].device
     chosen = torch.linspace(0, len(cameras) - 1, min(SAMPLED_CAMERAS, len(cameras))).round().long()
@@ -171,7 +173,7 @@ def estimate_pairs(params: Params, cameras: Cameras) -> int:
     level = 2 * (255 * torch.sigmoid(params["opacities"].flatten())).clamp_min(1).log()
     reach = level.sqrt().clamp_max(_REACH)  # [N] standard deviations at which a Gaussian is 1/255 opaque
     return max(
-        _count_pairs(means, scales, reach, viewmat, K, size.to(means))
+        _count_pairs(means, scales, reach, viewmat, K, size.to(means), near_plane)
         for viewmat, K, size in zip(viewmats, Ks, sizes, strict=True)
     )
 
@@ -183,6 +185,7 @@ def _count_pairs(
     viewmat: Tensor,  # [4, 4]
     K: Tensor,  # [3, 3]
     size: Tensor,  # [2] width and height in px
+    near_plane: float,
 ) -> int:
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]  # [N, 3]
     depths = points[:, 2:]  # [N, 1]
@@ -193,7 +196,7 @@ def _count_pairs(
     first = ((means2d - radii) / TILE_SIZE).floor().clamp_min(0).minimum(tiles)
     last = ((means2d + radii) / TILE_SIZE).ceil().clamp_min(0).minimum(tiles)
     counts = (last - first).prod(dim=-1)  # [N]
-    drawn = (depths[:, 0] > NEAR_PLANE) & (reach > 0) & counts.isfinite()
+    drawn = (depths[:, 0] >= near_plane) & (reach > 0) & counts.isfinite()
     return int(torch.where(drawn, counts, 0.0).double().sum())
 
 

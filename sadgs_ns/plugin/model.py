@@ -27,6 +27,7 @@ from torch import Tensor
 from sadgs_ns.data.cameras import refuse_unsupported_cameras
 from sadgs_ns.distributed.shards import Shards
 from sadgs_ns.errors import InputError
+from sadgs_ns.gsplat_internals import NEAR_PLANE
 from sadgs_ns.method.averaging import RunningMean
 from sadgs_ns.method.clearance import clear_of_cameras, limit_scales
 from sadgs_ns.method.color_matrices import anchored, correct_colors, identities
@@ -39,6 +40,7 @@ from sadgs_ns.method.initialization import (
     uncovered_points,
 )
 from sadgs_ns.method.losses import photometric_loss
+from sadgs_ns.method.near_plane import EmptySpace, nearest_depths, scene_near_plane
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.outliers import POINT_SHARE, REACH
 from sadgs_ns.plugin import gaussian_maps
@@ -103,6 +105,12 @@ class SadgsModelConfig(InstantiateConfig):
     max_off_axis: float = 4.0
     """Gaussians whose centre is projected further from the image's centre, in half images along x or y, are not drawn.
     Far off the axis a Gaussian's image is wrong, and can be haze over the view; 0 draws all."""
+    near_plane: float | None = None
+    """Depth from which Gaussians are drawn, in the run's units; nothing nearer is, in training or later.
+    None is half the depth at which a training camera's fifth SfM point lies, of the camera that comes nearest."""
+    prune_empty_space: bool = True
+    """Take away Gaussians just before the cameras and the path between them, where the photos show nothing.
+    Exported files have no near plane, and such a Gaussian is haze over a view between the photos."""
     max_angular_scale: float = 0.3
     """Longest standard deviation of a Gaussian as a share of its distance from the nearest training camera.
     A longer one can cover a view beside which it lies with haze; 0 sets no limit."""
@@ -138,6 +146,8 @@ class SadgsModelConfig(InstantiateConfig):
             raise InputError(
                 f"pipeline.model.max_off_axis must be 0, or at least 1, the image's border, got {self.max_off_axis:g}."
             )
+        if self.near_plane is not None and not 0 < self.near_plane < math.inf:
+            raise InputError(f"pipeline.model.near_plane must be positive and finite, got {self.near_plane:g}.")
         if not 0 <= self.sh_degree <= 4:
             raise InputError(f"pipeline.model.sh_degree must be in [0, 4], got {self.sh_degree}.")
         if not 1 <= self.num_random <= _MOST_RANDOM:
@@ -215,6 +225,9 @@ class SadgsModel(SplatfactoModel):
         """Degree of the harmonics that the first step draws; each step adds one."""
         self.average = RunningMean()
         self.camera_positions: Tensor | None = None  # [C, 3]
+        self.empty_space: EmptySpace | None = None
+        self.near_plane = NEAR_PLANE if config.near_plane is None else config.near_plane
+        """Depth in world units from which Gaussians are drawn."""
         self.infos: list[dict[str, Any]] = []
         # A bilateral grid would learn to brighten what a step without enough places in its tile lists leaves black.
         self.tile_forecast = None if config.color_model == "bilateral_grid" else TileForecast()
@@ -298,6 +311,23 @@ class SadgsModel(SplatfactoModel):
                 parameter.data = parameter.data[keep]
             self.guessed = self.guessed[keep.cpu()]
 
+    def set_near_plane(self, viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> None:
+        """Derive the near plane from the SfM points before the training cameras, unless it is given.
+
+        Call it after `set_cameras`.
+
+        Args:
+            viewmats: World to camera. [C, 4, 4]
+            Ks: Intrinsics in px. [C, 3, 3]
+            sizes: Width and height in px. [C, 2]
+        """
+        points = self.means.new_zeros((0, 3)) if self.seed_points is None else self.seed_points[0].to(self.means)
+        depths = nearest_depths(points, viewmats, Ks, sizes)
+        if self.config.near_plane is None:
+            self.near_plane = scene_near_plane(depths, self.strategy_state["scene_scale"])
+        if self.config.prune_empty_space:
+            self.empty_space = EmptySpace.of(points, viewmats, Ks, sizes, self.near_plane)
+
     def start_from(self, params: Mapping[str, Tensor], viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> int:
         """Start from the Gaussians of an earlier run, and from the initial ones where it knows nothing.
 
@@ -376,6 +406,9 @@ class SadgsModel(SplatfactoModel):
             self.average.add(self.gauss_params)
             if done >= iterations:
                 self.average.move_to(self.gauss_params)
+        if self.empty_space is not None and done in (self.strategy.windows.refine_stop_iter, iterations):
+            empty = self.empty_space.holds(self.means.detach())
+            self.strategy.take_away(self.gauss_params, self.optimizers, self.strategy_state, empty)
         share, positions = self.config.max_angular_scale, self.camera_positions
         if share > 0 and positions is not None and (done % LIMIT_EVERY == 0 or done >= iterations):
             limit_scales(self.scales, self.means, positions, share)
@@ -428,7 +461,11 @@ class SadgsModel(SplatfactoModel):
     @property
     def drawing(self) -> dict[str, Any]:
         """The options of `rasterize` that every picture of these Gaussians shares."""
-        return {"rasterize_mode": self.config.rasterize_mode, "max_off_axis": self.config.max_off_axis}
+        return {
+            "rasterize_mode": self.config.rasterize_mode,
+            "max_off_axis": self.config.max_off_axis,
+            "near_plane": self.near_plane,
+        }
 
     def render(
         self,
@@ -805,11 +842,14 @@ class SadgsModel(SplatfactoModel):
             "step": self.step,
             "strategy_state": dict(self.strategy_state),
             "average": self.average.state_dict(),
+            "near_plane": self.near_plane,
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` saved."""
         self.step = state["step"]
+        if self.config.near_plane is None:
+            self.near_plane = state.get("near_plane", self.near_plane)
         self.strategy_state = {
             key: value.to(self.device) if isinstance(value, Tensor) else value
             for key, value in state["strategy_state"].items()

@@ -31,7 +31,7 @@ from sadgs_ns.method.structure_tensor import ENERGY_BLUR, FREQUENCY_CONSTANT
 from sadgs_ns.plugin import nonfinite
 from sadgs_ns.plugin.cleaning_panel import CleaningPanel
 from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig, check_options
-from sadgs_ns.plugin.memory_plan import NEAR_PLANE, fit_to_memory, place_images, training_size
+from sadgs_ns.plugin.memory_plan import fit_to_memory, place_images, training_size
 from sadgs_ns.plugin.model import NORMALS, SadgsModel, SadgsModelConfig, in_viewer
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
 from sadgs_ns.plugin.optimizers import FusedAdam
@@ -150,7 +150,13 @@ class SadgsPipeline(VanillaPipeline):
             )
         if config.start_from is not None and self.model.strategy.reset_every is None:
             self.model.strategy.reset_every = 0  # What was learned is not to be learned again.
-        self.model.set_cameras(_positions(self.datamanager.train_dataset.cameras))
+        cameras = self.datamanager.train_dataset.cameras
+        self.model.set_cameras(_positions(cameras))
+        self.model.set_near_plane(
+            viewmats_from_camera_to_world(cameras.camera_to_worlds),
+            cameras.get_intrinsics_matrices(),
+            torch.cat([cameras.width, cameras.height], dim=-1),
+        )
         self.views = TrainingViews(self.datamanager, self.model)
         self.structure_maps = StructureMaps(
             self.views, config.frequency_constant, energy_blur=config.energy_blur, epsilon=config.epsilon
@@ -219,7 +225,8 @@ class SadgsPipeline(VanillaPipeline):
         if self.config.model.strategy.refine_stop_iter != 0:
             model, fused = self.model, self.config.model.fused and kernels.available(self.device)
             processes, views = 1 if self.shards is None else self.shards.num_ranks, self.views_per_iteration
-            size = training_size(self.datamanager, model.gauss_params, views, fused, processes)  # type: ignore[arg-type]
+            gaussians: Any = model.gauss_params
+            size = training_size(self.datamanager, gaussians, views, fused, processes, model.near_plane)
             try:
                 line, warning = fit_to_memory(
                     model.strategy,
@@ -263,14 +270,15 @@ class SadgsPipeline(VanillaPipeline):
         means = self.model.means.detach()
         means = means[:: -(-len(means) // _SAMPLED)].to(viewmats)  # [N, 3]
         depths = means @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]  # [N, C]
-        drawn = ((depths > NEAR_PLANE) & (depths < _FAR_PLANE)).any(dim=1)
+        near = self.model.near_plane
+        drawn = ((depths > near) & (depths < _FAR_PLANE)).any(dim=1)
         share = drawn.float().mean()
         if self.shards is not None:
             share = self.shards.sum(share.to(self.device)) / self.shards.num_ranks
         if share < 0.01:
             extent = float(self.model.strategy_state["scene_scale"])
             raise InputError(
-                f"The renderings would be empty, since a camera sees from {NEAR_PLANE} to {_FAR_PLANE:g} units and the "
+                f"The renderings would be empty, since a camera sees from {near:.2g} to {_FAR_PLANE:g} units and the "
                 f"cameras lie within {extent:.2g}: set the parser's scale-factor so that they lie within about 1, or "
                 "leave its auto-scale-poses on."
             )

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from sadgs_ns import gsplat_internals
+from sadgs_ns.gsplat_internals import NEAR_PLANE
 from sadgs_ns.kernels import compositing
 from sadgs_ns.kernels import projection as kernels_projection
 from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
@@ -41,6 +42,7 @@ def rasterization(
     absgrad: bool,
     rasterize_mode: Literal["classic", "antialiased"],
     max_off_axis: float = 0.0,
+    near_plane: float = NEAR_PLANE,
     tile_capacity: int | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render as the installed `gsplat.rasterization(..., tile_size=TILE_SIZE)` does; see
@@ -59,7 +61,7 @@ def rasterization(
     check_gaussians(num_views, len(means))
     check_pixels(num_views, height, width)
     radii, means2d, depths, conics, opacities, means = _geometry(
-        means, quats, scales, opacities, viewmats, Ks, width, height, rasterize_mode == "antialiased"
+        means, quats, scales, opacities, viewmats, Ks, width, height, rasterize_mode == "antialiased", near_plane
     )
     # Without a capacity the host waits for the lists' length: the colours are computed meanwhile.
     pending_tiles = intersect_tiles(means2d, radii, depths, conics, opacities, width, height, TILE_SIZE, max_off_axis)
@@ -80,6 +82,7 @@ def project(
     height: int,
     sh_degree: int | None,
     *,
+    near_plane: float = NEAR_PLANE,
     antialiased: bool = False,
     max_off_axis: float = 0.0,
 ) -> Projected:
@@ -90,7 +93,7 @@ def project(
     """
     check_gaussians(len(viewmats), len(means))
     radii, means2d, depths, conics, opacities, means = _geometry(
-        means, quats, scales, opacities, viewmats, Ks, width, height, antialiased
+        means, quats, scales, opacities, viewmats, Ks, width, height, antialiased, near_plane
     )
     if max_off_axis > 0:
         radii = cull_off_axis(radii, means2d, width, height, max_off_axis)
@@ -123,6 +126,7 @@ def _geometry(
     width: int,
     height: int,
     antialiased: bool,
+    near_plane: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Project Gaussians, without their colours.
 
@@ -131,7 +135,7 @@ def _geometry(
         from which colours are to be computed.
     """
     num_views = len(viewmats)
-    geometry = means, quats, scales, opacities, viewmats, Ks, width, height, antialiased
+    geometry = means, quats, scales, opacities, viewmats, Ks, width, height, antialiased, near_plane
     if BACKWARD == "moments" and not viewmats.requires_grad:
         # Colours take these centres, so that their gradient is added in the projection's backward kernel.
         radii, means2d, depths, conics, compensations, means = kernels_projection.project(*geometry)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from sadgs_ns import gsplat_internals, kernels
+from sadgs_ns.gsplat_internals import NEAR_PLANE
 from sadgs_ns.render import splatter
 from sadgs_ns.render.off_axis import culling
 from sadgs_ns.render.projected import Projected
@@ -30,6 +31,7 @@ def rasterize(
     absgrad: bool = False,
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
     max_off_axis: float = 0.0,
+    near_plane: float = NEAR_PLANE,
     fused: bool = True,
     tile_capacity: int | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
@@ -52,6 +54,7 @@ def rasterize(
         rasterize_mode: "antialiased" compensates opacities for the screen-space blur.
         max_off_axis: Gaussians whose centre is projected further from the image's centre, in half images along x or y,
             are culled (off_axis.py); 0 culls none.
+        near_plane: Gaussians whose centre is nearer along the viewing axis are culled, in world units.
         fused: On CUDA, list in each tile only the Gaussians that reach it, and differentiate the compositing of three
             channels, with Triton kernels; what is drawn is the same. Assumes rigid viewmats.
         tile_capacity: Number of pairs of a Gaussian and a tile, in all views, for which the Triton kernels make room,
@@ -99,6 +102,7 @@ def rasterize(
         render_mode=render_mode,
         absgrad=absgrad,
         rasterize_mode=rasterize_mode,
+        near_plane=near_plane,
         **options,
     )
 
@@ -117,6 +121,7 @@ def project(
     sh_degree: int | None = None,
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
     max_off_axis: float = 0.0,
+    near_plane: float = NEAR_PLANE,
     fused: bool = True,
 ) -> Projected:
     """Do the first half of `rasterize`, whose arguments these are: project Gaussians and compute their colours.
@@ -132,13 +137,13 @@ def project(
 
         return project(
             means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree,
-            antialiased=antialiased, max_off_axis=max_off_axis,
+            antialiased=antialiased, max_off_axis=max_off_axis, near_plane=near_plane,
         )  # fmt: skip
     if isinstance(colors, tuple):
         colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
     return splatter.project(
         means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree,
-        antialiased=antialiased, max_off_axis=max_off_axis,
+        antialiased=antialiased, max_off_axis=max_off_axis, near_plane=near_plane,
     )  # fmt: skip
 
 

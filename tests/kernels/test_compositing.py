@@ -326,11 +326,18 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
     """All of it for two views; torch code stands in for gsplat's projection."""
     width, height = 22, 18
 
-    def project(means, quats, scales, opacities, viewmats, Ks, width, height, calc_compensations):
+    def project(means, quats, scales, opacities, viewmats, Ks, width, height, calc_compensations, near_plane):
         covariances = gsplat_internals.torch_quat_scale_to_covar_preci(quats, scales, True, False)[0]
         assert covariances is not None
         return _fully_fused_projection(
-            means, covariances, viewmats, Ks, width, height, calc_compensations=calc_compensations
+            means,
+            covariances,
+            viewmats,
+            Ks,
+            width,
+            height,
+            near_plane=near_plane,
+            calc_compensations=calc_compensations,
         )
 
     monkeypatch.setattr(gsplat_internals, "project", project)

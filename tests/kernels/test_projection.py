@@ -48,13 +48,13 @@ def scene(num_views: int) -> dict[str, Any]:
 
 def project_in_torch(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor,
-    width: int, height: int, calc_compensations: bool, per_axis_radii: bool = False,
+    width: int, height: int, calc_compensations: bool, near_plane: float = 0.01, per_axis_radii: bool = False,
 ) -> tuple[Any, ...]:  # fmt: skip
     """Do what `gsplat_internals.project` does, with radii in either layout."""
     covariances, _ = gsplat_internals.torch_quat_scale_to_covar_preci(quats, scales, True, False)
     assert covariances is not None
     radii, *others = _fully_fused_projection(
-        means, covariances, viewmats, Ks, width, height, calc_compensations=calc_compensations
+        means, covariances, viewmats, Ks, width, height, near_plane=near_plane, calc_compensations=calc_compensations
     )
     assert others[0] is not None
     seen = gsplat_internals.drawn(radii, others[0])

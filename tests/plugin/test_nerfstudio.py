@@ -35,11 +35,14 @@ from runs import (
 from scenes import HEIGHT, POINTS, VIEWS, WIDTH
 
 from sadgs_ns.demo.scene import SPARSE_FOLDER
+from sadgs_ns.errors import InputError
 from sadgs_ns.method.codes import decode
+from sadgs_ns.method.near_plane import NEAR_SHARE
 from sadgs_ns.method.schedule import Schedule
 from sadgs_ns.plugin.model import SadgsModel, _load_lpips
 from sadgs_ns.plugin.presets import RATES
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
+from sadgs_ns.render.rasterization import viewmats_from_camera_to_world, visible
 
 
 @pytest.fixture(scope="module")
@@ -650,6 +653,42 @@ def test_held_out_cameras_render_as_nerfstudio_expects(trained: SadgsTrainer):
         }
         assert 0 <= outputs["rgb"].min() < outputs["rgb"].max() <= 1
         assert outputs["depth"].min() > 0
+
+
+@torch.no_grad()
+def test_training_evaluation_and_a_loaded_run_draw_from_the_same_plane(finished: Path, colmap: ColmapDataParserConfig):
+    (path,) = (finished / "nerfstudio_models").iterdir()
+    stored = torch.load(path, weights_only=True)["pipeline"]["_model._extra_state"]["near_plane"]
+    config, pipeline, _, _ = eval_setup(finished / "config.yml")
+    model = pipeline.model
+    assert isinstance(model, SadgsModel) and config.pipeline.model.near_plane is None
+    assert model.near_plane == stored
+    cameras = pipeline.datamanager.train_dataset.cameras
+    viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
+    depths = (model.seed_points[0] @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]).T  # [C, P]
+    in_front = torch.where(depths > 0, depths, torch.inf)
+    assert stored > 0.01 and float(in_front.min()) * NEAR_SHARE <= stored < 0.5 * float(in_front.median())
+    model.means.data[:] = model.means.data[:1] + 1e-3 * torch.randn_like(model.means)
+    pose = cameras.camera_to_worlds[:1].clone()
+    for share, drawn in ((0.9, 0), (1.1, model.num_points)):
+        pose[0, :, 3] = model.means.data[0] + share * stored * pose[0, :, 2]
+        viewmat = viewmats_from_camera_to_world(pose).to(model.device)
+        Ks = cameras.get_intrinsics_matrices()[:1].to(model.device)
+        _, _, info = model.render(viewmat, Ks, WIDTH, HEIGHT, "RGB")
+        assert int(visible(info).sum()) == drawn
+
+
+def test_a_plane_that_is_given_is_kept_also_where_the_checkpoint_has_another(
+    finished: Path, colmap: ColmapDataParserConfig, tmp_path: Path
+):
+    config = configure(tmp_path, colmap, ITERATIONS)
+    config.pipeline.model.near_plane = 0.123
+    assert set_up(config).pipeline.model.near_plane == 0.123
+    config.load_dir = finished / "nerfstudio_models"
+    assert set_up(config).pipeline.model.near_plane == 0.123
+    config.pipeline.model.near_plane = 0.0
+    with pytest.raises(InputError, match=r"^pipeline\.model\.near_plane must be positive and finite, got 0\.$"):
+        set_up(config)
 
 
 @torch.no_grad()
