@@ -27,7 +27,8 @@ class Views(NamedTuple):
     def of(cameras: Any) -> Views:
         """Take the views of nerfstudio's Cameras [C], whose images are undistorted."""
         viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
-        return Views(viewmats, cameras.get_intrinsics_matrices(), torch.cat([cameras.width, cameras.height], dim=-1))
+        Ks = cameras.get_intrinsics_matrices().to(viewmats)  # nerfstudio makes them on the host.
+        return Views(viewmats, Ks, torch.cat([cameras.width, cameras.height], dim=-1))
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:  # points: [P, 3]
         """Return pixels [C, P, 2] and depths [C, P] of points [P, 3], and which view sees which point [C, P]."""

@@ -12,6 +12,7 @@ import math
 from dataclasses import dataclass
 
 import torch
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from sadgs_ns.method.initialization import plausible_points
@@ -19,7 +20,7 @@ from sadgs_ns.method.initialization import plausible_points
 NEAREST_POINTS = 5
 """A view's nearest SfM points up to this one may be errors; the depth of this one is taken for true."""
 NEAR_SHARE = 0.5
-"""The near plane, as a share of the smallest such depth of all views. At 0.25 haze was left in three of nine sets of
+"""The near plane, as a share of the smallest such depth of all views. At 0.25 haze was left in two of nine sets of
 held-out views, and at 1 a view of leaves lost 9 dB (docs/results.md#near-plane)."""
 UNKNOWN_SHARE = 0.01
 """The near plane where no view sees enough SfM points, as a share of the cameras' extent."""
@@ -30,6 +31,11 @@ SIMILAR_DEGREES = 60.0
 BEHIND = 0.75
 """The cone of empty space before a camera begins this share of its length behind the camera, so that it also holds what
 lies just before a view beside the path. It still ends before a wall that is first seen at the image's border."""
+HAZE_ANGLE = 0.1
+"""Standard deviation, as a share of the depth, from which a Gaussian before a pose is haze over its image."""
+SURFACE_SHARE = 0.5
+"""Distance from the `NEAREST_POINTS`-th SfM point, as a share of the near plane, from which no surface is near. Without
+this, pruning took up to 1.6 dB from a view of castle (docs/results.md#exported-files)."""
 _MOST_STEPS = 8
 """Poses on the path between two cameras, at most; otherwise they are a near plane's depth apart."""
 _MOST_POSES = 4096
@@ -137,6 +143,8 @@ class EmptySpace:
     """Width and height of the images in px. [P, 2]"""
     near: Tensor
     """Depth in world units up to which the space before each pose is empty. [P]"""
+    surfaces: KDTree | None
+    """The SfM points; None where there are too few."""
 
     @staticmethod
     def of(
@@ -157,24 +165,34 @@ class EmptySpace:
         poses, ends = poses_of_path(viewmats, near_plane)
         Ks, sizes = Ks.to(poses)[ends], sizes.to(poses)[ends]
         depths = nearest_depths(points, poses, Ks, sizes)
-        return EmptySpace(poses, Ks, sizes, (NEAR_SHARE * depths).clamp_max(near_plane))
+        points = points[plausible_points(points)]
+        surfaces = KDTree(points.cpu().numpy()) if len(points) >= NEAREST_POINTS else None
+        return EmptySpace(poses, Ks, sizes, (NEAR_SHARE * depths).clamp_max(near_plane), surfaces)
 
     @torch.no_grad()
-    def holds(self, means: Tensor) -> Tensor:
-        """Tell which Gaussians lie in it.
+    def haze(self, means: Tensor, scales: Tensor) -> Tensor:
+        """Tell which Gaussians lie in it, would look large from there, and have no surface near them.
+
+        The host waits for the device.
 
         Args:
             means: Centres in world units. [N, 3]
+            scales: Standard deviations in world units. [N, 3]
 
         Returns:
             bool [N]
         """
+        reach = scales.amax(dim=1) / HAZE_ANGLE  # [N] Depth up to which a Gaussian looks large.
         empty = torch.zeros(len(means), dtype=torch.bool, device=means.device)
         poses, Ks, sizes, near = (value.to(means) for value in (self.viewmats, self.Ks, self.sizes, self.near))
         step = max(_PAIRS // max(len(means), 1), 1)
         for here in (slice(start, start + step) for start in range(0, len(poses), step)):
             depths = _depths_in_frusta(means, poses[here], Ks[here], sizes[here], BEHIND * near[here])  # [p, N]
-            empty |= (depths < near[here, None]).any(dim=0)
+            empty |= (depths < torch.minimum(near[here, None], reach)).any(dim=0)
+        found = empty.nonzero()[:, 0]
+        if self.surfaces is not None and len(found):
+            distances, _ = self.surfaces.query(means[found].cpu().numpy(), [NEAREST_POINTS])
+            empty[found] = torch.from_numpy(distances[:, 0]).to(means) > SURFACE_SHARE * float(near.max())
         return empty
 
 

@@ -34,6 +34,7 @@ from sadgs_ns.method.color_matrices import anchored, correct_colors, identities
 from sadgs_ns.method.initialization import (
     POINT_OPACITY,
     camera_extent,
+    neighbour_scales,
     plausible_points,
     seen_points,
     starting_points,
@@ -86,6 +87,9 @@ class SadgsModelConfig(InstantiateConfig):
     """Side of the cube around the origin in which random points are drawn, in the run's units."""
     bounding_box_points: bool = True
     """Also start from points on the faces of the SfM points' bounding box, which become sky and far background."""
+    stereo_points: int | None = None
+    """Points to start from beside the SfM points, at most, drawn from stereo depth of the training photos (CUDA).
+    None is 150,000 where there are 3 to 60 training views, and otherwise none."""
     initial_opacity: float = POINT_OPACITY
     """Opacity at which SfM points start, in (0, 1); random ones start at 0.1.
     Half opaque ones mostly have a lower LPIPS and make more Gaussians (docs/results.md)."""
@@ -152,6 +156,10 @@ class SadgsModelConfig(InstantiateConfig):
             raise InputError(f"pipeline.model.sh_degree must be in [0, 4], got {self.sh_degree}.")
         if not 1 <= self.num_random <= _MOST_RANDOM:
             raise InputError(f"pipeline.model.num_random must be in [1, {_MOST_RANDOM:,}], got {self.num_random:,}.")
+        if self.stereo_points is not None and not 0 <= self.stereo_points <= _MOST_RANDOM:
+            raise InputError(
+                f"pipeline.model.stereo_points must be in [0, {_MOST_RANDOM:,}], got {self.stereo_points:,}."
+            )
         if not 0 < self.random_scale < math.inf:
             raise InputError(f"pipeline.model.random_scale must be positive and finite, got {self.random_scale:g}.")
         for name in ("trans_l2_penalty", "rot_l2_penalty"):
@@ -199,6 +207,7 @@ class SadgsModel(SplatfactoModel):
     config: SadgsModelConfig
     strategy: StructureAwareStrategy
     view_numbers: Tensor
+    near_plane: float
 
     def populate_modules(self) -> None:
         """Make parameters, metrics and the strategy.
@@ -284,14 +293,18 @@ class SadgsModel(SplatfactoModel):
             guessed = guessed[keep]
         self.guessed = guessed
         """Which of the initial Gaussians stand for no SfM point, but are random or on their bounding box. bool [N]"""
-        sh_degree = config.sh_degree
+        return self._spheres(means, colors, scales, opacities)
+
+    def _spheres(self, means: Tensor, colors: Tensor, scales: Tensor, opacities: Tensor | float) -> dict[str, Tensor]:
+        """Make parameters by name of spheres: centres [P, 3], colours in [0, 1] [P, 3], scales [P], opacities [P]."""
+        sh_degree, number = self.config.sh_degree, len(means)
         return {
             "means": means,
             "scales": scales.log()[:, None].repeat(1, 3),
-            "quats": random_quat_tensor(len(means)),
+            "quats": random_quat_tensor(number),
             "features_dc": RGB2SH(colors) if sh_degree > 0 else torch.logit(colors, eps=1e-4),
-            "features_rest": torch.zeros((len(means), num_sh_bases(sh_degree) - 1, 3)),
-            "opacities": torch.logit(opacities)[:, None],
+            "features_rest": torch.zeros((number, num_sh_bases(sh_degree) - 1, 3)),
+            "opacities": torch.logit(torch.as_tensor(opacities).expand(number))[:, None],
         }
 
     def set_cameras(self, positions: Tensor) -> None:
@@ -327,6 +340,29 @@ class SadgsModel(SplatfactoModel):
             self.near_plane = scene_near_plane(depths, self.strategy_state["scene_scale"])
         if self.config.prune_empty_space:
             self.empty_space = EmptySpace.of(points, viewmats, Ks, sizes, self.near_plane)
+
+    def add_points(self, means: Tensor, colors: Tensor, scales: Tensor) -> int:
+        """Start from more points, as many as the cap has room for; call before optimizers are made.
+
+        Args:
+            means: World units. [P, 3]
+            colors: In [0, 1]. [P, 3]
+            scales: Largest standard deviations, world units; they are no longer than the way to neighbours. [P]
+
+        Returns:
+            Number of points that were added.
+        """
+        room = max(min(len(means), self.strategy.max_gaussians - self.num_points), 0)
+        means, colors, scales = means[:room], colors[:room], scales[:room]
+        if not room:
+            return 0
+        known = self.means.detach()[~self.guessed.to(self.means.device)]
+        spacing = neighbour_scales(torch.cat([known, means.to(known)]))[len(known) :]
+        added = self._spheres(means, colors, torch.minimum(scales, spacing.to(scales)), self.config.initial_opacity)
+        for name, parameter in self.gauss_params.items():
+            parameter.data = torch.cat([parameter.data, added[name].to(parameter)])
+        self.guessed = torch.cat([self.guessed, torch.zeros(room, dtype=torch.bool)])
+        return room
 
     def start_from(self, params: Mapping[str, Tensor], viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> int:
         """Start from the Gaussians of an earlier run, and from the initial ones where it knows nothing.
@@ -407,8 +443,8 @@ class SadgsModel(SplatfactoModel):
             if done >= iterations:
                 self.average.move_to(self.gauss_params)
         if self.empty_space is not None and done in (self.strategy.windows.refine_stop_iter, iterations):
-            empty = self.empty_space.holds(self.means.detach())
-            self.strategy.take_away(self.gauss_params, self.optimizers, self.strategy_state, empty)
+            haze = self.empty_space.haze(self.means.detach(), self.scales.detach().exp())
+            self.strategy.take_away(self.gauss_params, self.optimizers, self.strategy_state, haze)
         share, positions = self.config.max_angular_scale, self.camera_positions
         if share > 0 and positions is not None and (done % LIMIT_EVERY == 0 or done >= iterations):
             limit_scales(self.scales, self.means, positions, share)

@@ -82,6 +82,7 @@ def paper_pipeline(views_per_iteration: int) -> SadgsPipelineConfig:
             max_off_axis=0.0,
             max_angular_scale=0.0,
             prune_empty_space=False,
+            stereo_points=0,
             color_model="none",
             strategy=StructureAwareStrategy(
                 eta_every=1,

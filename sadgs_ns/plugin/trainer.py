@@ -33,6 +33,7 @@ from sadgs_ns.plugin.lost_output import drop_lost_output, print_elsewhere_once_u
 from sadgs_ns.plugin.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig, SadgsOptimizers
 from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.plugin.progress import about_cpu, remove_tables, what_next
+from sadgs_ns.plugin.stereo_start import start_from_stereo
 
 _LESS_MEMORY = (
     "lower --pipeline.model.strategy.max-gaussians or --pipeline.views-per-iteration, or take smaller images "
@@ -269,6 +270,8 @@ class SadgsTrainer(Trainer):
         self._checkpoint = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
         if self._checkpoint is None and config.pipeline.start_from is not None:
             start_from(self.pipeline, config.pipeline.start_from)
+        else:
+            start_from_stereo(self.pipeline, resumed=self._checkpoint is not None)
         self._derive_schedule()
         self._take_one_device_if_quicker()
         if self.shards is not None:

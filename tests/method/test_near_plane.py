@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 from torch import Tensor
@@ -106,12 +108,17 @@ def test_a_faint_gaussian_before_a_camera_is_haze_without_the_plane_and_nothing_
     quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1)
 
     def draw(count: int, near_plane: float) -> Tensor:
-        rows = (value[:count] for value in (means, quats, scales, opacities, colors))
-        return rasterize(*rows, viewmats, Ks, 100, 100, near_plane=near_plane)[0]
+        rows = [value[:count] for value in (means, quats, scales, opacities, colors)]
+        return rasterize(rows[0], rows[1], rows[2], rows[3], rows[4], viewmats, Ks, 100, 100, near_plane=near_plane)[0]
 
     clean = draw(1, 0.01)
     assert (draw(2, 0.01) - clean).abs().mean() > 0.1
     torch.testing.assert_close(draw(2, 4.0), clean)
+
+
+def holds(space: EmptySpace, means: Tensor) -> Tensor:
+    """Which Gaussians it would take away if they are large and it knew nothing of surfaces. bool [N]"""
+    return dataclasses.replace(space, surfaces=None).haze(means, torch.full_like(means, 1e3))
 
 
 def empty_space(points: Tensor, viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> EmptySpace:
@@ -140,13 +147,13 @@ def test_poses_lie_on_the_path_a_plane_apart_and_look_where_their_neighbours_loo
 def test_gaussians_before_the_cameras_and_between_them_are_in_the_empty_space_and_surfaces_are_not():
     cameras, points = row_of_cameras(), wall(8.0)  # 2 apart; the plane is at 4
     space = empty_space(points, *cameras)
-    assert not space.holds(points).any()
+    assert not holds(space, points).any()
     x = torch.linspace(-0.5, 10.5, 12)
     before = torch.stack([x, 0 * x, torch.full_like(x, 0.3)], dim=1)
-    assert space.holds(before).all()
-    assert not space.holds(before - torch.tensor([0.0, 0, 1])).any(), "behind the cameras nothing is known"
-    assert not space.holds(before + torch.tensor([0.0, 30, 0])).any(), "nor beside them"
-    assert not space.holds(before + torch.tensor([0.0, 0, 4.0])).any(), "nor beyond the plane"
+    assert holds(space, before).all()
+    assert not holds(space, before - torch.tensor([0.0, 0, 1])).any(), "behind the cameras nothing is known"
+    assert not holds(space, before + torch.tensor([0.0, 30, 0])).any(), "nor beside them"
+    assert not holds(space, before + torch.tensor([0.0, 0, 4.0])).any(), "nor beyond the plane"
 
 
 def test_a_wall_that_begins_at_the_image_s_border_is_not_in_the_empty_space():
@@ -159,9 +166,9 @@ def test_a_wall_that_begins_at_the_image_s_border_is_not_in_the_empty_space():
     _, Ks, sizes = row_of_cameras(8)
     space = empty_space(walls, viewmats, Ks, sizes)
     assert 0.9 < float(space.near.max()) < 1.2
-    assert not space.holds(walls).any()
+    assert not holds(space, walls).any()
     middle = torch.tensor([[0.0, 0.0, 3.2], [0.1, 0.1, 5.6]])
-    assert space.holds(middle).all()
+    assert holds(space, middle).all()
 
 
 def test_a_wall_between_two_rooms_is_not_in_the_empty_space():
@@ -172,8 +179,8 @@ def test_a_wall_between_two_rooms_is_not_in_the_empty_space():
     _, Ks, sizes = row_of_cameras(2)
     space = empty_space(points, viewmats, Ks, sizes)
     assert len(space.near) > 2
-    assert not space.holds(points).any()
-    assert space.holds(torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.0, 6.5]])).all()
+    assert not holds(space, points).any()
+    assert holds(space, torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.0, 6.5]])).all()
 
 
 @pytest.mark.parametrize("number", [0, 1])
@@ -181,3 +188,17 @@ def test_without_points_or_with_one_camera_there_is_a_space_all_the_same(number:
     viewmats, Ks, sizes = row_of_cameras(1)
     space = empty_space(wall(8.0) if number else torch.zeros(0, 3), viewmats, Ks, sizes)
     assert space.near.tolist() == pytest.approx([4.0 if number else UNKNOWN_SHARE * EXTENT])
+
+
+def test_gaussians_that_look_small_or_lie_near_a_surface_stay():
+    cameras, points = row_of_cameras(), wall(8.0)
+    thing = torch.tensor([4.0, 0.5, 1.5]) + 0.1 * wall(0.0, middle=0.0, width=1.0, number=2)  # four points: no surface
+    before = torch.tensor([[4.0, 0.5, 1.5], [2.0, 0.0, 1.5]])
+    large, small = torch.tensor([[0.01, 0.2, 0.01]] * 2), torch.full((2, 3), 0.01)
+    space = EmptySpace.of(torch.cat([points, thing]), *cameras, near_plane=4.0)
+    assert space.haze(before, large).tolist() == [True, True]
+    assert space.haze(before, small).tolist() == [False, False]
+    thing = torch.cat([thing, thing[:1] + 0.01])
+    space = EmptySpace.of(torch.cat([points, thing]), *cameras, near_plane=4.0)
+    space = dataclasses.replace(space, near=torch.full_like(space.near, 4.0))
+    assert space.haze(before, large).tolist() == [False, True]

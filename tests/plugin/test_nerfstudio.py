@@ -659,12 +659,14 @@ def test_held_out_cameras_render_as_nerfstudio_expects(trained: SadgsTrainer):
 def test_training_evaluation_and_a_loaded_run_draw_from_the_same_plane(finished: Path, colmap: ColmapDataParserConfig):
     (path,) = (finished / "nerfstudio_models").iterdir()
     stored = torch.load(path, weights_only=True)["pipeline"]["_model._extra_state"]["near_plane"]
-    config, pipeline, _, _ = eval_setup(finished / "config.yml")
-    model = pipeline.model
-    assert isinstance(model, SadgsModel) and config.pipeline.model.near_plane is None
+    _, pipeline, _, _ = eval_setup(finished / "config.yml")
+    model: Any = pipeline.model
+    assert isinstance(model, SadgsModel) and model.config.near_plane is None
     assert model.near_plane == stored
-    cameras = pipeline.datamanager.train_dataset.cameras
+    datamanager: Any = pipeline.datamanager
+    cameras = datamanager.train_dataset.cameras
     viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
+    assert model.seed_points is not None
     depths = (model.seed_points[0] @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]).T  # [C, P]
     in_front = torch.where(depths > 0, depths, torch.inf)
     assert stored > 0.01 and float(in_front.min()) * NEAR_SHARE <= stored < 0.5 * float(in_front.median())
