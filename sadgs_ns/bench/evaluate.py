@@ -128,7 +128,9 @@ def quality(model: Any, views: Iterable[View], networks: Networks) -> dict[str, 
 
 
 def view_psnr_in_viewers(model: Any, views: Iterable[View], view_psnr: list[float]) -> list[float]:
-    """Return the PSNR of each view in dB as other programs' viewers show the model: from VIEWERS_NEAR_PLANE on.
+    """Return the PSNR of each view in dB as other programs' viewers show the exported file: from VIEWERS_NEAR_PLANE on.
+
+    What the file leaves out, because it lies in the empty space before the cameras, is hidden meanwhile.
 
     Args:
         view_psnr: What `quality` measured; returned unless the model has a `near_plane` that lies beyond theirs.
@@ -136,11 +138,13 @@ def view_psnr_in_viewers(model: Any, views: Iterable[View], view_psnr: list[floa
     near_plane = getattr(model, "near_plane", 0.0)
     if near_plane <= VIEWERS_NEAR_PLANE:
         return view_psnr
+    opacities, space = model.opacities.data.clone(), model.empty_space
     model.near_plane = VIEWERS_NEAR_PLANE
     try:
+        model.opacities.data[space.haze(model.means.detach(), model.scales.detach().exp())] = -torch.inf
         return quality(model, views, {})["view_psnr"]
     finally:
-        model.near_plane = near_plane
+        model.near_plane, model.opacities.data[:] = near_plane, opacities
 
 
 def fitted(image: Tensor, truth: Tensor) -> Tensor:

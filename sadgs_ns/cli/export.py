@@ -24,6 +24,7 @@ if TYPE_CHECKING:  # torch takes seconds, which `--help` and a wrong path need n
 
     from sadgs_ns.data.run_cameras import RunCameras
     from sadgs_ns.method.cleaning import Cleaning
+    from sadgs_ns.method.near_plane import EmptySpace
 
 _MAX_OFF_AXIS = 4.0
 """As `sadgs` draws; what it leaves out has no true size on the screen."""
@@ -81,6 +82,7 @@ def export(
     crop: Sequence[float] | None = None,
     dust: float = 0.0,
     voxel_size: float | None = None,
+    keep_empty_space: bool = False,
 ) -> int:
     """Write the Gaussians of a run of sadgs or splatfacto, or a mesh, and say what was taken away of the Gaussians.
 
@@ -98,6 +100,8 @@ def export(
         crop: As in `Cleaning`; six numbers.
         dust: As in `Cleaning`.
         voxel_size: Of a mesh, as for `write_mesh`; None derives it.
+        keep_empty_space: Whether to write Gaussians just before the cameras, too, which the run itself does not draw
+            from there, because viewers of files have no near plane.
 
     Returns:
         The number of Gaussians written, or of triangles.
@@ -131,7 +135,10 @@ def export(
             )
         similarity = from_data(folder / TRANSFORMS_NAME).inverse()
     params = read_gaussians(run)
-    drawing = {"max_off_axis": _MAX_OFF_AXIS, "near_plane": read_near_plane(run)}
+    near_plane, space = read_near_plane(run)
+    drawing = {"max_off_axis": _MAX_OFF_AXIS, "near_plane": near_plane}
+    if space is not None and not keep_empty_space:
+        params = _without_empty_space(params, space)
     if params["features_rest"].shape[1] == 0:  # then training holds colours' logits
         params["features_dc"] = (params["features_dc"].sigmoid() - 0.5) / DEGREE_0
     start, cameras = None, None
@@ -154,6 +161,19 @@ def export(
         raise
     except ValueError as error:
         raise InputError(f"{checkpoint} holds no Gaussians that can be exported ({error}): {_REMEDY}.") from error
+
+
+def _without_empty_space(params: dict[str, Tensor], space: EmptySpace) -> dict[str, Tensor]:
+    """Return the parameters of the Gaussians outside the empty space, and print how many lie in it."""
+    import torch
+
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    inside = space.haze(params["means"].to(device), params["scales"].to(device).exp()).cpu()
+    if not inside.any() or inside.all():
+        return params
+    number = int(inside.sum())
+    print(f"Left out: {number:,} Gaussian{'s' * (number > 1)} just before the cameras, where the photos show nothing.")
+    return {name: value[~inside] for name, value in params.items()}
 
 
 def _cleaned(
@@ -224,8 +244,10 @@ def read_gaussians(run: Path) -> dict[str, Tensor]:
     return params
 
 
-def read_near_plane(run: Path) -> float:
-    """Return the depth from which a run's Gaussians are drawn, in world units; gsplat's where splatfacto made it.
+def read_near_plane(run: Path) -> tuple[float, EmptySpace | None]:
+    """Return the depth from which a run's Gaussians are drawn, in world units, and the empty space before its cameras.
+
+    Where splatfacto made it, that is gsplat's depth, and no space.
 
     Args:
         run: As of `export`.
@@ -234,9 +256,12 @@ def read_near_plane(run: Path) -> float:
         InputError: As `read_gaussians`.
     """
     from sadgs_ns.gsplat_internals import NEAR_PLANE
+    from sadgs_ns.method.near_plane import EmptySpace
 
     state = _read_pipeline(run)[1].get("_model._extra_state")
-    return state.get("near_plane", NEAR_PLANE) if isinstance(state, dict) else NEAR_PLANE
+    state = state if isinstance(state, dict) else {}
+    space = state.get("empty_space")
+    return state.get("near_plane", NEAR_PLANE), None if space is None else EmptySpace(**space)
 
 
 def _read_pipeline(run: Path) -> tuple[Path, dict[str, Any]]:
@@ -275,7 +300,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "transforms.json that the data came with (default %(default)s)",
     )
     cleaning = parser.add_argument_group(
-        "cleaning", "What is taken away, by default nothing; units are those of nerfstudio's frame."
+        "cleaning", "What else is taken away, by default nothing; units are those of nerfstudio's frame."
     )
     cleaning.add_argument(
         "--min-views", type=int, default=0, metavar="K", help="Gaussians that fewer than K training views see"
@@ -291,6 +316,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--dust", type=float, default=0.0, metavar="PX",
         help="Gaussians that make up less than this many pixels of each training view: opacity times area, less what "
         "others hide",
+    )  # fmt: skip
+    cleaning.add_argument(
+        "--keep-empty-space", action="store_true",
+        help="keep Gaussians just before the cameras and on the paths between them, where the photos show nothing; "
+        "without this they are left out, because viewers would show them as haze",
     )  # fmt: skip
     parser.add_argument(
         "--voxel-size", type=float, metavar="UNITS",

@@ -257,17 +257,6 @@ class StructureAwareStrategy(Strategy):
             if self.shards is not None and self.densifies(step):
                 self._even_out(params, optimizers, state)
 
-    def take_away(self, params: Params, optimizers: Any, state: Any, mask: Tensor) -> None:
-        """Remove Gaussians between two steps, with what optimizers and statistics know of them.
-
-        Args:
-            params, optimizers, state: As for `step_post_backward`.
-            mask: Which; if it is all, none are removed. bool [N]
-        """
-        self._prune(params, optimizers, state, mask)
-        if self.shards is not None:
-            self._even_out(params, optimizers, state)
-
     def consistently_low(self, statistics: Mapping[str, Tensor]) -> Tensor:
         """Gaussians that answered low on all three axes in more than τ_prune of their observations. bool [N]"""
         n_low, n_total = statistics["n_low"], statistics["n_total"]

@@ -112,9 +112,6 @@ class SadgsModelConfig(InstantiateConfig):
     near_plane: float | None = None
     """Depth from which Gaussians are drawn, in the run's units; nothing nearer is, in training or later.
     None is half the depth at which a training camera's fifth SfM point lies, of the camera that comes nearest."""
-    prune_empty_space: bool = True
-    """Take away Gaussians just before the cameras and the path between them, where the photos show nothing.
-    Exported files have no near plane, and such a Gaussian is haze over a view between the photos."""
     max_angular_scale: float = 0.3
     """Longest standard deviation of a Gaussian as a share of its distance from the nearest training camera.
     A longer one can cover a view beside which it lies with haze; 0 sets no limit."""
@@ -337,9 +334,8 @@ class SadgsModel(SplatfactoModel):
         points = self.means.new_zeros((0, 3)) if self.seed_points is None else self.seed_points[0].to(self.means)
         depths = nearest_depths(points, viewmats, Ks, sizes)
         if self.config.near_plane is None:
-            self.near_plane = scene_near_plane(depths, self.strategy_state["scene_scale"])
-        if self.config.prune_empty_space:
-            self.empty_space = EmptySpace.of(points, viewmats, Ks, sizes, self.near_plane)
+            self.near_plane = scene_near_plane(depths, float(self.strategy_state["scene_scale"]))
+        self.empty_space = EmptySpace.of(points, viewmats, Ks, sizes, self.near_plane)
 
     def add_points(self, means: Tensor, colors: Tensor, scales: Tensor) -> int:
         """Start from more points, as many as the cap has room for; call before optimizers are made.
@@ -442,9 +438,6 @@ class SadgsModel(SplatfactoModel):
             self.average.add(self.gauss_params)
             if done >= iterations:
                 self.average.move_to(self.gauss_params)
-        if self.empty_space is not None and done in (self.strategy.windows.refine_stop_iter, iterations):
-            haze = self.empty_space.haze(self.means.detach(), self.scales.detach().exp())
-            self.strategy.take_away(self.gauss_params, self.optimizers, self.strategy_state, haze)
         share, positions = self.config.max_angular_scale, self.camera_positions
         if share > 0 and positions is not None and (done % LIMIT_EVERY == 0 or done >= iterations):
             limit_scales(self.scales, self.means, positions, share)
@@ -879,6 +872,7 @@ class SadgsModel(SplatfactoModel):
             "strategy_state": dict(self.strategy_state),
             "average": self.average.state_dict(),
             "near_plane": self.near_plane,
+            "empty_space": None if self.empty_space is None else vars(self.empty_space),
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -886,6 +880,8 @@ class SadgsModel(SplatfactoModel):
         self.step = state["step"]
         if self.config.near_plane is None:
             self.near_plane = state.get("near_plane", self.near_plane)
+            space = state.get("empty_space")
+            self.empty_space = self.empty_space if space is None else EmptySpace(**space)
         self.strategy_state = {
             key: value.to(self.device) if isinstance(value, Tensor) else value
             for key, value in state["strategy_state"].items()

@@ -81,7 +81,6 @@ def paper_pipeline(views_per_iteration: int) -> SadgsPipelineConfig:
             averaged_share=0.0,
             max_off_axis=0.0,
             max_angular_scale=0.0,
-            prune_empty_space=False,
             stereo_points=0,
             color_model="none",
             strategy=StructureAwareStrategy(

@@ -477,8 +477,12 @@ def test_photographs_keep_their_alpha_and_names_that_repeat_are_told_apart(tmp_p
 def test_the_near_plane_of_other_viewers_is_measured_and_put_back(near_plane: float, planes: list[float]):
     model: Any = FlatModel()
     model.config, model.device, model.near_plane, drawn = SimpleNamespace(), "cpu", near_plane, []
+    model.means, model.opacities = torch.nn.Parameter(torch.zeros(3, 3)), torch.nn.Parameter(torch.ones(3, 1))
+    model.scales, hidden = model.means, torch.tensor([False, True, False])
+    model.empty_space = SimpleNamespace(haze=lambda means, scales: hidden)
 
     def draw(camera: Any) -> dict[str, Tensor]:
+        assert model.opacities.flatten().tolist() == [1, -torch.inf, 1]
         drawn.append(model.near_plane)
         return {"rgb": torch.full((12, 12, 3), camera), "background": torch.zeros(3)}
 
@@ -488,7 +492,7 @@ def test_the_near_plane_of_other_viewers_is_measured_and_put_back(near_plane: fl
     if planes:
         with pytest.raises(TypeError):  # of a camera that cannot be drawn
             evaluate.view_psnr_in_viewers(model, [(None, {})], [])
-    assert drawn == 2 * planes and model.near_plane == near_plane
+    assert drawn == 2 * planes and model.near_plane == near_plane and (model.opacities == 1).all()
 
 
 # Metrics

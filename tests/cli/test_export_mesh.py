@@ -214,7 +214,8 @@ def test_what_views_see_on_a_gpu_is_what_they_see_on_the_cpu(run: tuple[Path, Pa
     params["features_rest"] = params["features_rest"][:, :bands].contiguous()
     cameras = read_cameras(run[1], run[0])
     moved = {name: value.cuda() for name, value in params.items()}
-    for on_cpu, on_gpu in zip(*(meshing.look(p, cameras, range(2), max_off_axis=4.0) for p in (params, moved)), strict=True):
+    both = (meshing.look(p, cameras, range(2), max_off_axis=4.0) for p in (params, moved))
+    for on_cpu, on_gpu in zip(*both, strict=True):
         seen = (on_cpu.depth > 0) & (on_gpu.depth > 0)
         assert (seen == (on_cpu.depth > 0)).mean() > 0.99
         assert np.median(np.abs(on_cpu.depth - on_gpu.depth)[seen]) < 1e-4

@@ -101,7 +101,7 @@ def test_points_lie_where_two_views_are_not_masked(config: Any, scene: Path, tmp
 
 def test_the_paper_s_presets_start_as_the_paper_says():
     models: list[Any] = [p.config.pipeline.model for p in (presets.sadgs_paper, presets.sadgs_paper_indoor)]
-    assert [(m.stereo_points, m.prune_empty_space, m.near_plane) for m in models] == [(0, False, None)] * 2
+    assert [(m.stereo_points, m.near_plane) for m in models] == [(0, None)] * 2
 
 
 def test_a_negative_number_of_points_is_refused(config: Any):
