@@ -27,7 +27,7 @@ from runs import as_saved_before_the_folders
 import sadgs_ns.plugin.model
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.plugin import presets
+from sadgs_ns.plugin import presets, stereo_start
 from sadgs_ns.plugin.config import CheckedTrainerConfig, SadgsMachineConfig, SadgsViewerConfig
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
 from sadgs_ns.plugin.model import SadgsModel, SadgsModelConfig
@@ -165,6 +165,7 @@ def test_what_splatfacto_s_methods_read_of_its_configuration_is_there():
     overridden = set(vars(SadgsModel)) - set(re.findall(r"super\(\)\.(\w+)", ours))
     methods = [m for name, m in vars(SplatfactoModel).items() if inspect.isfunction(m) and name not in overridden]
     used = [m for m in methods if m.__name__ not in ("_get_downscale_factor", "_downscale_if_required")]
+    ours += inspect.getsource(stereo_start)
     read = set(re.findall(r"config\.(\w+)", ours + "".join(inspect.getsource(method) for method in used)))
     options = {option.name for option in dataclasses.fields(SadgsModelConfig) if not option.name.startswith("_")}
     assert {name for name in read if name in vars(SplatfactoModelConfig())} <= options

@@ -40,6 +40,7 @@ def test_cuda_gets_gsplat_unpacked(monkeypatch: pytest.MonkeyPatch) -> None:
         render_mode="RGB",
         absgrad=True,
         rasterize_mode="classic",
+        near_plane=0.01,
     )
 
 
