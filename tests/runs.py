@@ -75,17 +75,6 @@ def in_the_viewer(function: Callable[[], Any]) -> Any:
     return result[0]
 
 
-def as_saved_before_the_folders(config: str) -> str:
-    """What a config.yml said when all files of the package lay in one folder."""
-    text = config.replace("sadgs_ns.plugin.progress.ProgressTable", "nerfstudio.utils.writer.LocalWriter")
-    text = text.replace("sadgs_ns.plugin.", "sadgs_ns.").replace("sadgs_ns.method.", "sadgs_ns.")
-    text = text.replace("UnlistedAdam", "FusedAdam").replace("UnlistedDecay", "RunLengthDecay")
-    for name in ("MachineConfig", "ViewerConfig"):
-        text = text.replace(f"sadgs_ns.config.Sadgs{name}", f"nerfstudio.configs.base_config.{name}")
-    assert "sadgs_ns.model.SadgsModelConfig" in text and "sadgs_ns.strategy.StructureAwareStrategy" in text
-    return text
-
-
 def train(config: SadgsTrainerConfig, after_step: Callable[[SadgsTrainer], None] | None = None) -> SadgsTrainer:
     """Train to the end, calling `after_step` after each iteration's densification."""
     trainer = set_up(config)

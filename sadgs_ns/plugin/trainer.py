@@ -22,7 +22,7 @@ from sadgs_ns import kernels
 from sadgs_ns.atomic import atomic_path
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
 from sadgs_ns.method.schedule import between_one_and_four, schedule
-from sadgs_ns.plugin import checkpoints, older_runs, processes
+from sadgs_ns.plugin import checkpoints, processes
 from sadgs_ns.plugin.compilation import compile_kernels
 from sadgs_ns.plugin.config import CheckedTrainerConfig
 from sadgs_ns.plugin.earlier_run import start_from
@@ -62,9 +62,6 @@ class SadgsTrainerConfig(CheckedTrainerConfig):
     """Options of `ns-train sadgs`."""
 
     _target: type = field(default_factory=lambda: SadgsTrainer)
-
-
-older_runs.read_with(SadgsTrainerConfig)
 
 
 class SadgsTrainer(Trainer):

@@ -22,7 +22,6 @@ from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
-from runs import as_saved_before_the_folders
 
 import sadgs_ns.plugin.model
 from sadgs_ns.errors import InputError
@@ -31,7 +30,6 @@ from sadgs_ns.plugin import presets, stereo_start
 from sadgs_ns.plugin.config import CheckedTrainerConfig, SadgsMachineConfig, SadgsViewerConfig
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
 from sadgs_ns.plugin.model import SadgsModel, SadgsModelConfig
-from sadgs_ns.plugin.older_runs import NO_OPTIONS
 from sadgs_ns.plugin.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
 from sadgs_ns.plugin.pipeline import SadgsPipelineConfig
 from sadgs_ns.plugin.trainer import SadgsTrainerConfig
@@ -42,6 +40,8 @@ else:
     import tomli as tomllib
 
 CHECKOUT = Path(__file__).parents[2]
+NO_OPTIONS = {"run_length", "shards"}
+"""Attributes of the strategy that are decided in each run."""
 METHODS = ("sadgs", "sadgs-paper", "sadgs-paper-indoor")
 CONFIG_CLASSES = (
     CheckedTrainerConfig,
@@ -116,7 +116,7 @@ def test_every_public_field_is_followed_by_a_docstring(cls: type):
 def test_every_class_attribute_is_a_dataclass_field(cls: type):
     body = body_of(cls)
     assigned = {ast.unparse(target) for each in body if isinstance(each, ast.Assign) for target in each.targets}
-    assert assigned <= set(NO_OPTIONS)
+    assert assigned <= NO_OPTIONS
     annotated = {ast.unparse(statement.target) for statement in body if isinstance(statement, ast.AnnAssign)}
     assert annotated and annotated <= {field.name for field in dataclasses.fields(cls)}
 
@@ -277,86 +277,11 @@ def test_the_strategy_and_all_it_needs_import_without_nerfstudio(tmp_path: Path)
     assert result.stdout.strip() == "done", result.stderr
 
 
-# --- runs of earlier versions ---
-
-
-def with_options(config: str, *options: str) -> str:
-    """A config.yml with more options of the model."""
-    return config.replace("    ssim_lambda:", "".join(f"    {option}\n" for option in options) + "    ssim_lambda:")
-
-
-@pytest.mark.parametrize("name", METHODS)
-def test_the_config_of_a_run_made_before_the_folders_is_read_as_it_would_be_written_now(
-    name: str, capsys: pytest.CaptureFixture[str]
-):
-    options = ("densify: true", "num_downscales: 0", "warmup_length: 500", "eval_num_rays_per_chunk: 4096")
-    now = preset(name)
-    del now.optimizers["color_matrices"]  # Those runs learned none.
-    text = with_options(as_saved_before_the_folders(yaml.dump(now)), *options)
-    config = yaml.load(text, Loader=yaml.Loader)
-    assert isinstance(config, SadgsTrainerConfig)
-    assert yaml.dump(config.pipeline) == yaml.dump(now.pipeline)
-    assert yaml.dump(config.optimizers) == yaml.dump(now.optimizers)
-    config.check()
-    assert capsys.readouterr().out == ""
-
-
-@pytest.mark.parametrize(("grid", "color_model"), [("true", "bilateral_grid"), ("false", "none")])
-def test_the_switch_of_bilateral_grids_is_read_as_the_option_that_took_its_place(
-    grid: str, color_model: str, capsys: pytest.CaptureFixture[str]
-):
-    text = yaml.dump(preset("sadgs"))
-    assert "    color_model: none\n" in text
-    text = with_options(text.replace("    color_model: none\n", ""), f"use_bilateral_grid: {grid}")
-    model = yaml.load(text, Loader=yaml.Loader).pipeline.model
-    assert model.color_model == color_model and not hasattr(model, "use_bilateral_grid")
-    assert capsys.readouterr().out == ""
-
-
-def test_options_that_are_missing_in_an_older_config_get_their_defaults():
-    text = yaml.dump(preset("sadgs"))
-    for line in ("    fused: true\n    initial_opacity: 0.1\n", "seconds_per_save: 60.0\n"):
-        assert line in text
-        text = text.replace(line, "")
-    assert yaml.dump(yaml.load(text, Loader=yaml.Loader)) == yaml.dump(preset("sadgs"))
-
-
-def test_what_is_decided_in_a_run_is_no_option_and_older_files_that_have_it_are_read(
-    capsys: pytest.CaptureFixture[str],
-):
-    assert not set(NO_OPTIONS) & {option.name for option in dataclasses.fields(StructureAwareStrategy)}
-    text, line = yaml.dump(preset("sadgs")), "      min_opacity: 0.02\n"
-    assert line in text
-    text = text.replace(line, f"{line}      run_length: 712\n      shards: null\n")
-    strategy = yaml.load(text, Loader=yaml.Loader).pipeline.model.strategy
-    assert (strategy.run_length, strategy.shards) == (3000, None)
-    assert capsys.readouterr().out == ""
-
-
-def test_a_run_of_before_an_option_that_changes_training_goes_on_without_it():
-    text = yaml.dump(preset("sadgs"))
-    in_model = ("averaged_share: 0.05", "max_off_axis: 4.0", "max_angular_scale: 0.3")
-    for line in (*(f"    {line}\n" for line in in_model), "rates_follow_views: true\n"):
-        assert line in text
-        text = text.replace(line, "")
-    config = yaml.load(text, Loader=yaml.Loader)
-    model = config.pipeline.model
-    assert (model.averaged_share, model.max_off_axis, model.max_angular_scale) == (0.0, 0.0, 0.0)
-    assert config.rates_follow_views is False
-
-
-def test_options_that_this_version_lacks_are_named_where_they_changed_the_run(capsys: pytest.CaptureFixture[str]):
-    text = with_options(yaml.dump(preset("sadgs")), "densify: false", "l2_lambda: 2.0", "some_option: [1]")
-    config = yaml.load(text, Loader=yaml.Loader)
-    assert not hasattr(config.pipeline.model, "densify")
-    printed = " ".join(capsys.readouterr().out.split())
-    assert printed == (
-        "The config.yml is of another version of sadgs; of its options this version leaves out "
-        "pipeline.model.densify=False, pipeline.model.some_option=[1]: rendering is the same, more training may not be."
-    )
-
-
 # --- the package ---
+
+
+def test_what_is_decided_in_a_run_is_no_option():
+    assert not NO_OPTIONS & {option.name for option in dataclasses.fields(StructureAwareStrategy)}
 
 
 def test_an_installation_holds_every_module_and_the_protocols_of_the_benchmarks(tmp_path: Path):

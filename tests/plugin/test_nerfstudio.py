@@ -24,7 +24,6 @@ from runs import (
     ITERATIONS,
     SCHEDULE,
     TRAIN_VIEWS,
-    as_saved_before_the_folders,
     blender_data,
     checkpoint,
     configure,
@@ -108,17 +107,6 @@ def test_ns_eval_reports_psnr_and_ssim_and_says_once_why_lpips_is_missing(
     printed = capsys.readouterr().out
     assert printed.count("LPIPS is not reported") == 1
     assert "urlopen" in printed  # not for any other reason
-
-
-def test_a_run_whose_config_names_the_package_s_earlier_files_is_loaded(
-    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.delenv("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", raising=False)
-    text = as_saved_before_the_folders((finished / "config.yml").read_text())
-    (tmp_path / "config.yml").write_text(text)
-    _, pipeline, _, step = eval_setup(tmp_path / "config.yml")
-    assert isinstance(pipeline.model, SadgsModel) and pipeline.model.num_points > POINTS
-    assert step == ITERATIONS - 1
 
 
 def test_ns_export_writes_every_gaussian_that_can_be_seen(finished: Path, tmp_path: Path, open3d: None):
