@@ -27,7 +27,6 @@ from PIL import Image
 from sadgs_ns.bench import command_lines
 from sadgs_ns.bench.datasets import image_names
 from sadgs_ns.bench.validation import INTERVAL, SPARSE, TEST, VALIDATION
-from sadgs_ns.data.exposure import linear_light, srgb_values
 
 FILE = "exposures.json"
 """Name of the file with the gains."""
@@ -57,6 +56,16 @@ def draw_gains(
     factors -= factors.mean(axis=1, keepdims=True)
     # Less their mean, factors can be up to 4/3 as large.
     return gains, (1 + white_balance) ** (0.75 * factors)
+
+
+def linear_light(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the linear light in [0, 1] that sRGB's values in [0, 1] stand for."""
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
+
+def srgb_values(light: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return sRGB's values in [0, 1] of linear light in [0, 1]; the inverse of `linear_light`."""
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
 def with_gains(image: NDArray[np.uint8], gains: NDArray[np.float64]) -> NDArray[np.uint8]:

@@ -115,10 +115,9 @@ class SadgsModelConfig(InstantiateConfig):
     max_angular_scale: float = 0.3
     """Longest standard deviation of a Gaussian as a share of its distance from the nearest training camera.
     A longer one can cover a view beside which it lies with haze; 0 sets no limit."""
-    color_model: Literal["none", "auto", "affine", "bilateral_grid"] = "none"
+    color_model: Literal["none", "affine", "bilateral_grid"] = "none"
     """What is learned of each training photo's exposure and white balance, which held-out views are rendered without.
-    "affine" is a colour matrix, "bilateral_grid" a grid of them over the image and its brightness.
-    "auto" is "affine" where the photos' EXIF, or else their pixels, say that exposure varies."""
+    "affine" is a colour matrix, "bilateral_grid" a grid of them over the image and its brightness."""
     color_corrected_metrics: bool = False
     """Also report metrics after fitting the colours of each rendering to its photo, as suits changing exposure."""
     fused: bool = True

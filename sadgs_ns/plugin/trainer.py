@@ -26,7 +26,6 @@ from sadgs_ns.plugin import checkpoints, processes
 from sadgs_ns.plugin.compilation import compile_kernels
 from sadgs_ns.plugin.config import CheckedTrainerConfig
 from sadgs_ns.plugin.earlier_run import start_from
-from sadgs_ns.plugin.exposure import choose_color_model
 from sadgs_ns.plugin.graphed_steps import GraphedSteps
 from sadgs_ns.plugin.interrupts import HANG_UP, SIGNALS, Interrupted, Interrupts
 from sadgs_ns.plugin.lost_output import drop_lost_output, print_elsewhere_once_unread
@@ -274,8 +273,6 @@ class SadgsTrainer(Trainer):
         if self.shards is not None:
             self._turn_viewer_off()
             self.pipeline.share_out(self.shards)
-        elif line := choose_color_model(self.pipeline.model, self.pipeline.datamanager.train_dataset):
-            CONSOLE.print(line, highlight=False, soft_wrap=True)
         optimizers: dict[str, Any] = copy.deepcopy(dict(self.config.optimizers))
         for name, at_four in RATES_OF_FOUR_VIEWS.items() if self.config.rates_follow_views else ():
             start, end = (between_one_and_four(self.pipeline.views_per_iteration, factor) for factor in at_four)

@@ -10,8 +10,7 @@ import pytest
 from PIL import Image
 from scenes import VIEWS
 
-from sadgs_ns.bench.exposures import FILE, draw_gains, main, with_gains
-from sadgs_ns.data.exposure import linear_light
+from sadgs_ns.bench.exposures import FILE, draw_gains, linear_light, main, srgb_values, with_gains
 
 
 def pixels(scene: Path, name: str) -> np.ndarray:
@@ -55,6 +54,11 @@ def test_factors_of_channels_keep_the_brightness_and_stay_in_their_range():
     np.testing.assert_allclose(factors.prod(axis=1), 1.0)
     assert 1.05 < factors.max() <= 1.1 + 1e-9 and 1 / 1.1 - 1e-9 <= factors.min() < 0.95
     assert np.exp(np.log(gains).mean()) == pytest.approx(0.4)
+
+
+def test_srgb_and_linear_light_are_inverse():
+    values = np.linspace(0, 1, 1001)
+    np.testing.assert_allclose(srgb_values(linear_light(values)), values, atol=1e-7)
 
 
 def test_what_exceeds_white_saturates():

@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import yaml
-from kill_and_resume import parser_of, set_up
-from nerfstudio.utils.eval_utils import eval_setup
+from kill_and_resume import parser_of
 from runs import configure, train
 from torch import Tensor
 
@@ -33,7 +31,6 @@ def exposed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("exposed")
     write_scene(folder / "room", WIDTH, HEIGHT, VIEWS, POINTS)
     exposures.write_scene(folder / "room", folder / "exposed", SPREAD, WHITE_BALANCE, MEAN, seed=0)
-    exposures.write_scene(folder / "room", folder / "even", 1.0, 0.0, MEAN, seed=0)
     return folder / "exposed"
 
 
@@ -103,34 +100,3 @@ def test_a_resumed_run_goes_on_with_its_matrices_as_if_it_had_never_stopped(expo
     found = state(train(resumed))
     assert expected.keys() == found.keys()
     assert [name for name in expected if not torch.equal(expected[name], found[name])] == []
-
-
-@pytest.mark.parametrize(("copy", "learns"), [("exposed", True), ("even", False)])
-def test_auto_learns_matrices_where_exposure_varies(
-    exposed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], copy: str, learns: bool
-):
-    config = run_of(exposed.with_name(copy), tmp_path, "auto", 4)
-    trainer = train(config)
-    assert (trainer.pipeline.model.color_matrices is not None) == learns
-    assert ("color_matrices" in trainer.optimizers.optimizers) == learns
-    line = "The exposure of the photos varies"
-    said = " ".join(capsys.readouterr().out.split())
-    assert (line in said) == learns and ("is learned for each" in said) == learns
-    (tmp_path / "config.yml").write_text(yaml.dump(trainer.config))
-    _, pipeline, _, _ = eval_setup(tmp_path / "config.yml")  # It looks at no exposure, and renders the same.
-    dataset: Any = pipeline.datamanager.eval_dataset
-    camera = dataset.cameras[:1]
-    trainer.pipeline.eval()
-    shown = [p.model.get_outputs_for_camera(camera)["rgb"] for p in (pipeline, trainer.pipeline)]
-    assert torch.equal(*shown)
-    config.load_dir, config.max_num_iterations, config.timestamp = trainer.base_dir, 6, "resumed"
-    assert set_up(config)._start_step == 4
-
-
-def test_a_run_without_a_model_of_colours_names_it_where_exposure_varies(
-    exposed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    for copy, named in (("exposed", True), ("even", False)):
-        trainer = set_up(run_of(exposed.with_name(copy), tmp_path / copy, "none", 4))
-        assert trainer.pipeline.model.color_matrices is None
-        assert ("--pipeline.model.color-model affine" in capsys.readouterr().out) == named
