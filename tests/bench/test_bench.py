@@ -11,7 +11,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 import warnings
 from pathlib import Path
 from typing import Any
@@ -321,10 +320,9 @@ def test_an_interrupt_ends_the_running_processes(tmp_path: Path):
     def interrupt(_: object) -> None:
         raise KeyboardInterrupt
 
-    start = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
         bench.run_all(some_jobs("ab"), launch, interrupt, tmp_path / "log", gpus=["0", "1"])
-    assert processes[0].poll() is not None and time.monotonic() - start < 5
+    assert processes[0].poll() == -signal.SIGTERM, "it should end before its 60 seconds are over"
 
 
 @pytest.mark.usefixtures("nerfstudio")
