@@ -27,14 +27,13 @@ NEIGHBOURS = 4
 """Each camera's path leads to so many of the others, the nearest that look in a similar direction."""
 SIMILAR_DEGREES = 60.0
 """Largest angle between the viewing axes of two cameras with a path between them."""
-BEHIND = 0.75
-"""The cone of empty space before a camera begins this share of its length behind the camera, so that it also holds what
-lies just before a view beside the path. It still ends before a wall that is first seen at the image's border."""
-HAZE_ANGLE = 0.2
-"""Standard deviation, as a share of its depth, from which a Gaussian before a pose is haze. With 0.1, and with no such
-condition, files were as free from haze and castle's lost more (docs/results.md#exported-files)."""
-_MOST_STEPS = 8
-"""Poses on the path between two cameras, at most; otherwise they are a near plane's depth apart."""
+STEP = 0.25
+"""Distance between the poses of a path, as a share of the near plane, so that the cones before them leave few gaps."""
+HAZE_ANGLE = 0.1
+"""Standard deviation, as a share of its depth, from which a Gaussian before a pose is haze
+(docs/results.md#exported-files)."""
+_MOST_STEPS = 32
+"""Poses on the path between two cameras, at most."""
 _MOST_POSES = 4096
 """Of more poses, so many are taken, evenly spaced."""
 _MOST_POINTS = 2**17
@@ -90,7 +89,7 @@ def scene_near_plane(depths: Tensor, extent: float) -> float:
     return NEAR_SHARE * nearest if nearest < math.inf else UNKNOWN_SHARE * extent
 
 
-def poses_of_path(viewmats: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
+def poses_of_path(viewmats: Tensor, spacing: float) -> tuple[Tensor, Tensor, Tensor]:
     """Put poses on the straight paths between neighbouring cameras, where the views between them would be taken.
 
     Args:
@@ -98,14 +97,15 @@ def poses_of_path(viewmats: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
         spacing: Largest distance in world units between poses of a path, as long as `_MOST_STEPS` suffice.
 
     Returns:
-        World to camera, the cameras' own first [P, 4, 4]; and the camera at one end of each pose's path. int64 [P]
+        World to camera, the cameras' own first [P, 4, 4]; the camera at one end of each pose's path; and the number of
+        the path, −1 for the cameras. int64 [P] both
     """
     number, rotations = len(viewmats), viewmats[:, :3, :3].double().cpu()
     centres = -(rotations.mT @ viewmats[:, :3, 3:].double().cpu())[..., 0]  # [C, 3]
     distances = torch.cdist(centres, centres)
     unlike = rotations[:, 2] @ rotations[:, 2].T < math.cos(math.radians(SIMILAR_DEGREES))
     distances = distances.masked_fill(unlike, torch.inf).fill_diagonal_(torch.inf)
-    poses, ends = [viewmats], [torch.arange(number)]
+    poses, ends, paths = [viewmats], [torch.arange(number)], [torch.full((number,), -1)]
     if number > 1:
         others = distances.topk(min(NEIGHBOURS, number - 1), largest=False).indices  # [C, k]
         pairs = torch.stack([torch.arange(number)[:, None].expand_as(others), others], dim=-1).view(-1, 2)
@@ -125,7 +125,8 @@ def poses_of_path(viewmats: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
         chosen = torch.arange(len(edge))[:: -(-len(edge) // max(_MOST_POSES - number, 1)) or 1]
         poses.append(between[chosen].to(viewmats))
         ends.append(start[chosen])
-    return torch.cat(poses), torch.cat(ends).to(viewmats.device)
+        paths.append(edge[chosen])
+    return torch.cat(poses), torch.cat(ends).to(viewmats.device), torch.cat(paths).to(viewmats.device)
 
 
 @dataclass(frozen=True)
@@ -138,8 +139,8 @@ class EmptySpace:
     """Intrinsics in px. [P, 3, 3]"""
     sizes: Tensor
     """Width and height of the images in px. [P, 2]"""
-    near: Tensor
-    """Depth in world units up to which the space before each pose is empty. [P]"""
+    near: float
+    """Depth in world units up to which the space before the poses is empty."""
 
     @staticmethod
     def of(
@@ -151,16 +152,17 @@ class EmptySpace:
     ) -> EmptySpace:
         """Find the space before the training cameras and the paths between them.
 
-        Before a pose on a path, say in a wall between two rooms, it ends half-way to the SfM points there.
+        A path is left out if a pose on it comes nearer to SfM points than the cameras do: it may lead through a wall.
 
         Args:
             points, viewmats, Ks, sizes: As for `nearest_depths`.
             near_plane: Depth in world units up to which the space before the cameras is empty, > 0.
         """
-        poses, ends = poses_of_path(viewmats, near_plane)
+        poses, ends, paths = poses_of_path(viewmats, STEP * near_plane)
         Ks, sizes = Ks.to(poses)[ends], sizes.to(poses)[ends]
-        depths = nearest_depths(points, poses, Ks, sizes)
-        return EmptySpace(poses, Ks, sizes, (NEAR_SHARE * depths).clamp_max(near_plane))
+        blocked = paths[(NEAR_SHARE * nearest_depths(points, poses, Ks, sizes) < near_plane).to(paths.device)]
+        clear = (paths < 0) | ~torch.isin(paths, blocked)
+        return EmptySpace(poses[clear], Ks[clear], sizes[clear], near_plane)
 
     @torch.no_grad()
     def haze(self, means: Tensor, scales: Tensor) -> Tensor:
@@ -175,11 +177,11 @@ class EmptySpace:
         """
         reach = scales.amax(dim=1) / HAZE_ANGLE  # [N] Depth up to which a Gaussian looks large.
         inside = torch.zeros(len(means), dtype=torch.bool, device=means.device)
-        poses, Ks, sizes, near = (value.to(means) for value in (self.viewmats, self.Ks, self.sizes, self.near))
+        poses, Ks, sizes = (value.to(means) for value in (self.viewmats, self.Ks, self.sizes))
         step = max(_PAIRS // max(len(means), 1), 1)
         for here in (slice(start, start + step) for start in range(0, len(poses), step)):
-            depths = _depths_in_frusta(means, poses[here], Ks[here], sizes[here], BEHIND * near[here])  # [p, N]
-            inside |= (depths < torch.minimum(near[here, None], reach)).any(dim=0)
+            depths = _depths_in_frusta(means, poses[here], Ks[here], sizes[here])  # [p, N]
+            inside |= (depths < reach.clamp_max(self.near)).any(dim=0)
         return inside
 
 
@@ -188,13 +190,10 @@ def _depths_in_frusta(
     viewmats: Tensor,  # [C, 4, 4]
     Ks: Tensor,  # [C, 3, 3]
     sizes: Tensor,  # [C, 2]
-    behind: Tensor | float = 0.0,  # [C]
 ) -> Tensor:
-    """Depths of points in views, infinite outside frusta whose tips lie so far behind the cameras. [C, P]"""
+    """Depths of points in views, infinite outside the image. [C, P]"""
     viewmats, Ks, sizes = viewmats.to(points), Ks.to(points), sizes.to(points)
-    behind = torch.as_tensor(behind).to(points).expand(len(viewmats))[:, None]  # [C, 1]
-    moved = torch.nn.functional.pad(behind, (2, 0))[..., None]  # [C, 3, 1]
-    projected = (Ks @ viewmats[:, :3, :3]) @ points.T + Ks @ (viewmats[:, :3, 3:] + moved)  # [C, 3, P]
-    x, y, z = projected.unbind(dim=1)
-    inside = (x >= 0) & (x <= sizes[:, :1] * z) & (y >= 0) & (y <= sizes[:, 1:] * z) & (z > behind)
-    return torch.where(inside, z - behind, torch.inf)
+    projected = (Ks @ viewmats[:, :3, :3]) @ points.T + Ks @ viewmats[:, :3, 3:]  # [C, 3, P]
+    x, y, depths = projected.unbind(dim=1)
+    inside = (x >= 0) & (x <= sizes[:, :1] * depths) & (y >= 0) & (y <= sizes[:, 1:] * depths) & (depths > 0)
+    return torch.where(inside, depths, torch.inf)
