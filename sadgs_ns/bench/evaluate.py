@@ -23,6 +23,8 @@ import torch
 from pytorch_msssim import ssim as ssim_without_border
 from torch import Tensor
 
+from sadgs_ns.gsplat_internals import NEAR_PLANE
+
 if TYPE_CHECKING:  # torchmetrics takes a second to import, which is no part of the training that is timed
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
@@ -32,8 +34,6 @@ View = tuple[Any, dict[str, Any]]
 Networks = Mapping[str, "LearnedPerceptualImagePatchSimilarity | None"]
 """LPIPS networks by the names of their results; None where there are no weights."""
 
-VIEWERS_NEAR_PLANE = 0.01
-"""Depth in world units from which other programs, which read a PLY file, draw Gaussians."""
 _WINDOW = 11
 """Width of SSIM's window in px."""
 
@@ -128,7 +128,7 @@ def quality(model: Any, views: Iterable[View], networks: Networks) -> dict[str, 
 
 
 def view_psnr_in_viewers(model: Any, views: Iterable[View], view_psnr: list[float]) -> list[float]:
-    """Return the PSNR of each view in dB as other programs' viewers show the exported file: from VIEWERS_NEAR_PLANE on.
+    """Return the PSNR of each view in dB as other programs' viewers show the exported file: from NEAR_PLANE on.
 
     What the file leaves out, because it lies in the empty space before the cameras, is hidden meanwhile.
 
@@ -136,10 +136,10 @@ def view_psnr_in_viewers(model: Any, views: Iterable[View], view_psnr: list[floa
         view_psnr: What `quality` measured; returned unless the model has a `near_plane` that lies beyond theirs.
     """
     near_plane = getattr(model, "near_plane", 0.0)
-    if near_plane <= VIEWERS_NEAR_PLANE:
+    if near_plane <= NEAR_PLANE:
         return view_psnr
     opacities, space = model.opacities.data.clone(), model.empty_space
-    model.near_plane = VIEWERS_NEAR_PLANE
+    model.near_plane = NEAR_PLANE
     try:
         model.opacities.data[space.haze(model.means.detach(), model.scales.detach().exp())] = -torch.inf
         return quality(model, views, {})["view_psnr"]

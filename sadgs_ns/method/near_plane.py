@@ -160,7 +160,9 @@ class EmptySpace:
         """
         poses, ends, paths = poses_of_path(viewmats, STEP * near_plane)
         Ks, sizes = Ks.to(poses)[ends], sizes.to(poses)[ends]
-        blocked = paths[(NEAR_SHARE * nearest_depths(points, poses, Ks, sizes) < near_plane).to(paths.device)]
+        added = slice(len(viewmats), None)
+        depths = nearest_depths(points, poses[added], Ks[added], sizes[added])
+        blocked = paths[added][(NEAR_SHARE * depths < near_plane).to(paths.device)]
         clear = (paths < 0) | ~torch.isin(paths, blocked)
         return EmptySpace(poses[clear], Ks[clear], sizes[clear], near_plane)
 
@@ -175,13 +177,13 @@ class EmptySpace:
         Returns:
             bool [N], False where a centre is not finite.
         """
-        reach = scales.amax(dim=1) / HAZE_ANGLE  # [N] Depth up to which a Gaussian looks large.
+        reach = (scales.amax(dim=1) / HAZE_ANGLE).clamp_max(self.near)  # [N] Depth up to which a Gaussian is haze.
         inside = torch.zeros(len(means), dtype=torch.bool, device=means.device)
         poses, Ks, sizes = (value.to(means) for value in (self.viewmats, self.Ks, self.sizes))
         step = max(_PAIRS // max(len(means), 1), 1)
         for here in (slice(start, start + step) for start in range(0, len(poses), step)):
             depths = _depths_in_frusta(means, poses[here], Ks[here], sizes[here])  # [p, N]
-            inside |= (depths < reach.clamp_max(self.near)).any(dim=0)
+            inside |= (depths < reach).any(dim=0)
         return inside
 
 
