@@ -83,7 +83,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small drawn COLMAP dataset, to be read only."""
     from scenes import HEIGHT, POINTS, VIEWS, WIDTH
 
-    from sadgs_ns.demo.scene import write_scene
+    from examples.drawn_scene.scene import write_scene
 
     folder = tmp_path_factory.mktemp("colmap") / "scene"
     write_scene(folder, WIDTH, HEIGHT, VIEWS, POINTS)

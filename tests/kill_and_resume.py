@@ -1,6 +1,6 @@
 """Kill training runs with SIGKILL and resume them, until one ends; compare it with a run that nothing disturbed.
 
-    python tests/kill_and_resume.py FOLDER [--kills 10] [--iterations 300] [--seed 0]
+    PYTHONPATH=. python tests/kill_and_resume.py FOLDER [--kills 10] [--iterations 300] [--seed 0]
 
 Every attempt is a process of its own, forked before torch has computed anything. The places of the kills are drawn from
 the seed: within a step, after a step, right after a structure split, with half a checkpoint written, and between a
@@ -35,8 +35,8 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from sadgs_ns.demo.demonstration import fit_densification
-from sadgs_ns.demo.scene import EVAL_INTERVAL, SPARSE_FOLDER, write_scene
+from examples.drawn_scene.demonstration import fit_densification
+from examples.drawn_scene.scene import EVAL_INTERVAL, SPARSE_FOLDER, write_scene
 from sadgs_ns.plugin.presets import sadgs
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 

@@ -21,8 +21,8 @@ from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from PIL import Image
 from scenes import HEIGHT, POINTS, VIEWS, WIDTH
 
-from sadgs_ns.demo.drawing import render
-from sadgs_ns.demo.scene import arc_views, room_surfaces
+from examples.drawn_scene.drawing import render
+from examples.drawn_scene.scene import arc_views, room_surfaces
 from sadgs_ns.plugin.model import SadgsModel
 from sadgs_ns.plugin.presets import sadgs
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sadgs_ns.demo.drawing import Sphere, Surface, View, trace
+from examples.drawn_scene.drawing import Sphere, Surface, View, trace
 from sadgs_ns.formats.mesh import DepthView, Mesh
 
 Array = NDArray[np.float64]

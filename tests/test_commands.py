@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from examples.drawn_scene.scene import write_scene
 from sadgs_ns.bench.__main__ import COMMANDS
-from sadgs_ns.demo.scene import write_scene
 
 PYPROJECT = Path(__file__).parents[1] / "pyproject.toml"
 SCRIPTS = dict(re.findall(r'^(sadgs(?:-\w+)?) = "(.+):main"$', PYPROJECT.read_text("utf8"), re.MULTILINE))
@@ -20,7 +20,7 @@ SLOW = ("torch", "nerfstudio", "torchvision", "gsplat", "scipy", "matplotlib", "
 HELP = [
     *((module, ["--help"]) for module in SCRIPTS.values()),
     *((SCRIPTS["sadgs-bench"], [command, "--help"]) for command in COMMANDS),
-    ("sadgs_ns.demo.__main__", ["--help"]),
+    ("examples.drawn_scene.__main__", ["--help"]),
 ]
 
 

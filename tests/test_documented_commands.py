@@ -26,8 +26,8 @@ from scenes import HEIGHT, POINTS, WIDTH
 from test_commands import PYPROJECT, SCRIPTS
 from test_docs import CHECKOUT, names_in, without_code
 
+from examples.drawn_scene.scene import write_scene
 from sadgs_ns.bench import protocol
-from sadgs_ns.demo.scene import write_scene
 
 DOCUMENTS = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
 OTHER_LANGUAGES = {"python", "yaml", "diff", "{button-link}"}
@@ -61,8 +61,8 @@ RUN_BY = {
 """Tests that run commands which begin so, or files that do; the longest beginning counts."""
 SHORTER = {
     "ns-train sadgs": "--max-num-iterations 2 --vis tensorboard",
-    "python -m sadgs_ns.demo": "--width 40 --height 30 --views 9 --max-num-iterations 30",
-    "python -m sadgs_ns.demo.scene": "--width 40 --height 30 --views 16",
+    "python -m examples.drawn_scene": "--width 40 --height 30 --views 9 --max-num-iterations 30",
+    "python -m examples.drawn_scene.scene": "--width 40 --height 30 --views 16",
 }
 """Options with which commands that begin so are run here, beside those that they have and in place of these."""
 
@@ -134,7 +134,8 @@ def program(words: Sequence[str]) -> tuple[Callable[[], Any], list[str]]:
         given = importlib.import_module("torch.distributed.run").parse_args(list(words[1:]))
         words = ["python", "-m", given.training_script, *given.training_script_args]
     if words[0] == "python":
-        module = importlib.import_module(words[2] if words[2] != "sadgs_ns.demo" else "sadgs_ns.demo.__main__")
+        is_package = (CHECKOUT / words[2].replace(".", "/")).is_dir()
+        module = importlib.import_module(f"{words[2]}.__main__" if is_package else words[2])
         return getattr(module, "entrypoint", None) or module.main, [words[2], *words[3:]]
     (script,) = entry_points(group="console_scripts", name=words[0])
     return script.load(), list(words)
@@ -223,7 +224,7 @@ for main, argv in [program(words) for words in commands]:  # All have imported w
 
 def shortened(command: Command) -> str:
     """A command as it is run here: on files that are there, and no longer than it must be."""
-    line = " ".join(command.words).replace("make demo", "python -m sadgs_ns.demo")
+    line = " ".join(command.words).replace("make demo", "python -m examples.drawn_scene")
     line = re.sub(r"outputs/…\S*|(?<=--load-config )…", "outputs/scene/sadgs/run/config.yml", line)
     line = re.sub(r"(?<=--max-num-iterations )\d+", "2", line)
     start = max((start for start in SHORTER if f"{line} ".startswith(f"{start} ")), key=len, default="")

@@ -18,12 +18,12 @@ import cv2
 import numpy as np
 import torch
 
+from examples.drawn_scene.drawing import render
+from examples.drawn_scene.scene import describe_scene
 from sadgs_ns.bench import command_lines, results
 from sadgs_ns.bench.eta_errors import RUNS, demo_training_set, footprint_rows, interval_rows, random_footprints
 from sadgs_ns.bench.table import grid
 from sadgs_ns.bench.tensor_errors import AXIS_LENGTHS, Image, Row, batch, robustness_rows, structure_tensor_rows
-from sadgs_ns.demo.drawing import render
-from sadgs_ns.demo.scene import describe_scene
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 

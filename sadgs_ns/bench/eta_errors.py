@@ -11,8 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from examples.drawn_scene.scene import SceneDescription
 from sadgs_ns.bench.tensor_errors import Row, spread, timed
-from sadgs_ns.demo.scene import SceneDescription
 from sadgs_ns.method.eta import SCREEN_BLUR, eta, sample_footprint, sample_map
 from sadgs_ns.method.initialization import neighbour_scales
 from sadgs_ns.method.split import children_per_axis

@@ -16,6 +16,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from examples.drawn_scene.drawing import render
+from examples.drawn_scene.scene import describe_scene
 from sadgs_ns.bench import approximations, eta_errors, tensor_errors
 from sadgs_ns.bench.approximations import TABLES, Workload, find_device, main, markdown, measure, read_image
 from sadgs_ns.bench.eta_errors import (
@@ -42,8 +44,6 @@ from sadgs_ns.bench.tensor_errors import (
     structure_tensor_rows,
     timed,
 )
-from sadgs_ns.demo.drawing import render
-from sadgs_ns.demo.scene import describe_scene
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 
 CPU = torch.device("cpu")

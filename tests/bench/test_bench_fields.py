@@ -23,12 +23,12 @@ import yaml
 from PIL import Image
 from torch import Tensor
 
+from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
 from sadgs_ns.bench import __main__ as bench
 from sadgs_ns.bench import evaluate, images, phases, protocol, results, run, timer
 from sadgs_ns.bench.curve import undisturbed
 from sadgs_ns.bench.phases import PHASES, Stopwatch
 from sadgs_ns.bench.protocol import Job, Row, Scene
-from sadgs_ns.demo.scene import SPARSE_FOLDER, write_scene
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.render import splatter
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world

@@ -9,8 +9,8 @@ import pytest
 import torch
 from kill_and_resume import configure, set_up
 
+from examples.drawn_scene.scene import write_scene
 from sadgs_ns.bench import formats
-from sadgs_ns.demo.scene import write_scene
 from sadgs_ns.formats import html
 
 

@@ -9,8 +9,8 @@ import torch
 from interpreted import use_our_rasterizer
 from kill_and_resume import configure, set_up
 
+from examples.drawn_scene.scene import write_scene
 from sadgs_ns.bench import parts, step
-from sadgs_ns.demo.scene import write_scene
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="Triton's interpreter is for machines without CUDA")

@@ -17,10 +17,10 @@ import processes
 import pytest
 import torch
 
+from examples.drawn_scene.scene import write_scene
 from sadgs_ns import gsplat_internals, kernels
 from sadgs_ns.cli import doctor
 from sadgs_ns.data.validation import Finding
-from sadgs_ns.demo.scene import write_scene
 
 CHECKOUT = Path(__file__).parents[2]
 

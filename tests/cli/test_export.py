@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 from kill_and_resume import configure, set_up
 from plyfile import PlyData
 
+from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
 from sadgs_ns.cli import export
 from sadgs_ns.data.coordinates import Similarity, from_data, spherical_harmonics
 from sadgs_ns.data.run_cameras import find_capture, read_cameras
-from sadgs_ns.demo.scene import SPARSE_FOLDER, write_scene
 from sadgs_ns.errors import InputError
 from sadgs_ns.formats import html
 from sadgs_ns.gsplat_internals import torch_quat_scale_to_covar_preci, torch_spherical_harmonics

@@ -17,11 +17,11 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from surfaces import nearest
 
+from examples.drawn_scene.drawing import Sphere
+from examples.drawn_scene.scene import room_surfaces, write_scene
 from sadgs_ns.cli import export, meshing
 from sadgs_ns.data.coordinates import Similarity
 from sadgs_ns.data.run_cameras import read_cameras
-from sadgs_ns.demo.drawing import Sphere
-from sadgs_ns.demo.scene import room_surfaces, write_scene
 from sadgs_ns.errors import InputError
 from sadgs_ns.formats import mesh
 from sadgs_ns.formats.gaussians import DEGREE_0

@@ -23,8 +23,8 @@ from nerfstudio.viewer.viewer_elements import ViewerElement
 from PIL import Image
 from runs import in_the_viewer
 
+from examples.drawn_scene.scene import write_scene
 from sadgs_ns.cli import inspect, inspection
-from sadgs_ns.demo.scene import write_scene
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.codes import MASKED
 from sadgs_ns.method.strategy import StructureAwareStrategy

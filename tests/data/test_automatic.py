@@ -22,10 +22,10 @@ from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 from runs import blender_data, configure, nerfstudio_data, train
 
+from examples.drawn_scene.scene import SPARSE_FOLDER
 from sadgs_ns.data.automatic import AutomaticDataParserConfig, choose_parser
 from sadgs_ns.data.validation import check_data
 from sadgs_ns.data.validation.parsers import refuse_bad_data
-from sadgs_ns.demo.scene import SPARSE_FOLDER
 from sadgs_ns.errors import InputError
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
 

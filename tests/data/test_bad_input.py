@@ -35,9 +35,9 @@ from runs import (
 from scenes import HEIGHT, WIDTH
 from torch import Tensor
 
+from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
 from sadgs_ns.cli import doctor
 from sadgs_ns.data import colmap, validation
-from sadgs_ns.demo.scene import SPARSE_FOLDER, write_scene
 from sadgs_ns.errors import InputError, RunError
 
 CHECKOUT = Path(__file__).parents[2]

@@ -12,8 +12,8 @@ import trimesh
 from plyfile import PlyData
 from surfaces import depth_view, face_normals, nearest
 
+from examples.drawn_scene.scene import arc_views, room_surfaces
 from sadgs_ns.data.coordinates import Similarity
-from sadgs_ns.demo.scene import arc_views, room_surfaces
 from sadgs_ns.errors import InputError
 from sadgs_ns.formats import mesh
 from sadgs_ns.formats.mesh import Fusion, Mesh

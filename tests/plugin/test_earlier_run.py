@@ -18,9 +18,9 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from scenes import ITERATIONS
 from torch import Tensor
 
+from examples.drawn_scene.scene import SPARSE_FOLDER
 from sadgs_ns.data.coordinates import TRANSFORMS_NAME
 from sadgs_ns.data.validation.layouts import COLMAP_FOLDERS
-from sadgs_ns.demo.scene import SPARSE_FOLDER
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.schedule import CONTINUED_SHARE, schedule
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig

@@ -14,7 +14,7 @@ from kill_and_resume import configure, set_up
 from nerfstudio.cameras.cameras import Cameras
 from scenes import camera, random_params, splat
 
-from sadgs_ns.demo.scene import write_scene
+from examples.drawn_scene.scene import write_scene
 from sadgs_ns.errors import InputError
 from sadgs_ns.method import memory
 from sadgs_ns.method import strategy as strategy_module

@@ -33,7 +33,7 @@ from runs import (
 )
 from scenes import HEIGHT, POINTS, VIEWS, WIDTH
 
-from sadgs_ns.demo.scene import SPARSE_FOLDER
+from examples.drawn_scene.scene import SPARSE_FOLDER
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.codes import decode
 from sadgs_ns.method.near_plane import NEAR_SHARE

@@ -32,7 +32,7 @@ from nerfstudio.scripts.train import main as resume
 from nerfstudio.utils import writer
 from scenes import ITERATIONS
 
-from sadgs_ns.demo.scene import SPARSE_FOLDER
+from examples.drawn_scene.scene import SPARSE_FOLDER
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.schedule import Schedule, schedule
 from sadgs_ns.method.strategy import StructureAwareStrategy

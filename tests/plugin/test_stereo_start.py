@@ -15,7 +15,7 @@ from PIL import Image
 from runs import TRAIN_VIEWS, configure, nerfstudio_data, train
 from scenes import HEIGHT, POINTS, WIDTH
 
-from sadgs_ns.demo.scene import room_surfaces
+from examples.drawn_scene.scene import room_surfaces
 from sadgs_ns.errors import InputError
 from sadgs_ns.plugin import datamanager, pipeline, presets, stereo_start
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world

@@ -18,7 +18,7 @@ from kill_and_resume import configure, set_up
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.viewer import Viewer
 
-from sadgs_ns.demo.scene import write_scene
+from examples.drawn_scene.scene import write_scene
 from sadgs_ns.plugin.panel import OUTPUT
 
 LABEL = "[...document.querySelectorAll('label')].filter(l => l.textContent == '{}')[0]"

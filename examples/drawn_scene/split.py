@@ -1,4 +1,4 @@
-"""`python -m sadgs_ns.demo.split FOLDER`: two pictures of a structure step, computed by the method's own functions.
+"""`python -m examples.drawn_scene.split FOLDER`: two pictures of a structure step, by the method's own functions.
 
 `split.png` has one Gaussian in front of a grating: its axes beside the wavelength, and its children. `eta-step.png` has
 η of equal Gaussians in front of the drawn scene, before and after a step. A unit of the world is a pixel.
@@ -19,9 +19,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from torch import Tensor
 
+from examples.drawn_scene.drawing import render
+from examples.drawn_scene.scene import arc_views, room_surfaces
 from sadgs_ns.atomic import atomic_path
-from sadgs_ns.demo.drawing import render
-from sadgs_ns.demo.scene import arc_views, room_surfaces
 from sadgs_ns.errors import WriteError
 from sadgs_ns.method.eta import eta, projected_axes, wavelength
 from sadgs_ns.method.split import children_per_axis, grid_split
@@ -186,7 +186,7 @@ def eta_panels() -> list[Panel]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Draw both pictures and return the exit code, 2 if they cannot be written."""
     parser = argparse.ArgumentParser(
-        prog="python -m sadgs_ns.demo.split", description="Draw what a structure step does."
+        prog="python -m examples.drawn_scene.split", description="Draw what a structure step does."
     )
     parser.add_argument("folder", type=Path, help="takes split.png and eta-step.png")
     folder = parser.parse_args(arguments).folder

@@ -1,4 +1,4 @@
-"""`python -m sadgs_ns.demo`: draw the demo scene, train on it with and without densification, and show what changed."""
+"""`python -m examples.drawn_scene`: draw the demo scene, train on it with and without densification, and compare."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code, 2 if the input is wrong."""
     parser = argparse.ArgumentParser(
-        prog="python -m sadgs_ns.demo",
+        prog="python -m examples.drawn_scene",
         description="Draw the demo scene, train on it with and without densification, and show what changed.",
     )
     parser.add_argument(
@@ -27,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # nerfstudio and torch warn about their own internals, which is not what the demo is about.
     warnings.filterwarnings("ignore", module=r"(torch|nerfstudio|torchmetrics)\b")
     # This import takes ten seconds, which `--help` and wrong arguments need not wait for.
-    from sadgs_ns.demo.demonstration import demonstrate
+    from examples.drawn_scene.demonstration import demonstrate
 
     try:
         demonstrate(given.output, given.max_num_iterations, given.max_gaussians, given.width, given.height, given.views)

@@ -9,7 +9,7 @@ import pytest
 from matplotlib.patches import Ellipse
 from PIL import Image
 
-from sadgs_ns.demo import split
+from examples.drawn_scene import split
 
 
 def test_both_pictures_are_written_and_small(tmp_path: Path):

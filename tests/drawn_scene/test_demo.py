@@ -16,11 +16,9 @@ import torch
 from PIL import Image
 from plyfile import PlyData
 
-from sadgs_ns.atomic import atomic_path
-from sadgs_ns.cli.export import write_gaussians
-from sadgs_ns.demo import scene as demo_scene
-from sadgs_ns.demo.drawing import Rectangle, Sphere, View, expected_wavelength_map, render, trace
-from sadgs_ns.demo.scene import (
+from examples.drawn_scene import scene as demo_scene
+from examples.drawn_scene.drawing import Rectangle, Sphere, View, expected_wavelength_map, render, trace
+from examples.drawn_scene.scene import (
     EVAL_INTERVAL,
     SPARSE_FOLDER,
     SceneDescription,
@@ -29,6 +27,8 @@ from sadgs_ns.demo.scene import (
     room_surfaces,
     write_scene,
 )
+from sadgs_ns.atomic import atomic_path
+from sadgs_ns.cli.export import write_gaussians
 
 WIDTH, HEIGHT, VIEWS = 48, 36, 9
 
@@ -282,7 +282,7 @@ def test_atomic_path_keeps_the_old_file_on_failure(tmp_path: Path) -> None:
 
 def test_demo_refuses_too_few_iterations(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with quiet_import():
-        from sadgs_ns.demo.__main__ import main
+        from examples.drawn_scene.__main__ import main
 
     assert main(["--output", str(tmp_path / "out"), "--max-num-iterations", "3"]) == 2
     assert capsys.readouterr().err == "error: --max-num-iterations is 3; give at least 30, or nothing is split\n"

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sadgs_ns.demo.drawing import Array, Rectangle, Sphere, Surface, View, render, visible
+from examples.drawn_scene.drawing import Array, Rectangle, Sphere, Surface, View, render, visible
 
 EVAL_INTERVAL = 8
 """Every 8th view is held out, as nerfstudio's colmap parser does with `--eval-mode interval --eval-interval 8`."""
@@ -253,7 +253,9 @@ def write_scene(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m sadgs_ns.demo.scene", description=(__doc__ or "").split("\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m examples.drawn_scene.scene", description=(__doc__ or "").split("\n")[0]
+    )
     parser.add_argument("folder", type=Path, help="where to write the scene")
     parser.add_argument("--width", type=int, default=160, help="image width in px (default %(default)s)")
     parser.add_argument("--height", type=int, default=120, help="image height in px (default %(default)s)")

@@ -24,11 +24,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from torch import Tensor
 
+from examples.drawn_scene.drawing import expected_wavelength_map
+from examples.drawn_scene.scene import EVAL_INTERVAL, SPARSE_FOLDER, SceneDescription, write_scene
 from sadgs_ns.atomic import atomic_path
 from sadgs_ns.cli.export import write_gaussians
 from sadgs_ns.cli.inspection import get_view
-from sadgs_ns.demo.drawing import expected_wavelength_map
-from sadgs_ns.demo.scene import EVAL_INTERVAL, SPARSE_FOLDER, SceneDescription, write_scene
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin import color_scales, gaussian_maps, presets, texture
 from sadgs_ns.plugin.color_scales import ETA, PERIOD, Panel

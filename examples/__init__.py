@@ -1,0 +1,1 @@
+"""What a checkout shows and tests with, and the package does not need."""
