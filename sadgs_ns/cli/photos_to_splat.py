@@ -3,8 +3,8 @@
 Its folder holds the cameras in `scene`, the run in `training`, all that was printed in `log`, the splats, and
 `settings.json`, by which the command knows the folder again and what of it is done.
 
-Where photos were added since, their cameras are added to the scene, whose other cameras stay, and another run starts
-from the Gaussians of the finished one, which is removed when the splats of the new one are written.
+Where photos were added since, their cameras are added to the scene, whose other cameras stay, and another run is
+trained, in the frame of the one before, which is removed when the splats of the new one are written.
 """
 
 from __future__ import annotations
@@ -170,8 +170,6 @@ class PhotosToSplat:
             self._note()
             with contextlib.ExitStack() as stack:
                 training = None
-                if self._trained() and "views" not in self._settings and (self._scene / "transforms.json").exists():
-                    self._note(views=self._views())  # An earlier version trained it.
                 # Importing nerfstudio takes some 12 s, in which cameras can be found.
                 if not self._trained() or self._photos_added():
                     training = stack.enter_context(prepared(_TRAINING, self._log("training"), lock))
@@ -194,37 +192,33 @@ class PhotosToSplat:
         return sorted((frame["file_path"] for frame in described["frames"]), key=Path)
 
     def _choose_run(self) -> None:
-        """Begin another run where photos were added since the present one began.
-
-        It starts from the Gaussians of the last run that was finished, if there is one.
-        """
+        """Begin another run where photos were added since the present one began."""
         views, before = self._views(), self._settings.get("views")
         if views == before:
             return
-        chosen: dict[str, Any] = {"views": views}
-        if before and self._checkpoint():
-            if self._trained():
-                chosen |= {"start": self._run.name, "start_views": len(before)}
-            chosen |= {"run": f"run-{len(views)}", "trained": None}
-            if start := (self._settings | chosen).get("start"):
-                self._keep_frame_and_split(self._runs / start, before)
-        self._note(**chosen)
+        if before:
+            self._keep_frame_and_split(before)
+        begun = bool(before and self._checkpoint())
+        self._note(views=views, **({"run": f"run-{len(views)}", "trained": None} if begun else {}))
 
-    def _keep_frame_and_split(self, run: Path, before: Sequence[str]) -> None:
-        """Note in the scene how an earlier run moved the data, and that what it held out is held out again.
+    def _keep_frame_and_split(self, before: Sequence[str]) -> None:
+        """Note in the scene how the first run moved the data, and that what it held out is held out again.
 
         Of the photos that were added as many are held out as nerfstudio would. Where an option says which views are
-        held out, that option decides.
+        held out, that option decides. Before a run has begun there is nothing to keep.
 
         Args:
-            run: The earlier run.
-            before: The images that the scene had then.
+            before: The images of the present run.
         """
         from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fraction
 
-        file, moved = self._scene / "transforms.json", json.loads((run / TRANSFORMS_NAME).read_bytes())
+        file = self._scene / "transforms.json"
         described = json.loads(file.read_bytes())
-        described |= dict(zip(FRAME_KEYS, (moved["transform"], moved["scale"]), strict=True))
+        if FRAME_KEYS[0] not in described:
+            if not self._checkpoint():
+                return
+            moved = json.loads((self._run / TRANSFORMS_NAME).read_bytes())
+            described |= dict(zip(FRAME_KEYS, (moved["transform"], moved["scale"]), strict=True))
         if not any(re.match("--(eval|train|test)", option) for option in self.options):
             trained, held_out = described.get("train_filenames", []), described.get("test_filenames", [])
             known = {*trained, *held_out}
@@ -354,13 +348,11 @@ class PhotosToSplat:
             if trained := self._trained():
                 line.tell(f"{trained}; done before")
                 return
-            start, begun = self._settings.get("start"), bool(self._checkpoint())
-            first = f"starting from the splat of {self._settings.get('start_views')} photos" if start else "starting"
-            line.tell("going on" if begun else first)
+            begun = bool(self._checkpoint())
+            line.tell("going on" if begun else "starting")
             arguments = ["sadgs", "--data", str(self._scene.absolute()), "--output-dir", str(self.folder.absolute())]
             arguments += ["--experiment-name", "training", "--timestamp", self._run.name, "--vis", "tensorboard"]
             arguments += ["--steps-per-eval-image", "0", "--pipeline.effort", f"{self.effort:g}"]
-            arguments += ["--pipeline.start-from", str((self._runs / start).absolute())] if start else []
             arguments += ["--load-dir", str(self._run.absolute())] if begun else []
             self._stage(line, "training", _TRAINING, [*arguments, *self.options], hear, process)
             if not self._checkpoint():

@@ -60,16 +60,6 @@ class Similarity:
         back = self.orthogonal.T
         return Similarity(1 / self.scale, back, -back @ self.translation / self.scale)
 
-    def after(self, first: Similarity) -> Similarity:
-        """Return the map that is this one after another."""
-        translation = self.positions(first.translation[None])[0]
-        return Similarity(self.scale * first.scale, self.orthogonal @ first.orthogonal, translation)
-
-    def keeps_all(self) -> bool:
-        """Whether everything stays where it is, up to rounding in float32."""
-        moved = np.concatenate([self.scale * self.orthogonal - np.eye(3), self.translation[:, None]], axis=1)
-        return bool(np.abs(moved).max() < 1e-6)
-
     def positions(self, means: Array) -> Array:
         """Return positions in the new frame. [N, 3] → [N, 3]"""
         return self.scale * (means @ self.orthogonal.T) + self.translation

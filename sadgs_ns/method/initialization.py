@@ -120,41 +120,6 @@ def starting_points(
     )
 
 
-def uncovered_points(points: Tensor, scales: Tensor, means: Tensor) -> Tensor:
-    """Which points lie where no Gaussian is: the nearest one's centre is further away than the point's scale.
-
-    Args:
-        points: World units. [P, 3]
-        scales: Initial scales of the points, as `starting_points` gives them, world units. [P]
-        means: Centres of the Gaussians, world units. [N, 3]
-
-    Returns:
-        bool [P]
-    """
-    distances, _ = KDTree(means.detach().cpu().numpy()).query(points.detach().cpu().numpy(), workers=-1)
-    return torch.from_numpy(distances).to(scales) > scales
-
-
-def seen_points(points: Tensor, viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> Tensor:
-    """Which points lie within the image of a view at least, whatever is in front of them.
-
-    Args:
-        points: World units. [P, 3]
-        viewmats: World to camera. [C, 4, 4]
-        Ks: Intrinsics in px. [C, 3, 3]
-        sizes: Width and height of the images in px. [C, 2]
-
-    Returns:
-        bool [P]
-    """
-    seen = torch.zeros(len(points), dtype=torch.bool)
-    for viewmat, K, size in zip(viewmats, Ks, sizes, strict=True):
-        projected = (points @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T  # [P, 3]
-        depths = projected[:, 2:]
-        seen |= ((depths > 0) & (projected[:, :2] >= 0) & (projected[:, :2] <= size * depths)).all(dim=1)
-    return seen
-
-
 def camera_extent(positions: Tensor) -> float:
     """The extent of the cameras, which is 1.1 times the largest distance from their centre (3DGS).
 

@@ -14,8 +14,6 @@ BASE_VISITS = 2000
 """View visits of a run whatever the number of views."""
 VISITS_PER_VIEW = 50
 """View visits of a run for each training view."""
-CONTINUED_SHARE = 0.5
-"""Share of these visits for a run that starts from the Gaussians of an earlier one, before photos were added."""
 STEPS_BEFORE_VIEWS = 2000
 """Optimizer steps that a run should have before a step takes a view more."""
 MOST_VIEWS = 4
@@ -77,7 +75,6 @@ def schedule(
     effort: float = 1.0,
     iterations: int | None = None,
     views_per_iteration: int | None = None,
-    continued: bool = False,
 ) -> Schedule:
     """Derive the length of a run from the number of its training views.
 
@@ -91,12 +88,10 @@ def schedule(
         effort: How much training, relative to what the number of views asks for, > 0.
         iterations: Optimizer steps, if they are given; else they are as many as the visits take.
         views_per_iteration: Views of a step, if they are given; never more than there are.
-        continued: Whether the run starts from the Gaussians of an earlier one, and so has `CONTINUED_SHARE` of the
-            visits.
     """
     few, many = MORE_VISITS_FROM
     power = 1.0 if effort <= 1 else min(max((num_views - few) / (many - few), 0.0), 1.0)
-    visits = effort**power * (BASE_VISITS + VISITS_PER_VIEW * num_views) * (CONTINUED_SHARE if continued else 1.0)
+    visits = effort**power * (BASE_VISITS + VISITS_PER_VIEW * num_views)
     if views_per_iteration is None:
         views_per_iteration = min(max(int(visits) // STEPS_BEFORE_VIEWS, 1), MOST_VIEWS)
     views_per_iteration = min(views_per_iteration, num_views)

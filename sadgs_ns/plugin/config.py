@@ -313,8 +313,6 @@ class CheckedTrainerConfig(TrainerConfig):
         """
         self.check()
         checkpoints.check_chosen(self.load_dir, self.load_step, self.load_checkpoint)
-        if self.load_dir is None and self.load_checkpoint is None:
-            checkpoints.check_chosen(self.pipeline.start_from, None, None)
         self._check_folder()
         if not processes.is_first():
             return  # torchrun's other processes leave the files to the first.

@@ -36,9 +36,7 @@ from sadgs_ns.method.initialization import (
     camera_extent,
     neighbour_scales,
     plausible_points,
-    seen_points,
     starting_points,
-    uncovered_points,
 )
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.near_plane import EmptySpace, nearest_depths, scene_near_plane
@@ -226,8 +224,6 @@ class SadgsModel(SplatfactoModel):
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
         self._lpips: list[torch.nn.Module | None] = []  # In a list its weights stay out of the checkpoint.
         self.step = 0
-        self.first_sh_degree = 0
-        """Degree of the harmonics that the first step draws; each step adds one."""
         self.average = RunningMean()
         self.camera_positions: Tensor | None = None  # [C, 3]
         self.empty_space: EmptySpace | None = None
@@ -359,29 +355,6 @@ class SadgsModel(SplatfactoModel):
         self.guessed = torch.cat([self.guessed, torch.zeros(room, dtype=torch.bool)])
         return room
 
-    def start_from(self, params: Mapping[str, Tensor], viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> int:
-        """Start from the Gaussians of an earlier run, and from the initial ones where it knows nothing.
-
-        These are the SfM points near which it has no Gaussian, and of those on the faces of their bounding box, or of
-        the random ones, those that none of its views saw. Call it after `set_cameras` and before optimizers are made.
-
-        Args:
-            params: Parameters by name, in this run's frame, all of which are finite. [N, …]
-            viewmats: Of the earlier run's views, world to camera. [C, 4, 4]
-            Ks: Intrinsics in px. [C, 3, 3]
-            sizes: Width and height in px. [C, 2]
-
-        Returns:
-            Number of initial Gaussians that stay.
-        """
-        means, scales = self.means.detach(), self.scales.detach().exp().amax(dim=1)  # [P, 3], [P]
-        seen = seen_points(means.cpu(), viewmats, Ks, sizes)
-        keep = uncovered_points(means.cpu(), scales.cpu(), params["means"]) & ~(seen & self.guessed)  # [P]
-        for name, parameter in self.gauss_params.items():
-            parameter.data = torch.cat([params[name].to(parameter), parameter.data[keep.to(means.device)]])
-        self.first_sh_degree = self.config.sh_degree
-        return int(keep.sum())
-
     def learn_color_matrices(self) -> None:
         """Learn a matrix of colours for each training view; call before optimizers are made."""
         matrices = identities(self.num_train_data).to(self.means.device)
@@ -484,7 +457,7 @@ class SadgsModel(SplatfactoModel):
     def sh_degree_now(self) -> int | None:
         """Degree of the harmonics that are drawn at this step; None where colours do not depend on the direction."""
         # Each iteration adds a degree: 3DGS's 1,000 iterations between them leave too few of so short a run.
-        return min(self.first_sh_degree + self.step, self.config.sh_degree) if self.config.sh_degree > 0 else None
+        return min(self.step, self.config.sh_degree) if self.config.sh_degree > 0 else None
 
     @property
     def drawing(self) -> dict[str, Any]:

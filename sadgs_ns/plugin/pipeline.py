@@ -71,9 +71,6 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     effort: float = 1.0
     """How much training the capture is given, relative to what its number of views asks for.
     0.5 is a draft of half as many renderings. 2 adds more Gaussians; 2 and 4 render more where views are many."""
-    start_from: Path | None = None
-    """Folder of a finished run of the same capture, before photos were added, from whose Gaussians this run starts.
-    SfM points are added where it has none. The length that is derived is half of a run's that starts anew."""
     views_per_iteration: int | None = None
     """Training views rendered for one optimizer step, at most as many as there are; the loss is their mean.
     None takes one more for every 2,000 renderings of the run, up to 4. The paper uses 1 outdoors, 2 indoors."""
@@ -148,8 +145,6 @@ class SadgsPipeline(VanillaPipeline):
             CONSOLE.print(
                 "[yellow]Triton does not run here: without its kernels training takes about twice as long.[/]"
             )
-        if config.start_from is not None and self.model.strategy.reset_every is None:
-            self.model.strategy.reset_every = 0  # What was learned is not to be learned again.
         cameras = self.datamanager.train_dataset.cameras
         self.model.set_cameras(_positions(cameras))
         self.model.set_near_plane(
@@ -422,7 +417,15 @@ class SadgsPipeline(VanillaPipeline):
             InputError: If the checkpoint is of another method, or of other settings of the model.
         """
         loaded = {key.removeprefix("module."): value for key, value in loaded_state.items()}
-        self.gaussians_of(loaded)
+        for name, parameter in self.model.gauss_params.items():
+            value = loaded.get(f"_model.gauss_params.{name}")
+            if value is None:
+                raise InputError(f"The checkpoint has no {name} of Gaussians, so another method made it.")
+            if value.shape[1:] != parameter.shape[1:]:
+                raise InputError(
+                    f"The checkpoint's {name} have the shape {list(value.shape[1:])}, the model's "
+                    f"{list(parameter.shape[1:])}: set pipeline.model.sh-degree as it was."
+                )
         if not {"_extra_state", "_model._extra_state"} <= loaded.keys():
             raise InputError("The checkpoint lacks the state of structure-aware densification, so splatfacto made it.")
         for name, parameter in self.named_parameters():
@@ -433,25 +436,6 @@ class SadgsPipeline(VanillaPipeline):
                     "the parser's options that choose them as they were."
                 )
         super().load_pipeline(loaded_state, step)
-
-    def gaussians_of(self, loaded: dict[str, Any]) -> dict[str, Tensor]:
-        """Return the Gaussians of a checkpoint's pipeline by their parameters' names. [N, …]
-
-        Raises:
-            InputError: If the checkpoint is of another method, or of other settings of the model.
-        """
-        found = {}
-        for name, parameter in self.model.gauss_params.items():
-            value = loaded.get(f"_model.gauss_params.{name}")
-            if value is None:
-                raise InputError(f"The checkpoint has no {name} of Gaussians, so another method made it.")
-            if value.shape[1:] != parameter.shape[1:]:
-                raise InputError(
-                    f"The checkpoint's {name} have the shape {list(value.shape[1:])}, the model's "
-                    f"{list(parameter.shape[1:])}: set pipeline.model.sh-degree as it was."
-                )
-            found[name] = value
-        return found
 
     def refuse_other_capture(self, before: Sequence[str], positions_before: Tensor) -> None:
         """Check whether a checkpoint is of the data that training is about to go on with.

@@ -25,7 +25,6 @@ from sadgs_ns.method.schedule import between_one_and_four, schedule
 from sadgs_ns.plugin import checkpoints, processes
 from sadgs_ns.plugin.compilation import compile_kernels
 from sadgs_ns.plugin.config import CheckedTrainerConfig
-from sadgs_ns.plugin.earlier_run import start_from
 from sadgs_ns.plugin.graphed_steps import GraphedSteps
 from sadgs_ns.plugin.interrupts import HANG_UP, SIGNALS, Interrupted, Interrupts
 from sadgs_ns.plugin.lost_output import drop_lost_output, print_elsewhere_once_unread
@@ -220,7 +219,6 @@ class SadgsTrainer(Trainer):
             effort=config.pipeline.effort,
             iterations=before.get("iterations") if self._derived else config.max_num_iterations,
             views_per_iteration=before.get("views_per_iteration") if asked is None else asked,
-            continued=config.pipeline.start_from is not None,
         )
         config.max_num_iterations = pipeline.schedule.iterations
         self.config = config
@@ -259,15 +257,11 @@ class SadgsTrainer(Trainer):
         """Derive the run's length and build the optimizers with schedules as long as that, fused where the model is.
 
         Raises:
-            InputError: As `checkpoints.read_chosen`, since a run that goes on keeps its length, and
-                `start_from`.
+            InputError: As `checkpoints.read_chosen`, since a run that goes on keeps its length.
         """
         config = self.config
         self._checkpoint = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
-        if self._checkpoint is None and config.pipeline.start_from is not None:
-            start_from(self.pipeline, config.pipeline.start_from)
-        else:
-            start_from_stereo(self.pipeline, resumed=self._checkpoint is not None)
+        start_from_stereo(self.pipeline, resumed=self._checkpoint is not None)
         self._derive_schedule()
         self._take_one_device_if_quicker()
         if self.shards is not None:

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
-from scenes import camera
 
 from sadgs_ns.method.initialization import (
     bounding_box_points,
     camera_extent,
     neighbour_scales,
     plausible_points,
-    seen_points,
     starting_points,
-    uncovered_points,
 )
 
 
@@ -88,20 +85,3 @@ def test_a_sound_cloud_with_a_far_background_is_plausible():
     assert plausible_points(torch.zeros((9, 3))).all()
     assert plausible_points(torch.tensor([[0.0, 0, 0]] * 9 + [[5.0, 0, 0]])).all()  # most coincide
     assert len(plausible_points(torch.zeros((0, 3)))) == 0
-
-
-def test_points_near_a_gaussian_are_covered():
-    means = torch.tensor([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]])
-    points = torch.tensor([[0.1, 0.0, 0.0], [1.0, 0.0, 0.0], [5.0, 0.3, 0.0], [9.0, 0.0, 0.0]])
-    assert uncovered_points(points, torch.tensor([0.2, 0.2, 0.2, 5.0]), means).tolist() == [False, True, True, False]
-
-
-def test_points_are_seen_within_the_image_before_the_camera():
-    viewmats, Ks = camera(64, 48, 60.0)
-    points = torch.tensor([[0, 0, 2], [0, 0, -2], [1.06, 0, 2], [1.07, 0, 2], [0, 0.79, 2], [0, -0.81, 2.0]])
-    sizes = torch.tensor([[64, 48]])
-    assert seen_points(points, viewmats, Ks, sizes).tolist() == [True, False, True, False, True, False]
-    behind = viewmats.clone()
-    behind[0, 0, 0] = behind[0, 2, 2] = -1
-    both = torch.cat([viewmats, behind]), torch.cat([Ks, Ks]), sizes.expand(2, 2)
-    assert seen_points(points[:2], *both).all() and not seen_points(points, *(part[:0] for part in both)).any()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from sadgs_ns.method.schedule import (
-    CONTINUED_SHARE,
     DENSIFICATION_SHARE,
     MOST_VIEWS,
     Schedule,
@@ -51,14 +50,6 @@ def test_effort_above_1_adds_visits_only_where_views_are_many(num_views: int, fa
         derived = schedule(num_views, effort=effort)
         visits.append(derived.iterations * derived.views_per_iteration)
     assert [more / visits[0] for more in visits[1:]] == pytest.approx(factors, rel=2e-3)
-
-
-@pytest.mark.parametrize("num_views", [5, 50, 500])
-def test_a_run_that_starts_from_another_has_a_share_of_the_visits(num_views: int):
-    anew, continued = schedule(num_views), schedule(num_views, continued=True)
-    visits = [derived.iterations * derived.views_per_iteration for derived in (anew, continued)]
-    assert visits[1] / visits[0] == pytest.approx(CONTINUED_SHARE, rel=2e-3)
-    assert schedule(num_views, iterations=700, continued=True).iterations == 700
 
 
 def test_effort_lets_more_grow_and_a_draft_as_much():

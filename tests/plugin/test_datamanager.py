@@ -9,6 +9,7 @@ import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -148,6 +149,50 @@ def test_colmap_s_points_of_an_old_ns_process_data_are_read_without_a_question(
     expected = load(parser).train_dataset.metadata
     torch.testing.assert_close(metadata["points3D_xyz"], expected["points3D_xyz"], atol=3e-6, rtol=0)  # 6 digits
     assert torch.equal(metadata["points3D_rgb"], expected["points3D_rgb"])
+
+
+def change_description(data: Path, **values: Any) -> dict[str, Any]:
+    """Change values of the transforms.json of a capture, and return all."""
+    described = json.loads((data / "transforms.json").read_text()) | values
+    (data / "transforms.json").write_text(json.dumps(described))
+    return described
+
+
+def test_views_that_are_added_move_nothing_in_a_frame_that_the_data_fix(colmap: ColmapDataParserConfig, tmp_path: Path):
+    parser = nerfstudio_data(tmp_path)
+    parser.eval_mode = "all"
+    shutil.copytree(colmap.data / SPARSE_FOLDER, tmp_path / "colmap/sparse/0")
+    frames = change_description(tmp_path, applied_transform=np.eye(4)[:3].tolist())["frames"]
+
+    def parsed(**values: Any) -> DataparserOutputs:
+        change_description(tmp_path, **values)
+        return load(parser).train_dataparser_outputs
+
+    first = parsed(frames=frames[:6])
+    added = parsed(frames=frames)
+    assert abs(added.dataparser_scale - first.dataparser_scale) > 0.01
+    frame = {"dataparser_transform": first.dataparser_transform.tolist(), "dataparser_scale": first.dataparser_scale}
+    fixed = parsed(**frame)
+    assert torch.equal(fixed.dataparser_transform, first.dataparser_transform)
+    assert fixed.dataparser_scale == first.dataparser_scale and len(fixed.cameras) == len(frames)
+    same = [fixed.image_filenames.index(path) for path in first.image_filenames]
+    torch.testing.assert_close(fixed.cameras.camera_to_worlds[same], first.cameras.camera_to_worlds, atol=1e-6, rtol=0)
+    torch.testing.assert_close(fixed.metadata["points3D_xyz"], first.metadata["points3D_xyz"], atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        ({"dataparser_transform": [[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0]], "dataparser_scale": 1.0}, "no rotation"),
+        ({"dataparser_transform": [[1, 0, 0, 0]] * 2, "dataparser_scale": 1.0}, "no transform of 3 rows"),
+        ({"dataparser_scale": 1.0}, "'dataparser_transform'"),
+    ],
+)
+def test_a_frame_that_is_none_is_refused(values: dict[str, Any], told: str, tmp_path: Path):
+    parser = nerfstudio_data(tmp_path)
+    change_description(tmp_path, **values)
+    with pytest.raises(InputError, match=rf"transforms.json does not tell with .* is to be moved \(.*{told}"):
+        load(parser)
 
 
 POSITIONS = np.array([[0.0, 0.0, 1.0], [1.0, 0.5, 1.0], [-2.0, 0.25, 3.0]])
