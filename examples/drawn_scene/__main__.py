@@ -11,13 +11,8 @@ from pathlib import Path
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code, 2 if the input is wrong."""
-    parser = argparse.ArgumentParser(
-        prog="python -m examples.drawn_scene",
-        description="Draw the demo scene, train on it with and without densification, and show what changed.",
-    )
-    parser.add_argument(
-        "--output", type=Path, default=Path("demo-output"), help="folder to write (default %(default)s)"
-    )
+    parser = argparse.ArgumentParser(prog="python -m examples.drawn_scene", description=(__doc__ or "").split(": ")[1])
+    parser.add_argument("--output", type=Path, default=Path("demo-output"), help="folder (default %(default)s)")
     parser.add_argument("--max-num-iterations", type=int, default=300, help="of each run (default %(default)s)")
     parser.add_argument("--max-gaussians", type=int, default=8000, help="cap on their number (default %(default)s)")
     parser.add_argument("--width", type=int, default=160, help="image width in px (default %(default)s)")

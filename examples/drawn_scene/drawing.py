@@ -1,8 +1,8 @@
 """Surfaces whose textures have a known wavelength, pinhole views, and images of these by tracing rays.
 
-Every surface carries one texture whose wavelength is known in world units, so the wavelength that a view should show at
-each pixel follows from geometry alone (`expected_wavelength_map`). The world is z-up, cameras follow OpenCV (x right,
-y down, z forward), pixel centres lie at half-integers.
+The wavelength of each texture is known in world units, so geometry alone gives the wavelength at each pixel of a view
+(`expected_wavelength_map`). The world is z-up, cameras follow OpenCV (x right, y down, z forward), pixel centres lie at
+half-integers.
 """
 
 from __future__ import annotations
@@ -26,13 +26,11 @@ class Rectangle:
     corner: Array
     """World position of one corner. [3]"""
     edge_u: Array
-    """From the corner along one side. [3]"""
     edge_v: Array
-    """From the corner along the other side, orthogonal to `edge_u`. [3]"""
+    """From the corner along its two sides, which are orthogonal. [3] each"""
     dark: tuple[float, float, float]
-    """Colour of the texture's troughs, in [0, 1]."""
     bright: tuple[float, float, float]
-    """Colour of the texture's crests, in [0, 1]."""
+    """Colours of the texture's troughs and crests, in [0, 1]."""
     texture: Literal["grating", "checker", "plain"] = "plain"
     """A sine along one direction, hard-edged squares, or the mean colour."""
     wavelength: float = float("nan")
@@ -68,12 +66,7 @@ class Rectangle:
         return np.zeros((0, 3))
 
     def depth(self, origin: Array, directions: Array) -> Array:
-        """Ray parameter of the hit, inf where there is none. [R]
-
-        Args:
-            origin: [3]
-            directions: [R, 3]
-        """
+        """Ray parameter of the hit, inf where there is none. origin [3], directions [R, 3] → [R]"""
         with np.errstate(divide="ignore", invalid="ignore"):
             t = self.normal @ (self.corner - origin) / (directions @ self.normal)  # [R]
             local = origin + t[:, None] * directions - self.corner  # [R, 3]
@@ -106,23 +99,16 @@ class Sphere:
     name: str
     """Unique in the scene."""
     centre: Array
-    """[3]"""
+    """World position. [3]"""
     radius: float
     """World units."""
     albedo: tuple[float, float, float]
-    """In [0, 1]."""
-    wavelength: float = float("nan")
-    """There is none."""
+    """Colour where light falls from above, in [0, 1]."""
 
     @property
     def area(self) -> float:
         """World units²."""
         return 4 * np.pi * self.radius**2
-
-    @property
-    def frequencies(self) -> Array:
-        """None. [0, 3]"""
-        return np.zeros((0, 3))
 
     def depth(self, origin: Array, directions: Array) -> Array:
         """Ray parameter of the nearest hit, inf where there is none. origin [3], directions [R, 3] → [R]"""
@@ -153,15 +139,12 @@ class View:
     name: str
     """File name in the folder `images`."""
     rotation: Array
-    """World to camera. [3, 3]"""
     translation: Array
-    """World to camera. [3]"""
+    """From world to camera. [3, 3] and [3]"""
     focal: float
     """px, the same for x and y."""
     width: int
-    """px"""
     height: int
-    """px"""
 
     @property
     def position(self) -> Array:
@@ -171,11 +154,8 @@ class View:
     def rays(self, supersampling: int = 1) -> Array:
         """Ray directions in the world, scaled so that the ray parameter is the depth.
 
-        Args:
-            supersampling: Samples per pixel and axis.
-
         Returns:
-            Row by row over the image enlarged `supersampling` times. [H·s·W·s, 3]
+            One per sample, row by row, with `supersampling` (s) samples per pixel and axis. [H·s·W·s, 3]
         """
         x = (np.arange(self.width * supersampling) + 0.5) / supersampling - 0.5 * self.width
         y = (np.arange(self.height * supersampling) + 0.5) / supersampling - 0.5 * self.height
@@ -191,11 +171,7 @@ class View:
 
 
 def trace(surfaces: Sequence[Surface], origin: Array, directions: Array) -> tuple[NDArray[np.intp], Array]:
-    """First surface that each ray meets.
-
-    Args:
-        origin: [3]
-        directions: [R, 3]
+    """First surface that each ray meets. origin [3], directions [R, 3]
 
     Returns:
         Index of the surface, −1 where there is none [R], and the ray parameter, inf where there is none [R].

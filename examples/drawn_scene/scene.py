@@ -44,16 +44,17 @@ class SceneDescription:
     @property
     def wavelengths(self) -> dict[str, float]:
         """Wavelength of each textured surface in world units, by the surface's name."""
-        return {surface.name: surface.wavelength for surface in self.surfaces if len(surface.frequencies) > 0}
+        return {s.name: s.wavelength for s in self.surfaces if isinstance(s, Rectangle) and s.texture != "plain"}
 
 
-def _box(name: str, centre: tuple[float, float], size: tuple[float, float, float], turn: float, **texture) -> list:
-    """Five faces of a box that stands on the floor; keywords as for `Rectangle`.
+def _box(name: str, centre: tuple[float, float], size: tuple[float, float, float], turn: float, *texture) -> list:
+    """Five faces of a box that stands on the floor.
 
     Args:
         centre: x and y, world units.
         size: Along the box's own x, y and z, world units.
         turn: About the vertical, in rad.
+        texture: The last fields of `Rectangle`, from `dark`.
     """
     x = np.array([np.cos(turn), np.sin(turn), 0.0]) * size[0]
     y = np.array([-np.sin(turn), np.cos(turn), 0.0]) * size[1]
@@ -61,7 +62,7 @@ def _box(name: str, centre: tuple[float, float], size: tuple[float, float, float
     low = np.array([*centre, 0.0]) - 0.5 * (x + y)
     faces = [("front", low, x, z), ("left", low, y, z), ("back", low + y, x, z), ("right", low + x, y, z)]
     faces.append(("top", low + z, x, y))
-    return [Rectangle(f"{name} {side}", corner, u, v, **texture) for side, corner, u, v in faces]
+    return [Rectangle(f"{name} {side}", corner, u, v, *texture) for side, corner, u, v in faces]
 
 
 def room_surfaces() -> tuple[Surface, ...]:
@@ -73,26 +74,10 @@ def room_surfaces() -> tuple[Surface, ...]:
         Rectangle("fine wall", origin, x, z, (0.15, 0.25, 0.45), (0.75, 0.85, 0.95), "grating", 0.15),
         Rectangle("coarse wall", origin, y, z, (0.5, 0.2, 0.15), (0.95, 0.75, 0.5), "grating", 0.35, 1.0),
         *_box(
-            "tall box",
-            (0.65, 1.35),
-            (0.5, 0.5, 1.1),
-            0.4,
-            dark=(0.1, 0.3, 0.1),
-            bright=(0.7, 0.9, 0.5),
-            texture="grating",
-            wavelength=0.2,
-            angle=0.5 * np.pi,
+            "tall box", (0.65, 1.35), (0.5, 0.5, 1.1), 0.4, (0.1, 0.3, 0.1), (0.7, 0.9, 0.5), "grating", 0.2, np.pi / 2
         ),
         *_box(
-            "faint box",
-            (1.5, 0.6),
-            (0.7, 0.5, 0.5),
-            -0.3,
-            dark=(0.5, 0.42, 0.55),
-            bright=(0.62, 0.54, 0.67),
-            texture="grating",
-            wavelength=0.14,
-            angle=0.6,
+            "faint box", (1.5, 0.6), (0.7, 0.5, 0.5), -0.3, (0.5, 0.42, 0.55), (0.62, 0.54, 0.67), "grating", 0.14, 0.6
         ),
         Sphere("sphere", np.array([1.45, 1.5, 0.3]), 0.3, (0.9, 0.5, 0.3)),
     )
@@ -192,17 +177,11 @@ def _write_colmap(scene: SceneDescription, folder: Path) -> None:
 
 def _refuse_foreign(folder: Path) -> None:
     """Raise unless `folder` is absent, empty, or an earlier demo scene."""
-    if not folder.exists():
-        return
-    if not folder.is_dir():
+    if folder.is_file():
         raise FileExistsError(f"{folder} is a file; name a new or empty folder for the demo scene")
-    if not any(folder.iterdir()):
-        return
-    try:
-        known = json.loads((folder / _DESCRIPTION_NAME).read_text()).get("format") == _FORMAT
-    except (OSError, ValueError, AttributeError):
-        known = False
-    if not known:
+    description = folder / _DESCRIPTION_NAME
+    known = description.is_file() and _FORMAT.encode() in description.read_bytes()
+    if folder.exists() and any(folder.iterdir()) and not known:
         raise FileExistsError(f"{folder} holds files that are not a demo scene; name a new or empty folder")
 
 
@@ -233,15 +212,7 @@ def write_scene(
         for view in scene.views:
             Image.fromarray(render(scene.surfaces, view)).save(partial / "images" / view.name)
         _write_colmap(scene, partial / SPARSE_FOLDER)
-        description = {
-            "format": _FORMAT,
-            "width": width,
-            "height": height,
-            "views": views,
-            "points": len(scene.points),
-            "seed": seed,
-            "wavelengths": scene.wavelengths,
-        }
+        description = {"format": _FORMAT, "wavelengths": scene.wavelengths}
         (partial / _DESCRIPTION_NAME).write_text(json.dumps(description, indent=2) + "\n")
         if folder.exists():
             shutil.rmtree(folder)
