@@ -16,7 +16,6 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.configs.base_config import InstantiateConfig
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
-from nerfstudio.model_components.lib_bilagrid import BilateralGrid, total_variation_loss
 from nerfstudio.models.splatfacto import RGB2SH, SplatfactoModel, num_sh_bases, random_quat_tensor
 from nerfstudio.utils.colors import get_color
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -55,9 +54,6 @@ NORMALS = "normals"
 """Name of the output that only its readers pay for."""
 LIMIT_EVERY = 25
 """Iterations between two times that scales are limited; at the presets' rates an axis grows threefold until then."""
-BILATERAL_GRID_SHAPE = (16, 16, 8)
-"""Cells of a view's bilateral grid in x, y and guidance, as in splatfacto and in "Bilateral Guided Radiance Field
-Processing"."""
 _MOST_RANDOM = 10_000_000
 """Largest number of random points to start from; they take the host's memory before the cap thins them out."""
 
@@ -113,9 +109,9 @@ class SadgsModelConfig(InstantiateConfig):
     max_angular_scale: float = 0.3
     """Longest standard deviation of a Gaussian as a share of its distance from the nearest training camera.
     A longer one can cover a view beside which it lies with haze; 0 sets no limit."""
-    color_model: Literal["none", "affine", "bilateral_grid"] = "none"
+    color_model: Literal["none", "affine"] = "none"
     """What is learned of each training photo's exposure and white balance, which held-out views are rendered without.
-    "affine" is a colour matrix, "bilateral_grid" a grid of them over the image and its brightness."""
+    "affine" is a colour matrix."""
     color_corrected_metrics: bool = False
     """Also report metrics after fitting the colours of each rendering to its photo, as suits changing exposure."""
     fused: bool = True
@@ -230,8 +226,7 @@ class SadgsModel(SplatfactoModel):
         self.near_plane = NEAR_PLANE if config.near_plane is None else config.near_plane
         """Depth in world units from which Gaussians are drawn."""
         self.infos: list[dict[str, Any]] = []
-        # A bilateral grid would learn to brighten what a step without enough places in its tile lists leaves black.
-        self.tile_forecast = None if config.color_model == "bilateral_grid" else TileForecast()
+        self.tile_forecast: TileForecast | None = TileForecast()
         self.color_matrices: torch.nn.Parameter | None = None  # [V, 3, 4]
         self.crop_box: OrientedBox | None = None
         self.viewer_outputs: Callable[[Cameras, dict[str, Tensor]], dict[str, Tensor]] | None = None
@@ -242,9 +237,6 @@ class SadgsModel(SplatfactoModel):
             else get_color(config.background_color)
         )
         self.photo_background = self.background_color  # The viewer exchanges the other one while it draws.
-        if config.color_model == "bilateral_grid":
-            x, y, w = BILATERAL_GRID_SHAPE
-            self.bil_grids = BilateralGrid(num=self.num_train_data, grid_X=x, grid_Y=y, grid_W=w)
         if config.color_model == "affine":
             self.learn_color_matrices()
 
@@ -423,8 +415,6 @@ class SadgsModel(SplatfactoModel):
     def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
         """Return what is optimized, by the names of the optimizers."""
         groups = {name: [parameter] for name, parameter in self.trained_params.items()}
-        if self.config.color_model == "bilateral_grid":
-            groups["bilateral_grid"] = list(self.bil_grids.parameters())
         self.camera_optimizer.get_param_groups(param_groups=groups)  # type: ignore[arg-type]
         return groups  # type: ignore[return-value]
 
@@ -644,13 +634,6 @@ class SadgsModel(SplatfactoModel):
         if forecast is not None and "pair_counts" in info:  # Only our kernels count pairs.
             forecast.rendered(cam_indices, (width, height), kind.tile_capacity, info["pair_counts"])
         self.show_to_strategy(info, viewmats, Ks, structure_tensors)
-        if self.config.color_model == "bilateral_grid":
-            outputs["rgb"] = torch.stack(
-                [
-                    self._apply_bilateral_grid(view[None], i, height, width)[0]
-                    for view, i in zip(outputs["rgb"], cam_indices, strict=True)
-                ]
-            )
         return outputs
 
     def get_outputs(self, camera: Cameras) -> dict[str, Any]:
@@ -792,8 +775,6 @@ class SadgsModel(SplatfactoModel):
         if self.training:
             outputs["psnr"] = psnr
             self.camera_optimizer.get_loss_dict(losses)
-            if self.config.color_model == "bilateral_grid":
-                losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
         return losses
 
     def compared(self, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> tuple[Tensor, Tensor]:

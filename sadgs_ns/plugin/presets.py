@@ -26,7 +26,6 @@ RATES: dict[str, tuple[float, float, float]] = {
     "scales": (0.02, 1.0, 1.0),
     "quats": (0.002, 1.0, 1.0),
     "camera_opt": (1e-4, 1.0, 0.005),
-    "bilateral_grid": (2e-3, 1.0, 0.05),
     "color_matrices": (3e-3, 1.0, 0.1),
 }
 """Learning rate of each group of parameters, and the factors on it at the first and at the last iteration.

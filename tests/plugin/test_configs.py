@@ -136,7 +136,7 @@ def test_presets_have_their_own_names_and_every_optimizer(name: str):
     assert method.config.method_name == name
     assert method.description.startswith("Structure-aware densification")
     groups = set(model(dataclasses.replace(SadgsModelConfig(), num_random=10)).gauss_params)
-    assert set(method.config.optimizers) == groups | {"camera_opt", "bilateral_grid", "color_matrices"}
+    assert set(method.config.optimizers) == groups | {"camera_opt", "color_matrices"}
 
 
 def test_presets_differ_where_their_comments_say():
@@ -173,10 +173,10 @@ def test_what_splatfacto_s_methods_read_of_its_configuration_is_there():
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_the_help_shows_at_most_93_options_each_with_a_sentence(method: str, capsys: pytest.CaptureFixture[str]):
+def test_the_help_shows_at_most_91_options_each_with_a_sentence(method: str, capsys: pytest.CaptureFixture[str]):
     options = shown_options(method, capsys)
     beside = [name for name in options if not name.startswith("--pipeline.model.strategy.")]
-    assert len(beside) <= 93 - 16, "the strategy has at most 16"
+    assert len(beside) <= 91 - 16, "the strategy has at most 16"
     assert "Hard cap on the number of Gaussians" in options["--pipeline.model.strategy.max-gaussians"]
     assert "Training views rendered for one optimizer step" in options["--pipeline.views-per-iteration"]
     texts = {name: text.partition("(default:")[0].strip() for name, text in options.items() if name != "-h,"}

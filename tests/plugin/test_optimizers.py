@@ -60,18 +60,18 @@ def config(optimizer: Any, final_factor: float | None = 0.1) -> dict[str, Any]:
 
 
 class Training:
-    """A few Gaussians, poses and colour grids that follow made-up gradients."""
+    """A few Gaussians, poses and colours that follow made-up gradients."""
 
     def __init__(self, cls: type[Optimizers], **optimizers: Any) -> None:
         shapes = {name: (50, *width) for name, width in GAUSSIANS.items()}
-        shapes |= {"camera_opt": (4, 6), "bilateral_grid": (4, 12, 2)}
+        shapes |= {"camera_opt": (4, 6), "color_matrices": (4, 12, 2)}
         torch.manual_seed(0)
         self.params = {name: torch.nn.Parameter(torch.randn(shape).to(DEVICE)) for name, shape in shapes.items()}
         configs = {
             name: config(FusedAdamOptimizerConfig(lr=0.01 * (k + 1), eps=1e-15)) for k, name in enumerate(GAUSSIANS)
         }
         configs["camera_opt"] = config(AdamOptimizerConfig(lr=0.02))
-        configs["bilateral_grid"] = config(FusedAdamOptimizerConfig(lr=0.03, eps=1e-8), None)
+        configs["color_matrices"] = config(FusedAdamOptimizerConfig(lr=0.03, eps=1e-8), None)
         configs |= optimizers
         self.optimizers = cls(configs, {name: [parameter] for name, parameter in self.params.items()})
         self.log = NonFiniteLog(DEVICE)

@@ -126,11 +126,3 @@ def test_a_checkpoint_after_an_overflow_has_the_views_that_must_be_drawn_again(
     trainer.callbacks.append(TrainingCallback(location, keep))
     trainer.train()
     assert orders[3][:2] == forecast.views[3] and forecast.views[4] == forecast.views[3]
-
-
-def test_a_bilateral_grid_never_sees_a_black_rendering(short: SadgsTrainerConfig):
-    """It would learn to brighten it: such a run waits for the exact lists."""
-    short.pipeline.model.color_model = "bilateral_grid"
-    trainer = set_up(short)
-    assert trainer.pipeline.model.tile_forecast is None
-    trainer.shutdown()

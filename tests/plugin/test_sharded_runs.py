@@ -78,7 +78,6 @@ def assert_same_first_steps(results: list[dict[str, Any]], expected: dict[str, A
     ("option", "value"),
     [
         ("pipeline.model.color_model", "affine"),
-        ("pipeline.model.color_model", "bilateral_grid"),
         ("pipeline.model.camera_optimizer.mode", "SO3xR3"),
         ("start_paused", True),
     ],
