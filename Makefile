@@ -27,12 +27,12 @@ test-portable: $(STAMP)
 gate: $(STAMP)
 	rm -rf gate-output
 	$(BIN)/python -m examples.drawn_scene.scene gate-output/demo --width 80 --height 60 --views 24
-	CUDA_VISIBLE_DEVICES= OMP_NUM_THREADS=1 TORCH_HOME=/dev/null $(BIN)/sadgs-bench configs/bench/demo-gate.yaml \
+	CUDA_VISIBLE_DEVICES= OMP_NUM_THREADS=1 TORCH_HOME=/dev/null $(BIN)/python -m benchmarks configs/bench/demo-gate.yaml \
 	  --scenes gate-output --output gate-output/gate.jsonl --jobs-per-gpu 2 --gate configs/bench/baselines/demo-gate.json
 
 lint: $(STAMP)
-	$(BIN)/ruff check sadgs_ns examples tests
-	$(BIN)/ruff format --check sadgs_ns examples tests
+	$(BIN)/ruff check sadgs_ns benchmarks examples tests
+	$(BIN)/ruff format --check sadgs_ns benchmarks examples tests
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 # The site, in `site/`. mkdocs ends with an error at every warning, such as a link to nowhere.
@@ -51,4 +51,4 @@ $(STAMP): pyproject.toml constraints.txt
 
 clean:
 	rm -rf $(VENV) demo-output gate-output outputs build site *.egg-info .pytest_cache .ruff_cache .hypothesis
-	find sadgs_ns examples tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	find sadgs_ns benchmarks examples tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.__main__ import COMMANDS
 from examples.drawn_scene.scene import write_scene
-from sadgs_ns.bench.__main__ import COMMANDS
 
 PYPROJECT = Path(__file__).parents[1] / "pyproject.toml"
 SCRIPTS = dict(re.findall(r'^(sadgs(?:-\w+)?) = "(.+):main"$', PYPROJECT.read_text("utf8"), re.MULTILINE))
@@ -19,7 +19,7 @@ SLOW = ("torch", "nerfstudio", "torchvision", "gsplat", "scipy", "matplotlib", "
 """Packages that take between a third of a second and ten seconds to import."""
 HELP = [
     *((module, ["--help"]) for module in SCRIPTS.values()),
-    *((SCRIPTS["sadgs-bench"], [command, "--help"]) for command in COMMANDS),
+    *(("benchmarks.__main__", words) for words in (["--help"], *([command, "--help"] for command in COMMANDS))),
     ("examples.drawn_scene.__main__", ["--help"]),
 ]
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from sadgs_ns.bench import documents
+from benchmarks import documents
 
 CHECKOUT = Path(__file__).parents[1]
 

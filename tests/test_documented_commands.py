@@ -26,8 +26,8 @@ from scenes import HEIGHT, POINTS, WIDTH
 from test_commands import PYPROJECT, SCRIPTS
 from test_docs import CHECKOUT, names_in, without_code
 
+from benchmarks import protocol
 from examples.drawn_scene.scene import write_scene
-from sadgs_ns.bench import protocol
 
 DOCUMENTS = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
 OTHER_LANGUAGES = {"python", "yaml", "diff", "{button-link}"}
@@ -52,11 +52,13 @@ RUN_BY = {
     "test_the_mesh_lies_on_the_room_s_surfaces_in_both_frames",
     "sadgs-export outputs/demo/sadgs/run/config.yml --output splat.ply --crop": "tests/cli/test_export.py::"
     "test_what_is_taken_away_is_told_and_not_in_the_file",
-    "sadgs-bench PROTOCOL.yaml": "Makefile",
-    "sadgs-bench formats": "tests/bench/test_formats_table.py::test_the_table_has_every_format_with_its_size_and_loss",
-    "sadgs-bench kernels": "tests/bench/test_approximations.py::test_every_row_is_printed_and_written",
-    "sadgs-bench report": "tests/bench/test_report.py::test_a_second_report_replaces_the_first_and_keeps_other_files",
-    "sadgs-bench documents": "tests/test_docs.py::test_tables_are_what_their_rows_give",
+    "python -m benchmarks PROTOCOL.yaml": "Makefile",
+    "python -m benchmarks formats": "tests/benchmarks/test_formats_table.py::"
+    "test_the_table_has_every_format_with_its_size_and_loss",
+    "python -m benchmarks kernels": "tests/benchmarks/test_approximations.py::test_every_row_is_printed_and_written",
+    "python -m benchmarks report": "tests/benchmarks/test_report.py::"
+    "test_a_second_report_replaces_the_first_and_keeps_other_files",
+    "python -m benchmarks documents": "tests/test_docs.py::test_tables_are_what_their_rows_give",
 }
 """Tests that run commands which begin so, or files that do; the longest beginning counts."""
 SHORTER = {
@@ -182,7 +184,7 @@ def test_a_command_in_a_block_is_understood_and_the_test_that_runs_it_is_there(c
         given = understood(words)
         if "--" in words:
             understood(["ns-train", "sadgs", *words[words.index("--") + 1 :]])
-        if first == "sadgs-bench" and words[1].startswith("configs/"):
+        if words[:3] == ["python", "-m", "benchmarks"] and words[3].startswith("configs/"):
             jobs = protocol.load(CHECKOUT / given.protocol).jobs()
             labels = [
                 job.row.label for job in jobs if re.search(given.only, f"{job.scene.name}/{job.row.label}/{job.seed}")
@@ -266,6 +268,12 @@ def test_options_that_sentences_show_are_known(shown: str, capsys: pytest.Captur
             return "unrecognized" not in "".join(capsys.readouterr()).lower()
         return True
 
-    programs = [*SCRIPTS, "ns-train sadgs", "ns-train sadgs nerfstudio-data", "ns-render dataset"]
+    programs = [
+        *SCRIPTS,
+        "python -m benchmarks",
+        "ns-train sadgs",
+        "ns-train sadgs nerfstudio-data",
+        "ns-render dataset",
+    ]
     commands = [f"{name} {shown}" for name in programs] if shown.startswith("--") else [shown]
     assert shown in ("--no-deps", "--pipeline.") or any(map(is_known, commands))

@@ -13,7 +13,6 @@ import sadgs_ns
 ROOT = Path(sadgs_ns.__file__).parent
 USES = {
     # folder: the other folders that its modules may import; all may import the modules that lie flat in the package
-    "bench": {"cli", "plugin", "formats", "data", "method", "distributed", "render", "kernels"},
     "cli": {"plugin", "formats", "data", "method", "render", "kernels"},
     "plugin": {"data", "method", "distributed", "render", "kernels"},
     "formats": {"data"},

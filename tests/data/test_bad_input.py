@@ -704,7 +704,7 @@ def test_a_run_checks_its_data_once_and_other_ways_to_a_pipeline_check_them_too(
     set_up(config)
     assert checked == [first]  # ns-train
     set_up(config)
-    assert checked == [first, first]  # a program, ns-eval, sadgs-bench
+    assert checked == [first, first]  # a program, ns-eval, python -m benchmarks
     config.save_config()
     config.pipeline.datamanager.data = second
     (second / FIRST).unlink()

@@ -29,10 +29,10 @@ from nerfstudio.utils.eval_utils import eval_load_checkpoint, eval_setup
 from PIL import Image
 from tyro import cli
 
+from benchmarks import protocol, run
+from benchmarks.images import file_name
+from benchmarks.protocol import Row, Scene
 from examples.drawn_scene.scene import SPARSE_FOLDER
-from sadgs_ns.bench import protocol, run
-from sadgs_ns.bench.images import file_name
-from sadgs_ns.bench.protocol import Row, Scene
 from sadgs_ns.plugin import presets
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig

@@ -13,8 +13,8 @@ import scenes
 import torch
 from torch import Tensor
 
+from benchmarks.rasterizers import random_scene
 from sadgs_ns import kernels
-from sadgs_ns.bench.rasterizers import random_scene
 from sadgs_ns.gsplat_internals import torch_spherical_harmonics
 from sadgs_ns.method import losses
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients

@@ -125,7 +125,7 @@ import time
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from sadgs_ns.bench.timer import CompileTimer
+from benchmarks.timer import CompileTimer
 from sadgs_ns.kernels.trial import _write_one
 
 def compile():

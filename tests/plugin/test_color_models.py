@@ -12,9 +12,9 @@ from kill_and_resume import parser_of
 from runs import configure, train
 from torch import Tensor
 
+from benchmarks import exposures
+from benchmarks.evaluate import quality
 from examples.drawn_scene.scene import write_scene
-from sadgs_ns.bench import exposures
-from sadgs_ns.bench.evaluate import quality
 from sadgs_ns.method.color_matrices import anchored
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 

@@ -17,8 +17,8 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from runs import configure
 from torch import Tensor
 
+from benchmarks import phases
 from sadgs_ns import kernels
-from sadgs_ns.bench import phases
 from sadgs_ns.plugin import graphed_steps, optimizers
 from sadgs_ns.plugin.graphed_steps import Results
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig

@@ -15,7 +15,7 @@ from sadgs_ns.method.schedule import Schedule
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 LATER = (
-    "sadgs_ns.cli", "sadgs_ns.bench", "examples.drawn_scene", "pycolmap", "torchmetrics", "matplotlib.figure", "open3d",
+    "sadgs_ns.cli", "benchmarks", "examples.drawn_scene", "pycolmap", "torchmetrics", "matplotlib.figure", "open3d",
     "jinja2.sandbox", "sklearn", "skimage", "pandas", "plyfile", "wandb", "comet_ml",
 )  # fmt: skip
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sadgs_ns.bench.rasterizers import random_scene
+from benchmarks.rasterizers import random_scene
 from sadgs_ns.render import splatter
 from sadgs_ns.render.off_axis import cull_off_axis, culling, near_axis
 from sadgs_ns.render.rasterization import rasterize, visible

@@ -10,7 +10,7 @@ from unittest.mock import Mock
 import pytest
 import torch
 
-from sadgs_ns.bench.rasterizers import random_scene, render_with_gradients
+from benchmarks.rasterizers import random_scene, render_with_gradients
 from sadgs_ns.render import splatter
 from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world, visible
 
@@ -47,7 +47,7 @@ def test_cuda_gets_gsplat_unpacked(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_cpu_never_loads_gsplats_kernels() -> None:
     program = """
 import sys
-from sadgs_ns.bench.rasterizers import random_scene, render_with_gradients
+from benchmarks.rasterizers import random_scene, render_with_gradients
 import torch
 render_with_gradients(random_scene(20, 16, 0), "cpu", torch.float32)
 loaded = {"gsplat.cuda._backend", "gsplat.csrc", "gsplat_cuda"} & set(sys.modules)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from sadgs_ns.bench.rasterizers import random_scene
+from benchmarks.rasterizers import random_scene
 from sadgs_ns.render import splatter
 
 NEAR = 0.01

@@ -1,0 +1,77 @@
+"""How quality rises with time: held-out views measured within the training loop, while its clock stands still."""
+
+from __future__ import annotations
+
+import contextlib
+import random
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks import evaluate
+from benchmarks.timer import LoopTimer
+
+
+@contextlib.contextmanager
+def undisturbed(pipeline: Any) -> Iterator[None]:
+    """Put a nerfstudio pipeline in eval mode, and afterwards everything as it was.
+
+    That is the training mode, the random states of Python, numpy and torch, and what rendering notes on the model:
+    splatfacto's strategy still reads the `info` of the step's own rendering.
+    """
+    training, noted = pipeline.training, dict(vars(pipeline.model))
+    python, numpy = random.getstate(), np.random.get_state()
+    devices = [torch.cuda.current_device()] if torch.cuda.is_available() else []
+    pipeline.eval()
+    try:
+        with torch.random.fork_rng(devices):
+            yield
+    finally:
+        random.setstate(python)
+        np.random.set_state(numpy)
+        pipeline.train(training)
+        vars(pipeline.model).clear()
+        vars(pipeline.model).update(noted)
+
+
+class Curve:
+    """Measures the held-out views every so many iterations of a run.
+
+    It does so right after the optimizers' step and before what the iteration densifies: a split or an opacity reset
+    lowers quality for some steps, and methods that densify at other iterations would show it differently.
+
+    Args:
+        every: Iterations between two points.
+        timer: The run's, which is stopped meanwhile.
+    """
+
+    def __init__(self, every: int, timer: LoopTimer) -> None:
+        self.points: list[dict[str, Any]] = []
+        """By iterations: `step` (iterations done), `seconds` of the loop so far, `psnr`, `ssim`, `lpips` and
+        `gaussians`. The run's last iteration is not among them: the evaluation after the run measures it."""
+        self._every, self._timer = every, timer
+        self._networks: evaluate.Networks = {}
+
+    def attach(self, trainer: Any) -> None:
+        """Register with a nerfstudio Trainer that is set up."""
+        from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+
+        def measure(step: int) -> None:
+            pipeline = trainer.pipeline
+            with self._timer.stopped(), undisturbed(pipeline):
+                self._networks = self._networks or {"lpips": evaluate.load_lpips()}
+                views = pipeline.datamanager.fixed_indices_eval_dataloader
+                measured = evaluate.quality(pipeline.model, views, self._networks)
+            self.points.append(point(step + 1, self._timer.seconds, measured, int(pipeline.model.num_points)))
+
+        iterations = tuple(range(self._every - 1, trainer.config.max_num_iterations - 1, self._every))
+        after = TrainingCallbackLocation.AFTER_TRAIN_ITERATION
+        trainer.callbacks.insert(0, TrainingCallback([after], measure, iters=iterations))
+
+
+def point(step: int, seconds: float, measured: dict[str, float | None], gaussians: int) -> dict[str, Any]:
+    """A point of the curve, from what `evaluate.quality` measured."""
+    quality = {name: measured[name] for name in ("psnr", "ssim", "lpips")}
+    return {"step": step, "seconds": seconds, **quality, "gaussians": gaussians}

@@ -1,0 +1,108 @@
+"""Whether the folders of a benchmark's scenes hold what nerfstudio will read: asked before anything runs.
+
+nerfstudio itself asks on the terminal whether to make downscaled images that are missing; nobody is there to answer.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from PIL import Image
+
+from benchmarks.protocol import Job
+
+if TYPE_CHECKING:
+    from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+
+
+def runnable(jobs: Sequence[Job], root: Path, source: str | None = None, skip_missing: bool = False) -> list[Job]:
+    """The jobs whose scenes are there, after building every config once.
+
+    Args:
+        root: Folder that holds all scenes.
+        source: What the data are called and where they come from, for the error.
+        skip_missing: Leave out scenes that are missing, with a line on stderr, instead of raising.
+
+    Raises:
+        ValueError: A scene is missing (all of them with `skip_missing`), or as `build_config`; one sentence.
+    """
+    from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+
+    from benchmarks.run import build_config
+
+    missing = {}
+    checked = set()
+    for job in {(job.scene.name, job.row.label): job for job in jobs}.values():
+        name, folder = job.scene.name, root / job.scene.data
+        if not folder.exists():
+            missing[name] = f"{folder} does not exist"
+            continue
+        config: Any = build_config(job.scene, job.row, job.seed, root, Path("unused"))
+        parser = config.pipeline.datamanager.dataparser
+        if name in checked or not isinstance(parser, ColmapDataParserConfig):
+            continue
+        checked.add(name)
+        try:
+            names = image_names(parser, folder)
+        except FileNotFoundError as error:
+            missing[name] = str(error)
+            continue
+        if parser.eval_mode == "interval" and names != sorted(names):
+            print(
+                f"scene {name!r}: COLMAP numbered its images in another order than their names', so every "
+                f"{parser.eval_interval}th view is not the one that papers hold out: compare with no published number.",
+                file=sys.stderr,
+            )
+    if not missing:
+        return list(jobs)
+    what = ", ".join(f"scene {name!r}: {text}" for name, text in missing.items())
+    remedy = f"check --scenes or get {source}" if source else "check --scenes"
+    left = [job for job in jobs if job.scene.name not in missing]
+    if not left:
+        raise ValueError(f"{what}; {remedy}.")
+    there = ", ".join(dict.fromkeys(job.scene.name for job in left))
+    if not skip_missing:
+        raise ValueError(f"{what}; {remedy}. --skip-missing runs the others: {there}.")
+    print(f"Left out: {what}. Running {there}.", file=sys.stderr)
+    return left
+
+
+def image_names(parser: ColmapDataParserConfig, data: Path) -> list[str]:
+    """Names of a COLMAP scene's images in the order in which nerfstudio holds out every n-th.
+
+    Args:
+        parser: How nerfstudio will read the scene.
+        data: The scene's folder.
+
+    Raises:
+        FileNotFoundError: The model, the folder of (downscaled) images or an image is missing; names the path.
+    """
+    from nerfstudio.data.dataparsers.colmap_dataparser import MAX_AUTO_RESOLUTION
+    from nerfstudio.data.utils import colmap_parsing_utils as colmap
+
+    model, images = data / parser.colmap_path, data / parser.images_path
+    if (model / "cameras.txt").exists():  # nerfstudio's order of preference
+        views = colmap.read_images_text(model / "images.txt")
+    elif (model / "cameras.bin").exists():
+        views = colmap.read_images_binary(model / "images.bin")
+    else:
+        raise FileNotFoundError(f"{model} holds no COLMAP model")
+    names = [views[index].name for index in sorted(views)]
+    factor = parser.downscale_factor
+    if factor is None:
+        if not (images / names[0]).exists():
+            raise FileNotFoundError(f"{images / names[0]} does not exist")
+        with Image.open(images / names[0]) as image:
+            longest, factor = max(image.size), 1
+        while longest / factor > MAX_AUTO_RESOLUTION:
+            factor *= 2
+    folder = images if factor == 1 else images.with_name(f"{images.name}_{factor}")
+    if not folder.exists():
+        raise FileNotFoundError(f"{folder} does not exist")
+    absent = [name for name in names if not (folder / name).exists()]
+    if absent:
+        raise FileNotFoundError(f"{folder} lacks {len(absent)} of {len(names)} images, such as {absent[0]}")
+    return names

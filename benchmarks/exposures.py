@@ -1,0 +1,130 @@
+"""`python -m benchmarks exposures SCENE OUT`: a copy of a COLMAP scene with known exposures and white balances.
+
+Each training photo gets a gain in linear light, so that the gains' logarithms are evenly spread and the largest is
+`--spread` times the smallest, and factors of its channels of up to `--white-balance`, whose product is 1. Every 8th
+view from 0 and from 4, a test and a validation view, gets the geometric mean of the gains and no factors: what is
+learned can be compared with it without fitting its colours first. By default that mean is the largest one, `--mean`, at
+which no pixel saturates that was not saturated before.
+
+`exposures.json` beside the images holds gain and factors of each photo. With `--spread 1 --white-balance 0 --mean M`
+the copy is the control: its photos all have the exposure that the held-out ones of the other copy have.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from numpy.typing import NDArray
+from PIL import Image
+
+from benchmarks import command_lines
+from benchmarks.datasets import image_names
+from benchmarks.validation import INTERVAL, SPARSE, TEST, VALIDATION
+
+FILE = "exposures.json"
+"""Name of the file with the gains."""
+JPEG: dict[str, Any] = {"quality": 98, "subsampling": 0}
+"""Options with which JPEG files are written: the gains are to be the only difference that can be seen."""
+
+
+def draw_gains(
+    views: int, spread: float, white_balance: float, mean: float, seed: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Draw the gains of photos.
+
+    Args:
+        views: Number of photos, at least 1.
+        spread: Largest gain over the smallest one, at least 1.
+        white_balance: Largest change of a channel as a share, in [0, 1).
+        mean: Geometric mean of the gains.
+        seed: Which photo gets which gain.
+
+    Returns:
+        Gains, the logarithms of which are evenly spread, [V] and the channels' factors, each photo's of product 1
+        [V, 3].
+    """
+    generator = np.random.default_rng(seed)
+    gains = mean * spread ** (generator.permutation(views) / max(views - 1, 1) - 0.5 * (views > 1))
+    factors = generator.uniform(-1, 1, (views, 3))
+    factors -= factors.mean(axis=1, keepdims=True)
+    # Less their mean, factors can be up to 4/3 as large.
+    return gains, (1 + white_balance) ** (0.75 * factors)
+
+
+def linear_light(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the linear light in [0, 1] that sRGB's values in [0, 1] stand for."""
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
+
+def srgb_values(light: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return sRGB's values in [0, 1] of linear light in [0, 1]; the inverse of `linear_light`."""
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def with_gains(image: NDArray[np.uint8], gains: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Multiply the linear light of an image [H, W, 3] by a gain for each channel [3]; what exceeds 1 saturates."""
+    levels = linear_light(np.arange(256) / 255.0)  # [256]
+    table = np.rint(255 * srgb_values((levels[:, None] * gains).clip(0, 1))).astype(np.uint8)  # [256, 3]
+    return np.stack([table[image[..., channel], channel] for channel in range(3)], axis=-1)
+
+
+def write_scene(
+    scene: Path, out: Path, spread: float, white_balance: float, mean: float, seed: int
+) -> dict[str, dict[str, Any]]:
+    """Write the copy; an earlier one is replaced.
+
+    Returns:
+        What the file of gains holds: gain and channels' factors of each photo by its name, and whether it is held out.
+
+    Raises:
+        FileNotFoundError: The model or an image is missing; names the path.
+    """
+    names = image_names(ColmapDataParserConfig(colmap_path=SPARSE, downscale_factor=1), scene)
+    held_out = [i % INTERVAL in (TEST, VALIDATION) for i in range(len(names))]
+    gains, factors = draw_gains(held_out.count(False), spread, white_balance, mean, seed)
+    drawn = iter(zip(gains, factors, strict=True))
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    (out / "sparse").symlink_to((scene / "sparse").resolve())
+    written: dict[str, dict[str, Any]] = {}
+    for name, holds_out in zip(names, held_out, strict=True):
+        gain, of_channels = (mean, np.ones(3)) if holds_out else next(drawn)
+        with Image.open(scene / "images" / name) as image:
+            changed = Image.fromarray(with_gains(np.asarray(image.convert("RGB")), gain * of_channels))
+        path = out / "images" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        changed.save(path, **(JPEG if path.suffix.lower() in (".jpg", ".jpeg") else {}))
+        written[name] = {"gain": float(gain), "channels": of_channels.tolist(), "held_out": holds_out}
+    (out / FILE).write_text(json.dumps(written, indent=1) + "\n")
+    return written
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Write a copy and print its gains' range; returns the exit code, 2 where the scene or an option is wrong."""
+    given = command_lines.exposures().parse_args(argv)
+    largest = (1 + given.white_balance) ** -1 * given.spread**-0.5
+    mean = largest if given.mean is None else given.mean
+    problem = None
+    if not (given.scene / SPARSE).is_dir():
+        problem = f"{given.scene} holds no {SPARSE}; give the folder of a COLMAP scene."
+    elif given.out.exists() and not (given.out / FILE).exists():
+        problem = f"{given.out} is there and holds no {FILE}, so that it is no earlier copy; give another folder."
+    elif not (given.spread >= 1 and 0 <= given.white_balance < 1 and 0 < mean <= 1):
+        problem = "--spread must be at least 1, --white-balance in [0, 1), and --mean in (0, 1]."
+    if problem is not None:
+        print(f"python -m benchmarks exposures: {problem}", file=sys.stderr)
+        return 2
+    written = write_scene(given.scene, given.out, given.spread, given.white_balance, mean, given.seed)
+    gains = [photo["gain"] for photo in written.values() if not photo["held_out"]]
+    print(
+        f"{given.out}: gains of {len(gains)} training photos from {min(gains):.3f} to {max(gains):.3f}, "
+        f"of {len(written) - len(gains)} held-out ones {mean:.3f}"
+    )
+    return 0

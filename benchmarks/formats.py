@@ -1,0 +1,96 @@
+"""What the files of `sadgs-export` take and lose: `python -m benchmarks formats RUN` on any machine.
+
+It writes a run in every format, reads the lossy ones back with gsply, which is not ours, renders the held-out views,
+and prints sizes and PSNRs as a markdown table. glTF loses nothing, and a page holds the SOG.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from benchmarks import command_lines
+from sadgs_ns.cli.export import export
+from sadgs_ns.data.run_cameras import RunCameras, read_cameras
+from sadgs_ns.formats.files import SUFFIXES
+from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world
+
+_LOSSY = (".compressed.ply", ".spz", ".sog")
+
+
+@torch.no_grad()
+def render(path: Path, cameras: RunCameras, device: torch.device) -> list[Tensor]:
+    """Render what gsply reads from a file, before black.
+
+    Args:
+        path: A PLY, compressed PLY, SPZ or SOG.
+        cameras: C cameras in the file's frame.
+        device: Where to render.
+
+    Returns:
+        C images in [0, 1]. [H, W, 3]
+    """
+    import gsply
+    from gsply.sog_reader import sogread
+    from gsply.spz import read_spz
+
+    read: Any = {".spz": read_spz, ".sog": sogread}.get(path.suffix, gsply.plyread)
+    data = read(str(path))
+    rest = np.zeros((len(data.means), 0, 3), np.float32) if data.shN is None else data.shN
+    harmonics = torch.from_numpy(np.concatenate([data.sh0[:, None], rest], axis=1)).to(device)
+    parts = [torch.from_numpy(np.ascontiguousarray(part)).to(device) for part in (data.means, data.quats, data.scales)]
+    opacities = torch.from_numpy(data.opacities).flatten().to(device).sigmoid()
+    viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds).to(device)
+    images = []
+    for viewmat, K, (width, height) in zip(viewmats, cameras.Ks.to(device), cameras.sizes, strict=True):
+        means, quats, scales = parts
+        view = viewmat[None], K[None], width, height
+        degree = round(harmonics.shape[1] ** 0.5) - 1
+        image, _, _ = rasterize(means, quats, scales.exp(), opacities, harmonics, *view, sh_degree=degree)
+        images.append(image[0].clamp(0, 1).cpu())
+    return images
+
+
+def psnr(images: Sequence[Tensor], others: Sequence[Tensor]) -> float:
+    """Return the mean PSNR of pairs of images in [0, 1], in dB."""
+    return float(np.mean([-10 * (a - b).square().mean().log10() for a, b in zip(images, others, strict=True)]))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Print the table; returns the exit code, 1 where gsply is missing."""
+    options = command_lines.formats().parse_args(argv)
+    try:
+        import gsply
+    except ImportError:
+        print("The files are read back with gsply, which is not there: pip install -e '.[dev]' -c constraints.txt.")
+        return 1
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    paths = {suffix: options.output / f"splat{suffix}" for suffix in SUFFIXES}
+    for path in paths.values():
+        count = export(options.run, path, data=options.data)
+    folder = options.run if options.run.is_dir() else options.run.parent
+    cameras = read_cameras(folder, options.data, split="test")
+    photos = [torch.from_numpy(np.asarray(Image.open(path).convert("RGB")) / 255).float() for path in cameras.photos]
+    before = render(paths[".ply"], cameras, device)
+    print(f"{count:,} Gaussians, {len(photos)} held-out views, rendered on {device.type}, gsply {gsply.__version__}.\n")
+    print("| format | MB | of the PLY | PSNR of the held-out views | PSNR to the PLY's rendering |")
+    print("| --- | ---: | ---: | ---: | ---: |")
+    whole = paths[".ply"].stat().st_size
+    for suffix, path in paths.items():
+        size = path.stat().st_size
+        cells = ["as the SOG" if suffix == ".html" else "as the PLY", ""]
+        if suffix in (".ply", *_LOSSY):
+            after = before if suffix == ".ply" else render(path, cameras, device)
+            cells = [f"{psnr(after, photos):.2f} dB", "" if suffix == ".ply" else f"{psnr(after, before):.1f} dB"]
+        print(f"| `{suffix}` | {size / 1e6:.2f} | {100 * size / whole:.0f} % | {cells[0]} | {cells[1]} |")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

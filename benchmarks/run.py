@@ -1,0 +1,372 @@
+"""One training run, measured, in a process of its own: `python -m benchmarks.run --spec JSON --out FILE`.
+
+The spec is a `protocol.Job` as a dict, with "root", the folder that holds all scenes, and "images", the folder for
+renderings or null. Nothing heavy is imported before
+the clock runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import copy
+import datetime
+import importlib.metadata
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+import urllib.error
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from benchmarks.protocol import Job, Row, Scene, set_dotted
+
+if TYPE_CHECKING:
+    from nerfstudio.engine.trainer import TrainerConfig
+
+TRAIN_VIEWS = 4
+"""Training views whose PSNR is measured, to tell overfitting from underfitting."""
+
+
+def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> TrainerConfig:
+    """The nerfstudio config of a run.
+
+    Args:
+        root: Folder that holds all scenes.
+        work: Folder for what nerfstudio writes.
+
+    Raises:
+        ValueError: Unknown method, dataparser or setting, or no data; one sentence that names it.
+    """
+    import torch
+    from nerfstudio.configs.dataparser_configs import all_dataparsers
+    from nerfstudio.configs.method_configs import all_methods
+    from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
+    from nerfstudio.engine.trainer import TrainerConfig
+
+    from sadgs_ns.data.automatic import PARSERS
+    from sadgs_ns.plugin.trainer import SadgsTrainerConfig
+
+    config = copy.deepcopy(all_methods.get(row.method))
+    if not isinstance(config, TrainerConfig):
+        raise ValueError(f"row {row.label!r}: nerfstudio has no method {row.method!r}; install its package.")
+    datamanager = config.pipeline.datamanager
+    if not isinstance(datamanager, FullImageDatamanagerConfig):
+        raise ValueError(f"row {row.label!r}: {row.method!r} trains on rays; give a Gaussian splatting method.")
+    name = "blender-data" if scene.dataparser == "blender" else scene.dataparser
+    if name not in all_dataparsers:
+        known = ", ".join(sorted(all_dataparsers))
+        raise ValueError(f"scene {scene.name!r}: nerfstudio has no dataparser {name!r}; give one of {known}.")
+    if not (root / scene.data).exists():
+        raise ValueError(f"scene {scene.name!r}: {root / scene.data} does not exist; check --scenes.")
+    # As `ns-train METHOD PARSER` does: the method's own settings of its default parser, which may read SfM points.
+    own, registered = datamanager.dataparser, all_dataparsers[name]
+    if isinstance(config, SadgsTrainerConfig):
+        registered = PARSERS[name]
+    dataparser = copy.deepcopy(own if type(own) is type(registered) else registered)
+    for path, value in scene.options.items():
+        set_dotted(dataparser, path, value)
+    datamanager.dataparser = dataparser
+    datamanager.data = root / scene.data
+    for path, value in row.overrides.items():
+        set_dotted(config, path, value)
+
+    # The trainer compares `vis` with the names of viewers and event writers: any other value means no viewer (which
+    # would take GPU time and wait at the end), no event files and, without those, no evaluation within the loop.
+    config.vis = "none"  # type: ignore[assignment]
+    config.logging.local_writer.enable = False
+    config.logging.profiler = "none"
+    config.steps_per_save = 0
+    if isinstance(config, SadgsTrainerConfig):
+        config.seconds_per_save = 0
+    config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 0
+    config.output_dir = work
+    config.machine.seed = seed
+    datamanager.train_cameras_sampling_seed = seed  # nerfstudio's own generator: the seed above leaves it alone
+    if not torch.cuda.is_available():
+        config.machine.device_type = "cpu"
+        datamanager.cache_images = "gpu"  # "the model's device"; "cpu" pins memory, which needs CUDA
+    config.set_timestamp()
+    base = config.get_base_dir()
+    written = (config.get_checkpoint_dir(), base / config.logging.relative_log_dir)
+    for path in (*written, base / config.viewer.relative_log_filename):
+        if not path.resolve().is_relative_to(work.resolve()):
+            raise ValueError(f"row {row.label!r} on {scene.name!r}: it would write {path}, outside the run's folder.")
+    return config
+
+
+def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dict[str, Any]:
+    """Train once and measure.
+
+    Args:
+        root: Folder that holds all scenes.
+        work: Folder for what nerfstudio writes; the caller deletes it.
+        images: Folder for renderings of held-out views; None makes none.
+
+    Returns:
+        JSON-ready. Times in s:
+            import_seconds, setup_seconds, initialization_seconds, load_seconds, warmup_seconds,
+            structure_tensor_seconds: One after the other, before the loop. `initialization` makes the model from the
+                points (with splatfacto it also loads LPIPS); `setup` is parsing the data and all else that nerfstudio
+                builds; `structure_tensor` is there only where the method has them.
+            loop_seconds: The training loop, nothing else.
+            train_seconds: The loop and the checkpoint after it.
+            wall_seconds: Everything from the first import to the saved checkpoint.
+            compile_seconds: What Triton took to compile kernels, in a machine's first run, added up over those that are
+                compiled side by side in the setup; of them loop_compile_seconds in the loop.
+            evaluation_seconds: After it.
+        Over the held-out views: `psnr` in dB, `ssim`, `ssim_padded`, `lpips`, `lpips_vgg` (None without weights; see
+        `evaluate`); and `train_psnr` over some training views, `fps`, `gaussians`, `peak_gb`, how many views there
+        were, the machine's `gpu`.
+            view_psnr, ply_view_psnr: PSNR of each held-out view, and with the near plane of other programs' viewers.
+            view_names, view_angles, view_uncovered: Of each; see `coverage_of_views`.
+            phases: Milliseconds a step, by phase; see `phases.measure`.
+            launches: Launches, waits and the device's load in a step; see `launches.measure`. None without CUDA.
+            curve: Only if the job asks for it: the points of `curve.Curve`, the last one being the finished run.
+                None of the times above contains its evaluations.
+            images: Only with `images`: the renderings' paths in that folder.
+        Where torchrun started several processes, which train one splat on `devices` of them, the first measures all
+        but `phases`, `launches` and `curve`: its checkpoint is evaluated on one device, S̄ is computed in the loop, and
+        `peak_gb` is the first device's. The others return nothing.
+
+    Raises:
+        ValueError: As `build_config`.
+        RuntimeError: The training loop stopped early, or whatever the method raises.
+    """
+    seconds: dict[str, float] = {}
+    start = time.perf_counter()
+    import torch
+
+    # ns-train's own module: importing it also sets cuDNN as in a user's run.
+    from nerfstudio.scripts.train import _set_random_seed
+
+    from benchmarks import evaluate, launches, phases
+    from benchmarks import images as pictures
+    from benchmarks.curve import Curve, point
+    from benchmarks.timer import CompileTimer, LoopTimer
+    from sadgs_ns.plugin import processes
+
+    devices = processes.number_of_processes()
+    seconds["import_seconds"] = time.perf_counter() - start
+
+    @contextlib.contextmanager
+    def timed(name: str) -> Iterator[None]:
+        begin = evaluate.now()
+        yield
+        seconds[f"{name}_seconds"] = evaluate.now() - begin
+
+    def timed_initialization(populate_modules: Callable[[Any], None]) -> Callable[[Any], None]:
+        def populate(model: Any) -> None:
+            with timed("initialization"):
+                populate_modules(model)
+
+        return populate
+
+    compiling = CompileTimer()
+    with timed("setup"), compiling:
+        config = build_config(job.scene, job.row, job.seed, root, work)
+        _set_random_seed(job.seed)
+        trainer: Any = config.setup(local_rank=int(os.environ.get("LOCAL_RANK", "0")), world_size=devices)
+        with phases.replaced(config.pipeline.model._target, "populate_modules", timed_initialization):
+            trainer.setup(test_mode="test")  # "val" would evaluate on blender's validation views
+    seconds["setup_seconds"] -= seconds["initialization_seconds"]
+    if devices > 1 and getattr(trainer, "shards", None) is None:
+        raise ValueError(
+            f"row {job.row.label!r} on {job.scene.name!r} trains on one device, since its steps have few pixels or its "
+            "method knows one only: measure it with one GPU, or set share_always to true."
+        )
+    pipeline, datamanager, model = trainer.pipeline, trainer.pipeline.datamanager, trainer.pipeline.model
+    with timed("load"):  # else the first iteration decodes all images
+        train_images, _ = datamanager.cached_train, datamanager.cached_eval
+    if devices == 1:  # A model that several processes share draws nothing alone, and compiles in the setup.
+        # gsplat's, Triton's and torch.compile's kernels build at the first call, once per machine.
+        with timed("warmup"), compiling:
+            camera = datamanager.train_dataset.cameras[:1].to(trainer.device)
+            pipeline.eval()
+            outputs = model.get_outputs(camera)
+            losses = model.get_loss_dict(outputs, train_images[0]).values()
+            torch.stack(list(losses)).sum().backward()  # the first step forgets the gradients
+            with torch.no_grad():
+                model.get_outputs(camera)
+            pipeline.train()
+        if hasattr(pipeline, "structure_maps"):  # splatfacto's pipeline has none
+            with timed("structure_tensor"), compiling:
+                _ = pipeline.structure_maps.codes
+
+    timer, curve = LoopTimer(), None
+    if job.row.curve_every is not None and devices == 1:
+        curve = Curve(job.row.curve_every, timer)
+        curve.attach(trainer)
+    timer.attach(trainer)
+    before_loop = compiling.seconds
+    with timed("train"), compiling:
+        trainer.train()
+    seconds["train_seconds"] -= timer.stopped_seconds
+    wall = time.perf_counter() - start - timer.stopped_seconds
+    if not timer.finished:
+        raise RuntimeError("the training loop stopped before its last iteration.")
+    if devices > 1:
+        if not processes.is_first():
+            return {}
+        trainer = alone(job, root, work, trainer.checkpoint_dir)
+        pipeline, datamanager, model = trainer.pipeline, trainer.pipeline.datamanager, trainer.pipeline.model
+        train_images = datamanager.cached_train
+
+    pipeline.eval()
+    views = datamanager.fixed_indices_eval_dataloader
+    with timed("evaluation"):
+        networks = {"lpips": evaluate.load_lpips(), "lpips_vgg": evaluate.load_lpips_vgg()}
+        held_out = evaluate.quality(model, views, networks)
+        indices = torch.linspace(0, len(train_images) - 1, TRAIN_VIEWS).long().unique().tolist()
+        train_cameras = datamanager.train_dataset.cameras
+        train_views = [(train_cameras[i : i + 1].to(trainer.device), train_images[i]) for i in indices]
+        train_psnr = evaluate.quality(model, train_views, {})["psnr"]
+        fps = evaluate.frames_per_second(model, [camera for camera, _ in views])
+        held_out["ply_view_psnr"] = evaluate.view_psnr_in_viewers(model, views, held_out["view_psnr"])
+    record = {
+        "devices": devices,
+        "iterations": trainer.config.max_num_iterations,
+        "views_per_iteration": getattr(pipeline, "views_per_iteration", 1),
+        "loop_seconds": timer.seconds,
+        **seconds,
+        "wall_seconds": wall,
+        "compile_seconds": compiling.seconds,
+        "loop_compile_seconds": compiling.seconds - before_loop,
+        **held_out,
+        **coverage_of_views(datamanager, model),
+        "train_psnr": train_psnr,
+        "fps": fps,
+        "gaussians": int(model.num_points),
+        "peak_gb": timer.peak_gb,
+        "train_views": len(train_images),
+        "eval_views": len(views),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+    }
+    if curve is not None:
+        end = point(trainer.config.max_num_iterations, timer.seconds, held_out, int(model.num_points))
+        record["curve"] = [*curve.points, end]
+    if images is not None:
+        where = (images, job.scene.name, job.row.label, job.seed)
+        record["images"] = pictures.save(model, views, record["view_names"], *where)
+    if devices == 1:
+        record["phases"] = phases.measure(trainer)  # from here on the model is trained further
+        record["launches"] = launches.measure(trainer)
+    return record
+
+
+def coverage_of_views(datamanager: Any, model: Any) -> dict[str, list[Any]]:
+    """Tell how far the held-out views are from the training views, in the order in which they are evaluated.
+
+    Without SfM points, the centres of the model's Gaussians are the points. The images must be loaded, because that
+    takes the distortion from the cameras.
+
+    Returns:
+        The images' names without suffix, and what `coverage` measures: degrees and shares, None in place of NaN.
+    """
+    from benchmarks.coverage import Views, nearest_angles, uncovered_shares
+
+    training, held_out = datamanager.train_dataset, datamanager.eval_dataset
+    points = training.metadata.get("points3D_xyz")
+    points = (model.means.detach() if points is None or not len(points) else points).to(model.device)
+    there, known = (Views.of(dataset.cameras.to(model.device)) for dataset in (held_out, training))
+
+    def rounded(values: Any, digits: int) -> list[float | None]:
+        return [None if math.isnan(value) else round(value, digits) for value in values.tolist()]
+
+    return {
+        "view_names": [Path(path).stem for path in held_out.image_filenames],
+        "view_angles": rounded(nearest_angles(there, known, points), 1),
+        "view_uncovered": rounded(uncovered_shares(there, known, points), 3),
+    }
+
+
+def alone(job: Job, root: Path, work: Path, checkpoint: Path) -> Any:
+    """Return a trainer in which this process has all of what several have trained and have left by now.
+
+    Args:
+        checkpoint: Folder of the checkpoint that they wrote.
+    """
+    for name in [
+        name for name in os.environ if name in ("RANK", "WORLD_SIZE") or name.startswith(("LOCAL_", "GROUP_"))
+    ]:
+        del os.environ[name]
+    config = build_config(job.scene, job.row, job.seed, root, work)
+    config.load_dir = checkpoint
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup(test_mode="test")
+    return trainer
+
+
+def software() -> dict[str, str | None]:
+    """Versions, of what was imported where that tells its own, and the git commit if this package is a checkout."""
+    versions: dict[str, str | None] = {}
+    for name in ("torch", "gsplat", "nerfstudio", "sadgs_ns"):
+        try:
+            # Two installations in one folder have two metadata, of which the first need not be what runs.
+            versions[name] = getattr(sys.modules.get(name), "__version__", None) or importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            versions[name] = None
+    return {**versions, "commit": _commit(Path(__file__).resolve().parents[1])}
+
+
+def _commit(checkout: Path) -> str | None:
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(checkout), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        # Not the commit of some repository that happens to hold a virtual environment.
+        if Path(git("rev-parse", "--show-toplevel")) != checkout:
+            return None
+        return git("describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def describe(error: Exception) -> str:
+    """One sentence for a run that failed."""
+    if isinstance(error, (urllib.error.URLError, ConnectionError, TimeoutError)):
+        return (
+            "nerfstudio could not download the LPIPS weights; set TORCH_HOME to a folder that holds "
+            "hub/checkpoints/alexnet-owt-7be5be79.pth."
+        )
+    lines = str(error).strip().splitlines()
+    message = lines[0] if lines else "no message"
+    return message if isinstance(error, ValueError) else f"{type(error).__name__}: {message}"
+
+
+def main() -> None:
+    """Run a spec and write its result, also that of a run that fails."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.run", description="Measure one training run.")
+    parser.add_argument("--spec", required=True, help="JSON of a job, with the root of the scenes")
+    parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
+    arguments, rank = parser.parse_args(), os.environ.get("RANK", "0")
+    spec = json.loads(arguments.spec)
+    job = Job(Scene(**spec["scene"]), Row(**spec["row"]), spec["seed"])
+    images = None if spec["images"] is None else Path(spec["images"])
+    record = {
+        "status": "ok",
+        "error": None,
+        "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
+    }
+    with tempfile.TemporaryDirectory(dir=arguments.out.parent) as work:
+        try:
+            record |= run_row(job, Path(spec["root"]), Path(work), images)
+        except Exception as error:
+            traceback.print_exc()
+            record |= {"status": "failed", "error": describe(error)}
+    record["versions"] = software()
+    if rank == "0":
+        arguments.out.write_text(json.dumps(record))
+    if record["status"] == "failed" and "WORLD_SIZE" in os.environ:
+        raise SystemExit(1)  # The other processes would wait for this one.
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,150 @@
+"""`python -m benchmarks validation ROOT OUT`: scenes whose validation views are held out, for choosing rules.
+
+Test views are for tables alone. This writes a copy of each scene of a folder (images are links) in which every 8th view
+from 0, a test view, is gone, and every 8th from 4 is held out. Where the scene names its own test views (a
+`transforms.json` with lists of file names), every 8th training view from 4 is held out instead. With `--folds 2,4,6`,
+there are copies NAME-2, NAME-4 and NAME-6, in each of which every 8th view from that number is held out. Fold 0 holds
+out the test views and trains on all others, as the tables do. With `--masked`, a rectangle in each training view,
+somewhere else in each and a quarter of it in all, is masked; held-out views are whole. With `--noisy`, the camera of
+each training view is turned by a random angle, and those of held-out views are true.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from benchmarks import command_lines
+from benchmarks.datasets import image_names
+
+SPARSE = Path("sparse/0")
+"""Folder of a COLMAP scene's model."""
+INTERVAL, TEST, VALIDATION = 8, 0, 4
+"""Every 8th view from 0 is a test view, every 8th from 4 a validation view."""
+MASKED_SHARE = 0.25
+"""Share of a training view's pixels that `--masked` masks."""
+NOISY_DEGREES = 0.1
+"""Standard deviation of the angle by which `--noisy` turns a camera about each of its axes: 2 px at a focal length of
+1,150 px."""
+
+
+def write_colmap(scene: Path, out: Path, masked: bool = False, fold: int = VALIDATION) -> tuple[int, int]:
+    """Write one COLMAP scene with the lists that nerfstudio's parser reads.
+
+    Args:
+        scene: Folder with `images` and `sparse/0`.
+        out: Folder to write; one that is there is replaced.
+        masked: Whether to write `masks`, too.
+        fold: Number of the first view that is held out, in [0, 7]. Test views are in the training views of no fold.
+
+    Returns:
+        Numbers of training and of held-out views.
+
+    Raises:
+        FileNotFoundError: The model or an image is missing; names the path.
+    """
+    names = image_names(ColmapDataParserConfig(colmap_path=SPARSE, downscale_factor=1), scene)
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    for name in ("images", "sparse"):
+        (out / name).symlink_to((scene / name).resolve())
+    held_out = names[fold::INTERVAL]
+    train = [name for i, name in enumerate(names) if i % INTERVAL not in (TEST, fold)]
+    for split, chosen in {"train": train, "test": held_out, "val": held_out}.items():
+        (out / f"{split}_list.txt").write_text("\n".join(chosen))
+    for i, name in enumerate(names if masked else ()):
+        with Image.open(scene / "images" / name) as image:
+            mask = np.full(image.size[::-1], 255, np.uint8)
+        if name in train:
+            generator = np.random.default_rng(i)
+            height, width = (int(side * MASKED_SHARE**0.5) for side in mask.shape)
+            row, column = generator.integers(mask.shape[0] - height), generator.integers(mask.shape[1] - width)
+            mask[row : row + height, column : column + width] = 0
+        path = (out / "masks" / name).with_suffix(".png")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(mask).save(path)
+    return len(train), len(held_out)
+
+
+def turn_cameras(out: Path) -> None:
+    """Turn the training cameras of a copy about their centres, by NOISY_DEGREES, the same at each call.
+
+    Args:
+        out: Folder that `write_colmap` wrote.
+    """
+    import pycolmap  # Pillow cannot write PNGs if it is loaded after this.
+
+    model = pycolmap.Reconstruction(out / SPARSE)
+    train = set((out / "train_list.txt").read_text().splitlines())
+    generator = np.random.default_rng(0)
+    for image in sorted(model.images.values(), key=lambda image: image.name):
+        turn = Rotation.from_rotvec(generator.normal(0, NOISY_DEGREES, 3), degrees=True)
+        if image.name in train:
+            pose = image.cam_from_world()
+            matrix = turn.as_matrix() @ pose.matrix()
+            image.frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(matrix))
+    (out / "sparse").unlink()  # It was a link.
+    (out / SPARSE).mkdir(parents=True)
+    model.write(out / SPARSE)
+
+
+def write_transforms(scene: Path, out: Path, fold: int = VALIDATION) -> tuple[int, int]:
+    """Write one scene of a `transforms.json` that lists its splits, with every 8th training view held out.
+
+    Args:
+        scene, out: As for `write_colmap`.
+        fold: Number of the first training view that is held out, in [1, 7]; 0 holds out the listed test views.
+
+    Returns:
+        Numbers of training and of held-out views.
+    """
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    for path in scene.iterdir():
+        if path.name != "transforms.json":
+            (out / path.name).symlink_to(path.resolve())
+    content = json.loads((scene / "transforms.json").read_text())
+    names = content["train_filenames"]
+    held_out = content["test_filenames"] if fold == TEST else names[fold::INTERVAL]
+    train = [name for name in names if name not in held_out]
+    listed = {*train, *held_out}
+    content["frames"] = [frame for frame in content["frames"] if frame["file_path"] in listed]
+    content |= {"train_filenames": train, "val_filenames": held_out, "test_filenames": held_out}
+    (out / "transforms.json").write_text(json.dumps(content))
+    return len(train), len(held_out)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Write the scenes and print how many views each has; returns the exit code, 2 where the input is wrong."""
+    arguments = command_lines.validation().parse_args(argv)
+    folds = [str(VALIDATION)] if arguments.folds is None else arguments.folds.split(",")
+    if not {*folds} <= {str(fold) for fold in range(INTERVAL)}:
+        problem = f"--folds must be whole numbers from 0 to {INTERVAL - 1}, such as 2,4,6, not {arguments.folds!r}."
+        print(f"python -m benchmarks validation: {problem}", file=sys.stderr)
+        return 2
+    folders = sorted(path for path in arguments.root.iterdir() if path.is_dir()) if arguments.root.is_dir() else []
+    scenes = [path for path in folders if (path / SPARSE).is_dir() or (path / "transforms.json").exists()]
+    if not scenes:
+        print(f"{arguments.root} holds no folder with {SPARSE} or transforms.json: give the folder of the scenes.")
+        return 2
+    for scene, fold in ((scene, int(fold)) for scene in scenes for fold in folds):
+        name = scene.name if arguments.folds is None else f"{scene.name}-{fold}"
+        if (scene / SPARSE).is_dir():
+            train, held_out = write_colmap(scene, arguments.out / name, fold=fold)
+            if scene.name in arguments.masked:
+                write_colmap(scene, arguments.out / f"{name}-masked", masked=True, fold=fold)
+            if scene.name in arguments.noisy:
+                write_colmap(scene, arguments.out / f"{name}-noisy", fold=fold)
+                turn_cameras(arguments.out / f"{name}-noisy")
+        else:
+            train, held_out = write_transforms(scene, arguments.out / name, fold)
+        print(f"{name}: {train} training views, {held_out} held-out views")
+    return 0

@@ -1,0 +1,128 @@
+"""`python -m benchmarks views RESULTS.jsonl …`: the PSNR of each held-out view, and where it collapses.
+
+The reference of a view is the best label's median over seeds of its PSNR. A view collapses in a run whose PSNR lies
+COLLAPSE dB or more under it. With `--references` the runs of these files alone make references, which so stay the same.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks import command_lines, results, table
+from benchmarks.results import Result
+
+COLLAPSE = 3.0
+"""Difference from the reference at which a view collapses, in dB."""
+Runs = Mapping[str, Sequence[Result]]
+"""The runs of one scene by their labels, one a seed."""
+
+
+def load(paths: Iterable[Path]) -> dict[str, dict[str, list[Result]]]:
+    """Read the latest runs by scene and label; those without `view_psnr` are left out with one line on stderr.
+
+    Raises:
+        ValueError: A file is missing, or a line of it is no result; names it.
+    """
+    rows: list[Result] = []
+    for path in paths:
+        if not path.is_file():
+            raise ValueError(f"{path} is not a file; give one that python -m benchmarks wrote.")
+        rows += results.read(path, strict=True)
+    found: dict[str, dict[str, list[Result]]] = {}
+    for row in (latest := table.latest(rows)):
+        if row.get("view_psnr"):
+            found.setdefault(row["scene"], {}).setdefault(row["label"], []).append(row)
+    if without := [row["key"] for row in latest if not row.get("view_psnr")]:
+        print(f"Runs without view_psnr are skipped, {len(without)} of them, such as {without[0]}.", file=sys.stderr)
+    return found
+
+
+def view_names(scene: str, runs: Iterable[Result]) -> list[str]:
+    """Return the names of a scene's held-out views, or their numbers if no run tells names.
+
+    Raises:
+        ValueError: Two runs have different numbers of views, or different names.
+    """
+    told = [(len(row["view_psnr"]), row.get("view_names")) for row in runs]
+    names = next((names for _, names in told if names), [str(view) for view in range(told[0][0])])
+    if any(count != len(names) or (others or names) != names for count, others in told):
+        raise ValueError(f"the runs of {scene} hold out different views; give files of one split at a time.")
+    return names
+
+
+def references(runs: Runs) -> list[float]:
+    """Return the best label's median over seeds of each view's PSNR in dB, empty without runs."""
+    medians = [[statistics.median(view) for view in _by_view(group)] for group in runs.values()]
+    return [max(view) for view in zip(*medians, strict=True)]
+
+
+def collapsed(group: Sequence[Result], reference: Sequence[float]) -> list[tuple[int, Any]]:
+    """Return the pairs of a view's number and a seed in which one label's view collapses."""
+    return [
+        (view, row["seed"])
+        for view, best in enumerate(reference)
+        for row in group
+        if round(best - row["view_psnr"][view], 6) >= COLLAPSE  # floats make 30.1 − 27.1 less than 3
+    ]
+
+
+def markdown(scene: str, runs: Runs, names: Sequence[str], reference: Sequence[float]) -> str:
+    """Return a scene's table of views, with means over seeds ± standard deviations in dB, and a line for each label.
+
+    Args:
+        reference: Of each view, in dB; empty where nothing is known to compare with.
+    """
+    every = [row for group in runs.values() for row in group]
+    lines = []
+    for i, name in enumerate(names):
+        told = (_known(every, "view_angles", i, ".1f"), _known(every, "view_uncovered", i, ".3f"))
+        lines.append((name, *told, *(_mean_and_deviation(_by_view(group)[i]) for group in runs.values())))
+    text = [f"## {scene}", "", table.grid(("View", "Angle °", "Uncovered", *runs), lines), ""]
+    for label, group in runs.items():
+        median = statistics.median(statistics.fmean(view) for view in _by_view(group))
+        lowest, worst = min((psnr, i) for row in group for i, psnr in enumerate(row["view_psnr"]))
+        pairs = [f"{names[i]} (seed {seed})" for i, seed in collapsed(group, reference)]
+        told = f"collapsed: {', '.join(pairs) or 'none'}" if reference else "there is no reference"
+        text.append(f"- {label}: median {median:.2f} dB; worst view {names[worst]}, {lowest:.2f} dB; {told}")
+    return "\n".join(text)
+
+
+def _by_view(group: Sequence[Result]) -> list[tuple[float, ...]]:
+    return list(zip(*(row["view_psnr"] for row in group), strict=True))
+
+
+def _known(rows: Iterable[Result], field: str, view: int, form: str) -> str:
+    values = [row[field][view] for row in rows if row.get(field) and row[field][view] is not None]
+    return format(statistics.median(values), form) if values else "–"
+
+
+def _mean_and_deviation(values: Sequence[float]) -> str:
+    deviation = f" ± {statistics.stdev(values):.2f}" if len(values) > 1 else ""
+    return f"{statistics.fmean(values):.2f}{deviation}"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Print the tables; returns the exit code, 2 where a file is missing or does not fit the others."""
+    given = command_lines.views().parse_args(argv)
+    counts: dict[str, tuple[int, int]] = {}  # collapsed pairs, and all that have a reference
+    try:
+        scenes = load(given.results)
+        frozen = scenes if given.references is None else load(given.references)
+        for scene, runs in scenes.items():
+            others = frozen.get(scene, {})
+            names = view_names(scene, [row for group in (*runs.values(), *others.values()) for row in group])
+            reference = references(others)
+            print(markdown(scene, runs, names, reference), end="\n\n")
+            for label, group in runs.items():
+                bad, judged = counts.get(label, (0, 0))
+                counts[label] = bad + len(collapsed(group, reference)), judged + len(group) * len(reference)
+    except ValueError as error:
+        print(f"python -m benchmarks views: {error}", file=sys.stderr)
+        return 2
+    for label, (bad, judged) in counts.items():
+        print(f"{label}: {bad} of {judged} (view, run) pairs collapsed")
+    return 0

@@ -1,0 +1,636 @@
+"""What a benchmark's row holds: phases, curve, images, metrics. Tiny runs on whatever device there is."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import json
+import random
+import re
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from PIL import Image
+from torch import Tensor
+
+from benchmarks import __main__ as bench
+from benchmarks import evaluate, images, phases, protocol, results, run, timer
+from benchmarks.curve import undisturbed
+from benchmarks.phases import PHASES, Stopwatch
+from benchmarks.protocol import Job, Row, Scene
+from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
+from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.render import splatter
+from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
+
+WIDTH, HEIGHT, VIEWS = 48, 36, 10
+ITERATIONS = 12
+SCENE = Scene(
+    "demo",
+    "demo",
+    "colmap",
+    {"colmap_path": str(SPARSE_FOLDER), "downscale_factor": 1, "eval_mode": "interval", "eval_interval": 4},
+)
+SADGS = Row(
+    "ours [c=1]",
+    "sadgs",
+    {
+        "max_num_iterations": ITERATIONS,
+        "pipeline.model.background_color": "random",
+        "pipeline.model.bounding_box_points": False,
+        "pipeline.model.strategy.refine_start_iter": 1,
+        "pipeline.model.strategy.absgs_every": 2,
+        "pipeline.model.strategy.structure_every": 3,
+        "pipeline.model.strategy.eta_every": 2,
+    },
+)
+SPLATFACTO = Row(
+    "splatfacto",
+    "splatfacto",
+    {
+        "max_num_iterations": ITERATIONS,
+        "pipeline.model.num_downscales": 0,
+        "pipeline.model.warmup_length": 2,
+        "pipeline.model.refine_every": 2,
+        "pipeline.model.densify_grad_thresh": 1e-6,
+    },
+)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder that holds the scene."""
+    folder = tmp_path_factory.mktemp("scenes")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of nerfstudio's and its requirements' modules
+        importlib.import_module("nerfstudio.scripts.train")
+    write_scene(folder / "demo", WIDTH, HEIGHT, VIEWS, points=200)
+    return folder
+
+
+class RestlessNetwork(torch.nn.Module):
+    """In LPIPS's place: the mean difference; draws from every source of chance and takes an hour."""
+
+    hours = 0
+
+    def forward(self, image: Tensor, truth: Tensor) -> Tensor:
+        RestlessNetwork.hours += 1
+        assert not torch.backends.cudnn.benchmark, "its search takes all memory, and nerfstudio turns it on"
+        _ = random.random(), np.random.rand(), torch.rand(1)
+        return (image - truth).abs().mean()
+
+
+def replace_lpips(patch: pytest.MonkeyPatch) -> None:
+    """LPIPS without weights, and a clock that an evaluation with it puts forward."""
+    patch.setattr(evaluate, "load_lpips", RestlessNetwork)
+    patch.setattr(evaluate, "load_lpips_vgg", lambda: None)
+
+    def now() -> float:
+        return time.perf_counter() + 3600 * RestlessNetwork.hours
+
+    patch.setattr(evaluate, "now", now)
+    patch.setattr(timer, "now", now)
+
+
+def replace_gsplat(patch: pytest.MonkeyPatch) -> None:
+    """nerfstudio's own model without LPIPS and torch.compile and, where there is no GPU, with the splatter for gsplat.
+
+    torch.compile takes a minute, and on a GPU warns that TensorFloat32 is off.
+    """
+    from nerfstudio.models import splatfacto
+    from torchmetrics.image import lpip
+
+    patch.setattr(lpip, "LearnedPerceptualImagePatchSimilarity", lambda normalize: torch.nn.Identity())
+    patch.setattr(splatfacto, "get_viewmat", viewmats_from_camera_to_world)  # which is compiled
+    if torch.cuda.is_available():
+        return
+
+    def rasterization(packed: bool, sparse_grad: bool, **options: Any) -> Any:
+        return splatter.rasterization(**options)
+
+    patch.setattr(splatfacto, "rasterization", rasterization)
+    patch.setattr(torch.Tensor, "cuda", lambda tensor: tensor)
+
+
+def checkpoint(work: Path) -> dict[str, Any]:
+    (path,) = work.rglob("*.ckpt")
+    return torch.load(path, weights_only=False)
+
+
+Runs = dict[str, tuple[dict[str, Any], dict[str, Any]]]
+"""Record and checkpoint of a run `with` and `without` the curve."""
+
+
+@pytest.fixture(scope="module", params=[SADGS, SPLATFACTO], ids=["sadgs", "splatfacto"])
+def runs(request: pytest.FixtureRequest, root: Path, tmp_path_factory: pytest.TempPathFactory) -> Runs:
+    made = {}
+    with pytest.MonkeyPatch.context() as patch:
+        replace_lpips(patch)
+        replace_gsplat(patch)
+        for name, every in (("with", 5), ("without", None)):
+            work = tmp_path_factory.mktemp(name)
+            record = run.run_row(Job(SCENE, dataclasses.replace(request.param, curve_every=every), 0), root, work)
+            made[name] = record, checkpoint(work)
+            assert torch.backends.cudnn.benchmark  # as in a user's run
+    return made
+
+
+# Curve
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU adds up gradients in no fixed order")
+def test_the_curve_changes_nothing_in_the_training(runs: Runs):
+    (_, measured), (_, plain) = runs["with"], runs["without"]
+    assert len(plain["pipeline"]["_model.gauss_params.means"]) != 200, "densification took part"
+    for states in (measured, plain):
+        states["pipeline"].get("_extra_state", {}).pop("images", None)  # which are names, and no numbers
+    torch.testing.assert_close(measured, plain, rtol=0, atol=0)
+
+
+def test_the_curve_ends_in_the_finished_run(runs: Runs):
+    record, _ = runs["with"]
+    curve = record["curve"]
+    assert [set(point) for point in curve] == [{"step", "seconds", "psnr", "ssim", "lpips", "gaussians"}] * 3
+    assert [point["step"] for point in curve] == [5, 10, ITERATIONS]
+    assert {name: record[name] for name in ("psnr", "ssim", "lpips", "gaussians")} == {
+        name: curve[-1][name] for name in ("psnr", "ssim", "lpips", "gaussians")
+    }
+    assert curve[0]["psnr"] != curve[-1]["psnr"]
+    assert "curve" not in runs["without"][0]
+
+
+def test_no_time_contains_the_evaluation(runs: Runs):
+    """Each of the curve's evaluations takes hours of the clock."""
+    record, _ = runs["with"]
+    times = [point["seconds"] for point in record["curve"]]
+    assert 0 < times[0] < times[1] < times[2] == record["loop_seconds"] < record["train_seconds"] < 600
+
+
+def test_the_timer_stops(monkeypatch: pytest.MonkeyPatch):
+    clock = iter([1.0, 4.0, 5.0, 15.0, 16.0, 20.0])
+    monkeypatch.setattr(timer, "now", lambda: next(clock))
+    trainer = SimpleNamespace(config=SimpleNamespace(max_num_iterations=7), callbacks=[])
+    watch = timer.LoopTimer()
+    watch.attach(trainer)
+    begin, end = trainer.callbacks
+    begin.run_callback(0)
+    with watch.stopped():
+        assert watch.seconds == 3.0
+    assert not watch.finished
+    end.run_callback(5)
+    end.run_callback(6)
+    assert (watch.seconds, watch.stopped_seconds, watch.finished) == (7.0, 10.0, True)
+
+
+def test_undisturbed_restores_what_a_rendering_notes():
+    class Model(torch.nn.Linear):
+        info: Any
+
+    model = Model(1, 1)
+    pipeline = torch.nn.Sequential(model, torch.nn.Dropout())
+    pipeline.model = model
+    model.info = noted = {"step": 3}
+    with undisturbed(pipeline):
+        assert not model.training and not pipeline[1].training
+        model.info, model.size = {}, (3, 4)  # type: ignore[assignment]
+    assert model.training and pipeline[1].training
+    assert model.info is noted and not hasattr(model, "size")
+
+
+# Phases
+
+
+def test_phases_of_real_methods(runs: Runs):
+    record, saved = runs["with"]
+    measured = record["phases"]
+    assert tuple(measured) == PHASES
+    structure_aware = "structure_tensor_seconds" in record
+    assert (measured["eta"] > 0) is structure_aware
+    assert all(value > 0 for name, value in measured.items() if name != "eta")
+    assert record["gaussians"] == len(saved["pipeline"]["_model.gauss_params.means"])
+
+
+class FakeTime:
+    """In the place of the module `time`: the clock stands still except where `sleep` puts it forward."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def sleep(self, seconds: float) -> None:
+        self.seconds += seconds
+
+    def perf_counter(self) -> float:
+        return self.seconds
+
+
+class Slow(torch.autograd.Function):
+    """The identity; its forward and backward pass take time."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, clock: FakeTime, forward_seconds: float, backward_seconds: float) -> Tensor:
+        ctx.clock, ctx.seconds = clock, backward_seconds
+        clock.sleep(forward_seconds)
+        return x.clone()
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> Any:
+        ctx.clock.sleep(ctx.seconds)
+        return grad_outputs[0], None, None, None
+
+
+class SlowTrainer:
+    """A trainer whose phases take known times; it renders twice in a step, as sadgs does with two sizes of images."""
+
+    def __init__(self, clock: FakeTime) -> None:
+        self.config = SimpleNamespace(max_num_iterations=0)
+        self.callbacks: list[Any] = []
+        self.parameter = torch.ones(1, requires_grad=True)
+        self.pipeline = SimpleNamespace(model=self, train=lambda: None)
+        self.optimizers = SimpleNamespace(
+            zero_grad_some=lambda: clock.sleep(1),
+            optimizer_scaler_step_some=lambda: clock.sleep(10),
+            scheduler_step_all=lambda: clock.sleep(100),
+        )
+        self.clock = clock
+        self.device = "cpu"
+
+    def get_outputs(self) -> dict[str, Any]:
+        return {"rgb": Slow.apply(self.parameter, self.clock, 2, 3)}
+
+    def get_loss_dict(self, outputs: dict[str, Any]) -> dict[str, Any]:
+        return {"main": Slow.apply(outputs["rgb"], self.clock, 0.5, 0.25), "constant": torch.zeros(1)}
+
+    def train_iteration(self, step: int) -> None:
+        self.optimizers.zero_grad_some()
+        losses = [self.get_loss_dict(self.get_outputs()) for _ in range(2)]
+        torch.stack([value for loss in losses for value in loss.values()]).sum().backward()
+        self.optimizers.optimizer_scaler_step_some()
+        self.optimizers.scheduler_step_all()
+        self.clock.sleep(1000)
+
+
+def test_phases_are_told_apart(monkeypatch: pytest.MonkeyPatch):
+    clock, original = FakeTime(), torch.Tensor.backward
+    monkeypatch.setattr(phases, "time", clock)
+    trainer = SlowTrainer(clock)
+    measured = phases.measure(trainer, steps=4)
+    expected = {"rasterize_forward": 4, "rasterize_backward": 6, "loss": 1.5, "eta": 0, "optimizer": 111, "rest": 1000}
+    assert measured == {phase: 1000 * seconds for phase, seconds in expected.items()}
+    assert torch.Tensor.backward is original and "get_outputs" not in vars(trainer)
+
+
+def test_stopwatch_books_everything(monkeypatch: pytest.MonkeyPatch):
+    clock = iter([1.0, 2.0, 4.0, 7.0, 8.0, 16.0])
+    monkeypatch.setattr(phases, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    watch = Stopwatch(torch.device("cpu"))
+    watch.restart()
+    inner = watch.during("eta")(lambda: watch.phase)
+    assert watch.during("rasterize_forward")(inner)() == "eta"
+    assert watch.seconds() == {**dict.fromkeys(PHASES, 0.0), "rasterize_forward": 3.0, "eta": 3.0, "rest": 9.0}
+
+
+def test_measuring_observes_eta_and_densifies_nothing(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    import sadgs_ns.method.strategy
+
+    clock, calls, observe = FakeTime(), 0, sadgs_ns.method.strategy.observe
+
+    def slow_observe(*arguments: Any, **options: Any) -> None:
+        nonlocal calls
+        calls += 1
+        clock.sleep(20)
+        observe(*arguments, **options)
+
+    monkeypatch.setattr(sadgs_ns.method.strategy, "observe", slow_observe)
+    monkeypatch.setattr(phases, "time", clock)
+    config = run.build_config(SCENE, SADGS, 0, root, tmp_path)
+    trainer: Any = config.setup(local_rank=0, world_size=1)
+    trainer.setup(test_mode="test")
+    trainer.train()
+    strategy, model = trainer.pipeline.model.strategy, trainer.pipeline.model
+    schedule, gaussians = dict(vars(strategy)), model.num_points
+    calls = 0
+    measured = phases.measure(trainer, steps=5)
+    # At every second step from 12 on: in two of 3 steps to warm up, in three of the 6 that are measured.
+    assert calls == 5
+    if trainer.device == "cpu":  # elsewhere the GPU's clock counts
+        assert measured == {**dict.fromkeys(PHASES, 0.0), "eta": 10_000.0}
+    assert vars(strategy) == schedule and model.num_points == gaussians
+
+
+# The record and its images
+
+
+INITIALIZATION_SECONDS = 0.5
+
+
+@pytest.fixture(scope="module")
+def written(root: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
+    """What `benchmarks.run` writes for the command that python -m benchmarks starts, and the images' folder."""
+    from sadgs_ns.plugin.model import SadgsModel
+
+    folder = tmp_path_factory.mktemp("run")
+    commands: list[list[str]] = []
+    populate_modules = SadgsModel.populate_modules
+
+    def populate_slowly(model: SadgsModel) -> None:
+        time.sleep(INITIALIZATION_SECONDS)
+        populate_modules(model)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(subprocess, "Popen", lambda command, **_: commands.append(command))
+        bench.launcher(root, folder / "images")(Job(SCENE, SADGS, 3), None, folder)
+    with pytest.MonkeyPatch.context() as patch:
+        replace_lpips(patch)
+        patch.setattr(SadgsModel, "populate_modules", populate_slowly)
+        patch.setattr(sys, "argv", commands[0][2:])
+        run.main()
+        assert SadgsModel.populate_modules is populate_slowly, "the run has put it back"
+    return json.loads((folder / "result.json").read_text()), folder / "images"
+
+
+def test_a_record_holds_all_fields(written: tuple[dict[str, Any], Path]):
+    record, _ = written
+    assert record["status"] == "ok", record["error"]
+    assert record["lpips_vgg"] is None and "curve" not in record
+    assert record["ssim"] != record["ssim_padded"]
+    assert len(record["view_psnr"]) == record["eval_views"]
+    assert sum(record["view_psnr"]) / record["eval_views"] == pytest.approx(record["psnr"], abs=0.005)
+
+
+def test_each_held_out_view_is_told_in_the_order_of_its_psnr(runs: Runs, root: Path, tmp_path: Path):
+    record, _ = runs["with"]
+    assert record["view_names"] == ["000", "004", "008"] and len(record["ply_view_psnr"]) == 3
+    assert max(map(abs, record["view_angles"])) < 90 and max(record["view_uncovered"]) < 0.5
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    for row in (SPLATFACTO, SADGS):  # The order is that of the loader whose views are evaluated.
+        datamanager: Any = run.build_config(SCENE, row, 0, root, tmp_path).pipeline.datamanager.setup(test_mode="test")
+        for name, (_, batch) in zip(record["view_names"], datamanager.fixed_indices_eval_dataloader, strict=True):
+            photograph = np.asarray(Image.open(root / "demo" / "images" / f"{name}.png").convert("RGB"))
+            image = batch["image"].cpu().numpy()
+            assert np.array_equal(image if image.dtype == np.uint8 else np.rint(image * 255), photograph)
+        # Without SfM points the Gaussians' centres stand for them.
+        points = datamanager.train_dataset.metadata.pop("points3D_xyz")
+        told = run.coverage_of_views(datamanager, SimpleNamespace(means=points, device=device))
+        assert told == {name: record[name] for name in told}
+        told = run.coverage_of_views(datamanager, SimpleNamespace(means=points * torch.nan, device=device))
+        assert told["view_angles"] == told["view_uncovered"] == [None] * 3
+
+
+def test_the_times_add_up(written: tuple[dict[str, Any], Path]):
+    record, _ = written
+    names = ("import", "setup", "initialization", "load", "warmup", "structure_tensor", "train")
+    parts = {name: record[f"{name}_seconds"] for name in names}
+    assert parts["initialization"] >= INITIALIZATION_SECONDS and all(part > 0 for part in parts.values())
+    assert 0 <= record["wall_seconds"] - sum(parts.values()) < INITIALIZATION_SECONDS
+
+
+def test_images_lie_beside_the_photographs(written: tuple[dict[str, Any], Path], root: Path):
+    record, folder = written
+    label = images.file_name("ours [c=1]")
+    assert record["images"] == [f"demo/{label}-3/{name}.png" for name in ("000", "004", "008")]
+    assert sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.*")) == sorted(
+        [*record["images"], *(f"demo/truth/{name}.png" for name in ("000", "004", "008"))]
+    )
+    for path in record["images"]:
+        photograph = np.asarray(Image.open(root / "demo" / "images" / Path(path).name).convert("RGB"))
+        assert np.array_equal(np.asarray(Image.open(folder / "demo" / "truth" / Path(path).name)), photograph)
+        rendering = np.asarray(Image.open(folder / path))
+        assert rendering.shape == (HEIGHT, WIDTH, 3)
+        error = np.abs(rendering.astype(float) - photograph).mean()
+        assert 0 < error < np.abs(rendering.astype(float).mean() - photograph).mean(), "it shows this view"
+
+
+def test_two_processes_train_one_splat_whose_row_the_first_writes(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """They start as on two GPUs, `--gpus 0+1`, and find none. LPIPS is left out, since its weights are missing."""
+    monkeypatch.setenv("TORCH_HOME", "/dev/null")
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    overrides = {
+        **SADGS.overrides,
+        "machine.device_type": "cpu",
+        "pipeline.model.background_color": "black",
+        "pipeline.views_per_iteration": 2,
+        "share_always": True,
+    }
+    with bench.launcher(root)(Job(SCENE, Row("ours", "sadgs", overrides), 0), "0+1", tmp_path) as process:
+        assert process.wait(200) == 0, (tmp_path / "log").read_text()
+    record = json.loads((tmp_path / "result.json").read_text())
+    assert record["status"] == "ok" and record["devices"] == 2 and record["iterations"] == ITERATIONS
+    assert record["psnr"] > 10 and record["gaussians"] > 100 and record["loop_seconds"] > 0
+    assert "phases" not in record
+
+
+def test_names_of_files_are_safe_and_differ():
+    assert [images.file_name(name) for name in ("sadgs-3k", "v1.5_b")] == ["sadgs-3k", "v1.5_b"]
+    unsafe = ["a b", "a_b", "a/b", "a\\b", "..", ".", "", "η", "a[b=1,c=2]"]
+    names = [images.file_name(name) for name in unsafe]
+    assert all(re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", name) for name in names)
+    assert len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize(
+    ("count", "expected"), [(1, [0]), (3, [0, 1, 2]), (4, [0, 1, 2, 3]), (5, [0, 1, 3, 4]), (37, [0, 12, 24, 36])]
+)
+def test_chosen_views_are_spaced_evenly(count: int, expected: list[int]):
+    assert images.chosen(count) == expected
+
+
+class FlatModel:
+    """Renders grey on black."""
+
+    @staticmethod
+    def get_outputs_for_camera(camera: Any) -> dict[str, Tensor]:
+        return {"rgb": torch.full((4, 5, 3), 0.5), "background": torch.zeros(3)}
+
+    @staticmethod
+    def get_gt_img(image: Tensor) -> Tensor:
+        return image.float() / 255
+
+    @staticmethod
+    def composite_with_background(image: Tensor, background: Tensor) -> Tensor:
+        return image[..., :3]
+
+
+def test_photographs_keep_their_alpha_and_names_that_repeat_are_told_apart(tmp_path: Path):
+    photographs = [torch.full((4, 5, 4), value, dtype=torch.uint8) for value in (10, 200)]
+    views = [(None, {"image": image}) for image in photographs]
+    paths = images.save(FlatModel(), views, ["r", "r"], tmp_path, "../lego", "ours", 0)
+    assert len(set(paths)) == 2 and all((tmp_path / path).resolve().is_relative_to(tmp_path) for path in paths)
+    for path, photograph in zip(paths, photographs, strict=True):
+        truth = np.asarray(Image.open(tmp_path / Path(path).parts[0] / "truth" / Path(path).name))
+        assert np.array_equal(truth, photograph.numpy())
+        assert np.unique(np.asarray(Image.open(tmp_path / path))).tolist() == [128]
+
+
+@pytest.mark.parametrize(("near_plane", "planes"), [(0.01, []), (0.3, [0.01])])
+def test_the_near_plane_of_other_viewers_is_measured_and_put_back(near_plane: float, planes: list[float]):
+    model: Any = FlatModel()
+    model.config, model.device, model.near_plane, drawn = SimpleNamespace(), "cpu", near_plane, []
+    model.means, model.opacities = torch.nn.Parameter(torch.zeros(3, 3)), torch.nn.Parameter(torch.ones(3, 1))
+    model.scales, hidden = model.means, torch.tensor([False, True, False])
+    model.empty_space = SimpleNamespace(haze=lambda means, scales: hidden)
+
+    def draw(camera: Any) -> dict[str, Tensor]:
+        assert model.opacities.flatten().tolist() == [1, -torch.inf, 1]
+        drawn.append(model.near_plane)
+        return {"rgb": torch.full((12, 12, 3), camera), "background": torch.zeros(3)}
+
+    model.get_outputs_for_camera = draw
+    view = (0.5, {"image": torch.zeros(12, 12, 3)})
+    assert evaluate.view_psnr_in_viewers(model, [view], [1.0]) == ([6.02] if planes else [1.0])
+    if planes:
+        with pytest.raises(TypeError):  # of a camera that cannot be drawn
+            evaluate.view_psnr_in_viewers(model, [(None, {})], [])
+    assert drawn == 2 * planes and model.near_plane == near_plane and (model.opacities == 1).all()
+
+
+# Metrics
+
+
+def test_ssim_padded_is_the_one_of_3dgs():
+    generator = torch.Generator().manual_seed(0)
+    truth = torch.rand(1, 3, 30, 40, generator=generator)
+    image = (truth + 0.2 * torch.randn(truth.shape, generator=generator)).clamp(0, 1)
+    x = torch.arange(11.0) - 5
+    window = torch.exp(-(x**2) / (2 * 1.5**2))
+    window = (window[:, None] * window / window.sum() ** 2).expand(3, 1, 11, 11)
+
+    def blur(values: Tensor) -> Tensor:
+        return torch.nn.functional.conv2d(values, window, padding=5, groups=3)
+
+    mean1, mean2 = blur(image), blur(truth)
+    variance1, variance2 = blur(image**2) - mean1**2, blur(truth**2) - mean2**2
+    covariance = blur(image * truth) - mean1 * mean2
+    similarity = (2 * mean1 * mean2 + 0.01**2) * (2 * covariance + 0.03**2)
+    similarity /= (mean1**2 + mean2**2 + 0.01**2) * (variance1 + variance2 + 0.03**2)
+    torch.testing.assert_close(evaluate.ssim_padded(image, truth), similarity.mean(), rtol=1e-4, atol=1e-5)
+
+
+def test_vgg_is_never_downloaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setattr(torch.hub, "download_url_to_file", lambda *_, **__: pytest.fail("a download"))
+    assert evaluate.load_lpips_vgg() is None
+    assert f"there is no {tmp_path}/hub/checkpoints/vgg16-397923af.pth" in capsys.readouterr().out
+
+
+def test_vgg_is_loaded_from_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    import torchvision
+
+    weights = tmp_path / "hub" / "checkpoints" / "vgg16-397923af.pth"
+    weights.parent.mkdir(parents=True)
+    weights.touch()  # half a gigabyte, if it were real: random weights stand for it
+    untrained = torchvision.models.vgg16
+    loaded: list[str] = []
+
+    def vgg16(weights: Any) -> torch.nn.Module:
+        loaded.append(Path(weights.url).name)
+        torch.manual_seed(0)
+        return SimpleNamespace(features=untrained(weights=None, init_weights=False).features)  # type: ignore[return-value]
+
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setattr(torchvision.models, "vgg16", vgg16)
+    network = evaluate.load_lpips_vgg()
+    assert network is not None and loaded == [weights.name]
+    image = torch.rand(1, 3, 32, 32)
+    assert float(network(image, image)) == 0.0
+    assert network.normalize is False, "3DGS hands VGG images in [0, 1]"
+
+
+# Protocol and command
+
+
+def content(**changes: Any) -> dict[str, Any]:
+    scene = {"data": "demo", "dataparser": "colmap", "options": SCENE.options}
+    return {"scenes": {"demo": scene}, "rows": [{"label": "a", "method": "sadgs"}], **changes}
+
+
+def test_curve_every_is_part_of_the_key_only_where_it_is_given():
+    (plain, _), (measured, _), (finer, _) = (
+        protocol.parse(content(**changes)).jobs() for changes in ({}, {"curve_every": 500}, {"curve_every": 250})
+    )
+    assert (plain.row.curve_every, measured.row.curve_every) == (None, 500)
+    rows = [{"label": label, "method": "sadgs", "curve_every": every} for label, every in (("a", 100), ("b", None))]
+    one, _, none, _ = protocol.parse(content(curve_every=500, rows=rows)).jobs()
+    assert (one.row.curve_every, none.row.curve_every) == (100, None), "a row's own comes first"
+    assert len({plain.key, measured.key, finer.key}) == 3
+    # The key of a row that docs/results holds: files of before continue.
+    bonsai = Scene(
+        "bonsai",
+        "bonsai",
+        "colmap",
+        {"colmap_path": "sparse/0", "downscale_factor": 1, "eval_mode": "interval", "eval_interval": 8},
+    )
+    job = Job(bonsai, Row("full", "sadgs-indoor"), 0)
+    assert job.key in (Path(__file__).parents[2] / "docs" / "results" / "ablations.jsonl").read_text()
+
+
+@pytest.mark.parametrize("wrong", [0, -5, 1.5, "500", True])
+def test_curve_every_is_a_positive_whole_number(wrong: object):
+    with pytest.raises(ValueError, match="curve_every must be a whole number of iterations from 1, not"):
+        protocol.parse(content(curve_every=wrong))
+
+
+def test_the_bar_estimates_from_the_runs_that_ended():
+    clock = [0.0]
+    progress, task = bench.progress_bar(10, 4, disable=True, get_time=lambda: clock[0])
+    assert progress.tasks[0].time_remaining is None, "nothing is known before the first run has ended"
+    for clock[0], left in ((100.0, 500.0), (300.0, 600.0), (600.0, 600.0)):
+        progress.advance(task)
+        assert progress.tasks[0].time_remaining == left
+
+
+@pytest.fixture
+def command(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+    """python -m benchmarks on a protocol of two seeds, with runs that end at once."""
+
+    def launcher(scenes: Path, folder: Path | None = None) -> bench.Launch:
+        def launch(job: Job, gpu: str | None, work: Path) -> subprocess.Popen[bytes]:
+            made = {} if folder is None else {"images": [f"demo/{job.seed}.png"]}
+            measured = dict.fromkeys(("loop_seconds", "psnr", "ssim", "lpips", "peak_gb"), 1.0)
+            record = {"status": "ok", "error": None, **measured, "gaussians": 1, **made}
+            (work / "result.json").write_text(json.dumps(record))
+            return subprocess.Popen(["true"], start_new_session=True)
+
+        return launch
+
+    monkeypatch.setattr(bench, "launcher", launcher)
+    monkeypatch.setattr(bench, "POLL_SECONDS", 0.01)
+    (tmp_path / "p.yaml").write_text(yaml.safe_dump(content()))
+
+    def main(*options: str) -> int:
+        folders = ["--scenes", str(root), "--output", str(tmp_path / "r.jsonl")]
+        return bench.main([str(tmp_path / "p.yaml"), *folders, *options])
+
+    return main
+
+
+def test_a_continued_benchmark_says_which_runs_have_no_images(
+    command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert command("--only", "/0$") == 0
+    assert "no images" not in capsys.readouterr().out
+    folder = str(tmp_path / "images")
+    assert command("--images", folder) == 0
+    assert "1 finished runs have no images" in capsys.readouterr().out
+    assert ["images" in row for row in results.read(tmp_path / "r.jsonl")] == [False, True]
+    assert command("--images", str(tmp_path / "p.yaml")) == 2
+    assert "p.yaml is a file; give a folder." in capsys.readouterr().err
+
+
+def test_a_strategy_that_was_never_fitted_to_a_run_is_left_as_it_was():
+    strategy = StructureAwareStrategy()
+    before = vars(strategy).copy()
+    with phases.within_densification(strategy):
+        assert strategy.run_length > 3000
+    assert vars(strategy) == before and strategy.run_length == 3000

@@ -1,0 +1,257 @@
+"""The tables of documents, from made-up rows in a made-up checkout."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from benchmarks import documents, plots
+
+OPENING, CLOSING = "<!-- table: {} -->", "<!-- end -->"
+SWEEP = {
+    "kind": "sweep",
+    "rows": ["sweep.jsonl"],
+    "labels": {"T1": "× 1", "T2": "× 2"},
+    "scenes": {"fox": ["fox"], "castle": ["castle", "castle-2"]},
+}
+RUNS = {
+    "kind": "runs",
+    "columns": ["photos", "method", "loop", "ratio", "psnr", "gaussians"],
+    "lines": [
+        {"rows": "runs.jsonl", "scenes": ["fox"], "labels": {"slow": "slow", "ours": "ours"}, "reference": "slow"},
+        {"rows": "runs.jsonl", "scenes": ["tree"], "labels": {"ours": "ours, elsewhere"}},
+    ],
+}
+
+
+def row(scene: str, label: str, seed: int = 0, **changes: Any) -> dict[str, Any]:
+    return {
+        "key": f"{scene}/{label}/{seed}", "scene": scene, "label": label, "seed": seed, "status": "ok",
+        "train_views": 43, "loop_seconds": 10.0, "psnr": 30.0,
+        "ssim": 0.9, "lpips": 0.1, "gaussians": 200_000, "peak_gb": 1.0, **changes,
+    }  # fmt: skip
+
+
+ROWS = {
+    "runs.jsonl": [
+        row("fox", "slow", loop_seconds=250.0, psnr=29.0, gaussians=9_999),
+        row("fox", "ours", 0, psnr=30.0),
+        row("fox", "ours", 1, psnr=31.0, loop_seconds=11.0),
+        row("tree", "ours"),
+        row("tree", "ours", 1, status="failed", psnr=None),
+        row("tree", "bare", train_views=None),
+    ],
+    "sweep.jsonl": [
+        row("fox", "T1", 0), row("fox", "T1", 1, psnr=30.5),
+        row("fox", "T2", 0, psnr=30.0, ssim=0.91, lpips=0.09, gaussians=300_000),
+        row("fox", "T2", 1, psnr=30.0, ssim=0.91, lpips=0.09, gaussians=300_000),
+        row("castle", "T1", psnr=28.0), row("castle-2", "T1", psnr=30.0), row("castle", "T2", psnr=27.0),
+    ],
+}  # fmt: skip
+
+
+def checkout(folder: Path, tables: Any, rows: dict[str, list[dict[str, Any]]], **texts: str) -> Path:
+    """A checkout whose README holds all tables, still empty."""
+    results = folder / documents.RESULTS
+    results.mkdir(parents=True)
+    content = {"megapixels": {"fox": 0.68}, "tables": tables}
+    (results / documents.TABLES).write_text(yaml.safe_dump(content, allow_unicode=True, sort_keys=False), "utf8")
+    for name, lines in rows.items():
+        (results / name).write_text("".join(json.dumps(line) + "\n" for line in lines), "utf8")
+    marked = "\n\n".join(f"{OPENING.format(name)}\n{CLOSING}" for name in tables)
+    (folder / "README.md").write_text(f"# Title\n\n{marked}\n\nAfter.\n", "utf8")
+    for name, text in texts.items():
+        (folder / "docs" / f"{name}.md").write_text(text, "utf8")
+    return folder
+
+
+def test_runs_are_a_line_each(tmp_path: Path):
+    folder = checkout(tmp_path, {"main": RUNS}, {"runs.jsonl": ROWS["runs.jsonl"]})
+    assert documents.main([str(folder)]) == 0
+    assert (
+        (folder / "README.md").read_text("utf8")
+        == """# Title
+
+<!-- table: main -->
+
+| Scene: training views | Method | Loop s | Ratio | PSNR | Gaussians |
+| --- | --- | ---: | ---: | ---: | ---: |
+| fox: 43 of 0.68 MP | slow | 250.0 | 1 | 29.00 | 9,999 |
+| fox: 43 of 0.68 MP | ours | 10.5 ± 0.5 | 1/24 | 30.50 ± 0.50 | 200k |
+| tree: 43 | ours, elsewhere | 10.0 | – | 30.00 | 200k |
+
+<!-- end -->
+
+After.
+"""
+    )
+
+
+def test_a_sweep_is_differences_from_its_first_setting(tmp_path: Path):
+    folder = checkout(tmp_path, {"sweep": SWEEP}, {"sweep.jsonl": ROWS["sweep.jsonl"]})
+    assert documents.main([str(folder)]) == 0
+    lines = (folder / "README.md").read_text("utf8").splitlines()[6:10]
+    # Castle is the mean of its two scenes; its second setting lacks one of them.
+    assert lines[0] == "| × 1 | 30.25 / .9000 / .1000 / 200k | 29.00 / .9000 / .1000 / 200k |"
+    assert lines[1] == "| half the range of its runs | 0.25 / .0000 / .0000 | – |"
+    assert lines[2] == "| × 2 | −0.25 / +.0100 / −.0100 / ×1.50 | – |"
+
+
+def test_a_difference_that_rests_on_a_single_run_is_marked(tmp_path: Path):
+    rows = [row("fox", "T1", 0), row("fox", "T1", 1), row("fox", "T2", lpips=0.1 - 1e-9)]
+    folder = checkout(tmp_path, {"sweep": {**SWEEP, "scenes": {"fox": ["fox"]}}}, {"sweep.jsonl": rows})
+    assert documents.main([str(folder)]) == 0
+    assert "| × 2 | 0.00 / .0000 / .0000 / ×1.00 ¹ |" in (folder / "README.md").read_text("utf8")
+
+
+def test_approximations_and_growth_are_printed_as_their_commands_do(tmp_path: Path):
+    common = {"table": "footprint", "input": "demo", "median": 0.1, "p95": 0.2, "max": 0.3, "flips": 0.0, "ms": 1234.5}
+    rows = [{**common, "variant": "1 sample"}, {**common, "variant": "4 samples", "ms": None}]
+    tables = {
+        "eta": {"kind": "approximations", "rows": "a.jsonl", "table": "footprint", "input": "demo"},
+        "one": {
+            "kind": "approximations", "rows": "a.jsonl", "table": "footprint", "input": "demo", "variants": ["1 sample"]
+        },
+        "growth": {"kind": "growth", "rows": "growth.csv"},
+    }  # fmt: skip
+    folder = checkout(tmp_path, tables, {"a.jsonl": rows})
+    csv = "gaussians,megapixels,ours_ms,gsplat_ms\n1000000,2.0,3.0,9.0\n100000,2.0,2.0,5.0\n1000000,0.3,2.5,7.5\n"
+    (folder / documents.RESULTS / "growth.csv").write_text(csv, "utf8")
+    assert documents.main([str(folder)]) == 0
+    text = (folder / "README.md").read_text("utf8")
+    assert text.count("| 1 sample | 10 % | 20 % | 30 % | 0 % | 1,234 |") == 2
+    assert text.count("| 4 samples | 10 % | 20 % | 30 % | 0 % | – |") == 1
+    assert "| 100,000 | 2 | 2.00 | 5.00 | 2.5 |\n| 1,000,000 | 2 | 3.00 | 9.00 | 3.0 |\n| 1,000,000 | 0.3 |" in text
+
+
+FIGURE = {
+    "cost": "loop_seconds",
+    "parts": [{"rows": "runs.jsonl", "scenes": ["fox"], "labels": {"slow": "theirs 30k", "ours": "ours"}}],
+    "elsewhere": [{"rows": "runs.jsonl", "scenes": ["tree"], "labels": {"ours": "ours"}}],
+}
+
+
+def test_a_figure_is_drawn_from_its_rows_and_drawn_anew_only_when_they_change(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    folder = checkout(tmp_path, {"main": RUNS}, {"runs.jsonl": ROWS["runs.jsonl"]})
+    described = folder / documents.RESULTS / documents.TABLES
+    described.write_text(
+        described.read_text("utf8") + yaml.safe_dump({"figures": {"peers": FIGURE}}, sort_keys=False), "utf8"
+    )
+    path = folder / documents.FIGURES / "peers.png"
+    assert documents.main([str(folder), "--check"]) == 1 and not path.exists()
+    assert documents.main([str(folder)]) == 0
+    points = [["theirs 30k", True, 250.0, 29.0, 0.1], ["ours", True, 10.5, 30.5, 0.1], ["ours", False, 10.0, 30.0, 0.1]]
+    assert json.loads(plots.drawn_points(path) or "") == ["loop_seconds", *points]
+    assert documents.main([str(folder), "--check"]) == 0
+    rows = folder / documents.RESULTS / "runs.jsonl"
+    rows.write_text(rows.read_text("utf8").replace("250.0", "251.0"), "utf8")
+    written = path.read_bytes()
+    capsys.readouterr()
+    assert documents.main([str(folder), "--check"]) == 1 and path.read_bytes() == written
+    assert f"{path} is not what its rows give; run python -m benchmarks documents." in capsys.readouterr().out
+    assert documents.main([str(folder)]) == 0 and path.read_bytes() != written
+
+
+WRONG_FIGURES: dict[str, tuple[Any, str]] = {
+    "an unknown cost": ({**FIGURE, "cost": "price"}, "fox/slow/0 has no price"),
+    "an unknown label": (
+        {**FIGURE, "elsewhere": [{**FIGURE["parts"][0], "labels": {"none": "none"}}]},
+        "no row 'none'",
+    ),
+    "a missing key": ({"cost": "loop_seconds"}, "must be a mapping of cost, parts, elsewhere"),
+    "a list": ([FIGURE], "must be a mapping"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_FIGURES)
+def test_a_figure_that_is_described_wrongly_is_one_sentence(
+    case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    figure, sentence = WRONG_FIGURES[case]
+    folder = checkout(tmp_path, {"main": RUNS}, {"runs.jsonl": ROWS["runs.jsonl"]})
+    described = folder / documents.RESULTS / documents.TABLES
+    described.write_text(
+        described.read_text("utf8") + yaml.safe_dump({"figures": {"peers": figure}}, sort_keys=False), "utf8"
+    )
+    assert documents.main([str(folder)]) == 2
+    error = capsys.readouterr().err
+    assert sentence in error and error.count("\n") == 1
+    assert not (folder / documents.FIGURES).exists() and "fox" not in (folder / "README.md").read_text("utf8")
+
+
+def test_check_finds_what_changed_and_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder = checkout(tmp_path, {"main": RUNS}, {"runs.jsonl": ROWS["runs.jsonl"]})
+    assert documents.main([str(folder), "--check"]) == 1
+    assert documents.main([str(folder)]) == 0
+    assert documents.main([str(folder), "--check"]) == 0
+    capsys.readouterr()
+    readme = folder / "README.md"
+    wrong = readme.read_text("utf8").replace("29.00", "28.99")
+    readme.write_text(wrong, "utf8")
+    assert documents.main([str(folder), "--check"]) == 1
+    assert (
+        capsys.readouterr().out
+        == f"{readme}: table main is not what its rows give; run python -m benchmarks documents.\n"
+    )
+    assert readme.read_text("utf8") == wrong
+
+
+WRONG: dict[str, tuple[Any, str, str]] = {
+    "no table of that name": ({"main": RUNS}, "<!-- table: other -->\n<!-- end -->\n", "table other is not in"),
+    "a table without end": ({"main": RUNS}, "<!-- table: main -->\n\n", "needs one `<!-- end -->`"),
+    "an end alone": ({"main": RUNS}, "<!-- end -->\n", "needs one `<!-- end -->`"),
+    "an unknown kind": ({"main": {**RUNS, "kind": "run"}}, "", "kind is 'run'; give one of runs, sweep"),
+    "an unknown key": ({"main": {**RUNS, "row": 1}}, "", "must be a mapping of columns, lines"),
+    "a missing key": ({"main": {"kind": "runs", "columns": []}}, "", "must be a mapping of columns, lines"),
+    "an unknown column": ({"main": {**RUNS, "columns": ["speed"]}}, "", "there is no column 'speed'"),
+    "a number that rows lack": (
+        {"main": {**RUNS, "lines": [{"rows": "runs.jsonl", "scenes": ["tree"], "labels": {"bare": "bare"}}]}},
+        "",
+        "tree/bare/0 has no train_views",
+    ),
+    "an unknown label": ({"main": {**SWEEP, "rows": ["runs.jsonl"]}}, "", "have no row 'T1'"),
+    "an unknown scene": (
+        {"main": {**RUNS, "lines": [{"rows": "runs.jsonl", "scenes": ["site"], "labels": {"ours": "ours"}}]}},
+        "",
+        "there is no row 'ours' of site",
+    ),
+    "tables that are a list": ([RUNS], "", "tables must be a mapping"),
+    "scenes that are no mapping": ({"main": {**SWEEP, "scenes": ["fox"]}}, "", "table main: "),
+    "no such rows": ({"main": {**SWEEP, "rows": ["none.jsonl"]}}, "", "none.jsonl is not there"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_input_is_one_sentence_and_changes_nothing(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    tables, text, sentence = WRONG[case]
+    folder = checkout(tmp_path, tables, {"runs.jsonl": ROWS["runs.jsonl"]}, zulu=text)
+    before = (folder / "README.md").read_text("utf8")
+    assert documents.main([str(folder)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("python -m benchmarks documents: ") and sentence in error and error.count("\n") == 1
+    assert (folder / "README.md").read_text("utf8") == before
+
+
+def test_rows_that_no_table_cites_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder = checkout(tmp_path, {"main": RUNS}, ROWS)
+    assert documents.main([str(folder)]) == 2
+    assert "no table is made of sweep.jsonl" in capsys.readouterr().err
+
+
+def test_a_table_that_no_document_holds_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder = checkout(tmp_path, {"main": RUNS, "sweep": SWEEP}, ROWS)
+    readme = folder / "README.md"
+    readme.write_text(readme.read_text("utf8").replace(f"{OPENING.format('sweep')}\n{CLOSING}", ""), "utf8")
+    assert documents.main([str(folder)]) == 2
+    assert "no document holds sweep" in capsys.readouterr().err
+
+
+def test_a_folder_that_is_no_checkout_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert documents.main([str(tmp_path)]) == 2
+    assert "give the folder of a checkout" in capsys.readouterr().err

@@ -1,0 +1,83 @@
+"""Copies of scenes whose photos have known exposures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scenes import VIEWS
+
+from benchmarks.exposures import FILE, draw_gains, linear_light, main, srgb_values, with_gains
+
+
+def pixels(scene: Path, name: str) -> np.ndarray:
+    return np.asarray(Image.open(scene / "images" / name))
+
+
+def test_each_training_photo_has_the_gain_that_the_file_says_and_held_out_ones_the_mean(scene: Path, tmp_path: Path):
+    assert main([str(scene), str(tmp_path / "copy")]) == 0
+    photos = json.loads((tmp_path / "copy" / FILE).read_text())
+    assert len(photos) == VIEWS and (tmp_path / "copy" / "sparse" / "0" / "points3D.bin").exists()
+    held_out = [name for name, photo in photos.items() if photo["held_out"]]
+    assert held_out == ["000.png", "004.png", "008.png"]
+    gains = np.array([photo["gain"] for photo in photos.values() if not photo["held_out"]])
+    assert gains.max() / gains.min() == pytest.approx(4.0)
+    np.testing.assert_allclose([photos[name]["gain"] for name in held_out], np.exp(np.log(gains).mean()))
+    for name, photo in photos.items():
+        before, after = (linear_light(pixels(folder, name) / 255.0) for folder in (scene, tmp_path / "copy"))
+        gain = photo["gain"] * np.array(photo["channels"])
+        np.testing.assert_allclose(after, before * gain, atol=0.005)  # half a step of 8 bits
+        assert photo["held_out"] == (photo["channels"] == [1.0, 1.0, 1.0])
+        assert gain.max() <= 1
+
+
+def test_the_same_seed_draws_the_same_gains(scene: Path, tmp_path: Path):
+    texts = []
+    for seed in (0, 0, 1):
+        assert main([str(scene), str(tmp_path / "copy"), "--seed", str(seed)]) == 0
+        texts.append((tmp_path / "copy" / FILE).read_text())
+    assert texts[0] == texts[1] != texts[2]
+
+
+def test_a_control_has_one_exposure(scene: Path, tmp_path: Path):
+    options = ["--spread", "1", "--white-balance", "0", "--mean", "0.5"]
+    assert main([str(scene), str(tmp_path / "copy"), *options]) == 0
+    photos = json.loads((tmp_path / "copy" / FILE).read_text()).values()
+    assert {(photo["gain"], *photo["channels"]) for photo in photos} == {(0.5, 1.0, 1.0, 1.0)}
+
+
+def test_factors_of_channels_keep_the_brightness_and_stay_in_their_range():
+    gains, factors = draw_gains(500, 4.0, 0.1, 0.4, seed=3)
+    np.testing.assert_allclose(factors.prod(axis=1), 1.0)
+    assert 1.05 < factors.max() <= 1.1 + 1e-9 and 1 / 1.1 - 1e-9 <= factors.min() < 0.95
+    assert np.exp(np.log(gains).mean()) == pytest.approx(0.4)
+
+
+def test_srgb_and_linear_light_are_inverse():
+    values = np.linspace(0, 1, 1001)
+    np.testing.assert_allclose(srgb_values(linear_light(values)), values, atol=1e-7)
+
+
+def test_what_exceeds_white_saturates():
+    image = np.full((1, 1, 3), 200, np.uint8)
+    assert with_gains(image, np.array([1.0, 3.0, 0.0])).tolist() == [[[200, 255, 0]]]
+
+
+def test_wrong_input_is_one_sentence_and_leaves_all_as_it_was(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    (tmp_path / "copy").mkdir()
+    (tmp_path / "copy" / "kept").touch()
+    for arguments, said in (
+        ([str(tmp_path), str(tmp_path / "copy")], "holds no sparse/0"),
+        ([str(scene), str(scene)], "is there and holds no exposures.json"),
+        ([str(scene), str(tmp_path / "copy")], "is there and holds no exposures.json"),
+        ([str(scene), str(tmp_path / "new"), "--spread", "0.5"], "--spread must be at least 1"),
+    ):
+        assert main(arguments) == 2
+        error = capsys.readouterr().err
+        assert said in error and error.count("\n") == 1
+    assert (tmp_path / "copy" / "kept").exists() and (scene / "images").is_dir() and not (tmp_path / "new").exists()

@@ -1,0 +1,229 @@
+"""A benchmark's gate: what it lets pass, what it says, and what it writes; nothing is trained."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import re
+import subprocess
+import warnings
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks import __main__ as bench
+from benchmarks import gate, protocol
+from benchmarks.gate import Metric
+from benchmarks.protocol import Job, Row, Scene
+
+CONFIGS = Path(__file__).parents[2] / "configs" / "bench"
+BASELINES = sorted(path.stem for path in CONFIGS.glob("baselines/*.json"))
+
+
+def job(label: str = "ours", seed: int = 0) -> Job:
+    return Job(Scene("fox", "fox", "colmap"), Row(label, "sadgs"), seed)
+
+
+def result(job: Job, **measured: Any) -> dict[str, Any]:
+    return {"key": job.key, "status": "ok", "error": None, "psnr": 30.0, "lpips": 0.1, "gaussians": 1000, **measured}
+
+
+def entry(value: float, direction: str, tolerance: float) -> dict[str, Any]:
+    return {"value": value, "direction": direction, "tolerance": tolerance}
+
+
+@pytest.fixture
+def baseline(tmp_path: Path) -> Path:
+    path = tmp_path / "baseline.json"
+    psnr, count = entry(30.0, "higher", 0.5), entry(1000, "near", 50)
+    path.write_text(json.dumps({"fox/ours": {"psnr": psnr, "lpips": entry(0.1, "lower", 0.01), "gaussians": count}}))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("direction", "value", "fails"),
+    [
+        ("higher", 9.0, False), ("higher", 8.9, True), ("higher", 99.0, False),
+        ("lower", 11.0, False), ("lower", 11.1, True), ("lower", -99.0, False),
+        ("near", 11.0, False), ("near", 9.0, False), ("near", 11.1, True), ("near", 8.9, True),
+        ("higher", float("nan"), True), ("lower", float("nan"), True), ("near", float("nan"), True),
+    ],
+)  # fmt: skip
+def test_a_metric_fails_when_it_is_worse_by_more_than_the_tolerance(direction: str, value: float, fails: bool):
+    assert Metric(10.0, direction, 1.0).fails(value) is fails
+
+
+def test_means_over_seeds_are_compared(baseline: Path):
+    jobs = [job(seed=0), job(seed=1)]
+    assert not gate.regressions(gate.read(baseline), jobs, [result(jobs[0], psnr=29.0), result(jobs[1], psnr=30.2)])
+    lines = gate.regressions(gate.read(baseline), jobs, [result(jobs[0], psnr=29.0), result(jobs[1], psnr=29.8)])
+    assert lines == ["fox/ours: psnr moved by -0.6, from 30 to 29.4; tolerance 0.5 (higher is better)."]
+
+
+def test_a_regression_names_row_metric_move_and_tolerance(baseline: Path):
+    worse = result(job(), lpips=0.2, gaussians=900)
+    assert gate.regressions(gate.read(baseline), [job()], [worse]) == [
+        "fox/ours: lpips moved by +0.1, from 0.1 to 0.2; tolerance 0.01 (lower is better).",
+        "fox/ours: gaussians moved by -100, from 1000 to 900; tolerance 50 (either way).",
+    ]
+
+
+def test_what_was_not_measured_fails(baseline: Path):
+    jobs = [job(seed=0), job(seed=1)]
+    content = gate.read(baseline)
+    failed = {"key": jobs[1].key, "status": "failed", "error": "no memory."}
+    for results in ([result(jobs[0])], [result(jobs[0]), failed]):
+        (line,) = gate.regressions(content, jobs, results)
+        assert line == "fox/ours is missing from the results: 1 of 2 runs ended well."
+    (line,) = gate.regressions(content, [job("other")], [result(job("other"))])
+    assert line == "fox/ours is missing from the results: no such run was asked for."
+    (line,) = gate.regressions(content, [job()], [result(job(), lpips=None)])
+    assert line == "fox/ours: lpips was not measured; the baseline has 0.1."
+
+
+def test_an_update_keeps_directions_and_tolerances(baseline: Path):
+    before = json.loads(baseline.read_text())
+    before["south/ours"] = {"psnr": entry(18.0, "higher", 1.0)}
+    baseline.write_text(json.dumps(before))
+    jobs = [job(seed=0), job(seed=1)]
+    gate.renew(baseline, jobs, [result(jobs[0], psnr=20.0, lpips=0.3), result(jobs[1], psnr=21.0, lpips=0.3)])
+    before["fox/ours"]["psnr"]["value"], before["fox/ours"]["lpips"]["value"] = 20.5, 0.3
+    assert json.loads(baseline.read_text()) == before
+    assert [path.name for path in baseline.parent.iterdir()] == [baseline.name]
+    assert gate.judge(baseline, jobs, [result(j, psnr=20.5, lpips=0.3) for j in jobs]) is False  # south did not run
+
+
+def test_new_rows_get_defaults_for_what_was_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    path = tmp_path / "new" / "baseline.json"
+    gate.renew(path, [job()], [result(job(), ssim=0.9, lpips=None, gaussians=2000)])
+    assert json.loads(path.read_text()) == {
+        "fox/ours": {
+            "psnr": entry(30.0, "higher", 0.4),
+            "ssim": entry(0.9, "higher", 0.01),
+            "gaussians": entry(2000, "near", 80),
+        }
+    }
+    assert "New rows have default tolerances, to be set from several seeds: fox/ours." in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("results", "sentence"),
+    [
+        ([], "fox/ours: 1 of 1 runs have no result; finish them."),
+        ([result(job(), lpips=None)], "fox/ours: lpips was not measured"),
+    ],
+)
+def test_an_update_from_incomplete_results_changes_nothing(baseline: Path, results: list, sentence: str):
+    before = baseline.read_bytes()
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        gate.renew(baseline, [job()], results)
+    assert baseline.read_bytes() == before
+
+
+def test_a_failed_write_leaves_the_old_file(baseline: Path, monkeypatch: pytest.MonkeyPatch):
+    before = baseline.read_bytes()
+    monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(OSError("full")))
+    with pytest.raises(OSError, match="full"):
+        gate.renew(baseline, [job()], [result(job(), psnr=1.0)])
+    assert baseline.read_bytes() == before and len(list(baseline.parent.iterdir())) == 1
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        ("{", "b.json is not JSON"),
+        ("{}", "b.json must be an object with a row or more, named scene/label."),
+        ('{"a/b": {}}', "b.json: a/b must be an object with a metric or more."),
+        ('{"a/b": {"psnr": {"value": 3}}}', "b.json: a/b, psnr must have value, direction and tolerance"),
+        (json.dumps({"a/b": {"psnr": entry(3, "up", 1)}}), "direction must be one of higher, lower, near."),
+        (json.dumps({"a/b": {"psnr": entry(3, "near", -1)}}), "tolerance one from 0."),
+        ('{"a/b": {"psnr": {"value": NaN, "direction": "near", "tolerance": 1}}}', "value must be a number"),
+        ('{"a/b": {"psnr": {"value": true, "direction": "near", "tolerance": 1}}}', "value must be a number"),
+    ],
+)
+def test_wrong_baselines_say_what_is_wrong(tmp_path: Path, content: str, sentence: str):
+    path = tmp_path / "b.json"
+    path.write_text(content)
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        gate.read(path)
+
+
+# The command
+
+
+@pytest.fixture
+def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """`python -m benchmarks` on a protocol of one row, whose run measures at once what it is told."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        importlib.import_module("nerfstudio.configs.method_configs")
+    (tmp_path / "fox").mkdir()
+    scene = {"data": "fox", "dataparser": "nerfstudio-data"}
+    content = {"scenes": {"fox": scene}, "seeds": [0], "rows": [{"label": "ours", "method": "sadgs"}]}
+    (tmp_path / "p.yaml").write_text(json.dumps(content))
+    monkeypatch.setattr(bench, "POLL_SECONDS", 0.01)
+    started: list[str] = []
+
+    def run(*options: str, **measured: Any) -> int:
+        times = {"loop_seconds": 1.0, "ssim": 0.9, "peak_gb": None}
+
+        def launch(job: Job, gpu: str | None, folder: Path) -> subprocess.Popen[bytes]:
+            started.append(job.key)
+            (folder / "result.json").write_text(json.dumps(result(job, **times, **measured)))
+            return subprocess.Popen(["true"], start_new_session=True)
+
+        monkeypatch.setattr(bench, "launcher", lambda root, images: launch)
+        output = tmp_path / f"{len(started)}.jsonl"
+        return bench.main([str(tmp_path / "p.yaml"), "--scenes", str(tmp_path), "--output", str(output), *options])
+
+    run.started = started  # type: ignore[attr-defined]
+    return run
+
+
+def test_the_command_exits_with_1_on_a_regression(command: Any, baseline: Path, capsys: pytest.CaptureFixture[str]):
+    assert command("--gate", str(baseline), psnr=29.6) == 0
+    assert f"Gate: passed, 3 metrics of 1 rows in {baseline}." in capsys.readouterr().out
+    assert command("--gate", str(baseline), psnr=29.4) == 1
+    said = capsys.readouterr().out
+    assert "Gate: fox/ours: psnr moved by -0.6, from 30 to 29.4; tolerance 0.5 (higher is better)." in said
+    assert "Gate: FAILED" in said
+
+
+def test_the_command_updates_a_baseline_which_it_then_passes(command: Any, baseline: Path):
+    assert command("--update-baseline", str(baseline), psnr=29.4) == 0
+    assert gate.read(baseline)["fox/ours"]["psnr"] == Metric(29.4, "higher", 0.5)
+    assert command("--gate", str(baseline), psnr=29.4) == 0
+
+
+def test_rows_that_nothing_judges_are_told(command: Any, baseline: Path, capsys: pytest.CaptureFixture[str]):
+    baseline.write_text(baseline.read_text().replace("fox/ours", "fox/theirs"))
+    assert command("--gate", str(baseline)) == 1
+    said = capsys.readouterr().out
+    assert "fox/theirs is missing from the results" in said and "fox/ours is not in" in said
+
+
+def test_a_wrong_baseline_is_told_before_anything_runs(
+    command: Any, baseline: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert command("--gate", str(baseline.with_name("no.json"))) == 2
+    assert "no.json cannot be read" in capsys.readouterr().err
+    baseline.write_text("{")
+    assert command("--update-baseline", str(baseline)) == 2
+    assert not command.started
+
+
+# The baselines in configs/bench
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_every_baseline_has_the_rows_of_its_protocol(name: str):
+    jobs = protocol.load(CONFIGS / f"{name}.yaml").jobs()
+    baseline = gate.read(CONFIGS / "baselines" / f"{name}.json")
+    assert set(baseline) == {f"{job.scene.name}/{job.row.label}" for job in jobs}
+
+
+def test_the_demo_gate_judges_no_times():
+    for metrics in gate.read(CONFIGS / "baselines" / "demo-gate.json").values():
+        assert set(metrics) == {"psnr", "ssim", "gaussians"}

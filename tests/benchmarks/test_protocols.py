@@ -1,0 +1,293 @@
+"""The protocols in configs/bench, and what a benchmark says of scenes that are not there; nothing is trained."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import subprocess
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from benchmarks import __main__ as bench
+from benchmarks import protocol
+from benchmarks.datasets import image_names, runnable
+from benchmarks.protocol import Job, Row, Scene
+from benchmarks.run import build_config
+
+CONFIGS = Path(__file__).parents[2] / "configs" / "bench"
+PROTOCOLS = sorted(path.stem for path in CONFIGS.glob("*.yaml"))
+OPTIONS = {"colmap_path": "sparse/0", "downscale_factor": 4}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def nerfstudio() -> None:
+    """nerfstudio's registry, imported without the warnings of its own modules."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        importlib.import_module("nerfstudio.configs.method_configs")
+
+
+def load(name: str) -> protocol.Protocol:
+    return protocol.load(CONFIGS / f"{name}.yaml")
+
+
+def configs(name: str, root: Path) -> dict[tuple[str, str], Any]:
+    """By scene and label."""
+    jobs = load(name).jobs()
+    for job in jobs:
+        (root / job.scene.data).mkdir(parents=True, exist_ok=True)
+    return {(j.scene.name, j.row.label): build_config(j.scene, j.row, j.seed, root, root) for j in jobs}
+
+
+def colmap_scene(
+    folder: Path,
+    images: str = "images_4",
+    names: tuple[str, ...] = ("a.jpg", "b.jpg"),
+    size: tuple[int, int] = (4, 3),
+    text: bool = False,
+) -> Path:
+    """A scene with a COLMAP model of these images, in this order, and their files in one folder."""
+    from nerfstudio.data.utils import colmap_parsing_utils as colmap
+
+    (folder / images).mkdir(parents=True)
+    (folder / "sparse/0").mkdir(parents=True)
+    for name in names:
+        Image.new("RGB", size).save(folder / images / name)
+    pose, points = (np.array([1.0, 0, 0, 0]), np.zeros(3)), (np.zeros((1, 2)), np.array([-1]))
+    views = {i: colmap.Image(i, *pose, 1, name, *points) for i, name in enumerate(names, 1)}
+    cameras = {1: colmap.Camera(1, "PINHOLE", 16, 12, np.array([10.0, 10.0, 8.0, 6.0]))}
+    colmap.write_model(cameras, views, {}, str(folder / "sparse/0"), ext=".txt" if text else ".bin")
+    return folder
+
+
+def job(name: str = "garden", **options: Any) -> Job:
+    return Job(Scene(name, name, "colmap", {**OPTIONS, **options}), Row("ours", "sadgs"), 0)
+
+
+def names_of(options: dict[str, Any], folder: Path) -> list[str]:
+    config = build_config(Scene("s", folder.name, "colmap", options), Row("r", "sadgs"), 0, folder.parent, folder)
+    return image_names(config.pipeline.datamanager.dataparser, folder)  # type: ignore[attr-defined]
+
+
+# Protocols
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_every_row_of_every_protocol_fits_the_config_of_its_method(name: str, tmp_path: Path):
+    jobs = load(name).jobs()
+    assert len({job.key for job in jobs}) == len(jobs)
+    assert len(configs(name, tmp_path)) >= 1
+
+
+@pytest.mark.parametrize("name", ["mipnerf360", "deep-blending", "tanks-and-temples"])
+def test_table_1_has_the_settings_of_the_paper(name: str, tmp_path: Path):
+    built = configs(name, tmp_path)
+    for ours in ("sadgs", "sadgs-paper"):
+        assert {scene for scene, label in built if label == ours} == set(load(name).scenes)
+    for (scene, label), config in built.items():
+        parser = config.pipeline.datamanager.dataparser
+        assert (parser.eval_mode, parser.eval_interval, parser.colmap_path) == ("interval", 8, Path("sparse/0"))
+        indoor = scene in {"room", "counter", "kitchen", "bonsai"}
+        assert parser.downscale_factor == {"mipnerf360": 2 if indoor else 4}.get(name, 1)
+        if label == "sadgs-paper":
+            assert config.pipeline.views_per_iteration == (2 if indoor or name == "deep-blending" else 1)
+            assert config.max_num_iterations == (7000 if name == "tanks-and-temples" else 3000)
+        if label == "sadgs":
+            assert (config.max_num_iterations, config.pipeline.views_per_iteration) == (None, None), "derived"
+        if label.startswith("sadgs"):
+            assert config.pipeline.model.strategy.tau_split == 0.8
+    assert (
+        set(load(name).scenes)
+        == {
+            "mipnerf360": {
+                *["bicycle", "flowers", "garden", "stump", "treehill", "room", "counter", "kitchen", "bonsai"]
+            },
+            "deep-blending": {"drjohnson", "playroom"},
+            "tanks-and-temples": {"train", "truck"},
+        }[name]
+    )
+
+
+@pytest.mark.parametrize(
+    ("full", "stored"),  # sizes of the official images and images_4 or images_2
+    [((4946, 3286), (1237, 822)), ((5187, 3361), (1297, 840)), ((3114, 2075), (1557, 1038))],
+)
+def test_the_cameras_of_mipnerf360_have_the_size_of_the_official_images(full: tuple[int, int], stored: tuple[int, int]):
+    from nerfstudio.cameras.cameras import Cameras
+
+    options = load("mipnerf360").scenes["bicycle" if full[0] > 4000 else "room"].options
+    camera = Cameras(torch.eye(4)[None, :3], 1.0, 1.0, full[0] / 2, full[1] / 2, width=full[0], height=full[1])
+    camera.rescale_output_resolution(1 / options["downscale_factor"], options["downscale_rounding_mode"])
+    assert (camera.width.item(), camera.height.item()) == stored
+
+
+def test_each_ablation_changes_one_thing_of_the_full_method(tmp_path: Path):
+    built = configs("ablations", tmp_path)
+    strategy = "pipeline.model.strategy"
+    windows = {"structure_every": 500, "absgs_every": 100, "refine_start_iter": 100, "reset_every": 1200}
+    longer = {f"{strategy}.{name}": value for name, value in windows.items()}  # as in the preset
+    changes = {
+        "30k iterations": {"max_num_iterations": 30000, **longer},
+        "15k iterations": {"max_num_iterations": 15000, **longer},
+        "full": {},
+        "30k position schedule": {"optimizers.means.scheduler.max_steps": 30000},
+        "no multiview consistency": {f"{strategy}.tau_split": 0.0},
+        "no AbsGS": {f"{strategy}.absgs_every": 0},
+        "no bounding-box points": {"pipeline.model.bounding_box_points": False},
+    }
+    assert set(built) == {(scene, label) for scene in ("bonsai", "fox", "south") for label in changes}
+    for row in load("ablations").rows:
+        assert row.overrides == changes[row.label]
+        for scene in row.scenes or ():
+            assert built[scene, row.label].method_name == ("sadgs-paper" if scene == "south" else "sadgs-paper-indoor")
+
+
+def test_the_progressive_rows_add_one_thing_each(tmp_path: Path):
+    built = configs("progressive", tmp_path)
+    for scene in ("bonsai", "fox", "south"):
+        base, schedule, training, densification, full = (config for (s, _), config in built.items() if s == scene)
+        assert {c.max_num_iterations for c in (base, schedule, training, densification, full)} == {3000}
+        steps = [config.optimizers["means"]["scheduler"].max_steps for config in (base, schedule)]
+        assert steps == [30000, 3000]
+        strategies = [config.pipeline.model.strategy for config in (training, densification, full)]
+        assert [s.windows.structure_every for s in strategies] == [0, 500, 500]
+        assert [s.tau_split for s in strategies] == [0.8, 0.0, 0.8]
+
+
+def test_matched_counts_are_splatfactos_when_they_were_measured(tmp_path: Path):
+    measured = {"bonsai": 322_527, "fox": 152_390, "south": 604_755}  # on 2026-11-21; rows of commit 667700b
+    built = configs("matched-count", tmp_path)
+    for scene, count in measured.items():
+        assert built[scene, "sadgs-matched"].pipeline.model.strategy.max_gaussians == round(count, -3)
+        assert built[scene, "splatfacto"].max_num_iterations == 30000
+
+
+def of_sadgs(name: str, root: Path) -> dict[tuple[str, str], Any]:
+    """Configs of the protocol's rows of `sadgs`."""
+    return {key: config for key, config in configs(name, root).items() if config.method_name == "sadgs"}
+
+
+@pytest.mark.parametrize("name", ["ours", "schedule"])
+def test_the_derived_schedule_is_measured_on_all_eight_scenes(name: str, tmp_path: Path):
+    built = of_sadgs(name, tmp_path)
+    efforts: dict[str, set[float]] = {}
+    for (scene, _), config in built.items():
+        assert config.pipeline.model.background_color == ("white" if scene == "lego" else "black")
+        assert config.max_num_iterations is None
+        assert config.rates_follow_views
+        efforts.setdefault(scene, set()).add(config.pipeline.effort)
+    assert set(efforts) == {"bonsai", "fox", "room", "castle", "tree", "south", "site", "lego"}
+    assert all(of_scene == {0.5, 1.0, 2.0, 4.0} for of_scene in efforts.values())
+
+
+def test_defaults_are_chosen_on_validation_views_and_the_main_table_is_of_test_views():
+    for name, options in (("schedule", {}), ("ours", {"eval_mode": "interval", "eval_interval": 8})):
+        for scene in load(name).scenes.values():
+            held_out = {key: value for key, value in scene.options.items() if key.startswith("eval")}
+            assert held_out == ({} if scene.name == "lego" else options)
+
+
+def test_the_main_table_has_three_seeds_of_ours_beside_splatfacto():
+    seeds: dict[tuple[str, str], list[int]] = {}
+    for made in load("ours").jobs():
+        seeds.setdefault((made.row.label, made.scene.name), []).append(made.seed)
+    for scene in load("ours").scenes:
+        assert seeds["sadgs", scene] == [0, 1, 2]
+        assert all(seeds[label, scene] == [0] for label in ("splatfacto", "splatfacto-3k", "effort 0.5", "effort 4"))
+
+
+def content(*rows: dict[str, Any], **changes: Any) -> dict[str, Any]:
+    scene = {"data": "x", "dataparser": "colmap"}
+    return {"scenes": {"fox": scene, "south": scene}, "rows": list(rows), **changes}
+
+
+def test_rows_of_different_scenes_may_share_a_label():
+    fox, south = ({"label": "full", "method": "sadgs", "scenes": [name]} for name in ("fox", "south"))
+    jobs = protocol.parse(content(fox, south, seeds=[0])).jobs()
+    assert [(job.scene.name, job.row.label) for job in jobs] == [("fox", "full"), ("south", "full")]
+    with pytest.raises(ValueError, match="two rows have the label 'full' for south"):
+        protocol.parse(content(south, {"label": "full", "method": "sadgs"}))
+
+
+def test_the_source_is_text_and_changes_no_key():
+    row = {"label": "full", "method": "sadgs"}
+    with_source, without = protocol.parse(content(row, source="the moon")), protocol.parse(content(row))
+    assert (with_source.source, without.source) == ("the moon", None)
+    assert [job.key for job in with_source.jobs()] == [job.key for job in without.jobs()]
+    with pytest.raises(ValueError, match="source must be text, not 3"):
+        protocol.parse(content(row, source=3))
+
+
+# Scenes that are not there
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_names_come_in_the_models_order_from_the_folder_of_that_size(tmp_path: Path, text: bool):
+    folder = colmap_scene(tmp_path / "garden", "images_4", ("b.jpg", "a.jpg"), text=text)
+    assert names_of(OPTIONS, folder) == ["b.jpg", "a.jpg"]
+    with pytest.raises(FileNotFoundError, match=re.escape(f"{folder / 'images_2'} does not exist")):
+        names_of({**OPTIONS, "downscale_factor": 2}, folder)
+
+
+def test_without_a_factor_the_folder_is_the_one_that_nerfstudio_would_choose(tmp_path: Path):
+    small = colmap_scene(tmp_path / "small", "images", size=(1600, 1))
+    assert names_of({"colmap_path": "sparse/0"}, small) == ["a.jpg", "b.jpg"]
+    large = colmap_scene(tmp_path / "large", "images", size=(3201, 1))
+    with pytest.raises(FileNotFoundError, match="large/images_4 does not exist"):
+        names_of({"colmap_path": "sparse/0"}, large)
+
+
+def test_what_is_missing_in_a_scene_is_named(tmp_path: Path):
+    folder = colmap_scene(tmp_path / "garden")
+    (folder / "images_4" / "b.jpg").unlink()
+    with pytest.raises(FileNotFoundError, match=r"garden/images_4 lacks 1 of 2 images, such as b\.jpg"):
+        names_of(OPTIONS, folder)
+    with pytest.raises(FileNotFoundError, match="garden/sparse holds no COLMAP model"):
+        names_of({**OPTIONS, "colmap_path": "sparse"}, folder)
+
+
+def test_all_missing_scenes_are_one_sentence_with_their_source(tmp_path: Path):
+    with pytest.raises(ValueError) as error:
+        runnable([job("garden"), job("stump")], tmp_path, "the data set Mip-NeRF 360", skip_missing=True)
+    assert str(error.value) == (
+        f"scene 'garden': {tmp_path / 'garden'} does not exist, scene 'stump': {tmp_path / 'stump'} does not exist; "
+        "check --scenes or get the data set Mip-NeRF 360."
+    )
+
+
+def test_scenes_that_are_there_run_if_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    colmap_scene(tmp_path / "garden")
+    jobs = [job("garden"), job("stump"), job("garden", downscale_factor=4)]
+    with pytest.raises(ValueError, match=r"stump does not exist; check --scenes\. --skip-missing .* others: garden\."):
+        runnable(jobs, tmp_path)
+    assert runnable(jobs, tmp_path, skip_missing=True) == [jobs[0], jobs[2]]
+    said = capsys.readouterr().err
+    assert said == f"Left out: scene 'stump': {tmp_path / 'stump'} does not exist. Running garden.\n"
+
+
+def test_another_order_of_the_images_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    colmap_scene(tmp_path / "garden", names=("b.jpg", "a.jpg"))
+    assert runnable([job()], tmp_path) == [job()]
+    assert "scene 'garden': COLMAP numbered its images in another order" in capsys.readouterr().err
+
+
+def test_the_command_says_what_is_missing_before_it_runs_anything(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    output = tmp_path / "out" / "results.jsonl"
+    command = [str(CONFIGS / "mipnerf360.yaml"), "--scenes", str(tmp_path), "--output", str(output)]
+    assert bench.main(command) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and f"{tmp_path / 'bicycle'} does not exist" in said and "360_v2" in said
+    assert not output.parent.exists()
+
+
+def test_a_run_cannot_wait_for_an_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    given: dict[str, Any] = {}
+    monkeypatch.setattr(subprocess, "Popen", lambda command, **options: given.update(options))
+    bench.launcher(tmp_path)(job(), None, tmp_path)
+    assert given["stdin"] == subprocess.DEVNULL

@@ -1,0 +1,95 @@
+"""`python -m benchmarks views`: spread, worst and collapsed views, from made-up rows."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.view_table import main
+
+NAMED = {"view_names": ["a", "b"], "view_angles": [4.0, None], "view_uncovered": [0.125, 0.5]}
+
+
+def row(label: str, seed: int, psnr: list[float] | None, scene: str = "fox", **changes: Any) -> dict[str, Any]:
+    measured = {} if psnr is None else {"view_psnr": psnr}
+    key = f"{scene}/{label}/{seed}/{psnr}"
+    return {"key": key, "scene": scene, "label": label, "seed": seed, "status": "ok", **measured, **changes}
+
+
+def write(path: Path, *rows: dict[str, Any]) -> str:
+    path.write_text("".join(json.dumps(line) + "\n" for line in rows))
+    return str(path)
+
+
+BASE = [row("base", seed, [30.1, psnr], **NAMED) for seed, psnr in enumerate((20.0, 21.0, 28.0))]
+OURS = [row("ours", 0, [27.1, 21.0], **NAMED), row("ours", 1, [27.11, 17.5], **NAMED)]
+
+
+def test_spread_worst_view_and_collapses_of_each_label(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    fold = [row("ours", 0, [25.0], "fox-2"), row("ours", 1, [21.0], "fox-2")]
+    files = [write(tmp_path / "1.jsonl", *BASE), write(tmp_path / "2.jsonl", *OURS, *fold)]
+    assert main(files) == 0
+    assert (
+        capsys.readouterr().out
+        == """## fox
+
+| View | Angle ° | Uncovered | base | ours |
+| --- | ---: | ---: | ---: | ---: |
+| a | 4.0 | 0.125 | 30.10 ± 0.00 | 27.11 ± 0.01 |
+| b | – | 0.500 | 23.00 ± 4.36 | 19.25 ± 2.47 |
+
+- base: median 26.55 dB; worst view b, 20.00 dB; collapsed: none
+- ours: median 23.18 dB; worst view b, 17.50 dB; collapsed: a (seed 0), b (seed 1)
+
+## fox-2
+
+| View | Angle ° | Uncovered | ours |
+| --- | ---: | ---: | ---: |
+| 0 | – | – | 23.00 ± 2.83 |
+
+- ours: median 23.00 dB; worst view 0, 21.00 dB; collapsed: none
+
+base: 0 of 6 (view, run) pairs collapsed
+ours: 2 of 6 (view, run) pairs collapsed
+"""
+    )
+
+
+def test_frozen_references_alone_count_and_may_be_older(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    results = write(tmp_path / "r.jsonl", *BASE, *OURS, row("ours", 0, [25.0], "tree"))
+    old = [row("old", 0, [24.0, 23.5]), row("old", 1, [24.0, 24.5]), row("worse", 0, [9.0, 9.0])]
+    assert main([results, "--references", write(tmp_path / "f.jsonl", *old)]) == 0
+    told = capsys.readouterr().out
+    assert "worst view b, 20.00 dB; collapsed: b (seed 0), b (seed 1)\n" in told and "25.00 dB; there is no ref" in told
+    assert told.endswith("base: 2 of 6 (view, run) pairs collapsed\nours: 2 of 4 (view, run) pairs collapsed\n")
+    assert "old" not in told
+
+
+def test_runs_without_views_are_skipped_and_older_ones_number_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    rows = [row("ours", 0, [1.0, 1.0]), row("ours", 0, [26.0, 20.0]), row("ours", 1, None), row("base", 0, None)]
+    assert main([write(tmp_path / "r.jsonl", *rows)]) == 0
+    out, error = capsys.readouterr()
+    assert "| 0 | – | – | 26.00 |\n| 1 | – | – | 20.00 |\n" in out and "base" not in out
+    assert error == "Runs without view_psnr are skipped, 2 of them, such as fox/ours/1/None.\n"
+
+
+def test_wrong_files_are_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    good, missing = write(tmp_path / "r.jsonl", *OURS), str(tmp_path / "no.jsonl")
+    others = write(tmp_path / "o.jsonl", row("base", 0, [1.0, 2.0], view_names=["a", "c"]))
+    fewer = write(tmp_path / "p.jsonl", row("base", 0, [1.0]))
+    (tmp_path / "q.jsonl").write_text("no row\n")
+    different = "the runs of fox hold out different views; give files of one split at a time."
+    for arguments, sentence in (
+        ([good, "--references", missing], "no.jsonl is not a file; give one that python -m benchmarks wrote."),
+        ([str(tmp_path / "q.jsonl")], "q.jsonl:1 is not a benchmark's result; delete that line."),
+        ([good, others], different),
+        ([good, "--references", fewer], different),
+    ):
+        assert main(arguments) == 2
+        told = capsys.readouterr().err
+        assert (
+            told.startswith("python -m benchmarks views: ") and told.endswith(f"{sentence}\n") and told.count("\n") == 1
+        )
