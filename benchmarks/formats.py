@@ -18,7 +18,7 @@ from torch import Tensor
 from benchmarks import command_lines
 from sadgs_ns.cli.export import export
 from sadgs_ns.data.run_cameras import RunCameras, read_cameras
-from sadgs_ns.formats.files import SUFFIXES
+from sadgs_ns.formats import FORMATS
 from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world
 
 _LOSSY = (".compressed.ply", ".spz", ".sog")
@@ -71,7 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("The files are read back with gsply, which is not there: pip install -e '.[dev]' -c constraints.txt.")
         return 1
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    paths = {suffix: options.output / f"splat{suffix}" for suffix in SUFFIXES}
+    paths = {suffix: options.output / f"splat{suffix}" for suffix in FORMATS}
     for path in paths.values():
         count = export(options.run, path, data=options.data)
     folder = options.run if options.run.is_dir() else options.run.parent

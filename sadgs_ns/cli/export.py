@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sadgs_ns import formats
 from sadgs_ns.data.coordinates import TRANSFORMS_NAME, Similarity, from_data
 from sadgs_ns.errors import InputError, RunError, WriteError
-from sadgs_ns.formats import files, html
-from sadgs_ns.formats.files import MESH, SUFFIXES, Frame, format_of
+from sadgs_ns.formats import FORMATS, MESH, Frame, format_of, html
 from sadgs_ns.formats.gaussians import DEGREE_0, of_parameters
 from sadgs_ns.formats.mesh import load_open3d
 
@@ -62,7 +62,7 @@ def write_gaussians(
     """
     gaussians = of_parameters(_arrays(params))
     sound = (gaussians if similarity is None else gaussians.moved(similarity)).finite()
-    files.write(path, sound, frame, start)
+    formats.write(path, sound, frame, start)
     if len(sound) < len(gaussians):
         print(f"{path}: dropped {len(gaussians) - len(sound)} of {len(gaussians)} Gaussians that are not finite")
     return len(sound)
@@ -91,7 +91,7 @@ def export(
 
     Args:
         run: The run's folder, its `config.yml`, or one of its checkpoints; without one the latest is taken.
-        output: The file, whose name ends in one of `SUFFIXES`, or in `MESH` for a triangle mesh.
+        output: The file, whose name ends in a key of `FORMATS`, or in `MESH` for a triangle mesh.
         frame: "nerfstudio" is the frame of training: centred, upright, cameras within ±1. "colmap" is that of the
             COLMAP model, or of `transforms.json` where no COLMAP model stands behind it.
         data: The capture's folder, where cameras are needed; None is where the run's `config.yml` says it was.
@@ -290,7 +290,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("run", type=Path, help="folder of a run, its config.yml, or one of its checkpoints")
     parser.add_argument(
         "--output", "-o", type=Path, required=True, metavar="FILE",
-        help=f"the file to write: {', '.join(SUFFIXES)}, or {MESH} for a mesh",
+        help=f"the file to write: {', '.join(FORMATS)}, or {MESH} for a mesh",
     )  # fmt: skip
     parser.add_argument(
         "--frame",

@@ -36,7 +36,7 @@ from sadgs_ns.cli.process.video import VIDEO_SUFFIXES
 from sadgs_ns.cli.stage import Line, clock, prepared, run_stage
 from sadgs_ns.data.coordinates import FRAME_KEYS, TRANSFORMS_NAME
 from sadgs_ns.errors import InputError, RunError, WriteError, free_space, reason
-from sadgs_ns.formats.files import MESH, SUFFIXES
+from sadgs_ns.formats import FORMATS, MESH
 from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
 from sadgs_ns.plugin.lost_output import print_elsewhere_once_unread
 
@@ -391,7 +391,7 @@ def _shown(value: Any) -> str:
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:
     """Return the options, of which `options` are those for ns-train; exit with code 2 if one is wrong."""
-    formats = [suffix[1:] for suffix in (*SUFFIXES, MESH)]
+    formats = [suffix[1:] for suffix in (*FORMATS, MESH)]
     known = ", ".join(formats)
     parser = argparse.ArgumentParser(
         prog="sadgs",

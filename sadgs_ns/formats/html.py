@@ -50,17 +50,18 @@ class Start:
     """Angle of view along the longer side of the window."""
 
 
-def write(file: IO[bytes], gaussians: Gaussians, start: Start) -> None:
+def write(file: IO[bytes], gaussians: Gaussians, start: Start | None) -> None:
     """Write a page that shows Gaussians.
 
     Args:
         file: Open for writing.
         gaussians: What is shown, in a frame in which z is up; at least one.
-        start: Where the page opens.
+        start: Where the page opens; it must be given.
 
     Raises:
         InputError: If Node.js or its package cannot be run, or there are more Gaussians than SOG can hold.
     """
+    assert start is not None
     page, content = _page(), io.BytesIO()
     sog.write(content, gaussians.moved(Similarity(1.0, _TO_CONTENT, np.zeros(3))))
     encoded = base64.b64encode(content.getvalue()).decode()

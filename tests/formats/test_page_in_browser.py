@@ -13,8 +13,9 @@ from browser import open_page
 from gaussians import random_gaussians
 from PIL import Image
 
+from sadgs_ns import formats
 from sadgs_ns.errors import InputError
-from sadgs_ns.formats import files, html
+from sadgs_ns.formats import html
 from sadgs_ns.formats.gaussians import Gaussians
 from sadgs_ns.render import splatter
 
@@ -54,7 +55,7 @@ def test_a_page_shows_from_the_disk_what_we_render(tmp_path: Path):
     gaussians = random_gaussians(3000)
     gaussians.scales[:] += 1.0
     try:
-        files.write(tmp_path / "splat.html", gaussians, start=START)
+        formats.write(tmp_path / "splat.html", gaussians, start=START)
     except InputError as error:
         pytest.skip(str(error))
     found = 0.0
