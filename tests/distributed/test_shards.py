@@ -92,6 +92,9 @@ def prune_together(shards: Shards) -> list[int]:
     return [*numbers, len(params["means"])]
 
 
+@pytest.mark.hard_case(
+    "a prune that would leave fewer than one Gaussian for each process", "is left out, training goes on"
+)
 def test_each_process_keeps_a_gaussian(tmp_path: Path):
     """Two processes cannot train the one Gaussian that the first pruning would leave them."""
     assert run_ranks(prune_together, 2, tmp_path) == [[4, 0, 1], [4, 3, 2]]
@@ -103,6 +106,7 @@ def share_out_too_few(shards: Shards) -> str:
     return str(error.value)
 
 
+@pytest.mark.hard_case("fewer Gaussians than processes", "refused in one sentence")
 def test_fewer_gaussians_than_processes_are_refused(tmp_path: Path):
     for message in run_ranks(share_out_too_few, 2, tmp_path):
         assert message == "2 processes cannot share out 1 Gaussians: start fewer processes."

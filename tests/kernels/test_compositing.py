@@ -134,6 +134,9 @@ def gradients_of(scene: dict[str, Any], alphas: Tensor, last_ids: Tensor, absgra
 TOLERANCES = {"usual": 2e-6, "opaque": 3e-4, "faint": 2e-6, "long and thin": 3e-4, "tiny": 1e-3, "huge": 1e-4}
 
 
+@pytest.mark.hard_case(
+    "compositing opaque, faint, tiny, huge, long and thin Gaussians", "gradients equal float64 autograd"
+)
 @pytest.mark.parametrize("kind", TOLERANCES)
 def test_gradients_equal_float64_autograd(kind):
     scene = make_scene(kind, num_views=2 if kind == "usual" else 1)
@@ -224,6 +227,10 @@ def test_without_a_gradient_of_alphas_it_counts_as_zero():
         torch.testing.assert_close(value, expected[name], atol=1e-6, rtol=1e-5)
 
 
+@pytest.mark.hard_case(
+    "a pixel's gradient NaN, ±inf or beyond 10¹⁸",
+    "NaN in the gradients of the Gaussians that it sees, and of no others",
+)
 @pytest.mark.parametrize("broken", [float("nan"), float("inf"), -1e30])
 def test_a_broken_pixel_reaches_the_gaussians_that_it_sees_and_no_others(broken):
     scene = make_scene("usual", width=8, height=8)

@@ -49,6 +49,7 @@ def recorded(monkeypatch: pytest.MonkeyPatch, module: Any, *names: str) -> list[
     return calls
 
 
+@pytest.mark.hard_case("pixels where both images agree", "L1 has a kink there; its gradient is 0, as torch's")
 @pytest.mark.parametrize("shape", [(2, 21, 47, 3), (1, 11, 11, 3), (1, 20, 60, 3)], ids=str)
 def test_loss_and_gradient_equal_the_float64_reference(shape):
     generator = torch.Generator().manual_seed(0)
@@ -152,6 +153,7 @@ def test_a_triton_that_compiles_is_found(nothing_tried):
     assert kernels._compiles(DEVICE)
 
 
+@pytest.mark.hard_case("a trial of Triton that fails once", "told once, tried again")
 def test_a_failure_is_told_once_and_tried_again_and_a_success_is_kept(nothing_tried, monkeypatch):
     """The trial fails twice, as while another program fills the memory, and is made at questions 1, 2 and 4."""
     outcomes = [RuntimeError("CUDA error: out of memory.\nCompile with …"), RuntimeError("out of memory"), None]
@@ -168,6 +170,7 @@ def test_a_failure_is_told_once_and_tried_again_and_a_success_is_kept(nothing_tr
     assert answers == [False] * 3 + [True] * 17 and len(told) == 1 and not outcomes
 
 
+@pytest.mark.hard_case("a trial of Triton that fails for good", "told once, tried again ever more rarely")
 def test_a_failure_that_lasts_is_tried_at_ever_longer_intervals(nothing_tried, monkeypatch):
     trials = []
     monkeypatch.setattr("sadgs_ns.kernels.trial.run_trial", lambda device: trials.append(device) or 1 / 0)

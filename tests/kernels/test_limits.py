@@ -16,6 +16,10 @@ tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not inst
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
+@pytest.mark.hard_case(
+    "the most Gaussians × views, pixels, rows, views and tile pairs that the kernels address, and one more",
+    "run; refused in one sentence",
+)
 def test_the_largest_sizes_pass_and_one_more_is_refused():
     limits.check_gaussians(1, limits.MAX_ROWS)
     limits.check_pixels(1, 1, limits.MAX_ROWS)
@@ -42,6 +46,7 @@ def render(num_views: int, num_gaussians: int, side: int) -> None:
     )  # fmt: skip
 
 
+@pytest.mark.hard_case("more of them than the kernels address", "refused before anything runs")
 def test_too_many_gaussians_pixels_or_tile_pairs_are_refused_before_anything_runs():
     with pytest.raises(InputError, match=r"4 × 200,000,000, are 800,000,000, and .*: take fewer views at once, or"):
         render(4, 200_000_000, 10)
@@ -57,6 +62,7 @@ def test_too_many_gaussians_pixels_or_tile_pairs_are_refused_before_anything_run
         pending.lists()
 
 
+@pytest.mark.hard_case("coefficients beyond 2³¹ numbers (47.7 million Gaussians)", "are found, forward and backward")
 def test_coefficients_beyond_32_bits_are_found_forward_and_backward():
     """Three Gaussians whose rows of coefficients lie as far apart as those of 48 million: 2 · 2^30 overflows 32 bits.
 

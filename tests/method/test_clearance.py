@@ -16,6 +16,7 @@ def test_points_are_clear_of_cameras_from_their_radius_on():
     assert clear_of_cameras(means, torch.tensor([2.0, 2.5, 3.0]), positions).tolist() == [True, False, True]
 
 
+@pytest.mark.hard_case("cameras and points far from the origin", "distances to cameras are exact")
 @pytest.mark.parametrize("offset", [0.0, 1_000.0, 100_000.0])
 def test_distances_to_cameras_are_exact_far_from_the_origin(offset: float):
     generator = torch.Generator().manual_seed(0)
@@ -49,6 +50,11 @@ def test_a_gaussian_around_a_camera_keeps_a_finite_size():
     assert scales.isfinite().all() and (scales < -10).all()
 
 
+@pytest.mark.hard_case(
+    "a Gaussian many times longer than its distance from the cameras",
+    "its axes are shortened (`max_angular_scale`), because its image, a linear approximation, can cover a view "
+    "beside which it lies",
+)
 def test_a_giant_beside_the_view_covers_all_of_it_until_it_is_limited():
     # As on a capture of 30 photos: the camera looks along z, and the giant lies 30 units to its side, nearly in the
     # plane of its lens, with an axis that is ten times as long. Training views saw a little of its tail.

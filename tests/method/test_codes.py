@@ -10,6 +10,7 @@ from sadgs_ns.method.eta import principal_eigenvalue, sample_map
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 
 
+@pytest.mark.hard_case("S̄ kept in 8 bits", "the wavelength is kept within 1.9 %, S̄ stays positive semidefinite")
 @pytest.mark.parametrize("frequency_constant", [0.01, 0.4, HIGHEST_FREQUENCY])
 def test_every_wavelength_is_kept_within_two_percent_and_s_stays_semidefinite(frequency_constant: float):
     images = torch.rand((1, 48, 64, 3), generator=torch.Generator().manual_seed(0))
@@ -36,6 +37,7 @@ def test_nothing_the_ends_of_the_range_and_what_lies_beyond():
     ]
 
 
+@pytest.mark.hard_case("S̄ of a masked pixel in its three bytes", "has a code of its own, which no valid pixel gets")
 def test_masked_pixels_have_a_code_of_their_own():
     """NaN stays NaN, and no tensor of a valid pixel reads as one, whatever its correlation."""
     tensor = torch.tensor([[1.0, 0.5, 1.0], [1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [0.0, 0.0, 0.0]])

@@ -140,6 +140,7 @@ def test_points_outside_the_image_are_no_observation():
     assert values.dtype == torch.float32 and values[inside].eq(1).all() and values[~inside].eq(0).all()
 
 
+@pytest.mark.hard_case("a sample on a masked pixel of S̄", "no observation")
 @pytest.mark.parametrize("kept", [Tensor.half, encode], ids=["float16", "8 bits"])
 def test_points_on_masked_pixels_are_no_observation(kept):
     """Left half masked: points there are as unknown as those outside the image, and a smooth pixel is known to be."""

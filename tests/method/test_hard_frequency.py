@@ -1,4 +1,7 @@
-"""Hard cases of the frequency analysis (docs/hard-cases.md): S̄ stays finite, semidefinite and bounded on any image."""
+"""Hard cases of the frequency analysis: S̄ stays finite, semidefinite and bounded on any image.
+
+S̄ is given in units of c², so its trace is at most 1.
+"""
 
 from __future__ import annotations
 
@@ -74,6 +77,7 @@ def assert_sound(tensor: Tensor, mask: Tensor | None = None) -> None:
 # --- single images ---
 
 
+@pytest.mark.hard_case("a constant image, 0 to 10⁴, every dtype", "S̄ is exactly 0, the wavelength 10⁵ px")
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
 @pytest.mark.parametrize("value", [0.0, 1 / 255, 0.7, 1e4])
 def test_a_constant_image_has_exactly_no_structure(dtype: torch.dtype, value: float):
@@ -81,6 +85,9 @@ def test_a_constant_image_has_exactly_no_structure(dtype: torch.dtype, value: fl
     assert tensor.eq(0).all() and wavelength(tensor).min() == pytest.approx(1e5)
 
 
+@pytest.mark.hard_case(
+    "a line of one pixel", "the shortest wavelength, strongest on the line; the direction is exactly across it"
+)
 def test_a_line_of_one_pixel_is_the_shortest_wavelength_and_points_across():
     image = torch.zeros(1, 65, 65, 3)
     image[:, :, 32] = 1.0
@@ -90,6 +97,10 @@ def test_a_line_of_one_pixel_is_the_shortest_wavelength_and_points_across():
     assert (tensor[0, 32, 32, 0] >= tensor[0, 32, :, 0]).all(), "strongest on the line"
 
 
+@pytest.mark.hard_case(
+    "stripes or a checkerboard at Nyquist (a period of exactly 2 px)",
+    "**read as no texture**: a symmetric derivative is 0 there",
+)
 @pytest.mark.parametrize("pattern", ["stripes", "checkerboard"])
 def test_texture_at_the_nyquist_frequency_is_invisible(pattern: str):
     """A symmetric derivative has no answer at a period of exactly 2 px; it reads as no texture, not as garbage."""
@@ -101,18 +112,23 @@ def test_texture_at_the_nyquist_frequency_is_invisible(pattern: str):
     assert wavelength(tensor[0, 32, 32]) > 1e4
 
 
+@pytest.mark.hard_case(
+    "a period of 2.1 px", "is seen, at up to twice the wavelength of period 3; 2.2 px is within 20 %"
+)
 def test_texture_just_below_the_nyquist_frequency_is_seen():
     period_3 = wavelength(central(unit_tensor(grating(3.0))))
     assert wavelength(central(unit_tensor(grating(2.1)))) < 2 * period_3
     assert wavelength(central(unit_tensor(grating(2.2)))) < 1.2 * period_3
 
 
+@pytest.mark.hard_case("amplitudes of 1/255 to HDR 10⁴, and of 10⁻³⁷ to 10³⁸", "the same S̄ within 10⁻⁶")
 @pytest.mark.parametrize("scale", [1e-37, 1 / 255, 1.0, 1e4, 1e38])
 def test_amplitude_from_one_grey_level_to_hdr_changes_nothing(scale: float):
     image = noise(1, 40, 50, 3)
     torch.testing.assert_close(unit_tensor(scale * image), unit_tensor(image), rtol=0, atol=1e-6)
 
 
+@pytest.mark.hard_case("two neighbouring grey levels of 8 bits", "the same S̄ as in black and white")
 def test_one_grey_level_of_difference_is_a_texture():
     """An 8-bit image of only two neighbouring grey levels reads as the same pattern in black and white."""
     pattern = (grating(8.0) > 0.5).float()
@@ -120,6 +136,10 @@ def test_one_grey_level_of_difference_is_a_texture():
     torch.testing.assert_close(unit_tensor(levels), unit_tensor(pattern), rtol=0, atol=2e-3)
 
 
+@pytest.mark.hard_case(
+    "one pixel of 10⁴ in an image of [0, 1]",
+    "its surroundings keep their structure, **the rest fades**: ε is relative to the image's contrast",
+)
 def test_one_hdr_pixel_makes_the_rest_of_the_image_fade():
     """ε is relative to the image's contrast, which one pixel of 10⁴ dominates; away from it nothing is left."""
     image = noise(1, 96, 96, 3)
@@ -129,6 +149,10 @@ def test_one_hdr_pixel_makes_the_rest_of_the_image_fade():
     assert tensor[0, 5, 5].sum() > 0.5 and tensor[0, 80:, 80:].max() < 1e-3
 
 
+@pytest.mark.hard_case(
+    "contrast 1 on a pedestal of 100, and of 10⁶",
+    "is seen; fades to 0 (under 10⁻⁵ of the brightest pixel only rounding is left)",
+)
 def test_structure_on_a_pedestal_fades_only_where_float32_loses_it():
     image = noise(1, 40, 50, 3)
     assert unit_tensor(image + 100)[..., 0].min() > 0.25
@@ -137,6 +161,7 @@ def test_structure_on_a_pedestal_fades_only_where_float32_loses_it():
     assert drowned.max() < 1e-6
 
 
+@pytest.mark.hard_case("white noise", "a short wavelength, nearly isotropic")
 def test_noise_is_short_and_nearly_isotropic():
     tensor = unit_tensor(noise(1, 96, 96, 3))
     assert_sound(tensor)
@@ -147,6 +172,10 @@ def test_noise_is_short_and_nearly_isotropic():
 # --- sizes, masks, alpha, what is not finite ---
 
 
+@pytest.mark.hard_case(
+    "images of 1×1, 1×N and N×1 pixels, smaller than the kernels, of odd sizes",
+    "S̄ is sound, and transposed with the image; 1×1 is 0",
+)
 @pytest.mark.parametrize("height", [1, 2, 5])
 @pytest.mark.parametrize("width", [1, 2, 3, 31, 300])
 def test_images_of_any_size(height: int, width: int):
@@ -157,6 +186,7 @@ def test_images_of_any_size(height: int, width: int):
     assert height * width > 1 or tensor.eq(0).all()
 
 
+@pytest.mark.hard_case("one row of a grating", "reads as the whole grating does, within 10⁻⁴")
 def test_a_single_row_reads_a_grating_as_a_whole_image_does():
     whole = unit_tensor(grating(9.0, size=192))[:, 96:97, 60:130, 0]
     row = unit_tensor(grating(9.0, size=192)[:, 96:97])[..., 60:130, :]
@@ -164,6 +194,7 @@ def test_a_single_row_reads_a_grating_as_a_whole_image_does():
     torch.testing.assert_close(row[..., 0], whole, rtol=1e-4, atol=0)
 
 
+@pytest.mark.hard_case("a mask with 0, 1 or 2 distant valid pixels", "S̄ = 0 there, NaN at masked pixels")
 @pytest.mark.parametrize("valid", [0, 1, 2])
 def test_masks_that_leave_almost_nothing(valid: int):
     """Nothing, one pixel, or two that no kernel connects: no pair of pixels, no structure."""
@@ -173,6 +204,7 @@ def test_masks_that_leave_almost_nothing(valid: int):
     assert tensor[mask].eq(0).all() and tensor[~mask].isnan().all()
 
 
+@pytest.mark.hard_case("NaN, ±inf or 3·10³⁸ under a mask", "bitwise the same S̄ as without")
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 3e38])
 @pytest.mark.parametrize("incremental", [False, True])
 def test_what_lies_under_a_mask_does_not_matter(value: float, incremental: bool):
@@ -185,6 +217,7 @@ def test_what_lies_under_a_mask_does_not_matter(value: float, incremental: bool)
     assert_sound(expected, mask)
 
 
+@pytest.mark.hard_case("alpha", "is composited first: hidden colours leave no trace, the outline is an edge")
 def test_transparent_pixels_are_the_background():
     """Alpha is composited before S̄: hidden colours leave no trace, and the outline is an edge, as it is rendered."""
     alpha = torch.zeros(1, 96, 96, 1)
@@ -197,6 +230,7 @@ def test_transparent_pixels_are_the_background():
     assert tensor[0, 48, 40, 0] > 0.1 and tensor[..., 2].max() < 1e-6
 
 
+@pytest.mark.hard_case("NaN or ±inf in a valid pixel", "ValueError with the image's index")
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_pixels_that_are_not_finite_are_refused_by_image(value: float):
     images = noise(3, 20, 20, 3)
@@ -205,6 +239,9 @@ def test_pixels_that_are_not_finite_are_refused_by_image(value: float):
         unit_tensor(images)
 
 
+@pytest.mark.hard_case(
+    "NaN or ±inf in a pixel of a training image, masked or not", "an error names the file before the first step"
+)
 def test_the_pipeline_names_the_file_whose_pixels_are_not_finite():
     images = [noise(4, 5, 3), noise(4, 5, 3), torch.zeros(4, 5, 3, dtype=torch.uint8)]
     images[1][2, 3, 0] = math.nan
@@ -215,6 +252,7 @@ def test_the_pipeline_names_the_file_whose_pixels_are_not_finite():
         _ = TrainingViews(datamanager, SimpleNamespace(device="cpu")).cameras  # type: ignore[arg-type]
 
 
+@pytest.mark.hard_case("no pixels, no channels, no images", "ValueError")
 @pytest.mark.parametrize("shape", [(1, 0, 5, 3), (1, 5, 0, 3), (1, 5, 5, 0), (0, 5, 5, 3)], ids=str)
 def test_empty_images_are_refused(shape: tuple[int, ...]):
     with pytest.raises(ValueError, match="images must have pixels and channels"):
@@ -224,6 +262,10 @@ def test_empty_images_are_refused(shape: tuple[int, ...]):
 # --- precision ---
 
 
+@pytest.mark.hard_case(
+    "float32, float16 and bfloat16 images against float64",
+    "computing adds 3·10⁻⁷; rounding the image before it 8·10⁻⁵ (float16) and 4·10⁻⁴ (bfloat16) on the test image",
+)
 @pytest.mark.parametrize(
     ("dtype", "computed", "rounded"),
     [(torch.float32, 1e-6, 1e-6), (torch.float16, 1e-6, 2e-4), (torch.bfloat16, 1e-6, 2e-3)],
@@ -242,6 +284,7 @@ def test_each_dtype_agrees_with_float64(dtype: torch.dtype, computed: float, rou
 # --- equivariance ---
 
 
+@pytest.mark.hard_case("gratings every 5°", "wavelength within 1 % (measured: 0.3 %), direction within 0.5° (0.13°)")
 @pytest.mark.parametrize("period", [3.0, 7.0, 16.0])
 def test_gratings_at_every_angle(period: float):
     """5° apart: wavelength within 1 %, direction within 0.5°, although the pixels are a square grid."""
@@ -251,12 +294,14 @@ def test_gratings_at_every_angle(period: float):
     assert max(apart(degrees_of(tensor), degrees) for degrees, tensor in tensors.items()) < 0.5
 
 
+@pytest.mark.hard_case("a grating of any angle and any period of 2.5 to 16 px", "direction within 1°")
 @reproducible(max_examples=20)
 @given(period=st.floats(2.5, 16.0), degrees=st.floats(0.0, 180.0))
 def test_direction_of_any_grating(period: float, degrees: float):
     assert apart(degrees_of(central(unit_tensor(grating(period, degrees)))), degrees) < 1.0
 
 
+@pytest.mark.hard_case("periods of 2.3, 2.2 and 2.1 px", "direction within 1.5°, 3.5° and 9°")
 @pytest.mark.parametrize(("period", "error"), [(2.1, 9.0), (2.2, 3.5), (2.3, 1.5)])
 def test_directions_are_uncertain_near_the_nyquist_frequency(period: float, error: float):
     """There the sampled derivative is smaller along the pixels' axes than between them."""
@@ -264,6 +309,10 @@ def test_directions_are_uncertain_near_the_nyquist_frequency(period: float, erro
         assert apart(degrees_of(central(unit_tensor(grating(period, degrees)))), degrees) < error
 
 
+@pytest.mark.hard_case(
+    "a grating magnified 1.5 times, periods of 5 to 12 px",
+    "the wavelength grows **1.3 to 1.7 times**, not exactly 1.5: the levels end at σ = 1 and 5 px",
+)
 @pytest.mark.parametrize("period", [5.0, 6.5, 8.0, 10.0, 12.0])
 def test_a_magnified_grating_has_a_longer_wavelength(period: float):
     """Times 1.5, the step between levels: nearly that, for the levels end at σ = 1 and 5 px."""
@@ -271,6 +320,10 @@ def test_a_magnified_grating_has_a_longer_wavelength(period: float):
     assert 1.25 < large / small < 1.75
 
 
+@pytest.mark.hard_case(
+    "periods beyond the levels",
+    "the wavelength saturates: periods under 5 px all read alike, and so do those over 48 px",
+)
 def test_wavelengths_saturate_beyond_the_levels():
     constant = 1 / (2 * math.pi)  # the wavelength then reads as a period
     shortest, longest = 2 * math.pi, 2 * math.pi * 1.5**4
@@ -279,6 +332,7 @@ def test_wavelengths_saturate_beyond_the_levels():
         assert read == pytest.approx(shortest if period < 5 else longest, rel=0.12)
 
 
+@pytest.mark.hard_case("flips and quarter turns, any size and mask", "exact (10⁻¹² in float64)")
 @reproducible(max_examples=20)
 @given(height=st.integers(1, 40), width=st.integers(1, 40), masked=st.booleans(), seed=st.integers(0, 1000))
 def test_flips_and_quarter_turns_are_exact(height: int, width: int, masked: bool, seed: int):
@@ -295,6 +349,9 @@ def test_flips_and_quarter_turns_are_exact(height: int, width: int, masked: bool
 # --- nearly isotropic tensors ---
 
 
+@pytest.mark.hard_case(
+    "nearly isotropic tensors over 60 decades", "λ₁ within 3·10⁻⁷ in float32: neither of its two terms is negative"
+)
 @reproducible(max_examples=200)
 @given(
     trace=st.floats(-30, 30).map(lambda exponent: 10.0**exponent),
@@ -315,6 +372,9 @@ def test_the_eigenvalue_of_a_nearly_isotropic_tensor_does_not_cancel(trace: floa
 # --- any image ---
 
 
+@pytest.mark.hard_case(
+    "any finite pixels up to ±10³⁸ (hypothesis)", "finite, semidefinite within 10⁻⁶ of the trace, trace at most c²"
+)
 @reproducible(max_examples=60)
 @given(
     image=arrays.arrays(
@@ -329,6 +389,10 @@ def test_s_is_sound_for_any_finite_pixels(image: np.ndarray, dtype: torch.dtype,
     assert_sound(unit_tensor(torch.from_numpy(image).to(dtype), incremental=incremental))
 
 
+@pytest.mark.hard_case(
+    "any texture, exposure, pedestal, mask, `noise_floor` and `energy_blur` (hypothesis)",
+    "finite, semidefinite and bounded; NaN at masked pixels",
+)
 @reproducible(max_examples=60)
 @given(
     shape=st.tuples(st.just(2), st.integers(1, 48), st.integers(1, 48), st.integers(1, 4)),

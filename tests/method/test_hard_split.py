@@ -1,4 +1,14 @@
-"""Hard cases of splitting, pruning and optimizing; docs/hard-cases.md says what happens in each."""
+"""Hard cases of splitting, pruning and optimizing.
+
+`FusedAdam`, which optimizes every parameter of this method, takes a gradient as 0 if it is NaN or its magnitude is 1e18
+or more: its square would fill Adam's second moment with infinity, and the parameter would never move again. It does so
+at the step itself, number by number; the finite numbers of the same gradient are used. The report follows at most 100
+iterations later. With several views in an iteration it names all of them, since their loss is one mean.
+
+The guard does not catch gradients and losses that are wrong but finite; a parameter that is already NaN, as from a
+damaged checkpoint; optimizers other than `FusedAdam` put into a config (their losses are still watched); or NaN in
+depth, evaluation or viewer, which train nothing.
+"""
 
 from __future__ import annotations
 
@@ -85,6 +95,10 @@ def no_final_prune(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(strategy_module, "FINAL_PRUNE_OPACITY", 0.0)
 
 
+@pytest.mark.hard_case(
+    "η of 10¹², 3·10³⁸ or ∞, on every axis of every Gaussian",
+    "the cap is filled as far as whole parents fit, all numbers are finite",
+)
 @pytest.mark.parametrize("eta_max", [1e12, 3e38, math.inf])
 def test_all_violate_beyond_measure_and_fill_the_cap(eta_max: float):
     params, state = random_params(50), observed(50, eta_max)
@@ -96,6 +110,7 @@ def test_all_violate_beyond_measure_and_fill_the_cap(eta_max: float):
     assert not any(value.any() for value in state.values() if isinstance(value, Tensor))
 
 
+@pytest.mark.hard_case("no Gaussian violates", "nothing is split")
 @pytest.mark.parametrize("eta_max", [0.5, math.nan])
 def test_where_none_violates_nothing_is_split(eta_max: float):
     params, state = random_params(50), observed(50, eta_max)
@@ -104,11 +119,13 @@ def test_where_none_violates_nothing_is_split(eta_max: float):
     assert torch.equal(params["means"], before)
 
 
+@pytest.mark.hard_case("η is NaN", "no violation; its axis is not split")
 def test_an_eta_that_is_no_number_splits_nothing_even_where_it_counts_as_a_violation():
     eta_max = torch.tensor([[math.nan, 9.0, math.inf]])
     assert children_per_axis(eta_max, torch.ones(1, 3, dtype=torch.bool)).tolist() == [[1, 3, 8]]
 
 
+@pytest.mark.hard_case("a huge parent near the cap", "is passed over if it does not fit, and blocks nobody")
 def test_a_parent_that_does_not_fit_does_not_block_the_smaller_ones():
     growth = torch.tensor([511, 1, 7, 511, 3])
     priority = torch.tensor([9.0, 1.0, 5.0, 7.0, 6.0])
@@ -118,6 +135,10 @@ def test_a_parent_that_does_not_fit_does_not_block_the_smaller_ones():
     assert limit_growth(growth, priority, math.inf).all()
 
 
+@pytest.mark.hard_case(
+    "more violations than the cap allows",
+    "each parent is taken, in the order of η, that fits into the room which those before it left over",
+)
 def test_growth_is_chosen_one_by_one_from_the_largest_violation():
     generator = torch.Generator().manual_seed(0)
     sizes = torch.tensor([0, 1, 2, 3, 7, 26, 63, 511])
@@ -131,6 +152,7 @@ def test_growth_is_chosen_one_by_one_from_the_largest_violation():
         assert torch.equal(limit_growth(growth, priority, budget), expected)
 
 
+@pytest.mark.hard_case("a cap smaller than the initial count, in your own loop", "nothing is added, training goes on")
 def test_a_cap_under_the_initial_number_stops_growth_only():
     params = random_params(30)
     start = params["means"].detach().clone()
@@ -138,11 +160,15 @@ def test_a_cap_under_the_initial_number_stops_growth_only():
     assert not torch.equal(params["means"], start) and all(p.isfinite().all() for p in params.values())
 
 
+@pytest.mark.hard_case("a cap of 0", "refused: `strategy.max_gaussians must be at least 1, got 0.`")
 def test_a_cap_that_allows_no_gaussian_is_refused():
     with pytest.raises(ValueError, match=r"strategy\.max_gaussians must be at least 1, got 0\."):
         StructureAwareStrategy(max_gaussians=0).initialize_state()
 
 
+@pytest.mark.hard_case(
+    "`eta_every` or `min_observations` of 0, negative intervals of densification, thresholds NaN", "refused by name"
+)
 def test_an_interval_of_zero_is_refused_at_the_start():
     with pytest.raises(ValueError, match=r"strategy\.eta_every must be at least 1, got 0\."):
         StructureAwareStrategy(eta_every=0).initialize_state()
@@ -153,6 +179,7 @@ def test_an_interval_of_zero_is_refused_at_the_start():
             dataclasses.replace(StructureAwareStrategy(), **{option: value}).initialize_state()
 
 
+@pytest.mark.hard_case("a fraction or an opacity out of its range", "refused by name")
 @pytest.mark.parametrize(
     ("option", "value", "allowed"),
     [
@@ -165,6 +192,10 @@ def test_an_option_out_of_its_range_is_refused_at_the_start(option: str, value: 
         dataclasses.replace(StructureAwareStrategy(), **{option: value}).initialize_state()
 
 
+@pytest.mark.hard_case(
+    "children as large as their parent, or smaller than the paper's (`child_scale` not in [1, 2))",
+    "refused in one sentence",
+)
 @pytest.mark.parametrize("child_scale", [0.5, 2.0, math.nan])
 def test_children_smaller_than_the_papers_or_as_large_as_a_parent_are_refused(child_scale: float):
     with pytest.raises(ValueError, match=r"child_scale must be at least 1 and less than 2, got (0\.5|2|nan)\."):
@@ -174,11 +205,13 @@ def test_children_smaller_than_the_papers_or_as_large_as_a_parent_are_refused(ch
 # --- memory ---
 
 
+@pytest.mark.hard_case("a run without CUDA", "no limit of memory is assumed")
 def test_without_cuda_memory_is_not_planned():
     params = random_params(5)
     assert memory.affordable_growth(params, {}, memory.free_bytes(CPU), StepSize()) == math.inf
 
 
+@pytest.mark.hard_case("what a new Gaussian keeps in memory", "is counted")
 def test_what_is_kept_of_each_new_gaussian_is_counted():
     """Adam's state, the statistics and the parameters with gradients, as they are after a split."""
     params, state = random_params(50), observed(50, 4.0)
@@ -209,6 +242,11 @@ def test_what_is_kept_of_each_new_gaussian_is_counted():
     assert memory.affordable_growth(original, observed(50, 4.0), at_first, size) == 0
 
 
+@pytest.mark.hard_case(
+    "a split that would not fit in the device's memory",
+    "is estimated before anything is made, from the views, pixels and tile pairs of the step before; fewer are "
+    "added, the largest violations first; a warning says how many and what to do; training goes on",
+)
 @pytest.mark.parametrize("room", [0, 20])
 def test_a_split_that_would_not_fit_in_memory_is_reduced_with_a_warning_and_training_goes_on(
     room: int, monkeypatch: pytest.MonkeyPatch
@@ -230,6 +268,7 @@ def test_a_split_that_would_not_fit_in_memory_is_reduced_with_a_warning_and_trai
     assert all(p.isfinite().all() for p in params.values())
 
 
+@pytest.mark.hard_case("growth by AbsGS that would not fit in memory", "is reduced in the same way")
 def test_absgs_is_reduced_to_what_fits_in_memory_too(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(strategy_module, "affordable_growth", lambda *arguments: 7)
     params = random_params(30)
@@ -238,6 +277,7 @@ def test_absgs_is_reduced_to_what_fits_in_memory_too(monkeypatch: pytest.MonkeyP
     assert numbers == [30, 30, 30, 37, 37, 37]
 
 
+@pytest.mark.hard_case("enough memory", "no warning")
 def test_enough_memory_gives_no_warning(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(strategy_module, "free_bytes", lambda device: 1e9)
     params = random_params(30)
@@ -247,6 +287,7 @@ def test_enough_memory_gives_no_warning(monkeypatch: pytest.MonkeyPatch):
 # --- few Gaussians ---
 
 
+@pytest.mark.hard_case("one Gaussian from the start", "trains and splits")
 def test_one_gaussian_trains_and_splits():
     params = random_params(1)
     params["means"].data = torch.tensor([[0.0, 0.0, 4.0]])
@@ -256,6 +297,7 @@ def test_one_gaussian_trains_and_splits():
     assert all(p.isfinite().all() for p in params.values())
 
 
+@pytest.mark.hard_case("pruning that leaves one Gaussian", "training goes on")
 def test_pruning_may_leave_one():
     params, state = random_params(5), observed(5, 0.01)
     params["opacities"].data = torch.logit(torch.tensor([0.01, 0.02, 0.9, 0.03, 0.04]))
@@ -264,6 +306,7 @@ def test_pruning_may_leave_one():
     assert torch.equal(params["means"], kept)
 
 
+@pytest.mark.hard_case("a prune that would leave no Gaussian", "is left out, training goes on")
 def test_a_prune_that_would_leave_none_is_left_out(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(strategy_module, "FINAL_PRUNE_OPACITY", 0.5)
     params = random_params(6)
@@ -272,6 +315,10 @@ def test_a_prune_that_would_leave_none_is_left_out(monkeypatch: pytest.MonkeyPat
     assert numbers == [6] * 26 and all(p.isfinite().all() for p in params.values())
 
 
+@pytest.mark.hard_case(
+    "opacities of exactly 0 and 1 (logits ±200, ±∞)",
+    "finite everywhere else; 1 is clamped by the next structure step or reset, 0 is pruned",
+)
 def test_opacities_of_exactly_zero_and_one():
     """Logits of ±200 are 0 and 1 in float32, as are infinite ones."""
     params = random_params(12)
@@ -309,6 +356,14 @@ CLOUDS = {
 }
 
 
+@pytest.mark.hard_case(
+    "1, 2 or 3 SfM points",
+    "they start with finite scales (one alone: 0.01 units) and train; a single point has no bounding box, so "
+    "no face points",
+)
+@pytest.mark.hard_case(
+    "duplicate points, all or in pairs", "a scale of a millionth of the cloud's extent instead of log 0"
+)
 @pytest.mark.parametrize("name", CLOUDS)
 def test_few_duplicate_and_collinear_points_start_and_train(name: str):
     points = torch.tensor(CLOUDS[name])
@@ -338,6 +393,7 @@ def test_few_duplicate_and_collinear_points_start_and_train(name: str):
     assert is_finite(model)
 
 
+@pytest.mark.hard_case("collinear and coplanar points", "a flat box gets each face point once")
 def test_a_flat_box_has_each_face_point_once_and_a_point_has_no_box():
     for name, number in {"one": 0, "duplicates": 0, "collinear": 16 + 2, "coplanar": 256 + 4 * 16}.items():
         faces, spacing = bounding_box_points(torch.tensor(CLOUDS[name]))
@@ -345,6 +401,7 @@ def test_a_flat_box_has_each_face_point_once_and_a_point_has_no_box():
         assert spacing > 0
 
 
+@pytest.mark.hard_case("no point", "refused in one sentence")
 def test_no_points_at_all_are_refused():
     with pytest.raises(ValueError, match=r"There are no points to start from: give SfM points"):
         neighbour_scales(torch.zeros(0, 3))
@@ -355,6 +412,9 @@ def test_no_points_at_all_are_refused():
 WRONG = [math.nan, math.inf, -math.inf, 1e30]
 
 
+@pytest.mark.hard_case(
+    "gradients of NaN, ±∞ or 10³⁰ in torch's Adam and in our kernel", "count as 0, to the bit as if they had been 0"
+)
 @pytest.mark.parametrize("triton", [False, True])
 def test_adam_counts_gradients_it_could_not_recover_from_as_zero(triton: bool, monkeypatch: pytest.MonkeyPatch):
     if triton:
@@ -378,6 +438,7 @@ def test_adam_counts_gradients_it_could_not_recover_from_as_zero(triton: bool, m
         assert torch.equal(value, expected) and value.isfinite().all()
 
 
+@pytest.mark.hard_case("a gradient just under the bound of 10¹⁸", "Adam stays finite")
 def test_a_gradient_just_under_the_bound_keeps_adam_finite():
     parameter = torch.nn.Parameter(torch.zeros(2))
     optimizer = FusedAdam([parameter], lr=0.01, eps=1e-15)
@@ -387,6 +448,10 @@ def test_a_gradient_just_under_the_bound_keeps_adam_finite():
     torch.testing.assert_close(parameter.detach(), torch.tensor([-0.01, 0.01]))
 
 
+@pytest.mark.hard_case(
+    "NaN or ∞ in AbsGS's screen gradients",
+    "NaN adds nothing; a Gaussian whose sum overflowed does not grow until the sums start anew",
+)
 def test_absgs_sums_skip_what_is_no_number_and_ignore_what_overflowed():
     means2d = torch.zeros(2, 4, 2)
     means2d.grad = torch.full((2, 4, 2), 1e-3)
@@ -425,6 +490,11 @@ class HostWaits(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
+@pytest.mark.hard_case(
+    "the cost of the guard against NaN",
+    "one copy of a number on the device each step, and a comparison inside Adam's kernel; the host reads the "
+    "log every 100 steps and at the end",
+)
 def test_the_guard_never_waits_within_a_step():
     log = nonfinite.NonFiniteLog(CPU, capacity=10)
     gradient, loss = torch.tensor(WRONG), torch.tensor(math.nan)
@@ -447,6 +517,7 @@ def test_noting_a_loss_gives_the_device_no_work():
     assert log.read() == [(0, [0], "the loss was nan")]
 
 
+@pytest.mark.hard_case("the log of bad steps", "names steps, and forgets them once they are read")
 def test_the_log_names_steps_and_forgets_them_once_read():
     log = nonfinite.NonFiniteLog(CPU, capacity=4)
     log.begin_step(7, [3], torch.tensor(0.5))
@@ -461,6 +532,12 @@ def test_the_log_names_steps_and_forgets_them_once_read():
 ITERATIONS = 16
 
 
+@pytest.mark.hard_case(
+    "NaN in one image's pixels",
+    "the model and Adam's moments stay finite, densification goes on, a line names iteration and image",
+    "image-*",
+)
+@pytest.mark.hard_case("NaN in one image's gradient while its loss is finite", "the same", "gradient-*")
 @pytest.mark.parametrize("views", [1, 2])
 @pytest.mark.parametrize("where", ["image", "gradient"])
 def test_an_image_that_makes_nan_is_named_and_does_not_poison_the_model(
@@ -509,6 +586,7 @@ def test_an_image_that_makes_nan_is_named_and_does_not_poison_the_model(
             assert all(value.isfinite().all() for value in slots.values())
 
 
+@pytest.mark.hard_case("many iterations with NaN", "the first five of every hundred are named, the rest counted")
 def test_many_bad_iterations_are_summed_up(
     colmap: ColmapDataParserConfig,
     tmp_path: Path,
@@ -522,6 +600,7 @@ def test_many_bad_iterations_are_summed_up(
     assert printed.count("the loss was nan") == 5 and "The same in 4 more of the last iterations." in printed
 
 
+@pytest.mark.hard_case("more of them than the log holds", "the log is read before it overflows")
 def test_the_log_is_read_before_it_overflows(
     colmap: ColmapDataParserConfig,
     tmp_path: Path,

@@ -63,6 +63,7 @@ def test_points_come_first_and_the_faces_faint_grey_and_a_cell_large_after_them(
         torch.testing.assert_close(value[20:], torch.as_tensor(added).expand_as(value[20:]))
 
 
+@pytest.mark.hard_case("one wild camera", "does not count for the extent")
 def test_one_wild_camera_does_not_decide_the_extent():
     positions = torch.rand((20, 3), generator=torch.Generator().manual_seed(0))
     expected = camera_extent(positions)
@@ -70,6 +71,7 @@ def test_one_wild_camera_does_not_decide_the_extent():
         assert camera_extent(torch.cat([positions, torch.full((1, 3), far)])) == expected
 
 
+@pytest.mark.hard_case("one wild SfM point", "is left out and counted; all others stay")
 @pytest.mark.parametrize("number", [4, 60, 2_000])
 @pytest.mark.parametrize("far", [[1e5, 0, 0], [1e30, -1e30, 1e30], [torch.inf, 0, 0], [0, torch.nan, 0]])
 def test_a_wild_point_is_not_plausible_and_all_others_are(number: int, far: list[float]):
@@ -78,6 +80,7 @@ def test_a_wild_point_is_not_plausible_and_all_others_are(number: int, far: list
     assert (~plausible_points(points)).nonzero().tolist() == [[2]]
 
 
+@pytest.mark.hard_case("a sound cloud with a far background", "all points stay")
 def test_a_sound_cloud_with_a_far_background_is_plausible():
     generator = torch.Generator().manual_seed(0)
     near, background = (torch.randn((number, 3), generator=generator) for number in (1_000, 50))

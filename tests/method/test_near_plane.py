@@ -35,6 +35,7 @@ def test_the_plane_is_a_share_of_the_depth_of_what_is_nearest():
     assert scene_near_plane(wall(8.0), *row_of_cameras()) == pytest.approx(8.0 * NEAR_SHARE)
 
 
+@pytest.mark.hard_case("the same scene in other units", "the near plane scales with the units")
 @pytest.mark.parametrize("factor", [1e-3, 1e4])
 def test_a_scene_in_other_units_has_the_same_plane_in_them(factor: float):
     viewmats, Ks, sizes = row_of_cameras()
@@ -43,12 +44,14 @@ def test_a_scene_in_other_units_has_the_same_plane_in_them(factor: float):
     assert found == pytest.approx(factor * 8.0 * NEAR_SHARE, rel=1e-5)
 
 
+@pytest.mark.hard_case("a leaf close to one camera of many", "the near plane lies before the leaf")
 def test_a_leaf_before_a_single_camera_keeps_the_plane_before_it():
     leaf = torch.tensor([4.0, 0.0, 0.3]) + 0.02 * wall(0.0, middle=0.0, width=1.0, number=3)
     found = scene_near_plane(torch.cat([wall(8.0), leaf]), *row_of_cameras())
     assert found == pytest.approx(0.3 * NEAR_SHARE)
 
 
+@pytest.mark.hard_case("macro photos", "the near plane lies before the object")
 def test_macro_photos_have_a_plane_before_their_object():
     """Cameras half a unit from a coin, in front of a table that is a hundred times as far."""
     coin = wall(0.5, width=0.1, number=10)
@@ -56,6 +59,7 @@ def test_macro_photos_have_a_plane_before_their_object():
     assert found == pytest.approx(0.5 * NEAR_SHARE)
 
 
+@pytest.mark.hard_case("up to four wrong SfM points before a camera", "do not move the near plane")
 def test_a_few_wrong_points_before_a_camera_do_not_move_the_plane():
     wrong = torch.tensor([[2.0, 0.0, 1e-3]]).repeat(NEAREST_POINTS - 1, 1)
     broken = torch.tensor([[torch.nan, 0, 1], [2, 0, torch.inf]])
@@ -98,6 +102,10 @@ def looking_at_the_origin(centres: Tensor) -> Tensor:
     return viewmats
 
 
+@pytest.mark.hard_case(
+    "a faint Gaussian just before a camera, between the training cameras",
+    "haze over the image with a near plane of .01; nothing with the scene's",
+)
 def test_a_faint_gaussian_before_a_camera_is_haze_without_the_plane_and_nothing_with_it():
     viewmats, Ks, _ = row_of_cameras(1)
     means = torch.tensor([[0.0, 0, 8], [0, 0, 0.1]])
@@ -154,6 +162,10 @@ def test_gaussians_before_the_cameras_and_between_them_are_in_the_empty_space_an
     assert not holds(space, before + torch.tensor([0.0, 0, 4.0])).any(), "nor beyond the plane"
 
 
+@pytest.mark.hard_case(
+    "a wall that begins at an image's border",
+    "is not in the empty space before the cameras, whose large Gaussians files leave out",
+)
 def test_a_wall_that_begins_at_the_image_s_border_is_not_in_the_empty_space():
     """A corridor along z: the nearest that a camera sees of its walls is where they enter its image."""
     y, z = torch.meshgrid(torch.linspace(-0.3, 0.3, 15), torch.linspace(0, 20, 400), indexing="ij")
@@ -169,6 +181,7 @@ def test_a_wall_that_begins_at_the_image_s_border_is_not_in_the_empty_space():
     assert holds(space, middle).all()
 
 
+@pytest.mark.hard_case("a wall between two rooms with cameras on both sides", "is not in that empty space")
 def test_a_wall_between_two_rooms_is_not_in_the_empty_space():
     """Cameras on both sides of a wall look the same way: the path between them leads through the wall."""
     points = torch.cat([wall(3.0, middle=0.0), wall(14.0, middle=0.0)])

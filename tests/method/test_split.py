@@ -24,6 +24,9 @@ def test_split_factor_is_the_ceiling_of_the_root():
     assert children_per_axis(eta_max, violates).tolist() == [[1, 1, 2], [2, 3, 1]]
 
 
+@pytest.mark.hard_case(
+    "a parent whose η asks for any number of children", "gets 8 children an axis at most, 512 in all"
+)
 @pytest.mark.parametrize("eta_max", [1e3, 1e12, 3e38, math.inf])
 def test_no_parent_explodes(eta_max: float):
     counts = children_per_axis(torch.full((1, 3), eta_max), torch.ones(1, 3, dtype=torch.bool))
@@ -85,6 +88,10 @@ def test_split_keeps_the_parent_s_mean_and_covariance(counts: list[int], child_s
     torch.testing.assert_close(mass[1].sum(), mass[0].sum(), rtol=1e-12, atol=0)
 
 
+@pytest.mark.hard_case(
+    "parents of opacity e⁻²⁰⁰ or 1 − e⁻²⁰⁰",
+    "children are fainter by 1/k an axis, their logits finite and right to 10⁻⁶",
+)
 @pytest.mark.parametrize("logit", [-200.0, -30.0, 0.0, 30.0, 200.0])
 def test_children_of_extreme_opacity_have_finite_logits(logit: float):
     params = random_params(1)

@@ -61,6 +61,9 @@ def test_two_views_count_twice():
     assert float(one["n_total"][0]) == 1 and float(two["n_total"][0]) == 2
 
 
+@pytest.mark.hard_case(
+    "Gaussians that have faded", "are observed as opaque ones are, so that they can be pruned for low η"
+)
 def test_faint_gaussians_are_observed_as_opaque_ones_are():
     """Pruning by low η asks about Gaussians that have faded."""
     params = three_gaussians()
@@ -82,6 +85,7 @@ def test_textureless_pixels_are_low_not_high():
     assert statistics["n_low"][0].tolist() == [1.0] * 3 and not statistics["n_high"].any()
 
 
+@pytest.mark.hard_case("a sample on a masked pixel of S̄'s codes", "no observation, in the torch code as in the kernel")
 @pytest.mark.parametrize("kept", [torch.Tensor.half, encode], ids=["float16", "8 bits"])
 def test_masked_pixels_are_no_observation(kept):
     """One half of a smooth image is masked: only the Gaussian over the other half gets its low response."""
@@ -112,6 +116,10 @@ def test_garbage_of_the_unseen_never_enters():
     assert all(value.isfinite().all() for value in statistics.values())
 
 
+@pytest.mark.hard_case(
+    "an axis that violated in 1 of 1 or 2 of 2 observations",
+    "is not split: at least 3 are asked for (`min_observations`)",
+)
 def test_consistency_is_a_fraction_of_enough_observations():
     counts = torch.tensor([[9.0, 8.0, 0.0], [0.0, 0.0, 0.0]])
     total = torch.tensor([10.0, 0.0])

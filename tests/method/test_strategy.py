@@ -294,6 +294,9 @@ def test_absgs_halves_the_longest_axis_in_its_place():
         torch.testing.assert_close(children[name], parents[name][:, None].expand_as(children[name]))
 
 
+@pytest.mark.hard_case(
+    "a Gaussian that AbsGS splits or clones", "its children and its clone start with empty statistics"
+)
 @pytest.mark.parametrize("long_axis", [True, False])
 def test_absgs_leaves_statistics_with_the_gaussians_that_were_observed(long_axis: bool):
     """A parent of η = 20, halved four times, would ask for 5 cells an axis; each child is seen anew."""
