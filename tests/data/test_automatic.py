@@ -62,6 +62,11 @@ LAYOUTS: dict[str, tuple[Callable[[Path, Path], Any], Callable[[Path], DataParse
 }
 
 
+@pytest.mark.hard_case(
+    "`ns-train sadgs --data FOLDER` and `sadgs-doctor FOLDER` on `sparse/0`, `colmap/sparse/0`, `sparse`, "
+    "`transforms.json`, Blender",
+    "trains",
+)
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_the_parser_is_chosen_by_what_the_folder_holds(layout: str, scene: Path, tmp_path: Path):
     data = tmp_path / "capture"
@@ -73,6 +78,10 @@ def test_the_parser_is_chosen_by_what_the_folder_holds(layout: str, scene: Path,
     assert config.dataparser == expected(data)
 
 
+@pytest.mark.hard_case(
+    "`--data` is a part of a capture (`images`, `sparse/0`), the folder above one, or a file",
+    "refused: says which folder to give",
+)
 def test_a_folder_above_or_below_a_capture_is_told_where_that_is(scene: Path, tmp_path: Path):
     data = tmp_path / "above" / "capture"
     shutil.copytree(scene, data)
@@ -93,6 +102,7 @@ def test_a_folder_above_or_below_a_capture_is_told_where_that_is(scene: Path, tm
     assert "other holds neither transforms.json nor a COLMAP reconstruction" in finding.sentence
 
 
+@pytest.mark.hard_case("a folder that may not be entered, names too long", "refused: cannot be read")
 def test_a_folder_that_cannot_be_read_is_named(tmp_path: Path):
     data = tmp_path / ("a" * 300)
     sentence = f"{data} cannot be read (File name too long): correct its name or rights."
@@ -107,6 +117,7 @@ def parsed(*words: str) -> SadgsDatamanagerConfig:
     return tyro.cli(AnnotatedBaseConfigUnion, args=["sadgs", *words]).pipeline.datamanager
 
 
+@pytest.mark.hard_case("a parser that was named", "stays as named; `nerfstudio-data` on a COLMAP folder: leave it out")
 def test_the_command_line_tells_a_parser_that_was_named_from_none(scene: Path, capsys: pytest.CaptureFixture[str]):
     config = parsed()
     assert config.dataparser == AutomaticDataParserConfig()
@@ -126,6 +137,7 @@ def test_the_command_line_tells_a_parser_that_was_named_from_none(scene: Path, c
             refuse_bad_data(config)
 
 
+@pytest.mark.hard_case("a run whose parser was chosen by its folder", "`config.yml` names nerfstudio's own parser")
 def test_a_run_s_config_names_the_parser_and_serves_other_commands_and_more_training(scene: Path, tmp_path: Path):
     config = configure(tmp_path, AutomaticDataParserConfig(), iterations=2)
     config.data = config.pipeline.datamanager.data = scene  # as ns-train sets both
@@ -150,6 +162,10 @@ def large(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return Path(shutil.copytree(scene, tmp_path / "large"))
 
 
+@pytest.mark.hard_case(
+    "images of more than 1600 px without smaller copies, no parser named",
+    "trained on as they are, or as the copies that exist",
+)
 def test_large_images_are_taken_as_they_are_and_smaller_copies_where_they_exist(large: Path):
     for factor, copies in ((1, 4), (2, 2), (4, 4)):  # of factor 4 alone none is taken, for nerfstudio asks for each
         smaller = large / f"images_{copies}"
@@ -166,6 +182,10 @@ def test_large_images_are_taken_as_they_are_and_smaller_copies_where_they_exist(
             shutil.rmtree(smaller)
 
 
+@pytest.mark.hard_case(
+    "the same with `colmap` named, which asks a question",
+    "at a terminal a warning, then the question; without a terminal refused: `--downscale-factor 1`",
+)
 def test_a_question_that_a_named_parser_would_ask_nobody_is_an_error(large: Path, monkeypatch: pytest.MonkeyPatch):
     config = SadgsDatamanagerConfig(dataparser=ColmapDataParserConfig(data=large, colmap_path=SPARSE_FOLDER))
     monkeypatch.setattr(sys.stdin, "isatty", lambda: False)
@@ -176,6 +196,10 @@ def test_a_question_that_a_named_parser_would_ask_nobody_is_an_error(large: Path
     assert "nerfstudio will ask whether to make it with ffmpeg; say yes, or add `--down" in warning.sentence
 
 
+@pytest.mark.hard_case(
+    "`--downscale-factor 8` on small images or without copies; `--downscale-factor 0`",
+    "refused: leave that option out, and use `--pipeline.datamanager.camera-res-scale-factor 0.125`; refused by name",
+)
 def test_a_factor_without_copies_and_one_that_makes_nothing_smaller_are_named(scene: Path, tmp_path: Path):
     named: list[Any] = [
         ColmapDataParserConfig(data=scene, colmap_path=SPARSE_FOLDER),
@@ -195,6 +219,10 @@ def test_a_factor_without_copies_and_one_that_makes_nothing_smaller_are_named(sc
             refuse_bad_data(SadgsDatamanagerConfig(dataparser=parser))
 
 
+@pytest.mark.hard_case(
+    "`--eval-mode filename` with a name that holds neither train nor eval",
+    "refused: rename it, or leave the option out",
+)
 def test_images_that_are_to_be_divided_by_their_names_need_such_names(tmp_path: Path):
     parser = nerfstudio_data(tmp_path)
     parser.eval_mode = "filename"
@@ -209,6 +237,9 @@ def test_images_that_are_to_be_divided_by_their_names_need_such_names(tmp_path: 
     assert [finding for finding in findings if finding.severity != "note"] == []
 
 
+@pytest.mark.hard_case(
+    "`test_filenames` missing or empty; test images that are trained on", "a warning: shows nothing about new views"
+)
 def test_lists_without_test_images_and_with_training_images_among_them_are_warned_of(tmp_path: Path):
     nerfstudio_data(tmp_path)
     path = tmp_path / "transforms.json"

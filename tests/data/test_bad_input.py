@@ -1,4 +1,8 @@
-"""Bad input: one sentence that names file and remedy, in training as in `sadgs-doctor`, and nothing left over."""
+"""Bad input: one sentence that names file and remedy, in training as in `sadgs-doctor`, and nothing left over.
+
+`sadgs-doctor FOLDER` prints the same sentences as `ns-train`. Parsers other than nerfstudio's, COLMAP's and Blender's
+are not checked, nor is a JPEG damaged in its middle, which decodes to wrong pixels without an error.
+"""
 
 from __future__ import annotations
 
@@ -659,6 +663,222 @@ CASES = {
 """A layout, how to spoil it, and the sentence that says so."""
 
 
+@pytest.mark.hard_case("the folder is missing", "refused: does not exist", "folder-missing")
+@pytest.mark.hard_case("no images: an empty reconstruction, no frames", "refused", "no-images", "json-no-frames")
+@pytest.mark.hard_case(
+    "images without any pose",
+    "refused: counts them, and gives the command `sadgs-process` with the photos' folder in it",
+    "no-poses",
+    "json-missing",
+)
+@pytest.mark.hard_case(
+    "poses without images: one file, the whole folder",
+    "refused",
+    "image-missing",
+    "json-image-missing",
+    "no-image-folder",
+)
+@pytest.mark.hard_case("an image of 0 bytes", "refused", "image-empty")
+@pytest.mark.hard_case("a truncated PNG", "refused", "image-truncated")
+@pytest.mark.hard_case("a corrupt PNG", "refused (its checksums)", "image-corrupt")
+@pytest.mark.hard_case("a file that is no image", "refused", "image-not-one")
+@pytest.mark.hard_case(
+    "palette, CMYK or 16-bit images (nerfstudio would read wrong colours)",
+    "refused: convert to 8-bit RGB",
+    "image-mode",
+)
+@pytest.mark.hard_case(
+    "an image of another size than its camera", "refused: both sizes", "image-size", "json-size", "blender-size"
+)
+@pytest.mark.hard_case(
+    "masks for some frames only; masks of another size", "refused", "json-some-masks", "json-mask-size"
+)
+@pytest.mark.hard_case(
+    "NaN or infinity in a pose", "refused: names the image", "nan-pose", "json-nan-pose", "blender-nan"
+)
+@pytest.mark.hard_case("a pose that is no rotation, or no 4 × 4 matrix", "refused", "no-rotation", "json-short-pose")
+@pytest.mark.hard_case(
+    "a mirrored pose (determinant −1)", "refused: negate one column", "json-mirrored", "blender-mirrored"
+)
+@pytest.mark.hard_case(
+    "a stretched, skewed or transposed pose; a quaternion of another length",
+    "refused",
+    "json-stretched",
+    "json-transposed",
+    "quaternion-length",
+)
+@pytest.mark.hard_case(
+    "cameras more than about 8,400 times as far from the origin as they are spread",
+    "refused: float32 cannot tell them apart",
+    "poses-shifted",
+    "json-shifted",
+)
+@pytest.mark.hard_case(
+    "one camera that far from the others",
+    "refused: remove the image, or compute the poses again",
+    "pose-far",
+    "json-far",
+)
+@pytest.mark.hard_case("intrinsics missing or not positive", "refused", "json-no-focal", "camera-focal")
+@pytest.mark.hard_case(
+    "a principal point more than 10 image sizes from the middle of its image", "refused", "camera-center", "json-center"
+)
+@pytest.mark.hard_case(
+    "distortion that cannot be undone (k1 = 50, k1 = −3, p1 = 9)",
+    "refused",
+    "camera-k1",
+    "camera-folds",
+    "camera-p1",
+    "json-k1",
+)
+@pytest.mark.hard_case(
+    "k4 of a perspective camera, coefficients that are no finite number",
+    "refused: names frame and coefficient",
+    "json-k4",
+    "json-k1-nan",
+)
+@pytest.mark.hard_case(
+    "a fisheye whose coefficients are all 0, FISHEYE624 too",
+    "refused, by `sadgs-doctor` too; nothing is left",
+    "camera-fisheye-0",
+    "json-fisheye-0",
+    "json-fisheye624-0",
+)
+@pytest.mark.hard_case(
+    "a width of 160.5 px, numbers beyond float64, Blender's angle of view in degrees",
+    "refused",
+    "json-width",
+    "json-huge",
+    "blender-degrees",
+)
+@pytest.mark.hard_case(
+    "a camera model that nerfstudio cannot read; fisheye mixed with others; a camera that is missing",
+    "refused",
+    "camera-unsupported",
+    "json-camera-model",
+    "cameras-mixed-fisheye",
+    "camera-unknown",
+)
+@pytest.mark.hard_case(
+    "1 view in all; all cameras in one place", "refused: shows no depth", "one-view", "json-one-view", "json-one-place"
+)
+@pytest.mark.hard_case(
+    "`points3D` missing, empty, or with NaN",
+    "refused: `--load-3D-points False` starts from random points",
+    "points-missing",
+    "points-empty",
+    "points-nan",
+)
+@pytest.mark.hard_case(
+    "the PLY of points missing, empty, cut off, with NaN, or no PLY",
+    "refused: restore it, or remove `ply_file_path`",
+    "ply-nan",
+    "ply-missing",
+    "ply-empty",
+    "ply-truncated",
+    "ply-not-one",
+)
+@pytest.mark.hard_case("points that no camera has in front of it", "refused", "points-behind")
+@pytest.mark.hard_case(
+    "points more than 10⁵ times as far away as the cameras are apart", "refused", "points-too-far", "ply-too-far"
+)
+@pytest.mark.hard_case("the same, in `sadgs-doctor`", "a note", "point-wild", "point-beyond-bounds")
+@pytest.mark.hard_case(
+    "a corrupt COLMAP binary: cut off, empty, an unknown model, a count of 2⁶⁰",
+    "refused: where it ends",
+    "cameras-truncated",
+    "cameras-empty",
+    "cameras-corrupt",
+    "images-missing",
+    "images-truncated",
+    "images-corrupt-count",
+    "points-truncated",
+)
+@pytest.mark.hard_case("corrupt COLMAP text", "refused", "text-corrupt", "text-colour")
+@pytest.mark.hard_case(
+    "`transforms.json` cut off or of another kind; one of Blender's missing",
+    "refused",
+    "json-corrupt",
+    "json-list",
+    "blender-no-val",
+)
+@pytest.mark.hard_case(
+    "masks of three channels (RGB, RGBA), grey with alpha, palette",
+    "refused: convert it to 8-bit grey",
+    "json-mask-colour",
+)
+@pytest.mark.hard_case(
+    "an image or a mask that is a link to itself",
+    "refused: cannot be read as an image (Too many levels of symbolic links)",
+    "image-loop",
+    "json-mask-loop",
+)
+@pytest.mark.hard_case(
+    "`transforms.json`, the reconstruction's folder or its cameras are a link to itself",
+    "refused: is a link that leads nowhere",
+    "json-loop",
+    "model-loop",
+)
+@pytest.mark.hard_case(
+    "`images.bin` or the folder of images is a link to itself", "refused", "poses-loop", "images-loop"
+)
+@pytest.mark.hard_case(
+    "all images black, white or of one colour", "refused: they show a single colour and nothing else", "images-black"
+)
+@pytest.mark.hard_case(
+    "all images transparent", "refused, as above; colour under alpha 0 does not count", "json-transparent"
+)
+@pytest.mark.hard_case(
+    "all masks black", "refused: no pixel is left; make white what is to be trained on", "json-masks-black"
+)
+@pytest.mark.hard_case("names in `test_filenames` that do not exist", "refused: names the first", "json-test-names")
+@pytest.mark.hard_case(
+    "names in `val_filenames` or `train_filenames` that do not exist; lists that are no lists",
+    "refused",
+    "json-val-names",
+    "json-train-names",
+    "json-names-no-list",
+)
+@pytest.mark.hard_case(
+    "one of the lists `train_filenames` and `val_filenames` is missing", "refused", "json-names-missing"
+)
+@pytest.mark.hard_case(
+    "COLMAP's `train_list.txt`, `val_list.txt`, `test_list.txt`: an unknown name, a missing list, a byte order "
+    "mark, not UTF-8",
+    "refused",
+    "list-unknown",
+    "list-missing",
+    "list-mark",
+    "list-latin",
+)
+@pytest.mark.hard_case("UTF-16", "refused: save it in UTF-8", "json-utf16")
+@pytest.mark.hard_case(
+    "a `masks` folder beside a COLMAP reconstruction",
+    "a warning: `colmap --colmap-path … --masks-path masks`",
+    "masks-unused",
+)
+@pytest.mark.hard_case(
+    "a focal length in millimetres (an angle of view over 170°); one of 10⁹ px",
+    "refused: correct it, in pixels",
+    "json-focal-wide",
+    "json-focal-narrow",
+)
+@pytest.mark.hard_case("fx and fy that differ by more than 2 times", "a warning", "camera-stretched")
+@pytest.mark.hard_case("an image 1 px wide", "refused", "image-line")
+@pytest.mark.hard_case(
+    "`applied_transform` of another shape; `applied_scale` of 0, NaN or text; an unknown "
+    "`orientation_override`; `fisheye_crop_radius` of text",
+    "refused by name",
+    "json-applied-transform",
+    "json-applied-scale",
+    "json-orientation",
+    "json-crop",
+)
+@pytest.mark.hard_case("depths for some frames", "refused: all or none", "json-some-depths")
+@pytest.mark.hard_case("`distortion_params` that is no list of 6 numbers", "refused", "json-few-coefficients")
+@pytest.mark.hard_case("a pose whose last row is 0 0 0 2 (nerfstudio ignores it)", "refused", "json-last-row")
+@pytest.mark.hard_case("a zero byte in a file's name", "refused", "json-zero-byte")
+@pytest.mark.hard_case("a name with a space in COLMAP's text", "refused: write the model in binary", "text-space")
 @pytest.mark.parametrize("case", CASES)
 def test_bad_data_are_refused_in_one_sentence_by_training_and_doctor_alike(
     case: str,
@@ -718,6 +938,7 @@ def test_a_run_checks_its_data_once_and_other_ways_to_a_pipeline_check_them_too(
         set_up(config)  # what was good before does not count
 
 
+@pytest.mark.hard_case("several bad images", "one sentence for each kind: the first, and how many more")
 def test_several_problems_of_one_kind_are_one_finding_and_other_kinds_are_counted(copied: Callable[[str], Path]):
     data = copied("nerfstudio")
     for index in (2, 5, 7):
@@ -777,6 +998,12 @@ UNLIKELY = {
 }
 
 
+@pytest.mark.hard_case(
+    "one camera more than 30 times as far out as 90 % of them; a principal point just outside the image; "
+    "distortion that cannot be undone in the corners alone; points more than 10³ times as far away as the "
+    "cameras are apart",
+    "trains, with a warning",
+)
 @pytest.mark.parametrize("case", UNLIKELY)
 def test_unlikely_data_are_told_of_in_one_sentence(case: str, copied: Callable[[str], Path]):
     spoil, severity, sentence = UNLIKELY[case]
@@ -786,6 +1013,7 @@ def test_unlikely_data_are_told_of_in_one_sentence(case: str, copied: Callable[[
     assert finding.severity == severity and re.fullmatch(sentence, finding.sentence), finding
 
 
+@pytest.mark.hard_case("an angle of view under 0.5°", "a warning")
 def test_a_lens_of_a_telescope_is_a_warning(copied: Callable[[str], Path]):
     data = copied("nerfstudio")
     meta(lambda m: [frame.update(fl_x=1e4, fl_y=1e4) for frame in m["frames"]])(data)
@@ -797,6 +1025,7 @@ def test_a_lens_of_a_telescope_is_a_warning(copied: Callable[[str], Path]):
     assert re.fullmatch(text, finding.sentence)
 
 
+@pytest.mark.hard_case("points that fewer than half of the cameras see", "a warning")
 def test_points_behind_some_cameras_are_a_warning(copied: Callable[[str], Path]):
     data = copied("nerfstudio")
     with_points([[0.5, 0.5, 0.5]] * 4)(data)
@@ -807,6 +1036,7 @@ def test_points_behind_some_cameras_are_a_warning(copied: Callable[[str], Path])
     assert re.fullmatch(r"\S+/p\.ply has points that only 40% of the cameras can see .*\.", finding.sentence)
 
 
+@pytest.mark.hard_case("points beside a Blender scene (`--ply-path`)", "checked in the same way")
 def test_points_beside_a_blender_scene_are_checked(copied: Callable[[str], Path]):
     data = copied("blender")
 
@@ -823,6 +1053,7 @@ def test_points_beside_a_blender_scene_are_checked(copied: Callable[[str], Path]
     assert re.fullmatch(r"\S+/p\.ply should hold the SfM points but is empty: restore it, or leave .*\.", sentence)
 
 
+@pytest.mark.hard_case("one point 10⁵ to 10²⁰⁰ units away", "trains as without it; the run says how many it leaves out")
 @pytest.mark.parametrize("far", [1e5, 1e30, 1e200])
 def test_a_wild_point_does_not_change_what_training_starts_from(
     far: float, copied: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -853,6 +1084,7 @@ def test_a_wild_point_does_not_change_what_training_starts_from(
 # --- what looks bad and is not ---
 
 
+@pytest.mark.hard_case("a truncated JPEG, and one with bytes after its end", "refused; trains, as nerfstudio reads it")
 def test_a_jpeg_with_bytes_after_its_end_is_good_and_one_cut_off_is_not(copied: Callable[[str], Path]):
     data = copied("nerfstudio")
     path = data / FIRST  # the name does not matter to Pillow
@@ -865,6 +1097,7 @@ def test_a_jpeg_with_bytes_after_its_end_is_good_and_one_cut_off_is_not(copied: 
     assert "000.png cannot be read as an image (image file is truncated" in sentence
 
 
+@pytest.mark.hard_case("a PNG without its last chunk", "trains, as nerfstudio reads it")
 def test_a_png_that_lacks_only_its_last_chunk_is_good_as_it_is_to_nerfstudio(copied: Callable[[str], Path]):
     data = copied("nerfstudio")
     content = (data / FIRST).read_bytes()
@@ -872,6 +1105,9 @@ def test_a_png_that_lacks_only_its_last_chunk_is_good_as_it_is_to_nerfstudio(cop
     assert errors(data) == []
 
 
+@pytest.mark.hard_case(
+    "images without poses beside others; an unused image that is a link to itself", "trains; a warning names the first"
+)
 def test_images_without_poses_beside_others_are_a_warning(copied: Callable[[str], Path]):
     data = copied("colmap")
     model(lambda cameras, images, points: (images.pop(3), images.pop(5)))(data)
@@ -880,6 +1116,7 @@ def test_images_without_poses_beside_others_are_a_warning(copied: Callable[[str]
     assert re.fullmatch(r"\S+/002\.png \(and 1 more\) has no pose in \S+ and is not used: .*\.", finding.sentence)
 
 
+@pytest.mark.hard_case("mixed cameras and sizes", "**trains**")
 def test_cameras_of_several_models_and_sizes_train_together(copied: Callable[[str], Path], tmp_path: Path):
     data = copied("colmap")
 
@@ -902,6 +1139,11 @@ def test_cameras_of_several_models_and_sizes_train_together(copied: Callable[[st
     assert is_finite(trainer.pipeline.model)
 
 
+@pytest.mark.hard_case(
+    "masks of 1, 8 or 16 bits; grey images, or with alpha, among RGB; one mask black; one pixel unmasked; 3 "
+    "equal points",
+    "trains, finite",
+)
 def test_images_and_masks_of_several_kinds_and_few_points_train(copied: Callable[[str], Path], tmp_path: Path):
     data = copied("nerfstudio")
     for name, mode in (("001", "RGBA"), ("002", "L")):
@@ -920,6 +1162,7 @@ def test_images_and_masks_of_several_kinds_and_few_points_train(copied: Callable
     assert is_finite(train(config).pipeline.model)
 
 
+@pytest.mark.hard_case("1 or 2 training views of 2", "trains, finite, with a warning")
 @pytest.mark.parametrize(("layout", "views", "training"), [("nerfstudio", 2, 2), ("colmap", 2, 1)])
 def test_one_or_two_training_views_train_with_a_warning(
     layout: str,
@@ -973,6 +1216,9 @@ def test_colmap_s_text_and_binary_models_read_alike_and_as_nerfstudio_reads_them
         assert (colors == np.array([point.rgb for point in theirs[2].values()])).all()
 
 
+@pytest.mark.hard_case(
+    "images scaled down with the cameras", "trains; sizes are compared after scaling, with nerfstudio's rounding"
+)
 @pytest.mark.parametrize("factor", [2, 3])
 def test_scaled_down_images_are_compared_with_scaled_down_cameras(
     factor: int, copied: Callable[[str], Path], tmp_path: Path
@@ -990,6 +1236,9 @@ def test_scaled_down_images_are_compared_with_scaled_down_cameras(
     assert "has 48 × 36 px, but its camera" in sentence
 
 
+@pytest.mark.hard_case(
+    "200 photographs of 2 megapixels", "one is decoded to see whether it shows something (.02 s as JPEG, .3 s as PNG)"
+)
 def test_of_two_hundred_photographs_one_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     rng = np.random.default_rng(0)
     data = tmp_path / "photographs"
@@ -1022,6 +1271,11 @@ def test_of_two_hundred_photographs_one_is_decoded(tmp_path: Path, monkeypatch: 
 # --- the command line ---
 
 
+@pytest.mark.hard_case(
+    "an error of input, run or writing",
+    "one sentence on stderr, `error: FILE …: REMEDY.`, exit code 1 and no traceback; from Python an ordinary "
+    "`ValueError` (`InputError`), `RuntimeError` (`RunError`) or `OSError` (`WriteError`), never a `SystemExit`",
+)
 def test_uncaught_errors_print_one_sentence_and_exit_with_1():
     for kind, ordinary in ((InputError, ValueError), (RunError, RuntimeError)):
         code = f"import sadgs_ns.plugin; from sadgs_ns.errors import *; raise {kind.__name__}('Nothing: do something.')"
@@ -1033,6 +1287,11 @@ def test_uncaught_errors_print_one_sentence_and_exit_with_1():
     assert result.returncode == 1 and result.stderr.startswith("Traceback") and "somebody else" in result.stderr
 
 
+@pytest.mark.hard_case(
+    "options that cannot work",
+    "refused before anything is written; a run whose checkpoint cannot be read, or is of another capture, "
+    "leaves its `config.yml`",
+)
 @pytest.mark.parametrize(
     ("option", "value", "sentence"),
     [
@@ -1068,6 +1327,7 @@ def test_options_that_cannot_work_are_refused_in_one_sentence_before_anything_is
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.hard_case("`ns-train` on bad data", "the sentence alone")
 def test_ns_train_on_bad_data_ends_with_the_sentence_alone(
     copied: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

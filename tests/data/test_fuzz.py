@@ -1,7 +1,7 @@
 """Fuzz: damaged COLMAP models end in success or an error, never in a hang, a crash or gigabytes.
 
-The examples are drawn anew in each run; hypothesis prints the one that fails, and how to repeat it. More of them:
-`pytest tests/data/test_fuzz.py --hypothesis-profile=long`.
+A run of the suite draws 100 new examples; hypothesis prints the one that fails, and how to repeat it. `pytest
+tests/data/test_fuzz.py --hypothesis-profile=long` draws 5,000.
 """
 
 from __future__ import annotations
@@ -105,6 +105,10 @@ def copy(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return Path(shutil.copytree(scene, tmp_path_factory.mktemp("damaged") / "scene"))
 
 
+@pytest.mark.hard_case(
+    "COLMAP files with bits flipped, cut off, counts overwritten, bytes inserted",
+    "it parses or raises within 20 s and 1 GiB",
+)
 @given(st.lists(damages, min_size=1, max_size=3))
 @FEW
 def test_a_damaged_colmap_model_parses_or_raises_within_bounds(
@@ -122,6 +126,9 @@ def test_the_undamaged_model_parses(scene: Path):
     assert parse(scene) is None
 
 
+@pytest.mark.hard_case(
+    "a count of 2³¹ to 2⁶⁴ keypoints or track entries (nerfstudio alone allocates it)", "one sentence names the file"
+)
 @pytest.mark.parametrize("count", [2**31, 2**34, 2**40, 2**60, 2**64 - 1])
 @pytest.mark.parametrize("name", ["images.bin", "points3D.bin"])
 def test_a_count_beyond_the_file_is_one_sentence_that_names_it(name: str, count: int, scene: Path, copy: Path):

@@ -1,4 +1,9 @@
-"""Files from somebody else: what they can execute, where they can write, and who reaches the viewer."""
+"""Files from somebody else: what they can execute, where they can write, and who reaches the viewer.
+
+nerfstudio's `config.yml` executes code (it is read with `yaml.Loader`). Our presets (plain Python of the package),
+protocols (`yaml.safe_load`), checkpoints (`torch.load(weights_only=True)`), `transforms.json` and COLMAP models do not.
+Pillow and plyfile parse images and PLY files (open3d if `blender-data` or ScanNet name one).
+"""
 
 from __future__ import annotations
 
@@ -56,6 +61,10 @@ def yaml_payload(path: Path) -> str:
 # --- what executes code ---
 
 
+@pytest.mark.hard_case(
+    "`--load-dir` or `--load-checkpoint` with a hostile pickle, also with `TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD=1`",
+    "one sentence; nothing is executed",
+)
 @pytest.mark.parametrize("forced", [False, True])
 @pytest.mark.parametrize("option", ["load_dir", "load_checkpoint"])
 def test_resuming_from_a_hostile_checkpoint_executes_nothing(
@@ -78,6 +87,10 @@ def test_resuming_from_a_hostile_checkpoint_executes_nothing(
     assert executed.exists()  # so it was a hostile one
 
 
+@pytest.mark.hard_case(
+    "`ns-eval`, `ns-render`, `ns-viewer`, `ns-export` with a hostile checkpoint",
+    "torch ≥ 2.6 refuses it; nothing is executed",
+)
 def test_evaluating_a_hostile_checkpoint_executes_nothing(config: SadgsTrainerConfig, tmp_path: Path):
     executed, config.load_dir = tmp_path / "executed", tmp_path / "checkpoints"
     config.load_dir.mkdir()
@@ -87,6 +100,10 @@ def test_evaluating_a_hostile_checkpoint_executes_nothing(config: SadgsTrainerCo
     assert not executed.exists()
 
 
+@pytest.mark.hard_case(
+    "the same commands with a hostile `config.yml`",
+    "**it is executed**, by nerfstudio, before any code of ours; the README warns",
+)
 def test_nerfstudio_executes_what_a_config_yml_says_as_the_readme_warns(tmp_path: Path):
     executed, path = tmp_path / "executed", tmp_path / "config.yml"
     path.write_text(yaml_payload(executed))
@@ -95,6 +112,7 @@ def test_nerfstudio_executes_what_a_config_yml_says_as_the_readme_warns(tmp_path
     assert executed.exists()
 
 
+@pytest.mark.hard_case("a protocol with Python tags", "one line; nothing is executed")
 def test_a_hostile_protocol_executes_nothing(tmp_path: Path):
     (tmp_path / "p.yaml").write_text(f"scenes: {yaml_payload(tmp_path / 'executed')}")
     with pytest.raises(ValueError, match=r"p\.yaml is not YAML: .*python/object/apply"):
@@ -105,6 +123,10 @@ def test_a_hostile_protocol_executes_nothing(tmp_path: Path):
 # --- where files are written ---
 
 
+@pytest.mark.hard_case(
+    "a protocol whose experiment, timestamp, checkpoint, log or viewer path leads out of the run's folder",
+    "the run is refused in one sentence",
+)
 @pytest.mark.parametrize(
     "overrides",
     [
@@ -124,6 +146,10 @@ def test_a_protocol_cannot_write_outside_its_run_s_folder(overrides: dict[str, A
         run.build_config(where, Row("r", "sadgs", overrides), 0, scene.parent, tmp_path)
 
 
+@pytest.mark.hard_case(
+    "a scene, label or image name of any characters, as a file name of the benchmarks' `--images`",
+    "becomes one safe name right below its folder; different texts stay different",
+)
 @given(st.text(), st.text())
 def test_any_text_becomes_the_name_of_a_file_right_below_its_folder(first: str, second: str):
     name = file_name(first)
@@ -143,6 +169,10 @@ def rename_first_image(scene: Path, copy: Path, name: str, text: bool) -> Colmap
     return ColmapDataParserConfig(data=copy, colmap_path=Path(SPARSE_FOLDER), downscale_factor=1)
 
 
+@pytest.mark.hard_case(
+    "a COLMAP image named `../../x`, `/etc/x`, `` `id`.png ``, `$(…).png`",
+    "refused before nerfstudio downscales (it runs ffmpeg through a shell) or renders by that name",
+)
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize(
     "name",
@@ -172,6 +202,10 @@ def transforms(folder: Path, names: list[str]) -> NerfstudioDataParserConfig:
     return NerfstudioDataParserConfig(data=folder, downscale_factor=1, eval_mode="all")
 
 
+@pytest.mark.hard_case(
+    "an image of `transforms.json` that lies apart from the others by way of `..`",
+    "refused: `ns-render dataset` would write outside its output folder; all images in `../images` are fine",
+)
 def test_an_image_apart_from_the_others_by_dots_is_refused(tmp_path: Path):
     names = [f"images/{i}.png" for i in range(4)]
     parser = transforms(tmp_path / "data", [*names, "images/../../secret/4.png"])
@@ -181,6 +215,7 @@ def test_an_image_apart_from_the_others_by_dots_is_refused(tmp_path: Path):
     assert len(SadgsDatamanagerConfig(dataparser=beside).setup(device="cpu").train_dataset) == 4  # as people have them
 
 
+@pytest.mark.hard_case("a saved config of an older version", "gets the datamanager with these checks, too")
 def test_saved_configs_make_the_datamanager_with_the_checks():
     for name in ("sadgs", "sadgs_paper", "sadgs_paper_indoor"):
         datamanager: FullImageDatamanagerConfig = getattr(presets, name).config.pipeline.datamanager
@@ -220,6 +255,7 @@ def shut_down(trainer: SadgsTrainer) -> None:
     trainer.shutdown()
 
 
+@pytest.mark.hard_case("the viewer of `ns-train`", "listens on 127.0.0.1; `--viewer.websocket-host 0.0.0.0` opens it")
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere 127.0.0.2 is no address of this machine")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # viser's, in its thread: as an error it would never start
 @pytest.mark.parametrize(("host", "open_to_all"), [(None, False), ("0.0.0.0", True)])
@@ -243,6 +279,7 @@ def test_the_viewer_answers_only_on_loopback_unless_told_otherwise(
         shut_down(trainer)
 
 
+@pytest.mark.hard_case("the help of `ns-train sadgs`", "shows that default")
 @pytest.mark.parametrize("method", ["sadgs", "sadgs-paper"])
 def test_the_help_shows_that_the_viewer_listens_on_loopback(method: str, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit):
@@ -251,10 +288,14 @@ def test_the_help_shows_that_the_viewer_listens_on_loopback(method: str, capsys:
     assert found and "(default: 127.0.0.1)" in " ".join(after.split())[:200]
 
 
+@pytest.mark.hard_case(
+    "`ns-viewer`", "nerfstudio ignores the run's setting and listens everywhere; the README gives the option"
+)
 def test_ns_viewer_has_a_host_of_its_own_as_the_readme_warns():
     assert ViewerConfigWithoutNumRays().as_viewer_config().websocket_host == ViewerConfig().websocket_host == "0.0.0.0"
 
 
+@pytest.mark.hard_case("our own YAML files", "need no more than the safe loader")
 def test_no_yaml_of_ours_needs_more_than_the_safe_loader():
     for path in Path(__file__).parents[2].glob("configs/**/*.yaml"):
         assert isinstance(yaml.safe_load(path.read_text()), dict)

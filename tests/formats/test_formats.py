@@ -171,6 +171,7 @@ def test_a_morton_order_keeps_neighbours_together():
     )
 
 
+@pytest.mark.hard_case("Gaussians further away than SPZ's fixed point reaches", "refused; nothing is written")
 def test_positions_of_spz_are_as_fine_as_the_furthest_one_leaves(tmp_path: Path):
     written = random_gaussians(8)
     for reach, step in ((3.0, 2.0**-20), (1000.0, 2.0**-13), (8191.9995, 2.0**-10)):
@@ -210,6 +211,7 @@ def test_the_node_of_a_glb_turns_up_to_y(frame: Any, up: list[int], tmp_path: Pa
     np.testing.assert_allclose(turned, [0, 1, 0], atol=1e-12)
 
 
+@pytest.mark.hard_case("more Gaussians than glTF's 4 GB hold", "refused; nothing is written")
 def test_a_glb_of_more_than_four_gigabytes_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setattr(glb, "_MOST_BYTES", 1000)
     with pytest.raises(InputError, match=r"^5 Gaussians take more than the 4 GB that glTF can hold: choose"):
@@ -262,6 +264,9 @@ def _raise(error: Exception) -> Callable[..., Any]:
     return fail
 
 
+@pytest.mark.hard_case(
+    "a page without Node.js, without a network, or of another release of the viewer", "refused: what to install"
+)
 def test_what_goes_wrong_with_node_is_one_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     def fails(message: str) -> None:
         with pytest.raises(InputError, match=message):
@@ -289,6 +294,7 @@ def test_the_format_follows_the_name_in_any_case(suffix: str, tmp_path: Path):
     assert formats.format_of(tmp_path / f"a.b{suffix.upper()}") == suffix
 
 
+@pytest.mark.hard_case("no Gaussian to export", "refused; nothing is written")
 def test_nothing_is_written_of_nothing(tmp_path: Path):
     for suffix in formats.FORMATS:
         if suffix != ".ply":

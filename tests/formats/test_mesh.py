@@ -95,6 +95,7 @@ def test_nothing_and_what_is_far_behind_make_no_mesh():
         assert fusion.has_room_for([dataclasses.replace(view, depth=depth)])
 
 
+@pytest.mark.hard_case("a mesh of more voxels than fit in memory", "refused: names the option; nothing is written")
 @pytest.mark.usefixtures("open3d")
 def test_voxels_that_do_not_fit_are_refused_before_they_take_memory(monkeypatch: pytest.MonkeyPatch):
     view = depth_view(ROOM, arc_views(1, 80, 60)[0])
