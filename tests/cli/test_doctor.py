@@ -54,6 +54,10 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     return state
 
 
+@pytest.mark.hard_case(
+    "`sadgs-doctor` on a good scene",
+    "notes kind, number and size of images, masks and points, and says `Next: ns-train sadgs --data FOLDER`",
+)
 def test_it_runs_as_a_module_prints_versions_and_finds_nothing_wrong_with_a_good_scene(tmp_path: Path):
     write_scene(tmp_path / "scene", 32, 24, 9, 20)
     argv = ["sadgs_ns.cli.doctor", str(tmp_path / "scene")]

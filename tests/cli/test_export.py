@@ -399,6 +399,10 @@ def test_what_lies_just_before_the_cameras_is_left_out_unless_it_is_to_be_kept(
         assert said != bool(options)
 
 
+@pytest.mark.hard_case(
+    "cleaning that takes everything away, a box that is reversed, numbers that are negative or NaN",
+    "refused: names the option",
+)
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [

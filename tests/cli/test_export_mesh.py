@@ -163,6 +163,9 @@ def test_depth_is_along_the_axis_and_pixels_that_are_mostly_empty_are_left_out()
     np.testing.assert_allclose(view.color[16, 16], [0.9, 0.5, 0.1], atol=1e-5)
 
 
+@pytest.mark.hard_case(
+    "a mesh without a surface, with voxels of 0 or NaN", "refused: names the option; nothing is written"
+)
 @pytest.mark.usefixtures("open3d")
 @pytest.mark.parametrize(
     ("options", "sentence"),
@@ -182,6 +185,7 @@ def test_what_gives_no_mesh_is_one_sentence_and_leaves_nothing(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.hard_case("a mesh without views, or of faint Gaussians alone", "refused: there is no surface")
 @pytest.mark.usefixtures("open3d")
 def test_no_views_and_gaussians_that_are_all_faint_have_no_surface(run: tuple[Path, Path], tmp_path: Path):
     params = export.read_gaussians(run[1])
@@ -194,6 +198,7 @@ def test_no_views_and_gaussians_that_are_all_faint_have_no_surface(run: tuple[Pa
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.hard_case("a mesh without open3d", "refused before anything is rendered: what to install")
 def test_voxels_are_for_meshes_and_open3d_is_asked_for_first(
     run: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):

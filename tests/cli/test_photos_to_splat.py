@@ -66,6 +66,11 @@ def lines_of(printed: str) -> dict[str, str]:
     return dict(found)
 
 
+@pytest.mark.hard_case(
+    "Ctrl-C on `sadgs` in its first, second and third stage",
+    "the stage saves; the same command goes on, and does nothing twice",
+)
+@pytest.mark.hard_case("the reader of the output of `sadgs` ends", "all stages run; it prints where errors go")
 def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothing(
     photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], stop
 ):
@@ -127,6 +132,11 @@ def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothin
         assert f"({told}); give another --output or delete it." in capsys.readouterr().err
 
 
+@pytest.mark.hard_case(
+    "photos added to the folder of a finished `sadgs`, interrupted in each stage",
+    "cameras are added, and another run is trained in the same frame, with the same held-out views; the "
+    "earlier splat and run stay until the new one is written",
+)
 def test_photos_that_are_added_are_registered_and_the_splat_is_trained_anew_where_it_was(
     photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], stop
 ):
@@ -210,6 +220,10 @@ def test_photos_that_are_added_twice_before_anything_is_saved_are_all_in_the_spl
     assert second["dataparser_transform"] == moved["transform"] and len(second["test_filenames"]) == 5
 
 
+@pytest.mark.hard_case(
+    "fewer than half of the photos of `sadgs` register",
+    "it ends before training, and says what helps; `--anyway` goes on",
+)
 def test_few_registered_photos_end_it_until_it_shall_go_on_anyway(
     photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], program
 ):
@@ -235,6 +249,10 @@ def test_few_registered_photos_end_it_until_it_shall_go_on_anyway(
     assert str(log) in printed.err and " -m program sadgs --data " in log.read_text("utf8")
 
 
+@pytest.mark.hard_case(
+    "`sadgs` with photos removed, other settings or options, another folder, no Node.js for a page",
+    "one sentence before any work",
+)
 def test_wrong_input_is_told_in_a_sentence_before_any_work(
     photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -279,6 +297,7 @@ def test_wrong_input_is_told_in_a_sentence_before_any_work(
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.hard_case("two `sadgs` in one folder", "the second waits up to 10 s, then is refused")
 def test_two_runs_do_not_work_in_one_folder(
     photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -361,6 +380,7 @@ def test_a_prepared_stage_whose_import_failed_tells_why(program):
         assert ran.run([], Interrupts(waiting=lambda: False), process) == (1, "Without numpy nothing works")
 
 
+@pytest.mark.hard_case("a signal to `sadgs`", "is passed on once, and the stage may save")
 def test_a_signal_is_passed_on_once_and_the_stage_may_save(program):
     ran = program(
         "import signal, sys, time\n"
@@ -372,12 +392,14 @@ def test_a_signal_is_passed_on_once_and_the_stage_may_save(program):
     assert ran.log.read_text("utf8").endswith("ready\nsaved\n")
 
 
+@pytest.mark.hard_case("the training of `sadgs` is killed", "one sentence, and the same command goes on")
 def test_a_stage_that_is_killed_is_told_of(program):
     ran = program("import os, signal; os.kill(os.getpid(), signal.SIGKILL)")
     with pytest.raises(RunError, match="ended by SIGKILL, most likely for want of memory; all that it printed is in"):
         ran.run([], Interrupts(waiting=lambda: False))
 
 
+@pytest.mark.hard_case("`sadgs` is killed", "the stage is stopped as by SIGTERM (Linux)")
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the lock keeps the next run away until the stage ends")
 def test_a_stage_does_not_outlive_the_command_that_is_killed(program, tmp_path: Path):
     ran = program("import os, time\nprint(f'pid {os.getpid()}')\ntime.sleep(60)")

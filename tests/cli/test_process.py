@@ -1,4 +1,11 @@
-"""From photos to a scene, on drawn photos whose poses are known."""
+"""From photos to a scene, on drawn photos whose poses are known.
+
+Tried by hand: a downloaded vocabulary tree that is damaged (wrong SHA-256) counts as none, and the sentence says that
+it does not match. SIGKILL of the command ends COLMAP's process, too. If COLMAP's process is killed for want of memory,
+one sentence names the stage and the remedy. In both cases the same command goes on. CMYK, palette, grey, 16-bit PNG and
+TIFF, LZW TIFF and BMP become 8-bit RGB in the scene. Despite EXIF orientation, pixels stay as they are stored, in
+images and cameras.
+"""
 
 from __future__ import annotations
 
@@ -118,6 +125,11 @@ def run(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
     return Run(out, summary, stages, exit_code, printed.read_text(), left, matches)
 
 
+@pytest.mark.hard_case(
+    "SIGTERM, SIGHUP or Ctrl-C in `sadgs-process`",
+    'ends in 0.5 s with "stopped; the same command goes on.", exit code 143, 129 or 130; half-written folders '
+    "are removed, COLMAP's process is gone",
+)
 def test_an_interrupted_run_ends_in_a_sentence_and_goes_on(run: Run):
     assert run.exit_code == 143 and run.printed == "sadgs-process: stopped; the same command goes on.\n"
     assert run.left - {"database.db-shm", "database.db-wal"} == {"settings.json", "database.db", "alpha"}
@@ -167,6 +179,12 @@ def test_training_reads_the_scene_without_options(run: Run):
     assert 0 < len(dataset) < VIEWS and len(dataset.metadata["points3D_xyz"]) > 200
 
 
+@pytest.mark.hard_case(
+    "`work/` of a finished scene",
+    "holds what photos can be added to: settings, features with matches, and the model; the same command says "
+    "that the scene is finished and changes nothing",
+)
+@pytest.mark.hard_case("a scene is finished", "`sadgs-doctor` and `ns-train` are named as next, quoted for the shell")
 def test_a_finished_scene_keeps_what_photos_are_added_to_and_is_known_again(run: Run, photos: Path, capsys):
     assert {path.name for path in (run.out / "work").iterdir()} == {"settings.json", "database.db", "model"}
     before = {path: path.stat().st_mtime_ns for path in run.out.rglob("*")}
@@ -212,6 +230,7 @@ def test_photos_of_one_size_and_lens_share_a_camera(tmp_path: Path):
     assert groups == [["a.jpg", "b.jpg"], ["c.jpg"], ["d.jpg"], ["e.jpg"]]
 
 
+@pytest.mark.hard_case("the photos' folder or the video is a loop of links", "one sentence")
 @pytest.mark.parametrize(
     ("prepare", "sentence"),
     [
@@ -257,6 +276,11 @@ def link(path: Path) -> None:
     path.symlink_to(path)
 
 
+@pytest.mark.hard_case(
+    "photos cut at 60 % (JPEG, PNG, WebP, TIFF), empty ones, files that are no images, links to themselves, "
+    "more than 179 million pixels",
+    "refused before any work; all are named (20 at most, and how many more)",
+)
 def test_all_photos_that_are_not_whole_are_named(tmp_path: Path, capsys):
     """COLMAP reads the missing part of a photo as black."""
     photo = next(draw_photos())
@@ -277,6 +301,10 @@ def test_all_photos_that_are_not_whole_are_named(tmp_path: Path, capsys):
         read_photos(tmp_path, [f"{i}.jpg" for i in range(25)], lambda *step: None)
 
 
+@pytest.mark.hard_case(
+    "macOS's `._photo.jpg`, `.thumbnails/`, a folder named `x.png`, a link to the photos' own folder", "no photos"
+)
+@pytest.mark.hard_case("names that are no Unicode, or with line breaks", "refused by name: rename it")
 def test_hidden_files_and_folders_named_as_photos_are_no_photos(tmp_path: Path):
     black(tmp_path, "a.png", "b.png", "c.png", "._a.png", ".thumbnails/a.png", "folder.png/d.png")
     (tmp_path / "around").symlink_to(tmp_path)
@@ -286,6 +314,7 @@ def test_hidden_files_and_folders_named_as_photos_are_no_photos(tmp_path: Path):
         find_photos(tmp_path, tmp_path / "out")
 
 
+@pytest.mark.hard_case("the output folder is a loop of links", "one sentence")
 def test_an_output_folder_that_is_a_loop_of_links_is_named(photos: Path, tmp_path: Path, capsys):
     link(tmp_path / "out")
     assert main([str(photos), str(tmp_path / "out")]) == 1
@@ -293,6 +322,7 @@ def test_an_output_folder_that_is_a_loop_of_links_is_named(photos: Path, tmp_pat
     assert "out" in printed and printed.count("\n") == 1
 
 
+@pytest.mark.hard_case("a deleted working directory", "refused in one sentence (change to another, or give full paths)")
 def test_a_deleted_working_directory_is_told_in_a_sentence(tmp_path: Path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os, "getcwd", lambda: os.stat(tmp_path / "deleted"))
@@ -302,6 +332,7 @@ def test_a_deleted_working_directory_is_told_in_a_sentence(tmp_path: Path, monke
     )
 
 
+@pytest.mark.hard_case("`--max-size 5`, 63, −5", "refused: at least 64, or 0")
 @pytest.mark.parametrize("size", ["-5", "5", "63"])
 def test_a_size_without_structure_is_refused(tmp_path: Path, size: str, capsys):
     with pytest.raises(SystemExit):
@@ -309,6 +340,9 @@ def test_a_size_without_structure_is_refused(tmp_path: Path, size: str, capsys):
     assert "--max-size must be at least 64 px, or 0 to keep the photos' size" in capsys.readouterr().err
 
 
+@pytest.mark.hard_case("transparent photos", "alpha is kept: the scene's images are RGBA, a line says how many")
+@pytest.mark.hard_case("a folder of WebP (COLMAP reads none), or a mixed one", "converted")
+@pytest.mark.hard_case("names with spaces, quotes, umlauts, Chinese; suffixes in capitals; folders in folders", "work")
 def test_names_with_spaces_and_webp_and_transparent_photos(tmp_path: Path, capsys):
     """COLMAP reads no WebP and leaves out alpha, both without a word."""
     (tmp_path / "photos").mkdir()
@@ -341,6 +375,10 @@ def test_names_with_spaces_are_matched_by_colmap_s_own_function(tmp_path: Path, 
     assert neighbours == [tmp_path / "db"]
 
 
+@pytest.mark.hard_case(
+    "`--matching sequential` with photo 9 and photo 10",
+    "in the order of their numbers (names with spaces: COLMAP's own order)",
+)
 def test_numbered_photos_are_neighbours_in_the_order_of_their_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(pycolmap, "match_image_pairs", lambda database, **options: None)
     names = [f"{i}.png" for i in sorted(range(13), key=str)]
@@ -352,6 +390,7 @@ def no_vocabulary() -> None:
     raise RunError("COLMAP failed.")
 
 
+@pytest.mark.hard_case("a vocabulary tree that is there", "is found")
 def test_a_vocabulary_tree_that_is_there_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The tree is a small one of random descriptors, because COLMAP's own has to be downloaded."""
     random, kind = np.random.default_rng(0), pycolmap.FeatureExtractorType.SIFT
@@ -373,6 +412,11 @@ def numbered(count: int, has_position: bool = False, name: str = "IMG_{}.jpg") -
     return [Photo(name.format(i), (8, 8), (), has_position, False) for i in range(count)]
 
 
+@pytest.mark.hard_case(
+    "more than 200 photos without a network for the vocabulary tree",
+    "known before any work (a probe of COLMAP's own download); numbered photos are matched in their order, "
+    "others exhaustively, with a sentence that says so",
+)
 @pytest.mark.parametrize(
     ("asked", "photos", "is_video", "chosen", "told"),
     [
@@ -406,6 +450,9 @@ def test_without_a_vocabulary_photos_are_matched_in_another_way(
         assert choose_matching(asked, photos, is_video, lambda: None) == ("vocabulary", "")
 
 
+@pytest.mark.hard_case(
+    "how long `sadgs-process` takes", "a line says roughly; every stage has a bar, undistortion and frames, too"
+)
 def test_the_time_that_it_takes_is_told_roughly(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     told = {
@@ -418,6 +465,10 @@ def test_the_time_that_it_takes_is_told_roughly(monkeypatch: pytest.MonkeyPatch)
         assert expected_work(photos, matching) == sentence
 
 
+@pytest.mark.hard_case(
+    "`--matching vocabulary` without a network; `--matching spatial` without GPS positions",
+    "refused before any work: use sequential or exhaustive; how many have no position, and one of them",
+)
 def test_a_way_of_matching_that_cannot_work_is_told_before_any_work(photos: Path, tmp_path: Path, monkeypatch, capsys):
     command = [str(photos), str(tmp_path / "out"), "--matching"]
     assert main([*command, "spatial"]) == 2
@@ -435,6 +486,7 @@ def test_the_formats_are_those_that_training_reads():
     assert PHOTO_SUFFIXES == IMAGE_SUFFIXES
 
 
+@pytest.mark.hard_case("GPS positions without altitude, which COLMAP does not use", "count as none, before any work")
 def test_photos_with_gps_positions_are_known(tmp_path: Path):
     for i in range(3):
         exif = Image.Exif()
@@ -444,6 +496,7 @@ def test_photos_with_gps_positions_are_known(tmp_path: Path):
     assert [photo.has_position for photo in read] == [True, True, False]
 
 
+@pytest.mark.hard_case("COLMAP aborts", "one sentence with the stage and COLMAP's own words")
 def test_an_abort_of_colmap_is_an_error_like_others(tmp_path: Path):
     """Its vocabulary tree is not asked for here, because this database cannot be made."""
     steps: list[str] = []
@@ -453,6 +506,10 @@ def test_an_abort_of_colmap_is_an_error_like_others(tmp_path: Path):
     assert steps == ["vocabulary tree"] and not multiprocessing.active_children()
 
 
+@pytest.mark.hard_case(
+    "the disk is full while features are found or matched",
+    "one sentence names the folder and the free space; the same command goes on",
+)
 def test_a_full_disk_is_told_in_a_sentence_that_names_the_folder(photos: Path, tmp_path: Path, capsys):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, hard))  # of a file's bytes; COLMAP's process inherits it
@@ -481,6 +538,9 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     return register
 
 
+@pytest.mark.hard_case(
+    "3 of 12 photos register", "a warning with what to do, exit code 1; the features stay for another way of matching"
+)
 def test_a_scene_of_few_of_the_photos_is_warned_of(tmp_path: Path, registered: Callable[[int], None], capsys):
     photos = black(tmp_path / "photos", "a.png", "b.png", "c.png")
     registered(3)
@@ -498,6 +558,9 @@ def test_a_scene_of_few_of_the_photos_is_warned_of(tmp_path: Path, registered: C
     assert f"Train:  ns-train sadgs --data {tmp_path / 'out'}\n" in capsys.readouterr().out
 
 
+@pytest.mark.hard_case(
+    "the disk is full while photos are undistorted", "one sentence; nothing of the scene is replaced"
+)
 def test_photos_that_colmap_could_not_write_are_told(tmp_path: Path):
     """COLMAP says nothing where the disk is full."""
     folder = black(tmp_path / "undistorted", "images/a.png", "images/b.png")
@@ -507,6 +570,7 @@ def test_photos_that_colmap_could_not_write_are_told(tmp_path: Path):
         program._publish(folder, tmp_path)
 
 
+@pytest.mark.hard_case("two runs in one folder at a time", "the second is refused")
 def test_two_runs_do_not_disturb_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
     command = [str(black(tmp_path / "photos", "a.png", "b.png", "c.png")), str(tmp_path / "out")]
 
@@ -520,6 +584,10 @@ def test_two_runs_do_not_disturb_each_other(tmp_path: Path, monkeypatch: pytest.
     assert f"another sadgs-process works on {tmp_path / 'out'}; wait for it, or stop it." in capsys.readouterr().err
 
 
+@pytest.mark.hard_case(
+    "the disk is full while cameras are written",
+    "the model is read again before it counts; one sentence, the same command goes on",
+)
 @pytest.mark.parametrize("name", ["points3D.bin", "images.bin"])
 def test_a_model_that_colmap_could_not_write_is_told(run: Run, tmp_path: Path, name: str):
     """COLMAP says nothing here either."""
@@ -533,12 +601,16 @@ def test_a_model_that_colmap_could_not_write_is_told(run: Run, tmp_path: Path, n
             check_written(tmp_path, model)
 
 
+@pytest.mark.hard_case(
+    "the disk is full or the folder read-only at the start", "one sentence; the same command goes on"
+)
 def test_a_folder_in_which_no_settings_could_be_noted_can_be_used(tmp_path: Path, taken: list[list[str]]):
     (tmp_path / "out" / "work").mkdir(parents=True)
     photos = black(tmp_path / "photos", "a.png", "b.png", "c.png")
     assert main([str(photos), str(tmp_path / "out")]) == 130 and len(taken) == 1
 
 
+@pytest.mark.hard_case("a damaged `work/settings.json`", "one sentence names it: delete the folder and begin again")
 def test_damaged_settings_are_told_in_a_sentence(tmp_path: Path, capsys):
     photos = black(tmp_path / "photos", "a.png", "b.png", "c.png")
     (tmp_path / "out" / "work").mkdir(parents=True)
@@ -547,6 +619,10 @@ def test_damaged_settings_are_told_in_a_sentence(tmp_path: Path, capsys):
     assert "settings.json is damaged (" in (printed := capsys.readouterr().err) and printed.count("\n") == 1
 
 
+@pytest.mark.hard_case(
+    'Pillow writes a PNG after pycolmap was imported ("double free")',
+    "does not happen: COLMAP's process alone imports pycolmap",
+)
 def test_the_command_starts_without_slow_or_harmful_imports():
     """pycolmap replaces Pillow's zlib, which crashes Pillow where it is loaded later and writes a PNG."""
     imports = "import sys; from sadgs_ns.cli.process import command"
@@ -571,6 +647,10 @@ def test_a_gpu_matches_the_pairs_that_colmap_verifies(tmp_path: Path, monkeypatc
     assert calls == [(("a.png", "b.png"), device), ("verified",)]
 
 
+@pytest.mark.hard_case(
+    "photos without texture, or one photo five times",
+    "one sentence: no two photos could be related, and how many photos have few features",
+)
 def test_photos_without_texture_are_told_in_a_sentence(tmp_path: Path, capsys):
     (tmp_path / "photos").mkdir()
     for i in range(3):
@@ -580,6 +660,7 @@ def test_photos_without_texture_are_told_in_a_sentence(tmp_path: Path, capsys):
     assert not (tmp_path / "out" / "transforms.json").exists()
 
 
+@pytest.mark.hard_case("an output folder that is the photos' folder", "refused in a sentence")
 def test_other_folders_and_settings_are_left_alone(run: Run, photos: Path, tmp_path: Path, capsys):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "file").write_text("x")
@@ -589,6 +670,7 @@ def test_other_folders_and_settings_are_left_alone(run: Run, photos: Path, tmp_p
     assert "was begun with other photos or settings" in capsys.readouterr().err
 
 
+@pytest.mark.hard_case("a cut video, one of two frames, a photo as the video", "refused in a sentence")
 def test_a_film_that_is_none_is_told_in_a_sentence(tmp_path: Path, capsys):
     (tmp_path / "film.mp4").write_bytes(b"no film")
     assert main([str(tmp_path / "film.mp4"), str(tmp_path / "out")]) == 2
@@ -644,6 +726,9 @@ def test_a_film_whose_frames_were_being_written_goes_on(tmp_path: Path, monkeypa
     assert main(command) == 130 and taken[0] == taken[1]
 
 
+@pytest.mark.hard_case(
+    "the disk is full while frames of a video are written", "one sentence names the frame; it is made again"
+)
 def test_a_frame_that_could_not_be_written_is_told_and_made_again(tmp_path: Path, monkeypatch, taken: list, capsys):
     command = [str(film(tmp_path / "film.avi", 6)), str(tmp_path / "out"), "--frames", "6"]
 
@@ -701,6 +786,11 @@ def grown(photos: Path, tmp_path: Path) -> tuple[Path, Path, dict[str, Any]]:
     return source, out, described
 
 
+@pytest.mark.hard_case(
+    "photos added to a finished scene",
+    "their cameras are found, the others stay to the bit; it goes on after an interruption, and the scene "
+    "stays as it was until then",
+)
 def test_added_photos_leave_the_cameras_that_are_there(grown: tuple[Path, Path, dict[str, Any]], capsys):
     source, out, before = grown
     before |= {"dataparser_scale": 2.0, "test_filenames": ["images/01.png"]}  # A run may have noted these.
@@ -737,6 +827,7 @@ def test_added_photos_leave_the_cameras_that_are_there(grown: tuple[Path, Path, 
     assert photos_added(source, out) == []
 
 
+@pytest.mark.hard_case("an added photo of another size", "has a camera of its own")
 def test_an_added_photo_of_another_size_has_a_camera_of_its_own(grown: tuple[Path, Path, dict[str, Any]]):
     source, out, before = grown
     for name in ("00.png", "04.png"):
@@ -749,6 +840,10 @@ def test_an_added_photo_of_another_size_has_a_camera_of_its_own(grown: tuple[Pat
     assert "w" not in described and widths.pop("images/09.png") == 120 and set(widths.values()) == {before["w"]}
 
 
+@pytest.mark.hard_case(
+    "added photos that match none of the others",
+    "one sentence; the scene stays as it was, also when they are taken out again",
+)
 def test_added_photos_that_match_none_are_told_of_and_may_be_taken_out_again(
     grown: tuple[Path, Path, dict[str, Any]], photos: Path, capsys
 ):
@@ -764,6 +859,10 @@ def test_added_photos_that_match_none_are_told_of_and_may_be_taken_out_again(
     assert json.loads((out / "transforms.json").read_text()) == before
 
 
+@pytest.mark.hard_case(
+    "photos of a finished scene changed or removed; the same bytes at another time",
+    "refused, with their number and one name; the same bytes are no change",
+)
 def test_photos_are_added_only_where_the_others_are_as_they_were(grown: tuple[Path, Path, dict[str, Any]], capsys):
     source, out, before = grown
     (source / "05.png").touch()  # The same bytes at another time are no change.
@@ -776,6 +875,11 @@ def test_photos_are_added_only_where_the_others_are_as_they_were(grown: tuple[Pa
     assert json.loads((out / "transforms.json").read_text()) == before
 
 
+@pytest.mark.hard_case(
+    "photos added to a scene without its `database.db` or of an earlier version; another `--max-size` for a "
+    "finished scene",
+    "refused: give another folder",
+)
 def test_photos_cannot_be_added_to_a_scene_whose_features_are_not_there(
     grown: tuple[Path, Path, dict[str, Any]], capsys
 ):

@@ -73,6 +73,7 @@ def test_tile_lists_are_tried_in_the_size_of_the_run(config: SadgsTrainerConfig,
     trainer.shutdown()
 
 
+@pytest.mark.hard_case("a run some of whose kernels cannot be compiled", "goes on")
 @pytest.mark.skipif(torch.cuda.is_available(), reason="on a GPU gsplat's part would not fail")
 def test_what_cannot_be_compiled_leaves_the_run_as_it_was(
     config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -107,6 +108,7 @@ def test_what_cannot_be_compiled_leaves_the_run_as_it_was(
     trainer.shutdown()
 
 
+@pytest.mark.hard_case("kernels that cannot be compiled before training", "named with the first reason in one sentence")
 def test_kernels_that_fail_are_told_in_one_sentence(
     config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

@@ -208,6 +208,11 @@ def test_help_texts_break_their_lines_between_sentences_as_tyro_does_not_join_th
     assert texts and not [text for text in texts if not all(line.endswith(".") for line in text.strip().splitlines())]
 
 
+@pytest.mark.hard_case(
+    "`sh-degree` 9, `num-random` 10⁹ or `random-scale` out of range; `opacity-reg` ∞ or 10⁹; camera penalties "
+    "NaN or −1",
+    "refused by name",
+)
 @pytest.mark.parametrize(
     ("option", "value", "sentence"),
     [
@@ -239,6 +244,11 @@ def test_options_of_the_model_that_are_out_of_range_are_refused(option: str, val
     assert str(refused.value) == sentence
 
 
+@pytest.mark.hard_case(
+    "`energy-blur` ∞ or 10⁹, `epsilon` ∞; NaN, ∞, −1, 0 and 10⁹ in every numeric option of pipeline, model and "
+    "densification",
+    "refused by name, or known to train",
+)
 @pytest.mark.parametrize(
     ("option", "value", "sentence"),
     [

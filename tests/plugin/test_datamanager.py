@@ -87,6 +87,10 @@ def test_matches_of_points_are_left_to_nerfstudio(colmap: ColmapDataParserConfig
 MARK = b"\xef\xbb\xbf"
 
 
+@pytest.mark.hard_case(
+    "a byte order mark, or Windows's line ends, in COLMAP's `cameras.txt`, `images.txt`, `points3D.txt`",
+    "read as without it, by nerfstudio's parsers too",
+)
 @pytest.mark.parametrize(("comments", "line_end"), [(True, b"\n"), (False, b"\r\n")])
 def test_colmap_s_text_after_a_byte_order_mark_is_read_as_without_one(
     comments: bool, line_end: bytes, colmap: ColmapDataParserConfig, tmp_path: Path
@@ -107,6 +111,9 @@ def test_colmap_s_text_after_a_byte_order_mark_is_read_as_without_one(
     assert_equal_outputs(load(parser).train_dataparser_outputs, expected)
 
 
+@pytest.mark.hard_case(
+    "a byte order mark in `transforms.json` and Blender's files", "read as without it, by nerfstudio's parsers too"
+)
 @pytest.mark.parametrize("write", [nerfstudio_data, lambda folder: blender_data(folder, "white")])
 def test_json_after_a_byte_order_mark_is_read_as_without_one(
     write: Callable[[Path], DataParserConfig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -132,6 +139,10 @@ def assert_equal_outputs(outputs: DataparserOutputs, expected: DataparserOutputs
         assert name not in expected.metadata or torch.equal(outputs.metadata[name], expected.metadata[name])
 
 
+@pytest.mark.hard_case(
+    "`transforms.json` of an old ns-process-data (a COLMAP model beside it, no PLY)",
+    "COLMAP's points are read; nothing is asked or rewritten",
+)
 @pytest.mark.parametrize("transform", [None, [[1, 0, 0, 2], [0, 0, -1, 0], [0, 1, 0, 0.5]]])
 def test_colmap_s_points_of_an_old_ns_process_data_are_read_without_a_question(
     transform: list | None, colmap: ColmapDataParserConfig, tmp_path: Path, reads: list[Path]
@@ -180,6 +191,10 @@ def test_views_that_are_added_move_nothing_in_a_frame_that_the_data_fix(colmap: 
     torch.testing.assert_close(fixed.metadata["points3D_xyz"], first.metadata["points3D_xyz"], atol=1e-6, rtol=0)
 
 
+@pytest.mark.hard_case(
+    "`transforms.json` with a `dataparser_transform` that is no rotation and translation, or without its scale",
+    "one sentence",
+)
 @pytest.mark.parametrize(
     ("values", "told"),
     [

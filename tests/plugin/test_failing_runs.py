@@ -1,4 +1,12 @@
-"""Runs that cannot go on: full and read-only disks, unusable checkpoints and full memory end them with one sentence."""
+"""Runs that cannot go on: full and read-only disks, unusable checkpoints and full memory end them with one sentence.
+
+Out-of-memory errors are raised artificially; full disks are real (`/dev/full`). `ns-export` writes with nerfstudio's
+own code, not atomically.
+
+Tried by hand: if port 7007 is taken and none was given, a free one is taken and printed. A run with
+`--viewer.max-num-display-images` of −5 or 0 trains. A run whose data are moved away trains on, since images are in
+memory.
+"""
 
 from __future__ import annotations
 
@@ -38,6 +46,14 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig
 # --- options ---
 
 
+@pytest.mark.hard_case(
+    "accumulated gradients; several devices on the CPU without torchrun; CUDA or MPS on a machine without one; "
+    "a seed of −1 or 2³²; `--scale-factor`, `--camera-res-scale-factor` or `--train-split-fraction` of 0, −1 "
+    "or NaN; `--eval-interval` 0, 1, −2; learning rates outside [0, 1], NaN or 10⁹; schedule factors that are "
+    "not positive or leave that range; negative distances between checkpoints; a port beyond 65535; "
+    "`--load-step` without `--load-dir`",
+    "refused by name",
+)
 @pytest.mark.parametrize(
     ("option", "value", "sentence"),
     [
@@ -141,6 +157,7 @@ def test_options_with_which_no_run_can_work_are_refused_before_anything_is_writt
     assert not config.output_dir.exists()
 
 
+@pytest.mark.hard_case("images of less than 2 px after scaling", "refused: names the image")
 @pytest.mark.filterwarnings("ignore:Skipping Gaussian Smoothing:UserWarning")  # of images smaller than SSIM's window
 def test_images_that_are_too_small_after_scaling_are_named(config: SadgsTrainerConfig):
     config.pipeline.datamanager.camera_res_scale_factor = 1.5 / HEIGHT
@@ -153,6 +170,10 @@ def test_images_that_are_too_small_after_scaling_are_named(config: SadgsTrainerC
     assert is_finite(train(config).pipeline.model)
 
 
+@pytest.mark.hard_case(
+    "`--scale-factor` 10¹² (everything lies behind the far plane)",
+    "refused: the extent of the cameras, and what is seen",
+)
 def test_cameras_that_see_nothing_are_refused(config: SadgsTrainerConfig):
     parser: Any = config.pipeline.datamanager.dataparser
     config.pipeline.datamanager.dataparser = dataclasses.replace(parser, scale_factor=1e12)
@@ -169,6 +190,10 @@ def test_a_scene_in_tiny_units_is_seen_since_its_near_plane_is_in_them(config: S
     assert set_up(config).pipeline.model.near_plane == pytest.approx(1e-4 * plane, rel=1e-3)
 
 
+@pytest.mark.hard_case(
+    "a viewer's port that is taken; `--viewer.websocket-host` unknown, or an address of another machine",
+    "refused: give another, or no port for a free one",
+)
 def test_a_viewer_that_cannot_listen_where_it_is_told_to_is_refused(config: SadgsTrainerConfig):
     def refused() -> str:
         with pytest.raises(InputError) as error:
@@ -197,6 +222,12 @@ def test_a_viewer_that_cannot_listen_where_it_is_told_to_is_refused(config: Sadg
     config.save_config()
 
 
+@pytest.mark.hard_case(
+    "options beside `--load-config` (`--max-num-iterations 6000`); `--load-config` with no file, a folder, "
+    "another file",
+    "refused: names them, and `--load-dir`; the sentence comes after one line of nerfstudio's, not after 300 "
+    "lines of configuration",
+)
 def test_options_beside_a_config_that_nerfstudio_would_not_read_are_refused(
     config: SadgsTrainerConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -239,6 +270,7 @@ def fill_disk(partial: Path) -> None:
     partial.symlink_to("/dev/full")
 
 
+@pytest.mark.hard_case("an output folder below a file", "refused before anything is written")
 def test_an_output_folder_that_cannot_be_made_is_named_before_anything_is_written(
     config: SadgsTrainerConfig, tmp_path: Path
 ):
@@ -249,12 +281,14 @@ def test_an_output_folder_that_cannot_be_made_is_named_before_anything_is_writte
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
+@pytest.mark.hard_case("the name of a folder is longer than the file system allows", "refused")
 def test_an_output_folder_whose_name_is_too_long_is_named(config: SadgsTrainerConfig):
     config.timestamp = "x" * 300
     with pytest.raises(WriteError, match=r"/x+/config\.yml could not be written \(File name too long; .* free there"):
         config.save_config()
 
 
+@pytest.mark.hard_case("a read-only output folder", "refused before anything is written")
 def test_a_read_only_output_folder_is_named(config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch):
     def denied(path: Path, *args: Any, **kwargs: Any) -> None:
         raise PermissionError(13, "Permission denied", str(path))  # root, as in containers, may write everywhere
@@ -264,6 +298,10 @@ def test_a_read_only_output_folder_is_named(config: SadgsTrainerConfig, monkeypa
         config.save_config()
 
 
+@pytest.mark.hard_case(
+    "the disk is full while a checkpoint is saved",
+    "the run ends; the previous checkpoint is bitwise as it was, there is no partial file",
+)
 def test_a_full_disk_leaves_the_previous_checkpoint_and_ends_training_with_one_sentence(config: SadgsTrainerConfig):
     trainer = set_up(config)
     trainer.save_checkpoint(1)
@@ -284,6 +322,7 @@ def test_a_full_disk_leaves_the_previous_checkpoint_and_ends_training_with_one_s
     assert list(config.output_dir.rglob("*.partial")) == []
 
 
+@pytest.mark.hard_case("the disk is full in a logger (tensorboard)", "the run ends with the file's name")
 def test_a_logger_s_full_disk_is_one_sentence_and_other_errors_of_reading_are_themselves(config: SadgsTrainerConfig):
     def failing(error: OSError) -> SadgsTrainer:
         trainer = set_up(config)
@@ -300,6 +339,7 @@ def test_a_logger_s_full_disk_is_one_sentence_and_other_errors_of_reading_are_th
         failing(OSError("broken data stream")).train()
 
 
+@pytest.mark.hard_case("the run's folder is deleted while it trains (tensorboard)", "saved again, one sentence")
 def test_what_was_trained_is_saved_where_a_logger_fails_after_a_step(
     config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch
 ):
@@ -316,6 +356,7 @@ def test_what_was_trained_is_saved_where_a_logger_fails_after_a_step(
     assert [path.name for path in trainer.checkpoint_dir.iterdir()] == ["step-000000003.ckpt"]
 
 
+@pytest.mark.hard_case("the disk is full while a PLY is exported", "`WriteError`; the previous file is as it was")
 def test_a_full_disk_leaves_the_previous_export(tmp_path: Path):
     def write(count: int) -> None:
         params = {name: torch.zeros(count, 3) for name in ("means", "scales", "features_dc")}
@@ -399,6 +440,10 @@ CHECKPOINTS = {
 }
 
 
+@pytest.mark.hard_case(
+    "a checkpoint of another method, of splatfacto, of other harmonics, of another version, cut off, or none",
+    "refused: names the file (nerfstudio would go on from a mixture)",
+)
 @pytest.mark.parametrize("case", CHECKPOINTS)
 def test_a_checkpoint_that_cannot_be_continued_is_refused_in_one_sentence(
     case: str, saved: Path, config: SadgsTrainerConfig, tmp_path: Path
@@ -435,6 +480,7 @@ def test_one_whole_checkpoint_among_damaged_ones_is_enough(saved: Path, tmp_path
         checkpoints.check_chosen(tmp_path, 9, None)
 
 
+@pytest.mark.hard_case("no checkpoint in the folder, none of that step", "refused: the steps there are")
 def test_a_step_or_file_without_a_checkpoint_is_named(saved: Path, tmp_path: Path):
     with pytest.raises(InputError, match=r"no checkpoint of step 3: give --load-step one of 5\."):
         checkpoints.checkpoint_paths(saved.parent, 3, None)
@@ -445,6 +491,11 @@ def test_a_step_or_file_without_a_checkpoint_is_named(saved: Path, tmp_path: Pat
     assert checkpoints.checkpoint_paths(None, None, None) == []
 
 
+@pytest.mark.hard_case(
+    "`--load-dir` with a folder above the runs; `--load-checkpoint` with a folder, `--load-dir` with a file, "
+    "both options",
+    "refused: holds no checkpoint, such as the latest run below it; which option it belongs to",
+)
 def test_what_is_given_to_the_wrong_option_is_told_where_it_belongs(saved: Path, tmp_path: Path):
     run = saved.parents[1]
     for folder in (run, saved.parent):
@@ -489,6 +540,10 @@ def poison(trainer: SadgsTrainer, what: str) -> None:
             parameter.register_hook(spoil)
 
 
+@pytest.mark.hard_case(
+    "every loss, or every gradient, is NaN for 100 iterations",
+    "one sentence with the images and the remedy, exit code 1; finite Gaussians are saved, earlier checkpoints stay",
+)
 @pytest.mark.parametrize("what", ["loss", "gradients"])
 def test_a_run_that_learns_nothing_stops_with_one_sentence_and_a_finite_checkpoint(
     what: str, config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
@@ -519,6 +574,7 @@ def test_a_run_that_learns_nothing_stops_with_one_sentence_and_a_finite_checkpoi
     assert is_finite(train(config).pipeline.model)
 
 
+@pytest.mark.hard_case("the same for the whole of a shorter run", "the same")
 def test_a_short_run_whose_every_gradient_is_nan_does_not_end_well(config: SadgsTrainerConfig):
     config.pipeline.model.strategy.refine_stop_iter = 0
     trainer = set_up(config)
@@ -530,6 +586,7 @@ def test_a_short_run_whose_every_gradient_is_nan_does_not_end_well(config: Sadgs
     assert checkpoint(trainer, ITERATIONS - 1)["step"] == ITERATIONS - 1
 
 
+@pytest.mark.hard_case("the same, and the Gaussians are NaN themselves", "the sentence says so, nothing is saved")
 def test_gaussians_that_are_not_finite_are_not_saved(config: SadgsTrainerConfig):
     config.pipeline.model.strategy.refine_stop_iter = 0
     trainer = set_up(config)
@@ -540,6 +597,7 @@ def test_gaussians_that_are_not_finite_are_not_saved(config: SadgsTrainerConfig)
         trainer.train()
 
 
+@pytest.mark.hard_case("one Gaussian whose gradient is always NaN", "stops nobody")
 def test_one_gaussian_whose_gradient_is_always_nan_stops_nobody(
     config: SadgsTrainerConfig, capsys: pytest.CaptureFixture[str]
 ):
@@ -570,6 +628,10 @@ def fail_at(trainer: SadgsTrainer, step: int) -> None:
     trainer.pipeline.get_train_loss_dict = full  # type: ignore[method-assign]
 
 
+@pytest.mark.hard_case(
+    "CUDA is out of memory in an iteration",
+    "the run ends; the state before it is saved and can be resumed; the sentence names `max-gaussians` and image size",
+)
 def test_full_memory_saves_what_was_trained_and_says_what_helps(config: SadgsTrainerConfig, tmp_path: Path):
     trainer = set_up(config)
     fail_at(trainer, 4)
@@ -612,6 +674,9 @@ def _take_out_moments(trainer: SadgsTrainer) -> None:
     trainer.optimizers.optimizers["means"].state.clear()  # as gsplat does while it makes the longer ones
 
 
+@pytest.mark.hard_case(
+    "CUDA is out of memory in the middle of densification", "the run ends; the torn state is not saved"
+)
 @pytest.mark.parametrize("half_way", [_shorten, _take_out_moments])
 def test_full_memory_in_the_middle_of_densification_saves_no_torn_state(
     config: SadgsTrainerConfig, half_way: Callable[[SadgsTrainer], None]
@@ -626,6 +691,7 @@ def test_full_memory_in_the_middle_of_densification_saves_no_torn_state(
     assert list(config.output_dir.rglob("*.ckpt")) == []
 
 
+@pytest.mark.hard_case("CUDA is out of memory at the start", "the run ends in one sentence")
 def test_full_memory_at_the_start_is_one_sentence(config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch):
     def full(*args: Any, **kwargs: Any) -> None:
         raise FULL

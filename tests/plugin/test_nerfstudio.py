@@ -231,6 +231,7 @@ def test_a_finished_run_is_the_mean_of_its_last_iterations_also_when_it_was_stop
     assert differences(checkpoint(train(config), last), checkpoint(whole, last)) == []
 
 
+@pytest.mark.hard_case("such Gaussians in a run", "are limited every 25 iterations and at the end")
 @pytest.mark.parametrize("limit", [0.0, 0.5])
 def test_no_gaussian_of_a_run_is_larger_than_its_distance_from_the_cameras_allows(
     limit: float, colmap: ColmapDataParserConfig, tmp_path: Path
@@ -356,6 +357,9 @@ def test_sfm_points_start_as_opaque_as_asked_and_no_others(colmap: ColmapDataPar
     assert {round(x, 4) for x in model.opacities.sigmoid().flatten().tolist()} == {0.1}
 
 
+@pytest.mark.hard_case(
+    "a cap smaller than the initial count, in `ns-train`", "keeps a random `max_gaussians` of the points and says so"
+)
 def test_more_initial_points_than_max_gaussians_are_thinned_out(
     colmap: ColmapDataParserConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -457,6 +461,9 @@ def test_a_save_that_fails_leaves_the_previous_checkpoint_alone(
     assert checkpoint(trainer, 1)["step"] == 1
 
 
+@pytest.mark.hard_case(
+    "a `.partial` of a killed save lies there", "ignored; the next save in that folder replaces and removes it"
+)
 def test_what_a_killed_save_leaves_does_not_hinder_resuming(colmap: ColmapDataParserConfig, tmp_path: Path):
     config = configure(tmp_path, colmap)
     trainer = set_up(config)

@@ -1,4 +1,8 @@
-"""What nerfstudio's other commands, such as `ns-eval` and `ns-render`, say of a run where they cannot go on."""
+"""What nerfstudio's other commands, such as `ns-eval` and `ns-render`, say of a run where they cannot go on.
+
+Tried by hand: `ns-*` commands in a deleted working directory end with "Intel oneMKL FATAL ERROR", because MKL ends the
+process as nerfstudio imports torch, before any code of ours.
+"""
 
 from __future__ import annotations
 
@@ -50,6 +54,7 @@ def said_of(command: Any) -> str | None:
     return errors._of_nerfstudio(failed.value)
 
 
+@pytest.mark.hard_case("`ns-eval` with one held-out view; with none", "no deviations; refused")
 def test_one_held_out_view_has_no_deviation_and_none_is_one_sentence(run: tuple[int, Path], tmp_path: Path):
     held_out, config = run
     command = ComputePSNR(config, tmp_path / "results.json")
@@ -66,6 +71,10 @@ def test_one_held_out_view_has_no_deviation_and_none_is_one_sentence(run: tuple[
     assert {"psnr", "ssim", "fps"} <= results.keys() and not any(name.endswith("_std") for name in results)
 
 
+@pytest.mark.hard_case(
+    "`ns-render interpolate` with one held-out view, or none; `spiral`; `dataset` without a held-out view",
+    "one sentence: `--pose-source train`, or what to use instead",
+)
 def test_views_that_nerfstudio_cannot_render_are_one_sentence(run: tuple[int, Path], tmp_path: Path):
     held_out, config = run
     said = said_of(RenderInterpolated(config, tmp_path / "video.mp4"))
@@ -79,6 +88,9 @@ def test_views_that_nerfstudio_cannot_render_are_one_sentence(run: tuple[int, Pa
         )
 
 
+@pytest.mark.hard_case(
+    "`ns-eval` or `ns-render` with a config.yml that is missing or none; `ns-eval --output-path x.txt`", "one sentence"
+)
 def test_files_that_are_no_config_or_result_are_named(run: tuple[int, Path], tmp_path: Path):
     none = tmp_path / "none.yml"
     said = said_of(ComputePSNR(none))
@@ -91,6 +103,7 @@ def test_files_that_are_no_config_or_result_are_named(run: tuple[int, Path], tmp
     )
 
 
+@pytest.mark.hard_case("`--vis wandb` or `--vis comet` without a login", "one sentence")
 def test_a_logger_that_cannot_start_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     def init(**options: Any) -> None:
         raise RuntimeError("No API key configured.")
@@ -110,6 +123,7 @@ def test_errors_that_are_nobody_s_keep_their_traceback():
     assert errors._of_nerfstudio(failed.value) is None
 
 
+@pytest.mark.hard_case("a deleted working directory, our commands", "one sentence")
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows deletes no folder that a process works in")
 def test_a_deleted_working_directory_is_named_before_torch_ends_the_process(tmp_path: Path):
     gone = tmp_path / "gone"
@@ -123,6 +137,7 @@ def test_a_deleted_working_directory_is_named_before_torch_ends_the_process(tmp_
     assert (result.returncode, result.stderr) == (1, said)
 
 
+@pytest.mark.hard_case("the working directory is deleted while a run saves, and the disk is full there", "one sentence")
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows deletes no folder that a process works in")
 def test_free_space_is_told_in_a_deleted_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "gone").mkdir()

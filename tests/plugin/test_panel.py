@@ -18,6 +18,10 @@ def structure_step(iteration: int, before: int, after: int) -> dict[str, int]:
     return {"iteration": iteration, "before": before, "violating": 7, "low": 3, "split": 5, "pruned": 1, "after": after}
 
 
+@pytest.mark.hard_case(
+    "the panel's table and its header",
+    "agree: changes by AbsGS and pruning between structure steps, and since, have rows",
+)
 def test_the_table_leaves_out_no_change_of_the_number_of_gaussians():
     """What AbsGS added between the structure steps, and since, has a row; where there was no change there is none."""
     steps = [structure_step(500, 1000, 2000), structure_step(1000, 2600, 4000), structure_step(1500, 4000, 5000)]
@@ -73,6 +77,10 @@ def was_disabled(panel: StructurePanel) -> list[bool]:
     return panel.observe.gui_handle.shown  # type: ignore[attr-defined]
 
 
+@pytest.mark.hard_case(
+    "*Observe all training views* in the viewer",
+    "says above the table which view it is at, then what it found and what shows it; the button is off meanwhile",
+)
 def test_observing_all_training_views_tells_how_far_it_is_and_what_was_seen(
     pipeline: SadgsPipeline, monkeypatch: pytest.MonkeyPatch
 ):
@@ -95,6 +103,7 @@ def test_observing_all_training_views_tells_how_far_it_is_and_what_was_seen(
     assert "Observed" not in panel.table.gui_handle.shown[-1], "it is not said for ever"
 
 
+@pytest.mark.hard_case("the panel fails, as with full memory", "told in the panel as well as in the terminal")
 def test_what_goes_wrong_is_told_in_the_panel_too(
     pipeline: SadgsPipeline, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

@@ -69,6 +69,10 @@ def test_durations_have_at_most_two_units(seconds: float, words: str):
     assert duration(seconds) == words
 
 
+@pytest.mark.hard_case(
+    "a row of the table",
+    "has loss, PSNR, Gaussians, pace and the time that is left by the clock; the last row leaves the table as it was",
+)
 def test_a_row_tells_loss_psnr_gaussians_pace_and_the_time_that_is_left(
     events: list[dict[str, Any]], clock: list[float], capsys: pytest.CaptureFixture[str]
 ):
@@ -95,6 +99,9 @@ def test_a_row_tells_loss_psnr_gaussians_pace_and_the_time_that_is_left(
     ]
 
 
+@pytest.mark.hard_case(
+    "Gaussians, loss and PSNR while training", "are in every row, and read from the device for rows alone"
+)
 def test_values_are_read_from_the_device_for_rows_alone(events: list[dict[str, Any]]):
     table = ProgressTable(LocalWriterConfig())
     for step in range(1, 10):
@@ -103,6 +110,11 @@ def test_values_are_read_from_the_device_for_rows_alone(events: list[dict[str, A
         log(table, events, 10, Unread())
 
 
+@pytest.mark.hard_case(
+    "how long a run takes",
+    'a line after the first 10 iterations, or after 3 that take 10 s: "10 iterations after the first took 400 '
+    'ms each: at this pace the 89 that are left take 36 s"',
+)
 def test_slow_iterations_are_estimated_before_the_first_row(
     events: list[dict[str, Any]], clock: list[float], capsys: pytest.CaptureFixture[str]
 ):
@@ -115,6 +127,7 @@ def test_slow_iterations_are_estimated_before_the_first_row(
     )
 
 
+@pytest.mark.hard_case("a warning during training, in a terminal", "stands above the table")
 def test_in_a_terminal_rows_stay_in_place_and_warnings_above_them(
     events: list[dict[str, Any]], clock: list[float], monkeypatch: pytest.MonkeyPatch
 ):
@@ -144,6 +157,11 @@ def test_in_a_terminal_rows_stay_in_place_and_warnings_above_them(
     assert "30" not in last and {"40", "50", "Viewer"} <= set(last), "two rows and the banner"
 
 
+@pytest.mark.hard_case("output to a file", "one line for each row")
+@pytest.mark.hard_case("a second run in one process", "has its own table")
+@pytest.mark.hard_case(
+    "training ends", "the commands ns-viewer, ns-eval and sadgs-export with the run's config.yml, quoted for a shell"
+)
 def test_a_run_says_its_progress_and_what_can_be_done_with_it(
     config: SadgsTrainerConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -180,6 +198,10 @@ def test_the_table_is_there_by_default():
     assert logging.local_writer.enable and isinstance(logging.local_writer.setup(), ProgressTable)
 
 
+@pytest.mark.hard_case(
+    "a run on the CPU",
+    "is warned of at the start: it is slow, and with several threads OMP_NUM_THREADS=1 is quicker beside other work",
+)
 def test_a_run_on_the_cpu_says_that_it_is_slow_and_what_to_do_beside_other_work(
     config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

@@ -1,4 +1,13 @@
-"""Runs that are killed and resumed: what SIGKILL, SIGINT, SIGTERM and SIGHUP leave, and what a run goes on from."""
+"""Runs that are killed and resumed: what SIGKILL, SIGINT, SIGTERM and SIGHUP leave, and what a run goes on from.
+
+Iterations since the last checkpoint are done again, from the same random states and order of views. So on the CPU with
+one thread the final checkpoint is bitwise that of an undisturbed run: Gaussians, Adam's moments, statistics and random
+states. On a GPU, which sums in no fixed order, they are as far apart as any two runs. `kill_and_resume.py` kills,
+resumes and compares.
+
+Tried by hand: with an option turned on that learns something of each view, a resumed run goes on, and what is new
+starts anew.
+"""
 
 from __future__ import annotations
 
@@ -73,6 +82,11 @@ def kill_and_resume(*arguments: object) -> str:
 # --- killed ---
 
 
+@pytest.mark.hard_case(
+    "SIGKILL within a step, right after a split, with half a checkpoint written, between a checkpoint's "
+    "renaming and the deletion of the one before it",
+    "resumes from the last whole checkpoint; ends bitwise equal to an undisturbed run",
+)
 def test_a_run_killed_in_four_places_ends_bitwise_equal_to_one_that_nothing_disturbed(tmp_path: Path):
     sizes = ("--kills", 4, "--iterations", 24, "--save-every", 4, "--width", 48, "--views", 10)
     printed = kill_and_resume(tmp_path, *sizes)
@@ -85,6 +99,11 @@ def test_a_run_killed_in_four_places_ends_bitwise_equal_to_one_that_nothing_dist
     assert "bitwise equal; left over: []" in printed
 
 
+@pytest.mark.hard_case(
+    "ten kills in 300 iterations (slow): two in each of those places, one after a step and one from outside at "
+    "a random time",
+    "the same; nothing is left over",
+)
 @pytest.mark.slow
 def test_a_run_killed_ten_times_ends_bitwise_equal_to_one_that_nothing_disturbed(tmp_path: Path):
     printed = kill_and_resume(tmp_path, "--kills", 10)
@@ -118,6 +137,11 @@ class Clock:
         monkeypatch.setattr("sadgs_ns.plugin.trainer.time", SimpleNamespace(monotonic=lambda: self.now))
 
 
+@pytest.mark.hard_case(
+    "SIGKILL of a run without `--steps-per-save`",
+    "at most the last 60 s, or 100 times what a checkpoint takes, are lost; checkpoints on the way change no "
+    "result, and a run resumed from one ends bitwise equal",
+)
 def test_the_clock_makes_checkpoints_that_change_nothing_and_resume_to_the_same_model(
     scene: Path, finished: Path, config: SadgsTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -142,6 +166,7 @@ def test_the_clock_makes_checkpoints_that_change_nothing_and_resume_to_the_same_
     assert differences(ends[0], ends[1]) == differences(ends[0], ends[2]) == []
 
 
+@pytest.mark.hard_case("checkpoints by the clock where `--steps-per-save` is given, and in a short run", "none")
 @pytest.mark.parametrize(
     ("settings", "seconds", "saved"),
     [
@@ -169,6 +194,12 @@ def test_the_clock_gives_way_to_steps_and_makes_nothing_in_a_short_run(
 # --- interrupted ---
 
 
+@pytest.mark.hard_case(
+    "Ctrl-C on `ns-train`",
+    "the iteration ends, a checkpoint is saved, one line gives the command that resumes with all options, "
+    "`ns-train METHOD --load-config RUN/config.yml`; exit code 130; that command is run and finishes in the "
+    "same folder",
+)
 def test_ctrl_c_on_ns_train_prints_the_command_that_resumes_it(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -212,6 +243,10 @@ def hang_up_by_default() -> Iterator[None]:
     signal.signal(signal.SIGHUP, previous)
 
 
+@pytest.mark.hard_case(
+    "SIGINT, SIGTERM or SIGHUP in the middle of a step that splits",
+    "waits for the step's end, saves, exits with 130, 143 or 129; resumed, it ends bitwise equal to an undisturbed run",
+)
 @pytest.mark.usefixtures("hang_up_by_default")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_an_interrupt_within_a_step_waits_for_its_end_and_resumes_to_the_same_model(
@@ -245,6 +280,7 @@ def test_an_interrupt_within_a_step_waits_for_its_end_and_resumes_to_the_same_mo
     assert differences(*ends) == []
 
 
+@pytest.mark.hard_case("a second SIGHUP while the run saves", "what was trained is saved")
 @pytest.mark.usefixtures("hang_up_by_default")
 def test_a_second_hang_up_does_not_stop_the_saving(config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch):
     """Where ssh is cut off, the shell sends one, and the kernel another when the shell ends."""
@@ -265,6 +301,7 @@ def test_a_second_hang_up_does_not_stop_the_saving(config: SadgsTrainerConfig, m
     assert signal.getsignal(signal.SIGHUP) == signal.SIG_DFL
 
 
+@pytest.mark.hard_case("a write to the terminal fails before SIGHUP comes", "the run still ends as hung up")
 @pytest.mark.usefixtures("hang_up_by_default")
 def test_a_write_that_fails_before_the_hang_up_comes_does_not_hide_it(
     config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch
@@ -301,6 +338,10 @@ def printing_run(scene: Path, output: Path, iterations: int) -> str:
     )
 
 
+@pytest.mark.hard_case(
+    "the terminal is gone (a dropped ssh; SIGHUP), also while the table is drawn",
+    "what was trained is saved; exit code 129",
+)
 def test_a_terminal_that_is_gone_costs_nothing_that_was_trained(scene: Path, tmp_path: Path):
     """As where ssh is cut off: the run loses the terminal that it prints to, and is sent SIGHUP."""
     ours, theirs = os.openpty()
@@ -320,6 +361,7 @@ def test_a_terminal_that_is_gone_costs_nothing_that_was_trained(scene: Path, tmp
     assert torch.load(path, weights_only=True)["step"] > 0
 
 
+@pytest.mark.hard_case("the terminal goes while the run saves", "what was trained is saved")
 def test_a_terminal_that_goes_while_the_hung_up_run_saves_hides_nothing(scene: Path, tmp_path: Path):
     """As where the system sends SIGHUP before it takes the terminal away."""
     ours, theirs = os.openpty()
@@ -350,6 +392,11 @@ def test_a_terminal_that_goes_while_the_hung_up_run_saves_hides_nothing(scene: P
     assert config.load_dir == path.parent
 
 
+@pytest.mark.hard_case(
+    "the reader of the output ends: `| head`, or `| tee log` with `tee` killed",
+    "the run trains on and ends with exit code 0; it prints where errors go, or nowhere if they went to the "
+    "same reader",
+)
 @pytest.mark.parametrize("errors", ["elsewhere", "to the same reader", "closed"])
 def test_a_run_whose_output_nobody_reads_any_more_trains_on(errors: str, scene: Path, tmp_path: Path):
     """As with `| head`, or with `| tee log` where tee is killed."""
@@ -374,6 +421,10 @@ def test_a_run_whose_output_nobody_reads_any_more_trains_on(errors: str, scene: 
         assert printed.count("What can be done with these") == 1
 
 
+@pytest.mark.hard_case(
+    "Ctrl-C on `ns-train … | tee log`, which ends `tee`, too",
+    "saves, exit code 130; the line that resumes is printed where errors go",
+)
 def test_ctrl_c_that_ends_tee_as_well_costs_nothing_that_was_trained(scene: Path, tmp_path: Path):
     """`ns-train | tee log`: both get the signal, and tee ends first."""
     files = output, errors = tmp_path / "output", tmp_path / "errors"
@@ -403,6 +454,7 @@ def read_until(start: str, pipe: Path) -> str:
     return "".join(lines)
 
 
+@pytest.mark.hard_case("Ctrl-C while the data are loaded", "one line, exit code 130")
 def test_ctrl_c_while_the_data_are_loaded_ends_without_a_traceback(
     config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -414,6 +466,9 @@ def test_ctrl_c_while_the_data_are_loaded_ends_without_a_traceback(
     assert line == "SIGINT: stopped before an iteration was done; the same command starts again."
 
 
+@pytest.mark.hard_case(
+    "Ctrl-C while paused, before the first iteration", "says that the same command starts again; writes nothing"
+)
 def test_an_interrupt_while_paused_before_the_first_iteration_leaves_nothing(
     config: SadgsTrainerConfig, capsys: pytest.CaptureFixture[str]
 ):
@@ -429,6 +484,9 @@ def test_an_interrupt_while_paused_before_the_first_iteration_leaves_nothing(
     assert checkpoints(trainer) == []
 
 
+@pytest.mark.hard_case(
+    "Ctrl-C in the final save, or while the viewer waits after it", "the final checkpoint is there; exit code 0"
+)
 @pytest.mark.parametrize("moment", ["final save", "waiting for the viewer's user"])
 def test_an_interrupt_after_the_last_iteration_ends_a_finished_run_without_an_error(
     moment: str, config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -449,6 +507,7 @@ def test_an_interrupt_after_the_last_iteration_ends_a_finished_run_without_an_er
     assert "SIGINT" not in capsys.readouterr().out
 
 
+@pytest.mark.hard_case("a second Ctrl-C", "stops at once, as nerfstudio does; the previous checkpoint stays")
 def test_a_second_interrupt_stops_at_once_as_without_us(config: SadgsTrainerConfig):
     trainer = set_up(config)
     for _ in range(2):
@@ -459,6 +518,7 @@ def test_a_second_interrupt_stops_at_once_as_without_us(config: SadgsTrainerConf
     assert checkpoints(trainer) == []
 
 
+@pytest.mark.hard_case("a program that handles SIGTERM itself", "its handler stays")
 def test_a_handler_that_the_program_has_for_sigterm_stays(config: SadgsTrainerConfig):
     received: list[int] = []
     previous = signal.signal(signal.SIGTERM, lambda number, _: received.append(number))
@@ -483,6 +543,10 @@ def finished(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return trainer.base_dir
 
 
+@pytest.mark.hard_case(
+    "a finished run opened with `--load-dir` or `--load-checkpoint`, with or without the viewer",
+    "says how to train on, ends well, changes nothing",
+)
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of viser and websockets
 @pytest.mark.parametrize(("option", "vis"), [("load_dir", "tensorboard"), ("load_checkpoint", "viewer")])
 def test_opening_a_finished_run_says_how_to_train_on_and_ends_well(
@@ -516,6 +580,7 @@ def test_opening_a_finished_run_says_how_to_train_on_and_ends_well(
     assert differences(*ends) == []
 
 
+@pytest.mark.hard_case("`--load-dir RUN` instead of `RUN/nerfstudio_models`", "works as well")
 def test_a_run_s_folder_does_as_well_as_its_folder_of_checkpoints(finished: Path, config: SadgsTrainerConfig):
     (saved,) = (finished / "nerfstudio_models").iterdir()
     for folder in (finished, saved.parent):
@@ -526,6 +591,10 @@ def test_a_run_s_folder_does_as_well_as_its_folder_of_checkpoints(finished: Path
     assert set_up(config)._start_step == ITERATIONS
 
 
+@pytest.mark.hard_case(
+    "`--timestamp` of a run that has checkpoints; `--load-config` of a killed run",
+    "refused, and the checkpoints stay: `--load-dir` goes on from them",
+)
 def test_checkpoints_of_an_earlier_run_are_not_deleted(finished: Path, config: SadgsTrainerConfig, tmp_path: Path):
     """As where --timestamp names a finished run, or --load-config a run that was killed and so names no checkpoint."""
     (saved,) = (finished / "nerfstudio_models").iterdir()
@@ -548,6 +617,10 @@ def test_checkpoints_of_an_earlier_run_are_not_deleted(finished: Path, config: S
 # --- other data than the checkpoint's ---
 
 
+@pytest.mark.hard_case(
+    "another scene's checkpoint; the same data at another scale or orientation",
+    "refused: how many of its cameras stand where one of these does",
+)
 def test_a_checkpoint_of_another_capture_is_refused(finished: Path, tmp_path: Path):
     other = runs.configure(tmp_path, runs.nerfstudio_data(tmp_path / "data"))
     other.load_dir = finished
@@ -561,6 +634,7 @@ def test_a_checkpoint_of_another_capture_is_refused(finished: Path, tmp_path: Pa
     )
 
 
+@pytest.mark.hard_case("views added or taken away in the same world", "goes on")
 @pytest.mark.parametrize(
     ("options", "goes_on"),
     [
@@ -602,6 +676,10 @@ def test_a_resumed_run_keeps_the_length_that_was_derived_unless_another_is_asked
     assert set_up(config).pipeline.schedule == Schedule(iterations=7, views_per_iteration=3)
 
 
+@pytest.mark.hard_case(
+    "a checkpoint with matrices of colours or poses, resumed without them or with other views",
+    "refused: the options, the number of views",
+)
 def test_what_is_learned_of_each_view_goes_on_with_the_same_views_and_options_alone(
     config: SadgsTrainerConfig, tmp_path: Path
 ):
@@ -620,6 +698,7 @@ def test_what_is_learned_of_each_view_goes_on_with_the_same_views_and_options_al
         set_up(config)
 
 
+@pytest.mark.hard_case("the same cameras, images of other names (a rig)", "goes on with a warning")
 def test_images_with_other_names_at_the_same_cameras_are_told_of(
     finished: Path, config: SadgsTrainerConfig, capsys: pytest.CaptureFixture[str]
 ):
@@ -670,6 +749,10 @@ def plan(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     return allow
 
 
+@pytest.mark.hard_case(
+    "more, or less, of the GPU's memory is free than when the run began",
+    "the cap stays as it was, or a line says why it is lower",
+)
 @pytest.mark.parametrize(
     ("now", "asked", "cap", "said"),
     [
@@ -743,6 +826,10 @@ DAMAGES: dict[str, Callable[[Path], Any]] = {
 }
 
 
+@pytest.mark.hard_case(
+    "the latest checkpoint is truncated, empty, no checkpoint, or has flipped bits",
+    "a warning names it, the one before it is taken",
+)
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_checkpoint_is_named_and_the_one_before_it_taken(
     damage: str, two_checkpoints: tuple[SadgsTrainerConfig, Path], capsys: pytest.CaptureFixture[str]
@@ -754,6 +841,7 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_it_taken(
     assert line.endswith(f"Going on from {folder / 'step-000000001.ckpt'} instead.")
 
 
+@pytest.mark.hard_case("every checkpoint is damaged", "one sentence")
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_damaged_checkpoints_alone_are_one_sentence(
     damage: str, two_checkpoints: tuple[SadgsTrainerConfig, Path], capsys: pytest.CaptureFixture[str]
@@ -768,6 +856,10 @@ def test_damaged_checkpoints_alone_are_one_sentence(
     assert "\n" not in message and "Going on" not in capsys.readouterr().out
 
 
+@pytest.mark.hard_case(
+    "the damaged one was asked for with `--load-step` or `--load-checkpoint`",
+    "one sentence; no other is taken silently",
+)
 @pytest.mark.parametrize("which", ["load_step", "load_checkpoint"])
 def test_a_damaged_checkpoint_that_was_asked_for_is_not_replaced_by_another(
     which: str, two_checkpoints: tuple[SadgsTrainerConfig, Path]

@@ -43,6 +43,7 @@ def test_the_first_steps_are_those_of_one_process(ranks: int, views: int, scene:
     assert_same_first_steps(results, expected)
 
 
+@pytest.mark.hard_case("images of several sizes with several processes", "trains as in one process")
 @pytest.mark.parametrize("tier", ["gpu", "compressed"])
 def test_images_of_several_sizes_train_as_in_one_process(tier: Any, tmp_path: Path):
     """Each step has one view of one size and two of another, or three of one; the small views are one process's."""
@@ -74,6 +75,10 @@ def assert_same_first_steps(results: list[dict[str, Any]], expected: dict[str, A
         assert close.float().mean() > 0.995, name
 
 
+@pytest.mark.hard_case(
+    "matrices of colours, camera optimizers or a paused start with several processes",
+    "refused by name",
+)
 @pytest.mark.parametrize(
     ("option", "value"),
     [
@@ -146,6 +151,10 @@ def saved(folder: Path) -> tuple[int, dict[str, torch.Tensor]]:
     return state["step"], parameters
 
 
+@pytest.mark.hard_case(
+    "SIGTERM to one of several processes; a checkpoint of three processes, resumed with two and with one",
+    "all stop after the same step and save one checkpoint; each process takes its part",
+)
 def test_a_run_goes_on_with_fewer_processes(scene: Path, tmp_path: Path):
     """With three, then with two, which a signal to one of them ends, then with one."""
     config = configure(scene, tmp_path / "runs", 20, save_every=0)
@@ -198,6 +207,7 @@ def fade_and_train(shards: Shards, config: SadgsTrainerConfig, faint: tuple[int,
     return train_set_up(trainer, None)
 
 
+@pytest.mark.hard_case("a process that loses all its Gaussians in a prune", "gets others in the same step")
 @pytest.mark.parametrize("faint", [(0,), (0, 1, 2)])
 def test_a_process_that_loses_all_its_gaussians_gets_others(faint: tuple[int, ...], scene: Path, tmp_path: Path):
     """Where none would be left in any process, none is pruned."""
@@ -238,6 +248,7 @@ def die_in_setup(shards: Shards, config: SadgsTrainerConfig) -> str:
     return str(error.value)
 
 
+@pytest.mark.hard_case("one of several processes is killed before the first step", "the others name it")
 def test_a_process_that_is_killed_before_the_first_step_is_named(scene: Path, tmp_path: Path):
     config = configure(scene, tmp_path / "runs", 20, save_every=0)
     _, *messages = run_ranks(die_in_setup, 3, tmp_path / "meet", config, doomed=(0,))
@@ -263,6 +274,10 @@ def train_and_die(shards: Shards, config: SadgsTrainerConfig, doomed: int, kille
     return str(error.value), time.time() - killed.stat().st_mtime
 
 
+@pytest.mark.hard_case(
+    "one of several processes is killed",
+    "all end within a minute; the others name it and the last checkpoint, from which the run resumes",
+)
 def test_a_killed_process_ends_the_others_with_a_sentence_that_names_it(scene: Path, tmp_path: Path):
     config = configure(scene, tmp_path / "runs", 20, save_every=3)
     endings = run_ranks(train_and_die, 3, tmp_path / "meet", config, 1, tmp_path / "killed", doomed=(1,))

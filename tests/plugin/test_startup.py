@@ -104,6 +104,9 @@ def test_late_rates_that_are_constant_by_hand_stay_so_with_any_number_of_views(c
         assert "features_dc" not in schedulers
 
 
+@pytest.mark.hard_case(
+    "more views an iteration than there are, such as 50 of 10", "trains with all of them, with a warning at the start"
+)
 def test_a_run_says_where_there_are_fewer_views_than_a_step_should_take(
     config: SadgsTrainerConfig,
     says: Callable[[SadgsTrainerConfig], tuple[SadgsTrainer, str]],

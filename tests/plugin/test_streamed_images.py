@@ -136,6 +136,10 @@ def train_until_an_image_is_lost(shards: Shards, config: SadgsTrainerConfig, fol
     return str(error.value), len(list(trainer.checkpoint_dir.glob("*.ckpt")))
 
 
+@pytest.mark.hard_case(
+    "an image that one of several processes cannot read any more",
+    "it ends with the image's name, the others name that process; the run resumes from the last checkpoint",
+)
 def test_an_image_that_one_process_cannot_read_any_more_ends_all(tmp_path: Path):
     config = configured(tmp_path / "runs", nerfstudio_data(tmp_path / "data"), "compressed", 2)
     config.steps_per_save = 2
@@ -171,6 +175,11 @@ def place_together(shards: Shards, asked: str) -> tuple[str, str | None]:
     return datamanager.config.cache_images, line
 
 
+@pytest.mark.hard_case(
+    "`cache_images cpu` with several processes, for all of which the host has no room; processes that find "
+    "different memory",
+    "one line; the images stay compressed, in all of them",
+)
 @pytest.mark.parametrize("asked", ["gpu", "cpu"])
 def test_processes_that_find_different_memory_place_their_images_alike(asked: str, tmp_path: Path):
     (first, line), (second, same_line) = run_ranks(place_together, 2, tmp_path, asked)

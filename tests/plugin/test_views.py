@@ -48,6 +48,9 @@ def steps_of(views: TrainingViews, number: int, steps: int = STEPS) -> list[list
     return [[index for index, _ in views.draw(number)] for _ in range(steps)]
 
 
+@pytest.mark.hard_case(
+    "a round of views that ends inside a step of several", "no view twice in a step, all equally often"
+)
 @pytest.mark.parametrize(
     ("total", "number", "strategy"),
     [(10, 4, "random"), (5, 4, "random"), (4, 4, "random"), (7, 3, "random"), (10, 1, "random"), (10, 4, "fps")],
@@ -163,6 +166,9 @@ def test_a_round_of_fewer_views_than_a_step_takes_repeats_some():
     assert all(len(drawn) == 5 for drawn in steps_of(views_of(datamanager), 5, steps=50))
 
 
+@pytest.mark.hard_case(
+    "a run of several views a step is resumed", "goes on with the views of a run that was never stopped"
+)
 @pytest.mark.parametrize(("total", "number"), [(10, 4), (5, 4), (7, 3)])
 def test_a_resumed_run_goes_on_with_the_views_of_the_run_that_was_never_stopped(total: int, number: int):
     undisturbed = steps_of(views_of(Datamanager(total)), number, steps=60)
