@@ -254,7 +254,7 @@ def test_commands_that_no_other_test_runs_work_in_the_order_of_the_documents(tmp
 
 def with_options() -> list[str]:
     """What sentences show of options: the words of a command, or options alone."""
-    texts = [path.read_text("utf8") for path in DOCUMENTS if path.name != "hard-cases.md"]  # Its are wrong on purpose.
+    texts = [path.read_text("utf8") for path in DOCUMENTS]
     spans = {" ".join(span.split()) for text in texts for span in re.findall(r"`([^`]+)`", without_code(text))}
     return sorted(span for span in spans if re.match(r"--[a-z]|((sadgs|ns)(-[a-z]+)?|python -m) .*--[a-z]", span))
 
