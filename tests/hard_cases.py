@@ -39,8 +39,8 @@ def literal(node: ast.expr, where: str) -> str:
 
 
 def cases_of(module: ast.Module, file: str) -> Iterator[HardCase]:
-    for test in module.body:
-        for marker in test.decorator_list if isinstance(test, ast.FunctionDef) else []:
+    for test in [node for node in module.body if isinstance(node, ast.FunctionDef)]:
+        for marker in test.decorator_list:
             if not ast.unparse(marker).startswith("pytest.mark.hard_case"):
                 continue
             where = f"{file}:{marker.lineno}"
