@@ -56,7 +56,6 @@ COMMANDS = {
     "memory": ("memory", "the memory plan beside the real peaks of training steps (CUDA)"),
     "shards": ("shards", "a training step of Gaussians that are spread over several devices, with torchrun"),
     "formats": ("formats", "what the files that sadgs-export writes take and lose, on a run's held-out views"),
-    "rasterizers": ("rasterizers", "how far the CPU splatter and our tile lists are from gsplat (CUDA)"),
 }
 """What `python -m benchmarks` does besides running a protocol, and the module that does it."""
 

@@ -180,17 +180,6 @@ def parts() -> argparse.ArgumentParser:
     return parser
 
 
-def rasterizers() -> argparse.ArgumentParser:
-    """Return the options of `python -m benchmarks rasterizers`."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks rasterizers", description="Compare the torch splatter with gsplat on CUDA."
-    )
-    parser.add_argument("--gaussians", type=int, default=3000)
-    parser.add_argument("--size", type=int, default=128, help="width and height of the image in pixels")
-    parser.add_argument("--seed", type=int, default=0)
-    return parser
-
-
 def formats() -> argparse.ArgumentParser:
     """Return the options of `python -m benchmarks formats`."""
     parser = argparse.ArgumentParser(

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import scenes
 import torch
+from random_scene import random_scene
 from torch import Tensor
 
-from benchmarks.rasterizers import random_scene
 from sadgs_ns import kernels
 from sadgs_ns.gsplat_internals import torch_spherical_harmonics
 from sadgs_ns.method import losses

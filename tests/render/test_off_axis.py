@@ -9,9 +9,9 @@ from typing import Any
 import gsplat.rendering
 import pytest
 import torch
+from random_scene import random_scene
 from torch import Tensor
 
-from benchmarks.rasterizers import random_scene
 from sadgs_ns.render import splatter
 from sadgs_ns.render.off_axis import cull_off_axis, culling, near_axis
 from sadgs_ns.render.rasterization import rasterize, visible

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from typing import Any
@@ -9,8 +10,8 @@ from unittest.mock import Mock
 
 import pytest
 import torch
+from random_scene import random_scene, render_with_gradients
 
-from benchmarks.rasterizers import random_scene, render_with_gradients
 from sadgs_ns.render import splatter
 from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world, visible
 
@@ -47,13 +48,14 @@ def test_cuda_gets_gsplat_unpacked(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_cpu_never_loads_gsplats_kernels() -> None:
     program = """
 import sys
-from benchmarks.rasterizers import random_scene, render_with_gradients
+from random_scene import random_scene, render_with_gradients
 import torch
 render_with_gradients(random_scene(20, 16, 0), "cpu", torch.float32)
 loaded = {"gsplat.cuda._backend", "gsplat.csrc", "gsplat_cuda"} & set(sys.modules)
 sys.exit(f"loaded {loaded}" if loaded else 0)
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    paths = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", program], env=paths, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from random_scene import random_scene
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from benchmarks.rasterizers import random_scene
 from sadgs_ns.render import splatter
 
 NEAR = 0.01

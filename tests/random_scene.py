@@ -1,20 +1,12 @@
-"""How far the torch splatter is from gsplat: `python -m benchmarks rasterizers` on a CUDA machine.
-
-Renders one random scene with gsplat on CUDA in float32, with gsplat's parts and our tile lists, and with the splatter
-on the CPU in float32 and float64, and prints the largest deviations of the images, projections and gradients from
-gsplat's as a markdown table.
-"""
+"""A random scene, and what either rasterizer makes of it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
-import gsplat
 import torch
 from torch import Tensor
 
-from benchmarks import command_lines
 from sadgs_ns.render.rasterization import rasterize, visible
 
 _PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
@@ -78,42 +70,3 @@ def render_with_gradients(
     results |= {f"gradient of {name}": arguments[name].grad for name in _PARAMETERS}
     results["absgrad"] = info["means2d"].absgrad
     return {"visible": visible(info).cpu()} | {name: value.detach().cpu().double() for name, value in results.items()}
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Print the table; returns the exit code, 1 where there is no CUDA device."""
-    options = command_lines.rasterizers().parse_args(argv)
-    if not torch.cuda.is_available():
-        print("This comparison needs a CUDA device for gsplat, and torch finds none.")
-        return 1
-
-    scene = random_scene(options.gaussians, options.size, options.seed)
-    reference = render_with_gradients(scene, "cuda", torch.float32)
-    others = {
-        "splatter, float32": render_with_gradients(scene, "cpu", torch.float32),
-        "splatter, float64": render_with_gradients(scene, "cpu", torch.float64),
-        "exact lists": render_with_gradients(scene, "cuda", torch.float32, fused=True),
-    }
-    print(f"gsplat {gsplat.__version__}, torch {torch.__version__}, {torch.cuda.get_device_name()}; ", end="")
-    print(f"{options.gaussians} Gaussians, {options.size} x {options.size} px, seed {options.seed}. ", end="")
-    changed = (f"{int((one['visible'] != reference['visible']).sum())} ({name})" for name, one in others.items())
-    print(f"Gaussians visible in one only: {'; '.join(changed)}.\n")
-    print("Largest deviation from gsplat, absolute and divided by gsplat's largest absolute value.\n")
-    print(f"| quantity | {' | '.join(others)} |")
-    print(f"| --- |{' --- |' * len(others)}")
-    for name in [key for key in reference if key != "visible"]:
-        cells = []
-        for one in others.values():
-            expected, actual = reference[name], one[name]
-            if name in ("means2d", "conics"):
-                # gsplat leaves these uninitialised for culled Gaussians.
-                drawn = reference["visible"] & one["visible"]
-                expected, actual = expected[drawn], actual[drawn]
-            deviation = (actual - expected).abs().max().item()
-            cells.append(f"{deviation:.1e}, {deviation / expected.abs().max().item():.1e}")
-        print(f"| {name} | {' | '.join(cells)} |")
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
