@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from examples.drawn_scene.drawing import Sphere, Surface, View, trace
-from sadgs_ns.formats.mesh import DepthView, Mesh
+from sadgs_ns.formats.mesh import DepthView, TriangleMesh
 
 Array = NDArray[np.float64]
 
@@ -43,7 +43,7 @@ def nearest(surfaces: Sequence[Surface], points: Array) -> tuple[Array, Array]:
     return np.min(distances, axis=0), np.argmin(distances, axis=0)
 
 
-def face_normals(mesh: Mesh) -> Array:
+def face_normals(mesh: TriangleMesh) -> Array:
     """Normals of the triangles, as long as twice their area, on the side where corners run counterclockwise. [F, 3]"""
-    a, b, c = (mesh.vertices[mesh.triangles[:, corner]].astype(np.float64) for corner in range(3))
+    a, b, c = (np.asarray(mesh.vertices)[corner] for corner in np.asarray(mesh.triangles).T)
     return np.cross(b - a, c - a)

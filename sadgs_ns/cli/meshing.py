@@ -67,14 +67,14 @@ def write_mesh(
     views = look(params, cameras, range(number), **drawing)
     for view in track(views, "Fusing depth", number, console=console, disable=not console.is_terminal):
         fusion.add(view)
-    found = fusion.mesh().without_small_parts()
+    found = fusion.mesh()
     if not len(found.triangles):
         raise InputError(
             f"No surface came out of {number} training views with voxels of {voxel_size:.3g}: take fewer Gaussians "
             "away, or leave --voxel-size out."
         )
     with atomic_path(path) as partial, partial.open("wb") as file:
-        mesh.write(file, found if similarity is None else found.moved(similarity))
+        mesh.write(file, found if similarity is None else mesh.moved(found, similarity))
     return len(found.triangles)
 
 

@@ -7,7 +7,7 @@ each voxel keeps the mean of its signed distances to the surfaces that views see
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import IO, Any
 
 import numpy as np
@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 from sadgs_ns.data.coordinates import Similarity
 from sadgs_ns.errors import InputError, reason
 
+TriangleMesh = Any
+"""`open3d.geometry.TriangleMesh`; open3d cannot be imported everywhere. It has `vertices` in world units [V, 3], their
+`vertex_colors` in [0, 1] [V, 3], and `triangles`, with corners counterclockwise for a camera that sees them [F, 3]."""
 MOST_VOXELS = 60_000_000
 """A mesh takes at most so many voxels; at the peak, while their number doubles, each takes 71 bytes, 4.3 GB in all."""
 PIXELS_PER_VOXEL = 2.0
@@ -51,39 +54,6 @@ class DepthView:
     def focal(self) -> float:
         """Focal length in px, the geometric mean of both axes'."""
         return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """V vertices and F triangles, whose corners run counterclockwise where a camera sees them."""
-
-    vertices: NDArray[np.float32]
-    """World units. [V, 3]"""
-    colors: NDArray[np.uint8]
-    """Of the vertices. [V, 3]"""
-    triangles: NDArray[np.int32]
-    """Indices of vertices. [F, 3]"""
-
-    def moved(self, similarity: Similarity) -> Mesh:
-        """Return the mesh in another frame; a reflection turns the corners' order round."""
-        mirrored = np.linalg.det(similarity.orthogonal) < 0
-        vertices = similarity.positions(self.vertices.astype(np.float64)).astype(np.float32)
-        return replace(self, vertices=vertices, triangles=self.triangles[:, :: -1 if mirrored else 1])
-
-    def without_small_parts(self) -> Mesh:
-        """Return the connected components that have at least a hundredth of the largest one's triangles."""
-        from scipy.sparse import coo_array
-        from scipy.sparse.csgraph import connected_components
-
-        number = len(self.vertices)
-        ends = self.triangles[:, [1, 2]].T.ravel()
-        edges = coo_array((np.ones(len(ends), bool), (self.triangles[:, [0, 0]].T.ravel(), ends)), (number, number))
-        _, parts = connected_components(edges, directed=False)
-        sizes = np.bincount(parts[self.triangles[:, 0]], minlength=1)
-        triangles = self.triangles[sizes[parts[self.triangles[:, 0]]] >= _SMALLEST_SHARE * sizes.max()]
-        used, corners = np.unique(triangles, return_inverse=True)
-        corners = corners.reshape(-1, 3).astype(np.int32)
-        return Mesh(self.vertices[used], self.colors[used], corners)
 
 
 class Fusion:
@@ -148,16 +118,33 @@ class Fusion:
         color = self._image(self._core.Tensor(view.color))
         self._grid.integrate(blocks, camera.pop("depth"), color, **camera)
 
-    def mesh(self) -> Mesh:
-        """Return the surface, which has no triangles where the views showed none."""
-        if not self._grid.hashmap().size():
-            return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros((0, 3), np.int32))
-        # Open3D wants more views than the threshold says.
-        found = self._grid.extract_triangle_mesh(weight_threshold=min(_VIEWS, self._views) - 0.5)
-        if not len(found.triangle) or not found.triangle.indices.shape[0]:
-            return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros((0, 3), np.int32))
-        colors = np.rint(255 * found.vertex.colors.numpy().clip(0, 1)).astype(np.uint8)
-        return Mesh(found.vertex.positions.numpy(), colors, found.triangle.indices.numpy().astype(np.int32))
+    def mesh(self) -> TriangleMesh:
+        """Return the surface, which has no triangles where the views showed none.
+
+        It leaves out connected components with less than a hundredth of the largest one's triangles.
+        """
+        found = load_open3d().geometry.TriangleMesh()
+        if self._grid.hashmap().size():
+            # Open3D wants more views than the threshold says.
+            extracted = self._grid.extract_triangle_mesh(weight_threshold=min(_VIEWS, self._views) - 0.5)
+            found = extracted.to_legacy() if len(extracted.triangle) else found
+        return without_small_parts(found)
+
+
+def without_small_parts(mesh: TriangleMesh) -> TriangleMesh:
+    """Return a mesh without components of less than a hundredth of the largest one's triangles; it is changed."""
+    parts, sizes, _ = map(np.asarray, mesh.cluster_connected_triangles())
+    mesh.remove_triangles_by_mask(sizes[parts] < _SMALLEST_SHARE * sizes.max(initial=0))
+    return mesh.remove_unreferenced_vertices()
+
+
+def moved(mesh: TriangleMesh, similarity: Similarity) -> TriangleMesh:
+    """Return a mesh in another frame; it is changed. A reflection turns the order of the triangles' corners round."""
+    transform = np.eye(4)
+    transform[:3] = np.c_[similarity.scale * similarity.orthogonal, similarity.translation]
+    if np.linalg.det(similarity.orthogonal) < 0:
+        mesh.triangles = type(mesh.triangles)(np.asarray(mesh.triangles)[:, ::-1])
+    return mesh.transform(transform)
 
 
 def load_open3d() -> Any:
@@ -176,21 +163,23 @@ def load_open3d() -> Any:
     return open3d
 
 
-def write(file: IO[bytes], mesh: Mesh) -> None:
+def write(file: IO[bytes], mesh: TriangleMesh) -> None:
     """Write a mesh as binary little-endian PLY, with colours of vertices.
+
+    Open3D's own writer takes a full disk for success.
 
     Args:
         file: Open for writing.
         mesh: What is written.
     """
-    lines = ["ply", "format binary_little_endian 1.0", "comment sadgs_ns: fused from rendered depth"]
-    lines += [f"element vertex {len(mesh.vertices)}", *(f"property float {axis}" for axis in "xyz")]
-    lines += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
-    lines += [f"element face {len(mesh.triangles)}", "property list uchar int vertex_indices", "end_header"]
-    file.write(("\n".join(lines) + "\n").encode())
     vertices = np.empty(len(mesh.vertices), [("position", "<f4", 3), ("color", "u1", 3)])
-    vertices["position"], vertices["color"] = mesh.vertices, mesh.colors
+    vertices["position"], vertices["color"] = mesh.vertices, np.rint(255 * np.asarray(mesh.vertex_colors).clip(0, 1))
     faces = np.empty(len(mesh.triangles), [("corners", "u1"), ("indices", "<i4", 3)])
     faces["corners"], faces["indices"] = 3, mesh.triangles
+    lines = ["ply", "format binary_little_endian 1.0", "comment sadgs_ns: fused from rendered depth"]
+    lines += [f"element vertex {len(vertices)}", *(f"property float {axis}" for axis in "xyz")]
+    lines += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
+    lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
+    file.write(("\n".join(lines) + "\n").encode())
     file.write(vertices.tobytes())
     file.write(faces.tobytes())

@@ -16,7 +16,7 @@ from examples.drawn_scene.scene import arc_views, room_surfaces
 from sadgs_ns.data.coordinates import Similarity
 from sadgs_ns.errors import InputError
 from sadgs_ns.formats import mesh
-from sadgs_ns.formats.mesh import Fusion, Mesh
+from sadgs_ns.formats.mesh import Fusion, TriangleMesh
 
 ROOM = room_surfaces()
 VOXEL = 0.04
@@ -24,25 +24,36 @@ VOXEL = 0.04
 
 
 @pytest.fixture(scope="module")
-def room(open3d: None) -> Mesh:
+def room(open3d: None) -> TriangleMesh:
     """A mesh of 12 views of the room."""
     fusion = Fusion(VOXEL)
     for view in arc_views(12, 160, 120):
         fusion.add(depth_view(ROOM, view))
-    return fusion.mesh().without_small_parts()
+    return fusion.mesh()
 
 
-def test_the_surface_lies_within_a_tenth_of_a_voxel_in_the_median(room: Mesh):
-    distances, which = nearest(ROOM, room.vertices.astype(float))
+def a_mesh(vertices: np.ndarray, triangles: np.ndarray) -> TriangleMesh:
+    """A mesh [V, 3], [F, 3] whose colours are a twentieth of the places."""
+    import open3d
+
+    found = open3d.geometry.TriangleMesh(
+        open3d.utility.Vector3dVector(vertices.astype(float)), open3d.utility.Vector3iVector(triangles.astype(np.int32))
+    )
+    found.vertex_colors = open3d.utility.Vector3dVector(vertices / 20)
+    return found
+
+
+def test_the_surface_lies_within_a_tenth_of_a_voxel_in_the_median(room: TriangleMesh):
+    distances, which = nearest(ROOM, np.asarray(room.vertices))
     assert np.median(distances) < 0.1 * VOXEL and np.quantile(distances, 0.9) < 0.3 * VOXEL
     assert set(which) >= {index for index, surface in enumerate(ROOM) if "back" not in surface.name and "left" not in
                           surface.name}, "all that the views see has a part"  # fmt: skip
 
 
-def test_corners_run_counterclockwise_where_cameras_see_them(room: Mesh):
+def test_corners_run_counterclockwise_where_cameras_see_them(room: TriangleMesh):
     """The room's corner is at the origin, so that the floor and the walls are seen from the positive side."""
     normals = face_normals(room)
-    middles = room.vertices[room.triangles].mean(axis=1).astype(float)
+    middles = np.asarray(room.vertices)[np.asarray(room.triangles)].mean(axis=1)
     distances, which = nearest(ROOM, middles)
     for index, axis in ((0, 2), (1, 1), (2, 0)):
         on = normals[(which == index) & (distances < VOXEL)]
@@ -53,21 +64,21 @@ def test_corners_run_counterclockwise_where_cameras_see_them(room: Mesh):
     assert ((normals * outward).sum(axis=1)[on] > 0).mean() > 0.99
 
 
-def test_vertices_have_the_colours_of_their_surface(room: Mesh):
-    points = room.vertices.astype(float)
+def test_vertices_have_the_colours_of_their_surface(room: TriangleMesh):
+    points = np.asarray(room.vertices)
     distances, which = nearest(ROOM, points)
     for index in (0, 1, 2, len(ROOM) - 1):
         on = (which == index) & (distances < 0.3 * VOXEL)
-        errors = np.abs(ROOM[index].colour(points[on]) - room.colors[on] / 255)
+        errors = np.abs(ROOM[index].colour(points[on]) - np.asarray(room.vertex_colors)[on])
         assert np.median(errors) < 0.03, "but at edges, over which a voxel averages"
 
 
-def test_a_reflection_keeps_the_front(room: Mesh):
+def test_a_reflection_keeps_the_front(room: TriangleMesh):
     mirror = Similarity(2.0, np.diag([1.0, 1, -1]), np.array([0.0, 0, 5]))
-    moved = room.moved(mirror)
-    np.testing.assert_allclose(moved.vertices, 2 * room.vertices * [1, 1, -1] + [0, 0, 5], rtol=1e-6, atol=1e-6)
-    expected = 4 * face_normals(room) * [1, 1, -1]
-    np.testing.assert_allclose(face_normals(moved), expected, atol=1e-6)
+    vertices, normals = 2 * np.asarray(room.vertices) * [1, 1, -1] + [0, 0, 5], 4 * face_normals(room) * [1, 1, -1]
+    moved = mesh.moved(type(room)(room), mirror)
+    np.testing.assert_allclose(moved.vertices, vertices, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(face_normals(moved), normals, atol=1e-6)
 
 
 @pytest.mark.usefixtures("open3d")
@@ -90,8 +101,7 @@ def test_nothing_and_what_is_far_behind_make_no_mesh():
     for depth in (nothing, far, between):
         fusion = Fusion(VOXEL)
         fusion.add(dataclasses.replace(view, depth=depth))
-        assert fusion.mesh().triangles.shape == (0, 3)
-        assert fusion.mesh().without_small_parts().vertices.shape == (0, 3)
+        assert len(fusion.mesh().triangles) == len(fusion.mesh().vertices) == 0
         assert fusion.has_room_for([dataclasses.replace(view, depth=depth)])
 
 
@@ -105,6 +115,7 @@ def test_voxels_that_do_not_fit_are_refused_before_they_take_memory(monkeypatch:
         Fusion(0.02).add(view)
 
 
+@pytest.mark.usefixtures("open3d")
 def test_parts_of_less_than_a_hundredth_of_the_largest_are_left_out():
     sides = [11, 1, 2]  # squares of the grids: 242, 2 and 8 triangles
     vertices, triangles = [], []
@@ -114,29 +125,33 @@ def test_parts_of_less_than_a_hundredth_of_the_largest_are_left_out():
         corners = [first, first + side + 1, first + 1, first + 1, first + side + 1, first + side + 2]
         triangles.append(np.stack(corners, 1).reshape(-1, 3))
         vertices.append(np.stack([x, y, np.full_like(x, number)], -1).reshape(-1, 3))
-    whole = Mesh(
-        np.concatenate(vertices).astype(np.float32),
-        np.concatenate(vertices).astype(np.uint8),
-        np.concatenate(triangles).astype(np.int32),
-    )
-    kept = whole.without_small_parts()
-    assert set(kept.vertices[:, 2]) == {0, 2} and len(kept.triangles) == 242 + 8
-    assert len(kept.vertices) == 12 * 12 + 3 * 3 and (kept.vertices == kept.colors).all()
+    kept = mesh.without_small_parts(a_mesh(np.concatenate(vertices), np.concatenate(triangles)))
+    left = np.asarray(kept.vertices)
+    assert set(left[:, 2]) == {0, 2} and len(kept.triangles) == 242 + 8
+    assert len(left) == 12 * 12 + 3 * 3 and (left == 20 * np.asarray(kept.vertex_colors)).all()
     np.testing.assert_allclose(np.linalg.norm(face_normals(kept), axis=1), 1)
 
 
+@pytest.mark.usefixtures("open3d")
 def test_foreign_readers_read_the_file(tmp_path: Path):
-    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.5]], np.float32)
-    colors = np.arange(12, dtype=np.uint8).reshape(4, 3)
-    triangles = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.5]])
+    triangles = np.array([[0, 1, 2], [0, 2, 3]])
     path = tmp_path / "a.mesh.ply"
     with path.open("wb") as file:
-        mesh.write(file, Mesh(vertices, colors, triangles))
+        mesh.write(file, a_mesh(vertices, triangles))
     read = trimesh.load(path, process=False)
     np.testing.assert_array_equal(read.vertices, vertices)  # type: ignore[union-attr]
     np.testing.assert_array_equal(read.faces, triangles)  # type: ignore[union-attr]
+    colors = np.rint(255 * vertices / 20)
     np.testing.assert_array_equal(read.visual.vertex_colors[:, :3], colors)  # type: ignore[union-attr]
     assert "fused from rendered depth" in PlyData.read(str(path)).comments[0]
     empty = io.BytesIO()
-    mesh.write(empty, Mesh(vertices[:0], colors[:0], triangles[:0]))
+    mesh.write(empty, a_mesh(vertices[:0], triangles[:0]))
     assert PlyData.read(io.BytesIO(empty.getvalue()))["face"].count == 0
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux")
+@pytest.mark.usefixtures("open3d")
+def test_a_full_disk_is_noticed():
+    with pytest.raises(OSError, match="No space left"), open("/dev/full", "wb") as file:
+        mesh.write(file, a_mesh(np.eye(3), np.arange(3)[None]))
