@@ -103,8 +103,7 @@ def print_uncaught_errors_as_sentences() -> None:
     show = sys.excepthook
 
     def show_sentence(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
-        sentence = str(error) if isinstance(error, InputError | RunError | WriteError) else _of_nerfstudio(error)
-        if sentence is None:
+        if (sentence := sentence_of(error)) is None:
             show(kind, error, traceback)
         else:
             print(f"error: {sentence}", file=sys.stderr)
@@ -112,8 +111,10 @@ def print_uncaught_errors_as_sentences() -> None:
     sys.excepthook = show_sentence
 
 
-def _of_nerfstudio(error: BaseException) -> str | None:
-    """Return what to tell the user of an error of nerfstudio's own; None if a traceback tells more."""
+def sentence_of(error: BaseException) -> str | None:
+    """Return what to tell the user of an error of ours or of nerfstudio's; None if a traceback tells more."""
+    if isinstance(error, InputError | RunError | WriteError):
+        return str(error)
     frames = [frame for frame, _ in tracebacks.walk_tb(error.__traceback__)]
     places = [(str(frame.f_globals.get("__name__")), frame.f_code.co_name) for frame in frames]
     raised = re.findall(r"^sadgs_ns\.errors\.\w+: (.*)", str(error), re.MULTILINE)

@@ -77,8 +77,9 @@ def test_photos_that_have_features_are_not_searched_again(features, tmp_path: Pa
 
     monkeypatch.setattr(features, "sift", noting)
     database = tmp_path / "database.db"
-    features.extract(tmp_path, [names[:2]], database, lambda *step: None)
-    features.extract(tmp_path, [names], database, lambda *step: told.append(step))
+    features.extract(tmp_path, [names[:2]], database)
+    monkeypatch.setattr(features, "progress", lambda *step: told.append(step))
+    features.extract(tmp_path, [names], database)
     assert sorted(searched) == names
     assert told[-1] == ("features", 4, 4)
     with features.pycolmap.Database.open(database) as opened:

@@ -74,7 +74,7 @@ def test_photos_are_related_as_by_colmap_s_own_matches(matching: ModuleType, tmp
     inliers = []
     for ours in (False, True):
         database = tmp_path / f"{ours}.db"
-        features.extract(tmp_path / "photos", [names], database, lambda *_: None)
+        features.extract(tmp_path / "photos", [names], database)
         pairs = [(names[0], names[1]), (names[0], names[2]), (names[1], names[2])]
         if ours:
             matching.write_matches(database, pairs, torch.device("cpu"))

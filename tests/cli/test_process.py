@@ -14,7 +14,6 @@ import errno
 import functools
 import itertools
 import json
-import multiprocessing
 import os
 import resource
 import shutil
@@ -36,7 +35,8 @@ from rich.progress import Progress
 from room import HEIGHT, VIEWS, WIDTH, camera_centres, draw_photos
 
 from sadgs_ns.cli.process import command as program
-from sadgs_ns.cli.process.apart import run_apart
+from sadgs_ns.cli.process import stages as colmap_stages
+from sadgs_ns.cli.process.colmap import run_colmap
 from sadgs_ns.cli.process.command import main, photos_added, process
 from sadgs_ns.cli.process.photos import PHOTO_SUFFIXES, Photo, find_photos, photos_by_camera, read_photos
 from sadgs_ns.cli.process.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching, expected_work
@@ -116,7 +116,6 @@ def run(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
         patched.setattr(sys, "stderr", stderr)
         spy_on_stages(patched, interrupt)
         exit_code = main([str(photos), str(out)])
-    assert not multiprocessing.active_children()
     left = {path.name for path in (out / "work").iterdir()}
     count_matches()
     with pytest.MonkeyPatch.context() as patched:
@@ -257,11 +256,14 @@ def heic(folder: Path) -> None:
         (folder / f"IMG_{i}.HEIC").write_bytes(b"ftypheic")
 
 
-def test_photos_that_are_not_read_are_told_beside_those_that_are(tmp_path: Path, monkeypatch, capsys):
+def test_photos_that_are_not_read_are_told_beside_those_that_are(
+    tmp_path: Path, registered: Callable[[int], None], capsys
+):
     heic(tmp_path / "photos")
-    monkeypatch.setattr(program, "process", lambda **options: Summary(9, 9, 100, 0.5, {}))
+    black(tmp_path / "photos", "a.png", "b.png", "c.png")
+    registered(9)
     assert main([str(tmp_path / "photos"), str(tmp_path / "out")]) == 0
-    assert "9 of 9 photos registered" in (printed := capsys.readouterr().out)
+    assert "9 of 12 photos registered" in (printed := capsys.readouterr().out)
     assert "Its 4 .HEIC files are not read: convert them to one of bmp, jpeg, jpg, png" in printed
 
 
@@ -335,8 +337,7 @@ def test_a_deleted_working_directory_is_told_in_a_sentence(tmp_path: Path, monke
 @pytest.mark.hard_case("`--max-size 5`, 63, −5", "refused: at least 64, or 0")
 @pytest.mark.parametrize("size", ["-5", "5", "63"])
 def test_a_size_without_structure_is_refused(tmp_path: Path, size: str, capsys):
-    with pytest.raises(SystemExit):
-        main([str(tmp_path), str(tmp_path / "out"), "--max-size", size])
+    assert main([str(tmp_path), str(tmp_path / "out"), "--max-size", size]) == 2
     assert "--max-size must be at least 64 px, or 0 to keep the photos' size" in capsys.readouterr().err
 
 
@@ -371,7 +372,7 @@ def test_names_with_spaces_and_webp_and_transparent_photos(tmp_path: Path, capsy
 def test_names_with_spaces_are_matched_by_colmap_s_own_function(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     neighbours: list[Path] = []  # of a film: these photos' neighbours stand apart
     monkeypatch.setattr(pycolmap, "match_sequential", lambda database, **options: neighbours.append(database))
-    match(["a 1.png", "a 2.png"], tmp_path / "db", tmp_path / "pairs.txt", "sequential", None, lambda *step: None)
+    match(["a 1.png", "a 2.png"], tmp_path / "db", tmp_path / "pairs.txt", "sequential", None)
     assert neighbours == [tmp_path / "db"]
 
 
@@ -382,7 +383,7 @@ def test_names_with_spaces_are_matched_by_colmap_s_own_function(tmp_path: Path, 
 def test_numbered_photos_are_neighbours_in_the_order_of_their_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(pycolmap, "match_image_pairs", lambda database, **options: None)
     names = [f"{i}.png" for i in sorted(range(13), key=str)]
-    match(names, tmp_path / "db", tmp_path / "pairs.txt", "sequential", None, lambda *step: None)
+    match(names, tmp_path / "db", tmp_path / "pairs.txt", "sequential", None)
     assert "9.png 10.png\n" in (tmp_path / "pairs.txt").read_text()
 
 
@@ -404,7 +405,8 @@ def test_a_vocabulary_tree_that_is_there_is_found(tmp_path: Path, monkeypatch: p
     matching = functools.partial(pycolmap.match_vocabtree, pairing_options=pairing)
     monkeypatch.setattr(pycolmap, "match_vocabtree", matching)
     steps: list[tuple] = []
-    fetch_vocabulary(tmp_path, lambda *step: steps.append(step))
+    monkeypatch.setattr(colmap_stages, "progress", lambda *step: steps.append(step))
+    fetch_vocabulary(tmp_path)
     assert steps == [("vocabulary tree", 0, 1), ("vocabulary tree", 1, 1)]
 
 
@@ -462,7 +464,7 @@ def test_the_time_that_it_takes_is_told_roughly(monkeypatch: pytest.MonkeyPatch)
     }
     for (count, matching), sentence in told.items():
         photos = [dataclasses.replace(photo, size=(4000, 3000)) for photo in numbered(count)]
-        assert expected_work(photos, matching) == sentence
+        assert expected_work(photos, matching) == (sentence, sentence.partition(": ")[2].partition(" on ")[0])
 
 
 @pytest.mark.hard_case(
@@ -474,7 +476,7 @@ def test_a_way_of_matching_that_cannot_work_is_told_before_any_work(photos: Path
     assert main([*command, "spatial"]) == 2
     told = "every photo, and 11 of the 11 have none, such as 00.png; use sequential, exhaustive or auto."
     assert told in capsys.readouterr().err
-    monkeypatch.setattr(program, "run_apart", lambda *arguments, **others: no_vocabulary())
+    monkeypatch.setattr(program, "run_colmap", lambda *arguments, **others: no_vocabulary())
     assert main([*command, "vocabulary"]) == 2
     assert (
         "Use --matching sequential for photos in the order of their taking, or exhaustive." in capsys.readouterr().err
@@ -500,10 +502,11 @@ def test_photos_with_gps_positions_are_known(tmp_path: Path):
 def test_an_abort_of_colmap_is_an_error_like_others(tmp_path: Path):
     """Its vocabulary tree is not asked for here, because this database cannot be made."""
     steps: list[str] = []
-    function = "sadgs_ns.cli.process.stages:fetch_vocabulary"
     with pytest.raises(RunError, match=r"^COLMAP failed while it worked on vocabulary tree \(.+\); the same command"):
-        run_apart(function, tmp_path / "none", folder=tmp_path, report=lambda stage, *others: steps.append(stage))
-    assert steps == ["vocabulary tree"] and not multiprocessing.active_children()
+        run_colmap(
+            "fetch_vocabulary", tmp_path / "none", folder=tmp_path, report=lambda stage, *others: steps.append(stage)
+        )
+    assert steps == ["vocabulary tree"] and not list(tmp_path.iterdir())
 
 
 @pytest.mark.hard_case(
@@ -527,12 +530,12 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """Has COLMAP register so many of 12 photos at once, instead of running it."""
 
     def register(count: int) -> None:
-        def stand_in(function: str, *arguments: Any, folder: Path, report: object) -> Summary:
+        def stand_in(function: str, *arguments: Any, folder: Path, report: object) -> dict[str, Any]:
             (folder / "model").mkdir()
             (folder / "database.db").write_bytes(b"features")
-            return Summary(12, count, 100, 0.5, {}, arguments[2])
+            return dataclasses.asdict(Summary(12, count, 100, 0.5, {}, arguments[2]))
 
-        monkeypatch.setattr(program, "run_apart", stand_in)
+        monkeypatch.setattr(program, "run_colmap", stand_in)
         monkeypatch.setattr(program, "_publish", lambda *others: None)
 
     return register
@@ -579,7 +582,7 @@ def test_two_runs_do_not_disturb_each_other(tmp_path: Path, monkeypatch: pytest.
         assert main(command) == 2 and (folder / "models").is_dir()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(program, "run_apart", run_another)
+    monkeypatch.setattr(program, "run_colmap", run_another)
     assert main(command) == 130 and not (tmp_path / "out" / "work" / "models").exists()
     assert f"another sadgs-process works on {tmp_path / 'out'}; wait for it, or stop it." in capsys.readouterr().err
 
@@ -643,7 +646,7 @@ def test_a_gpu_matches_the_pairs_that_colmap_verifies(tmp_path: Path, monkeypatc
     )
     monkeypatch.setattr(pycolmap, "match_image_pairs", lambda database, **options: calls.append(("verified",)))
     device = torch.device("cpu")
-    match(["a.png", "b.png"], tmp_path / "db", tmp_path / "pairs.txt", "exhaustive", device, lambda *step: None)
+    match(["a.png", "b.png"], tmp_path / "db", tmp_path / "pairs.txt", "exhaustive", device)
     assert calls == [(("a.png", "b.png"), device), ("verified",)]
 
 
@@ -707,7 +710,7 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         runs.append(sorted(itertools.chain(*groups)))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(program, "run_apart", stop)
+    monkeypatch.setattr(program, "run_colmap", stop)
     return runs
 
 

@@ -51,7 +51,7 @@ def said_of(command: Any) -> str | None:
     """What is printed in place of the traceback."""
     with pytest.raises((ValueError, OSError, AssertionError)) as failed:
         command.main()
-    return errors._of_nerfstudio(failed.value)
+    return errors.sentence_of(failed.value)
 
 
 @pytest.mark.hard_case("`ns-eval` with one held-out view; with none", "no deviations; refused")
@@ -111,7 +111,7 @@ def test_a_logger_that_cannot_start_is_named(monkeypatch: pytest.MonkeyPatch, tm
     monkeypatch.setitem(sys.modules, "wandb", types.SimpleNamespace(init=init))
     with pytest.raises(RuntimeError) as failed:
         writer.setup_event_writer(True, False, False, log_dir=tmp_path, experiment_name="test")
-    assert errors._of_nerfstudio(failed.value) == (
+    assert errors.sentence_of(failed.value) == (
         "The logger that --vis names could not start (No API key configured): log in to its service, or choose another "
         "--vis."
     )
@@ -120,7 +120,7 @@ def test_a_logger_that_cannot_start_is_named(monkeypatch: pytest.MonkeyPatch, tm
 def test_errors_that_are_nobody_s_keep_their_traceback():
     with pytest.raises(ValueError) as failed:
         int("seven")
-    assert errors._of_nerfstudio(failed.value) is None
+    assert errors.sentence_of(failed.value) is None
 
 
 @pytest.mark.hard_case("a deleted working directory, our commands", "one sentence")

@@ -7,25 +7,26 @@ what photos that come later are added to: the features and matches in `database.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import dataclasses
-import fcntl
 import json
 import os
 import shlex
 import shutil
-import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
+from sadgs_ns import events
 from sadgs_ns.atomic import atomic_path
-from sadgs_ns.cli.process.apart import Report, run_apart
+from sadgs_ns.cli.process.colmap import Report, run_colmap
 from sadgs_ns.cli.process.photos import (
     changed_photos,
     convert_photos,
@@ -40,15 +41,15 @@ from sadgs_ns.cli.process.photos import (
 )
 from sadgs_ns.cli.process.plan import Matching, Summary, choose_matching, expected_work
 from sadgs_ns.cli.process.video import video_frames, write_frames
+from sadgs_ns.cli.program import exit_code, locked, parse
 from sadgs_ns.data.coordinates import FRAME_KEYS
-from sadgs_ns.errors import InputError, RunError, WriteError, free_space, reason
-from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
+from sadgs_ns.errors import InputError, WriteError, reason
+from sadgs_ns.plugin.interrupts import Interrupts
 
 MIN_SIZE = 64
 """Smallest longest side of the result in px; no structure is left in smaller images."""
 _SECONDS_PER_LINE = 1.0
 """Least time between two lines of a stage's progress in a file."""
-_STAGES = "sadgs_ns.cli.process.stages"
 _KEPT_KEYS = (*FRAME_KEYS, "train_filenames", "val_filenames", "test_filenames")
 """Keys that a scene's `transforms.json` keeps when photos are added."""
 _MODEL = "model"
@@ -129,9 +130,8 @@ def process(
     frames: int = 200,
     max_size: int = 1600,
     camera_per_photo: bool = False,
-    tell: Callable[[str], None] = print,
 ) -> Summary:
-    """Make a scene of photos or a video.
+    """Make a scene of photos or a video, and say how far it is, in print and as events.
 
     Args:
         source: A folder of photos, searched with its subfolders, or a video.
@@ -145,16 +145,27 @@ def process(
         max_size: Longest side of the undistorted photos in px; 0 keeps them as they are.
         camera_per_photo: Whether every photo has a focal length of its own. Otherwise photos of one size share a
             camera, unless EXIF tells of several cameras or focal lengths.
-        tell: Called with sentences that the user should read, as the work goes on.
 
     Returns:
         What was registered and what was not.
 
     Raises:
         InputError: If the photos, the folder or the settings cannot be used.
+        Interrupted: If a signal came; what was done is kept.
         OSError: If a file cannot be written.
         RunError: If COLMAP fails.
     """
+    with Interrupts(waiting=lambda: True):
+        summary = _process(source, out, matching, frames, max_size, camera_per_photo)
+    print(summary)
+    if source.is_dir() and (not_read := photos_not_read(source)):
+        print(not_read)
+    return summary
+
+
+def _process(
+    source: Path, out: Path, matching: Matching, frames: int, max_size: int, camera_per_photo: bool
+) -> Summary:
     work = out / "work"
     noted = work / "settings.json"
     if out.is_file() or (not noted.exists() and any(not path.is_dir() for path in out.rglob("*"))):
@@ -177,7 +188,7 @@ def process(
     model = f"{_MODEL}-{len(settings['photos'])}" if added else _MODEL
     if finished and not added:
         _remove_intermediate_files(work, begun)
-        tell(f"{out} is finished; delete it to make it again.")
+        _say("unchanged", f"{out} is finished; delete it to make it again.")
         return Summary(**finished)
     columns = (TextColumn("{task.description:>24}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, disable=not sys.stdout.isatty()) as progress, contextlib.ExitStack() as alone:
@@ -201,7 +212,7 @@ def process(
 
         def fetch_vocabulary() -> None:
             with tempfile.TemporaryDirectory() as scratch:
-                run_apart(f"{_STAGES}:fetch_vocabulary", Path(scratch), folder=Path(scratch), report=report)
+                run_colmap("fetch_vocabulary", Path(scratch), folder=Path(scratch), report=report)
 
         chosen_matching, notice = choose_matching(matching, photos, is_video, fetch_vocabulary)
         if not is_video:
@@ -209,16 +220,18 @@ def process(
             alone.enter_context(_alone(work))
         known = len(photos) - len(added) if added else 0
         if added:
-            tell(f"{len(added)} photo{'s' * (len(added) > 1)} added to {known}.")
-        tell(f"{notice} {expected_work(photos, chosen_matching, known)}".lstrip())
+            told = f"{len(added)} photo{'s' * (len(added) > 1)} added to {known}"
+            _say("added", f"{told}.", told=told)
+        work_sentence, duration = expected_work(photos, chosen_matching, known)
+        _say("expected", f"{notice} {work_sentence}".lstrip(), duration=duration)
         folder, photos = convert_photos(folder, photos, work / "photos")
         if transparent := write_alpha(folder, photos, work / "alpha"):
-            tell(f"{transparent} photos are partly transparent; their images in the scene are, too.")
+            _say("transparent", f"{transparent} photos are partly transparent; their images in the scene are, too.")
         groups = [[photo.name] for photo in photos] if camera_per_photo else photos_by_camera(photos)
         if added:  # An interrupted run may have made a model without some of them.
             shutil.rmtree(work / model, ignore_errors=True)
         arguments = (folder, groups, chosen_matching, max_size, work / "alpha", work, model, base)
-        summary = run_apart(f"{_STAGES}:make_model", *arguments, folder=work, report=report)
+        summary = Summary(**run_colmap("make_model", *arguments, folder=work, report=report))
         _publish(work / "undistorted", out, bool(added))
         if summary.is_poor and not added:  # the features serve another way of matching
             shutil.rmtree(work / model)
@@ -230,6 +243,12 @@ def process(
     return summary
 
 
+def _say(event: str, sentence: str, **fields: str) -> None:
+    """Print a sentence, and tell a listener of the event that it is about."""
+    print(sentence, flush=True)
+    events.report(event, **fields)
+
+
 @contextlib.contextmanager
 def _alone(work: Path) -> Iterator[None]:
     """Keep other runs away from a work folder, and leave nothing half-written there.
@@ -237,20 +256,13 @@ def _alone(work: Path) -> Iterator[None]:
     Raises:
         InputError: If another run works there.
     """
-    lock = os.open(work, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise InputError(f"another sadgs-process works on {work.parent}; wait for it, or stop it.") from error
+    with locked(work, f"another sadgs-process works on {work.parent}; wait for it, or stop it."):
         try:
             yield
         finally:
             for name in _UNFINISHED:
                 shutil.rmtree(work / name, ignore_errors=True)
             (work / "pairs.txt").unlink(missing_ok=True)
-    finally:
-        os.close(lock)
 
 
 def _remove_intermediate_files(work: Path, settings: dict) -> None:
@@ -280,6 +292,7 @@ def _reporter(progress: Progress) -> Report:
 
     def report(stage: str, done: int, total: int) -> None:
         nonlocal printed
+        events.progress(stage, done, total)
         begins = stage not in tasks
         if begins:
             tasks[stage] = progress.add_task(stage, total=total)
@@ -331,75 +344,66 @@ def _publish(undistorted: Path, out: Path, grown: bool = False) -> None:
         (undistorted / name).rename(out / name)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Make a scene and return the exit code.
+@dataclass
+class Process:
+    """From photos or a video to a scene for sadgs."""
 
-    It is 0 for a scene of at least half of the photos, 1 for one of fewer, a full disk or a failure of COLMAP, 2 if the
-    input is wrong, and 130, 143 or 129 after SIGINT, SIGTERM or SIGHUP.
-    """
-    parser = argparse.ArgumentParser(prog="sadgs-process", description="From photos or a video to a scene for sadgs.")
-    parser.add_argument("source", type=Path, help="folder of photos, or a video")
-    parser.add_argument("out", type=Path, help="folder for the scene; an interrupted run goes on in it")
-    parser.add_argument(
-        "--matching",
-        default="auto",
-        choices=["auto", "exhaustive", "sequential", "spatial", "vocabulary"],
-        help="which photos are compared (default %(default)s, by their kind and number)",
-    )
-    parser.add_argument("--frames", type=int, default=200, help="frames to take of a video (default %(default)s)")
-    parser.add_argument(
-        "--max-size",
-        type=int,
-        default=1600,
-        metavar="PX",
-        help=f"longest side of the result, at least {MIN_SIZE}, 0 to keep it (default %(default)s)",
-    )
-    parser.add_argument(
-        "--camera-per-photo", action="store_true", help="every photo has its own zoom, and EXIF does not tell"
-    )
-    options = parser.parse_args(argv)
-    if options.frames < 3:
-        parser.error("--frames must be at least 3")
-    if options.max_size != 0 and options.max_size < MIN_SIZE:
-        parser.error(f"--max-size must be at least {MIN_SIZE} px, or 0 to keep the photos' size")
-    try:
-        if not (options.source.is_absolute() and options.out.is_absolute()):
+    source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS_OR_VIDEO")]
+    """Folder of photos, or a video."""
+    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
+    """Folder for the scene; an interrupted run goes on in it."""
+    matching: Matching = "auto"
+    """Which photos are compared; auto decides by their kind and number."""
+    frames: int = 200
+    """Frames to take of a video, at least 3."""
+    max_size: Annotated[int, tyro.conf.arg(metavar="PX")] = 1600
+    """Longest side of the result, at least 64, 0 to keep it."""
+    camera_per_photo: bool = False
+    """Every photo has its own zoom, and EXIF does not tell."""
+
+    def make(self) -> int:
+        """Make the scene, and return 0, or 1 where fewer than half of the photos registered."""
+        if self.frames < 3:
+            raise InputError("--frames must be at least 3.")
+        check_size(self.max_size)
+        if not (self.source.is_absolute() and self.out.is_absolute()):
             try:
                 os.getcwd()
             except FileNotFoundError:
                 raise InputError(
                     "the working directory was deleted; change to another one, or give full paths."
                 ) from None
-        with Interrupts(waiting=lambda: True):
-            summary = process(**vars(options))
-    except InputError as error:
-        print(f"sadgs-process: {error}", file=sys.stderr)
-        return 2
-    except (OSError, RunError) as error:
-        told = str(error)
-        if isinstance(error, OSError) and error.errno is not None:
-            where = error.filename or options.out
-            told = f"{where}: {reason(error)} ({free_space(options.out)} free there); the same command goes on."
-        print(f"sadgs-process: {told}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt as stopped:
-        print("sadgs-process: stopped; the same command goes on.", file=sys.stderr)
-        return 128 + (stopped.number if isinstance(stopped, Interrupted) else signal.SIGINT)
-    print(summary)
-    if options.source.is_dir() and (not_read := photos_not_read(options.source)):
-        print(not_read)
-    out = shlex.quote(str(options.out))
-    if summary.is_poor:
+        summary = process(**vars(self))
+        out = shlex.quote(str(self.out))
+        if not summary.is_poor:
+            print(
+                f"\nCheck machine and data before a long run:  sadgs-doctor {out}\nTrain:  ns-train sadgs --data {out}"
+            )
+            return 0
         again = "the same command with --matching exhaustive, which uses the features found so far; or "
         print(
-            f"warning: {options.out} shows only what {summary.registered} of {summary.photos} photos saw. Try "
+            f"warning: {self.out} shows only what {summary.registered} of {summary.photos} photos saw. Try "
             f"{'' if summary.matching == 'exhaustive' else again}another folder with more photos between those that "
             f"did not register, with two thirds of overlap. This trains on what is there: ns-train sadgs --data {out}",
             file=sys.stderr,
         )
         return 1
-    print(f"\nCheck machine and data before a long run:  sadgs-doctor {out}\nTrain:  ns-train sadgs --data {out}")
-    return 0
+
+
+def check_size(max_size: int) -> None:
+    """Raise an InputError if a longest side in px leaves no structure in the photos."""
+    if max_size != 0 and max_size < MIN_SIZE:
+        raise InputError(f"--max-size must be at least {MIN_SIZE} px, or 0 to keep the photos' size.")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Make a scene and return the exit code.
+
+    It is 0 for a scene of at least half of the photos, 1 for one of fewer, a full disk or a failure of COLMAP, 2 if the
+    input is wrong, and 130, 143 or 129 after SIGINT, SIGTERM or SIGHUP.
+    """
+    given = parse(Process, "sadgs-process", argv)
+    return exit_code("sadgs-process", given.out, given.make)
 
 
 if __name__ == "__main__":

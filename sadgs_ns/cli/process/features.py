@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pycolmap
 
-from sadgs_ns.cli.process.apart import Report
 from sadgs_ns.cli.process.plan import MAX_SIDE, searched_pixels
+from sadgs_ns.events import progress
 from sadgs_ns.method.host_memory import available_host_bytes
 
 MOST_FEATURES = 8192
@@ -24,7 +24,7 @@ _BYTES_PER_PIXEL = 240
 """Memory that OpenCV takes for features, as measured; it doubles the photo's size first."""
 
 
-def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, report: Report) -> None:
+def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path) -> None:
     """Find SIFT features in the photos that have none yet; each group of photos shares a camera.
 
     A photo that cannot be decoded gets no features.
@@ -33,10 +33,9 @@ def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, repor
         photos: The folder of the photos.
         groups: The photos' names, those of one camera together.
         database: COLMAP's database, which is made if it does not exist.
-        report: Called as the work goes on.
     """
     total = sum(map(len, groups))
-    report("features", 0, total)
+    progress("features", 0, total)
     with pycolmap.Database.open(database) as opened:
         known = {image.name: image.camera_id for image in opened.read_all_images()}
     for group in groups:
@@ -59,7 +58,7 @@ def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, repor
                     opened.write_keypoints(image.image_id, keypoints)
                     opened.write_descriptors(image.image_id, features)
                 done += 1
-                report("features", done, total)
+                progress("features", done, total)
 
 
 def sift(photo: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -110,8 +110,8 @@ def searched_pixels(size: tuple[int, int]) -> float:
     return width * height * min(1.0, MAX_SIDE / max(width, height)) ** 2
 
 
-def expected_work(photos: Sequence[Photo], matching: str, known: int = 0) -> str:
-    """Return a sentence on how much there is to do, and roughly how long it takes on this machine.
+def expected_work(photos: Sequence[Photo], matching: str, known: int = 0) -> tuple[str, str]:
+    """Return a sentence on how much there is to do, and how long it takes on this machine, as "roughly a minute".
 
     Args:
         photos: All photos.
@@ -129,7 +129,6 @@ def expected_work(photos: Sequence[Photo], matching: str, known: int = 0) -> str
     cores = os.cpu_count() or 1
     features = megapixels * new / len(photos) * _FEATURES_PER_MEGAPIXEL
     minutes = (features + pairs * per_pair + new * _POSE) / cores / 60
-    duration = (
-        f"{minutes / 60:.1f} hours" if minutes >= 60 else f"{minutes:.0f} minutes" if minutes >= 2 else "a minute"
-    )
-    return f"{new} photos, up to {pairs:,} pairs to match: roughly {duration} on {cores} processor cores."
+    duration = f"{minutes / 60:.1f} hours" if minutes >= 60 else f"{minutes:.0f} minutes"
+    duration = f"roughly {duration if minutes >= 2 else 'a minute'}"
+    return f"{new} photos, up to {pairs:,} pairs to match: {duration} on {cores} processor cores.", duration

@@ -1,6 +1,6 @@
 """The stages from photos to a scene are features, matches, cameras with points, and undistortion, all by pycolmap.
 
-Each stage goes on where an interrupted run left it. They run in a process of their own (`apart.py`), so no other
+Each stage goes on where an interrupted run left it. They run in a process of their own (`colmap.py`), so no other
 module of the package may import this one.
 """
 
@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pycolmap
 
-from sadgs_ns.cli.process.apart import Report
 from sadgs_ns.cli.process.features import extract
 from sadgs_ns.cli.process.photos import empty_folder, in_order
 from sadgs_ns.cli.process.plan import Matching, Summary
 from sadgs_ns.errors import InputError
+from sadgs_ns.events import progress
 
 if TYPE_CHECKING:
     import torch
@@ -61,7 +61,6 @@ def make_model(
     work: Path,
     model: str,
     base: str | None,
-    report: Report,
 ) -> Summary:
     """Make a model of photos, and from it the undistorted scene in `work/undistorted`.
 
@@ -77,7 +76,6 @@ def make_model(
         work: Folder for all files; what an interrupted run left there is used again.
         model: Name of the model's folder in `work`.
         base: Name of the earlier model's folder in `work`, whose cameras stay as they are; None begins anew.
-        report: Called as the work goes on.
 
     Raises:
         InputError: If no two photos could be related, or none could be added.
@@ -88,14 +86,11 @@ def make_model(
     if not made.exists():
         with ThreadPoolExecutor(1) as pool:  # Features need no torch, whose import takes seconds.
             gpu = pool.submit(wake_gpu)
-            extract(photos, groups, database, report)
-        match(names, database, work / "pairs.txt", matching, gpu.result(), report)
-        if base is None:
-            reconstruct(photos, len(names), database, models, made, report)
-        else:
-            register(photos, names, database, work / base, models, made, report)
+            extract(photos, groups, database)
+        match(names, database, work / "pairs.txt", matching, gpu.result())
+        place_cameras(photos, names, database, models, made, None if base is None else work / base)
     known = set() if base is None else registered_photos(pycolmap.Reconstruction(work / base))
-    undistort(photos, alphas, made, work / "undistorted", max_size, report, known)
+    undistort(photos, alphas, made, work / "undistorted", max_size, known)
     describe(work / "undistorted")
     return dataclasses.replace(summarize(names, made, database), matching=matching)
 
@@ -111,15 +106,14 @@ def wake_gpu() -> torch.device | None:
     return device
 
 
-def fetch_vocabulary(folder: Path, report: Report) -> None:
+def fetch_vocabulary(folder: Path) -> None:
     """Have COLMAP load its vocabulary tree, which it downloads if it must; the process aborts if it cannot.
 
     Args:
         folder: An empty folder for a database of two made-up photos.
-        report: Called at the start, because nothing tells how the download goes on.
     """
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
-    report("vocabulary tree", 0, 1)
+    progress("vocabulary tree", 0, 1)
     database = folder / "database.db"
     random = np.random.default_rng(0)
     with pycolmap.Database.open(database) as opened:
@@ -132,7 +126,7 @@ def fetch_vocabulary(folder: Path, report: Report) -> None:
             descriptors = random.integers(0, 256, (50, 128), dtype=np.uint8)
             opened.write_descriptors(image_id, pycolmap.FeatureDescriptors(type=kind, data=descriptors))
     pycolmap.match_vocabtree(database)
-    report("vocabulary tree", 1, 1)
+    progress("vocabulary tree", 1, 1)
 
 
 def sequential_pairs(names: Sequence[str], overlap: int = 10) -> list[tuple[str, str]]:
@@ -152,7 +146,6 @@ def match(
     pair_list: Path,
     matching: Matching,
     gpu: torch.device | None,
-    report: Report,
 ) -> None:
     """Match features between photos; pairs that an earlier run matched are skipped.
 
@@ -164,7 +157,6 @@ def match(
         pair_list: A file to write lists of pairs to.
         matching: Which pairs are matched; any but "auto".
         gpu: The device that compares features; None leaves them to COLMAP.
-        report: Called as the work goes on.
     """
     stage = f"matches ({matching})"
     verification = pycolmap.TwoViewGeometryOptions()
@@ -173,7 +165,7 @@ def match(
     # COLMAP separates the names in a list of pairs by spaces.
     listable = not any(character.isspace() for name in names for character in name)
     if matching in ("spatial", "vocabulary") or not listable:  # these functions tell nothing of their progress
-        report(stage, 0, 1)
+        progress(stage, 0, 1)
         functions = {
             "spatial": pycolmap.match_spatial,
             "vocabulary": pycolmap.match_vocabtree,
@@ -181,10 +173,10 @@ def match(
             "exhaustive": pycolmap.match_exhaustive,
         }
         functions[matching](database, verification_options=verification)
-        report(stage, 1, 1)
+        progress(stage, 1, 1)
         return
     pairs = sequential_pairs(in_order(names)) if matching == "sequential" else list(itertools.combinations(names, 2))
-    report(stage, 0, len(pairs))
+    progress(stage, 0, len(pairs))
     at_once = _PAIRS_ON_GPU if gpu is not None else _PAIRS
     for start in range(0, len(pairs), at_once):
         chunk = pairs[start : start + at_once]
@@ -195,120 +187,79 @@ def match(
         pair_list.write_text("".join(f"{a} {b}\n" for a, b in chunk), "utf8")
         pairing = pycolmap.ImportedPairingOptions(match_list_path=pair_list)
         pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
-        report(stage, start + len(chunk), len(pairs))
+        progress(stage, start + len(chunk), len(pairs))
 
 
-def _mapping_options(**options: Any) -> pycolmap.IncrementalPipelineOptions:
-    """Return COLMAP's options for placing cameras, with these and ours in the place of its own."""
-    chosen = pycolmap.IncrementalPipelineOptions(random_seed=_SEED, **_ADJUSTMENT, **options)
-    chosen.mapper.ba_local_num_images = _ADJUSTED_PHOTOS
-    return chosen
-
-
-def reconstruct(photos: Path, count: int, database: Path, attempts: Path, model: Path, report: Report) -> None:
+def place_cameras(
+    photos: Path, names: Sequence[str], database: Path, attempts: Path, model: Path, base: Path | None
+) -> None:
     """Estimate cameras and points, and keep the model with the most photos if there are several.
+
+    Where there is an earlier model, photos are added to it: poses and intrinsics of the cameras that it has stay as
+    they are, points are triangulated with the new photos, and photos that did not register before are tried again.
 
     Args:
         photos: The folder of the photos.
-        count: How many photos there are.
+        names: All photos.
         database: COLMAP's database, which holds features and matches.
         attempts: A folder for all models.
         model: The folder to make of the best one; it appears when it is complete.
-        report: Called as the work goes on.
+        base: The folder of the model to add to; None begins anew.
 
     Raises:
-        InputError: If no two photos could be related.
+        InputError: If no two photos could be related, or no photo could be added.
     """
-    registered = 0
+    before = None if base is None else pycolmap.Reconstruction(base)
+    registered = 0 if before is None else before.num_reg_images()
+    others: dict[str, Any] = {"min_model_size": 3}
+    if before is not None:
+        others = {"multiple_models": False, "fix_existing_frames": True, "image_names": list(names)}
+        others["constant_cameras"] = set(before.cameras)
+    options = pycolmap.IncrementalPipelineOptions(random_seed=_SEED, **_ADJUSTMENT, **others)
+    options.mapper.ba_local_num_images = _ADJUSTED_PHOTOS
 
     def advance(more: int) -> None:
         nonlocal registered
-        registered = min(registered + more, count)  # COLMAP counts on where it begins another model.
-        report("cameras", registered, count)
+        registered = min(registered + more, len(names))  # COLMAP counts on where it begins another model.
+        progress("cameras", registered, len(names))
 
     advance(0)
     models = pycolmap.incremental_mapping(
         database,
         photos,
         empty_folder(attempts),
-        _mapping_options(min_model_size=3),
+        options,
+        input_path=base or "",
         initial_image_pair_callback=lambda: advance(2),
         next_image_callback=lambda: advance(1),
     )
-    if not models:
+    best = max(models.values(), key=lambda candidate: candidate.num_reg_images(), default=None)
+    if before is None and best is None:
         with pycolmap.Database.open(database) as opened:
             images = opened.read_all_images()
             poor = sum(opened.num_keypoints_for_image(image.image_id) < FEW_FEATURES for image in images)
         raise InputError(
-            f"no two photos could be related to each other ({poor} of {count} have fewer than {FEW_FEATURES} "
+            f"no two photos could be related to each other ({poor} of {len(names)} have fewer than {FEW_FEATURES} "
             "features); take more of them, with at least two thirds of overlap, sharp, and of a scene with texture."
         )
-    _write(max(models.values(), key=lambda candidate: candidate.num_reg_images()), model)
-    report("cameras", count, count)
-
-
-def register(
-    photos: Path, names: Sequence[str], database: Path, base: Path, attempts: Path, model: Path, report: Report
-) -> None:
-    """Add photos to a model, in which poses and intrinsics of the cameras that it has stay as they are.
-
-    Points are triangulated with the new photos, and moved by bundle adjustment as in any other model. Photos that could
-    not be registered before are tried again.
-
-    Args:
-        photos: The folder of the photos.
-        names: All photos.
-        database: COLMAP's database, which holds features and matches of all photos.
-        base: The folder of the model to add to.
-        attempts: A folder for COLMAP's own output.
-        model: The folder to make of the larger model; it appears when it is complete.
-        report: Called as the work goes on.
-
-    Raises:
-        InputError: If no photo could be added.
-    """
-    before = pycolmap.Reconstruction(base)
-    registered = before.num_reg_images()
-
-    def advance() -> None:
-        nonlocal registered
-        registered = min(registered + 1, len(names))
-        report("cameras", registered, len(names))
-
-    report("cameras", registered, len(names))
-    options = _mapping_options(
-        multiple_models=False,
-        fix_existing_frames=True,
-        constant_cameras=set(before.cameras),
-        image_names=list(names),
-    )
-    models = pycolmap.incremental_mapping(
-        database, photos, empty_folder(attempts), options, input_path=base, next_image_callback=advance
-    )
-    grown = next(iter(models.values()), before)
-    if grown.num_reg_images() <= before.num_reg_images():
+    if best is None or (before is not None and best.num_reg_images() <= before.num_reg_images()):
         raise InputError(
             "none of the photos that were added could be related to the others: take some that share two thirds of "
             "what they show with each other and with those that are there, or take these out of the folder again."
         )
-    for frame_id, frame in before.frames.items():  # COLMAP rounds poses that it holds fixed.
+    for frame_id, frame in before.frames.items() if before else ():  # COLMAP rounds poses that it holds fixed.
         if frame.has_pose:
-            grown.frames[frame_id].rig_from_world = frame.rig_from_world
-    _write(grown, model)
-    report("cameras", len(names), len(names))
+            best.frames[frame_id].rig_from_world = frame.rig_from_world
+    partial = empty_folder(model.with_name("model.partial"))
+    best.write(partial)
+    check_written(partial, best)
+    partial.rename(model)
+    progress("cameras", len(names), len(names))
 
 
 def registered_photos(model: pycolmap.Reconstruction) -> set[str]:
     """Return the names of the photos whose poses a model has."""
     return {image.name for image in model.images.values() if image.has_pose}
-
-
-def _write(reconstruction: pycolmap.Reconstruction, model: Path) -> None:
-    """Write a model to a folder, which appears when it is complete."""
-    partial = empty_folder(model.with_name("model.partial"))
-    reconstruction.write(partial)
-    check_written(partial, reconstruction)
-    partial.rename(model)
 
 
 def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
@@ -329,7 +280,7 @@ def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
 
 
 def undistort(
-    photos: Path, alphas: Path, model: Path, folder: Path, max_size: int, report: Report, known: Collection[str] = ()
+    photos: Path, alphas: Path, model: Path, folder: Path, max_size: int, known: Collection[str] = ()
 ) -> None:
     """Write undistorted photos, their opacity and the model that fits them and those that are known.
 
@@ -339,7 +290,6 @@ def undistort(
         model: The folder of their model.
         folder: The folder to write `images`, `alpha` and `sparse/0` to; what is in it is removed before.
         max_size: Longest side of the undistorted photos in px; 0 keeps them as they are.
-        report: Called as the work goes on.
         known: Names of photos that were undistorted before, by the same cameras.
 
     Raises:
@@ -347,7 +297,7 @@ def undistort(
     """
     reconstruction = pycolmap.Reconstruction(model)
     registered = [image for image in reconstruction.images.values() if image.has_pose and image.name not in known]
-    report("undistorted photos", 0, len(registered))
+    progress("undistorted photos", 0, len(registered))
     shutil.rmtree(folder, ignore_errors=True)
     options = pycolmap.UndistortCameraOptions(max_image_size=max_size or -1)
     with ThreadPoolExecutor(1) as pool:
@@ -358,7 +308,7 @@ def undistort(
         while not undistortion.done():
             wait([undistortion], timeout=0.5)
             written = sum(path.is_file() for path in (folder / "images").rglob("*"))
-            report("undistorted photos", written, len(registered))
+            progress("undistorted photos", written, len(registered))
         undistortion.result()
     for image in registered:
         alpha = alphas / f"{image.name}.png"
@@ -373,7 +323,7 @@ def undistort(
     for file in sparse.glob("*.bin"):
         file.rename(sparse / "0" / file.name)
     check_written(sparse / "0", reconstruction)
-    report("undistorted photos", len(registered), len(registered))
+    progress("undistorted photos", len(registered), len(registered))
 
 
 def describe(folder: Path) -> None:

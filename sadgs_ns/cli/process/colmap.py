@@ -1,0 +1,76 @@
+"""COLMAP runs in a process of its own.
+
+COLMAP aborts the whole process where it meets an error in one of its threads, such as a full disk or a failed
+download, and does not listen to signals while it works. pycolmap's library also replaces the zlib that Pillow brings:
+Pillow crashes when it writes a PNG and was loaded after pycolmap.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from sadgs_ns.cli.worker import Worker, WorkerError
+from sadgs_ns.errors import RunError, free_space
+
+Report = Callable[[str, int, int], None]
+"""Called with a stage's name, how much of it is done, and how much there is to do."""
+_FULL_DISK = re.compile("no space left|disk is full|disk I/O error|file too large|failed to write", re.IGNORECASE)
+_FULL_BELOW = 8 * 2**20
+"""Free bytes under which a disk counts as full."""
+_LOG_PREFIX = re.compile(r"^([IWEF]\d{8} .*?\] |\s*what\(\):\s*)?(\[[\w.]+:\d+\] )?(Check failed: (\S+\(\) )?)?")
+_ERROR_LINE = re.compile(r"^[EF]\d{8} |^\s*what\(\): |Error: ")
+
+
+def run_colmap(function: str, *arguments: Any, folder: Path, report: Report) -> Any:
+    """Call a function of `stages.py` in another process, which is killed when this function is left by an exception.
+
+    Args:
+        function: Its name.
+        arguments: Its arguments.
+        folder: A folder that is there, to which the function writes; errors name it.
+        report: Called in this process as the work goes on.
+
+    Returns:
+        What the function returns, as `Worker.run` does.
+
+    Raises:
+        InputError: If the function raises it.
+        OSError: If the disk is full.
+        RunError: If the function raises anything else, or if its process ends.
+    """
+    begun, log = "its start", folder / "colmap.txt"
+
+    def hear(event: str, stage: str, done: int, total: int) -> None:
+        nonlocal begun
+        begun = stage
+        report(stage, done, total)
+
+    try:
+        with Worker(f"sadgs_ns.cli.process.stages:{function}", log) as worker:
+            return worker.run(*arguments, on_event=hear)
+    except WorkerError as error:
+        raise _error_of(error, begun, folder) from None
+    finally:
+        log.unlink(missing_ok=True)
+
+
+def _error_of(error: WorkerError, stage: str, folder: Path) -> Exception:
+    """Return the error that says why a process ended before its work was done."""
+    told = [_LOG_PREFIX.sub("", line).strip() for line in error.output.splitlines() if _ERROR_LINE.search(line)]
+    if _FULL_DISK.search(error.output) or shutil.disk_usage(folder).free < _FULL_BELOW:
+        return OSError(
+            f"{folder} could not be written while COLMAP worked on {stage} ({free_space(folder)} free there): "
+            "make room, and the same command goes on."
+        )
+    if error.exitcode == -signal.SIGKILL:
+        return RunError(
+            f"COLMAP was killed while it worked on {stage}, most likely for want of memory: close other programs, or "
+            "give it smaller photos; the same command goes on."
+        )
+    why = f"({told[-1]})" if told else f"(exit code {error.exitcode})"
+    return RunError(f"COLMAP failed while it worked on {stage} {why}; the same command tries it again.")

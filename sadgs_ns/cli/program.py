@@ -1,0 +1,96 @@
+"""What the commands share: a command line that tyro reads, an exit code, and a folder that one command works in."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import TypeVar
+
+import tyro
+
+from sadgs_ns.errors import InputError, RunError, free_space, reason
+from sadgs_ns.plugin.interrupts import Interrupted
+
+Options = TypeVar("Options")
+
+
+def parse(options: type[Options], name: str, argv: Sequence[str] | None) -> Options:
+    """Read a command line, or print the help, the version or what is wrong with it, and exit.
+
+    Args:
+        options: A dataclass; its docstring and those of its fields are the help.
+        name: The command.
+        argv: The command line without the name; None is that of the process.
+
+    Raises:
+        SystemExit: With code 0 after the help or the version, with code 2 if the command line is wrong.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    if "--version" in words:
+        print(f"{name} {version('sadgs_ns')}")
+        raise SystemExit(0)
+    description = f"{' '.join((options.__doc__ or '').split())} --version prints the version."
+    config = (tyro.conf.FlagCreatePairsOff,)
+    return tyro.cli(options, prog=name, description=description, args=words, config=config)
+
+
+def exit_code(name: str, folder: Path | None, run: Callable[[], int]) -> int:
+    """Run a command that goes on where it was stopped, and print the sentence with which it ended.
+
+    Args:
+        name: The command.
+        folder: Where it writes.
+        run: The command, which returns its exit code.
+
+    Returns:
+        The exit code: 1 where a file could not be written or the run failed, 2 if the input is wrong, and 130, 143 or
+        129 after SIGINT, SIGTERM or SIGHUP.
+    """
+    try:
+        return run()
+    except InputError as error:
+        told, code = str(error), 2
+    except (OSError, RunError) as error:
+        told, code = str(error), 1
+        if isinstance(error, OSError) and error.errno is not None:
+            where, folder = error.filename or folder, folder or Path()
+            told = f"{where}: {reason(error)} ({free_space(folder)} free there); the same command goes on."
+    except KeyboardInterrupt as stopped:
+        told = "stopped; the same command goes on."
+        code = 128 + (stopped.number if isinstance(stopped, Interrupted) else signal.SIGINT)
+    print(f"{name}: {told}", file=sys.stderr)
+    return code
+
+
+@contextlib.contextmanager
+def locked(folder: Path, refusal: str, seconds: float = 0.0) -> Iterator[int]:
+    """Keep others away from a folder, as long as a process lives that has the file descriptor which this yields.
+
+    Args:
+        folder: It must be there.
+        refusal: What to tell the user where somebody else works there.
+        seconds: How long to wait until the folder is free.
+
+    Raises:
+        InputError: If it does not become free.
+    """
+    lock, end = os.open(folder, os.O_RDONLY), time.monotonic() + seconds
+    try:
+        while True:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError as error:
+                if time.monotonic() > end:
+                    raise InputError(refusal) from error
+                time.sleep(0.2)
+        yield lock
+    finally:
+        os.close(lock)

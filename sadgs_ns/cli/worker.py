@@ -1,0 +1,209 @@
+"""Run a function in another process, hear its events, and raise here what it raised there.
+
+A library that crashes, is killed for want of memory or does not listen to signals, such as COLMAP, then ends its own
+process alone. What was imported there is gone with it, too.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import pickle
+import pkgutil
+import re
+import signal
+import subprocess
+import sys
+import threading
+import traceback as tracebacks
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from sadgs_ns import events
+from sadgs_ns.errors import InputError, RunError, sentence_of
+from sadgs_ns.plugin.interrupts import Interrupted
+
+OnEvent = Callable[..., None]
+"""Called with an event's name and, by keyword, its fields."""
+_POLL_SECONDS = 0.1
+"""Time between two looks at the events."""
+_KEPT_BYTES = 65536
+"""How much of the end of what a process printed is looked at when it failed."""
+_PREFIX = re.compile(r"^(error|sadgs-[\w-]+): ")
+"""What commands put before the sentence with which they end."""
+
+
+class WorkerError(RunError):
+    """A function raised something else than an InputError, or its process ended.
+
+    Args:
+        sentence: Says why, without a full stop.
+        exitcode: Of the process; negative is the signal that ended it.
+        output: The end of what the process printed.
+    """
+
+    def __init__(self, sentence: str, exitcode: int, output: str) -> None:
+        super().__init__(sentence)
+        self.exitcode, self.output = exitcode, output
+
+
+class Worker:
+    """A process that imports a function at once, and calls it when `run` brings the arguments.
+
+    It has a session of its own, so that a terminal's Ctrl-C reaches it once, from here. It gets a SIGTERM when this
+    process is gone, and it is ended when the context is left.
+
+    Args:
+        function: As `module:name`.
+        log: All that the process prints is added to this file.
+        keep_open: File descriptors that it inherits, such as a lock's.
+        saves: Whether it may save what it did when it is interrupted. Otherwise it is killed.
+
+    Raises:
+        OSError: If the log cannot be written.
+    """
+
+    def __init__(self, function: str, log: Path, keep_open: Sequence[int] = (), saves: bool = False) -> None:
+        self._log, self._events, self._saves = log, log.with_suffix(".events"), saves
+        log.parent.mkdir(parents=True, exist_ok=True)
+        self._events.write_bytes(b"")
+        code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
+        with log.open("ab") as output:
+            self._start = output.tell()
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", code, function],
+                stdin=subprocess.PIPE,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                pass_fds=keep_open,
+                env=os.environ | {"PYTHONUNBUFFERED": "1", events.FILE: str(self._events.absolute())},
+            )
+
+    def __enter__(self) -> Worker:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._end(signal.SIGKILL)
+        self._events.unlink(missing_ok=True)
+
+    def run(self, *arguments: Any, on_event: OnEvent, argv: Sequence[str] = ()) -> Any:
+        """Call the function, and wait for its end.
+
+        Args:
+            arguments: The function's; they are pickled.
+            on_event: Called here with each event. One that is named "stopping" comes when the process is interrupted.
+            argv: The command line, for a function that reads one.
+
+        Returns:
+            What the function returns, as JSON holds it: a dataclass as a dictionary.
+
+        Raises:
+            InputError: If the function raises it.
+            WorkerError: If the function raises anything else, or if its process ends.
+        """
+        assert self._process.stdin is not None
+        try:
+            with suppress(BrokenPipeError):  # Its import may have failed.
+                self._process.stdin.write(pickle.dumps((list(argv), arguments)))
+                self._process.stdin.flush()
+            return self._listen(on_event)
+        except BaseException as error:
+            if self._process.poll() is None and self._saves:
+                with suppress(OSError):  # The terminal may be gone.
+                    on_event("stopping")
+                self._end(error.number if isinstance(error, Interrupted) else signal.SIGTERM)
+            raise
+
+    def _listen(self, on_event: OnEvent) -> Any:
+        sentence, is_input, rest = None, False, b""
+        with self._events.open("rb") as file:
+            ended = False
+            while not ended:
+                with suppress(subprocess.TimeoutExpired):
+                    self._process.wait(_POLL_SECONDS)
+                ended = self._process.returncode is not None
+                *lines, rest = (rest + file.read()).split(b"\n")
+                for line in lines:
+                    fields = json.loads(line)
+                    event = fields.pop("event")
+                    if event == "result":
+                        if self._saves:  # Its threads may be writing.
+                            self._process.wait()
+                        return fields["value"]
+                    if event == "error":
+                        sentence, is_input = fields["sentence"], fields["is_input"]
+                    else:
+                        on_event(event, **fields)
+        if sentence is not None and is_input:
+            raise InputError(sentence)
+        exitcode, output = self._process.returncode, self._output()
+        if exitcode < 0:
+            name = signal.Signals(-exitcode).name
+            sentence = f"it was ended by {name}" + ", most likely for want of memory" * (name == "SIGKILL")
+        raise WorkerError((sentence or _last_sentence(output.splitlines())).rstrip("."), exitcode, output)
+
+    def _output(self) -> str:
+        with self._log.open("rb") as file:
+            file.seek(max(self._start, self._log.stat().st_size - _KEPT_BYTES))
+            return file.read().decode(errors="replace")
+
+    def _end(self, number: int) -> None:
+        """Send a signal and wait until the process has ended; Ctrl-C meanwhile kills it."""
+        with suppress(ProcessLookupError):
+            if self._process.poll() is None:
+                os.killpg(self._process.pid, number)
+        try:
+            self._process.wait()
+        except KeyboardInterrupt:
+            os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait()
+        finally:
+            assert self._process.stdin is not None
+            with suppress(BrokenPipeError):
+                self._process.stdin.close()
+
+
+def _last_sentence(lines: Sequence[str]) -> str:
+    """Return what a command said last; of a box, as around a wrong option, its first paragraph."""
+    if lines and lines[-1].startswith("╰"):
+        boxed = [line.strip("│ ") for line in lines if line.startswith("│ ")]
+        paragraph = itertools.takewhile(lambda text: not text.startswith("──"), boxed)
+        return " ".join(text for text in paragraph if text)
+    last = next((line.strip() for line in reversed(lines) if re.search(r"\w", line)), "it printed nothing")
+    return _PREFIX.sub("", last)
+
+
+def main() -> None:
+    """Import the function that the command line names, and call it when its arguments come; the worker runs this."""
+    channel, nowhere = os.dup(0), os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nowhere, 0)
+    try:
+        function = pkgutil.resolve_name(sys.argv[1])
+        with os.fdopen(channel, "rb", closefd=False) as given, suppress(EOFError):
+            sys.argv[1:], arguments = pickle.load(given)
+            threading.Thread(target=_end_with_parent, args=(channel,), daemon=True).start()
+            events.report("result", value=function(*arguments))
+    except KeyboardInterrupt:
+        raise SystemExit(128 + signal.SIGINT) from None
+    except Exception as error:
+        sentence = sentence_of(error)
+        if sentence is None:
+            tracebacks.print_exc()
+            sentence = tracebacks.format_exception_only(error)[-1].strip()
+        else:
+            print(f"error: {sentence}", file=sys.stderr)
+        events.report("error", sentence=sentence, is_input=isinstance(error, InputError))
+        raise SystemExit(1) from None
+
+
+def _end_with_parent(channel: int) -> None:
+    """Interrupt this process when its parent, which holds the other end of the channel, is gone."""
+    os.read(channel, 1)
+    os.kill(os.getpid(), signal.SIGTERM)
