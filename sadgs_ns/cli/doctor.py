@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-import argparse
 import ctypes.util
 import importlib.util
 import os
 import platform
 import shlex
 import shutil
-import sys
 import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Annotated
 
+import tyro
+
+from sadgs_ns.cli.program import parse
 from sadgs_ns.data.validation import Finding, check_data
 from sadgs_ns.errors import free_space, reason
 
@@ -152,27 +155,24 @@ def check_all(data: Path | None) -> Iterator[Finding]:
             yield Finding("note", f"{data}: nothing to complain about.")
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@dataclass
+class Doctor:
+    """Print what this machine offers to training and what a data folder holds, and check both. The exit code is 1 if
+    something would stop training."""
+
+    data: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="DATA")] = None
+    """Folder with transforms.json, a COLMAP model or Blender data."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return 1 if there is an error, else 0."""
-    parser = argparse.ArgumentParser(
-        prog="sadgs-doctor",
-        description="Print what this machine offers to training and what a data folder holds, and check both. The exit "
-        "code is 1 if something would stop training.",
-    )
-    parser.add_argument(
-        "data", type=Path, nargs="?", help="folder with transforms.json, a COLMAP model or Blender data"
-    )
-    given = parser.parse_args(arguments)
+    data = parse(Doctor, "sadgs-doctor", argv).data
     print(", ".join(f"{package} {number}" for package, number in versions().items()))
     print(f"note: Free disk space here: {free_space(Path())}.", flush=True)
     failed = False
-    for finding in check_all(given.data):
+    for finding in check_all(data):
         print(f"{finding.severity}: {finding.sentence}", flush=True)  # The next one may take seconds.
         failed |= finding.severity == "error"
-    if given.data is not None and not failed:
-        print(f"Next: ns-train sadgs --data {shlex.quote(str(given.data))}")
+    if data is not None and not failed:
+        print(f"Next: ns-train sadgs --data {shlex.quote(str(data))}")
     return int(failed)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

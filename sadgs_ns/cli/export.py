@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+import tyro
 from numpy.typing import NDArray
 
 from sadgs_ns import formats
+from sadgs_ns.cli.program import parse
 from sadgs_ns.data.coordinates import TRANSFORMS_NAME, Similarity, from_data
 from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.formats import FORMATS, MESH, Frame, format_of, html
@@ -26,6 +28,9 @@ if TYPE_CHECKING:  # torch takes seconds, which `--help` and a wrong path need n
     from sadgs_ns.method.cleaning import Cleaning
     from sadgs_ns.method.near_plane import EmptySpace
 
+Box = tuple[float, float, float, float, float, float]
+"""Lowest x, y and z, and highest."""
+_OUTPUT = f"The file to write: {', '.join(FORMATS)}, or {MESH} for a mesh."
 _MAX_OFF_AXIS = 4.0
 """As `sadgs` draws; what it leaves out has no true size on the screen."""
 _PREFIX = "_model.gauss_params."
@@ -79,7 +84,7 @@ def export(
     data: Path | None = None,
     min_views: int = 0,
     max_extent: float | None = None,
-    crop: Sequence[float] | None = None,
+    crop: Box | None = None,
     dust: float = 0.0,
     voxel_size: float | None = None,
     keep_empty_space: bool = False,
@@ -97,7 +102,7 @@ def export(
         data: The capture's folder, where cameras are needed; None is where the run's `config.yml` says it was.
         min_views: As in `Cleaning`, whose units are those of nerfstudio's frame, and so the next three.
         max_extent: As in `Cleaning`.
-        crop: As in `Cleaning`; six numbers.
+        crop: As in `Cleaning`.
         dust: As in `Cleaning`.
         voxel_size: Of a mesh, as for `write_mesh`; None derives it.
         keep_empty_space: Whether to write Gaussians just before the cameras, too, which the run itself does not draw
@@ -122,8 +127,7 @@ def export(
     checkpoint = _checkpoint_of(run)
     from sadgs_ns.method.cleaning import Cleaning  # It imports torch.
 
-    box = None if crop is None else (crop[0], crop[1], crop[2], crop[3], crop[4], crop[5])
-    cleaning = Cleaning(min_views, max_extent, box, dust)
+    cleaning = Cleaning(min_views, max_extent, crop, dust)
     folders = checkpoint.absolute().parents[:2]
     folder = next((folder for folder in folders if (folder / TRANSFORMS_NAME).is_file()), folders[-1])
     similarity = None
@@ -276,66 +280,47 @@ def _read_pipeline(run: Path) -> tuple[Path, dict[str, Any]]:
     return checkpoint, state["pipeline"] if isinstance(state["pipeline"], dict) else {}
 
 
+@dataclass
+class Export:
+    """Write a trained run's Gaussians as a file for viewers of 3D Gaussian splatting.
+
+    The end of the file's name chooses the format: .ply, the largest, which all viewers read; .compressed.ply, .spz and
+    .sog, which are smaller and lose a little; .glb, which is glTF with KHR_gaussian_splatting; .html, a page that opens
+    in a browser without a network, for which Node.js must be installed. A name that ends in .mesh.ply is for a mesh
+    fused from rendered depth, for measuring and previews; splats keep no surface. A GPU is not needed, and nothing of
+    the run's files is executed. Lengths are in units of nerfstudio's frame.
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """Folder of a run, its config.yml, or one of its checkpoints."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE", help=_OUTPUT)]
+    frame: Frame = "nerfstudio"
+    """Coordinates: nerfstudio's, centred, upright and with cameras within ±1, or those of the COLMAP model or
+    transforms.json that the data came with."""
+    data: Annotated[Path | None, tyro.conf.arg(metavar="DATA")] = None
+    """Folder of the capture, for .html, .mesh.ply, --min-views and --dust; by default where it was in training."""
+    min_views: Annotated[int, tyro.conf.arg(metavar="K")] = 0
+    """Take away Gaussians that fewer than K training views see."""
+    max_extent: Annotated[float | None, tyro.conf.arg(metavar="UNITS")] = None
+    """Take away Gaussians whose longest standard deviation is more than this."""
+    crop: Annotated[Box | None, tyro.conf.arg(metavar="X Y Z X Y Z")] = None
+    """Take away Gaussians whose centre is outside the box from the lowest x, y and z to the highest."""
+    dust: Annotated[float, tyro.conf.arg(metavar="PX")] = 0.0
+    """Take away Gaussians that make up less than this many pixels of each training view: opacity times area, less what
+    others hide."""
+    voxel_size: Annotated[float | None, tyro.conf.arg(metavar="UNITS")] = None
+    """Edge of a voxel of a mesh; by default two pixels at the median depth, or more where the mesh would not fit in
+    memory."""
+    keep_empty_space: bool = False
+    """Keep Gaussians just before the cameras and on the paths between them, where the photos show nothing; without this
+    they are left out, because viewers would show them as haze."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code, 2 if the run or the output cannot be used."""
-    parser = argparse.ArgumentParser(
-        prog="sadgs-export",
-        description="Write a trained run's Gaussians as a file for viewers of 3D Gaussian splatting. The end of its "
-        "name chooses the format: .ply, the largest, which all viewers read; .compressed.ply, .spz and .sog, which are "
-        "smaller and lose a little; .glb, which is glTF with KHR_gaussian_splatting; .html, a page that opens in a "
-        "browser without a network, for which Node.js must be installed. A name that ends in .mesh.ply is for a mesh "
-        "fused from rendered depth, for measuring and previews; splats keep no surface. A GPU is not needed, and "
-        "nothing of the run's files is executed.",
-    )
-    parser.add_argument("run", type=Path, help="folder of a run, its config.yml, or one of its checkpoints")
-    parser.add_argument(
-        "--output", "-o", type=Path, required=True, metavar="FILE",
-        help=f"the file to write: {', '.join(FORMATS)}, or {MESH} for a mesh",
-    )  # fmt: skip
-    parser.add_argument(
-        "--frame",
-        choices=["nerfstudio", "colmap"],
-        default="nerfstudio",
-        help="coordinates: nerfstudio's, centred, upright and with cameras within ±1, or those of the COLMAP model or "
-        "transforms.json that the data came with (default %(default)s)",
-    )
-    cleaning = parser.add_argument_group(
-        "cleaning", "What else is taken away, by default nothing; units are those of nerfstudio's frame."
-    )
-    cleaning.add_argument(
-        "--min-views", type=int, default=0, metavar="K", help="Gaussians that fewer than K training views see"
-    )
-    cleaning.add_argument(
-        "--max-extent", type=float, metavar="UNITS", help="Gaussians whose longest standard deviation is more than this"
-    )
-    cleaning.add_argument(
-        "--crop", type=float, nargs=6, metavar=("X", "Y", "Z", "X", "Y", "Z"),
-        help="Gaussians whose centre is outside the box from the lowest x, y and z to the highest",
-    )  # fmt: skip
-    cleaning.add_argument(
-        "--dust", type=float, default=0.0, metavar="PX",
-        help="Gaussians that make up less than this many pixels of each training view: opacity times area, less what "
-        "others hide",
-    )  # fmt: skip
-    cleaning.add_argument(
-        "--keep-empty-space", action="store_true",
-        help="keep Gaussians just before the cameras and on the paths between them, where the photos show nothing; "
-        "without this they are left out, because viewers would show them as haze",
-    )  # fmt: skip
-    parser.add_argument(
-        "--voxel-size", type=float, metavar="UNITS",
-        help="edge of a voxel of a mesh, in units of nerfstudio's frame (default: two pixels at the median depth, or "
-        "more where the mesh would not fit in memory)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--data",
-        type=Path,
-        help="folder of the capture, for .html, .mesh.ply, --min-views and --dust (default: where it was in training)",
-    )
-    given = parser.parse_args(argv)
-    options = {name: value for name, value in vars(given).items() if name not in ("run", "output", "frame", "data")}
+    given = parse(Export, "sadgs-export", argv)
     try:
-        count = export(given.run, given.output, given.frame, given.data, **options)
+        count = export(**vars(given))
     except (InputError, RunError, WriteError) as error:
         print(f"sadgs-export: {error}", file=sys.stderr)
         return 2

@@ -2,29 +2,41 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from sadgs_ns.cli.program import parse
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@dataclass
+class Inspect:
+    """Pictures of a view of a run: the photo's structure tensor as ellipses and local wavelength, η of the Gaussians,
+    how many children they would get, which are low, and one densification step, conventional against structure-aware,
+    in random colours. A config.yml is a program, which this runs: give only those you trust."""
+
+    config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CONFIG")]
+    """config.yml of a finished or running run of sadgs, or its folder."""
+    view: int = 0
+    """Number of the view, from 0."""
+    split: Literal["train", "eval"] = "train"
+    """The views among which it is counted."""
+    output: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Folder for the PNGs; by default inspect, beside the config."""
+    load_step: Annotated[int | None, tyro.conf.arg(metavar="STEP")] = None
+    """Step of the checkpoint; by default the latest."""
+    data: Annotated[Path | None, tyro.conf.arg(metavar="DATA")] = None
+    """Folder of the capture; by default where it was in training."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code, 2 if the input is wrong."""
-    parser = argparse.ArgumentParser(
-        prog="sadgs-inspect",
-        description="Pictures of a view of a run: the photo's structure tensor as ellipses and local wavelength, η of "
-        "the Gaussians, how many children they would get, which are low, and one densification step, conventional "
-        "against structure-aware, in random colours. A config.yml is a program, which this runs: give only those "
-        "you trust.",
-    )
-    parser.add_argument("config", type=Path, help="config.yml of a finished or running run of sadgs, or its folder")
-    parser.add_argument("--view", type=int, default=0, help="number of the view, from 0 (default %(default)s)")
-    parser.add_argument("--split", choices=["train", "eval"], default="train", help="(default %(default)s)")
-    parser.add_argument("--output", type=Path, help="folder for the PNGs (default: inspect beside the config)")
-    parser.add_argument("--load-step", type=int, help="step of the checkpoint (default: the latest)")
-    parser.add_argument("--data", type=Path, help="folder of the capture (default: where it was in training)")
-    given = parser.parse_args(arguments)
+    given = parse(Inspect, "sadgs-inspect", argv)
     # nerfstudio and torch warn about their own internals.
     warnings.filterwarnings("ignore", module=r"(torch|nerfstudio|torchmetrics)\b")
     # These imports take ten seconds, which `--help` and wrong arguments need not wait for.
@@ -44,7 +56,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for path in written:
         print(path)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
