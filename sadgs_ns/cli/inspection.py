@@ -154,7 +154,6 @@ def screen_gradients(pipeline: SadgsPipeline, progress: Callable[[range], Any]) 
     """
     model = pipeline.model
     gradients = empty_gradients(model.num_points, pipeline.device)
-    background = model.photo_background.to(pipeline.device)
     for index in progress(range(len(pipeline.datamanager.train_dataset))):
         data = pipeline.datamanager.cached_train[index]
         height, width = data["image"].shape[:2]
@@ -162,7 +161,7 @@ def screen_gradients(pipeline: SadgsPipeline, progress: Callable[[range], Any]) 
         with torch.enable_grad():
             render, alpha, info = model.render(viewmats.detach(), Ks, width, height, "RGB", absgrad=True)
             keep_gradient(info["means2d"])
-            outputs = {"rgb": render[..., :3] + (1 - alpha) * background, "background": background}
+            outputs = {"rgb": render[..., :3] + (1 - alpha) * model.background, "background": model.background}
             batch = {name: data[name][None].to(pipeline.device) for name in ("image", "mask") if name in data}
             model.get_loss_dict(outputs, batch)["main_loss"].backward()
         accumulate_gradients(gradients, info, num_views=1, fused=model.strategy.fused)

@@ -17,7 +17,6 @@ from nerfstudio.configs.base_config import InstantiateConfig
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.models.splatfacto import RGB2SH, SplatfactoModel, num_sh_bases, random_quat_tensor
-from nerfstudio.utils.colors import get_color
 from nerfstudio.utils.rich_utils import CONSOLE
 from pytorch_msssim import SSIM
 from rich.markup import escape
@@ -71,8 +70,8 @@ class SadgsModelConfig(InstantiateConfig):
     """When and how Gaussians are split, cloned and pruned."""
     camera_optimizer: CameraOptimizerConfig = field(default_factory=CameraOptimizerConfig)
     """Whether and how the cameras' poses are refined in training."""
-    background_color: Literal["random", "black", "white"] = "black"
-    """Colour behind the Gaussians; "random" draws one for each iteration."""
+    background_color: Literal["black", "white"] = "black"
+    """Colour behind the Gaussians."""
     random_init: bool = False
     """Start from random points even where the data has SfM points."""
     num_random: int = 50000
@@ -126,6 +125,8 @@ class SadgsModelConfig(InstantiateConfig):
         """
         if not 0 <= self.ssim_lambda <= 1:
             raise InputError(f"pipeline.model.ssim_lambda must be in [0, 1], got {self.ssim_lambda:g}.")
+        if self.background_color not in ("black", "white"):
+            raise InputError(f"pipeline.model.background_color must be black or white, got {self.background_color}.")
         if not 0 < self.initial_opacity < 1:
             raise InputError(f"pipeline.model.initial_opacity must be in (0, 1), got {self.initial_opacity:g}.")
         if not 0 <= self.opacity_reg <= 100:
@@ -230,13 +231,6 @@ class SadgsModel(SplatfactoModel):
         self.color_matrices: torch.nn.Parameter | None = None  # [V, 3, 4]
         self.crop_box: OrientedBox | None = None
         self.viewer_outputs: Callable[[Cameras, dict[str, Tensor]], dict[str, Tensor]] | None = None
-        # A random background is for training; viewers show viser's own instead.
-        self.background_color = (
-            torch.tensor([0.1490, 0.1647, 0.2157])
-            if config.background_color == "random"
-            else get_color(config.background_color)
-        )
-        self.photo_background = self.background_color  # The viewer exchanges the other one while it draws.
         if config.color_model == "affine":
             self.learn_color_matrices()
 
@@ -566,13 +560,9 @@ class SadgsModel(SplatfactoModel):
         if view_numbers is not None:
             matrices = anchored(params["color_matrices"], view_numbers)
             render = correct_colors(render, alpha, matrices, fused=self.config.fused)
-        penalty, background = info.pop("opacity_reg"), self.background_of_step()
+        penalty, background = info.pop("opacity_reg"), self.background
         outputs = {"rgb": self.before_background(render, alpha, background), "background": background}
         return outputs if penalty is None else outputs | {"opacity_reg": penalty}, info
-
-    def background_of_step(self) -> Tensor:
-        """Return the colour behind the Gaussians [3], in training drawn anew where it is random."""
-        return self._get_background_color()
 
     def before_background(self, render: Tensor, alpha: Tensor, background: Tensor) -> Tensor:
         """Put renderings before a background.
@@ -651,7 +641,7 @@ class SadgsModel(SplatfactoModel):
         """
         refuse_unsupported_cameras(camera)
         width, height = int(camera.width.item()), int(camera.height.item())
-        background = self._get_background_color()
+        background = self.background
         if self.crop_box is not None and not self.crop_box.within(self.means).any():
             return self.get_empty_outputs(width, height, background)
         viewmats = viewmats_from_camera_to_world(camera.camera_to_worlds)
@@ -707,7 +697,7 @@ class SadgsModel(SplatfactoModel):
                 raise
             _say_once(str(error))
             width, height = int(camera.width.item()), int(camera.height.item())
-            outputs = self.get_empty_outputs(width, height, self._get_background_color())
+            outputs = self.get_empty_outputs(width, height, self.background)
         if self.viewer_outputs is not None:
             outputs = outputs | self.viewer_outputs(camera, outputs)
         if in_viewer():
@@ -726,10 +716,10 @@ class SadgsModel(SplatfactoModel):
         image = image.to(self.device)
         return image / 255.0 if image.dtype == torch.uint8 else image
 
-    def _get_background_color(self) -> Tensor:
-        """Return the background's colour [3]; unlike splatfacto, without making black and white anew in each step."""
-        grey = {"black": 0.0, "white": 1.0}.get(self.config.background_color)
-        return super()._get_background_color() if grey is None else _constant_color(grey, self.device)
+    @property
+    def background(self) -> Tensor:
+        """Colour behind the Gaussians, which is not made anew in each step. [3]"""
+        return _constant_color(float(self.config.background_color == "white"), self.device)
 
     def composite_with_background(self, image: Tensor, background: Tensor) -> Tensor:
         """Put images with an alpha channel before the background.

@@ -48,7 +48,7 @@ def losses_of_views(
         shards, *splats, viewmats, Ks, width, height, absgrad=kind.absgrad, fused=model.config.fused, **options
     )
     model.show_to_strategy(info, viewmats, Ks, structure_tensors)
-    background, error = model.background_of_step(), torch.zeros((), device=shards.device)
+    background, error = model.background, torch.zeros((), device=shards.device)
     for band, colors, alphas in rendered:
         rgb = model.before_background(colors, alphas, background)
         rows = slice(band.top, band.bottom)

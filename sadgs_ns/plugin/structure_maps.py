@@ -99,8 +99,7 @@ class StructureMaps:
     def photo(self, data: Mapping[str, Any]) -> Tensor:
         """An image of the datamanager as the loss sees it: on the training device and on the background. [H, W, 3]"""
         model = self.views.model
-        background = model.photo_background.to(model.device, non_blocking=True)
-        return model.composite_with_background(model.get_gt_img(data["image"]), background).to(model.device)
+        return model.composite_with_background(model.get_gt_img(data["image"]), model.background)
 
     def codes_of(self, data: Sequence[Mapping[str, Any]]) -> Tensor:
         """Codes of S̄ of images of the datamanager that have one size.

@@ -46,7 +46,7 @@ SADGS = Row(
     "sadgs",
     {
         "max_num_iterations": ITERATIONS,
-        "pipeline.model.background_color": "random",
+        "pipeline.model.background_color": "white",
         "pipeline.model.bounding_box_points": False,
         "pipeline.model.strategy.refine_start_iter": 1,
         "pipeline.model.strategy.absgs_every": 2,

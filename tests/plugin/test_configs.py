@@ -218,6 +218,7 @@ def test_help_texts_break_their_lines_between_sentences_as_tyro_does_not_join_th
     [
         ("sh_degree", 5, "pipeline.model.sh_degree must be in [0, 4], got 5."),
         ("sh_degree", -1, "pipeline.model.sh_degree must be in [0, 4], got -1."),
+        ("background_color", "random", "pipeline.model.background_color must be black or white, got random."),
         ("num_random", 0, "pipeline.model.num_random must be in [1, 10,000,000], got 0."),
         ("num_random", 10**9, "pipeline.model.num_random must be in [1, 10,000,000], got 1,000,000,000."),
         ("random_scale", 0.0, "pipeline.model.random_scale must be positive and finite, got 0."),
