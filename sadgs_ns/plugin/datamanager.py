@@ -68,12 +68,12 @@ class SadgsDatamanagerConfig(FullImageDatamanagerConfig):
     """Type in which the images are kept; "uint8" takes a quarter of the memory."""
     max_thread_workers: Suppress[int | None] = None
     """Threads that decode images; None is one for each core, up to 16."""
-    train_cameras_sampling_strategy: Literal["random", "fps"] = "random"
-    """Order of the training views: "random" takes each once a round; "fps" takes views far from each other first."""
+    train_cameras_sampling_strategy: Suppress[Literal["random", "fps"]] = "random"
+    """Each view comes once a round; another order is refused."""
     train_cameras_sampling_seed: int = 42
     """Seed of the order of the training views."""
     fps_reset_every: Suppress[int] = 100
-    """Views after which "fps" starts again; it draws no more than there are."""
+    """Not read where each view comes once a round."""
 
 
 KEPT_FILES_SHARE = 0.25
@@ -96,6 +96,11 @@ def check_options(config: FullImageDatamanagerConfig) -> None:
     for name, (fits, allowed) in ranges.items():
         if hasattr(parser, name) and not fits(value := getattr(parser, name)):
             raise InputError(f"{name}, an option of the data's parser, must be {allowed}, got {value:g}.")
+    if config.train_cameras_sampling_strategy != "random":
+        raise InputError(
+            f"pipeline.datamanager.train_cameras_sampling_strategy is {config.train_cameras_sampling_strategy}, and "
+            "sadgs takes each view once a round: leave it out."
+        )
     if not 0 < config.camera_res_scale_factor <= 1:
         raise InputError(
             f"pipeline.datamanager.camera_res_scale_factor must be in (0, 1], got {config.camera_res_scale_factor:g}."

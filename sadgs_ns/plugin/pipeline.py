@@ -479,21 +479,18 @@ class SadgsPipeline(VanillaPipeline):
         """Return what lets a resumed run go on as if it had never been stopped, and tells of which data it is.
 
         This is random states, the order of the views, the settings, and the names and cameras of the images.
-
-        With nerfstudio's farthest-point sampling of views, the order after the present round is drawn anew.
         """
         self._repeat_overflowed(wait=True)  # The views that are put back are part of the order.
         state: dict[str, Any] = {
             "torch": torch.get_rng_state(),
             "view_order": list(self.datamanager.train_unseen_cameras),
+            "view_shuffle": self.datamanager.random_generator.getstate(),
             "settings": self._settings(),
             "schedule": {**asdict(self.schedule), "effort": self.config.effort},
             "max_gaussians": self.model.strategy.max_gaussians,  # It may be lower than the setting.
             "images": [path.name for path in self.datamanager.train_dataset.image_filenames],
             "camera_positions": _positions(self.datamanager.train_dataset.cameras),
         }
-        if hasattr(self.datamanager, "random_generator"):
-            state["view_shuffle"] = self.datamanager.random_generator.getstate()
         if self.device.type == "cuda":
             state["cuda"] = torch.cuda.get_rng_state(self.device)
         return state
@@ -518,8 +515,7 @@ class SadgsPipeline(VanillaPipeline):
         torch.set_rng_state(state["torch"].cpu())
         if max(state["view_order"], default=0) < len(self.datamanager.train_dataset):
             self.datamanager.train_unseen_cameras = list(state["view_order"])
-            if "view_shuffle" in state and hasattr(self.datamanager, "random_generator"):
-                self.datamanager.random_generator.setstate(state["view_shuffle"])
+            self.datamanager.random_generator.setstate(state["view_shuffle"])
         if "cuda" in state and self.device.type == "cuda":
             torch.cuda.set_rng_state(state["cuda"].cpu(), self.device)
 

@@ -141,8 +141,7 @@ class TrainingViews:
     def _next_steps(self, number: int) -> Iterator[list[int]]:
         """Yield the views of the next steps, as far as they are known without changing what will be drawn."""
         datamanager = self.datamanager
-        generator: Any = getattr(datamanager, "random_generator", None)  # Farthest-point sampling has none.
-        order, more = [*datamanager.train_unseen_cameras], generator is not None
+        generator, order, more = datamanager.random_generator, [*datamanager.train_unseen_cameras], True
         while True:
             step: list[int] = []
             while len(step) < number:

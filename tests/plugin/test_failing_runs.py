@@ -67,6 +67,11 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig
         ("machine.num_machines", 2, "machine.num_machines is 2, and sadgs trains on several machines with torchrun: "),
         ("machine.device_type", "cuda", "machine.device_type is cuda, but torch finds no CUDA device: set it to cpu,"),
         ("machine.device_type", "mps", "machine.device_type is mps, but torch finds no MPS device: set it to cpu, or "),
+        (
+            "pipeline.datamanager.train_cameras_sampling_strategy",
+            "fps",
+            "pipeline.datamanager.train_cameras_sampling_strategy is fps, and sadgs takes each view once a round: leave ",
+        ),
         ("machine.seed", -1, "machine.seed must be in [0, 2³²), got -1."),
         ("machine.seed", 2**32, "machine.seed must be in [0, 2³²), got 4294967296."),
         (

@@ -51,12 +51,9 @@ def steps_of(views: TrainingViews, number: int, steps: int = STEPS) -> list[list
 @pytest.mark.hard_case(
     "a round of views that ends inside a step of several", "no view twice in a step, all equally often"
 )
-@pytest.mark.parametrize(
-    ("total", "number", "strategy"),
-    [(10, 4, "random"), (5, 4, "random"), (4, 4, "random"), (7, 3, "random"), (10, 1, "random"), (10, 4, "fps")],
-)
-def test_no_view_comes_twice_in_a_step_and_all_come_equally_often(total: int, number: int, strategy: Any):
-    views = views_of(Datamanager(total, train_cameras_sampling_strategy=strategy))
+@pytest.mark.parametrize(("total", "number"), [(10, 4), (5, 4), (4, 4), (7, 3), (10, 1)])
+def test_no_view_comes_twice_in_a_step_and_all_come_equally_often(total: int, number: int):
+    views = views_of(Datamanager(total))
     visits: Counter[int] = Counter()
     for drawn in steps_of(views, number):
         assert len(set(drawn)) == number
@@ -65,11 +62,9 @@ def test_no_view_comes_twice_in_a_step_and_all_come_equally_often(total: int, nu
         assert max(counts) - min(counts) <= 1
 
 
-@pytest.mark.parametrize(
-    ("total", "number", "strategy"), [(60, 4, "random"), (10, 3, "random"), (5, 4, "random"), (60, 4, "fps")]
-)
-def test_images_that_are_decoded_ahead_change_no_order_and_are_awaited_once(total: int, number: int, strategy: Any):
-    options = {"train_cameras_sampling_strategy": strategy, "max_thread_workers": 2}
+@pytest.mark.parametrize(("total", "number"), [(60, 4), (10, 3), (5, 4)])
+def test_images_that_are_decoded_ahead_change_no_order_and_are_awaited_once(total: int, number: int):
+    options = {"max_thread_workers": 2}
     expected = steps_of(views_of(Datamanager(total, **options)), number, steps=100)
     datamanager = Datamanager(total, cache_images="cpu", **options)
     datamanager.cached_train = tuple(datamanager.cached_train)  # type: ignore[assignment]
@@ -82,19 +77,15 @@ def test_images_that_are_decoded_ahead_change_no_order_and_are_awaited_once(tota
         assert drawn == step
         awaited += not known.issuperset(drawn)
         assert len(views.ahead._loading) + len(views.ahead._sent) <= 2 + 2 * number
-    rounds = 100 * number // total
-    assert awaited == 1 or (strategy == "fps" and awaited <= rounds + 1)  # fps draws a round when it begins.
+    assert awaited == 1
     views.close()
 
 
-@pytest.mark.parametrize(
-    ("total", "number", "ranks", "strategy"),
-    [(60, 4, 2, "random"), (60, 4, 3, "random"), (10, 3, 2, "random"), (5, 4, 8, "random"), (60, 4, 2, "fps")],
-)
+@pytest.mark.parametrize(("total", "number", "ranks"), [(60, 4, 2), (60, 4, 3), (10, 3, 2), (5, 4, 8)])
 def test_each_process_prepares_what_it_composites_and_nothing_else(
-    total: int, number: int, ranks: int, strategy: Any, monkeypatch: pytest.MonkeyPatch
+    total: int, number: int, ranks: int, monkeypatch: pytest.MonkeyPatch
 ):
-    options = {"train_cameras_sampling_strategy": strategy, "max_thread_workers": 2}
+    options = {"max_thread_workers": 2}
     expected = steps_of(views_of(Datamanager(total, **options)), number, steps=100)
     loaded: list[int] = []
     load = ImagesAhead._load
@@ -119,8 +110,7 @@ def test_each_process_prepares_what_it_composites_and_nothing_else(
         assert under_way.total() <= 2 + 2 * number
         views.close()
         assert taken <= Counter(loaded) <= taken + under_way
-        rounds = 100 * number // total
-        assert awaited <= 1 or (strategy == "fps" and awaited <= rounds + 1)
+        assert awaited <= 1
     assert composited == [set(step) for step in expected]
 
 
@@ -159,11 +149,6 @@ def test_views_that_are_put_back_come_next_and_all_count_equally_often(total: in
         missing = Counter(index for indices in lost.values() for index in indices)
         counts = [visits[index] + missing[index] for index in range(total)]
         assert max(counts) - min(counts) <= 1
-
-
-def test_a_round_of_fewer_views_than_a_step_takes_repeats_some():
-    datamanager = Datamanager(9, train_cameras_sampling_strategy="fps", fps_reset_every=2)
-    assert all(len(drawn) == 5 for drawn in steps_of(views_of(datamanager), 5, steps=50))
 
 
 @pytest.mark.hard_case(
