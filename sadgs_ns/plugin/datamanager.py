@@ -64,8 +64,8 @@ class SadgsDatamanagerConfig(FullImageDatamanagerConfig):
     cache_images: Literal["gpu", "cpu", "compressed"] = "gpu"  # type: ignore[assignment]
     """Where the images are kept: "gpu" is the device of training, as long as that leaves enough of its memory free.
     Otherwise it is "cpu", decoded in the host's memory, or "compressed", files that are decoded ahead of their step."""
-    cache_images_type: Literal["uint8", "float32"] = "uint8"
-    """Type in which the images are kept; "uint8" takes a quarter of the memory."""
+    cache_images_type: Suppress[Literal["uint8", "float32"]] = "uint8"
+    """Images are kept as bytes, as they are in files; another type is refused."""
     max_thread_workers: Suppress[int | None] = None
     """Threads that decode images; None is one for each core, up to 16."""
     train_cameras_sampling_strategy: Suppress[Literal["random", "fps"]] = "random"
@@ -96,6 +96,11 @@ def check_options(config: FullImageDatamanagerConfig) -> None:
     for name, (fits, allowed) in ranges.items():
         if hasattr(parser, name) and not fits(value := getattr(parser, name)):
             raise InputError(f"{name}, an option of the data's parser, must be {allowed}, got {value:g}.")
+    if config.cache_images_type != "uint8":
+        raise InputError(
+            f"pipeline.datamanager.cache_images_type is {config.cache_images_type}, and sadgs keeps images as bytes, "
+            "which is what their files hold: leave it out."
+        )
     if config.train_cameras_sampling_strategy != "random":
         raise InputError(
             f"pipeline.datamanager.train_cameras_sampling_strategy is {config.train_cameras_sampling_strategy}, and "
@@ -180,7 +185,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
                 <= KEPT_FILES_SHARE * available_host_bytes()
             )
         )
-        images = ImagesOnDemand(dataset, self.config.cache_images_type, keep)
+        images = ImagesOnDemand(dataset, keep)
         self.train_cameras = self.train_dataset.cameras
         if on_demand:
             return images

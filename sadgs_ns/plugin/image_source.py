@@ -10,7 +10,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any, overload
 
 import cv2
 import numpy as np
@@ -24,7 +24,6 @@ from torch import Tensor
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.plugin.processes import processes_on_this_machine
 
-ImageType = Literal["uint8", "float32"]
 _MOST_THREADS = 16
 """Threads that decode images on a machine of at least as many cores."""
 
@@ -67,14 +66,12 @@ class ImagesOnDemand(Sequence[dict[str, Any]]):
 
     Args:
         dataset: The images, with their cameras and masks. It must be given to one such object only.
-        image_type: Type of the pixels.
         keep_files: Whether to keep the bytes of files in memory once they have been read. Otherwise a file is read at
             each access, from the operating system's cache of files where that has room.
     """
 
-    def __init__(self, dataset: InputDataset, image_type: ImageType, keep_files: bool = False) -> None:
+    def __init__(self, dataset: InputDataset, keep_files: bool = False) -> None:
         self._names = dataset.image_filenames
-        self._image_type: ImageType = image_type
         self._sizes = torch.cat([dataset.cameras.width, dataset.cameras.height], dim=-1).tolist()  # [C][2] px
         self._lenses = _undistort_cameras(dataset.cameras)
         outputs, kept = copy.copy(dataset._dataparser_outputs), {} if keep_files else None
@@ -100,18 +97,17 @@ class ImagesOnDemand(Sequence[dict[str, Any]]):
         """Decode an image and undistort it.
 
         Returns:
-            `image` [H, W, 3 or 4], contiguous and on the CPU, boolean `mask` [H, W, 1] if the image has one, and what
-            else the dataset adds.
+            `image` uint8 [H, W, 3 or 4], contiguous and on the CPU, boolean `mask` [H, W, 1] if the image has one, and
+            what else the dataset adds.
 
         Raises:
-            InputError: If the image or its mask cannot be read any more, has another size than its camera, or holds
-                NaN or infinite pixels.
+            InputError: If the image or its mask cannot be read any more, or has another size than its camera.
         """
         if isinstance(index, slice):
             return [self[position] for position in range(len(self))[index]]
         name, size, lens = self._names[index], tuple(self._sizes[index]), self._lenses[index]
         try:
-            data = self._dataset.get_data(index, image_type=self._image_type)
+            data = self._dataset.get_data(index, image_type="uint8")
         except MemoryError:
             raise
         except Exception as error:  # Decoders raise OSError, SyntaxError, struct.error, …
@@ -130,7 +126,6 @@ class ImagesOnDemand(Sequence[dict[str, Any]]):
             image = torch.from_numpy(np.ascontiguousarray(undistorted))
             if mask is not None:
                 data["mask"] = mask.contiguous()
-        refuse_non_finite(image, name)
         return {**data, "image": image}
 
     def _decode(self, image_idx: int) -> NDArray[np.uint8]:
@@ -155,20 +150,6 @@ class ImagesOnDemand(Sequence[dict[str, Any]]):
         if image is not None:
             self._opencv_agrees = np.array_equal(image, expected)
         return expected
-
-
-def refuse_non_finite(image: Tensor, name: Path) -> None:
-    """Check whether the pixels of an image are numbers, masked ones too, since the loss multiplies by masks.
-
-    Args:
-        image: Of any type. [H, W, C]
-        name: The image's file.
-
-    Raises:
-        InputError: If one is NaN or infinite.
-    """
-    if image.is_floating_point() and not image.isfinite().all():
-        raise InputError(f"{name} holds NaN or infinite pixels: replace them, or leave the image out.")
 
 
 def _undistort_cameras(cameras: Cameras) -> list[_Lens | None]:

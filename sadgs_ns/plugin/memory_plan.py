@@ -88,7 +88,7 @@ def training_size(
         here = views  # Views of several sizes are shared out size by size, and a process may have a part of each.
         if len(sizes) == 1:
             here = max(len(views_of_rank([*map(tuple, sizes)] * views, processes, r)) for r in range(processes))
-        kept = float((3 * _value_bytes(datamanager) * here + CODE_BYTES * views) * largest)
+        kept = float((3 * here + CODE_BYTES * views) * largest)
         structure = float(STRUCTURE_PIXEL_BYTES * max(largest, min(PIXELS_PER_BATCH, here * largest)))
     # A process composites its share of the pixels, and as many pairs as its share of the Gaussians has in all views.
     pixels, pairs = -(-views * largest // processes), views * estimate_pairs(params, cameras, near_plane)
@@ -105,11 +105,7 @@ def image_bytes(datamanager: FullImageDatamanager) -> float:
         float((cameras.height * cameras.width).sum())
         for cameras in (datamanager.train_dataset.cameras, datamanager.eval_dataset.cameras)
     )  # px
-    return 3 * _value_bytes(datamanager) * (train + held_out) + CODE_BYTES * train
-
-
-def _value_bytes(datamanager: FullImageDatamanager) -> int:
-    return 1 if datamanager.config.cache_images_type == "uint8" else 4
+    return 3 * (train + held_out) + CODE_BYTES * train
 
 
 def place_images(datamanager: FullImageDatamanager, device: torch.device) -> str | None:

@@ -105,7 +105,7 @@ class StructureMaps:
         """Codes of S̄ of images of the datamanager that have one size.
 
         Args:
-            data: The images, with their masks where they have any.
+            data: The images, in bytes, with their masks where they have any.
 
         Returns:
             On the training device. uint8 [B, H, W, 3]
@@ -115,8 +115,7 @@ class StructureMaps:
         if any("mask" in d for d in data):
             everything = torch.ones(images.shape[1:3], dtype=torch.bool, device=images.device)
             masks = torch.stack([d["mask"][..., 0].to(images.device) if "mask" in d else everything for d in data])
-        in_bytes = all(d["image"].dtype == torch.uint8 for d in data)
-        return encode(self.of_images(images, masks, known_finite=in_bytes), self.views.model.config.fused)
+        return encode(self.of_images(images, masks, known_finite=True), self.views.model.config.fused)
 
     def of_images(
         self,

@@ -14,7 +14,7 @@ from torch import Tensor
 from sadgs_ns.data.cameras import refuse_failed_undistortion
 from sadgs_ns.distributed.bands import views_of_rank
 from sadgs_ns.distributed.shards import Shards
-from sadgs_ns.plugin.image_source import ImagesAhead, refuse_non_finite, thread_count
+from sadgs_ns.plugin.image_source import ImagesAhead, thread_count
 from sadgs_ns.plugin.model import SadgsModel
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
@@ -180,13 +180,10 @@ class TrainingViews:
         device.
 
         Raises:
-            InputError: If a training image holds NaN or infinite pixels, masked or not (the loss multiplies by masks),
-                or if undistorting it failed.
+            InputError: If undistorting an image failed.
         """
         dataset = self.datamanager.train_dataset
-        images = self.datamanager.cached_train  # Undistorting the images has changed the intrinsics.
-        for index, data in enumerate(images) if isinstance(images, list) else ():
-            refuse_non_finite(data["image"], dataset.image_filenames[index])
+        _ = self.datamanager.cached_train  # Undistorting the images has changed the intrinsics.
         cameras, device = dataset.cameras, self.model.device
         refuse_failed_undistortion(cameras, dataset.image_filenames)
         viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +19,6 @@ from torch import Tensor
 from sadgs_ns.method.eta import principal_eigenvalue, wavelength
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.plugin.model import SadgsModel
-from sadgs_ns.plugin.views import TrainingViews
 
 unit_tensor = partial(multiscale_structure_tensor, frequency_constant=1.0)
 """S̄ in units of c²: its trace is at most 1."""
@@ -237,19 +234,6 @@ def test_pixels_that_are_not_finite_are_refused_by_image(value: float):
     images[1, 7, 3, 2] = value
     with pytest.raises(ValueError, match=r"images \[1\] of the batch hold NaN or infinite pixels"):
         unit_tensor(images)
-
-
-@pytest.mark.hard_case(
-    "NaN or ±inf in a pixel of a training image, masked or not", "an error names the file before the first step"
-)
-def test_the_pipeline_names_the_file_whose_pixels_are_not_finite():
-    images = [noise(4, 5, 3), noise(4, 5, 3), torch.zeros(4, 5, 3, dtype=torch.uint8)]
-    images[1][2, 3, 0] = math.nan
-    dataset = SimpleNamespace(image_filenames=[Path(f"images/{name}.exr") for name in "abc"])
-    data = [{"image": image} for image in images]
-    datamanager = SimpleNamespace(train_dataset=dataset, cached_train=data)
-    with pytest.raises(ValueError, match=r"images/b\.exr holds NaN or infinite pixels: replace them"):
-        _ = TrainingViews(datamanager, SimpleNamespace(device="cpu")).cameras  # type: ignore[arg-type]
 
 
 @pytest.mark.hard_case("no pixels, no channels, no images", "ValueError")

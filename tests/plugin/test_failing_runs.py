@@ -68,9 +68,14 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig
         ("machine.device_type", "cuda", "machine.device_type is cuda, but torch finds no CUDA device: set it to cpu,"),
         ("machine.device_type", "mps", "machine.device_type is mps, but torch finds no MPS device: set it to cpu, or "),
         (
+            "pipeline.datamanager.cache_images_type",
+            "float32",
+            "pipeline.datamanager.cache_images_type is float32, and sadgs keeps images as bytes, which is what their ",
+        ),
+        (
             "pipeline.datamanager.train_cameras_sampling_strategy",
             "fps",
-            "pipeline.datamanager.train_cameras_sampling_strategy is fps, and sadgs takes each view once a round: leave ",
+            "pipeline.datamanager.train_cameras_sampling_strategy is fps, and sadgs takes each view once a round: ",
         ),
         ("machine.seed", -1, "machine.seed must be in [0, 2³²), got -1."),
         ("machine.seed", 2**32, "machine.seed must be in [0, 2³²), got 4294967296."),

@@ -100,13 +100,13 @@ def assert_same_cameras(cameras: Any, expected: Any) -> None:
         assert torch.equal(value, other) if isinstance(value, torch.Tensor) else value == other
 
 
-@pytest.mark.parametrize("options", [{}, {"camera_res_scale_factor": 0.5}, {"cache_images_type": "float32"}], ids=str)
+@pytest.mark.parametrize("options", [{}, {"camera_res_scale_factor": 0.5}], ids=str)
 @pytest.mark.parametrize("tier", TIERS)
 @pytest.mark.parametrize("data", DATA)
 def test_images_and_cameras_are_nerfstudio_s_to_the_bit(data: str, tier: Any, options: dict, tmp_path: Path):
     parser = DATA[data](tmp_path)
-    options = {"cache_images_type": "uint8", **options}
-    expected: FullImageDatamanager = datamanager_of(parser, FullImageDatamanagerConfig, cache_images="gpu", **options)
+    in_bytes: dict[str, Any] = {"cache_images": "gpu", "cache_images_type": "uint8"}
+    expected: FullImageDatamanager = datamanager_of(parser, FullImageDatamanagerConfig, **in_bytes, **options)
     datamanager = datamanager_of(parser, cache_images=tier, **options)
     assert datamanager.config.cache_images == tier
     for _ in range(2):  # Decoding an image again gives the same image.

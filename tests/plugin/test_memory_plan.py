@@ -274,7 +274,7 @@ def test_points_that_are_not_finite_or_at_the_camera_count_for_nothing_or_one_im
 def test_the_size_of_a_run_is_that_of_its_images_and_largest_step():
     train, held_out = cameras(number=3), cameras(100, 10, number=2)
     datamanager: Any = SimpleNamespace(
-        config=SimpleNamespace(cache_images="gpu", cache_images_type="uint8"),
+        config=SimpleNamespace(cache_images="gpu"),
         train_dataset=SimpleNamespace(cameras=train),
         eval_dataset=SimpleNamespace(cameras=held_out),
     )
@@ -346,7 +346,7 @@ def test_images_are_kept_where_there_is_room(number: int, card: Any, monkeypatch
             cameras = SimpleNamespace(height=torch.full((number, 1), side), width=torch.tensor(side))
             return type("Dataset", (), {"cameras": cameras, "__len__": lambda _: number})()
 
-        config = SimpleNamespace(cache_images="gpu", cache_images_type="uint8")
+        config = SimpleNamespace(cache_images="gpu")
         return SimpleNamespace(config=config, train_dataset=dataset(number), eval_dataset=dataset(100))
 
     gpu, share = torch.device("cuda"), 0.25 if number > 500 else 0.5

@@ -159,7 +159,7 @@ def sizes_of(number: int, side: int) -> Any:
     cameras = SimpleNamespace(height=torch.full((number, 1), side), width=torch.full((number, 1), side))
     dataset = type("Dataset", (), {"cameras": cameras, "__len__": lambda _: number})()
     return SimpleNamespace(
-        config=SimpleNamespace(cache_images="gpu", cache_images_type="uint8"),
+        config=SimpleNamespace(cache_images="gpu"),
         train_dataset=dataset,
         eval_dataset=dataset,
     )
