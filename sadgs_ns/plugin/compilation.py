@@ -122,7 +122,7 @@ def compile_kernels(
             torch.autograd.backward([value.sum() for value in some if value is not None])
 
     def projection() -> None:
-        from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
+        from sadgs_ns.kernels.harmonics import colors_from_harmonics
         from sadgs_ns.kernels.projection import project
 
         antialiased = config.rasterize_mode == "antialiased"
@@ -131,7 +131,7 @@ def compile_kernels(
             centres, rotations, sizes, opacities, *camera, antialiased
         )
         results = [means2d, conics] if compensations is None else [means2d, conics, compensations]
-        if 0 < config.sh_degree <= MAX_DEGREE:
+        if config.sh_degree > 0:
             coefficients = blank("features_dc"), blank("features_rest")
             results.append(colors_from_harmonics(config.sh_degree, centres, *coefficients, viewmats, radii))
         torch.autograd.backward([value.sum() for value in results])

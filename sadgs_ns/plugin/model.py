@@ -87,7 +87,7 @@ class SadgsModelConfig(InstantiateConfig):
     """Opacity at which SfM points start, in (0, 1); random ones start at 0.1.
     Half opaque ones mostly have a lower LPIPS and make more Gaussians (docs/results.md)."""
     sh_degree: int = 3
-    """Degree of the spherical harmonics that make colours depend on the direction of view, 0 to 4."""
+    """Degree of the spherical harmonics that make colours depend on the direction of view, 0 to 3."""
     rasterize_mode: Literal["classic", "antialiased"] = "classic"
     """How Gaussians smaller than a pixel are drawn: "classic" as in 3DGS, "antialiased" fades them by their size.
     Viewers of PLY files expect "classic"."""
@@ -143,8 +143,8 @@ class SadgsModelConfig(InstantiateConfig):
             )
         if self.near_plane is not None and not 0 < self.near_plane < math.inf:
             raise InputError(f"pipeline.model.near_plane must be positive and finite, got {self.near_plane:g}.")
-        if not 0 <= self.sh_degree <= 4:
-            raise InputError(f"pipeline.model.sh_degree must be in [0, 4], got {self.sh_degree}.")
+        if not 0 <= self.sh_degree <= 3:
+            raise InputError(f"pipeline.model.sh_degree must be in [0, 3], got {self.sh_degree}.")
         if not 1 <= self.num_random <= _MOST_RANDOM:
             raise InputError(f"pipeline.model.num_random must be in [1, {_MOST_RANDOM:,}], got {self.num_random:,}.")
         if self.stereo_points is not None and not 0 <= self.stereo_points <= _MOST_RANDOM:

@@ -216,8 +216,8 @@ def test_help_texts_break_their_lines_between_sentences_as_tyro_does_not_join_th
 @pytest.mark.parametrize(
     ("option", "value", "sentence"),
     [
-        ("sh_degree", 5, "pipeline.model.sh_degree must be in [0, 4], got 5."),
-        ("sh_degree", -1, "pipeline.model.sh_degree must be in [0, 4], got -1."),
+        ("sh_degree", 4, "pipeline.model.sh_degree must be in [0, 3], got 4."),
+        ("sh_degree", -1, "pipeline.model.sh_degree must be in [0, 3], got -1."),
         ("background_color", "random", "pipeline.model.background_color must be black or white, got random."),
         ("num_random", 0, "pipeline.model.num_random must be in [1, 10,000,000], got 0."),
         ("num_random", 10**9, "pipeline.model.num_random must be in [1, 10,000,000], got 1,000,000,000."),
