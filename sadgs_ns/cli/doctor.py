@@ -18,7 +18,7 @@ from typing import Annotated
 import tyro
 
 from sadgs_ns.cli.program import parse
-from sadgs_ns.data.validation import Finding, check_data
+from sadgs_ns.data.checks import Finding, check_data
 from sadgs_ns.errors import free_space, reason
 
 PACKAGES = ("sadgs_ns", "torch", "torchvision", "gsplat", "nerfstudio", "triton", "pycolmap", "open3d")

@@ -14,9 +14,9 @@ from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConf
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
-from sadgs_ns.data.validation.colmap import chosen_factor
-from sadgs_ns.data.validation.findings import unreadable
-from sadgs_ns.data.validation.layouts import find_reconstruction, layout_of
+from sadgs_ns.data.checks.colmap import chosen_factor
+from sadgs_ns.data.checks.findings import unreadable
+from sadgs_ns.data.checks.layouts import find_reconstruction, layout_of
 from sadgs_ns.errors import InputError
 
 

@@ -18,7 +18,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from tyro.conf import Suppress
 
 from sadgs_ns.atomic import atomic_path
-from sadgs_ns.data.validation.parsers import check_ahead
+from sadgs_ns.data.checks.parsers import check_ahead
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.plugin import checkpoints, processes
 from sadgs_ns.plugin.optimizers import RunLengthDecaySchedulerConfig

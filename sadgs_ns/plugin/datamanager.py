@@ -30,10 +30,10 @@ from tyro.conf import Suppress
 
 from sadgs_ns.data import colmap, ply
 from sadgs_ns.data.automatic import AnyParserConfig, AutomaticDataParserConfig, choose_parser
+from sadgs_ns.data.checks import names
+from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS
+from sadgs_ns.data.checks.transforms import read_json
 from sadgs_ns.data.coordinates import FRAME_KEYS, Similarity, fixed_frame
-from sadgs_ns.data.validation import names
-from sadgs_ns.data.validation.layouts import COLMAP_FOLDERS
-from sadgs_ns.data.validation.transforms import read_json
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.memory import available_host_bytes
 from sadgs_ns.plugin.image_source import ImagesOnDemand, thread_count

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from sadgs_ns import kernels
 from sadgs_ns.data.cameras import refuse_unsupported_cameras
-from sadgs_ns.data.validation.parsers import findings_of
+from sadgs_ns.data.checks.parsers import findings_of
 from sadgs_ns.distributed.shards import Shards
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.codes import HIGHEST_FREQUENCY

@@ -42,7 +42,7 @@ from sadgs_ns.cli.process.photos import PHOTO_SUFFIXES, Photo, find_photos, phot
 from sadgs_ns.cli.process.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching, expected_work
 from sadgs_ns.cli.process.stages import check_written, fetch_vocabulary, match, sequential_pairs
 from sadgs_ns.cli.process.video import sharpest_frames
-from sadgs_ns.data.validation.images import IMAGE_SUFFIXES
+from sadgs_ns.data.checks.images import IMAGE_SUFFIXES
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
 

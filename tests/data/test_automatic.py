@@ -24,8 +24,8 @@ from runs import blender_data, configure, nerfstudio_data, train
 
 from examples.drawn_scene.scene import SPARSE_FOLDER
 from sadgs_ns.data.automatic import AutomaticDataParserConfig, choose_parser
-from sadgs_ns.data.validation import check_data
-from sadgs_ns.data.validation.parsers import refuse_bad_data
+from sadgs_ns.data.checks import check_data
+from sadgs_ns.data.checks.parsers import refuse_bad_data
 from sadgs_ns.errors import InputError
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
 
@@ -157,8 +157,8 @@ def test_a_run_s_config_names_the_parser_and_serves_other_commands_and_more_trai
 @pytest.fixture
 def large(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A capture whose images are larger than nerfstudio takes without a question."""
-    monkeypatch.setattr("sadgs_ns.data.validation.images.MAX_AUTO_RESOLUTION", 20)
-    monkeypatch.setattr("sadgs_ns.data.validation.colmap.MAX_AUTO_RESOLUTION", 20)
+    monkeypatch.setattr("sadgs_ns.data.checks.images.MAX_AUTO_RESOLUTION", 20)
+    monkeypatch.setattr("sadgs_ns.data.checks.colmap.MAX_AUTO_RESOLUTION", 20)
     return Path(shutil.copytree(scene, tmp_path / "large"))
 
 

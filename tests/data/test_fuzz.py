@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
-from sadgs_ns.data.validation.parsers import refuse_bad_data
+from sadgs_ns.data.checks.parsers import refuse_bad_data
 from sadgs_ns.errors import InputError
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
 

@@ -26,7 +26,7 @@ from runs import blender_data, nerfstudio_data
 
 from examples.drawn_scene.scene import SPARSE_FOLDER
 from sadgs_ns.data import ply
-from sadgs_ns.data.validation.parsers import refuse_bad_data
+from sadgs_ns.data.checks.parsers import refuse_bad_data
 from sadgs_ns.errors import InputError
 from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig
 

@@ -12,11 +12,11 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.utils import dataparsers_utils as splits
 
-from sadgs_ns.data import validation
+from sadgs_ns.data import checks
 from sadgs_ns.data.automatic import choose_parser
 from sadgs_ns.errors import InputError
 
-_checked: list[tuple[FullImageDatamanagerConfig, list[validation.Finding]]] = []
+_checked: list[tuple[FullImageDatamanagerConfig, list[checks.Finding]]] = []
 """Settings whose data were just found good, at most one, with the findings that do not stop training."""
 
 
@@ -31,7 +31,7 @@ def check_ahead(config: FullImageDatamanagerConfig) -> None:
     _checked.append((copy.deepcopy(config), findings))
 
 
-def findings_of(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[validation.Finding]:
+def findings_of(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[checks.Finding]:
     """Return the findings of `check_ahead`, once, if it checked these settings, or else those of a check now.
 
     Raises:
@@ -44,7 +44,7 @@ def findings_of(config: FullImageDatamanagerConfig, open_images: bool = True) ->
     return refuse_bad_data(config, open_images)
 
 
-def refuse_bad_data(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[validation.Finding]:
+def refuse_bad_data(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[checks.Finding]:
     """Choose the parser where none was named, and check the data before nerfstudio parses them.
 
     Parsers other than nerfstudio's three common ones are not checked.
@@ -63,7 +63,7 @@ def refuse_bad_data(config: FullImageDatamanagerConfig, open_images: bool = True
     parser = config.dataparser
     data = Path(config.data or parser.data)
     if isinstance(parser, ColmapDataParserConfig):
-        findings = validation.check_colmap(
+        findings = checks.check_colmap(
             data,
             images_path=parser.images_path,
             colmap_path=parser.colmap_path,
@@ -75,7 +75,7 @@ def refuse_bad_data(config: FullImageDatamanagerConfig, open_images: bool = True
             open_images=open_images,
         )
     elif isinstance(parser, NerfstudioDataParserConfig):
-        findings = validation.check_nerfstudio(
+        findings = checks.check_nerfstudio(
             data,
             downscale_factor=parser.downscale_factor,
             load_points=parser.load_3D_points,
@@ -83,10 +83,10 @@ def refuse_bad_data(config: FullImageDatamanagerConfig, open_images: bool = True
             open_images=open_images,
         )
     elif isinstance(parser, BlenderDataParserConfig):
-        findings = validation.check_blender(data, ply_path=parser.ply_path, open_images=open_images)
+        findings = checks.check_blender(data, ply_path=parser.ply_path, open_images=open_images)
     else:
         findings = []
-    validation.refuse(findings, data)
+    checks.refuse(findings, data)
     return findings
 
 

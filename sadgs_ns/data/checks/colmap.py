@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sadgs_ns.data import colmap
-from sadgs_ns.data.validation.findings import Finding, collect_findings
-from sadgs_ns.data.validation.geometry import Camera, View, check_points, check_positive, check_views
-from sadgs_ns.data.validation.images import (
+from sadgs_ns.data.checks.findings import Finding, collect_findings
+from sadgs_ns.data.checks.geometry import Camera, View, check_points, check_positive, check_views
+from sadgs_ns.data.checks.images import (
     MAX_AUTO_RESOLUTION,
     Frame,
     Rounding,
@@ -26,8 +26,8 @@ from sadgs_ns.data.validation.images import (
     scaled_size,
     smaller_folder,
 )
-from sadgs_ns.data.validation.layouts import COLMAP_FOLDERS, find_reconstruction, no_layout
-from sadgs_ns.data.validation.splits import SPLITS, check_splits
+from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS, find_reconstruction, no_layout
+from sadgs_ns.data.checks.splits import SPLITS, check_splits
 from sadgs_ns.errors import InputError, reason
 
 UNSUPPORTED_CAMERAS = {"FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}

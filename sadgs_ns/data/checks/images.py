@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from sadgs_ns.data.validation.findings import Finding
+from sadgs_ns.data.checks.findings import Finding
 from sadgs_ns.errors import InputError, reason
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"}

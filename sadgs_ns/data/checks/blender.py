@@ -6,11 +6,11 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
-from sadgs_ns.data.validation.findings import Finding, collect_findings
-from sadgs_ns.data.validation.geometry import Camera, check_ply, check_positive, check_rotations, check_views
-from sadgs_ns.data.validation.images import Frame, check_images, image_size
-from sadgs_ns.data.validation.layouts import no_layout
-from sadgs_ns.data.validation.transforms import frames_of, read_json, view_of
+from sadgs_ns.data.checks.findings import Finding, collect_findings
+from sadgs_ns.data.checks.geometry import Camera, check_ply, check_positive, check_rotations, check_views
+from sadgs_ns.data.checks.images import Frame, check_images, image_size
+from sadgs_ns.data.checks.layouts import no_layout
+from sadgs_ns.data.checks.transforms import frames_of, read_json, view_of
 from sadgs_ns.errors import InputError
 
 

@@ -6,7 +6,7 @@ import shlex
 from pathlib import Path
 from typing import Literal
 
-from sadgs_ns.data.validation.images import images_in
+from sadgs_ns.data.checks.images import images_in
 
 COLMAP_FOLDERS = ("colmap/sparse/0", "sparse/0", "sparse", "colmap")
 """Folders in which a reconstruction is looked for; nerfstudio's default is the first."""

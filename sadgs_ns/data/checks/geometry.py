@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sadgs_ns.data import ply
-from sadgs_ns.data.validation.findings import Finding
+from sadgs_ns.data.checks.findings import Finding
 from sadgs_ns.errors import InputError
 from sadgs_ns.outliers import CAMERA_SHARE, POINT_SHARE, REACH, far_outliers
 

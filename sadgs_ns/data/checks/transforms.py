@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sadgs_ns.data import colmap
-from sadgs_ns.data.coordinates import fixed_frame
-from sadgs_ns.data.validation.findings import Finding, collect_findings
-from sadgs_ns.data.validation.geometry import (
+from sadgs_ns.data.checks.findings import Finding, collect_findings
+from sadgs_ns.data.checks.geometry import (
     UNDISTORTED_FISHEYE,
     Camera,
     View,
@@ -24,7 +23,7 @@ from sadgs_ns.data.validation.geometry import (
     check_views,
     finite,
 )
-from sadgs_ns.data.validation.images import (
+from sadgs_ns.data.checks.images import (
     Frame,
     check_factor,
     check_images,
@@ -33,8 +32,9 @@ from sadgs_ns.data.validation.images import (
     no_copies,
     scaled_size,
 )
-from sadgs_ns.data.validation.layouts import COLMAP_FOLDERS, GIVE_POSES, find_reconstruction, no_layout
-from sadgs_ns.data.validation.splits import SPLITS, check_splits
+from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS, GIVE_POSES, find_reconstruction, no_layout
+from sadgs_ns.data.checks.splits import SPLITS, check_splits
+from sadgs_ns.data.coordinates import fixed_frame
 from sadgs_ns.errors import InputError, reason
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")

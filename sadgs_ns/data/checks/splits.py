@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from sadgs_ns.data.validation.findings import Finding
+from sadgs_ns.data.checks.findings import Finding
 from sadgs_ns.errors import InputError
 
 SPLITS = ("train", "val", "test")
