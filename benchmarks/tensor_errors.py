@@ -124,7 +124,7 @@ class ConvolutionPrecision(TorchFunctionMode):
 def structure_tensor_rows(images: Tensor, repeats: int) -> Iterator[Row]:
     """How S̄ is computed and stored.
 
-    Truncation, incremental blur and what is shipped are held against float64 with kernels to 8σ; precision and storage
+    Truncation and what is shipped are held against float64 with kernels to 8σ; precision and storage
     against float64 with the kernels that are shipped, so that their rows show what they alone add.
 
     Args:
@@ -146,9 +146,6 @@ def structure_tensor_rows(images: Tensor, repeats: int) -> Iterator[Row]:
     for truncation in TRUNCATIONS:
         tensor, ms = measure(partial(compute, truncation=truncation))
         yield row(f"float32, kernels to {truncation:g}σ", tensor, reference, ms, 12)
-    for truncation in (TRUNCATION, REFERENCE_TRUNCATION):
-        tensor, ms = measure(partial(compute, truncation=truncation, incremental=True))
-        yield row(f"incremental blur, float32, to {truncation:g}σ", tensor, reference, ms, 12)
     code, ms = measure(lambda: encode(compute()))
     yield row(f"as shipped: float32, to {TRUNCATION:g}σ, stored in 8 bits", decode(code), reference, ms, 3)
 

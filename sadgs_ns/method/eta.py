@@ -148,21 +148,3 @@ def eta(axes: Tensor, structure_tensor: Tensor) -> Tensor:
         η ≥ 0; above 1 the axis is longer than the local wavelength. [M, 3]
     """
     return torch.hypot(axes[..., 0], axes[..., 1]) / wavelength(structure_tensor)[:, None]
-
-
-def projected_eta(axes: Tensor, structure_tensor: Tensor) -> Tensor:
-    """Frequency violation of each axis along its own direction: η_k^(proj) = √(v_kᵀ S̄ v_k) (paper, eq. 7).
-
-    The paper found it to give worse views than `eta`, and training does not use it.
-
-    Args:
-        axes: v_k in px. [M, 3, 2]
-        structure_tensor: S̄ at the footprint's sample, (xx, xy, yy) in 1/px². [M, 3]
-
-    Returns:
-        η^(proj) ≥ 0, at most η. [M, 3]
-    """
-    length = torch.hypot(axes[..., 0], axes[..., 1])  # [M, 3]
-    xx, xy, yy = structure_tensor[:, None].unbind(-1)  # [M, 1] each
-    u, v = (axes / length.clamp_min(torch.finfo(length.dtype).tiny)[..., None]).unbind(-1)  # lengths² overflow
-    return length * (xx * u**2 + 2 * xy * u * v + yy * v**2).clamp_min(0).sqrt()

@@ -79,7 +79,6 @@ def multiscale_structure_tensor(
     energy_blur: float = ENERGY_BLUR,
     epsilon: float | None = None,
     truncation: float = TRUNCATION,
-    incremental: bool = False,
     fused: bool = True,
     known_finite: bool = False,
 ) -> Tensor:
@@ -101,8 +100,6 @@ def multiscale_structure_tensor(
         epsilon: ε > 0 of eq. 3 and 5 as the paper prints it, the same number for every image and level, in the units
             of the pixel values; the released code takes 1e-6 with values in [0, 1]. `noise_floor` then has no effect.
         truncation: Radius of every kernel, in multiples of its standard deviation.
-        incremental: Blur level l − 1 by √(σ_l² − σ_{l−1}²) instead of the image by σ_l: shorter kernels, but each
-            level inherits what the one before it lost at borders and by truncation.
         fused: Use our Triton kernels where they run: CUDA, float32.
         known_finite: The valid pixels are known to be finite. To find that out, the host waits for the device.
 
@@ -134,10 +131,7 @@ def multiscale_structure_tensor(
     previous = image  # I_{l−1}
     for level, sigma in enumerate(levels):
         # The scale space: I_l and its gradient.
-        source, step = image, sigma
-        if incremental and level > 0:
-            source, step = previous * valid, math.sqrt(sigma**2 - levels[level - 1] ** 2)
-        blurs, totals = sums.blur_and_gradient(source, step), sums.total_and_gradient(step)
+        blurs, totals = sums.blur_and_gradient(image, sigma), sums.total_and_gradient(sigma)
         smoothed, products, energy = operations.differentiate(blurs, totals, sums.weight, previous)
         # Eq. 2, the structure tensor: S_l is the mean of the gradient's products over a window of ρ_l.
         rho = INTEGRATION_FACTOR * sigma

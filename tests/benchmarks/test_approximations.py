@@ -136,7 +136,6 @@ def test_coarser_numbers_cost_accuracy(tensor_rows: dict[str, dict[str, Any]]):
 @pytest.mark.parametrize(
     ("planted", "variant"),
     [
-        ({"incremental": True}, "incremental blur, float32, to 8σ"),
         ({"truncation": 4.0}, "float32, kernels to 4σ"),
     ],
 )
@@ -296,7 +295,7 @@ def test_every_row_is_printed_and_written(
     rows = [json.loads(line) for line in output.read_text().splitlines()]
     counts = {name: sum(row["table"] == name for row in rows) for name in TABLES}
     assert counts == {
-        "structure_tensor": 1 + len(TRUNCATIONS) + 2 + 1 + 4 + 3,
+        "structure_tensor": 1 + len(TRUNCATIONS) + 1 + 4 + 3,
         "footprint": 1 + len(SAMPLES),
         "interval": len(INTERVALS) + 1,
         "robustness": 8,

@@ -16,7 +16,6 @@ from sadgs_ns.method.eta import (
     eta,
     principal_eigenvalue,
     projected_axes,
-    projected_eta,
     sample_footprint,
     sample_map,
     wavelength,
@@ -173,17 +172,7 @@ def test_eta_equals_the_brute_force_footprint_average():
 
 
 def test_eta_compares_the_axis_with_the_wavelength():
-    """A grating along x: every axis is held against the one wavelength; the projected one sees only x."""
+    """A grating along x: every axis is held against the one wavelength."""
     tensor = torch.tensor([[0.25, 0.0, 0.0]])  # Λ = 2 px along x
     axes = torch.tensor([[[4.0, 0.0], [0.0, 4.0], [3.0, 4.0]]])
     torch.testing.assert_close(eta(axes, tensor), torch.tensor([[2.0, 2.0, 2.5]]), rtol=1e-4, atol=0)
-    torch.testing.assert_close(projected_eta(axes, tensor), torch.tensor([[2.0, 0.0, 1.5]]), rtol=1e-4, atol=0)
-
-
-def test_projected_eta_never_exceeds_eta():
-    generator = torch.Generator().manual_seed(0)
-    a = torch.randn((500, 2, 2), generator=generator)
-    matrix = a @ a.mT
-    tensor = torch.stack([matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 1]], -1)
-    axes = torch.randn((500, 3, 2), generator=generator)
-    assert (projected_eta(axes, tensor) <= eta(axes, tensor) * (1 + 1e-4) + 1e-5).all()
