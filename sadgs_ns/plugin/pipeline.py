@@ -11,7 +11,6 @@ from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -64,7 +63,7 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     """Options of the data, the model and the structure tensors of the images."""
 
     _target: type = field(default_factory=lambda: SadgsPipeline)
-    datamanager: FullImageDatamanagerConfig = field(default_factory=SadgsDatamanagerConfig)
+    datamanager: SadgsDatamanagerConfig = field(default_factory=SadgsDatamanagerConfig)
     """How images are loaded and drawn."""
     model: SadgsModelConfig = field(default_factory=SadgsModelConfig)
     """The Gaussians and their densification."""
@@ -116,7 +115,7 @@ class SadgsPipeline(VanillaPipeline):
     """
 
     config: SadgsPipelineConfig
-    datamanager: FullImageDatamanager
+    datamanager: SadgsDatamanager
 
     def __init__(self, config: SadgsPipelineConfig, *args: Any, **kwargs: Any) -> None:
         config.check()
@@ -127,11 +126,7 @@ class SadgsPipeline(VanillaPipeline):
         super().__init__(config, *args, **kwargs)
         for dataset in (self.datamanager.train_dataset, self.datamanager.eval_dataset):
             refuse_unsupported_cameras(dataset.cameras)
-        if not isinstance(self.datamanager, SadgsDatamanager):
-            if self.device.type == "cpu":
-                # "gpu" is the training device; nerfstudio would pin memory for CUDA with "cpu".
-                self.datamanager.config.cache_images = "gpu"
-        elif config.datamanager.cache_images != "compressed" and kwargs.get("test_mode") != "inference":
+        if config.datamanager.cache_images != "compressed" and kwargs.get("test_mode") != "inference":
             line = place_images(self.datamanager, self.device)
             if line is not None:
                 CONSOLE.print(line, highlight=False, soft_wrap=True)

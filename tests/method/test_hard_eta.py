@@ -23,7 +23,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nerfstudio.cameras.cameras import Cameras, CameraType
-from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 from torch import Tensor
@@ -32,6 +31,7 @@ from sadgs_ns.data.cameras import refuse_failed_undistortion, refuse_unsupported
 from sadgs_ns.method import losses, statistics
 from sadgs_ns.method.eta import SCREEN_BLUR, eta, projected_axes, sample_footprint
 from sadgs_ns.method.statistics import empty_statistics, observe
+from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig
 from sadgs_ns.plugin.model import SadgsModel
 from sadgs_ns.plugin.pipeline import SadgsPipeline, SadgsPipelineConfig
 from sadgs_ns.plugin.views import TrainingViews
@@ -515,7 +515,7 @@ DIRECTIONS = [(x, y) for x in (-0.4, 0.0, 0.5) for y in (-0.3, 0.0, 0.35)]
 
 def fisheye_data(
     folder: Path, k1: float, camera_model: str = "OPENCV_FISHEYE", focal: float = FISHEYE_FOCAL
-) -> FullImageDatamanagerConfig:
+) -> SadgsDatamanagerConfig:
     """Equidistant images (radius = focal · angle) of dots in known directions, as ns-process-data describes them."""
     (folder / "images").mkdir(parents=True)
     image = np.zeros((96, 128), np.float32)
@@ -535,13 +535,13 @@ def fisheye_data(
     text |= {"w": 128, "h": 96, "k1": k1, "k2": 0, "k3": 0, "k4": 0, "frames": described}
     (folder / "transforms.json").write_text(json.dumps(text))
     parser = NerfstudioDataParserConfig(data=folder, load_3D_points=False, downscale_factor=1, eval_mode="all")
-    return FullImageDatamanagerConfig(dataparser=parser, cache_images="gpu")
+    return SadgsDatamanagerConfig(dataparser=parser)
 
 
 @pytest.mark.hard_case("a fisheye with distortion coefficients", "nerfstudio undistorts it: right within 0.3 px")
 def test_a_fisheye_that_nerfstudio_undistorts_is_right(tmp_path: Path):
     """The dots lie where the pinhole of the changed intrinsics puts them; the coefficient is what the refusal names."""
-    datamanager: FullImageDatamanager = fisheye_data(tmp_path, k1=1e-9).setup(device="cpu")
+    datamanager: SadgsDatamanager = fisheye_data(tmp_path, k1=1e-9).setup(device="cpu")
     dataset = datamanager.train_dataset
     refuse_unsupported_cameras(dataset.cameras)
     image = datamanager.cached_train[0]["image"].float().mean(-1)
@@ -564,7 +564,7 @@ def test_a_fisheye_that_nerfstudio_undistorts_is_right(tmp_path: Path):
 @pytest.mark.hard_case("a fisheye of about 180°, which nerfstudio makes black", "ValueError naming the file")
 @pytest.mark.parametrize(("focal", "k1"), [(40.0, 1e-9), (41.0, 1e-3)])  # a focal length of 0, a centre far off
 def test_a_fisheye_of_180_degrees_that_nerfstudio_makes_black_is_refused(tmp_path: Path, focal: float, k1: float):
-    datamanager: FullImageDatamanager = fisheye_data(tmp_path, k1=k1, focal=focal).setup(device="cpu")
+    datamanager: SadgsDatamanager = fisheye_data(tmp_path, k1=k1, focal=focal).setup(device="cpu")
     assert datamanager.cached_train[0]["image"].max() == 0
     with pytest.raises(ValueError, match=r"images/0\.png is a FISHEYE image that nerfstudio could not undistort"):
         _ = TrainingViews(datamanager, SimpleNamespace(device="cpu")).cameras  # type: ignore[arg-type]
