@@ -30,7 +30,7 @@ from tyro.conf import Suppress
 
 from sadgs_ns.data import colmap, ply
 from sadgs_ns.data.automatic import AnyParserConfig, AutomaticDataParserConfig, choose_parser
-from sadgs_ns.data.checks import names
+from sadgs_ns.data.checks import splits
 from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS
 from sadgs_ns.data.checks.transforms import read_json
 from sadgs_ns.data.coordinates import FRAME_KEYS, Similarity, fixed_frame
@@ -119,8 +119,8 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
     The checks are here rather than in the pipeline, because `ns-render dataset` makes a datamanager of its own.
 
     Raises:
-        InputError: If an image is too small; as `colmap.read_poses`, `ply.read_points`, `names.check_names` and
-            `names.check_paths`.
+        InputError: If an image is too small; as `colmap.read_poses`, `ply.read_points`, `splits.check_names` and
+            `splits.check_paths`.
     """
 
     def __init__(self, config: FullImageDatamanagerConfig, *args: Any, **kwargs: Any) -> None:
@@ -133,7 +133,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
             model = (config.data or parser.data) / parser.colmap_path
             kind = "txt" if (model / "cameras.txt").exists() else "bin"
             if (source := model / f"images.{kind}").is_file():
-                names.check_names((name for name, _, _ in colmap.read_poses(source)), source)
+                splits.check_names((name for name, _, _ in colmap.read_poses(source)), source)
             plain = parser._target is ColmapDataParser and parser.max_2D_matches_per_3D_point == 0
             if plain and parser.load_3D_points:
                 self._points = colmap.points_file(model)
@@ -146,7 +146,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         super().__init__(config, *args, **kwargs)  # type: ignore[arg-type]
         self.config.cache_images = asked
         for dataset in (self.train_dataset, self.eval_dataset):
-            names.check_paths(dataset.image_filenames)
+            splits.check_paths(dataset.image_filenames)
             _check_sizes(dataset)
 
     def create_train_dataset(self) -> InputDataset:

@@ -8,11 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from sadgs_ns.data.checks.blender import check_blender
 from sadgs_ns.data.checks.colmap import check_colmap, chosen_factor
 from sadgs_ns.data.checks.findings import Finding, collect_findings, refuse
 from sadgs_ns.data.checks.layouts import find_reconstruction, layout_of, no_layout
-from sadgs_ns.data.checks.transforms import check_nerfstudio
+from sadgs_ns.data.checks.transforms import check_blender, check_nerfstudio
 from sadgs_ns.errors import InputError
 
 __all__ = ["Finding", "check_blender", "check_colmap", "check_data", "check_nerfstudio", "refuse"]
