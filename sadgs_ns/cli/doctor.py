@@ -18,7 +18,8 @@ from typing import Annotated
 import tyro
 
 from sadgs_ns.cli.program import parse
-from sadgs_ns.data.checks import Finding, check_data
+from sadgs_ns.data.checks import check_data
+from sadgs_ns.data.checks.findings import Finding
 from sadgs_ns.errors import free_space, reason
 
 PACKAGES = ("sadgs_ns", "torch", "torchvision", "gsplat", "nerfstudio", "triton", "pycolmap", "open3d")

@@ -18,7 +18,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from tyro.conf import Suppress
 
 from sadgs_ns.atomic import atomic_path
-from sadgs_ns.data.checks.parsers import check_ahead
+from sadgs_ns.data.checks.parsers import keep_findings, refuse_bad_data
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.plugin import checkpoints, processes
 from sadgs_ns.plugin.optimizers import RunLengthDecaySchedulerConfig
@@ -318,8 +318,9 @@ class CheckedTrainerConfig(TrainerConfig):
             return  # torchrun's other processes leave the files to the first.
         if self.is_viewer_enabled() or self.is_viewer_legacy_enabled():
             self._check_address()
-        check_ahead(self.pipeline.datamanager)
+        findings = refuse_bad_data(self.pipeline.datamanager)
         CONSOLE.log(f"Saving config to: {self.write()}")
+        keep_findings(self.pipeline.datamanager, findings)  # After writing, so that `config.yml` holds none.
 
     def write(self) -> Path:
         """Write `config.yml` and return its path.

@@ -20,7 +20,7 @@ import torch
 from examples.drawn_scene.scene import write_scene
 from sadgs_ns import gsplat_internals, kernels
 from sadgs_ns.cli import doctor
-from sadgs_ns.data.checks import Finding
+from sadgs_ns.data.checks.findings import Finding
 
 CHECKOUT = Path(__file__).parents[2]
 

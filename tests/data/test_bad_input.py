@@ -41,7 +41,11 @@ from torch import Tensor
 
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
 from sadgs_ns.cli import doctor
-from sadgs_ns.data import checks, colmap
+from sadgs_ns.data import colmap
+from sadgs_ns.data.checks import check_data, parsers
+from sadgs_ns.data.checks.findings import Finding, refuse
+from sadgs_ns.data.checks.layouts import ParserOptions
+from sadgs_ns.data.checks.transforms import check_blender, check_nerfstudio
 from sadgs_ns.errors import InputError, RunError
 
 CHECKOUT = Path(__file__).parents[2]
@@ -74,13 +78,13 @@ def copied(captures: Path, tmp_path: Path) -> Callable[[str], Path]:
 
 
 def errors(data: Path) -> list[str]:
-    return [finding.sentence for finding in checks.check_data(data) if finding.severity == "error"]
+    return [finding.sentence for finding in check_data(data) if finding.severity == "error"]
 
 
-def remarks(data: Path) -> list[checks.Finding]:
+def remarks(data: Path) -> list[Finding]:
     """The findings that are more than a count of images or points."""
     counts = re.compile(r"\S+ has [\d,]+ (images of|points\.)")
-    return [finding for finding in checks.check_data(data) if not counts.match(finding.sentence)]
+    return [finding for finding in check_data(data) if not counts.match(finding.sentence)]
 
 
 # --- ways to spoil a capture ---
@@ -906,15 +910,20 @@ def test_bad_data_are_refused_in_one_sentence_by_training_and_doctor_alike(
 
 @pytest.mark.parametrize("layout", ["colmap", "nerfstudio", "blender"])
 def test_good_data_have_no_error_and_no_warning(layout: str, captures: Path):
-    assert [finding for finding in checks.check_data(captures / layout) if finding.severity != "note"] == []
+    assert [finding for finding in check_data(captures / layout) if finding.severity != "note"] == []
 
 
 def test_a_run_checks_its_data_once_and_other_ways_to_a_pipeline_check_them_too(
     captures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     checked: list[Path] = []
-    check_colmap = checks.check_colmap
-    monkeypatch.setattr(checks, "check_colmap", lambda data, **kw: (checked.append(data), check_colmap(data, **kw))[1])
+    check_colmap = parsers.CHECKS[ColmapDataParserConfig]
+
+    def check(data: Path, *options: Any) -> list[Finding]:
+        checked.append(data)
+        return check_colmap(data, *options)
+
+    monkeypatch.setitem(parsers.CHECKS, ColmapDataParserConfig, check)
     first = Path(shutil.copytree(captures / "colmap", tmp_path / "first"))
     second = Path(shutil.copytree(captures / "colmap", tmp_path / "second"))
     config = configure(tmp_path / "out", parser_of(first))
@@ -942,12 +951,12 @@ def test_several_problems_of_one_kind_are_one_finding_and_other_kinds_are_counte
     for index in (2, 5, 7):
         (data / f"images/00{index}.png").write_bytes(b"")
     (data / "images/003.png").unlink()
-    findings = checks.check_data(data)
+    findings = check_data(data)
     assert len([finding for finding in findings if finding.severity == "error"]) == 2
     with pytest.raises(
         InputError, match=r"002\.png \(and 2 more\) has 0 bytes: .*\(`sadgs-doctor .*` shows 1 more\.\)"
     ):
-        checks.refuse(findings, data)
+        refuse(findings, data)
 
 
 # --- what is unlikely ---
@@ -1015,7 +1024,7 @@ def test_unlikely_data_are_told_of_in_one_sentence(case: str, copied: Callable[[
 def test_a_lens_of_a_telescope_is_a_warning(copied: Callable[[str], Path]):
     data = copied("nerfstudio")
     meta(lambda m: [frame.update(fl_x=1e4, fl_y=1e4) for frame in m["frames"]])(data)
-    (finding,) = [finding for finding in checks.check_data(data) if finding.severity != "note"]
+    (finding,) = [finding for finding in check_data(data) if finding.severity != "note"]
     assert finding.severity == "warning"
     text = (
         r"\S+: frame images/000\.png has the focal length 10000 px, with which 48 × 36 px span an angle of 0\.28°: .*\."
@@ -1027,9 +1036,9 @@ def test_a_lens_of_a_telescope_is_a_warning(copied: Callable[[str], Path]):
 def test_points_behind_some_cameras_are_a_warning(copied: Callable[[str], Path]):
     data = copied("nerfstudio")
     with_points([[0.5, 0.5, 0.5]] * 4)(data)
-    assert [finding for finding in checks.check_data(data) if finding.severity != "note"] == []
+    assert [finding for finding in check_data(data) if finding.severity != "note"] == []
     change_poses(*range(6), times=np.diag([1.0, -1, -1, 1]))(data)  # OpenCV's axes instead of OpenGL's
-    (finding,) = [finding for finding in checks.check_data(data) if finding.severity != "note"]
+    (finding,) = [finding for finding in check_data(data) if finding.severity != "note"]
     assert finding.severity == "warning"
     assert re.fullmatch(r"\S+/p\.ply has points that only 40% of the cameras can see .*\.", finding.sentence)
 
@@ -1041,7 +1050,7 @@ def test_points_beside_a_blender_scene_are_checked(copied: Callable[[str], Path]
     def check(*positions: list[float]) -> list[str]:
         lines = "".join("{} {} {}\n".format(*position) for position in positions)
         (data / "p.ply").write_text(PLY.format(len(positions)) + lines)
-        findings = checks.check_blender(data, ply_path=Path("p.ply"))
+        findings = check_blender(data, ParserOptions(ply_path=Path("p.ply")))
         return [finding.sentence for finding in findings if finding.severity == "error"]
 
     assert check([0.5, 0.5, 0.5], [1, 1, 1]) == []
@@ -1154,7 +1163,7 @@ def test_images_and_masks_of_several_kinds_and_few_points_train(copied: Callable
         image.save(data / "mask3.png")  # of a single pixel
     meta(lambda m: [frame.update(mask_path=f"mask{k % 5}.png") for k, frame in enumerate(m["frames"])])(data)
     with_points([[0, 0, 0]] * 3)(data)
-    assert [finding for finding in checks.check_data(data) if finding.severity != "note"] == []
+    assert [finding for finding in check_data(data) if finding.severity != "note"] == []
     config = configure(tmp_path / "out", parser_of(data), iterations=8)
     config.pipeline.views_per_iteration = 2
     assert is_finite(train(config).pipeline.model)
@@ -1226,7 +1235,7 @@ def test_scaled_down_images_are_compared_with_scaled_down_cameras(
     (data / f"images_{factor}").mkdir()
     for path in (data / "images").iterdir():
         Image.effect_noise((47 // factor, 35 // factor), 50).save(data / f"images_{factor}" / path.name)
-    findings = checks.check_nerfstudio(data, downscale_factor=factor)
+    findings = check_nerfstudio(data, ParserOptions(downscale_factor=factor))
     assert [finding for finding in findings if finding.severity == "error"] == []
     parser = NerfstudioDataParserConfig(data=data, load_3D_points=True, downscale_factor=factor)
     train(configure(tmp_path / "out", parser, iterations=1))  # nerfstudio agrees
@@ -1261,7 +1270,7 @@ def test_of_two_hundred_photographs_one_is_decoded(tmp_path: Path, monkeypatch: 
         return load(image)
 
     monkeypatch.setattr(ImageFile.ImageFile, "load", note)
-    findings = checks.check_data(data)
+    findings = check_data(data)
     assert [finding for finding in findings if finding.severity != "note"] == []
     assert len(decoded) == 1  # to see whether it shows something
 

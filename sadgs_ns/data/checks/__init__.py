@@ -9,12 +9,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from sadgs_ns.data.checks.colmap import check_colmap, chosen_factor
-from sadgs_ns.data.checks.findings import Finding, collect_findings, refuse
-from sadgs_ns.data.checks.layouts import find_reconstruction, layout_of, no_layout
+from sadgs_ns.data.checks.findings import Finding, collect_findings
+from sadgs_ns.data.checks.layouts import ParserOptions, find_reconstruction, layout_of, no_layout
 from sadgs_ns.data.checks.transforms import check_blender, check_nerfstudio
 from sadgs_ns.errors import InputError
-
-__all__ = ["Finding", "check_blender", "check_colmap", "check_data", "check_nerfstudio", "refuse"]
 
 
 @collect_findings
@@ -29,10 +27,11 @@ def check_data(data: Path) -> Iterator[Finding]:
     """
     layout = layout_of(data)
     if layout == "nerfstudio":
-        yield from check_nerfstudio(data)
+        yield from check_nerfstudio(data, ParserOptions())
     elif layout == "blender":
-        yield from check_blender(data)
+        yield from check_blender(data, ParserOptions())
     elif (folder := find_reconstruction(data)) is not None:
-        yield from check_colmap(data, colmap_path=folder, downscale_factor=chosen_factor(data, folder))
+        factor = chosen_factor(data, folder)
+        yield from check_colmap(data, ParserOptions(colmap_path=folder, downscale_factor=factor, eval_mode="interval"))
     else:
         raise InputError(no_layout(data))

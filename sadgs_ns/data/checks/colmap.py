@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,6 @@ from sadgs_ns.data.checks.geometry import Camera, View, check_points, check_posi
 from sadgs_ns.data.checks.images import (
     MAX_AUTO_RESOLUTION,
     Frame,
-    Rounding,
     check_factor,
     check_images,
     existing_factor,
@@ -26,7 +24,7 @@ from sadgs_ns.data.checks.images import (
     scaled_size,
     smaller_folder,
 )
-from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS, find_reconstruction, no_layout
+from sadgs_ns.data.checks.layouts import ParserOptions, find_reconstruction, no_layout
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
 from sadgs_ns.errors import InputError, reason
 
@@ -35,27 +33,17 @@ UNSUPPORTED_CAMERAS = {"FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}
 
 
 @collect_findings
-def check_colmap(
-    data: Path,
-    *,
-    images_path: Path = Path("images"),
-    colmap_path: Path = Path(COLMAP_FOLDERS[0]),
-    masks_path: Path | None = None,
-    downscale_factor: int | None = None,
-    rounding: Rounding = "floor",
-    load_points: bool = True,
-    training_images: Callable[[Sequence[str]], int] = lambda names: len(names) - math.ceil(len(names) / 8),
-    open_images: bool = True,
-) -> Iterator[Finding]:
+def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -> Iterator[Finding]:
     """Check a COLMAP reconstruction, binary or text.
 
     Args:
-        data: The folder that the other paths are relative to.
-        images_path, colmap_path, masks_path, downscale_factor, rounding: As of nerfstudio's parser.
-        load_points, training_images, open_images: As for `check_nerfstudio`.
+        data: The folder that the options' paths are relative to.
+        options: How the data will be read.
+        open_images: Whether to look into the images, too.
     """
-    check_factor(downscale_factor)
-    images_folder, model_folder = data / images_path, data / colmap_path
+    check_factor(options.downscale_factor)
+    colmap_path = options.colmap_path
+    images_folder, model_folder = data / options.images_path, data / colmap_path
     kind = next((kind for kind in ("txt", "bin") if (model_folder / f"cameras.{kind}").is_file()), None)
     if kind is None:
         if (found := find_reconstruction(data)) is not None:
@@ -97,14 +85,14 @@ def check_colmap(
         )
         training = len(set(lists["train"]))
     else:
-        training = training_images([name for name, _, _ in poses])
+        training = options.count_training_images([name for name, _, _ in poses])
     views = _views(poses, used, poses_path, cameras_path)
     yield from (of_views := list(check_views(views, training, poses_path)))
-    if load_points:
+    if options.load_3D_points:
         wrong = any(finding.severity == "error" for finding in of_views)
         random = f"end the command with `colmap --colmap-path {colmap_path} --load-3D-points False`"
         yield from _check_points(model_folder, [] if wrong else views, f"{random} to start from random points")
-    if masks_path is None and images_in(data / "masks"):
+    if options.masks_path is None and images_in(data / "masks"):
         yield Finding(
             "warning",
             f"{data / 'masks'} holds masks that are not used: end the command with "
@@ -112,14 +100,14 @@ def check_colmap(
         )
     if not open_images:
         return
-    factor = downscale_factor
+    factor = options.downscale_factor
     if factor is None:
         factor, size = 1, image_size(images_folder / poses[0][0])
         while max(size) / factor > MAX_AUTO_RESOLUTION:
             factor *= 2
     smaller = smaller_folder(images_folder, factor)
     if not all((smaller / name).parent.exists() for name, _, _ in poses):
-        if downscale_factor is not None:
+        if options.downscale_factor is not None:
             problem, remedy = no_copies(smaller, factor)
         else:
             problem = f"{images_folder} holds images of more than {MAX_AUTO_RESOLUTION} px and there is no {smaller}"
@@ -132,10 +120,10 @@ def check_colmap(
         factor, smaller = 1, images_folder
     frames = []
     for name, camera_id, _ in poses:
-        size = scaled_size((used[camera_id].width, used[camera_id].height), factor, rounding)
+        size = scaled_size((used[camera_id].width, used[camera_id].height), factor, options.downscale_rounding_mode)
         mask = None
-        if masks_path is not None:
-            mask = (smaller_folder(data / masks_path, factor) / name).with_suffix(".png")
+        if options.masks_path is not None:
+            mask = (smaller_folder(data / options.masks_path, factor) / name).with_suffix(".png")
         frames.append(Frame(smaller / name, size, mask))
     yield from check_images(frames, poses_path, look_for_unused=factor == 1)
 

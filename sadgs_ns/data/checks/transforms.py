@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ from sadgs_ns.data.checks.images import (
     no_copies,
     scaled_size,
 )
-from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS, GIVE_POSES, find_reconstruction, no_layout
+from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS, GIVE_POSES, ParserOptions, find_reconstruction, no_layout
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
 from sadgs_ns.data.coordinates import fixed_frame
 from sadgs_ns.errors import InputError, reason
@@ -43,21 +43,12 @@ _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
 @collect_findings
-def check_nerfstudio(
-    data: Path,
-    *,
-    downscale_factor: int | None = None,
-    load_points: bool = True,
-    training_images: Callable[[Sequence[str]], int] = lambda names: math.ceil(0.9 * len(names)),
-    open_images: bool = True,
-) -> Iterator[Finding]:
+def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = True) -> Iterator[Finding]:
     """Check a `transforms.json`, as `ns-process-data` writes it.
 
     Args:
         data: The folder, or the file itself.
-        downscale_factor: As of nerfstudio's parser: None chooses by size.
-        load_points: Whether the SfM points will be read.
-        training_images: Says of the names of all images how many of them are trained on.
+        options: How the data will be read.
         open_images: Whether to look into the images, too.
     """
     path = data if data.suffix == ".json" else data / "transforms.json"
@@ -76,8 +67,8 @@ def check_nerfstudio(
     if model not in perspective:
         raise InputError(f"{path} has the camera model {model!r}: give one of {', '.join(perspective)}.")
     _check_transform(meta, path)
-    check_factor(downscale_factor)
-    factor = downscale_factor
+    check_factor(options.downscale_factor)
+    factor = options.downscale_factor
     if factor is None:
         factor = _smaller_copies(folder, Path(described[0]["file_path"])) if open_images else 1
     if factor > 1 and not (folder / f"images_{factor}").is_dir():
@@ -110,24 +101,24 @@ def check_nerfstudio(
         yield from check_splits(lists, lambda split: f"{path}: {split}_filenames", locate, places)
         training = len(set(map(locate, lists["train"])))
     else:
-        training = training_images([frame["file_path"] for frame in described])
+        training = options.count_training_images([frame["file_path"] for frame in described])
     yield from (of_views := list(check_views(views, training, path)))
     if 3 <= training == len(frames) < 10:  # With more frames all are trained on only where that was asked for.
         yield Finding("note", f"{path} has {training} views, none of them held out: `ns-eval` cannot measure any.")
     if open_images:
         yield from check_images(frames, path, look_for_unused=factor == 1)
-    if load_points:
+    if options.load_3D_points:
         wrong = any(finding.severity == "error" for finding in of_views)
         yield from _check_ply(meta, path, [] if wrong else views)
 
 
 @collect_findings
-def check_blender(data: Path, *, ply_path: Path | None = None, open_images: bool = True) -> Iterator[Finding]:
+def check_blender(data: Path, options: ParserOptions, open_images: bool = True) -> Iterator[Finding]:
     """Check a synthetic scene in the layout of NeRF's: `transforms_train.json` and its siblings.
 
     Args:
         data: The folder.
-        ply_path: SfM points, relative to the folder, as of nerfstudio's parser.
+        options: How the data will be read.
         open_images: Whether to look into the images, too.
     """
     if not (data / "transforms_train.json").is_file():
@@ -151,10 +142,10 @@ def check_blender(data: Path, *, ply_path: Path | None = None, open_images: bool
         views = [view_of(frame, f"{path}: frame {frame['file_path']}", camera) for frame in described]
         if split == "train":
             yield from (of_views := list(check_views(views, len(views), path)))
-            if ply_path is not None:
+            if options.ply_path is not None:
                 wrong = any(finding.severity == "error" for finding in of_views)
                 remedy = "restore it, or leave `--ply-path` out to start from random points"
-                yield from check_ply(data / ply_path, [] if wrong else views, remedy)
+                yield from check_ply(data / options.ply_path, [] if wrong else views, remedy)
         else:
             yield from check_rotations(views)
         if open_images:
