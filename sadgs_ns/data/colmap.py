@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sadgs_ns.data.text import refuse_byte_order_mark
 from sadgs_ns.errors import InputError, reason
 
 CAMERA_PARAMETERS = {
@@ -140,7 +141,9 @@ def _read_binary_points(path: Path) -> Points:
 def _read_text(path: Path, minimum: int) -> Iterator[tuple[list[str], Iterator[str]]]:
     """Yield the fields of each line that is neither empty nor a comment, and the lines after it."""
     try:
-        with path.open(encoding="utf-8-sig") as file:  # Editors of Windows write a byte order mark before the text.
+        with path.open(encoding="utf8") as file:
+            refuse_byte_order_mark(file.read(1), path)
+            file.seek(0)
             for line in file:
                 if line.strip() and not line.lstrip().startswith("#"):
                     fields = line.split()
@@ -149,6 +152,8 @@ def _read_text(path: Path, minimum: int) -> Iterator[tuple[list[str], Iterator[s
                     yield fields, file
     except OSError as error:
         raise InputError(f"{path} cannot be read ({reason(error)}): copy the whole reconstruction.") from error
+    except InputError:
+        raise
     except ValueError as error:
         raise _not_colmap(path, error) from error
 

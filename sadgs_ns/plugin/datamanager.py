@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import codecs
-import contextlib
 import copy
 import math
-import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,9 +14,7 @@ import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
-from nerfstudio.data.dataparsers import blender_dataparser, nerfstudio_dataparser
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
-from nerfstudio.data.dataparsers.blender_dataparser import Blender
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 from nerfstudio.data.datasets.base_dataset import InputDataset
@@ -138,8 +133,8 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
             if plain and parser.load_3D_points:
                 self._points = colmap.points_file(model)
                 parser.load_3D_points = self._points is None
-        own = {Nerfstudio: _Nerfstudio, Blender: _Blender, ColmapDataParser: _Colmap}
-        parser._target = own.get(parser._target, parser._target)
+        if parser._target is Nerfstudio:
+            parser._target = _Nerfstudio
         config.dataparser = parser
         # nerfstudio would keep more than 500 images on the host, whatever their size, and say so in a line.
         asked, config.cache_images = config.cache_images, "cpu"
@@ -260,8 +255,7 @@ class _Nerfstudio(Nerfstudio):
         model = self.config.data / COLMAP_FOLDERS[0]
         if model.exists():
             self.prompted_user, self.create_pc = True, False  # The answer no; the points are read below.
-        with _reading_byte_order_marks(nerfstudio_dataparser):
-            outputs = super()._generate_dataparser_outputs(split)
+        outputs = super()._generate_dataparser_outputs(split)
         path = self.config.data if self.config.data.suffix == ".json" else self.config.data / "transforms.json"
         _move_to_fixed_frame(outputs, read_json(path), path)
         source = colmap.points_file(model)
@@ -294,42 +288,6 @@ def _move_to_fixed_frame(outputs: DataparserOutputs, meta: dict[str, Any], path:
         metadata["points3D_xyz"] = torch.from_numpy(fixed.positions(chosen.inverse().positions(points))).float()
     transform, scale = (meta[name] for name in FRAME_KEYS)
     outputs.dataparser_transform, outputs.dataparser_scale = torch.tensor(transform), float(scale)
-
-
-class _Blender(Blender):
-    """nerfstudio's parser of Blender scenes, which alone would stumble over a byte order mark."""
-
-    def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
-        with _reading_byte_order_marks(blender_dataparser):
-            return super()._generate_dataparser_outputs(split)
-
-
-class _Colmap(ColmapDataParser):
-    """nerfstudio's parser of COLMAP's files, which alone would stumble over a byte order mark."""
-
-    def _get_all_images_and_cameras(self, recon_dir: Path) -> dict[str, Any]:
-        files = [recon_dir / "cameras.txt", recon_dir / "images.txt"]
-        if not files[0].exists() or not any(_has_byte_order_mark(file) for file in files):
-            return super()._get_all_images_and_cameras(recon_dir)
-        with tempfile.TemporaryDirectory() as folder:
-            for file in files:
-                Path(folder, file.name).write_bytes(file.read_bytes().removeprefix(codecs.BOM_UTF8))
-            return super()._get_all_images_and_cameras(Path(folder))
-
-
-def _has_byte_order_mark(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(3) == codecs.BOM_UTF8
-
-
-@contextlib.contextmanager
-def _reading_byte_order_marks(module: Any) -> Iterator[None]:
-    """Give a module of nerfstudio's a reader of JSON that takes a byte order mark, which editors of Windows write."""
-    before, module.load_from_json = module.load_from_json, read_json
-    try:
-        yield
-    finally:
-        module.load_from_json = before
 
 
 def _points_in_the_run(

@@ -318,7 +318,7 @@ COLMAP = {
     ),
     "list-mark": (
         overwrite("train_list.txt", "\ufeff001.png\n"),
-        r"\S+/train_list\.txt starts with a byte order mark, which nerfstudio takes for a part of the first name: .*\.",
+        r"\S+/train_list\.txt starts with a byte order mark, which nerfstudio cannot read: .*\.",
     ),
     "list-latin": (
         overwrite("train_list.txt", b"\xe9.png\n"),

@@ -14,13 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from nerfstudio.data.dataparsers import blender_dataparser, nerfstudio_dataparser
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 from nerfstudio.data.utils import colmap_parsing_utils
 from nerfstudio.process_data.colmap_utils import create_ply_from_colmap
-from nerfstudio.utils.io import load_from_json
 from plyfile import PlyData, PlyElement
 from runs import blender_data, nerfstudio_data
 
@@ -87,47 +85,51 @@ def test_matches_of_points_are_left_to_nerfstudio(colmap: ColmapDataParserConfig
 MARK = b"\xef\xbb\xbf"
 
 
-@pytest.mark.hard_case(
-    "a byte order mark, or Windows's line ends, in COLMAP's `cameras.txt`, `images.txt`, `points3D.txt`",
-    "read as without it, by nerfstudio's parsers too",
-)
-@pytest.mark.parametrize(("comments", "line_end"), [(True, b"\n"), (False, b"\r\n")])
-def test_colmap_s_text_after_a_byte_order_mark_is_read_as_without_one(
-    comments: bool, line_end: bytes, colmap: ColmapDataParserConfig, tmp_path: Path
-):
-    data = Path(shutil.copytree(colmap.data, tmp_path / "scene"))
+def text_model(colmap: ColmapDataParserConfig, data: Path) -> ColmapDataParserConfig:
+    """A copy of a scene with COLMAP's files as text."""
+    shutil.copytree(colmap.data, data)
     folder = data / SPARSE_FOLDER
     model = colmap_parsing_utils.read_model(str(folder), ".bin")
     assert model is not None
     for path in folder.iterdir():
         path.unlink()
     colmap_parsing_utils.write_model(*model, str(folder), ".txt")
-    parser = dataclasses.replace(colmap, data=data)
+    return dataclasses.replace(colmap, data=data)
+
+
+@pytest.mark.hard_case(
+    "Windows's line ends in COLMAP's `cameras.txt`, `images.txt`, `points3D.txt`", "read as without them"
+)
+@pytest.mark.parametrize("comments", [True, False])
+def test_colmap_s_text_with_windows_s_line_ends_is_read_as_without_them(
+    comments: bool, colmap: ColmapDataParserConfig, tmp_path: Path
+):
+    parser = text_model(colmap, tmp_path / "scene")
     expected = load(parser).train_dataparser_outputs
-    for path in folder.iterdir():
+    for path in (parser.data / SPARSE_FOLDER).iterdir():
         lines = path.read_bytes().splitlines()
-        path.write_bytes(MARK + b"".join(line + line_end for line in lines if comments or not line.startswith(b"#")))
+        path.write_bytes(b"".join(line + b"\r\n" for line in lines if comments or not line.startswith(b"#")))
     assert refuse_bad_data(SadgsDatamanagerConfig(dataparser=parser))
     assert_equal_outputs(load(parser).train_dataparser_outputs, expected)
 
 
 @pytest.mark.hard_case(
-    "a byte order mark in `transforms.json` and Blender's files", "read as without it, by nerfstudio's parsers too"
+    "a byte order mark in `transforms.json`, Blender's files or COLMAP's text", "one sentence naming the file"
 )
-@pytest.mark.parametrize("write", [nerfstudio_data, lambda folder: blender_data(folder, "white")])
-def test_json_after_a_byte_order_mark_is_read_as_without_one(
-    write: Callable[[Path], DataParserConfig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    parser = write(tmp_path)
-    expected = load(parser).train_dataparser_outputs
-    for path in tmp_path.glob("*.json"):
-        path.write_bytes(MARK + path.read_bytes())
-    assert refuse_bad_data(SadgsDatamanagerConfig(dataparser=parser))
-    datamanager = load(parser)
-    assert_equal_outputs(datamanager.train_dataparser_outputs, expected)
-    assert datamanager.dataparser.get_dataparser_outputs("val").image_filenames  # as `ns-render dataset` asks for it
-    for module in (nerfstudio_dataparser, blender_dataparser):
-        assert vars(module)["load_from_json"] is load_from_json  # for others' parsers
+@pytest.mark.parametrize("kind", ["transforms.json", "blender", "cameras.txt", "images.txt", "points3D.txt"])
+def test_a_byte_order_mark_is_refused_by_the_file_s_name(kind: str, colmap: ColmapDataParserConfig, tmp_path: Path):
+    if kind.endswith(".txt"):
+        parser: DataParserConfig = text_model(colmap, tmp_path / "scene")
+        file = parser.data / SPARSE_FOLDER / kind
+    elif kind == "blender":
+        parser, file = blender_data(tmp_path, "white"), tmp_path / "transforms_train.json"
+    else:
+        parser, file = nerfstudio_data(tmp_path), tmp_path / kind
+    file.write_bytes(MARK + file.read_bytes())
+    with pytest.raises(InputError) as refused:
+        refuse_bad_data(SadgsDatamanagerConfig(dataparser=parser))
+    told = f"{file} starts with a byte order mark, which nerfstudio cannot read: save it as UTF-8 without one."
+    assert str(refused.value) == told
 
 
 def assert_equal_outputs(outputs: DataparserOutputs, expected: DataparserOutputs) -> None:

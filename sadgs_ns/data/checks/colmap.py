@@ -26,6 +26,7 @@ from sadgs_ns.data.checks.images import (
 )
 from sadgs_ns.data.checks.layouts import ParserOptions, find_reconstruction, no_layout
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
+from sadgs_ns.data.text import refuse_byte_order_mark
 from sadgs_ns.errors import InputError, reason
 
 UNSUPPORTED_CAMERAS = {"FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}
@@ -160,11 +161,7 @@ def _read_list(path: Path) -> list[str]:
         text = path.read_text("utf8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path} cannot be read as text in UTF-8 ({reason(error)}): correct or remove it.") from error
-    if text.startswith("\ufeff"):
-        raise InputError(
-            f"{path} starts with a byte order mark, which nerfstudio takes for a part of the first name: save it as "
-            "UTF-8 without one."
-        )
+    refuse_byte_order_mark(text, path)
     return text.splitlines()
 
 

@@ -36,6 +36,7 @@ from sadgs_ns.data.checks.images import (
 from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS, GIVE_POSES, ParserOptions, find_reconstruction, no_layout
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
 from sadgs_ns.data.coordinates import fixed_frame
+from sadgs_ns.data.text import refuse_byte_order_mark
 from sadgs_ns.errors import InputError, reason
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -184,13 +185,18 @@ def applied_transform(meta: dict[str, Any]) -> NDArray[np.float64]:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return the object that a file holds in UTF-8, after a byte order mark or without one.
+    """Return the object that a file holds in UTF-8.
 
     Raises:
-        InputError: If the file cannot be read, is not UTF-8 or JSON, or holds something else.
+        InputError: If the file cannot be read, is not UTF-8 or JSON, starts with a byte order mark, or holds something
+            else.
     """
     try:
-        meta = json.loads(path.read_text(encoding="utf-8-sig"))
+        text = path.read_text("utf8")
+        refuse_byte_order_mark(text, path)
+        meta = json.loads(text)
+    except InputError:
+        raise
     except FileNotFoundError:
         raise InputError(f"{path} does not exist: restore it, or {GIVE_POSES}.") from None
     except UnicodeDecodeError:
