@@ -7,15 +7,15 @@ which are low, and one densification step, conventional against structure-aware.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 import yaml
 from nerfstudio.engine.trainer import TrainerConfig
-from rich.console import Console
 from rich.progress import track
 from torch import Tensor
 
@@ -93,26 +93,24 @@ def load_run(path: Path, load_step: int | None = None, data: Path | None = None)
         method = f"of the method {config.method_name}" if isinstance(config, TrainerConfig) else "no run's config.yml"
         raise InputError(f"{path} is {method}: give one of a method whose name begins with sadgs.")
     folder = path.parent / config.relative_model_dir
-    if not folder.is_dir() or not any(folder.iterdir()):
+    if not any(folder.glob("*")):
         raise InputError(
             f"{folder} holds no checkpoint yet: train to the end, or with --steps-per-save 500 to look on the way."
         )
     chosen = checkpoints.read_chosen(folder, load_step, None, _REMEDY)
     assert chosen is not None
     checkpoint, state = chosen
-    if data is not None:
-        config.pipeline.datamanager.data = data
+    config.pipeline.datamanager.data = data or config.pipeline.datamanager.data
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     pipeline: SadgsPipeline = config.pipeline.setup(device=device, test_mode="test")
     pipeline.eval()
     try:
         pipeline.load_pipeline(state["pipeline"], state["step"])
+        pipeline.model.strategy.fit_to_run(state["pipeline"]["_extra_state"]["schedule"]["iterations"])
     except InputError as error:
         raise InputError(f"{checkpoint} does not fit its run: {str(error).rstrip('.')}; {_REMEDY}.") from error
     except (KeyError, RuntimeError) as error:  # A part is missing or has another size.
         raise InputError(f"{checkpoint} is not of this version of sadgs ({reason(error)}): {_REMEDY}.") from error
-    saved = state["pipeline"]["_extra_state"].get("schedule", {})  # Earlier versions did not derive it.
-    pipeline.model.strategy.fit_to_run(saved.get("iterations", config.max_num_iterations))
     return pipeline, state["step"] + 1
 
 
@@ -122,32 +120,29 @@ def get_view(pipeline: SadgsPipeline, index: int, split: Literal["train", "eval"
     Raises:
         InputError: If there is no such view.
     """
-    datamanager = pipeline.datamanager
-    dataset = datamanager.train_dataset if split == "train" else datamanager.eval_dataset
+    training, datamanager = split == "train", pipeline.datamanager
+    dataset = datamanager.train_dataset if training else datamanager.eval_dataset
     if not 0 <= index < len(dataset):
         raise InputError(f"--view {index}: the {split} split has views 0 to {len(dataset) - 1}.")
     # Loading the images undistorts them, which changes the intrinsics.
-    data = (datamanager.cached_train if split == "train" else datamanager.cached_eval)[index]
+    data = (datamanager.cached_train if training else datamanager.cached_eval)[index]
     camera = dataset.cameras[index : index + 1]
+    viewmat = viewmats_from_camera_to_world(camera.camera_to_worlds)[0]
     return View(
         name=dataset.image_filenames[index].name,
         photo=pipeline.structure_maps.photo(data),
         structure_tensor=decode(pipeline.structure_maps.codes_of([data])[0]),
-        viewmat=(
-            pipeline.views.viewmat(index)
-            if split == "train"
-            else viewmats_from_camera_to_world(camera.camera_to_worlds)[0]
-        ).to(pipeline.device),
+        viewmat=(pipeline.views.viewmat(index) if training else viewmat).to(pipeline.device),
         K=camera.get_intrinsics_matrices()[0].to(pipeline.device),
     )
 
 
-def screen_gradients(pipeline: SadgsPipeline, progress: Callable[[range], Any]) -> dict[str, Tensor]:
+def screen_gradients(pipeline: SadgsPipeline, progress: Callable[[range], Iterable[int]] = iter) -> dict[str, Tensor]:
     """Return what AbsGS decides on: the loss's screen gradients of all training views, added up as in training.
 
     Args:
         pipeline: A loaded run.
-        progress: Called with the range of the views' numbers; what it returns is iterated over.
+        progress: Wraps the numbers of the views, to show how far the work is.
 
     Returns:
         As `absgs.empty_gradients`.
@@ -179,44 +174,37 @@ class Step:
     """Number of the Gaussian before the step that each one was or came from. int64 [M]"""
 
 
-def _try(
-    model: SadgsModel, state: dict[str, Any], densify: Callable[[dict[str, Any], Any, dict[str, Any]], Any]
-) -> Step:
+def _try(model: SadgsModel, state: dict[str, Any], densify: Callable[[Any, Any, Any], Any]) -> Step:
+    """Call a function of parameters, optimizers and state that changes copies of the model's Gaussians."""
     params = {name: torch.nn.Parameter(value.detach().clone()) for name, value in model.gauss_params.items()}
     # The numbers are a parameter, since children take theirs from their parents, while rows of the state begin anew.
     # float64 counts exactly.
     numbers = torch.arange(model.num_points, device=params["means"].device, dtype=torch.float64)
     params["origins"] = torch.nn.Parameter(numbers)
-    optimizers = {name: torch.optim.SGD([parameter], lr=0.0) for name, parameter in params.items()}
-    densify(params, optimizers, state)
+    densify(params, {name: torch.optim.SGD([parameter], lr=0.0) for name, parameter in params.items()}, state)
     origins = params.pop("origins").detach().long()
     return Step({name: value.detach() for name, value in params.items()}, origins)
 
 
 def structure_step(model: SadgsModel, statistics: dict[str, Tensor]) -> Step:
     """Try a structure-aware step without its pruning, and return what it makes of the Gaussians."""
-    counts, child_scale = model.strategy.children_now(model.gauss_params, statistics), model.strategy.child_scale
-    return _try(model, {}, lambda p, o, s: grid_split(p, o, s, counts, child_scale))
+    counts = model.strategy.children_now(model.gauss_params, statistics)
+    return _try(model, {}, partial(grid_split, counts=counts, child_scale=model.strategy.child_scale))
 
 
 def conventional_step(model: SadgsModel, gradients: dict[str, Tensor]) -> Step:
     """Try a conventional step (AbsGS: clone, or split in two) without its pruning, and return what it makes."""
-    strategy, extent = model.strategy, float(model.strategy_state["scene_scale"])
+    strategy = model.strategy
+    densify = partial(
+        grow,
+        clone_threshold=strategy.clone_grad2d,
+        split_threshold=strategy.split_absgrad2d,
+        size_threshold=SMALL_SCALE * float(model.strategy_state["scene_scale"]),
+        budget=strategy.max_gaussians - model.num_points,
+    )
     with torch.random.fork_rng(devices=[model.device] if model.device.type == "cuda" else []):
         torch.manual_seed(SEED)  # gsplat draws the children's places at random.
-        return _try(
-            model,
-            dict(gradients),
-            lambda params, optimizers, state: grow(
-                params,
-                optimizers,
-                state,
-                clone_threshold=strategy.clone_grad2d,
-                split_threshold=strategy.split_absgrad2d,
-                size_threshold=SMALL_SCALE * extent,
-                budget=strategy.max_gaussians - model.num_points,
-            ),
-        )
+        return _try(model, dict(gradients), densify)
 
 
 def view_panels(pipeline: SadgsPipeline, view: View, statistics: dict[str, Tensor]) -> dict[str, Panel]:
@@ -229,33 +217,18 @@ def view_panels(pipeline: SadgsPipeline, view: View, statistics: dict[str, Tenso
     enlarge = max(MIN_SIDE / max(height, width), 1.0)
     size = (round(enlarge * height), round(enlarge * width))
     split, added = int((counts > 1).any(dim=1).sum()), int((num_children(counts) - 1).sum())
-    photo = to_picture(view.photo)
+    of_all = f"of {model.num_points:,} Gaussians"
+    ellipses = texture.draw_ellipses(to_picture(view.photo), view.structure_tensor, constant, size)
+    period = texture.texture_period(view.structure_tensor, constant)
+    eta = gaussian_maps.eta_map(params, statistics, *view.camera, **options)
+    children = gaussian_maps.children_map(params, counts, *view.camera, **options)
+    low = gaussian_maps.share_map(params, is_low, *view.camera, **options)
     return {
-        "ellipses": Panel(
-            f"{view.name}: the structure tensor, its inverse as ellipses",
-            texture.draw_ellipses(photo, view.structure_tensor, constant, size),
-            PERIOD,
-        ),
-        "wavelength": Panel(
-            f"{view.name}: local wavelength",
-            PERIOD(texture.texture_period(view.structure_tensor, constant)),
-            PERIOD,
-        ),
-        "eta": Panel(
-            f"{view.name}: η of the Gaussians, largest of their observations; over 1 violates",
-            ETA(gaussian_maps.eta_map(params, statistics, *view.camera, **options)),
-            ETA,
-        ),
-        "children": Panel(
-            f"{view.name}: {split:,} of {model.num_points:,} Gaussians would split, {added:,} more",
-            CHILDREN(gaussian_maps.children_map(params, counts, *view.camera, **options)),
-            CHILDREN,
-        ),
-        "low": Panel(
-            f"{view.name}: {int(is_low.sum()):,} of {model.num_points:,} Gaussians are consistently low (η < 0.1)",
-            LOW(gaussian_maps.share_map(params, is_low, *view.camera, **options)),
-            LOW,
-        ),
+        "ellipses": Panel(f"{view.name}: the structure tensor, its inverse as ellipses", ellipses, PERIOD),
+        "wavelength": Panel(f"{view.name}: local wavelength", PERIOD(period), PERIOD),
+        "eta": Panel(f"{view.name}: η of the Gaussians, largest of their observations; over 1 violates", ETA(eta), ETA),
+        "children": Panel(f"{view.name}: {split:,} {of_all} would split, {added:,} more", CHILDREN(children), CHILDREN),
+        "low": Panel(f"{view.name}: {int(is_low.sum()):,} {of_all} are consistently low (η < 0.1)", LOW(low), LOW),
     }
 
 
@@ -289,7 +262,6 @@ def inspect_run(
     output: Path | None = None,
     load_step: int | None = None,
     data: Path | None = None,
-    console: Console | None = None,
 ) -> list[Path]:
     """Write all pictures of one view of a run.
 
@@ -300,7 +272,6 @@ def inspect_run(
         output: Folder, made if need be; None is `inspect` beside the config.
         load_step: Step of the checkpoint; None takes the latest.
         data: The capture; None is where it was in training.
-        console: For progress and numbers.
 
     Returns:
         The files.
@@ -309,31 +280,22 @@ def inspect_run(
         InputError: As `load_run` and `get_view`; nothing is written then.
         WriteError: If a file cannot be written.
     """
-    console = console or Console()
-
-    def progress(what: str) -> Callable[[range], Any]:
-        return lambda views: track(views, what, console=console, transient=True)
-
     pipeline, iterations = load_run(path, load_step, data)
-    view = get_view(pipeline, index, split)
-    statistics = observe_training_views(pipeline.structure_maps, progress("η in all training views"))
-    gradients = screen_gradients(pipeline, progress("gradients of all training views"))
-    model = pipeline.model
-    seen = statistics["n_total"] > 0
-    violating = (statistics["eta_max"] > 1).any(dim=1)
-    console.print(
-        f"{path}: {model.num_points} Gaussians after {iterations} iterations. In {len(pipeline.views)} "
-        f"training views {int(seen.sum())} were observed, {int(violating.sum())} with η over 1 in one of them.",
-        soft_wrap=True,
-        highlight=False,
+    model, view = pipeline.model, get_view(pipeline, index, split)
+    progress = partial(track, transient=True)
+    statistics = observe_training_views(
+        pipeline.structure_maps, partial(progress, description="η in all training views")
+    )
+    gradients = screen_gradients(pipeline, partial(progress, description="gradients of all training views"))
+    print(
+        f"{path}: {model.num_points} Gaussians after {iterations} iterations. In {len(pipeline.views)} training views "
+        f"{int((statistics['n_total'] > 0).sum())} were observed, "
+        f"{int((statistics['eta_max'] > 1).any(dim=1).sum())} with η over 1 in one of them."
     )
     folder = output or (path if path.is_dir() else path.parent) / "inspect"
-    prefix = f"{split}-{index:03d}"
-    written = []
-    for name, panel in view_panels(pipeline, view, statistics).items():
-        written.append(folder / f"{prefix}-{name}.png")
-        color_scales.draw(written[-1], [panel])
-    steps = conventional_step(model, gradients), structure_step(model, statistics)
-    written.append(folder / f"{prefix}-step.png")
-    color_scales.draw(written[-1], step_panels(model, view, *steps), columns=2)
-    return written
+    pictures = {name: [panel] for name, panel in view_panels(pipeline, view, statistics).items()}
+    pictures["step"] = step_panels(model, view, conventional_step(model, gradients), structure_step(model, statistics))
+    written = {folder / f"{split}-{index:03d}-{name}.png": panels for name, panels in pictures.items()}
+    for file, panels in written.items():
+        color_scales.draw(file, panels, columns=min(len(panels), 2))
+    return list(written)
