@@ -5,7 +5,6 @@ Every run is a process of its own, so that none inherits another's memory, cache
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import dataclasses
 import importlib
@@ -22,6 +21,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import tyro
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -31,8 +31,9 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from tyro.conf import Positional
 
-from benchmarks import command_lines, gate, protocol, results
+from benchmarks import gate, protocol, results
 from benchmarks.protocol import Job
 from benchmarks.results import Result
 from benchmarks.table import markdown
@@ -44,20 +45,20 @@ TORCHRUN_SECONDS = 40.0
 """The same of a run on several GPUs: torchrun kills its processes, which have sessions of their own, after 30 s."""
 
 COMMANDS = {
-    "report": ("report", "the plots and the page of a results file"),
-    "views": ("view_table", "the PSNR of each held-out view, how far it is from others, and where it collapses"),
-    "documents": ("documents", "the tables of README and docs, and some figures, from the rows of docs/results"),
-    "kernels": ("approximations", "what each shortcut in the frequency analysis gets wrong, beside what it costs"),
-    "step": ("step", "the parts of a training step, with and without our Triton kernels (CUDA)"),
-    "parts": ("parts", "the parts of a training step of a finished run, each by itself (CUDA)"),
-    "growth": ("growth", "a training step of more and more Gaussians, and of larger images, beside gsplat's (CUDA)"),
-    "validation": ("validation", "copies of scenes whose validation views are held out, for choosing constants"),
-    "exposures": ("exposures", "a copy of a scene whose photos have known exposures, for measuring models of colours"),
-    "memory": ("memory", "the memory plan beside the real peaks of training steps (CUDA)"),
-    "shards": ("shards", "a training step of Gaussians that are spread over several devices, with torchrun"),
-    "formats": ("formats", "what the files that sadgs-export writes take and lose, on a run's held-out views"),
+    "table": ("table:Command", "the table of a results file, and plots of quality against time and Gaussians"),
+    "views": ("view_table:Command", "the PSNR of each held-out view, and where it collapses"),
+    "documents": ("documents:Command", "the tables and figures of the documents, from the rows of docs/results"),
+    "approximations": ("approximations:Command", "speed against error of the frequency analysis"),
+    "step": ("step:Compare", "the parts of a training step, with and without our Triton kernels (CUDA)"),
+    "parts": ("step:Parts", "the parts of a training step of a finished run, each by itself (CUDA)"),
+    "growth": ("step:Growth", "a training step of more Gaussians, and of larger images, beside gsplat's (CUDA)"),
+    "memory": ("step:Memory", "the memory plan beside the real peaks of training steps (CUDA)"),
+    "shards": ("step:Together", "a training step of Gaussians that are spread over several devices, with torchrun"),
+    "validation": ("validation:Command", "copies of scenes whose validation views are held out"),
+    "exposures": ("exposures:Command", "a copy of a scene whose photos have known exposures"),
+    "formats": ("formats:Command", "what the files that sadgs-export writes take and lose, on a run's held-out views"),
 }
-"""What `python -m benchmarks` does besides running a protocol, and the module that does it."""
+"""What is done besides running a protocol, and the class that does it."""
 
 Launch = Callable[[Job, "str | None", Path], "subprocess.Popen[bytes]"]
 """Starts a job on a GPU (None: any; "0+1": two) in a folder, where `result.json` and `log` appear."""
@@ -103,12 +104,11 @@ class _Run:
             self.process.wait()
 
 
-def launcher(root: Path, images: Path | None = None) -> Launch:
-    """Starts jobs with `benchmarks.run`, on scenes in a folder, with another for images of held-out views."""
+def launcher(root: Path) -> Launch:
+    """Starts jobs with `benchmarks.run`, on scenes in a folder."""
 
     def launch(job: Job, gpu: str | None, folder: Path) -> subprocess.Popen[bytes]:
-        folders = {"root": str(root), "images": None if images is None else str(images)}
-        spec = json.dumps({**dataclasses.asdict(job), **folders}, default=str)
+        spec = json.dumps({**dataclasses.asdict(job), "root": str(root)}, default=str)
         command = ["-m", "benchmarks.run", "--spec", spec, "--out", str(folder / "result.json")]
         devices = devices_of(gpu)
         if len(devices) > 1:
@@ -212,25 +212,6 @@ def progress_bar(total: int, done: int, **options: Any) -> tuple[Progress, TaskI
     return progress, task
 
 
-def _selected(arguments: argparse.Namespace) -> list[Job]:
-    """The protocol's jobs that are asked for, all checked before the first one runs."""
-    from benchmarks.datasets import runnable
-
-    chosen = protocol.load(arguments.protocol)
-    jobs = chosen.jobs()
-    try:
-        jobs = [job for job in jobs if re.search(arguments.only, f"{job.scene.name}/{job.row.label}/{job.seed}")]
-    except re.error as error:
-        raise ValueError(f"--only {arguments.only!r} is not a regular expression ({error}).") from error
-    if not jobs:
-        raise ValueError(f"--only {arguments.only!r} leaves no run; it is searched for in scene/label/seed.")
-    if arguments.images is not None and arguments.images.exists() and not arguments.images.is_dir():
-        raise ValueError(f"--images {arguments.images} is a file; give a folder.")
-    if arguments.jobs_per_gpu < 1:
-        raise ValueError(f"--jobs-per-gpu must be 1 or more, not {arguments.jobs_per_gpu}.")
-    return runnable(jobs, arguments.scenes, chosen.source, arguments.skip_missing)
-
-
 @contextlib.contextmanager
 def _sigterm_exits() -> Iterator[None]:
     """Meanwhile SIGTERM ends the program by an exception, which also ends the runs."""
@@ -241,99 +222,118 @@ def _sigterm_exits() -> Iterator[None]:
         signal.signal(signal.SIGTERM, previous)
 
 
+@dataclasses.dataclass
+class Benchmark:
+    """Run a benchmark, or what is left of it."""
+
+    protocol: Positional[Path]
+    """YAML file of scenes, rows and seeds"""
+    scenes: Path
+    """folder that holds the scenes"""
+    output: Path
+    """JSON-lines file; runs already in it are skipped"""
+    gpus: str | None = None
+    """such as 0,1 (default: the first visible one); 0+1 trains one splat on both"""
+    jobs_per_gpu: int = 1
+    """times are only comparable with 1"""
+    only: str = ""
+    """regular expression: only runs whose scene/label/seed match"""
+    time_limit: float = float("inf")
+    """seconds after which no run starts"""
+    skip_missing: bool = False
+    """run the scenes that are there"""
+    gate: Path | None = None
+    """baseline in JSON: exit with 1 if results are worse"""
+    update_baseline: Path | None = None
+    """baseline that the results' values are written to"""
+    reference: str | None = None
+    """label of the row whose loop seconds are 1 in the column Ratio"""
+
+    def selected(self) -> list[Job]:
+        """The protocol's jobs that are asked for, all checked before the first one runs."""
+        from benchmarks.datasets import runnable
+
+        chosen = protocol.load(self.protocol)
+        try:
+            jobs = [j for j in chosen.jobs() if re.search(self.only, f"{j.scene.name}/{j.row.label}/{j.seed}")]
+        except re.error as error:
+            raise ValueError(f"--only {self.only!r} is not a regular expression ({error}).") from error
+        if not jobs:
+            raise ValueError(f"--only {self.only!r} leaves no run; it is searched for in scene/label/seed.")
+        if self.jobs_per_gpu < 1:
+            raise ValueError(f"--jobs-per-gpu must be 1 or more, not {self.jobs_per_gpu}.")
+        return runnable(jobs, self.scenes, chosen.source, self.skip_missing)
+
+    def __call__(self) -> int:
+        """Run it; returns 0, 1 if a run failed or the gate found a regression, 130 after an interrupt."""
+        if self.gate is not None and self.update_baseline is not None:
+            raise ValueError("--gate and --update-baseline exclude each other.")
+        for baseline in (self.gate, self.update_baseline):
+            if baseline is not None and (baseline == self.gate or baseline.exists()):
+                gate.read(baseline)  # its errors now rather than after hours
+        jobs = self.selected()
+        gpus = self.gpus.split(",") if self.gpus else (None,)
+        devices = {max(len(devices_of(gpu)), 1) for gpu in gpus}
+        done = results.read(self.output)
+        devices |= {result["devices"] for result in done if result.get("devices") is not None}
+        if len(devices) > 1:
+            raise ValueError(
+                "a file holds runs on equally many devices: give --gpus as many for each run, and another --output "
+                f"than {self.output} if that has runs on others."
+            )
+        todo = unfinished(jobs, done)
+        log = self.output.with_suffix(".log")
+        progress, task = progress_bar(len(jobs), len(jobs) - len(todo), disable=not sys.stdout.isatty())
+        with _sigterm_exits(), progress:
+
+            def finished(result: Result) -> None:
+                results.append(self.output, result)
+                print(line(result), flush=True)
+                progress.advance(task)
+
+            self.output.parent.mkdir(parents=True, exist_ok=True)
+            launch = launcher(self.scenes.resolve())
+            try:
+                left = run_all(todo, launch, finished, log, gpus, self.jobs_per_gpu, self.time_limit)
+            except KeyboardInterrupt:
+                return 130
+        if left:
+            print(f"{left} runs were not started within the time limit; the same command continues.")
+        latest = {result["key"]: result for result in results.read(self.output)}
+        rows = [latest[job.key] for job in jobs if job.key in latest]
+        print(markdown(rows, self.reference))
+        bad = any(row["status"] != "ok" for row in rows)
+        if self.gate is not None:
+            bad |= not gate.judge(self.gate, jobs, rows)
+        if self.update_baseline is not None:
+            try:
+                gate.renew(self.update_baseline, jobs, rows)
+            except ValueError as error:
+                print(f"python -m benchmarks: {error}", file=sys.stderr)
+                bad = True
+        return int(bad)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a benchmark.
+    """Run a protocol, or one of COMMANDS.
 
     Returns:
-        Exit code: 0, 1 if a run failed or the gate found a regression, 2 if the input is wrong, 130 after an interrupt.
+        Exit code: what the command returns, 2 if the input is wrong.
     """
-    argv = sys.argv[1:] if argv is None else argv
-    if argv and argv[0] in COMMANDS:
-        getattr(command_lines, argv[0])().parse_args(
-            argv[1:]
-        )  # It ends with help or an error before the slow imports below.
-        return importlib.import_module(f"benchmarks.{COMMANDS[argv[0]][0]}").main(argv[1:])
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks",
-        description="Run a benchmark, or what is left of it.",
-        epilog="\n".join(
-            ["other commands, each with --help:", *(f"  {n}: {what}" for n, (_, what) in COMMANDS.items())]
-        ),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("protocol", type=Path, help="YAML file of scenes, rows and seeds")
-    parser.add_argument("--scenes", type=Path, required=True, metavar="ROOT", help="folder that holds the scenes")
-    parser.add_argument("--output", type=Path, required=True, help="JSON-lines file; runs already in it are skipped")
-    parser.add_argument(
-        "--gpus", metavar="0,1", help="GPUs to use (default: the first visible one); 0+1 trains one splat on both"
-    )
-    parser.add_argument("--jobs-per-gpu", type=int, default=1, help="times are only comparable with 1, the default")
-    parser.add_argument("--only", default="", metavar="REGEX", help="only runs whose scene/label/seed match")
-    parser.add_argument("--time-limit", type=float, default=float("inf"), metavar="SECONDS", help="then start no run")
-    parser.add_argument("--images", type=Path, metavar="FOLDER", help="write some held-out views of each run as PNG")
-    parser.add_argument("--skip-missing", action="store_true", help="run the scenes that are there")
-    group = parser.add_mutually_exclusive_group()
-    group.add_argument("--gate", type=Path, metavar="BASELINE.json", help="exit with 1 if results are worse than these")
-    group.add_argument("--update-baseline", type=Path, metavar="BASELINE.json", help="write the results' values there")
-    parser.add_argument("--reference", metavar="LABEL", help="row whose loop seconds are 1 in the column Ratio")
-    arguments = parser.parse_args(argv)
+    words = list(sys.argv[1:] if argv is None else argv)
+    name, target, kind = "python -m benchmarks", words[0] if words else "", Benchmark
+    others = "\n".join(f"  {other}: {what}" for other, (_, what) in COMMANDS.items())
+    description = f"{Benchmark.__doc__} Other commands, each with --help:\n\n{others}"
+    if target in COMMANDS:
+        module, _, attribute = COMMANDS[target][0].partition(":")
+        kind, description = getattr(importlib.import_module(f"benchmarks.{module}"), attribute), None
+        name, words = f"{name} {target}", words[1:]
+    command = tyro.cli(kind, prog=name, description=description, args=words, config=(tyro.conf.FlagCreatePairsOff,))
     try:
-        for baseline in (arguments.gate, arguments.update_baseline):
-            if baseline is not None and (baseline == arguments.gate or baseline.exists()):
-                gate.read(baseline)  # its errors now rather than after hours
-        jobs = _selected(arguments)
-    except ValueError as error:
-        print(f"python -m benchmarks: {error}", file=sys.stderr)
+        return command()
+    except (ValueError, OSError) as error:
+        print(f"{name}: {error}", file=sys.stderr)
         return 2
-
-    gpus = arguments.gpus.split(",") if arguments.gpus else (None,)
-    devices = {max(len(devices_of(gpu)), 1) for gpu in gpus}
-    done = results.read(arguments.output)
-    devices |= {result["devices"] for result in done if result.get("devices") is not None}
-    if len(devices) > 1:
-        print(
-            "python -m benchmarks: a file holds runs on equally many devices: give --gpus as many for each run, and "
-            f"another --output than {arguments.output} if that has runs on others.",
-            file=sys.stderr,
-        )
-        return 2
-    todo = unfinished(jobs, done)
-    if arguments.images is not None:
-        keys = {job.key for job in jobs} - {job.key for job in todo}
-        without = sum("images" not in result for result in done if result["key"] in keys)
-        if without:
-            print(f"{without} finished runs have no images; delete their lines to run them again.", flush=True)
-    log = arguments.output.with_suffix(".log")
-    progress, task = progress_bar(len(jobs), len(jobs) - len(todo), disable=not sys.stdout.isatty())
-    with _sigterm_exits(), progress:
-
-        def finished(result: Result) -> None:
-            results.append(arguments.output, result)
-            print(line(result), flush=True)
-            progress.advance(task)
-
-        arguments.output.parent.mkdir(parents=True, exist_ok=True)
-        images = None if arguments.images is None else arguments.images.resolve()
-        launch = launcher(arguments.scenes.resolve(), images)
-        try:
-            left = run_all(todo, launch, finished, log, gpus, arguments.jobs_per_gpu, arguments.time_limit)
-        except KeyboardInterrupt:
-            return 130
-    if left:
-        print(f"{left} runs were not started within the time limit; the same command continues.")
-    latest = {result["key"]: result for result in results.read(arguments.output)}
-    rows = [latest[job.key] for job in jobs if job.key in latest]
-    print(markdown(rows, arguments.reference))
-    bad = any(row["status"] != "ok" for row in rows)
-    if arguments.gate is not None:
-        bad |= not gate.judge(arguments.gate, jobs, rows)
-    if arguments.update_baseline is not None:
-        try:
-            gate.renew(arguments.update_baseline, jobs, rows)
-        except ValueError as error:
-            print(f"python -m benchmarks: {error}", file=sys.stderr)
-            bad = True
-    return int(bad)
 
 
 if __name__ == "__main__":

@@ -1,237 +1,233 @@
-"""`python -m benchmarks kernels`: what each shortcut in the frequency analysis gets wrong, beside what it costs.
+"""`python -m benchmarks approximations`: speed against error of S̄ and of η, against float64 or brute force.
 
-Four tables: how S̄ is computed and stored, how many samples a footprint gets, how often η is observed, and how S̄ reacts
-to image perturbations as in the paper's supplement. Errors are against float64 or brute force; times are medians, on a
-CPU of processor time.
+Two tables: how S̄ is computed and stored, and how many samples a footprint gets. Times are medians, on a CPU of
+processor time, which other processes there do not disturb.
 """
 
 from __future__ import annotations
 
+import math
 import platform
-import sys
-from collections.abc import Callable, Iterator, Sequence
+import statistics
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
+from PIL import Image, UnidentifiedImageError
+from torch import Tensor
 
-from benchmarks import command_lines, results
-from benchmarks.eta_errors import RUNS, demo_training_set, footprint_rows, interval_rows, random_footprints
-from benchmarks.table import grid
-from benchmarks.tensor_errors import AXIS_LENGTHS, Image, Row, batch, robustness_rows, structure_tensor_rows
+from benchmarks import results, table
 from examples.drawn_scene.drawing import render
 from examples.drawn_scene.scene import describe_scene
-from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.method.codes import decode, encode
+from sadgs_ns.method.eta import SCREEN_BLUR, eta, sample_footprint, sample_map, wavelength
+from sadgs_ns.method.statistics import HIGH_ETA
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 
-
-def _number(value: float) -> str:
-    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.2g}"
-
-
-def _percent(value: float) -> str:
-    return f"{_number(100 * value)} %"
-
-
-@dataclass(frozen=True)
-class Table:
-    """How rows are printed."""
-
-    title: str
-    note: str
-    """What the numbers mean."""
-    columns: dict[str, tuple[str, Callable[[Any], str]]]
-    """Header and format of each number."""
+AXIS_LENGTHS = (3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)
+"""Axes ‖v‖ in px whose η > 1 decision is compared at every pixel; c = 0.4 has no wavelength under 2.5 px."""
+SAMPLES, QUADRATURE_POINTS = (1, 4, 16), 1024
+"""Of a footprint, and of its exact average."""
+Row = dict[str, Any]
+"""`table`, `variant`, and the numbers of that table's columns."""
 
 
-_LENGTHS = ", ".join(f"{length:g}" for length in AXIS_LENGTHS)
-TABLES = {
-    "structure_tensor": Table(
-        "S̄ and Λ: computing and storing",
-        "Λ: |Λ / Λ_ref − 1| over the pixels. Flips: pixels × axes of "
-        f"{_LENGTHS} px on the other side of η = 1. Rows that say *alone* are held against float64 with the kernels as "
-        "shipped, the others against the reference. The time of storage is that of encoding.",
-        {
-            "bytes": ("Bytes/px", str),
-            "median": ("Λ, median", _percent),
-            "p95": ("Λ, 95 %", _percent),
-            "max": ("Λ, max", _percent),
-            "flips": ("η > 1 flips", _percent),
-            "ms": ("ms an image", _number),
-        },
-    ),
-    "footprint": Table(
-        "η: samples in a footprint",
-        "η: |η / η_ref − 1| over random footprints of 1 to 32 px. Flips: axes on the other side of η = 1.",
-        {
-            "median": ("η, median", _percent),
-            "p95": ("η, 95 %", _percent),
-            "max": ("η, max", _percent),
-            "flips": ("η > 1 flips", _percent),
-            "ms": ("ms a view", _number),
-        },
-    ),
-    "interval": Table(
-        "η: every k-th iteration",
-        "Ratio: |Δ N_high / N_total| over the axes, in [0, 1]. Flips: axes whose decision to split changes. The last "
-        f"row is what chance alone changes. Means over {RUNS} runs.",
-        {
-            "mean": ("Ratio, mean", _number),
-            "p95": ("Ratio, 95 %", _number),
-            "max": ("Ratio, max", _number),
-            "flips": ("Axes that flip", _percent),
-            "splits": ("Gaussians split otherwise", _percent),
-            "growth": ("Gaussians afterwards", _percent),
-            "ms": ("ms an iteration", _number),
-        },
-    ),
-    "robustness": Table(
-        "Robustness of S̄",
-        "Change of S̄: mean ‖ΔS̄‖ over mean ‖S̄‖; the paper's is from its supplement, on its own images. "
-        "Λ and flips as above.",
-        {
-            "change": ("Change of S̄", _percent),
-            "paper": ("Paper", _percent),
-            "median": ("Λ, median", _percent),
-            "p95": ("Λ, 95 %", _percent),
-            "flips": ("η > 1 flips", _percent),
-        },
-    ),
-}
+def timed(function: Callable[[], Any], device: torch.device, repeats: int) -> tuple[Any, float]:
+    """What a function returns, and the median milliseconds of `repeats` calls after a first one."""
+    clock = time.perf_counter if device.type == "cuda" else time.process_time
+    synchronize = torch.cuda.synchronize if device.type == "cuda" else lambda: None
+    result, seconds = function(), []
+    for _ in range(repeats):
+        synchronize()
+        start = clock()
+        function()
+        synchronize()
+        seconds.append(clock() - start)
+    return result, 1e3 * statistics.median(seconds)
 
 
-def markdown(rows: Sequence[Row]) -> str:
-    """One table's rows as a titled Markdown table; what is None is a dash."""
-    table = TABLES[rows[0]["table"]]
-    return f"### {table.title}\n\n{table.note}\n\n{body(rows)}"
+def spread(errors: Tensor) -> Row:
+    """Median, 95th percentile and maximum of errors ≥ 0 of any shape."""
+    ordered = errors.flatten().sort().values  # torch.quantile refuses more than 16 M values
+    quantiles = {"median": 0.5, "p95": 0.95, "max": 1.0}
+    return {name: float(ordered[round((len(ordered) - 1) * quantile)]) for name, quantile in quantiles.items()}
 
 
-def body(rows: Sequence[Row]) -> str:
-    """As `markdown`, without title and note."""
-    columns = TABLES[rows[0]["table"]].columns
-    header = ("Variant", *(header for header, _ in columns.values()))
-    lines = (
-        (row["variant"], *("–" if row[name] is None else form(row[name]) for name, (_, form) in columns.items()))
-        for row in rows
-    )
-    return grid(header, lines)
+def map_errors(tensor: Tensor, reference: Tensor) -> Row:
+    """Errors |Λ / Λ_ref − 1| of the wavelength over the pixels of S̄, both [B, H, W, 3], and `flips`, the share of
+    pixels × AXIS_LENGTHS on the other side of η = 1."""
+    actual, expected = wavelength(tensor.double()), wavelength(reference.double())  # [B, H, W]
+    lengths = torch.tensor(AXIS_LENGTHS, dtype=actual.dtype, device=actual.device).view(-1, 1, 1, 1)
+    flips = ((lengths / actual > HIGH_ETA) != (lengths / expected > HIGH_ETA)).double().mean()
+    return {**spread((actual / expected - 1).abs()), "flips": float(flips)}
+
+
+def structure_tensor_rows(images: Tensor, repeats: int) -> Iterator[Row]:
+    """How S̄ of images, float32 in [0, 1] [B, H, W, 3], is computed and stored; all against float64."""
+    measure = partial(timed, device=images.device, repeats=repeats)
+    reference, ms = measure(lambda: multiscale_structure_tensor(images.double()))
+    single = reference.float()
+    variants: dict[str, tuple[Callable[[], Tensor], Callable[[Tensor], Tensor], int]] = {
+        "as shipped: float32, stored in 8 bits": (lambda: encode(multiscale_structure_tensor(images)), decode, 3),
+        "precision alone: float32": (lambda: multiscale_structure_tensor(images), lambda code: code, 12),
+        "storage alone: float16": (single.half, lambda code: code, 6),
+        "storage alone: 8 bits": (lambda: encode(single), decode, 3),
+    }
+    made = {"reference: float64": (reference, ms, lambda code: code, 24)}
+    made |= {name: (*measure(store), read, size) for name, (store, read, size) in variants.items()}
+    for name, (code, ms, read, size) in made.items():
+        row = {"table": "structure_tensor", "variant": name, "bytes": size, **map_errors(read(code), reference)}
+        yield {**row, "ms": ms / len(images)}
 
 
 @dataclass(frozen=True)
-class Workload:
-    """How much is measured; the tests measure less."""
+class Footprints:
+    """M projected Gaussians."""
 
-    repeats: int = command_lines.KERNEL_REPEATS
-    longest_side: int | None = None
-    """px; None is 1600 for a photo and 320 for the demo's images."""
-    gaussians: int = command_lines.KERNEL_GAUSSIANS
-    views: int = 24
-    """Of the demo scene."""
-    analysed_views: int = 2
-    """So many of the demo's images stand in for a photo."""
-    iterations: int = StructureAwareStrategy().windows.structure_every
-    """Between two structure steps."""
+    image_ids: Tensor
+    """Which image. int64 [M]"""
+    means2d: Tensor
+    """px. [M, 2]"""
+    axes: Tensor
+    """Principal axes of Σ2D, their lengths the standard deviations in px, axis before component. [M, 2, 2]"""
+
+    @property
+    def conics(self) -> Tensor:
+        """(a, b, c) of the inverse of Σ2D + SCREEN_BLUR·I in 1/px², as gsplat's. [M, 3]"""
+        axes = self.axes.double()
+        covariances = axes.mT @ axes + SCREEN_BLUR * torch.eye(2, dtype=torch.float64, device=axes.device)
+        return torch.linalg.inv(covariances).flatten(1)[:, [0, 1, 3]].to(self.axes)
 
 
-def find_device(name: str) -> torch.device:
-    """The device of a name.
+def random_footprints(count: int, images: Tensor, seed: int = 0) -> Footprints:
+    """Footprints anywhere in images [B, H, W, C], of 1 to 32 px along the major axis, up to 8 times less along the
+    minor one."""
+    generator = torch.Generator().manual_seed(seed)
+    batch, height, width = images.shape[:3]
+    x, y, size, ratio, turn, image = torch.rand((6, count), generator=generator)
+    major = 32.0**size  # log-uniform
+    minor = major * 8.0**-ratio
+    cos, sin = (math.pi * turn).cos(), (math.pi * turn).sin()
+    axes = torch.stack([major * cos, major * sin, -minor * sin, minor * cos], -1).view(count, 2, 2)
+    parts = (image * batch).long(), torch.stack([x * width, y * height], -1), axes
+    return Footprints(*(part.to(images.device) for part in parts))
 
-    Raises:
-        ValueError: If there is none, or it lacks float64.
+
+def average(tensors: Tensor, footprints: Footprints, positions: Iterator[Tensor]) -> tuple[Tensor, Tensor]:
+    """S̄ [B, H, W, 3] averaged over points of each footprint, of those that lie in the image.
+
+    Args:
+        positions: A point of each footprint in px, as often as there are points. [M, 2]
+
+    Returns:
+        The averages, 0 outside [M, 3], and whether any point lies in the image. bool [M]
     """
-    try:
-        device = torch.device(name)
-        if device.type not in ("cpu", "cuda"):
-            raise RuntimeError("only cpu and cuda compute in float64")
-        torch.zeros(1, device=device)
-    except (RuntimeError, AssertionError) as error:  # a torch without CUDA asserts
-        reason = str(error).splitlines()[0].rstrip(".")
-        raise ValueError(f"--device {name!r} cannot be used ({reason}); give cpu, cuda or cuda:N.") from error
-    return device
+    total, count = tensors.new_zeros((len(footprints.means2d), 3)), tensors.new_zeros(len(footprints.means2d))
+    for points in positions:
+        values, inside = sample_map(tensors, footprints.image_ids, points)
+        total += values
+        count += inside
+    return total / count.clamp_min(1)[:, None], count > 0
 
 
-def read_image(path: Path, longest_side: int) -> Image:
-    """A photo as RGB, reduced so that no side exceeds `longest_side` px. [H, W, 3]
+def quadrature(footprints: Footprints) -> Iterator[Tensor]:
+    """The points of a sunflower spiral that covers each 2σ ellipse evenly. [M, 2] each"""
+    for i in range(QUADRATURE_POINTS):
+        radius, angle = 2 * math.sqrt((i + 0.5) / QUADRATURE_POINTS), i * (math.pi * (3 - math.sqrt(5)))
+        disc = torch.tensor([radius * math.cos(angle), radius * math.sin(angle)]).to(footprints.axes)
+        yield footprints.means2d + disc @ footprints.axes
+
+
+def footprint_rows(tensors: Tensor, footprints: Footprints, repeats: int) -> Iterator[Row]:
+    """η by few jittered samples, of which training takes one, against η by the exact average of S̄ [B, H, W, 3]."""
+    conics, generator = footprints.conics, torch.Generator(tensors.device).manual_seed(0)
+
+    def observed(points: Callable[[], Iterator[Tensor]]) -> tuple[Tensor, Tensor]:
+        tensor, seen = average(tensors, footprints, points())
+        return eta(footprints.axes, tensor), seen
+
+    def jittered(samples: int) -> Iterator[Tensor]:
+        for _ in range(samples):
+            jitter = torch.rand(footprints.means2d.shape, generator=generator, device=conics.device)
+            yield sample_footprint(footprints.means2d, conics, jitter)
+
+    ways = {f"reference: {QUADRATURE_POINTS} points of quadrature": partial(quadrature, footprints)}
+    ways |= {f"{samples} sample{'s' * (samples > 1)}": partial(jittered, samples) for samples in SAMPLES}
+    measured = {name: timed(partial(observed, way), tensors.device, repeats) for name, way in ways.items()}
+    (expected, expected_seen), _ = next(iter(measured.values()))
+    for name, ((actual, seen), ms) in measured.items():
+        both = seen & expected_seen
+        errors = spread((actual[both, 0] / expected[both, 0] - 1).abs())  # the same for both axes
+        flips = float(((actual > HIGH_ETA) != (expected > HIGH_ETA))[both].double().mean())
+        yield {"table": "footprint", "variant": name, **errors, "flips": flips, "ms": ms}
+
+
+@dataclass
+class Command:
+    """Tabulate what each shortcut in the frequency analysis gets wrong, beside what it costs."""
+
+    image: Path | None = None
+    """a photo (default: images of the drawn scene)"""
+    device: str = "cpu"
+    """cpu, cuda or cuda:N"""
+    repeats: int = 5
+    """timed calls"""
+    gaussians: int = 5000
+    """whose footprints η is sampled in"""
+    width: int = 320
+    """of the drawn scene's images, in px"""
+    output: Path | None = None
+    """JSON-lines file that the rows are added to"""
+
+    def __call__(self) -> int:
+        for name, least in (("repeats", 1), ("gaussians", 10), ("width", 32)):
+            if getattr(self, name) < least:
+                raise ValueError(f"--{name} is {getattr(self, name)}; give at least {least}.")
+        try:
+            device = torch.zeros(1, dtype=torch.float64, device=self.device).device
+        except (RuntimeError, AssertionError, TypeError) as error:  # a torch without CUDA asserts
+            told = str(error).splitlines()[0].rstrip(".")
+            raise ValueError(f"--device {self.device!r} cannot be used ({told}); give cpu, cuda or cuda:N.") from error
+        images = (drawn(self.width) if self.image is None else read_photo(self.image)).to(device)
+        footprints = random_footprints(self.gaussians, images)
+        processor = f"CPU ({platform.machine()}, {torch.get_num_threads()} threads)"
+        where = torch.cuda.get_device_name(device) if device.type == "cuda" else processor
+        source = "demo" if self.image is None else self.image.name
+        print(f"{source} on {where}, torch {torch.__version__}, median of {self.repeats} calls\n", flush=True)
+        for rows in (
+            structure_tensor_rows(images, self.repeats),
+            footprint_rows(multiscale_structure_tensor(images), footprints, self.repeats),
+        ):
+            measured = list(rows)
+            print(table.of_approximations(measured), end="\n\n", flush=True)
+            if self.output is not None:
+                common = {"input": source, "device": where, "torch": torch.__version__, "repeats": self.repeats}
+                for row in measured:
+                    key = "/".join((where, source, row["table"], row["variant"]))
+                    results.append(self.output, {"key": key, **common, **row})
+        return 0
+
+
+def drawn(width: int) -> Tensor:
+    """Two views of the drawn scene in [0, 1]. [2, H, W, 3]"""
+    scene = describe_scene(width, width * 3 // 4, 9)
+    return torch.from_numpy(np.stack([render(scene.surfaces, view) for view in scene.views[:2]])).float() / 255
+
+
+def read_photo(path: Path) -> Tensor:
+    """A photo as RGB in [0, 1], reduced so that no side exceeds 1,600 px. [1, H, W, 3]
 
     Raises:
         ValueError: If it cannot be read.
     """
     try:
-        bgr = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
-    except (OSError, cv2.error):
-        bgr = None
-    if bgr is None:
-        raise ValueError(f"--image {path} cannot be read as an image; give a JPEG or PNG file.")
-    height, width = bgr.shape[:2]
-    factor = longest_side / max(height, width)
-    if factor < 1:
-        size = (max(round(factor * width), 1), max(round(factor * height), 1))
-        bgr = cv2.resize(bgr, size, interpolation=cv2.INTER_AREA)
-    return np.ascontiguousarray(bgr[..., ::-1], dtype=np.uint8)
-
-
-def measure(device: torch.device, photo: Image | None, workload: Workload) -> Iterator[list[Row]]:
-    """Everything, one table at a time.
-
-    Args:
-        device: Where it is measured.
-        photo: RGB [H, W, 3], or None for the demo's images. η over iterations needs posed views: always the demo's.
-        workload: How much.
-    """
-    width = workload.longest_side or 320
-    if photo is not None:
-        width = min(width, 320)
-    scene = describe_scene(width, width * 3 // 4, workload.views, workload.gaussians)
-    drawn = [render(scene.surfaces, view) for view in scene.views]
-    analysed = drawn[: workload.analysed_views] if photo is None else [photo]
-    images = batch(analysed, device)
-    yield list(structure_tensor_rows(images, workload.repeats))
-    footprints = random_footprints(workload.gaussians, images)
-    yield list(footprint_rows(multiscale_structure_tensor(images), footprints, workload.repeats))
-    training = demo_training_set(scene, batch(drawn, torch.device("cpu")), device)
-    yield list(interval_rows(training, workload.iterations, workload.repeats))
-    yield list(robustness_rows(analysed, device))
-
-
-def _device_name(device: torch.device) -> str:
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    return f"CPU ({platform.machine()}, {torch.get_num_threads()} threads)"
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Print the tables; returns the exit code, 2 if the input is wrong."""
-    given = command_lines.kernels().parse_args(argv)
-    try:
-        for name, value, least in (("repeats", given.repeats, 1), ("gaussians", given.gaussians, 10),
-                                   ("longest-side", given.longest_side, 32)):  # fmt: skip
-            if value is not None and value < least:
-                raise ValueError(f"--{name} is {value}; give at least {least}.")
-        if given.output is not None and given.output.is_dir():
-            raise ValueError(f"--output {given.output} is a folder; name a file.")
-        device = find_device(given.device)
-        photo = None if given.image is None else read_image(given.image, given.longest_side or 1600)
-    except ValueError as error:
-        print(f"python -m benchmarks kernels: {error}", file=sys.stderr)
-        return 2
-
-    workload = Workload(given.repeats, given.longest_side, given.gaussians)
-    where, source = _device_name(device), "demo" if given.image is None else given.image.name
-    print(f"{source} on {where}, torch {torch.__version__}, median of {workload.repeats} calls\n", flush=True)
-    rows: list[Row] = []
-    for table in measure(device, photo, workload):
-        print(markdown(table), end="\n\n", flush=True)
-        rows += table
-    if given.output is not None:
-        common = {"input": source, "device": where, "torch": torch.__version__, "repeats": workload.repeats}
-        for row in rows:
-            key = "/".join((where, source, row["table"], row["variant"]))
-            results.append(given.output, {"key": key, **common, **row})
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        with Image.open(path) as image:
+            image.thumbnail((1600, 1600), Image.Resampling.BOX)
+            return torch.from_numpy(np.asarray(image.convert("RGB"), np.float32) / 255)[None]
+    except (OSError, UnidentifiedImageError) as error:
+        raise ValueError(f"--image {path} cannot be read as an image; give a JPEG or PNG file.") from error

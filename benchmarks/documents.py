@@ -14,75 +14,137 @@ A table stands between `<!-- table: NAME -->` and `<!-- end -->`. What it is mad
         rows: [sweep.jsonl]
         labels: {T1: × 1, T2: × 2}
         scenes: {fox: [fox], castle: [castle, castle-2]}   # a column each, of the mean of these scenes
-      storage: {kind: approximations, rows: approximations.jsonl, table: structure_tensor, input: demo}
+      storage: {kind: approximations, rows: approximations.jsonl, of: structure_tensor, input: demo}
       growth: {kind: growth, rows: growth.csv}
-    figures:
-      peers-time:               # docs/figures/peers-time.png, quality against the field `cost`, a run a point
+    figures:                    # docs/figures/NAME.png
+      peers-time:               # quality against the field `cost`, a run a point
+        kind: peers
         cost: loop_seconds
-        parts: [{rows: peers.jsonl, scenes: [fox], labels: {splatfacto: splatfacto}}]
+        lines: [{rows: peers.jsonl, scenes: [fox], labels: {splatfacto: splatfacto}}]
         elsewhere: [{rows: ours.jsonl, scenes: [fox], labels: {ours: sadgs}}]
+      quality-time: {kind: quality, cost: loop_seconds, rows: beside.jsonl}
+      growth: {kind: growth, rows: growth.csv}
 
 Labels are those of the rows, with the name that the table gives them, or the figure, where names of one method begin
-with the same word. A figure holds the points that it was drawn from, which are compared, since pixels depend on
+with the same word. A figure holds a digest of what it was drawn from, which is compared, since pixels depend on
 matplotlib's version.
 """
 
 from __future__ import annotations
 
-import dataclasses
+import hashlib
+import inspect
+import json
 import re
-import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import yaml
+from tyro.conf import Positional
 
-from benchmarks import command_lines, plots
-from benchmarks.document_tables import KINDS, RESULTS, Figure, Table, described
+from benchmarks import table
+from benchmarks.table import Run
 from sadgs_ns.atomic import atomic_path
 
-FIGURES = Path("docs", "figures")
-"""Folder of the figures, in a checkout."""
-TABLES = "tables.yaml"
+RESULTS, FIGURES, TABLES = Path("docs", "results"), Path("docs", "figures"), "tables.yaml"
+"""Folders of the rows and of the figures in a checkout, and the name of the description among the rows."""
 _MARKED = re.compile(r"^<!-- table: (\S+) -->\n(.*?)^<!-- end -->$", re.MULTILINE | re.DOTALL)
 _OPENED = re.compile(r"^<!-- (?:table: \S+|end) -->$", re.MULTILINE)
 
 
-@dataclass(frozen=True)
-class Catalogue:
-    """What tables.yaml holds."""
+@dataclass
+class Source:
+    """The rows of a folder, and the tables and the data of figures that are made of them."""
 
+    folder: Path
     megapixels: Mapping[str, float]
     """Of an image of each scene."""
-    tables: Mapping[str, Table]
-    figures: Mapping[str, Figure] = dataclasses.field(default_factory=dict)
+    cited: set[str] = field(default_factory=lambda: {TABLES})
+    """Names of the files that were read."""
+
+    def read(self, *names: str) -> list[dict[str, Any]]:
+        """The rows of files in the folder."""
+        self.cited |= {*names}
+        return [row for name in names for row in table.read_rows(self.folder / name)]
+
+    def lines(
+        self, rows: str, scenes: Sequence[str], labels: Mapping[str, str], reference: str | None = None
+    ) -> list[Run]:
+        """Of each scene a run for each label; `reference` is the label whose loop seconds there are 1."""
+        found, runs = table.groups(self.read(rows)), []
+        for scene in scenes:
+            base = [] if reference is None else table.group_of(found, scene, reference)
+            for label, name in labels.items():
+                runs.append(Run(scene, name, table.group_of(found, scene, label), base, self.megapixels.get(scene)))
+        return runs
+
+    def runs(self, columns: Sequence[str], lines: Sequence[Mapping[str, Any]]) -> str:
+        """A run a line."""
+        return table.of_runs((run for line in lines for run in self.lines(**line)), columns)
+
+    def sweep(self, rows: Sequence[str], labels: Mapping[str, str], scenes: Mapping[str, Sequence[str]]) -> str:
+        """A setting a line."""
+        return table.of_sweep(table.groups(self.read(*rows)), labels, scenes)
+
+    def approximations(self, rows: str, of: str, input: str, variants: Sequence[str] | None = None) -> str:
+        """What `approximations` measured in an image, of some variants or of all."""
+        found = {r["variant"]: r for r in self.read(rows) if (r["table"], r["input"]) == (of, input)}
+        names = list(found) if variants is None else variants
+        if not names or not found.keys() >= {*names}:
+            raise ValueError(f"{rows} has of {of!r} and {input!r} only {', '.join(found)}.")
+        return table.of_approximations([found[name] for name in names])
+
+    def growth(self, rows: str) -> str:
+        """What `growth` measured."""
+        return table.of_growth(self.read(rows))
+
+    def peers_drawn(
+        self, cost: str, lines: Sequence[Mapping[str, Any]], elsewhere: Sequence[Mapping[str, Any]] = ()
+    ) -> list[Any]:
+        """Arguments of `plots.peers`."""
+        runs = [(run, here) for here, parts in ((True, lines), (False, elsewhere)) for line in parts
+                for run in self.lines(**line)]  # fmt: skip
+        return [[(run.name, here, *map(run.mean, (cost, "psnr", "lpips"))) for run, here in runs], cost]
+
+    def quality_drawn(self, rows: str, cost: str) -> list[Any]:
+        """Arguments of `plots.quality`."""
+        return [list(table.groups(self.read(rows)).items()), cost]
+
+    def growth_drawn(self, rows: str) -> list[Any]:
+        """Arguments of `plots.growth`."""
+        return [self.read(rows)]
 
 
-def read_catalogue(path: Path) -> Catalogue:
-    """Read tables.yaml.
+KINDS: dict[str, dict[str, Callable[..., Any]]] = {
+    "table": {"runs": Source.runs, "sweep": Source.sweep, "approximations": Source.approximations,
+              "growth": Source.growth},
+    "figure": {"peers": Source.peers_drawn, "quality": Source.quality_drawn, "growth": Source.growth_drawn},
+}  # fmt: skip
+
+
+def made(source: Source, what: str, name: str, description: Any) -> Any:
+    """What one of KINDS gives for a description in tables.yaml.
 
     Raises:
-        ValueError: It cannot be read, or is not what this module's docstring shows.
+        ValueError: The description is wrong, or a row lacks what it names; one sentence.
     """
     try:
-        content = yaml.safe_load(path.read_text("utf-8"))
-        tables = {}
-        for name, table in described(Catalogue, content).tables.items():
-            kind = table.pop("kind", None)
-            if kind not in KINDS:
-                raise ValueError(f"table {name}: kind is {kind!r}; give one of {', '.join(KINDS)}.")
-            tables[name] = described(KINDS[kind], table)
-        figures = {name: described(Figure, figure) for name, figure in content.get("figures", {}).items()}
-        return Catalogue(content["megapixels"], tables, figures)
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read ({error.strerror}); give the folder of a checkout.") from error
-    except (AttributeError, TypeError) as error:
-        raise ValueError(f"{path}: tables must be a mapping of names to mappings.") from error
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path} is not YAML: {' '.join(str(error).split())}.") from error
+        if not isinstance(description, dict) or description.get("kind") not in KINDS[what]:
+            raise ValueError(f"{description!r} must be a mapping whose kind is one of {', '.join(KINDS[what])}.")
+        function, options = KINDS[what][description["kind"]], {k: v for k, v in description.items() if k != "kind"}
+        signature = inspect.signature(function)
+        try:
+            signature.bind(source, **options)
+        except TypeError as error:
+            names = ", ".join([*signature.parameters][1:])
+            raise ValueError(f"{options!r} must be a mapping of {names}.") from error
+        return function(source, **options)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise ValueError(f"{what} {name}: {error}") from error
+    except (AttributeError, KeyError, TypeError) as error:
+        raise ValueError(f"{what} {name}: its description or rows are not as expected ({error}).") from error
 
 
 def write(checkout: Path, check: bool = False) -> list[str]:
@@ -99,78 +161,68 @@ def write(checkout: Path, check: bool = False) -> list[str]:
         ValueError: A table without description, rows or end, a description without a table, or rows that no table has.
         WriteError: If a document cannot be written.
     """
+    from benchmarks import plots
+
     folder = checkout / RESULTS
-    catalogue = read_catalogue(folder / TABLES)
-    documents = [path for path in (checkout / "README.md", *sorted((checkout / "docs").glob("*.md"))) if path.exists()]
+    try:
+        content = yaml.safe_load((folder / TABLES).read_text("utf-8"))
+        tables, figures = dict(content["tables"]), dict(content.get("figures", {}))
+        source = Source(folder, content["megapixels"])
+    except OSError as error:
+        raise ValueError(
+            f"{folder / TABLES} cannot be read ({error.strerror}); give the folder of a checkout."
+        ) from error
+    except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError) as error:
+        told = " ".join(str(error).split())
+        raise ValueError(
+            f"{folder / TABLES} must be YAML with megapixels and tables, both mappings: {told}."
+        ) from error
+
+    new = {name: f"\n{made(source, 'table', name, description)}\n\n" for name, description in tables.items()}
+    drawn = {name: made(source, "figure", name, description) for name, description in figures.items()}
+    if spare := {path.name for path in folder.iterdir()} - source.cited:
+        raise ValueError(f"{folder}: no table is made of {', '.join(sorted(spare))}; delete what none needs.")
     texts, changed, used = {}, [], set()
-    for path in documents:
+    for path in (path for path in (checkout / "README.md", *sorted((checkout / "docs").glob("*.md"))) if path.exists()):
         text = path.read_text("utf-8")
         if len(_OPENED.findall(text)) != 2 * len(_MARKED.findall(text)):
             raise ValueError(f"{path}: each `<!-- table: NAME -->` needs one `<!-- end -->` after it.")
-
-        def replaced(match: re.Match[str], path: Path = path) -> str:
-            name = match[1]
-            if name not in catalogue.tables:
+        for name, old in _MARKED.findall(text):
+            if name not in tables:
                 raise ValueError(f"{path}: table {name} is not in {folder / TABLES}.")
             used.add(name)
-            try:
-                new = f"\n{catalogue.tables[name].text(folder, catalogue.megapixels)}\n\n"
-            except ValueError as error:
-                raise ValueError(f"{path}: table {name}: {error}") from error
-            except (AttributeError, KeyError, TypeError) as error:
-                raise ValueError(
-                    f"{path}: table {name}: its description or rows are not as expected ({error!r})."
-                ) from error
-            if new != match[2]:
-                changed.append(f"{path}: table {name}")
-            return f"<!-- table: {name} -->\n{new}<!-- end -->"
-
-        texts[path] = _MARKED.sub(replaced, text)
-    if spare := catalogue.tables.keys() - used:
+            changed += [f"{path}: table {name}"] if new[name] != old else []
+        texts[path] = _MARKED.sub(lambda match: f"<!-- table: {match[1]} -->\n{new[match[1]]}<!-- end -->", text)
+    if spare := tables.keys() - used:
         raise ValueError(f"{folder / TABLES}: no document holds {', '.join(sorted(spare))}; delete what none needs.")
-    drawn = {}
-    for name, figure in catalogue.figures.items():
+    stale = {}
+    for name, arguments in drawn.items():
         path = checkout / FIGURES / f"{name}.png"
-        try:
-            points = figure.points(folder)
-            if plots.drawn_points(path) != plots.as_text(figure.cost, points):
-                drawn[path] = (figure.cost, points)
-        except (ValueError, AttributeError, KeyError, TypeError) as error:
-            raise ValueError(f"{folder / TABLES}: figure {name}: {error}") from error
-    made = (*catalogue.tables.values(), *catalogue.figures.values())
-    cited = {TABLES, *(file for one in made for file in one.files())}
-    if spare := {path.name for path in folder.iterdir()} - cited:
-        raise ValueError(f"{folder}: no table is made of {', '.join(sorted(spare))}; delete what none needs.")
+        if plots.digest_in(path) != (digest := hashlib.sha256(json.dumps(arguments).encode()).hexdigest()):
+            stale[path] = (figures[name]["kind"], arguments, digest)
     for path, text in {} if check else texts.items():
         if text != path.read_text("utf-8"):
             with atomic_path(path) as partial:
                 partial.write_text(text, "utf-8")
-    for path, (cost, points) in {} if check else drawn.items():
+    for path, (kind, arguments, digest) in {} if check else stale.items():
         with atomic_path(path) as partial:
-            plots.save_peers(cost, points, partial)
-    return [*changed, *map(str, drawn)]
+            plots.save(getattr(plots, kind)(*arguments), partial, digest)
+    return [*changed, *map(str, stale)]
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Write the tables, or check them.
+@dataclass
+class Command:
+    """Write the tables that stand between `<!-- table: NAME -->` and `<!-- end -->` in README.md and docs/*.md, and
+    figures, as docs/results/tables.yaml describes them, from the rows in docs/results."""
 
-    Returns:
-        Exit code: 0, 1 if `--check` found a table that is not what its rows give, 2 if the input is wrong.
-    """
-    given = command_lines.documents().parse_args(argv)
-    try:
-        changed = write(given.checkout, given.check)
-    except (ValueError, OSError) as error:
-        print(f"python -m benchmarks documents: {error}", file=sys.stderr)
-        return 2
-    for name in changed:
-        print(
-            f"{name} is not what its rows give; run python -m benchmarks documents."
-            if given.check
-            else f"{name} is written."
-        )
-    return int(given.check and bool(changed))
+    checkout: Positional[Path] = Path()
+    """folder of README.md and docs"""
+    check: bool = False
+    """write nothing; exit with 1 if one is not as its rows"""
 
-
-if __name__ == "__main__":
-    sys.exit(main())
+    def __call__(self) -> int:
+        changed = write(self.checkout, self.check)
+        remedy = "is not what its rows give; run python -m benchmarks documents." if self.check else "is written."
+        for name in changed:
+            print(f"{name} {remedy}")
+        return int(self.check and bool(changed))

@@ -14,8 +14,7 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
-from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +22,8 @@ import numpy as np
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from numpy.typing import NDArray
 from PIL import Image
+from tyro.conf import Positional
 
-from benchmarks import command_lines
 from benchmarks.datasets import image_names
 from benchmarks.validation import INTERVAL, SPARSE, TEST, VALIDATION
 
@@ -106,25 +105,36 @@ def write_scene(
     return written
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Write a copy and print its gains' range; returns the exit code, 2 where the scene or an option is wrong."""
-    given = command_lines.exposures().parse_args(argv)
-    largest = (1 + given.white_balance) ** -1 * given.spread**-0.5
-    mean = largest if given.mean is None else given.mean
-    problem = None
-    if not (given.scene / SPARSE).is_dir():
-        problem = f"{given.scene} holds no {SPARSE}; give the folder of a COLMAP scene."
-    elif given.out.exists() and not (given.out / FILE).exists():
-        problem = f"{given.out} is there and holds no {FILE}, so that it is no earlier copy; give another folder."
-    elif not (given.spread >= 1 and 0 <= given.white_balance < 1 and 0 < mean <= 1):
-        problem = "--spread must be at least 1, --white-balance in [0, 1), and --mean in (0, 1]."
-    if problem is not None:
-        print(f"python -m benchmarks exposures: {problem}", file=sys.stderr)
-        return 2
-    written = write_scene(given.scene, given.out, given.spread, given.white_balance, mean, given.seed)
-    gains = [photo["gain"] for photo in written.values() if not photo["held_out"]]
-    print(
-        f"{given.out}: gains of {len(gains)} training photos from {min(gains):.3f} to {max(gains):.3f}, "
-        f"of {len(written) - len(gains)} held-out ones {mean:.3f}"
-    )
-    return 0
+@dataclass
+class Command:
+    """Copy a COLMAP scene, with known exposures of its training photos."""
+
+    scene: Positional[Path]
+    """folder of a COLMAP scene"""
+    out: Positional[Path]
+    """folder for the copy"""
+    spread: float = 4.0
+    """largest gain over the smallest"""
+    white_balance: float = 0.1
+    """largest change of a channel, a share"""
+    mean: float | None = None
+    """geometric mean of the gains (default: the largest at which nothing saturates)"""
+    seed: int = 0
+    """which photo gets which gain"""
+
+    def __call__(self) -> int:
+        largest = (1 + self.white_balance) ** -1 * max(self.spread, 1e-9) ** -0.5
+        mean = largest if self.mean is None else self.mean
+        if not (self.scene / SPARSE).is_dir():
+            raise ValueError(f"{self.scene} holds no {SPARSE}; give the folder of a COLMAP scene.")
+        if self.out.exists() and not (self.out / FILE).exists():
+            raise ValueError(f"{self.out} is there and holds no {FILE}, so it is no earlier copy; give another folder.")
+        if not (self.spread >= 1 and 0 <= self.white_balance < 1 and 0 < mean <= 1):
+            raise ValueError("--spread must be at least 1, --white-balance in [0, 1), and --mean in (0, 1].")
+        written = write_scene(self.scene, self.out, self.spread, self.white_balance, mean, self.seed)
+        gains = [photo["gain"] for photo in written.values() if not photo["held_out"]]
+        print(
+            f"{self.out}: gains of {len(gains)} training photos from {min(gains):.3f} to {max(gains):.3f}, "
+            f"of {len(written) - len(gains)} held-out ones {mean:.3f}"
+        )
+        return 0

@@ -7,15 +7,20 @@ and prints sizes and PSNRs as a markdown table. glTF loses nothing, and a page h
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import gsply
 import numpy as np
 import torch
+from gsply.sog_reader import sogread
+from gsply.spz import read_spz
 from PIL import Image
 from torch import Tensor
+from tyro.conf import Positional
 
-from benchmarks import command_lines
+from benchmarks.table import grid
 from sadgs_ns.cli.export import export
 from sadgs_ns.data.run_cameras import RunCameras, read_cameras
 from sadgs_ns.formats import FORMATS
@@ -36,10 +41,6 @@ def render(path: Path, cameras: RunCameras, device: torch.device) -> list[Tensor
     Returns:
         C images in [0, 1]. [H, W, 3]
     """
-    import gsply
-    from gsply.sog_reader import sogread
-    from gsply.spz import read_spz
-
     read: Any = {".spz": read_spz, ".sog": sogread}.get(path.suffix, gsply.plyread)
     data = read(str(path))
     rest = np.zeros((len(data.means), 0, 3), np.float32) if data.shN is None else data.shN
@@ -62,35 +63,33 @@ def psnr(images: Sequence[Tensor], others: Sequence[Tensor]) -> float:
     return float(np.mean([-10 * (a - b).square().mean().log10() for a, b in zip(images, others, strict=True)]))
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Print the table; returns the exit code, 1 where gsply is missing."""
-    options = command_lines.formats().parse_args(argv)
-    try:
-        import gsply
-    except ImportError:
-        print("The files are read back with gsply, which is not there: pip install -e '.[dev]' -c constraints.txt.")
-        return 1
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    paths = {suffix: options.output / f"splat{suffix}" for suffix in FORMATS}
-    for path in paths.values():
-        count = export(options.run, path, data=options.data)
-    folder = options.run if options.run.is_dir() else options.run.parent
-    cameras = read_cameras(folder, options.data, split="test")
-    photos = [torch.from_numpy(np.asarray(Image.open(path).convert("RGB")) / 255).float() for path in cameras.photos]
-    before = render(paths[".ply"], cameras, device)
-    print(f"{count:,} Gaussians, {len(photos)} held-out views, rendered on {device.type}, gsply {gsply.__version__}.\n")
-    print("| format | MB | of the PLY | PSNR of the held-out views | PSNR to the PLY's rendering |")
-    print("| --- | ---: | ---: | ---: | ---: |")
-    whole = paths[".ply"].stat().st_size
-    for suffix, path in paths.items():
-        size = path.stat().st_size
-        cells = ["as the SOG" if suffix == ".html" else "as the PLY", ""]
-        if suffix in (".ply", *_LOSSY):
-            after = before if suffix == ".ply" else render(path, cameras, device)
-            cells = [f"{psnr(after, photos):.2f} dB", "" if suffix == ".ply" else f"{psnr(after, before):.1f} dB"]
-        print(f"| `{suffix}` | {size / 1e6:.2f} | {100 * size / whole:.0f} % | {cells[0]} | {cells[1]} |")
-    return 0
+@dataclass
+class Command:
+    """Write a run's Gaussians in every format, read them back, and compare sizes and renderings."""
 
+    run: Positional[Path]
+    """folder of a run, or its config.yml"""
+    output: Path = Path("formats")
+    """folder that takes the files"""
+    data: Path | None = None
+    """folder of the capture (default: where it was in training)"""
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+    def __call__(self) -> int:
+        device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        paths = {suffix: self.output / f"splat{suffix}" for suffix in FORMATS}
+        counts = [export(self.run, path, data=self.data) for path in paths.values()]
+        cameras = read_cameras(self.run if self.run.is_dir() else self.run.parent, self.data, split="test")
+        photos = [torch.from_numpy(np.asarray(Image.open(p).convert("RGB")) / 255).float() for p in cameras.photos]
+        before = render(paths[".ply"], cameras, device)
+        print(f"{counts[0]:,} Gaussians, {len(photos)} held-out views, rendered on {device.type}, ", end="")
+        print(f"gsply {gsply.__version__}.\n")
+        whole, lines = paths[".ply"].stat().st_size, []
+        for suffix, path in paths.items():
+            size = path.stat().st_size
+            cells = ["as the SOG" if suffix == ".html" else "as the PLY", ""]
+            if suffix in (".ply", *_LOSSY):
+                after = before if suffix == ".ply" else render(path, cameras, device)
+                cells = [f"{psnr(after, photos):.2f} dB", "" if suffix == ".ply" else f"{psnr(after, before):.1f} dB"]
+            lines.append((f"`{suffix}`", f"{size / 1e6:.2f}", f"{100 * size / whole:.0f} %", *cells))
+        print(grid(("format", "MB", "of the PLY", "PSNR of the held-out views", "PSNR to the PLY's rendering"), lines))
+        return 0

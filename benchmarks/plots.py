@@ -1,64 +1,44 @@
-"""Plots of a benchmark's results: quality against time and against the number of Gaussians, and where the time goes.
+"""Plots of a benchmark's results: quality against time and against the number of Gaussians, and growing steps.
 
-Every method has a colour (Okabe–Ito), a marker and a line style of its own on all plots, every stage a colour and a
-hatch, so that none needs the colour. 7.2 in wide with text of 8 pt and more: true to size on a page of A4 or letter.
+Every method has a colour (Okabe–Ito), a marker and a line style of its own on all plots, so that none needs the colour.
+7.2 in wide with text of 8 pt and more: true to size on a page of A4 or letter.
 """
 
 from __future__ import annotations
 
-import io
 import itertools
-import json
 import math
 import textwrap
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import matplotlib
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.text import Annotation
-from matplotlib.ticker import EngFormatter, Formatter, FuncFormatter, LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, NullLocator
 from matplotlib.transforms import Bbox
 from PIL import Image
 
 from benchmarks.results import Result
 from benchmarks.table import mean
 
-Groups = dict[tuple[str, str], list[Result]]
-"""Results that are ok by scene and label, as `table.groups` gives them."""
-
 METRICS = {"psnr": ("PSNR [dB]", True), "ssim": ("SSIM", True), "lpips": ("LPIPS", False)}
 """Axis title, and whether higher is better."""
-COSTS = {"loop_seconds": "Training loop [s]   (← less is better)", "gaussians": "Gaussians   (← fewer is better)"}
+COSTS = {"loop_seconds": "Training loop [s]   ({})", "gaussians": "Gaussians   (← fewer is better)"}
 """Fields that quality is drawn against, with the title of their axis."""
-PEER_METRICS = ("psnr", "lpips")
-"""The fields of METRICS that `peers` draws, in the order of `Point`."""
-STAGES = {
-    "import_seconds": "import",
-    "setup_seconds": "setup",
-    "initialization_seconds": "initialization",
-    "load_seconds": "load images",
-    "structure_tensor_seconds": "structure tensors",
-    "loop_seconds": "training loop",
-}
 
 _OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#000000", "#CC79A7", "#56B4E9", "#E69F00")  # yellow is too light
 _MARKERS = "os^DvPX*<>phd"
 _FILLS = ("full", "none", "left", "top", "right", "bottom")
 _LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)))
-_STAGE_COLORS = ("#DDDDDD", "#E69F00", "#009E73", "#F0E442", "#CC79A7", "#56B4E9", "#D55E00", "#0072B2")
-_HATCHES = ("....", "////", "xxxx", "\\\\\\\\", "++++", "", "----", "oooo")
 _SHOWN_BELOW = {"psnr": 5.0, "ssim": 0.15, "lpips": 0.2}
 """How much worse than the worst final value a curve's beginning may be and still be shown."""
-
 _INK, _GREY = "#222222", "#767676"
-_WIDTH, _BAR = 7.2, 0.25
+_WIDTH = 7.2
 _LEAST_RATIO = 5.0
 """Between the ends of a logarithmic axis; the ticks below then are at least three."""
 _TICKS = {12: (1, 2, 3, 5), 50: (1, 2, 5), 500: (1, 3)}
@@ -81,21 +61,19 @@ _RC: Any = {
     "axes.axisbelow": True,
     "grid.color": "#e4e4e4",
     "grid.linewidth": 0.6,
-    "lines.markersize": 6,
-    "hatch.linewidth": 0.5,
     "legend.frameon": False,
     "figure.labelsize": 8,
     "figure.constrained_layout.use": True,
     "text.parse_math": False,  # a label may hold dollars
-    "svg.hashsalt": "sadgs-bench-report",  # the same results give the same bytes
     "savefig.facecolor": "white",
 }
 _FRONT: dict[str, Any] = {"color": _GREY, "linewidth": 1.0, "drawstyle": "steps-post", "zorder": 1}
 _styled = matplotlib.rc_context(_RC)
 
+Points = Iterable[tuple[float | None, float | None]]
 
-@dataclass(frozen=True)
-class Style:
+
+class Style(NamedTuple):
     """How a method is drawn; colours and line styles repeat, a marker with its filling does not before 78 methods."""
 
     color: str
@@ -107,32 +85,6 @@ class Style:
         """Arguments of `Axes.plot`."""
         looks = {"color": self.color, "marker": self.marker, "fillstyle": self.fill, "linestyle": self.line}
         return {**looks, "markerfacecoloralt": "white", **changes}
-
-
-class Point(NamedTuple):
-    """The end of a run, as `peers` draws it."""
-
-    name: str
-    """Its first word is that of the method."""
-    here: bool
-    """Whether it ran on the machine that most points share."""
-    cost: float
-    psnr: float
-    lpips: float
-
-    @property
-    def method(self) -> str:
-        """What points of one look have in common."""
-        return self.name.split()[0].rstrip(",")
-
-
-class Growth(NamedTuple):
-    """Milliseconds of a training step of one view; None where the memory was too small."""
-
-    gaussians: int
-    megapixels: float
-    ours_ms: float | None
-    gsplat_ms: float | None
 
 
 def styles(labels: Iterable[str]) -> dict[str, Style]:
@@ -160,127 +112,81 @@ def pareto_front(points: Iterable[tuple[float, float]], higher_is_better: bool) 
 
 
 @_styled
-def quality_time(groups: Groups, looks: dict[str, Style]) -> Figure:
-    """PSNR, SSIM and LPIPS against training seconds, a row of panels a scene: a line where runs have a curve."""
-    figure, panels = _quality_panels(groups)
+def quality(results: Iterable[tuple[tuple[str, str], list[Result]]], cost: str) -> Figure:
+    """PSNR, SSIM and LPIPS against a field of COSTS, a row of panels a scene.
+
+    Against seconds, runs that were measured on their way have lines; against Gaussians there is the Pareto front.
+
+    Args:
+        results: Scene and label, and the results of their seeds.
+        cost: The field.
+    """
+    groups, timed = dict(results), cost == "loop_seconds"
+    scenes, labels = (list(dict.fromkeys(key[i] for key in groups)) for i in (0, 1))
+    looks, rows = styles(labels), [row for group in groups.values() for row in group]
+    figure = Figure(figsize=(_WIDTH, 1.9 * len(scenes) + 0.3))
+    grid = figure.subplots(len(scenes), len(METRICS), sharex="row", squeeze=False)
+    panels: dict[tuple[str, str], Axes] = dict(zip(itertools.product(scenes, METRICS), grid.flat, strict=True))
+    ends: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for (scene, metric), axes in panels.items():
-        finals = [
-            point
-            for label, group in _of_scene(groups, scene)
-            for point in _final_points(axes, group, "loop_seconds", metric, looks[label])
-        ]
-        for label, group in _of_scene(groups, scene):
+        here = {label: groups[scene, label] for label in labels if (scene, label) in groups}
+        end = [point for label, group in here.items() for point in _ends(axes, group, cost, metric, looks[label])]
+        for label, group in here.items() if timed else ():
             for row in group if len(group) > 1 else []:
-                look = looks[label].line2d(alpha=0.3, linewidth=0.7, marker="")
-                _plot(axes, _near(_curve([row], metric), finals, metric), look)
-            _plot(axes, _near(_curve(group, metric), finals, metric), looks[label].line2d(markersize=3.5))
-    _finish(panels, FuncFormatter(lambda x, _: f"{x:g}"))
-    lines = any(row.get("curve") for group in groups.values() for row in group)
-    _finish_figure(
-        figure, f"Training loop [s]   ({_time_remark(groups)})", _method_handles(groups, looks, lines), lines
-    )
-    return figure
-
-
-@_styled
-def quality_count(groups: Groups, looks: dict[str, Style]) -> Figure:
-    """PSNR, SSIM and LPIPS against the number of Gaussians, a row of panels a scene, with the Pareto front."""
-    figure, panels = _quality_panels(groups)
-    means = {
-        (scene, metric): [
-            point
-            for label, group in _of_scene(groups, scene)
-            for point in _final_points(axes, group, "gaussians", metric, looks[label])
-        ]
-        for (scene, metric), axes in panels.items()
-    }
-    _finish(panels, EngFormatter(sep=""))
-    for (scene, metric), axes in panels.items():
-        if front := pareto_front(means[scene, metric], METRICS[metric][1]):
+                thin = looks[label].line2d(alpha=0.3, linewidth=0.7, marker="")
+                _plot(axes, _near(_curve([row], metric), end, metric), thin)
+            _plot(axes, _near(_curve(group, metric), end, metric), looks[label].line2d(markersize=3.5))
+        ends[scene, metric] = end
+    for scene, axes in zip(scenes, grid[:, 0], strict=True):
+        axes.set_title(scene)
+    _finish(panels)
+    for (scene, metric), axes in () if timed else panels.items():
+        if front := pareto_front(ends[scene, metric], METRICS[metric][1]):
             worst, right = axes.get_ylim()[0 if METRICS[metric][1] else 1], axes.get_xlim()[1]
             steps = [(front[0][0], worst), *front, (right, front[-1][1])]
             axes.plot(*zip(*steps, strict=True), **_FRONT, scalex=False, scaley=False)
-    handles = [
-        *_method_handles(groups, looks, lines=False),
-        Line2D([], [], **_FRONT, label="Pareto front of the means"),
-    ]
-    _finish_figure(figure, "Gaussians   (← fewer is better)", handles, lines=False)
+    lines = timed and any(row.get("curve") for row in rows)
+    plain = {} if lines else {"linestyle": ""}
+    handles = [Line2D([], [], **looks[label].line2d(label=label, **plain)) for label in labels]
+    if any(len(group) > 1 for group in groups.values()):
+        seeds: dict[str, Any] = {"color": _GREY, "alpha": 0.6, "marker": "o", "markersize": 3.5, "linestyle": ""}
+        handles.append(Line2D([], [], **seeds, label="small: single seeds"))
+    handles += [] if timed else [Line2D([], [], **_FRONT, label="Pareto front of the means")]
+    shared = any(row.get("jobs_per_gpu", 1) > 1 for row in rows)
+    remark = "runs shared a GPU: times are not comparable" if shared else "← less is better"
+    _finish_figure(figure, COSTS[cost].format(remark), handles, 3.2 if lines else 1.5)
     return figure
 
 
 @_styled
-def time_breakdown(groups: Groups) -> Figure:
-    """Stacked bars, one a scene and label, means over seeds: seconds by stage and, if recorded, ms a step by phase."""
-    parts = [(groups, STAGES, f"Seconds a run   ({_time_remark(groups)})")]
-    phases = {key: [row["phases"] for row in group if row.get("phases")] for key, group in groups.items()}
-    if any(phases.values()):
-        names = dict.fromkeys(name for rows in phases.values() for row in rows for name in row)
-        titles = {name: name.replace("_", " ") for name in names}
-        parts.append((phases, titles, f"Milliseconds a training step   ({_time_remark(groups)})"))
-    ticks = {label: textwrap.fill(label, 26) for _, label in groups}
-    bar = max(0.25, 0.08 + 0.13 * max(1 + tick.count("\n") for tick in ticks.values()))
-    height = 0.36 * len(_scenes(groups)) + bar * len(groups) + 0.9
-    figure = Figure(figsize=(_WIDTH, height * len(parts)))
-    for part, (measured, names, title) in zip(
-        figure.subfigures(len(parts), 1, squeeze=False)[:, 0], parts, strict=True
-    ):
-        _stacked_bars(part, measured, names, title, ticks)
-    return figure
-
-
-def _stacked_bars(figure: SubFigure, groups: Groups, names: dict[str, str], title: str, ticks: dict[str, str]) -> None:
-    """A panel a scene, a bar a label (as in `ticks`), a segment a field of `names` (field: what to call it)."""
-    counts = {scene: len(_of_scene(groups, scene)) for scene in _scenes(groups)}
-    panels = figure.subplots(len(counts), 1, sharex=True, squeeze=False, height_ratios=list(counts.values()))[:, 0]
-    looks = {
-        name: {"facecolor": color, "hatch": hatch, "edgecolor": _INK, "linewidth": 0}
-        for name, color, hatch in zip(names, itertools.cycle(_STAGE_COLORS), itertools.cycle(_HATCHES), strict=False)
-        if any(mean(group, name) for group in groups.values())
-    }
-    longest = 0.0
-    for axes, scene in zip(panels, counts, strict=True):
-        for y, (_, group) in enumerate(_of_scene(groups, scene)):
-            end = 0.0
-            for name, look in looks.items():
-                length = mean(group, name) or 0.0
-                axes.barh(y, length, 0.7, end, **look)
-                end += length
-            axes.text(end, y, f" {end:.1f}" if end else " not measured", va="center")
-            longest = max(longest, end)
-        axes.set_yticks(range(counts[scene]), [ticks[label] for label, _ in _of_scene(groups, scene)])
-        axes.set_ylim(counts[scene] - 0.45, -0.55)
-        axes.tick_params(axis="y", length=0)
-        axes.grid(False, axis="y")
-        axes.set_title(scene)
-    panels[-1].set_xlabel(title)
-    panels[-1].set_xlim(0, 1.1 * longest or 1)
-    _legend(figure, [Patch(**look, label=names[name]) for name, look in looks.items()], 2.5)
-
-
-@_styled
-def growth(rows: Sequence[Growth]) -> Figure:
+def growth(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Milliseconds of a step against the number of Gaussians, and against pixels, both axes logarithmic.
 
     Args:
-        rows: The first one's size goes with all numbers of Gaussians, and its number with all sizes.
+        rows: `gaussians`, `megapixels`, `ours_ms` and `gsplat_ms`, None where the memory was too small. The first row's
+            size goes with all numbers of Gaussians, and its number with all sizes.
     """
-    number, size = rows[0].gaussians, rows[0].megapixels
+    number, size = rows[0]["gaussians"], rows[0]["megapixels"]
     figure = Figure(figsize=(_WIDTH, 2.8))
     left, right = figure.subplots(1, 2, sharey=True)
     looks = styles(("ours", "gsplat and torch"))
     panels = (
-        (left, [(row.gaussians, row) for row in rows if row.megapixels == size], f"{size:g} megapixels"),
-        (right, [(1e6 * row.megapixels, row) for row in rows if row.gaussians == number], f"{number:,} Gaussians"),
+        (left, [(row["gaussians"], row) for row in rows if row["megapixels"] == size], f"{size:g} megapixels"),
+        (
+            right,
+            [(1e6 * row["megapixels"], row) for row in rows if row["gaussians"] == number],
+            f"{number:,g} Gaussians",
+        ),
     )
     for axes, points, title in panels:
         for label, field in (("ours", "ours_ms"), ("gsplat and torch", "gsplat_ms")):
-            timed = sorted((x, getattr(row, field)) for x, row in points if getattr(row, field) is not None)
+            timed = sorted((x, row[field]) for x, row in points if row[field] is not None)
             axes.plot(*zip(*timed, strict=True), label=label, **looks[label].line2d())
         axes.set(xscale="log", yscale="log", title=title)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_minor_locator(NullLocator())
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
+        axes.yaxis.set_major_formatter(EngFormatter(sep=""))
     left.set(xlabel="Gaussians", ylabel="Milliseconds a training step")
     right.set_xlabel("Pixels")
     left.legend()
@@ -288,28 +194,31 @@ def growth(rows: Sequence[Growth]) -> Figure:
 
 
 @_styled
-def peers(cost: str, points: Sequence[Point]) -> Figure:
+def peers(points: Sequence[tuple[str, bool, float, float, float]], cost: str) -> Figure:
     """PSNR and LPIPS against a cost on a logarithmic axis, each point with its name; those of other machines hollow.
 
     Args:
-        cost: Field that the points' cost is, of COSTS.
+        points: Name, the first word of which is that of the method; whether it ran on the machine that most points
+            share; cost, PSNR and LPIPS.
+        cost: Field of COSTS that the points' cost is.
     """
     figure = Figure(figsize=(_WIDTH, 3.0))
-    panels = {("", metric): axes for metric, axes in zip(PEER_METRICS, figure.subplots(1, 2), strict=True)}
-    looks = styles(point.method for point in points)
-    for (_, metric), axes in panels.items():
-        for point in points:
-            look = looks[point.method].line2d(linestyle="", fillstyle="full" if point.here else "none")
-            axes.plot(point.cost, getattr(point, metric), **look)
-    _finish(panels, EngFormatter(sep=""))
+    panels = {("", metric): axes for metric, axes in zip(("psnr", "lpips"), figure.subplots(1, 2), strict=True)}
+    methods = [name.split()[0].rstrip(",") for name, *_ in points]
+    looks = styles(methods)
+    for column, axes in enumerate(panels.values(), 3):
+        for method, point in zip(methods, points, strict=True):
+            look = looks[method].line2d(linestyle="", fillstyle="full" if point[1] else "none")
+            axes.plot(point[2], point[column], **look)
+    _finish(panels)
     grey: dict[str, Any] = {"color": _GREY, "marker": "o", "linestyle": ""}
     handles = [Line2D([], [], **grey, label="on one machine")]
-    if not all(point.here for point in points):
+    if not all(here for _, here, *_ in points):
         handles.append(Line2D([], [], **grey, fillstyle="none", label="on other machines"))
-    _finish_figure(figure, COSTS[cost], handles, lines=False)
+    _finish_figure(figure, COSTS[cost].format("← less is better"), handles, 1.5)
     figure.draw_without_rendering()  # The panels then have their places, which names must not change.
-    for (_, metric), axes in panels.items():
-        _name_points(axes, [(point.name, point.cost, getattr(point, metric)) for point in points])
+    for column, axes in enumerate(panels.values(), 3):
+        _name_points(axes, [(point[0], point[2], point[column]) for point in points])  # type: ignore[misc]
     return figure
 
 
@@ -337,74 +246,27 @@ def _area(box: Bbox | None) -> float:
     return 0.0 if box is None else box.width * box.height
 
 
-def as_text(cost: str, points: Sequence[Point]) -> str:
-    """What `peers` draws, for a file to say of what it was drawn."""
-    return json.dumps([cost, *points])
+@_styled
+def save(figure: Figure, path: Path, digest: str | None = None) -> None:
+    """Write a figure as PNG (200 dpi), which may hold a digest of what it was drawn from."""
+    figure.savefig(path, format="png", dpi=200, metadata={"Software": None, "Description": digest})
 
 
-def drawn_points(path: Path) -> str | None:
-    """What `as_text` gave when a file was drawn; None if there is no such file, or it does not say."""
+def digest_in(path: Path) -> str | None:
+    """The digest that a figure holds; None if there is no such file, or it holds none."""
     if not path.exists():
         return None
     with Image.open(path) as image:
         return image.info.get("Description")
 
 
-@_styled
-def save_peers(cost: str, points: Sequence[Point], path: Path) -> None:
-    """Write `peers` as PNG (200 dpi), which holds `as_text`."""
-    metadata = {"Software": None, "Description": as_text(cost, points)}
-    peers(cost, points).savefig(path, format="png", dpi=200, metadata=metadata)
-
-
-@_styled
-def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG (200 dpi) and as SVG.
-
-    Args:
-        path: Without suffix.
-    """
-    figure.savefig(path.with_suffix(".png"), dpi=200, metadata={"Software": None})
-    path.with_suffix(".svg").write_text(svg(figure), encoding="utf-8")
-
-
-@_styled
-def svg(figure: Figure) -> str:
-    """A figure as SVG, the same text for the same results."""
-    written = io.StringIO()
-    figure.savefig(written, format="svg", metadata={"Date": None})
-    return written.getvalue()
-
-
-def _scenes(groups: Groups) -> list[str]:
-    return list(dict.fromkeys(scene for scene, _ in groups))
-
-
-def _of_scene(groups: Groups, scene: str) -> list[tuple[str, list[Result]]]:
-    """Labels and results of a scene, the labels in one order for all scenes."""
-    return [
-        (label, groups[scene, label]) for label in dict.fromkeys(name for _, name in groups) if (scene, label) in groups
-    ]
-
-
-def _quality_panels(groups: Groups) -> tuple[Figure, dict[tuple[str, str], Axes]]:
-    """A figure of a row of panels a scene, one a metric."""
-    scenes = _scenes(groups)
-    figure = Figure(figsize=(_WIDTH, 1.9 * len(scenes) + 0.3))
-    grid = figure.subplots(len(scenes), len(METRICS), sharex="row", squeeze=False)
-    for scene, row in zip(scenes, grid, strict=True):
-        row[0].set_title(scene)
-    return figure, dict(zip(itertools.product(scenes, METRICS), grid.flat, strict=True))
-
-
-def _finite(points: Iterable[tuple[float | None, float | None]]) -> list[tuple[float, float]]:
+def _finite(points: Points) -> list[tuple[float, float]]:
     """The points that a logarithmic x axis can show."""
-    return [
-        (x, y) for x, y in points if x is not None and y is not None and math.isfinite(x) and x > 0 and math.isfinite(y)
-    ]
+    known = [(x, y) for x, y in points if x is not None and y is not None]
+    return [(x, y) for x, y in known if math.isfinite(x) and x > 0 and math.isfinite(y)]
 
 
-def _plot(axes: Axes, points: Iterable[tuple[float | None, float | None]], looks: dict[str, Any]) -> None:
+def _plot(axes: Axes, points: Points, looks: dict[str, Any]) -> None:
     if shown := _finite(points):
         axes.plot(*zip(*shown, strict=True), **looks)
 
@@ -412,16 +274,14 @@ def _plot(axes: Axes, points: Iterable[tuple[float | None, float | None]], looks
 def _curve(group: list[Result], name: str) -> list[tuple[float | None, float | None]]:
     """Mean (seconds, metric) at the steps that all of a group's curves have, and the end of the runs; empty without."""
     curves = [{point["step"]: point for point in row["curve"]} for row in group if row.get("curve")]
-    if not curves:
-        return []
-    steps = sorted(set.intersection(*map(set, curves)))
+    steps = sorted(set.intersection(*map(set, curves))) if curves else []
     points = [[curve[step] for curve in curves] for step in steps]
     curve = [(mean(point, "seconds"), mean(point, name)) for point in points]
-    end = mean(group, "loop_seconds")
+    end = mean(group, "loop_seconds") if curves else None
     return [*curve, (end, mean(group, name))] if end and all(x is None or x < end for x, _ in curve) else curve
 
 
-def _final_points(axes: Axes, group: list[Result], cost: str, metric: str, style: Style) -> list[tuple[float, float]]:
+def _ends(axes: Axes, group: list[Result], cost: str, metric: str, style: Style) -> list[tuple[float, float]]:
     """Draw the runs as small points and their mean as a large one, which is returned, if there is one."""
     for row in group if len(group) > 1 else []:
         _plot(axes, [(row.get(cost), row.get(metric))], style.line2d(alpha=0.4, markersize=3.5, linestyle=""))
@@ -430,22 +290,14 @@ def _final_points(axes: Axes, group: list[Result], cost: str, metric: str, style
     return _finite(average)
 
 
-def _near(
-    curve: list[tuple[float | None, float | None]], finals: list[tuple[float, float]], metric: str
-) -> list[tuple[float, float]]:
+def _near(curve: Points, ends: list[tuple[float, float]], metric: str) -> list[tuple[float, float]]:
     """A curve without its far worse beginning, so that the ends can be told apart."""
     sign, shown = (1 if METRICS[metric][1] else -1), _finite(curve)
-    worst = min((sign * value for _, value in finals or shown), default=0.0)
+    worst = min((sign * value for _, value in ends or shown), default=0.0)
     return [(x, value) for x, value in shown if sign * value >= worst - _SHOWN_BELOW[metric]]
 
 
-def _time_remark(groups: Groups) -> str:
-    if any(row.get("jobs_per_gpu", 1) > 1 for group in groups.values() for row in group):
-        return "runs shared a GPU: times are not comparable"
-    return "← less is better"
-
-
-def _finish(panels: dict[tuple[str, str], Axes], form: Formatter) -> None:
+def _finish(panels: Mapping[tuple[str, str], Axes]) -> None:
     """Titles, and a logarithmic x axis with two ticks or more."""
     for (_, metric), axes in panels.items():
         title, higher = METRICS[metric]
@@ -465,32 +317,17 @@ def _finish(panels: dict[tuple[str, str], Axes], form: Formatter) -> None:
         subs = next((subs for limit, subs in _TICKS.items() if ratio < limit), (1,))
         axes.xaxis.set_major_locator(LogLocator(subs=subs))
         axes.xaxis.set_minor_locator(NullLocator())
-        axes.xaxis.set_major_formatter(form)
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
 
 
-def _finish_figure(figure: Figure, title: str, handles: Sequence[Artist], lines: bool) -> None:
-    """The title of x below all panels and the legend above them, which makes the figure taller."""
-    figure.supxlabel(title)
-    figure.align_ylabels()
-    figure.set_figheight(figure.get_figheight() + _legend(figure, handles, 3.2 if lines else 1.5))
-
-
-def _method_handles(groups: Groups, looks: dict[str, Style], lines: bool) -> list[Line2D]:
-    plain = {} if lines else {"linestyle": ""}
-    labels = dict.fromkeys(label for _, label in groups)
-    handles = [Line2D([], [], **looks[label].line2d(label=label, **plain)) for label in labels]
-    if any(len(group) > 1 for group in groups.values()):
-        seeds = {"color": _GREY, "alpha": 0.6, "marker": "o", "markersize": 3.5, "linestyle": ""}
-        handles.append(Line2D([], [], **seeds, label="small: single seeds"))
-    return handles
-
-
-def _legend(figure: Figure | SubFigure, handles: Sequence[Artist], length: float) -> float:
-    """A legend above the panels in as few lines as fit; returns its height in inches.
+def _finish_figure(figure: Figure, title: str, handles: Sequence[Artist], length: float) -> None:
+    """The title of x below all panels, and above them, which makes the figure taller, a legend in as few lines as fit.
 
     Args:
-        length: Of the handles, in units of the font's size.
+        length: Of the legend's handles, in units of the font's size.
     """
+    figure.supxlabel(title)
+    figure.align_ylabels()
     labels = [textwrap.fill(str(handle.get_label()), 60) for handle in handles]
     height = 0.0
     for lines in range(max(math.ceil(len(labels) / 6), 1), len(labels) + 1):
@@ -504,4 +341,4 @@ def _legend(figure: Figure | SubFigure, handles: Sequence[Artist], length: float
         if box.width < 0.98 * figure.bbox.width or columns == 1:
             break
         legend.remove()
-    return height
+    figure.set_figheight(figure.get_figheight() + height)

@@ -10,7 +10,6 @@ from typing import Any
 
 Result = dict[str, Any]
 """What `benchmarks.run` measured, with `key`, `status` ("ok" or "failed") and `error`."""
-
 _IDENTITY = ("key", "scene", "label", "seed", "status")
 
 
@@ -20,13 +19,19 @@ def read(path: Path, strict: bool = False) -> list[Result]:
     A line that a killed benchmark left half-written is reported on stderr and ignored.
 
     Args:
-        strict: Whether such a line, or one that does not say whose result it is, is an error.
+        strict: Whether such a line, one that does not say whose result it is, or no file is an error.
 
     Raises:
-        ValueError: With `strict`; names the line.
+        ValueError: With `strict`; names the file and the line.
     """
+    if strict and not path.is_file():
+        raise ValueError(f"{path} is not a file; give one that python -m benchmarks wrote.")
     results: dict[str, Result] = {}
-    for number, line in enumerate(path.read_text().splitlines() if path.exists() else [], 1):
+    try:
+        lines = path.read_text("utf-8").splitlines() if path.exists() else []
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is not text; give a file that python -m benchmarks wrote.") from error
+    for number, line in enumerate(lines, 1):
         try:
             result = json.loads(line)
             for name in _IDENTITY if strict else ():

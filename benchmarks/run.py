@@ -1,7 +1,6 @@
 """One training run, measured, in a process of its own: `python -m benchmarks.run --spec JSON --out FILE`.
 
-The spec is a `protocol.Job` as a dict, with "root", the folder that holds all scenes, and "images", the folder for
-renderings or null. Nothing heavy is imported before
+The spec is a `protocol.Job` as a dict, with "root", the folder that holds all scenes. Nothing heavy is imported before
 the clock runs.
 """
 
@@ -101,13 +100,12 @@ def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> T
     return config
 
 
-def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dict[str, Any]:
+def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
     """Train once and measure.
 
     Args:
         root: Folder that holds all scenes.
         work: Folder for what nerfstudio writes; the caller deletes it.
-        images: Folder for renderings of held-out views; None makes none.
 
     Returns:
         JSON-ready. Times in s:
@@ -130,7 +128,6 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
             launches: Launches, waits and the device's load in a step; see `launches.measure`. None without CUDA.
             curve: Only if the job asks for it: the points of `curve.Curve`, the last one being the finished run.
                 None of the times above contains its evaluations.
-            images: Only with `images`: the renderings' paths in that folder.
         Where torchrun started several processes, which train one splat on `devices` of them, the first measures all
         but `phases`, `launches` and `curve`: its checkpoint is evaluated on one device, S̄ is computed in the loop, and
         `peak_gb` is the first device's. The others return nothing.
@@ -147,7 +144,6 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
     from nerfstudio.scripts.train import _set_random_seed
 
     from benchmarks import evaluate, launches, phases
-    from benchmarks import images as pictures
     from benchmarks.curve import Curve, point
     from benchmarks.timer import CompileTimer, LoopTimer
     from sadgs_ns.plugin import processes
@@ -251,9 +247,6 @@ def run_row(job: Job, root: Path, work: Path, images: Path | None = None) -> dic
     if curve is not None:
         end = point(trainer.config.max_num_iterations, timer.seconds, held_out, int(model.num_points))
         record["curve"] = [*curve.points, end]
-    if images is not None:
-        where = (images, job.scene.name, job.row.label, job.seed)
-        record["images"] = pictures.save(model, views, record["view_names"], *where)
     if devices == 1:
         record["phases"] = phases.measure(trainer)  # from here on the model is trained further
         record["launches"] = launches.measure(trainer)
@@ -349,7 +342,6 @@ def main() -> None:
     arguments, rank = parser.parse_args(), os.environ.get("RANK", "0")
     spec = json.loads(arguments.spec)
     job = Job(Scene(**spec["scene"]), Row(**spec["row"]), spec["seed"])
-    images = None if spec["images"] is None else Path(spec["images"])
     record = {
         "status": "ok",
         "error": None,
@@ -357,7 +349,7 @@ def main() -> None:
     }
     with tempfile.TemporaryDirectory(dir=arguments.out.parent) as work:
         try:
-            record |= run_row(job, Path(spec["root"]), Path(work), images)
+            record |= run_row(job, Path(spec["root"]), Path(work))
         except Exception as error:
             traceback.print_exc()
             record |= {"status": "failed", "error": describe(error)}

@@ -1,266 +1,525 @@
-"""What surrounds rasterization in a training step, with and without our kernels: `python -m benchmarks step`.
+"""A training step on made-up Gaussians, its parts with and without our kernels, and how it grows.
 
-A synthetic scene on a CUDA device: Gaussians on a spherical shell in front of one camera, an image to compare with,
-Adam with its moments. Each part is timed by itself, then the whole step, a split, and the structure tensors of images.
+The Gaussians are a spherical shell, which cameras around it look at, or several shells that no camera sees two of, as a
+view of a city sees a part of it. Calls follow each other, so that the host's work counts only where it takes longer
+than the GPU's.
 """
 
 from __future__ import annotations
 
+import math
+import os
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+from pathlib import Path
 from typing import Any
 
-import gsplat
 import torch
+import torch.distributed as dist
+from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
+from tyro.conf import Positional
 
-from benchmarks import command_lines
 from benchmarks.evaluate import now
-from sadgs_ns.method.codes import encode
-from sadgs_ns.method.losses import photometric_loss
-from sadgs_ns.method.split import grid_split
+from benchmarks.table import grid
+from sadgs_ns import kernels
+from sadgs_ns.cli.export import read_gaussians
+from sadgs_ns.data.run_cameras import read_cameras
+from sadgs_ns.distributed.rasterization import rasterize as rasterize_together
+from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.method import memory
+from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, keep_gradient
+from sadgs_ns.method.losses import photometric_loss, photometric_part
 from sadgs_ns.method.statistics import empty_statistics, observe
-from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
+from sadgs_ns.plugin.memory_plan import estimate_pairs
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
 from sadgs_ns.plugin.optimizers import FusedAdam, step_together
-from sadgs_ns.render.rasterization import rasterize, visible
+from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world, visible
 
 REPEATS = 20
+"""Calls in a row that are timed together."""
 ETA_EVERY = 10
-"""What `StructureAwareStrategy.eta_every` is in a run of 3,000 iterations."""
+"""Steps between two that observe η, about as many as in a run of 3,000 iterations."""
+ASPECT = 1.5
+"""Width of the images, relative to their height."""
+BLOCKS_APART = 10.0
+"""Distance between the centres of two blocks, in radii of one."""
+ROOM = 1.25
+"""Places in the tile lists, relative to the pairs of the first step: as in training, later ones do not wait."""
 
 
-def milliseconds(function: Callable[[], object], rounds: int = 5) -> float:
+def milliseconds(function: Callable[[], object], rounds: int = 5, repeats: int = REPEATS) -> float:
     """Time of a call among calls that follow each other, as in training: the median of some rounds, after one."""
     times = []
     for _ in range(1 + rounds):
         start = now()
-        for _ in range(REPEATS):
+        for _ in range(repeats):
             function()
-        times.append((now() - start) / REPEATS * 1e3)
+        times.append((now() - start) / repeats * 1e3)
     return statistics.median(times[1:])
 
 
-def rasterize_parameters(
-    params: Mapping[str, Tensor], viewmats: Tensor, Ks: Tensor, width: int, height: int, **options: bool
-) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Call `rasterize` with parameters as they are trained, of degree 3.
-
-    Args:
-        params: `means` [N, 3], log `scales` [N, 3], `quats` [N, 4], logit `opacities` [N, 1], `features_dc` [N, 3] and
-            `features_rest` [N, 15, 3].
-        viewmats: World to camera. [C, 4, 4]
-        Ks: Intrinsics in px. [C, 3, 3]
-        width: px.
-        height: px.
-        options: `rasterize`'s switches, such as `absgrad`.
-    """
-    return rasterize(
-        params["means"],
-        params["quats"],
-        torch.exp(params["scales"]),
-        torch.sigmoid(params["opacities"]).squeeze(-1),
-        (params["features_dc"], params["features_rest"]),
-        viewmats,
-        Ks,
-        width,
-        height,
-        sh_degree=3,
-        **options,  # type: ignore[arg-type]
-    )
+def size_of(megapixels: float) -> tuple[int, int]:
+    """Width and height in px of an image."""
+    height = round((megapixels * 1e6 / ASPECT) ** 0.5)
+    return round(ASPECT * height), height
 
 
 class Step:
-    """A training step on a synthetic scene, whose parts can be run one by one.
+    """A training step of which this process has its part, and whose parts can be called one by one.
 
     Args:
-        gaussians: Number N of Gaussians.
+        gaussians: Number of the Gaussians of all processes, of degree 3.
         width: px.
         height: px.
+        views: Number V of views of a step.
+        device: Where this process computes.
+        shards: The processes; None for one process.
+        blocks: Number of shells, at least 1, each of which has as many Gaussians and views as another where it divides
+            their numbers. Each process has as many Gaussians of a block as another process.
         fused: Use our kernels, or what they are tested against.
     """
 
-    def __init__(self, gaussians: int, width: int, height: int, fused: bool) -> None:
-        device = torch.device("cuda")
-        generator = torch.Generator(device).manual_seed(0)
+    def __init__(
+        self,
+        gaussians: int,
+        width: int,
+        height: int,
+        views: int = 1,
+        device: torch.device | str = "cuda",
+        shards: Shards | None = None,
+        blocks: int = 1,
+        fused: bool = True,
+    ) -> None:
+        self.shards, self.width, self.height, self.views, self.fused = shards, width, height, views, fused
+        device = torch.device(device)
+        part = slice(0, gaussians) if shards is None else shards.take_even_part(gaussians)
+        number = part.stop - part.start
+        generator = torch.Generator(device).manual_seed(part.start)
 
         def uniform(low: float, high: float, *shape: int) -> Tensor:
-            return low + (high - low) * torch.rand(shape, generator=generator, device=device)
+            return torch.empty(shape, device=device).uniform_(low, high, generator=generator)
 
-        directions = torch.nn.functional.normalize(torch.randn((gaussians, 3), generator=generator, device=device))
-        spacing = (12.57 / gaussians) ** 0.5  # of points on the unit sphere
+        directions = torch.empty((number, 3), device=device).normal_(generator=generator)
+        spacing = math.sqrt(4 * math.pi * blocks / gaussians)  # of points on the unit sphere
+        means = torch.nn.functional.normalize(directions, dim=-1) * uniform(0.95, 1.05, number, 1)
+        means[:, 1] += BLOCKS_APART * (torch.arange(number, device=device) % blocks)
         values = {
-            "means": directions * uniform(0.95, 1.05, gaussians, 1),
-            "scales": torch.log(spacing * uniform(0.3, 1.2, gaussians, 3)),
-            "quats": uniform(-1.0, 1.0, gaussians, 4),
-            "features_dc": uniform(-1.0, 1.0, gaussians, 3),
-            "features_rest": uniform(-0.1, 0.1, gaussians, 15, 3),
-            "opacities": torch.logit(uniform(0.05, 0.95, gaussians, 1)),
+            "means": means,
+            "scales": torch.log(spacing * uniform(0.3, 1.2, number, 3)),
+            "quats": uniform(-1.0, 1.0, number, 4),
+            "features_dc": uniform(-1.0, 1.0, number, 3),
+            "features_rest": uniform(-0.1, 0.1, number, 15, 3),
+            "opacities": torch.logit(uniform(0.05, 0.95, number, 1)),
         }
-        self.fused, self.width, self.height = fused, width, height
         self.params = {name: torch.nn.Parameter(value) for name, value in values.items()}
-        self.optimizers: dict[str, torch.optim.Optimizer] = {
-            name: FusedAdam([p], lr=1e-6, eps=1e-15) if fused else torch.optim.Adam([p], lr=1e-6, eps=1e-15, fused=True)
-            for name, p in self.params.items()
-        }
+        adam = FusedAdam if fused else partial(torch.optim.Adam, fused=True)
+        self.optimizers: dict[str, Any] = {name: adam([p], lr=1e-6, eps=1e-15) for name, p in self.params.items()}
         log = NonFiniteLog(device, capacity=1)
-        for optimizer in self.optimizers.values():
-            if isinstance(optimizer, FusedAdam):
-                optimizer.log = log  # one for all, as in training: what shares it is updated in one launch
-        self.state: dict[str, Any] = empty_statistics(gaussians, device)
-        self.viewmats = torch.eye(4, device=device)[None]
-        self.viewmats[0, 2, 3] = 1.6
-        self.Ks = torch.tensor([[[width * 0.8, 0, width / 2], [0, width * 0.8, height / 2], [0, 0, 1]]], device=device)
-        self.target = uniform(0.0, 1.0, 1, height, width, 3)
-        self.structure_tensors = torch.randint(0, 255, (1, height, width, 3), dtype=torch.uint8, device=device)
-        self.rendered = self.target.clone().requires_grad_()
-        self.gradients: list[Tensor | None] = []
-        self.calls = 0  # of `whole`
-        self.render()
-        self.keep_gradients()
+        for optimizer in self.optimizers.values() if fused else ():
+            optimizer.log = log  # one for all, as in training: what shares it is updated in one launch
+        self.state: dict[str, Any] = empty_statistics(number, device) | empty_gradients(number, device)
+        numbers = torch.arange(views, device=device)
+        angles = (numbers // blocks) * (2 * math.pi * blocks / views)
+        self.viewmats = torch.eye(4, device=device).repeat(views, 1, 1)
+        self.viewmats[:, 0, 0] = self.viewmats[:, 2, 2] = angles.cos()
+        self.viewmats[:, 0, 2], self.viewmats[:, 2, 0] = angles.sin(), -angles.sin()
+        self.viewmats[:, 1, 3], self.viewmats[:, 2, 3] = -BLOCKS_APART * (numbers % blocks), 1.6
+        K = torch.tensor([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]], device=device)
+        self.Ks = K.repeat(views, 1, 1)
+        self.images = torch.full((views, height, width, 3), 100, dtype=torch.uint8, device=device)
+        self.codes = torch.full((views, height, width, 3), 60, dtype=torch.uint8, device=device)
+        self.rendered = (self.images / 255).requires_grad_()
+        self.capacity: int | None = None
+        self.count = 0
+        self.info: dict[str, Any] = {}
 
-    def forward(self) -> tuple[Tensor, dict[str, Any]]:
-        """Colours [1, H, W, 3] and gsplat's info."""
-        colors, _, info = rasterize_parameters(
-            self.params, self.viewmats, self.Ks, self.width, self.height, fused=self.fused
-        )
-        self.info = info | {"viewmats": self.viewmats, "Ks": self.Ks, "structure_tensors": self.structure_tensors}
-        return colors, info
+    def draw(self) -> list[Tensor]:
+        """Rasterize: the views [V, H, W, 3] of one process, or the bands of views that this one of several has."""
+        p = self.params
+        splats: Any = (
+            p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid().squeeze(-1),
+            (p["features_dc"], p["features_rest"]), self.viewmats, self.Ks, self.width, self.height,
+        )  # fmt: skip
+        if self.shards is not None:
+            self.bands, self.start, info = rasterize_together(self.shards, *splats, sh_degree=3, absgrad=True)
+            drawn = [colors for _, colors, _ in self.bands]
+        else:
+            image, _, info = rasterize(
+                *splats, sh_degree=3, absgrad=True, tile_capacity=self.capacity, fused=self.fused
+            )
+            keep_gradient(info["means2d"])
+            if "pair_counts" in info and self.capacity is None:
+                self.capacity = int(ROOM * sum(info["pair_counts"].wait()))
+            drawn = [image]
+        self.info = {**info, "viewmats": self.viewmats, "Ks": self.Ks, "structure_tensors": self.codes}
+        return drawn
+
+    def loss(self, drawn: list[Tensor]) -> Tensor:
+        """The photometric loss of what `draw` gave; of several processes each has a part."""
+        if self.shards is None:
+            return photometric_loss(drawn[0], self.images, fused=self.fused)[0]
+        loss = self.start
+        for (band, _, _), colors in zip(self.bands, drawn, strict=True):
+            part, _ = photometric_part(
+                colors, self.images[band.view][None, band.top : band.bottom],
+                rows=(band.first, band.last), top=band.top, height=self.height,
+            )  # fmt: skip
+            loss = loss + part / self.views
+        return loss
 
     def forget_gradients(self) -> None:
+        """As a step begins."""
         for parameter in self.params.values():
             parameter.grad = None
-
-    def keep_gradients(self) -> None:
-        """Remember the gradients for `optimize`."""
-        self.gradients = [parameter.grad for parameter in self.params.values()]
 
     def render(self) -> None:
         """Rasterize forward and backward."""
         self.forget_gradients()
-        colors, _ = self.forward()
-        colors.backward(self.target)
+        self.draw()[0].sum().backward()
 
     def compare(self) -> None:
         """The photometric loss with its gradient."""
         self.rendered.grad = None
-        photometric_loss(self.rendered, self.target, fused=self.fused)[0].backward()
+        self.loss([self.rendered]).backward()
 
     def observe(self) -> None:
         """One observation of η."""
-        observe(self.state, self.params, self.info, fused=self.fused)  # type: ignore[arg-type]
+        jitter = None if self.shards is None else self.shards.rand(self.views)
+        observe(self.state, self.params, self.info, jitter=jitter, fused=self.fused)  # type: ignore[arg-type]
 
     def optimize(self) -> None:
-        """Adam on all parameters."""
-        for parameter, gradient in zip(self.params.values(), self.gradients, strict=True):
-            parameter.grad = gradient
-        self.step_optimizers()
-
-    def step_optimizers(self) -> None:
         """Adam on all parameters that have gradients: our kernel in one launch, as in training."""
         together = [o for o in self.optimizers.values() if isinstance(o, FusedAdam) and o.triton]
         step_together(together)
         for optimizer in () if together else self.optimizers.values():
             optimizer.step()
 
-    def whole(self) -> None:
-        """A step; η is observed in the calls that `ETA_EVERY` divides."""
+    def __call__(self, after: Callable[[str], None] = lambda phase: None) -> None:
+        """A whole step; the first of every `ETA_EVERY` observes η.
+
+        Args:
+            after: Called with the name of each of `memory.step_bytes`' phases when it is over.
+        """
         self.forget_gradients()
-        colors, _ = self.forward()
-        if self.calls % ETA_EVERY == 0:
+        drawn = self.draw()
+        if self.count % ETA_EVERY == 0:
             self.observe()
-        self.calls += 1
-        photometric_loss(colors, self.target, fused=self.fused)[0].backward()
-        self.step_optimizers()
+        self.count += 1
+        after("tile lists")
+        loss = self.loss(drawn)
+        after("loss")
+        loss.backward()
+        accumulate_gradients(self.state, self.info, self.views)
+        after("backward")
+        self.optimize()
 
 
-def compare_parts(gaussians: int, width: int, height: int) -> None:
-    """Print the table of the parts of a step."""
-    columns: list[dict[str, float]] = []
-    for fused in (False, True):
-        step = Step(gaussians, width, height, fused)
-        seen = int(visible(step.info).sum())
-        parts = {
-            "rasterize, forward and backward": step.render,
-            "L1 + SSIM + ℓ2 with gradient": step.compare,
-            "one observation of η": step.observe,
-            "Adam, all parameters": step.optimize,
-            f"whole step, η in every {ETA_EVERY}th": step.whole,
-        }
-        columns.append({name: milliseconds(part) for name, part in parts.items()})
-        del step
-    slow, fast = columns
-    print(f"\n{gaussians:,} Gaussians, {seen:,} of them visible, one view of {width}×{height} px; ms:\n")
-    print("| part | gsplat and torch | with our kernels |\n| --- | ---: | ---: |")
-    for name in slow:
-        print(f"| {name} | {slow[name]:.2f} | {fast[name]:.2f} |")
-    render, whole = (columns[1][name] for name in (next(iter(slow)), list(slow)[-1]))
-    print(f"\nWhole step / rasterize, with our kernels: {whole / render:.2f}; with gsplat's rasterizer: ", end="")
-    print(f"{columns[0][list(slow)[-1]] / columns[0][next(iter(slow))]:.2f}")
+def gpu() -> None:
+    """Print what the GPU is.
+
+    Raises:
+        ValueError: There is none.
+    """
+    if not torch.cuda.is_available():
+        raise ValueError("this needs a CUDA device, and torch finds none.")
+    print(f"torch {torch.__version__}, {torch.cuda.get_device_name()}\n", flush=True)
 
 
-def time_split(parents: int) -> None:
-    """Print what a split into four children each costs, the second time: the first loads kernels."""
-    for _ in range(2):
-        step = Step(parents, 64, 64, True)
-        step.optimize()
-        step.gradients = []
-        step.forget_gradients()
-        counts = torch.tensor([[2, 2, 1]], device="cuda").expand(parents, 3)
-        torch.cuda.synchronize()
+@dataclass
+class Compare:
+    """Time the parts of a training step with and without our kernels (CUDA)."""
+
+    gaussians: tuple[int, ...] = (500_000, 4_000_000)
+    """numbers of Gaussians"""
+    width: int = 1600
+    """px"""
+    height: int = 1060
+    """px"""
+
+    def __call__(self) -> int:
+        gpu()
+        for gaussians in self.gaussians:
+            columns, seen = [], 0
+            for fused in (False, True):
+                step = Step(gaussians, self.width, self.height, fused=fused)
+                step()
+                parts = {
+                    "rasterize, forward and backward": step.render,
+                    "L1 + SSIM + ℓ2 with gradient": step.compare,
+                    "one observation of η": step.observe,
+                    "Adam, all parameters": step.optimize,
+                    f"whole step, η in every {ETA_EVERY}th": step,
+                }
+                columns.append({name: milliseconds(part) for name, part in parts.items()})
+                seen = int(visible(step.info).sum())
+                del step, parts
+            print(f"{gaussians:,} Gaussians, {seen:,} of them visible, a view of {self.width}×{self.height} px; ms:\n")
+            lines = [(name, *(f"{column[name]:.2f}" for column in columns)) for name in columns[0]]
+            print(grid(("part", "gsplat and torch", "with our kernels"), lines), end="\n\n", flush=True)
+        return 0
+
+
+@dataclass
+class Growth:
+    """Time training steps of more and more Gaussians, and of larger images, beside gsplat's (CUDA)."""
+
+    gaussians: tuple[int, ...] = (1_000_000, 100_000, 300_000, 4_000_000, 16_000_000)
+    """the first of them goes with all sizes"""
+    megapixels: tuple[float, ...] = (2.0, 0.3, 1.0, 4.0, 8.0, 16.0)
+    """the first of them goes with all numbers of Gaussians"""
+    output: Path = Path("growth.csv")
+    """takes the table"""
+
+    def __call__(self) -> int:
+        gpu()
+        first, *others = self.megapixels
+        lines = ["gaussians,megapixels,ours_ms,gsplat_ms"]
+        for number, size in [*((n, first) for n in self.gaussians), *((self.gaussians[0], size) for size in others)]:
+            times = (self.time(number, size, fused) for fused in (True, False))
+            lines.append(",".join([str(number), str(size), *(f"{time:.4f}" for time in times)]))
+            print(lines[-1], flush=True)
+        self.output.write_text("\n".join(lines) + "\n")
+        return 0
+
+    def time(self, gaussians: int, megapixels: float, fused: bool) -> float:
+        """Milliseconds of a step of one view; NaN where the device's memory is too small."""
+        try:
+            return milliseconds(Step(gaussians, *size_of(megapixels), fused=fused))
+        except torch.cuda.OutOfMemoryError:
+            return math.nan
+
+
+@dataclass
+class Memory:
+    """Compare the memory plan with the real peaks of training steps (CUDA), in GB."""
+
+    gaussians: tuple[int, ...] = (300_000, 1_000_000)
+    """numbers of Gaussians"""
+    megapixels: tuple[float, ...] = (0.4, 2.0, 5.0)
+    """sizes of a view"""
+    views: tuple[int, ...] = (1, 4)
+    """of a step"""
+
+    def __call__(self) -> int:
+        gpu()
+        phases = list(memory.step_bytes(0, memory.StepSize()))
+        header = ("Gaussians", "megapixels", "views", "million pairs (estimated)", *phases, "step", "plan / peak")
+        lines = []
+        for gaussians, megapixels, views in product(self.gaussians, self.megapixels, self.views):
+            step = Step(gaussians, *size_of(megapixels), views)
+            peaks, pairs = peaks_of(step), pairs_of(step)
+            planned = plan(step)
+            planned["step"], peaks["step"] = max(planned.values()), max(peaks.values())
+            cells = [f"{planned[name] / 1e9:.2f} / {peaks[name] / 1e9:.2f}" for name in planned]
+            told = f"{memory.StepSize.of([step.info]).pairs / 1e6:.1f} ({pairs / 1e6:.1f})"
+            ratio = f"{planned['step'] / peaks['step']:.2f}"
+            lines.append((f"{gaussians:,}", f"{megapixels:g}", str(views), told, *cells, ratio))
+            del step
+            torch.cuda.empty_cache()
+        print(grid(header, lines, names=0))
+        return 0
+
+
+def plan(step: Step) -> dict[str, float]:
+    """Bytes of all that a step has at its peak in each phase, as the memory plan counts them."""
+    n, size = len(step.params["means"]), memory.StepSize.of([step.info])
+    kept = memory.kept_bytes(step.params, step.state) * n + step.images.numel() + step.codes.numel()  # type: ignore[arg-type]
+    return {name: kept + value for name, value in memory.step_bytes(n, size).items()}
+
+
+def peaks_of(step: Step) -> dict[str, float]:
+    """Bytes of all that torch had allocated at the peak of each phase of a step that observes η."""
+    peaks: dict[str, float] = {}
+
+    def note(phase: str) -> None:
+        peaks[phase] = torch.cuda.max_memory_allocated()
         torch.cuda.reset_peak_memory_stats()
-        start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
-        start.record()
-        grid_split(step.params, step.optimizers, step.state, counts)  # type: ignore[arg-type]
-        end.record()
-        torch.cuda.synchronize()
-    result = 3 * sum(p.numel() for p in step.params.values()) * 4  # with both moments
-    print(f"\nSplit of {parents:,} into {len(step.params['means']):,}: {start.elapsed_time(end):.0f} ms; ", end="")
-    print(f"memory at its peak {torch.cuda.max_memory_allocated() / result:.2f} times that of the resulting ", end="")
-    print(f"parameters and moments, {result / 1e9:.2f} GB.")
 
-
-def time_structure_tensors(images: int, width: int, height: int) -> None:
-    """Print what the structure tensors of a training set cost."""
-    pictures = torch.randint(0, 256, (images, height, width, 3), dtype=torch.uint8, device="cuda")
-    batch = max(4_000_000 // (width * height), 1)
-
-    def run(count: int) -> None:
-        for start in range(0, count, batch):
-            encode(multiscale_structure_tensor(pictures[start : start + batch].float() / 255))
-
-    run(batch)
+    for _ in range(2):  # kernels are compiled, and Adam's moments are made
+        step()
+    step.count = 0
     torch.cuda.synchronize()
     torch.cuda.reset_peak_memory_stats()
-    before = torch.cuda.memory_allocated()
-    start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
-    start.record()
-    run(images)
-    end.record()
-    torch.cuda.synchronize()
-    working = (torch.cuda.max_memory_allocated() - before) / 1e9
-    print(
-        f"\nS̄ of {images} images of {width}×{height} px: {start.elapsed_time(end) / 1e3:.2f} s, {working:.2f} GB of ",
-        end="",
-    )
-    print(f"working memory; the images take {pictures.numel() / 1e9:.2f} GB, and so do the tensors.")
+    step(note)
+    return peaks
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Print the tables; returns the exit code, 1 where there is no CUDA device."""
-    options = command_lines.step().parse_args(argv)
-    if not torch.cuda.is_available():
-        print("This comparison needs a CUDA device, and torch finds none.")
-        return 1
-    print(
-        f"gsplat {gsplat.__version__}, torch {torch.__version__}, {torch.cuda.get_device_name()}, medians of {REPEATS}."
-    )
-    for gaussians in options.gaussians:
-        compare_parts(gaussians, options.width, options.height)
-    time_split(500_000)
-    time_structure_tensors(200, options.width, options.height)
-    return 0
+def pairs_of(step: Step) -> float:
+    """Pairs of a Gaussian and a tile in all views of a step, as the plan estimates them before the first one."""
+    poses = step.viewmats.inverse()[:, :3].cpu() * torch.tensor([1.0, -1.0, -1.0, 1.0])  # OpenCV's axes to OpenGL's
+    focal, centre = 0.8 * step.width, (step.width / 2, step.height / 2)
+    cameras = Cameras(poses, focal, focal, *centre, step.width, step.height)
+    return step.views * estimate_pairs(step.params, cameras)  # type: ignore[arg-type]
 
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+@dataclass
+class Together:
+    """Time training steps of made-up Gaussians that are spread over the devices of the processes that torchrun starts;
+    without torchrun, on one device.
+
+    With as many blocks and views as devices this tells how much longer a step takes where the scene grows with them.
+    """
+
+    gaussians: tuple[int, ...] = (8_000_000,)
+    """of all devices together"""
+    megapixels: tuple[float, ...] = (2.0, 8.0)
+    """sizes of a view"""
+    views: tuple[int, ...] = (2,)
+    """of a step"""
+    blocks: int = 1
+    """parts of the scene, of which a view sees one"""
+    repeats: int = 10
+    """steps in each of three rounds"""
+
+    def __call__(self) -> int:
+        if self.blocks < 1:
+            raise ValueError(f"--blocks must be at least 1, got {self.blocks}.")
+        number, local = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("LOCAL_RANK", "0"))
+        device, shards = torch.device("cpu"), None
+        if torch.cuda.is_available():
+            device = torch.device("cuda", local)
+            torch.cuda.set_device(device)  # NCCL, and Triton, take the current device.
+        if number > 1:
+            dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
+            shards = Shards(device)
+        lines = []
+        for gaussians, megapixels, views in product(self.gaussians, self.megapixels, self.views):
+            step = Step(gaussians, *size_of(megapixels), views, device, shards, self.blocks)
+            time, peak = step_time(step, self.repeats)
+            peaks = torch.tensor([peak], device=device)
+            peaks = peaks if shards is None else shards.gather(peaks)[:, 0]
+            each = ", ".join(f"{peak:.2f}" for peak in peaks.tolist())
+            size = (str(number), f"{gaussians:,}", f"{megapixels:g}", str(views), str(self.blocks))
+            lines.append((*size, f"{time:.2f}", each))
+            del step
+        if shards is None or shards.rank == 0:
+            name = torch.cuda.get_device_name() if device.type == "cuda" else "CPU"
+            print(f"{number} × {name}, torch {torch.__version__}\n")
+            header = ("devices", "Gaussians", "megapixels", "views", "blocks", "ms a step", "peak GB of each device")
+            print(grid(header, lines, names=0), flush=True)
+        if shards is not None:
+            dist.destroy_process_group()
+        return 0
+
+
+def step_time(step: Step, repeats: int) -> tuple[float, float]:
+    """Time steps that follow each other in all processes.
+
+    Returns:
+        Milliseconds a step, and the peak of this process's memory on the device in 10⁹ bytes, NaN without CUDA.
+    """
+
+    def steps() -> None:
+        for _ in range(repeats):
+            step()
+        if step.shards is not None:
+            step.shards.all(True)
+
+    for _ in range(3):  # kernels are compiled
+        step()
+    if step.images.is_cuda:
+        torch.cuda.reset_peak_memory_stats()
+    time = milliseconds(steps, rounds=3, repeats=1) / repeats
+    return time, torch.cuda.max_memory_allocated() / 1e9 if step.images.is_cuda else math.nan
+
+
+@dataclass
+class Parts:
+    """Time the parts of a training step of a finished run, each by itself (CUDA)."""
+
+    run: Positional[Path]
+    """folder of a run, or its config.yml"""
+    data: Path | None = None
+    """folder of the capture (default: where it was in training)"""
+    views: int = 1
+    """training views of a step"""
+    max_off_axis: float = 4.0
+    """as pipeline.model.max-off-axis"""
+
+    def __call__(self) -> int:
+        device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        if not kernels.available(device):
+            raise ValueError("the parts are our Triton kernels, which need a CUDA device.")
+        folder = self.run if self.run.is_dir() else self.run.parent
+        params = {name: value.to(device) for name, value in read_gaussians(folder).items()}
+        cameras = read_cameras(folder, self.data, split="train")
+        same = [i for i, size in enumerate(cameras.sizes) if size == cameras.sizes[0]][: self.views]
+        width, height = cameras.sizes[0]
+        viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds[same]).to(device)
+        timed, pairs = parts(params, viewmats, cameras.Ks[same].to(device), width, height, self.max_off_axis)
+        print(
+            f"{len(params['means']):,} Gaussians, {len(same)} views of {width}×{height}, {pairs / 1e6:.2f} million "
+            f"pairs of a Gaussian and a tile, torch {torch.__version__}.\n"
+        )
+        print(grid(("part", "ms"), [(name, f"{milliseconds(part, 3):.3f}") for name, part in timed.items()]))
+        return 0
+
+
+def parts(
+    params: Mapping[str, Tensor],
+    viewmats: Tensor,  # [V, 4, 4]
+    Ks: Tensor,  # [V, 3, 3]
+    width: int,
+    height: int,
+    max_off_axis: float,
+) -> tuple[dict[str, Callable[[], object]], int]:
+    """Return the parts of a step by their names, each of which can be called again and again, and the number of pairs.
+
+    Args:
+        params: `means` [N, 3], `quats` [N, 4], log `scales` [N, 3], logit `opacities` [N, 1], `features_dc` [N, 3] and
+            `features_rest` [N, K − 1, 3] of degree 3 at most.
+        viewmats: World to camera. [V, 4, 4]
+        Ks: Intrinsics in px. [V, 3, 3]
+        width: px.
+        height: px.
+        max_off_axis: As `render.rasterization.rasterize` takes it.
+    """
+    from sadgs_ns.kernels import compositing
+    from sadgs_ns.kernels.compositing_forward import composite_forward
+    from sadgs_ns.kernels.harmonics import colors_from_harmonics
+    from sadgs_ns.kernels.projection import project
+    from sadgs_ns.kernels.tiles import intersect_tiles
+
+    views, degree = len(viewmats), round((params["features_rest"].shape[1] + 1) ** 0.5) - 1
+    geometry = [params["means"], params["quats"], params["scales"].exp()]
+    leaves = [value.clone().requires_grad_() for value in geometry]
+    first, rest = (params[name].clone().requires_grad_() for name in ("features_dc", "features_rest"))
+    opacities = params["opacities"].sigmoid().flatten()
+    cameras = viewmats, Ks, width, height
+
+    def projected() -> tuple[Tensor, ...]:
+        return project(*leaves, opacities, *cameras, False)[:4]  # type: ignore[return-value]
+
+    radii, means2d, depths, conics = (value.detach().contiguous() for value in projected())
+    each = torch.stack([opacities] * views)
+
+    def colored() -> Tensor:
+        return colors_from_harmonics(degree, leaves[0].detach(), first, rest, viewmats, radii)
+
+    ellipses = means2d, radii, depths, conics, each
+    counted = partial(intersect_tiles, *ellipses, width, height, compositing.TILE_SIZE, max_off_axis)
+    pending = counted()
+    pairs = sum(pending.pair_counts.wait())
+    capacity = int(ROOM * pairs) + 1
+    starts, ids = pending.lists(capacity)
+    splats = [value.detach().clone().requires_grad_() for value in (means2d, conics, colored(), each)]
+    drawn = [value.detach() for value in splats]
+    renders, _ = partial(compositing.rasterize_to_pixels, *splats)(width, height, starts, ids, False)
+    upstream, target = torch.rand_like(renders), torch.zeros_like(renders, dtype=torch.uint8)
+    image = renders.detach().requires_grad_()
+    return {
+        "projection": projected,
+        "projection, with gradient": lambda: torch.autograd.grad([v.sum() for v in projected()[1:]], leaves),
+        "harmonics": colored,
+        "harmonics, with gradient": lambda: torch.autograd.grad(colored().sum(), [first, rest]),
+        "tiles counted, order by depth": counted,
+        "tile lists": lambda: pending.lists(capacity),
+        "compositing": partial(composite_forward, *drawn, width, height, starts, ids),
+        "compositing's gradient": lambda: torch.autograd.grad(renders, splats, upstream, retain_graph=True),
+        "loss": lambda: photometric_loss(image, target),
+        "loss, with gradient": lambda: torch.autograd.grad(photometric_loss(image, target)[0], [image]),
+    }, pairs

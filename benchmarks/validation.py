@@ -13,16 +13,16 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
-from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from PIL import Image
 from scipy.spatial.transform import Rotation
+from tyro.conf import Positional
 
-from benchmarks import command_lines
 from benchmarks.datasets import image_names
 
 SPARSE = Path("sparse/0")
@@ -122,29 +122,41 @@ def write_transforms(scene: Path, out: Path, fold: int = VALIDATION) -> tuple[in
     return len(train), len(held_out)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Write the scenes and print how many views each has; returns the exit code, 2 where the input is wrong."""
-    arguments = command_lines.validation().parse_args(argv)
-    folds = [str(VALIDATION)] if arguments.folds is None else arguments.folds.split(",")
-    if not {*folds} <= {str(fold) for fold in range(INTERVAL)}:
-        problem = f"--folds must be whole numbers from 0 to {INTERVAL - 1}, such as 2,4,6, not {arguments.folds!r}."
-        print(f"python -m benchmarks validation: {problem}", file=sys.stderr)
-        return 2
-    folders = sorted(path for path in arguments.root.iterdir() if path.is_dir()) if arguments.root.is_dir() else []
-    scenes = [path for path in folders if (path / SPARSE).is_dir() or (path / "transforms.json").exists()]
-    if not scenes:
-        print(f"{arguments.root} holds no folder with {SPARSE} or transforms.json: give the folder of the scenes.")
-        return 2
-    for scene, fold in ((scene, int(fold)) for scene in scenes for fold in folds):
-        name = scene.name if arguments.folds is None else f"{scene.name}-{fold}"
-        if (scene / SPARSE).is_dir():
-            train, held_out = write_colmap(scene, arguments.out / name, fold=fold)
-            if scene.name in arguments.masked:
-                write_colmap(scene, arguments.out / f"{name}-masked", masked=True, fold=fold)
-            if scene.name in arguments.noisy:
-                write_colmap(scene, arguments.out / f"{name}-noisy", fold=fold)
-                turn_cameras(arguments.out / f"{name}-noisy")
-        else:
-            train, held_out = write_transforms(scene, arguments.out / name, fold)
-        print(f"{name}: {train} training views, {held_out} held-out views")
-    return 0
+@dataclass
+class Command:
+    """Copy scenes with validation views held out and test views left out."""
+
+    root: Positional[Path]
+    """folder that holds the scenes"""
+    out: Positional[Path]
+    """folder for the copies"""
+    folds: str | None = None
+    """such as 2,4,6: write NAME-2, … with every 8th view from 2, … held out (default: 4, as NAME)"""
+    masked: tuple[str, ...] = ()
+    """scenes of which NAME-masked is written, too"""
+    noisy: tuple[str, ...] = ()
+    """scenes of which NAME-noisy is written, too"""
+
+    def __call__(self) -> int:
+        folds = [str(VALIDATION)] if self.folds is None else self.folds.split(",")
+        if not {*folds} <= {str(fold) for fold in range(INTERVAL)}:
+            raise ValueError(
+                f"--folds must be whole numbers from 0 to {INTERVAL - 1}, such as 2,4,6, not {self.folds!r}."
+            )
+        folders = sorted(path for path in self.root.iterdir() if path.is_dir()) if self.root.is_dir() else []
+        scenes = [path for path in folders if (path / SPARSE).is_dir() or (path / "transforms.json").exists()]
+        if not scenes:
+            raise ValueError(f"{self.root} holds no folder with {SPARSE} or transforms.json; give that of the scenes.")
+        for scene, fold in product(scenes, map(int, folds)):
+            name = scene.name if self.folds is None else f"{scene.name}-{fold}"
+            if (scene / SPARSE).is_dir():
+                train, held_out = write_colmap(scene, self.out / name, fold=fold)
+                if scene.name in self.masked:
+                    write_colmap(scene, self.out / f"{name}-masked", masked=True, fold=fold)
+                if scene.name in self.noisy:
+                    write_colmap(scene, self.out / f"{name}-noisy", fold=fold)
+                    turn_cameras(self.out / f"{name}-noisy")
+            else:
+                train, held_out = write_transforms(scene, self.out / name, fold)
+            print(f"{name}: {train} training views, {held_out} held-out views")
+        return 0

@@ -9,10 +9,13 @@ from __future__ import annotations
 import statistics
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks import command_lines, results, table
+from tyro.conf import Positional
+
+from benchmarks import results, table
 from benchmarks.results import Result
 
 COLLAPSE = 3.0
@@ -27,11 +30,7 @@ def load(paths: Iterable[Path]) -> dict[str, dict[str, list[Result]]]:
     Raises:
         ValueError: A file is missing, or a line of it is no result; names it.
     """
-    rows: list[Result] = []
-    for path in paths:
-        if not path.is_file():
-            raise ValueError(f"{path} is not a file; give one that python -m benchmarks wrote.")
-        rows += results.read(path, strict=True)
+    rows = [row for path in paths for row in results.read(path, strict=True)]
     found: dict[str, dict[str, list[Result]]] = {}
     for row in (latest := table.latest(rows)):
         if row.get("view_psnr"):
@@ -105,13 +104,19 @@ def _mean_and_deviation(values: Sequence[float]) -> str:
     return f"{statistics.fmean(values):.2f}{deviation}"
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Print the tables; returns the exit code, 2 where a file is missing or does not fit the others."""
-    given = command_lines.views().parse_args(argv)
-    counts: dict[str, tuple[int, int]] = {}  # collapsed pairs, and all that have a reference
-    try:
-        scenes = load(given.results)
-        frozen = scenes if given.references is None else load(given.references)
+@dataclass
+class Command:
+    """Print the PSNR of held-out views, and which lie 3 dB or more under the best label's median."""
+
+    results: Positional[tuple[Path, ...]]
+    """files that python -m benchmarks wrote"""
+    references: tuple[Path, ...] = ()
+    """files whose runs alone make the references (default: the results)"""
+
+    def __call__(self) -> int:
+        counts: dict[str, tuple[int, int]] = {}  # collapsed pairs, and all that have a reference
+        scenes = load(self.results)
+        frozen = load(self.references) if self.references else scenes
         for scene, runs in scenes.items():
             others = frozen.get(scene, {})
             names = view_names(scene, [row for group in (*runs.values(), *others.values()) for row in group])
@@ -120,9 +125,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             for label, group in runs.items():
                 bad, judged = counts.get(label, (0, 0))
                 counts[label] = bad + len(collapsed(group, reference)), judged + len(group) * len(reference)
-    except ValueError as error:
-        print(f"python -m benchmarks views: {error}", file=sys.stderr)
-        return 2
-    for label, (bad, judged) in counts.items():
-        print(f"{label}: {bad} of {judged} (view, run) pairs collapsed")
-    return 0
+        for label, (bad, judged) in counts.items():
+            print(f"{label}: {bad} of {judged} (view, run) pairs collapsed")
+        return 0

@@ -55,9 +55,10 @@ RUN_BY = {
     "python -m benchmarks PROTOCOL.yaml": "Makefile",
     "python -m benchmarks formats": "tests/benchmarks/test_formats_table.py::"
     "test_the_table_has_every_format_with_its_size_and_loss",
-    "python -m benchmarks kernels": "tests/benchmarks/test_approximations.py::test_every_row_is_printed_and_written",
-    "python -m benchmarks report": "tests/benchmarks/test_report.py::"
-    "test_a_second_report_replaces_the_first_and_keeps_other_files",
+    "python -m benchmarks approximations": "tests/benchmarks/test_approximations.py::"
+    "test_every_row_is_printed_and_written",
+    "python -m benchmarks table": "tests/benchmarks/test_table.py::"
+    "test_the_command_prints_the_table_and_draws_two_plots",
     "python -m benchmarks documents": "tests/test_docs.py::test_tables_are_what_their_rows_give",
 }
 """Tests that run commands which begin so, or files that do; the longest beginning counts."""

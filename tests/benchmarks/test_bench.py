@@ -339,12 +339,12 @@ def test_sigterm_ends_the_runs_and_its_handler_is_the_program_s_again(tmp_path: 
     (tmp_path / "fox").mkdir()
     arguments = [str(tmp_path / "p.yaml"), "--scenes", str(tmp_path), "--output", str(tmp_path / "r.jsonl")]
     before = signal.getsignal(signal.SIGTERM)
-    monkeypatch.setattr(bench, "launcher", lambda root, images: launch)
+    monkeypatch.setattr(bench, "launcher", lambda root: launch)
     with pytest.raises(SystemExit) as stopped:
         bench.main(arguments)
     assert stopped.value.code == 143 and processes[0].poll() is not None
     assert signal.getsignal(signal.SIGTERM) == before
-    monkeypatch.setattr(bench, "launcher", lambda root, images: FakeRunner(crashes={"ours"}))
+    monkeypatch.setattr(bench, "launcher", lambda root: FakeRunner(crashes={"ours"}))
     assert bench.main(arguments) == 1
     assert signal.getsignal(signal.SIGTERM) == before
 
@@ -357,7 +357,7 @@ def test_runs_on_other_numbers_of_devices_are_not_mixed(
         json.dumps(content(scenes={"fox": {"data": "fox", "dataparser": "nerfstudio-data"}}))
     )
     (tmp_path / "fox").mkdir()
-    monkeypatch.setattr(bench, "launcher", lambda root, images: pytest.fail("nothing may start"))
+    monkeypatch.setattr(bench, "launcher", lambda root: pytest.fail("nothing may start"))
     output = tmp_path / "r.jsonl"
     results.append(output, result(devices=there))
     arguments = ["p.yaml", "--scenes", ".", "--output", str(output), "--gpus", gpus]
@@ -402,12 +402,11 @@ def test_table_means_over_seeds_and_ratio_to_the_reference():
         result(scene="south", label="ours", lpips=None, peak_gb=None),
     ]
     lines = markdown(rows, "base").splitlines()
-    assert lines[2] == "| fox | base | 100.0 | 1.000 | 30.00 | 0.9000 | 0.1000 | 1,000 | 2.00 | 1 |"
+    assert lines[2] == "| fox | base | 100.0 | 1.000 | 30.00 | .9000 | .1000 | 1,000 | 2.0 | 1 |"
     assert lines[3] == (
-        "| fox | ours | 10.0 ± 1.0 | 0.100 | 30.50 ± 0.50 | 0.9000 ± 0.0000 | 0.1000 | 1,500,000 ± 500,000 "
-        "| 2.00 ± 0.00 | 2 |"
+        "| fox | ours | 10.0 ± 1.0 | 0.100 | 30.50 ± 0.50 | .9000 ± .0000 | .1000 | 1,500k | 2.0 ± 0.0 | 2 |"
     )
-    assert lines[4] == "| south | ours | 10.0 | – | 30.00 | 0.9000 | – | 1,000 | – | 1 |"
+    assert lines[4] == "| south | ours | 10.0 | – | 30.00 | .9000 | – | 1,000 | – | 1 |"
     assert lines[-1] == "- fox, ours, seed 2 failed: RuntimeError: out of memory"
 
 

@@ -1,4 +1,4 @@
-"""What a benchmark's row holds: phases, curve, images, metrics. Tiny runs on whatever device there is."""
+"""What a benchmark's row holds: phases, curve, metrics. Tiny runs on whatever device there is."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ import dataclasses
 import importlib
 import json
 import random
-import re
 import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,12 +17,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import yaml
 from PIL import Image
 from torch import Tensor
 
 from benchmarks import __main__ as bench
-from benchmarks import evaluate, images, phases, protocol, results, run, timer
+from benchmarks import evaluate, phases, protocol, run, timer
 from benchmarks.curve import undisturbed
 from benchmarks.phases import PHASES, Stopwatch
 from benchmarks.protocol import Job, Row, Scene
@@ -327,15 +324,15 @@ def test_measuring_observes_eta_and_densifies_nothing(root: Path, tmp_path: Path
     assert vars(strategy) == schedule and model.num_points == gaussians
 
 
-# The record and its images
+# The record
 
 
 INITIALIZATION_SECONDS = 0.5
 
 
 @pytest.fixture(scope="module")
-def written(root: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
-    """What `benchmarks.run` writes for the command that python -m benchmarks starts, and the images' folder."""
+def written(root: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What `benchmarks.run` writes for the command that python -m benchmarks starts."""
     from sadgs_ns.plugin.model import SadgsModel
 
     folder = tmp_path_factory.mktemp("run")
@@ -348,18 +345,18 @@ def written(root: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(subprocess, "Popen", lambda command, **_: commands.append(command))
-        bench.launcher(root, folder / "images")(Job(SCENE, SADGS, 3), None, folder)
+        bench.launcher(root)(Job(SCENE, SADGS, 3), None, folder)
     with pytest.MonkeyPatch.context() as patch:
         replace_lpips(patch)
         patch.setattr(SadgsModel, "populate_modules", populate_slowly)
         patch.setattr(sys, "argv", commands[0][2:])
         run.main()
         assert SadgsModel.populate_modules is populate_slowly, "the run has put it back"
-    return json.loads((folder / "result.json").read_text()), folder / "images"
+    return json.loads((folder / "result.json").read_text())
 
 
-def test_a_record_holds_all_fields(written: tuple[dict[str, Any], Path]):
-    record, _ = written
+def test_a_record_holds_all_fields(written: dict[str, Any]):
+    record = written
     assert record["status"] == "ok", record["error"]
     assert record["lpips_vgg"] is None and "curve" not in record
     assert record["ssim"] != record["ssim_padded"]
@@ -386,28 +383,12 @@ def test_each_held_out_view_is_told_in_the_order_of_its_psnr(runs: Runs, root: P
         assert told["view_angles"] == told["view_uncovered"] == [None] * 3
 
 
-def test_the_times_add_up(written: tuple[dict[str, Any], Path]):
-    record, _ = written
+def test_the_times_add_up(written: dict[str, Any]):
+    record = written
     names = ("import", "setup", "initialization", "load", "warmup", "structure_tensor", "train")
     parts = {name: record[f"{name}_seconds"] for name in names}
     assert parts["initialization"] >= INITIALIZATION_SECONDS and all(part > 0 for part in parts.values())
     assert 0 <= record["wall_seconds"] - sum(parts.values()) < INITIALIZATION_SECONDS
-
-
-def test_images_lie_beside_the_photographs(written: tuple[dict[str, Any], Path], root: Path):
-    record, folder = written
-    label = images.file_name("ours [c=1]")
-    assert record["images"] == [f"demo/{label}-3/{name}.png" for name in ("000", "004", "008")]
-    assert sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.*")) == sorted(
-        [*record["images"], *(f"demo/truth/{name}.png" for name in ("000", "004", "008"))]
-    )
-    for path in record["images"]:
-        photograph = np.asarray(Image.open(root / "demo" / "images" / Path(path).name).convert("RGB"))
-        assert np.array_equal(np.asarray(Image.open(folder / "demo" / "truth" / Path(path).name)), photograph)
-        rendering = np.asarray(Image.open(folder / path))
-        assert rendering.shape == (HEIGHT, WIDTH, 3)
-        error = np.abs(rendering.astype(float) - photograph).mean()
-        assert 0 < error < np.abs(rendering.astype(float).mean() - photograph).mean(), "it shows this view"
 
 
 def test_two_processes_train_one_splat_whose_row_the_first_writes(
@@ -431,21 +412,6 @@ def test_two_processes_train_one_splat_whose_row_the_first_writes(
     assert "phases" not in record
 
 
-def test_names_of_files_are_safe_and_differ():
-    assert [images.file_name(name) for name in ("sadgs-3k", "v1.5_b")] == ["sadgs-3k", "v1.5_b"]
-    unsafe = ["a b", "a_b", "a/b", "a\\b", "..", ".", "", "η", "a[b=1,c=2]"]
-    names = [images.file_name(name) for name in unsafe]
-    assert all(re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", name) for name in names)
-    assert len(set(names)) == len(names)
-
-
-@pytest.mark.parametrize(
-    ("count", "expected"), [(1, [0]), (3, [0, 1, 2]), (4, [0, 1, 2, 3]), (5, [0, 1, 3, 4]), (37, [0, 12, 24, 36])]
-)
-def test_chosen_views_are_spaced_evenly(count: int, expected: list[int]):
-    assert images.chosen(count) == expected
-
-
 class FlatModel:
     """Renders grey on black."""
 
@@ -460,17 +426,6 @@ class FlatModel:
     @staticmethod
     def composite_with_background(image: Tensor, background: Tensor) -> Tensor:
         return image[..., :3]
-
-
-def test_photographs_keep_their_alpha_and_names_that_repeat_are_told_apart(tmp_path: Path):
-    photographs = [torch.full((4, 5, 4), value, dtype=torch.uint8) for value in (10, 200)]
-    views = [(None, {"image": image}) for image in photographs]
-    paths = images.save(FlatModel(), views, ["r", "r"], tmp_path, "../lego", "ours", 0)
-    assert len(set(paths)) == 2 and all((tmp_path / path).resolve().is_relative_to(tmp_path) for path in paths)
-    for path, photograph in zip(paths, photographs, strict=True):
-        truth = np.asarray(Image.open(tmp_path / Path(path).parts[0] / "truth" / Path(path).name))
-        assert np.array_equal(truth, photograph.numpy())
-        assert np.unique(np.asarray(Image.open(tmp_path / path))).tolist() == [128]
 
 
 @pytest.mark.parametrize(("near_plane", "planes"), [(0.01, []), (0.3, [0.01])])
@@ -588,44 +543,6 @@ def test_the_bar_estimates_from_the_runs_that_ended():
     for clock[0], left in ((100.0, 500.0), (300.0, 600.0), (600.0, 600.0)):
         progress.advance(task)
         assert progress.tasks[0].time_remaining == left
-
-
-@pytest.fixture
-def command(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
-    """python -m benchmarks on a protocol of two seeds, with runs that end at once."""
-
-    def launcher(scenes: Path, folder: Path | None = None) -> bench.Launch:
-        def launch(job: Job, gpu: str | None, work: Path) -> subprocess.Popen[bytes]:
-            made = {} if folder is None else {"images": [f"demo/{job.seed}.png"]}
-            measured = dict.fromkeys(("loop_seconds", "psnr", "ssim", "lpips", "peak_gb"), 1.0)
-            record = {"status": "ok", "error": None, **measured, "gaussians": 1, **made}
-            (work / "result.json").write_text(json.dumps(record))
-            return subprocess.Popen(["true"], start_new_session=True)
-
-        return launch
-
-    monkeypatch.setattr(bench, "launcher", launcher)
-    monkeypatch.setattr(bench, "POLL_SECONDS", 0.01)
-    (tmp_path / "p.yaml").write_text(yaml.safe_dump(content()))
-
-    def main(*options: str) -> int:
-        folders = ["--scenes", str(root), "--output", str(tmp_path / "r.jsonl")]
-        return bench.main([str(tmp_path / "p.yaml"), *folders, *options])
-
-    return main
-
-
-def test_a_continued_benchmark_says_which_runs_have_no_images(
-    command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    assert command("--only", "/0$") == 0
-    assert "no images" not in capsys.readouterr().out
-    folder = str(tmp_path / "images")
-    assert command("--images", folder) == 0
-    assert "1 finished runs have no images" in capsys.readouterr().out
-    assert ["images" in row for row in results.read(tmp_path / "r.jsonl")] == [False, True]
-    assert command("--images", str(tmp_path / "p.yaml")) == 2
-    assert "p.yaml is a file; give a folder." in capsys.readouterr().err
 
 
 def test_a_strategy_that_was_never_fitted_to_a_run_is_left_as_it_was():

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
+from benchmarks import __main__ as bench
 from benchmarks import documents, plots
 
 OPENING, CLOSING = "<!-- table: {} -->", "<!-- end -->"
@@ -71,7 +72,7 @@ def checkout(folder: Path, tables: Any, rows: dict[str, list[dict[str, Any]]], *
 
 def test_runs_are_a_line_each(tmp_path: Path):
     folder = checkout(tmp_path, {"main": RUNS}, {"runs.jsonl": ROWS["runs.jsonl"]})
-    assert documents.main([str(folder)]) == 0
+    assert bench.main(["documents", str(folder)]) == 0
     assert (
         (folder / "README.md").read_text("utf8")
         == """# Title
@@ -93,7 +94,7 @@ After.
 
 def test_a_sweep_is_differences_from_its_first_setting(tmp_path: Path):
     folder = checkout(tmp_path, {"sweep": SWEEP}, {"sweep.jsonl": ROWS["sweep.jsonl"]})
-    assert documents.main([str(folder)]) == 0
+    assert bench.main(["documents", str(folder)]) == 0
     lines = (folder / "README.md").read_text("utf8").splitlines()[6:10]
     # Castle is the mean of its two scenes; its second setting lacks one of them.
     assert lines[0] == "| × 1 | 30.25 / .9000 / .1000 / 200k | 29.00 / .9000 / .1000 / 200k |"
@@ -104,7 +105,7 @@ def test_a_sweep_is_differences_from_its_first_setting(tmp_path: Path):
 def test_a_difference_that_rests_on_a_single_run_is_marked(tmp_path: Path):
     rows = [row("fox", "T1", 0), row("fox", "T1", 1), row("fox", "T2", lpips=0.1 - 1e-9)]
     folder = checkout(tmp_path, {"sweep": {**SWEEP, "scenes": {"fox": ["fox"]}}}, {"sweep.jsonl": rows})
-    assert documents.main([str(folder)]) == 0
+    assert bench.main(["documents", str(folder)]) == 0
     assert "| × 2 | 0.00 / .0000 / .0000 / ×1.00 ¹ |" in (folder / "README.md").read_text("utf8")
 
 
@@ -112,16 +113,16 @@ def test_approximations_and_growth_are_printed_as_their_commands_do(tmp_path: Pa
     common = {"table": "footprint", "input": "demo", "median": 0.1, "p95": 0.2, "max": 0.3, "flips": 0.0, "ms": 1234.5}
     rows = [{**common, "variant": "1 sample"}, {**common, "variant": "4 samples", "ms": None}]
     tables = {
-        "eta": {"kind": "approximations", "rows": "a.jsonl", "table": "footprint", "input": "demo"},
+        "eta": {"kind": "approximations", "rows": "a.jsonl", "of": "footprint", "input": "demo"},
         "one": {
-            "kind": "approximations", "rows": "a.jsonl", "table": "footprint", "input": "demo", "variants": ["1 sample"]
+            "kind": "approximations", "rows": "a.jsonl", "of": "footprint", "input": "demo", "variants": ["1 sample"]
         },
         "growth": {"kind": "growth", "rows": "growth.csv"},
     }  # fmt: skip
     folder = checkout(tmp_path, tables, {"a.jsonl": rows})
     csv = "gaussians,megapixels,ours_ms,gsplat_ms\n1000000,2.0,3.0,9.0\n100000,2.0,2.0,5.0\n1000000,0.3,2.5,7.5\n"
     (folder / documents.RESULTS / "growth.csv").write_text(csv, "utf8")
-    assert documents.main([str(folder)]) == 0
+    assert bench.main(["documents", str(folder)]) == 0
     text = (folder / "README.md").read_text("utf8")
     assert text.count("| 1 sample | 10 % | 20 % | 30 % | 0 % | 1,234 |") == 2
     assert text.count("| 4 samples | 10 % | 20 % | 30 % | 0 % | – |") == 1
@@ -129,8 +130,9 @@ def test_approximations_and_growth_are_printed_as_their_commands_do(tmp_path: Pa
 
 
 FIGURE = {
+    "kind": "peers",
     "cost": "loop_seconds",
-    "parts": [{"rows": "runs.jsonl", "scenes": ["fox"], "labels": {"slow": "theirs 30k", "ours": "ours"}}],
+    "lines": [{"rows": "runs.jsonl", "scenes": ["fox"], "labels": {"slow": "theirs 30k", "ours": "ours"}}],
     "elsewhere": [{"rows": "runs.jsonl", "scenes": ["tree"], "labels": {"ours": "ours"}}],
 }
 
@@ -144,28 +146,28 @@ def test_a_figure_is_drawn_from_its_rows_and_drawn_anew_only_when_they_change(
         described.read_text("utf8") + yaml.safe_dump({"figures": {"peers": FIGURE}}, sort_keys=False), "utf8"
     )
     path = folder / documents.FIGURES / "peers.png"
-    assert documents.main([str(folder), "--check"]) == 1 and not path.exists()
-    assert documents.main([str(folder)]) == 0
-    points = [["theirs 30k", True, 250.0, 29.0, 0.1], ["ours", True, 10.5, 30.5, 0.1], ["ours", False, 10.0, 30.0, 0.1]]
-    assert json.loads(plots.drawn_points(path) or "") == ["loop_seconds", *points]
-    assert documents.main([str(folder), "--check"]) == 0
+    assert bench.main(["documents", str(folder), "--check"]) == 1 and not path.exists()
+    assert bench.main(["documents", str(folder)]) == 0
+    digest = plots.digest_in(path)
+    assert bench.main(["documents", str(folder), "--check"]) == 0
     rows = folder / documents.RESULTS / "runs.jsonl"
     rows.write_text(rows.read_text("utf8").replace("250.0", "251.0"), "utf8")
     written = path.read_bytes()
     capsys.readouterr()
-    assert documents.main([str(folder), "--check"]) == 1 and path.read_bytes() == written
+    assert bench.main(["documents", str(folder), "--check"]) == 1 and path.read_bytes() == written
     assert f"{path} is not what its rows give; run python -m benchmarks documents." in capsys.readouterr().out
-    assert documents.main([str(folder)]) == 0 and path.read_bytes() != written
+    assert bench.main(["documents", str(folder)]) == 0 and path.read_bytes() != written
+    assert digest is not None and plots.digest_in(path) not in (digest, None)
 
 
 WRONG_FIGURES: dict[str, tuple[Any, str]] = {
     "an unknown cost": ({**FIGURE, "cost": "price"}, "fox/slow/0 has no price"),
     "an unknown label": (
-        {**FIGURE, "elsewhere": [{**FIGURE["parts"][0], "labels": {"none": "none"}}]},
+        {**FIGURE, "elsewhere": [{**FIGURE["lines"][0], "labels": {"none": "none"}}]},
         "no row 'none'",
     ),
-    "a missing key": ({"cost": "loop_seconds"}, "must be a mapping of cost, parts, elsewhere"),
-    "a list": ([FIGURE], "must be a mapping"),
+    "a missing key": ({"kind": "peers", "cost": "price"}, "must be a mapping of cost, lines, elsewhere"),
+    "a list": ([FIGURE], "must be a mapping whose kind is one of peers, quality, growth."),
 }
 
 
@@ -179,7 +181,7 @@ def test_a_figure_that_is_described_wrongly_is_one_sentence(
     described.write_text(
         described.read_text("utf8") + yaml.safe_dump({"figures": {"peers": figure}}, sort_keys=False), "utf8"
     )
-    assert documents.main([str(folder)]) == 2
+    assert bench.main(["documents", str(folder)]) == 2
     error = capsys.readouterr().err
     assert sentence in error and error.count("\n") == 1
     assert not (folder / documents.FIGURES).exists() and "fox" not in (folder / "README.md").read_text("utf8")
@@ -187,14 +189,14 @@ def test_a_figure_that_is_described_wrongly_is_one_sentence(
 
 def test_check_finds_what_changed_and_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     folder = checkout(tmp_path, {"main": RUNS}, {"runs.jsonl": ROWS["runs.jsonl"]})
-    assert documents.main([str(folder), "--check"]) == 1
-    assert documents.main([str(folder)]) == 0
-    assert documents.main([str(folder), "--check"]) == 0
+    assert bench.main(["documents", str(folder), "--check"]) == 1
+    assert bench.main(["documents", str(folder)]) == 0
+    assert bench.main(["documents", str(folder), "--check"]) == 0
     capsys.readouterr()
     readme = folder / "README.md"
     wrong = readme.read_text("utf8").replace("29.00", "28.99")
     readme.write_text(wrong, "utf8")
-    assert documents.main([str(folder), "--check"]) == 1
+    assert bench.main(["documents", str(folder), "--check"]) == 1
     assert (
         capsys.readouterr().out
         == f"{readme}: table main is not what its rows give; run python -m benchmarks documents.\n"
@@ -206,7 +208,7 @@ WRONG: dict[str, tuple[Any, str, str]] = {
     "no table of that name": ({"main": RUNS}, "<!-- table: other -->\n<!-- end -->\n", "table other is not in"),
     "a table without end": ({"main": RUNS}, "<!-- table: main -->\n\n", "needs one `<!-- end -->`"),
     "an end alone": ({"main": RUNS}, "<!-- end -->\n", "needs one `<!-- end -->`"),
-    "an unknown kind": ({"main": {**RUNS, "kind": "run"}}, "", "kind is 'run'; give one of runs, sweep"),
+    "an unknown kind": ({"main": {**RUNS, "kind": "run"}}, "", "must be a mapping whose kind is one of runs, sweep"),
     "an unknown key": ({"main": {**RUNS, "row": 1}}, "", "must be a mapping of columns, lines"),
     "a missing key": ({"main": {"kind": "runs", "columns": []}}, "", "must be a mapping of columns, lines"),
     "an unknown column": ({"main": {**RUNS, "columns": ["speed"]}}, "", "there is no column 'speed'"),
@@ -221,7 +223,7 @@ WRONG: dict[str, tuple[Any, str, str]] = {
         "",
         "there is no row 'ours' of site",
     ),
-    "tables that are a list": ([RUNS], "", "tables must be a mapping"),
+    "tables that are a list": ([RUNS], "", "must be YAML with megapixels and tables, both mappings"),
     "scenes that are no mapping": ({"main": {**SWEEP, "scenes": ["fox"]}}, "", "table main: "),
     "no such rows": ({"main": {**SWEEP, "rows": ["none.jsonl"]}}, "", "none.jsonl is not there"),
 }
@@ -232,7 +234,7 @@ def test_wrong_input_is_one_sentence_and_changes_nothing(case: str, tmp_path: Pa
     tables, text, sentence = WRONG[case]
     folder = checkout(tmp_path, tables, {"runs.jsonl": ROWS["runs.jsonl"]}, zulu=text)
     before = (folder / "README.md").read_text("utf8")
-    assert documents.main([str(folder)]) == 2
+    assert bench.main(["documents", str(folder)]) == 2
     error = capsys.readouterr().err
     assert error.startswith("python -m benchmarks documents: ") and sentence in error and error.count("\n") == 1
     assert (folder / "README.md").read_text("utf8") == before
@@ -240,7 +242,7 @@ def test_wrong_input_is_one_sentence_and_changes_nothing(case: str, tmp_path: Pa
 
 def test_rows_that_no_table_cites_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     folder = checkout(tmp_path, {"main": RUNS}, ROWS)
-    assert documents.main([str(folder)]) == 2
+    assert bench.main(["documents", str(folder)]) == 2
     assert "no table is made of sweep.jsonl" in capsys.readouterr().err
 
 
@@ -248,10 +250,10 @@ def test_a_table_that_no_document_holds_is_named(tmp_path: Path, capsys: pytest.
     folder = checkout(tmp_path, {"main": RUNS, "sweep": SWEEP}, ROWS)
     readme = folder / "README.md"
     readme.write_text(readme.read_text("utf8").replace(f"{OPENING.format('sweep')}\n{CLOSING}", ""), "utf8")
-    assert documents.main([str(folder)]) == 2
+    assert bench.main(["documents", str(folder)]) == 2
     assert "no document holds sweep" in capsys.readouterr().err
 
 
 def test_a_folder_that_is_no_checkout_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert documents.main([str(tmp_path)]) == 2
+    assert bench.main(["documents", str(tmp_path)]) == 2
     assert "give the folder of a checkout" in capsys.readouterr().err

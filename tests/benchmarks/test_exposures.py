@@ -10,7 +10,8 @@ import pytest
 from PIL import Image
 from scenes import VIEWS
 
-from benchmarks.exposures import FILE, draw_gains, linear_light, main, srgb_values, with_gains
+from benchmarks import __main__ as bench
+from benchmarks.exposures import FILE, draw_gains, linear_light, srgb_values, with_gains
 
 
 def pixels(scene: Path, name: str) -> np.ndarray:
@@ -18,7 +19,7 @@ def pixels(scene: Path, name: str) -> np.ndarray:
 
 
 def test_each_training_photo_has_the_gain_that_the_file_says_and_held_out_ones_the_mean(scene: Path, tmp_path: Path):
-    assert main([str(scene), str(tmp_path / "copy")]) == 0
+    assert bench.main(["exposures", str(scene), str(tmp_path / "copy")]) == 0
     photos = json.loads((tmp_path / "copy" / FILE).read_text())
     assert len(photos) == VIEWS and (tmp_path / "copy" / "sparse" / "0" / "points3D.bin").exists()
     held_out = [name for name, photo in photos.items() if photo["held_out"]]
@@ -37,14 +38,14 @@ def test_each_training_photo_has_the_gain_that_the_file_says_and_held_out_ones_t
 def test_the_same_seed_draws_the_same_gains(scene: Path, tmp_path: Path):
     texts = []
     for seed in (0, 0, 1):
-        assert main([str(scene), str(tmp_path / "copy"), "--seed", str(seed)]) == 0
+        assert bench.main(["exposures", str(scene), str(tmp_path / "copy"), "--seed", str(seed)]) == 0
         texts.append((tmp_path / "copy" / FILE).read_text())
     assert texts[0] == texts[1] != texts[2]
 
 
 def test_a_control_has_one_exposure(scene: Path, tmp_path: Path):
     options = ["--spread", "1", "--white-balance", "0", "--mean", "0.5"]
-    assert main([str(scene), str(tmp_path / "copy"), *options]) == 0
+    assert bench.main(["exposures", str(scene), str(tmp_path / "copy"), *options]) == 0
     photos = json.loads((tmp_path / "copy" / FILE).read_text()).values()
     assert {(photo["gain"], *photo["channels"]) for photo in photos} == {(0.5, 1.0, 1.0, 1.0)}
 
@@ -77,7 +78,7 @@ def test_wrong_input_is_one_sentence_and_leaves_all_as_it_was(
         ([str(scene), str(tmp_path / "copy")], "is there and holds no exposures.json"),
         ([str(scene), str(tmp_path / "new"), "--spread", "0.5"], "--spread must be at least 1"),
     ):
-        assert main(arguments) == 2
+        assert bench.main(["exposures", *arguments]) == 2
         error = capsys.readouterr().err
         assert said in error and error.count("\n") == 1
     assert (tmp_path / "copy" / "kept").exists() and (scene / "images").is_dir() and not (tmp_path / "new").exists()

@@ -9,6 +9,7 @@ import pytest
 import torch
 from kill_and_resume import configure, set_up
 
+from benchmarks import __main__ as bench
 from benchmarks import formats
 from examples.drawn_scene.scene import write_scene
 from sadgs_ns.formats import html
@@ -24,7 +25,7 @@ def test_the_table_has_every_format_with_its_size_and_loss(
     page = b'<script type="application/json" id="sse-bootstrap">{"settings": {}}</script>'
     monkeypatch.setattr(html, "_page", lambda: page)
     capsys.readouterr()
-    assert formats.main([str(trainer.base_dir / "config.yml"), "--output", str(tmp_path / "out")]) == 0
+    assert bench.main(["formats", str(trainer.base_dir / "config.yml"), "--output", str(tmp_path / "out")]) == 0
     head, *lines = capsys.readouterr().out.splitlines()
     assert head.startswith(f"{trainer.pipeline.model.num_points:,} Gaussians, 2 held-out views, rendered on ")
     rows = {cells[0].strip("` "): cells[1:] for cells in (line.strip("|").split("|") for line in lines[3:])}

@@ -174,7 +174,7 @@ def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
             (folder / "result.json").write_text(json.dumps(result(job, **times, **measured)))
             return subprocess.Popen(["true"], start_new_session=True)
 
-        monkeypatch.setattr(bench, "launcher", lambda root, images: launch)
+        monkeypatch.setattr(bench, "launcher", lambda root: launch)
         output = tmp_path / f"{len(started)}.jsonl"
         return bench.main([str(tmp_path / "p.yaml"), "--scenes", str(tmp_path), "--output", str(output), *options])
 

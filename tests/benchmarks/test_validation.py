@@ -12,12 +12,13 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from PIL import Image
 from scenes import HEIGHT, VIEWS, WIDTH
 
+from benchmarks import __main__ as bench
 from benchmarks.datasets import image_names
-from benchmarks.validation import MASKED_SHARE, SPARSE, main
+from benchmarks.validation import MASKED_SHARE, SPARSE
 
 
 def test_a_colmap_scene_is_split_as_nerfstudio_then_reads_it(scene: Path, tmp_path: Path):
-    assert main([str(scene.parent), str(tmp_path), "--masked", scene.name]) == 0
+    assert bench.main(["validation", str(scene.parent), str(tmp_path), "--masked", scene.name]) == 0
     names = image_names(ColmapDataParserConfig(colmap_path=SPARSE, downscale_factor=1), scene)
     for folder, masks in ((tmp_path / scene.name, None), (tmp_path / f"{scene.name}-masked", Path("masks"))):
         parser = ColmapDataParserConfig(data=folder, colmap_path=SPARSE, downscale_factor=1, masks_path=masks).setup()
@@ -33,7 +34,7 @@ def test_a_colmap_scene_is_split_as_nerfstudio_then_reads_it(scene: Path, tmp_pa
 
 
 def test_each_fold_holds_out_its_views_and_only_fold_0_holds_out_test_views(scene: Path, tmp_path: Path):
-    assert main([str(scene.parent), str(tmp_path), "--folds", "1,4,0", "--noisy", scene.name]) == 0
+    assert bench.main(["validation", str(scene.parent), str(tmp_path), "--folds", "1,4,0", "--noisy", scene.name]) == 0
     names = image_names(ColmapDataParserConfig(colmap_path=SPARSE, downscale_factor=1), scene)
     for fold in (0, 1, 4):
         for path in (tmp_path / f"{scene.name}-{fold}", tmp_path / f"{scene.name}-{fold}-noisy"):
@@ -44,7 +45,7 @@ def test_each_fold_holds_out_its_views_and_only_fold_0_holds_out_test_views(scen
 
 @pytest.mark.parametrize("folds", ["8", "-1", "2,x", ""])
 def test_a_fold_that_there_is_not_is_refused(folds: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert main([str(tmp_path), str(tmp_path), f"--folds={folds}"]) == 2
+    assert bench.main(["validation", str(tmp_path), str(tmp_path), f"--folds={folds}"]) == 2
     told = (
         f"python -m benchmarks validation: --folds must be whole numbers from 0 to 7, such as 2,4,6, not {folds!r}.\n"
     )
@@ -52,7 +53,7 @@ def test_a_fold_that_there_is_not_is_refused(folds: str, tmp_path: Path, capsys:
 
 
 def test_noise_turns_training_cameras_about_their_centres_and_leaves_the_others(scene: Path, tmp_path: Path):
-    assert main([str(scene.parent), str(tmp_path), "--noisy", scene.name]) == 0
+    assert bench.main(["validation", str(scene.parent), str(tmp_path), "--noisy", scene.name]) == 0
     outputs = {}
     for name in (scene.name, f"{scene.name}-noisy"):
         parser = ColmapDataParserConfig(data=tmp_path / name, colmap_path=SPARSE, downscale_factor=1)
@@ -80,8 +81,8 @@ def test_a_scene_that_lists_its_views_keeps_its_test_views_out(tmp_path: Path):
         "train_filenames": names[:20], "val_filenames": names[20:], "test_filenames": names[20:],
     }  # fmt: skip
     (scene / "transforms.json").write_text(json.dumps(content))
-    assert main([str(scene.parent), str(tmp_path / "out")]) == 0
-    assert main([str(scene.parent), str(tmp_path / "out"), "--folds", "0,2"]) == 0
+    assert bench.main(["validation", str(scene.parent), str(tmp_path / "out")]) == 0
+    assert bench.main(["validation", str(scene.parent), str(tmp_path / "out"), "--folds", "0,2"]) == 0
     for copy, held_out in (("listed", names[4:20:8]), ("listed-0", names[20:]), ("listed-2", names[2:20:8])):
         parser = NerfstudioDataParserConfig(data=tmp_path / "out" / copy, downscale_factor=1).setup()
         expected = {"train": [name for name in names[:20] if name not in held_out], "val": held_out, "test": held_out}
@@ -90,5 +91,5 @@ def test_a_scene_that_lists_its_views_keeps_its_test_views_out(tmp_path: Path):
 
 
 def test_a_folder_without_scenes_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert main([str(tmp_path), str(tmp_path / "out")]) == 2
-    assert capsys.readouterr().out.startswith(f"{tmp_path} holds no folder with sparse/0 or transforms.json")
+    assert bench.main(["validation", str(tmp_path), str(tmp_path / "out")]) == 2
+    assert f": {tmp_path} holds no folder with sparse/0 or transforms.json; give" in capsys.readouterr().err

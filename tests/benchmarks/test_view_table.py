@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks.view_table import main
+from benchmarks import __main__ as bench
 
 NAMED = {"view_names": ["a", "b"], "view_angles": [4.0, None], "view_uncovered": [0.125, 0.5]}
 
@@ -31,7 +31,7 @@ OURS = [row("ours", 0, [27.1, 21.0], **NAMED), row("ours", 1, [27.11, 17.5], **N
 def test_spread_worst_view_and_collapses_of_each_label(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     fold = [row("ours", 0, [25.0], "fox-2"), row("ours", 1, [21.0], "fox-2")]
     files = [write(tmp_path / "1.jsonl", *BASE), write(tmp_path / "2.jsonl", *OURS, *fold)]
-    assert main(files) == 0
+    assert bench.main(["views", *files]) == 0
     assert (
         capsys.readouterr().out
         == """## fox
@@ -61,7 +61,7 @@ ours: 2 of 6 (view, run) pairs collapsed
 def test_frozen_references_alone_count_and_may_be_older(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     results = write(tmp_path / "r.jsonl", *BASE, *OURS, row("ours", 0, [25.0], "tree"))
     old = [row("old", 0, [24.0, 23.5]), row("old", 1, [24.0, 24.5]), row("worse", 0, [9.0, 9.0])]
-    assert main([results, "--references", write(tmp_path / "f.jsonl", *old)]) == 0
+    assert bench.main(["views", results, "--references", write(tmp_path / "f.jsonl", *old)]) == 0
     told = capsys.readouterr().out
     assert "worst view b, 20.00 dB; collapsed: b (seed 0), b (seed 1)\n" in told and "25.00 dB; there is no ref" in told
     assert told.endswith("base: 2 of 6 (view, run) pairs collapsed\nours: 2 of 4 (view, run) pairs collapsed\n")
@@ -70,7 +70,7 @@ def test_frozen_references_alone_count_and_may_be_older(tmp_path: Path, capsys: 
 
 def test_runs_without_views_are_skipped_and_older_ones_number_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     rows = [row("ours", 0, [1.0, 1.0]), row("ours", 0, [26.0, 20.0]), row("ours", 1, None), row("base", 0, None)]
-    assert main([write(tmp_path / "r.jsonl", *rows)]) == 0
+    assert bench.main(["views", write(tmp_path / "r.jsonl", *rows)]) == 0
     out, error = capsys.readouterr()
     assert "| 0 | – | – | 26.00 |\n| 1 | – | – | 20.00 |\n" in out and "base" not in out
     assert error == "Runs without view_psnr are skipped, 2 of them, such as fox/ours/1/None.\n"
@@ -88,7 +88,7 @@ def test_wrong_files_are_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixt
         ([good, others], different),
         ([good, "--references", fewer], different),
     ):
-        assert main(arguments) == 2
+        assert bench.main(["views", *arguments]) == 2
         told = capsys.readouterr().err
         assert (
             told.startswith("python -m benchmarks views: ") and told.endswith(f"{sentence}\n") and told.count("\n") == 1

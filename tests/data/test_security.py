@@ -20,8 +20,6 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from hypothesis import given
-from hypothesis import strategies as st
 from kill_and_resume import set_up
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
@@ -35,7 +33,6 @@ from PIL import Image
 from tyro import cli
 
 from benchmarks import protocol, run
-from benchmarks.images import file_name
 from benchmarks.protocol import Row, Scene
 from examples.drawn_scene.scene import SPARSE_FOLDER
 from sadgs_ns.plugin import presets
@@ -144,18 +141,6 @@ def test_a_protocol_cannot_write_outside_its_run_s_folder(overrides: dict[str, A
         ValueError, match=r"row 'r' on 'demo': it would write .*elsewhere.*, outside the run's folder\."
     ):
         run.build_config(where, Row("r", "sadgs", overrides), 0, scene.parent, tmp_path)
-
-
-@pytest.mark.hard_case(
-    "a scene, label or image name of any characters, as a file name of the benchmarks' `--images`",
-    "becomes one safe name right below its folder; different texts stay different",
-)
-@given(st.text(), st.text())
-def test_any_text_becomes_the_name_of_a_file_right_below_its_folder(first: str, second: str):
-    name = file_name(first)
-    path = Path("folder", name)
-    assert path.parent == Path("folder") and path.name == name and not name.startswith(".")
-    assert first == second or name != file_name(second)
 
 
 def rename_first_image(scene: Path, copy: Path, name: str, text: bool) -> ColmapDataParserConfig:

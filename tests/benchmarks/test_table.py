@@ -1,0 +1,191 @@
+"""The table and the plots of a results file, from made-up results."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.text import Annotation
+from PIL import Image
+
+from benchmarks import __main__ as bench
+from benchmarks import plots, table
+
+
+def result(scene: str = "fox", label: str = "ours", seed: int = 0, **changes: Any) -> dict[str, Any]:
+    return {
+        "key": f"{scene}/{label}/{seed}", "scene": scene, "label": label, "method": "sadgs", "seed": seed,
+        "overrides": {"max_num_iterations": 3000}, "status": "ok", "error": None, "date": "2026-11-21T05:17:12+00:00",
+        "versions": {"torch": "2.11.0", "commit": "0123456789abcdef"}, "iterations": 3000, "gpu": "NVIDIA H200",
+        "loop_seconds": 20.0 + seed, "import_seconds": 12.0, "setup_seconds": 0.5, "load_seconds": 0.4,
+        "psnr": 30.0 + seed, "ssim": 0.9, "lpips": 0.1, "gaussians": 400_000, "peak_gb": 2.0, "jobs_per_gpu": 1,
+        **changes,
+    }  # fmt: skip
+
+
+def write_lines(path: Path, rows: list[dict[str, Any]]) -> str:
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return str(path)
+
+
+def test_the_command_prints_the_table_and_draws_two_plots(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    curve = [{"step": s, "seconds": s / 150, "psnr": 20 + s / 300, "ssim": 0.8, "lpips": None} for s in (0, 1500, 3000)]
+    rows = [
+        result(label="a", curve=curve), result(label="a", seed=1, curve=curve), result(label="b", loop_seconds=200.0),
+        result(scene="south & west", label="<b>$x_1$</b>"), result(scene="south & west", label="_hidden", psnr=24.0),
+        result(scene="south & west", label="broken", status="failed", error="RuntimeError: out of <memory>."),
+    ]  # fmt: skip
+    lines = write_lines(tmp_path / "r.jsonl", rows)
+    assert bench.main(["table", lines, "--reference", "b", "--plots", str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr().out
+    assert "| fox | a | 20.5 ± 0.5 | 0.102 | 30.50 ± 0.50 |" in printed and "| _hidden |" in printed
+    assert "- south & west, broken, seed 0 failed: RuntimeError: out of <memory>.\n" in printed
+    for name in ("quality-time", "quality-count"):
+        with Image.open(tmp_path / "out" / f"{name}.png") as image:
+            assert image.format == "PNG" and image.width == round(7.2 * 200)
+
+
+def test_old_results_without_new_fields(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """No curve, phases, versions; then also hardly any metric."""
+    bare = {"key": "k", "scene": "fox", "label": "bare", "seed": 0, "status": "ok", "loop_seconds": 10.0, "psnr": 20.0}
+    least = {name: bare[name] for name in ("key", "scene", "label", "seed", "status")}
+    for rows in ([result(lpips=None, gpu=None, peak_gb=None), bare], [least]):
+        lines = write_lines(tmp_path / "r.jsonl", rows)
+        assert bench.main(["table", lines, "--plots", str(tmp_path / "out")]) == 0
+        assert "| fox | bare | " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("content", "options", "sentence"),
+    [
+        (None, [], r"results\.jsonl is not a file; give one that python -m benchmarks wrote\."),
+        ("", [], r"has no successful run among its 0\."),
+        (b"\xff\xfe", [], r"results\.jsonl is not text; give a file that python -m benchmarks wrote\."),
+        ([result(status="failed", error="no data.")], [], r"has no successful run among its 1\."),
+        (json.dumps(result()) + '\n{"key": "b", "sta\n', [], r"results\.jsonl:2 is not a benchmark's result; delete"),
+        (json.dumps(result()) + '\n{"key": "b"}\n', [], r"results\.jsonl:2 is not a benchmark's result; delete"),
+        ([result()], ["--reference", "base"], r"--reference 'base' is no label of these: ours\."),
+    ],
+)
+def test_wrong_input_is_one_sentence_and_writes_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: Any, options: list[str], sentence: str
+):
+    lines = tmp_path / "results.jsonl"
+    if isinstance(content, list):
+        write_lines(lines, content)
+    elif content is not None:
+        lines.write_bytes(content if isinstance(content, bytes) else content.encode())
+    assert bench.main(["table", str(lines), "--plots", str(tmp_path / "out"), *options]) == 2
+    error = capsys.readouterr().err
+    assert re.search(sentence, error) and error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_growth_has_a_panel_for_gaussians_and_one_for_pixels():
+    rows = [(1e6, 2.0, 4.0, 8.0), (1e5, 2.0, 3.1, 6.2), (4e6, 2.0, 7.0, None), (1e6, 8.0, 10.0, 20.0)]
+    names = ("gaussians", "megapixels", "ours_ms", "gsplat_ms")
+    figure = plots.growth([dict(zip(names, row, strict=True)) for row in rows])
+    lines = [[np.asarray(line.get_xydata()).tolist() for line in axes.lines] for axes in figure.axes]
+    assert lines[0] == [[[1e5, 3.1], [1e6, 4.0], [4e6, 7.0]], [[1e5, 6.2], [1e6, 8.0]]]
+    assert lines[1] == [[[2e6, 4.0], [8e6, 10.0]], [[2e6, 8.0], [8e6, 20.0]]]
+
+
+def test_pareto_front_of_a_hand_made_case():
+    points = [(3.0, 30.0), (1.0, 20.0), (2.0, 30.0), (2.0, 25.0), (4.0, 29.0), (5.0, 31.0), (1.0, 20.0)]
+    assert plots.pareto_front(points, higher_is_better=True) == [(1.0, 20.0), (2.0, 30.0), (5.0, 31.0)]
+    assert plots.pareto_front([(1, 0.3), (2, 0.2), (3, 0.25)], higher_is_better=False) == [(1, 0.3), (2, 0.2)]
+    assert plots.pareto_front([], higher_is_better=True) == []
+
+
+def test_pareto_front_is_drawn_as_steps_through_the_means():
+    groups = table.groups([
+        result(label="small", gaussians=100, psnr=20.0),
+        result(label="large", gaussians=300, psnr=29.0), result(label="large", seed=1, gaussians=500, psnr=31.0),
+        result(label="worse", gaussians=900, psnr=25.0),
+    ])  # fmt: skip
+    axes = plots.quality(groups.items(), "gaussians").axes[0]
+    front = next(line for line in axes.lines if line.get_drawstyle() == "steps-post")
+    xs, ys = (np.asarray(front.get_data()[i]).tolist() for i in (0, 1))
+    assert list(zip(xs, ys, strict=True))[1:3] == [(100, 20.0), (400, 30.0)]
+    assert ys[-1] == 30.0 and xs[-1] == axes.get_xlim()[1]
+
+
+def test_labels_are_told_apart_without_colour():
+    looks = plots.styles(f"label {i}" for i in range(78))
+    assert len({(look.marker, look.fill) for look in looks.values()}) == 78
+    first = list(looks.values())[:13]
+    assert len({look.marker for look in first}) == 13 and {look.fill for look in first} == {"full"}
+    neighbours = zip(list(looks.values())[:-1], list(looks.values())[1:], strict=True)
+    assert all(a.line != b.line and a.color != b.color for a, b in neighbours)
+
+
+def test_a_label_looks_the_same_in_all_panels_and_in_the_legend():
+    groups = table.groups([result(label="a"), result(label="b"), result(scene="south", label="b")])
+    looks = plots.styles(label for _, label in groups)
+    figure = plots.quality(groups.items(), "loop_seconds")
+    markers = [{str(line.get_marker()) for line in axes.lines} for axes in figure.axes]
+    assert markers[:3] == [{looks["a"].marker, looks["b"].marker}] * 3 and markers[3:] == [{looks["b"].marker}] * 3
+    legend = figure.legends[0]
+    shown = [
+        (text.get_text(), line.get_marker()) for text, line in zip(legend.get_texts(), legend.get_lines(), strict=True)
+    ]
+    assert shown == [("a", looks["a"].marker), ("b", looks["b"].marker)]
+
+
+def test_curves_are_means_over_seeds_that_end_with_the_run():
+    def curve(offset: float, pace: float) -> list[dict[str, Any]]:
+        psnr = {1: 20.0, 2: 27.0}
+        return [{"step": s, "seconds": pace * s, "psnr": offset + psnr[s], "ssim": 0.8, "lpips": None} for s in psnr]
+
+    groups = table.groups([result(curve=curve(0, 3.0)), result(seed=1, curve=curve(2, 5.0))])
+    lines = plots.quality(groups.items(), "loop_seconds").axes[0].lines
+    mean = max(lines, key=lambda line: line.get_linewidth() if line.get_linestyle() != "None" else 0)
+    points = np.asarray(mean.get_xydata()).tolist()
+    assert points == [[8.0, 28.0], [20.5, 30.5]], "21 dB is far worse than the end and left out"
+
+
+@pytest.mark.parametrize("shared", [1, 4])
+def test_times_of_runs_that_shared_a_gpu_are_marked(shared: int):
+    groups = table.groups([result(jobs_per_gpu=shared)])
+    title = plots.quality(groups.items(), "loop_seconds").get_supxlabel()
+    assert ("not comparable" in title) == (shared > 1)
+
+
+def test_text_is_readable_and_legends_do_not_reach_beyond_the_figure():
+    groups = table.groups([result(label=f"method number {i} with a long name") for i in range(20)])
+    figure = plots.quality(groups.items(), "loop_seconds")
+    figure.draw_without_rendering()
+    box = figure.legends[0].get_window_extent()
+    panel = figure.axes[0].get_window_extent()
+    assert box.x0 >= 0 and box.x1 <= figure.bbox.width and box.y1 <= figure.bbox.height
+    assert box.y0 >= panel.y1 and panel.height > 1.2 * figure.dpi, "the legend must not eat the panels"
+    texts: Any = [*figure.legends[0].get_texts(), *figure.axes[0].get_xticklabels(), figure.axes[0].yaxis.label]
+    assert min(text.get_fontsize() for text in texts) >= 8
+
+
+def test_names_of_points_stand_inside_beside_their_points_and_apart():
+    points = [
+        ("theirs 30k", True, 300, 30.0, 0.2),
+        ("theirs, faster", True, 12, 31.8, 0.196),
+        ("ours", False, 11, 31.9, 0.185),
+        ("ours, earlier", True, 30, 31.9, 0.19),
+    ]
+    figure = plots.peers(points, "loop_seconds")
+    assert [axes.get_ylabel()[:4] for axes in figure.axes] == ["PSNR", "LPIP"]
+    for axes in figure.axes:
+        texts = [text for text in axes.texts if isinstance(text, Annotation)]
+        assert [text.get_text() for text in texts] == [name for name, *_ in points]
+        boxes = [text.get_window_extent() for text in texts]
+        centres = axes.transData.transform([text.xy for text in texts])
+        for number, box in enumerate(boxes):
+            assert axes.bbox.containsx(box.x0) and axes.bbox.containsx(box.x1)
+            assert not any(box.contains(*centre) for centre in centres)
+            assert not any(box.overlaps(other) for other in boxes[:number])
+            assert np.abs(np.clip(centres[number], box.min, box.max) - centres[number]).max() < 20
+    lines = figure.axes[0].lines
+    assert [line.get_fillstyle() for line in lines] == ["full", "full", "none", "full"]
+    assert lines[0].get_marker() == lines[1].get_marker() != lines[2].get_marker() == lines[3].get_marker()
