@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,6 @@ from sadgs_ns.data.checks.geometry import Camera, View, check_points, check_posi
 from sadgs_ns.data.checks.images import (
     MAX_AUTO_RESOLUTION,
     Frame,
-    check_factor,
     check_images,
     existing_factor,
     image_size,
@@ -39,12 +38,9 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
 
     Args:
         data: The folder that the options' paths are relative to.
-        options: How the data will be read.
-        open_images: Whether to look into the images, too.
+        options, open_images: As for `check_nerfstudio`.
     """
-    check_factor(options.downscale_factor)
-    colmap_path = options.colmap_path
-    images_folder, model_folder = data / options.images_path, data / colmap_path
+    images_folder, model_folder = data / options.images_path, data / options.colmap_path
     kind = next((kind for kind in ("txt", "bin") if (model_folder / f"cameras.{kind}").is_file()), None)
     if kind is None:
         if (found := find_reconstruction(data)) is not None:
@@ -54,8 +50,49 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
             )
         raise InputError(no_layout(data))
     cameras_path, poses_path = model_folder / f"cameras.{kind}", model_folder / f"images.{kind}"
-    cameras = colmap.read_cameras(cameras_path)
-    poses = colmap.read_poses(poses_path)
+    poses, cameras = _read_model(poses_path, cameras_path)
+    this_model = f"end the command with `colmap --colmap-path {options.colmap_path}"
+    if not images_folder.is_dir():
+        raise InputError(
+            f"{poses_path} has poses of {len(poses)} images, but there is no folder {images_folder}: put them there, "
+            f"or {this_model} --images-path FOLDER`."
+        )
+    names = [name for name, _, _ in poses]
+    lists = {split: _read_list(path) for split in SPLITS if (path := data / f"{split}_list.txt").is_file()}
+    training = yield from check_splits(
+        names, lists, lambda split: f"{data / split}_list.txt", lambda name: images_folder / name, options
+    )
+    views = _views(poses, cameras, poses_path, cameras_path)
+    sound = yield from check_views(views, training, poses_path)
+    if options.load_3D_points:
+        random = f"{this_model} --load-3D-points False` to start from random points"
+        yield from _check_points(model_folder, views if sound else [], random)
+    if options.masks_path is None and images_in(data / "masks"):
+        yield Finding(
+            "warning",
+            f"{data / 'masks'} holds masks that are not used: {this_model} --masks-path masks` to leave out what is "
+            "black in them.",
+        )
+    if not open_images:
+        return
+    factor = yield from _check_factor(images_folder, names, options)
+    frames = []
+    for name, camera_id, _ in poses:
+        camera, mask = cameras[camera_id], None
+        size = scaled_size((camera.width, camera.height), factor, options.downscale_rounding_mode)
+        if options.masks_path is not None:
+            mask = (smaller_folder(data / options.masks_path, factor) / name).with_suffix(".png")
+        frames.append(Frame(smaller_folder(images_folder, factor) / name, size, mask))
+    yield from check_images(frames, poses_path, look_for_unused=factor == 1)
+
+
+def _read_model(poses_path: Path, cameras_path: Path) -> tuple[list[colmap.Pose], dict[int, colmap.Camera]]:
+    """Return the poses, and the cameras that they use.
+
+    Raises:
+        InputError: If there is none, or one of them cannot be read or makes no sense.
+    """
+    cameras, poses = colmap.read_cameras(cameras_path), colmap.read_poses(poses_path)
     if not poses:
         raise InputError(f"{poses_path} holds no pose, so there is no image to train on: run COLMAP's mapper again.")
     for name, camera_id, pose in poses:
@@ -66,67 +103,40 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
             raise InputError(f"{where} has a rotation that is no unit quaternion: run COLMAP's mapper again.")
         if camera_id not in cameras:
             raise InputError(f"{where} has camera {camera_id}, which {cameras_path} lacks: take both of one model.")
-    used = {camera_id: cameras[camera_id] for _, camera_id, _ in poses}
     for camera_id, camera in cameras.items():  # nerfstudio reads unused ones, too.
         _check_camera(camera, f"{cameras_path}: camera {camera_id}")
+    used = {camera_id: cameras[camera_id] for _, camera_id, _ in poses}
     if len({"FISHEYE" in camera.model for camera in used.values()}) > 1:
         raise InputError(
             f"{cameras_path} mixes fisheye and other cameras, which nerfstudio cannot read: undistort the images with "
             "`colmap image_undistorter`."
         )
-    if not images_folder.is_dir():
-        raise InputError(
-            f"{poses_path} has poses of {len(poses)} images, but there is no folder {images_folder}: put them there, "
-            f"or end the command with `colmap --colmap-path {colmap_path} --images-path FOLDER`."
-        )
-    if lists := {split: _read_list(path) for split in SPLITS if (path := data / f"{split}_list.txt").is_file()}:
-        places = {images_folder / name for name, _, _ in poses}
-        yield from check_splits(
-            lists, lambda split: f"{data / split}_list.txt", lambda name: images_folder / name, places
-        )
-        training = len(set(lists["train"]))
-    else:
-        training = options.count_training_images([name for name, _, _ in poses])
-    views = _views(poses, used, poses_path, cameras_path)
-    yield from (of_views := list(check_views(views, training, poses_path)))
-    if options.load_3D_points:
-        wrong = any(finding.severity == "error" for finding in of_views)
-        random = f"end the command with `colmap --colmap-path {colmap_path} --load-3D-points False`"
-        yield from _check_points(model_folder, [] if wrong else views, f"{random} to start from random points")
-    if options.masks_path is None and images_in(data / "masks"):
-        yield Finding(
-            "warning",
-            f"{data / 'masks'} holds masks that are not used: end the command with "
-            f"`colmap --colmap-path {colmap_path} --masks-path masks` to leave out what is black in them.",
-        )
-    if not open_images:
-        return
+    return poses, used
+
+
+def _check_factor(images_folder: Path, names: Sequence[str], options: ParserOptions) -> Generator[Finding, None, int]:
+    """Return the factor by which the images that will be read are scaled down, after a check that they are there.
+
+    Raises:
+        InputError: If they are not, and nobody can answer nerfstudio's question whether to make them.
+    """
     factor = options.downscale_factor
     if factor is None:
-        factor, size = 1, image_size(images_folder / poses[0][0])
+        factor, size = 1, image_size(images_folder / names[0])
         while max(size) / factor > MAX_AUTO_RESOLUTION:
             factor *= 2
     smaller = smaller_folder(images_folder, factor)
-    if not all((smaller / name).parent.exists() for name, _, _ in poses):
-        if options.downscale_factor is not None:
-            problem, remedy = no_copies(smaller, factor)
-        else:
-            problem = f"{images_folder} holds images of more than {MAX_AUTO_RESOLUTION} px and there is no {smaller}"
-            remedy = "add `--downscale-factor 1` after `colmap` to take them as they are"
-        if sys.stdin is None or not sys.stdin.isatty():
-            raise InputError(f"{problem}: {remedy}.")
-        yield Finding(
-            "warning", f"{problem}: nerfstudio will ask whether to make it with ffmpeg; say yes, or {remedy}."
-        )
-        factor, smaller = 1, images_folder
-    frames = []
-    for name, camera_id, _ in poses:
-        size = scaled_size((used[camera_id].width, used[camera_id].height), factor, options.downscale_rounding_mode)
-        mask = None
-        if options.masks_path is not None:
-            mask = (smaller_folder(data / options.masks_path, factor) / name).with_suffix(".png")
-        frames.append(Frame(smaller / name, size, mask))
-    yield from check_images(frames, poses_path, look_for_unused=factor == 1)
+    if all((smaller / name).parent.exists() for name in names):
+        return factor
+    if options.downscale_factor is not None:
+        problem, remedy = no_copies(smaller, factor)
+    else:
+        problem = f"{images_folder} holds images of more than {MAX_AUTO_RESOLUTION} px and there is no {smaller}"
+        remedy = "add `--downscale-factor 1` after `colmap` to take them as they are"
+    if sys.stdin is None or not sys.stdin.isatty():
+        raise InputError(f"{problem}: {remedy}.")
+    yield Finding("warning", f"{problem}: nerfstudio will ask whether to make it with ffmpeg; say yes, or {remedy}.")
+    return 1
 
 
 def chosen_factor(data: Path, colmap_path: Path) -> int:

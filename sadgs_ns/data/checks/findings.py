@@ -47,6 +47,11 @@ def unreadable(error: OSError) -> str:
     return f"{error.filename} cannot be read ({reason(error)}): correct its name or rights."
 
 
+def and_more(where: object, count: int) -> str:
+    """Return the start of a sentence on several files or views: the first of them, and how many others there are."""
+    return f"{where} (and {count - 1} more)" if count > 1 else f"{where}"
+
+
 def refuse(findings: Sequence[Finding], data: Path) -> None:
     """Raise the first error among findings.
 

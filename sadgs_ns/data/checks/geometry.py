@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sadgs_ns.data import ply
-from sadgs_ns.data.checks.findings import Finding
+from sadgs_ns.data.checks.findings import Finding, and_more
 from sadgs_ns.errors import InputError
 from sadgs_ns.outliers import CAMERA_SHARE, POINT_SHARE, REACH, far_outliers
 
@@ -107,20 +107,22 @@ def finite(value: Any, name: str, where: str) -> float:
     raise InputError(f"{where} has {name} = {value!r}, which is no finite number: correct it.")
 
 
-def check_views(views: Sequence[View], training: int, source: Path) -> Iterator[Finding]:
+def check_views(views: Sequence[View], training: int, source: Path) -> Generator[Finding, None, bool]:
     """Check number, cameras, rotations and positions of the views.
 
     Args:
         views: All of them.
         training: How many are trained on.
         source: The file that they are from.
+
+    Returns:
+        Whether all is right enough to compare points with them.
     """
-    yield from _check_number(len(views), training, source)
-    yield from check_rotations(views)
-    yield from _check_centres(views, source)
+    findings = [*_check_number(len(views), training, source), *check_rotations(views), *_check_centres(views, source)]
     first = {view.camera: view.where_camera for view in reversed(views)}  # Of views with one camera the first is named.
-    for camera, where in first.items():
-        yield from _check_camera(camera, where)
+    findings += [finding for camera, where in first.items() for finding in _check_camera(camera, where)]
+    yield from findings
+    return all(finding.severity != "error" for finding in findings)
 
 
 def _check_number(views: int, training: int, source: Path) -> Iterator[Finding]:
@@ -145,8 +147,8 @@ def check_rotations(views: Sequence[View]) -> Iterator[Finding]:
         (mirrored, "a mirrored pose (determinant −1)", "negate one column of its rotation"),
     ):
         if wrong.any():
-            where = views[int(wrong.argmax())].where
-            yield Finding("error", f"{_and_more(where, wrong)} has {what}: {remedy}, or compute the poses again.")
+            where = and_more(views[int(wrong.argmax())].where, int(wrong.sum()))
+            yield Finding("error", f"{where} has {what}: {remedy}, or compute the poses again.")
 
 
 def _check_centres(views: Sequence[View], source: Path) -> Iterator[Finding]:
@@ -167,12 +169,12 @@ def _check_centres(views: Sequence[View], source: Path) -> Iterator[Finding]:
         )
     far = far_outliers(centres, CAMERA_SHARE)
     if far.any():
-        first = views[int(far.argmax())].where
+        where = and_more(views[int(far.argmax())].where, int(far.sum()))
         times = f"{distances.max() / spread:.3g} times as far from the other cameras as those are from each other"
         too_far = bool(distances.max() * _FLOAT32_STEP * _FEWEST_STEPS > spread)
         yield Finding(
             "error" if too_far else "warning",
-            f"{_and_more(first, far)} has its camera {times}: remove the image from the poses, or compute them again.",
+            f"{where} has its camera {times}: remove the image from the poses, or compute them again.",
         )
 
 
@@ -305,8 +307,3 @@ def _distances(centres: NDArray[np.float64]) -> NDArray[np.float64]:
 def _spread(centres: NDArray[np.float64]) -> float:
     """Return how far from their median most of the centres [V, 3] lie; one of them, at least, does not count."""
     return float(np.quantile(_distances(centres), CAMERA_SHARE, method="lower"))
-
-
-def _and_more(where: str, which: NDArray[np.bool_]) -> str:
-    """Return the start of a sentence on the views that are marked: the first of them, and how many others there are."""
-    return f"{where} (and {which.sum() - 1} more)" if which.sum() > 1 else where

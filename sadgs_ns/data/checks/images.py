@@ -14,8 +14,8 @@ from typing import Any, Literal
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from sadgs_ns.data.checks.findings import Finding
-from sadgs_ns.errors import InputError, reason
+from sadgs_ns.data.checks.findings import Finding, and_more
+from sadgs_ns.errors import reason
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"}
 MAX_AUTO_RESOLUTION = 1600
@@ -70,16 +70,6 @@ def smaller_folder(folder: Path, factor: int) -> Path:
     return folder.with_name(f"{folder.name}_{factor}") if factor > 1 else folder
 
 
-def check_factor(downscale_factor: int | None) -> None:
-    """Check whether a factor can make images smaller.
-
-    Raises:
-        InputError: If it is less than 1.
-    """
-    if downscale_factor is not None and downscale_factor < 1:
-        raise InputError(f"downscale-factor must be at least 1, got {downscale_factor}.")
-
-
 def no_copies(folder: Path, factor: int) -> tuple[str, str]:
     """Return what is wrong and what helps where `--downscale-factor` asks for smaller copies that are not there."""
     return (
@@ -127,7 +117,7 @@ def check_images(frames: Sequence[Frame], source: Path, look_for_unused: bool = 
             problems[found[0]].append(found[1:])
     for same in problems.values():
         path, text = same[0]
-        yield Finding("error", f"{_and_more(path, len(same))} {text}.")
+        yield Finding("error", f"{and_more(path, len(same))} {text}.")
     if not problems and all(_is_of_one_colour(frame.image) for frame in frames):
         yield Finding(
             "error",
@@ -195,7 +185,7 @@ def unused_images(frames: Sequence[Frame], source: Path) -> str | None:
     if not unused:
         return None
     return (
-        f"{_and_more(unused[0], len(unused))} has no pose in {source} and is not used: reconstruct again if it matters."
+        f"{and_more(unused[0], len(unused))} has no pose in {source} and is not used: reconstruct again if it matters."
     )
 
 
@@ -204,11 +194,6 @@ def images_in(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
-
-
-def _and_more(path: Path, count: int) -> str:
-    """Return the start of a sentence on some paths: the first of them, and how many others there are."""
-    return f"{path} (and {count - 1} more)" if count > 1 else f"{path}"
 
 
 def _inspect(path: Path) -> _Image:

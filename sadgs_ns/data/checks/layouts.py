@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import shlex
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Literal
-
-import numpy as np
 
 from sadgs_ns.data.checks.images import Rounding, images_in
 from sadgs_ns.errors import InputError
@@ -22,7 +18,11 @@ GIVE_POSES = "compute poses with `sadgs-process PHOTOS FOLDER` or `ns-process-da
 
 @dataclass(frozen=True)
 class ParserOptions:
-    """Options of nerfstudio's parsers, by the names that they have there; each layout reads those of its parser."""
+    """Options of nerfstudio's parsers, by the names that they have there; each layout reads those of its parser.
+
+    Raises:
+        InputError: If the factor makes images larger.
+    """
 
     images_path: Path = Path("images")
     colmap_path: Path = Path(COLMAP_FOLDERS[0])
@@ -35,25 +35,9 @@ class ParserOptions:
     train_split_fraction: float = 0.9
     eval_interval: int = 8
 
-    def count_training_images(self, names: Sequence[str]) -> int:
-        """Return how many images are trained on, of the names of all.
-
-        Raises:
-            InputError: If names shall divide the images, and one of them does not say where it belongs.
-        """
-        if self.eval_mode == "fraction":
-            return math.ceil(len(names) * self.train_split_fraction)
-        if self.eval_mode == "interval":
-            return int(np.count_nonzero(np.arange(len(names)) % self.eval_interval))
-        if self.eval_mode != "filename":
-            return len(names)
-        for name in names:
-            if not any(word in PurePosixPath(name).name for word in ("train", "eval")):
-                raise InputError(
-                    f"{name} has neither train nor eval in its name, by which `--eval-mode filename` divides the "
-                    "images: rename them, or leave that option out."
-                )
-        return sum("train" in PurePosixPath(name).name for name in names)
+    def __post_init__(self) -> None:
+        if self.downscale_factor is not None and self.downscale_factor < 1:
+            raise InputError(f"downscale-factor must be at least 1, got {self.downscale_factor}.")
 
 
 def find_reconstruction(data: Path) -> Path | None:

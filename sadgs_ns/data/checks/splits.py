@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from os.path import commonpath
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+import numpy as np
+
 from sadgs_ns.data.checks.findings import Finding
+from sadgs_ns.data.checks.layouts import ParserOptions
 from sadgs_ns.errors import InputError
 
 SPLITS = ("train", "val", "test")
@@ -17,34 +21,43 @@ _SHELL = set('"$`\\')
 
 
 def check_splits(
+    names: Sequence[str],
     lists: Mapping[str, Any],
     called: Callable[[str], str],
     locate: Callable[[str], Path],
-    images: Collection[Path],
-) -> Iterator[Finding]:
+    options: ParserOptions,
+) -> Generator[Finding, None, int]:
     """Check the lists of a capture that has any; nerfstudio then divides the images by nothing else.
 
     Args:
+        names: The names of all images that have poses.
         lists: What is given as the list of each split, for the splits that have one.
         called: The start of a sentence about a split's list.
-        locate: The file that a name in a list stands for.
-        images: The files that have poses.
+        locate: The file that a name stands for.
+        options: How the images are divided where there are no lists.
+
+    Returns:
+        How many images are trained on.
 
     Raises:
-        InputError: If training or evaluation on the way lacks its list, or one of the lists names no such image.
+        InputError: If training or evaluation on the way lacks its list, if one of the lists names no such image, or if
+            names shall divide the images and one of them does not say where it belongs.
     """
+    if not lists:
+        return _count_training_images(names, options)
+    images = set(map(locate, names))
     for split in ("train", "val"):
         if split not in lists:
             raise InputError(f"{called(split)} is missing beside other lists of images: add it, or remove the others.")
     located: dict[str, set[Path]] = {}
-    for split, names in lists.items():
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+    for split, listed in lists.items():
+        if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
             raise InputError(f"{called(split)} is no list of images' names: correct it, or remove all such lists.")
-        unknown = [name for name in names if locate(name) not in images]
+        unknown = [name for name in listed if locate(name) not in images]
         if unknown:
             more = f" (and {len(unknown) - 1} more)" if len(unknown) > 1 else ""
             raise InputError(f"{called(split)} names {unknown[0]!r}{more}, which is no image with a pose: correct it.")
-        located[split] = {locate(name) for name in names}
+        located[split] = set(map(locate, listed))
     if not located.get("test"):
         state = "is empty" if "test" in located else "is missing"
         yield Finding("warning", f"{called('test')} {state}: `ns-eval` will have nothing to measure; name some images.")
@@ -54,6 +67,23 @@ def check_splits(
             f"{called('test')} names {len(both)} of the {len(located['train'])} training images: what `ns-eval` "
             "measures of them shows nothing about new views.",
         )
+    return len(located["train"])
+
+
+def _count_training_images(names: Sequence[str], options: ParserOptions) -> int:
+    if options.eval_mode == "fraction":
+        return math.ceil(len(names) * options.train_split_fraction)
+    if options.eval_mode == "interval":
+        return int(np.count_nonzero(np.arange(len(names)) % options.eval_interval))
+    if options.eval_mode != "filename":
+        return len(names)
+    for name in names:
+        if not any(word in PurePosixPath(name).name for word in ("train", "eval")):
+            raise InputError(
+                f"{name} has neither train nor eval in its name, by which `--eval-mode filename` divides the images: "
+                "rename them, or leave that option out."
+            )
+    return sum("train" in PurePosixPath(name).name for name in names)
 
 
 def check_names(names: Iterable[str], source: Path) -> None:

@@ -26,7 +26,6 @@ from sadgs_ns.data.checks.geometry import (
 )
 from sadgs_ns.data.checks.images import (
     Frame,
-    check_factor,
     check_images,
     existing_factor,
     image_size,
@@ -53,22 +52,15 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
         open_images: Whether to look into the images, too.
     """
     path = data if data.suffix == ".json" else data / "transforms.json"
-    folder = path.parent
     if not path.is_file():
-        if (found := find_reconstruction(data)) is not None:
-            raise InputError(
-                f"{path} does not exist, but {data / found} holds a COLMAP reconstruction: leave `nerfstudio-data` out "
-                "of the command."
-            )
-        raise InputError(no_layout(data) if data.suffix != ".json" else f"{path} does not exist: {GIVE_POSES}.")
-    meta = read_json(path)
+        raise InputError(_no_transforms(data, path))
+    folder, meta = path.parent, read_json(path)
     described = frames_of(meta, path)
     model = meta.get("camera_model", "OPENCV")
     perspective = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FISHEYE624")
     if model not in perspective:
         raise InputError(f"{path} has the camera model {model!r}: give one of {', '.join(perspective)}.")
     _check_transform(meta, path)
-    check_factor(options.downscale_factor)
     factor = options.downscale_factor
     if factor is None:
         factor = _smaller_copies(folder, Path(described[0]["file_path"])) if open_images else 1
@@ -93,24 +85,30 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
             raise InputError(
                 f"{path} names {what} for {having} of {len(frames)} frames: give all of them one, or none."
             )
-    if lists := {split: meta[f"{split}_filenames"] for split in SPLITS if f"{split}_filenames" in meta}:
+    names = [frame["file_path"] for frame in described]
+    lists = {split: meta[f"{split}_filenames"] for split in SPLITS if f"{split}_filenames" in meta}
 
-        def locate(name: str) -> Path:
-            return folder / (Path(name).name if factor > 1 else name)  # Smaller copies lie in one folder.
+    def locate(name: str) -> Path:
+        return folder / (Path(name).name if factor > 1 else name)  # Smaller copies lie in one folder.
 
-        places = {locate(frame["file_path"]) for frame in described}
-        yield from check_splits(lists, lambda split: f"{path}: {split}_filenames", locate, places)
-        training = len(set(map(locate, lists["train"])))
-    else:
-        training = options.count_training_images([frame["file_path"] for frame in described])
-    yield from (of_views := list(check_views(views, training, path)))
+    training = yield from check_splits(names, lists, lambda split: f"{path}: {split}_filenames", locate, options)
+    sound = yield from check_views(views, training, path)
     if 3 <= training == len(frames) < 10:  # With more frames all are trained on only where that was asked for.
         yield Finding("note", f"{path} has {training} views, none of them held out: `ns-eval` cannot measure any.")
     if open_images:
         yield from check_images(frames, path, look_for_unused=factor == 1)
     if options.load_3D_points:
-        wrong = any(finding.severity == "error" for finding in of_views)
-        yield from _check_ply(meta, path, [] if wrong else views)
+        yield from _check_ply(meta, path, views if sound else [])
+
+
+def _no_transforms(data: Path, path: Path) -> str:
+    """Return the sentence for data whose `transforms.json` is not there."""
+    if (found := find_reconstruction(data)) is not None:
+        return (
+            f"{path} does not exist, but {data / found} holds a COLMAP reconstruction: leave `nerfstudio-data` out of "
+            "the command."
+        )
+    return no_layout(data) if data.suffix != ".json" else f"{path} does not exist: {GIVE_POSES}."
 
 
 @collect_findings
@@ -119,8 +117,7 @@ def check_blender(data: Path, options: ParserOptions, open_images: bool = True) 
 
     Args:
         data: The folder.
-        options: How the data will be read.
-        open_images: Whether to look into the images, too.
+        options, open_images: As for `check_nerfstudio`.
     """
     if not (data / "transforms_train.json").is_file():
         raise InputError(no_layout(data))
@@ -142,11 +139,10 @@ def check_blender(data: Path, options: ParserOptions, open_images: bool = True) 
         camera = Camera(width, height, focal, focal, width / 2, height / 2)
         views = [view_of(frame, f"{path}: frame {frame['file_path']}", camera) for frame in described]
         if split == "train":
-            yield from (of_views := list(check_views(views, len(views), path)))
+            sound = yield from check_views(views, len(views), path)
             if options.ply_path is not None:
-                wrong = any(finding.severity == "error" for finding in of_views)
                 remedy = "restore it, or leave `--ply-path` out to start from random points"
-                yield from check_ply(data / options.ply_path, [] if wrong else views, remedy)
+                yield from check_ply(data / options.ply_path, views if sound else [], remedy)
         else:
             yield from check_rotations(views)
         if open_images:
