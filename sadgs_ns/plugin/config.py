@@ -31,7 +31,7 @@ class SadgsMachineConfig(MachineConfig):
     """nerfstudio's options of the machine; those of several machines are not shown, since torchrun starts these."""
 
     seed: int = 42
-    """Seed of everything that is drawn at random."""
+    """Seed of everything that is drawn at random, the order of the training views too."""
     num_devices: int = 1
     """Number of CUDA devices of this machine to train on, among which the Gaussians are shared out.
     torchrun can start the processes instead, on several machines, too; this is then 1."""

@@ -65,8 +65,8 @@ class SadgsDatamanagerConfig(FullImageDatamanagerConfig):
     """Threads that decode images; None is one for each core, up to 16."""
     train_cameras_sampling_strategy: Suppress[Literal["random", "fps"]] = "random"
     """Each view comes once a round; another order is refused."""
-    train_cameras_sampling_seed: int = 42
-    """Seed of the order of the training views."""
+    train_cameras_sampling_seed: Suppress[int] = 42
+    """Seed of the order of the training views; the trainer takes `machine.seed`."""
     fps_reset_every: Suppress[int] = 100
     """Not read where each view comes once a round."""
 

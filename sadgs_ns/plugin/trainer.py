@@ -84,6 +84,7 @@ class SadgsTrainer(Trainer):
         if self.shards is not None:
             with processes.first_of_each_machine_before_others(self.shards, local_rank):
                 kernels.available(self.shards.device)  # This compiles a kernel, and is asked for again below.
+        config.pipeline.datamanager.train_cameras_sampling_seed = config.machine.seed
         self._vis: Any = config.vis
         # nerfstudio would wrap the pipeline for several devices in its own way.
         super().__init__(config, local_rank, world_size=1)

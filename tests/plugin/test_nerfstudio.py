@@ -431,6 +431,15 @@ def test_the_position_rate_grows_with_the_cameras_extent(colmap: ColmapDataParse
     assert trainer.optimizers.schedulers["means"].get_last_lr() == pytest.approx([RATES["means"][0] * extent])
 
 
+def test_the_seed_decides_the_order_of_the_views(colmap: ColmapDataParserConfig, tmp_path: Path):
+    orders = []
+    for seed in (42, 1, 1):
+        config = configure(tmp_path, colmap)
+        config.machine.seed = seed
+        orders.append(set_up(config).pipeline.datamanager.train_unseen_cameras)
+    assert orders[0] != orders[1] == orders[2] and sorted(orders[0]) == sorted(orders[1])
+
+
 def test_optimized_camera_poses_move(colmap: ColmapDataParserConfig, tmp_path: Path):
     config = configure(tmp_path, colmap, iterations=4)
     config.pipeline.model.camera_optimizer.mode = "SO3xR3"
