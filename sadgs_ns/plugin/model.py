@@ -21,6 +21,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from pytorch_msssim import SSIM
 from rich.markup import escape
 from torch import Tensor
+from tyro.conf import Suppress
 
 from sadgs_ns.data.cameras import refuse_unsupported_cameras
 from sadgs_ns.distributed.shards import Shards
@@ -58,6 +59,18 @@ _MOST_RANDOM = 10_000_000
 
 
 @dataclass
+class PoseOptimizerConfig(CameraOptimizerConfig):
+    """nerfstudio's options of learned camera poses, with its own penalties, which hold them near the given ones."""
+
+    mode: Literal["off", "SO3xR3", "SE3"] = "off"
+    """Whether and how the cameras' poses are refined; SO3xR3 turns and moves each camera."""
+    trans_l2_penalty: Suppress[float] = 1e-2
+    """Weight of the mean length of the translations in the loss; another is refused."""
+    rot_l2_penalty: Suppress[float] = 1e-3
+    """Weight of the mean length of the rotations in the loss; another is refused."""
+
+
+@dataclass
 class SadgsModelConfig(InstantiateConfig):
     """Options of the Gaussians, their loss and their densification.
 
@@ -68,7 +81,7 @@ class SadgsModelConfig(InstantiateConfig):
     _target: type = field(default_factory=lambda: SadgsModel)
     strategy: StructureAwareStrategy = field(default_factory=StructureAwareStrategy)
     """When and how Gaussians are split, cloned and pruned."""
-    camera_optimizer: CameraOptimizerConfig = field(default_factory=CameraOptimizerConfig)
+    camera_optimizer: PoseOptimizerConfig = field(default_factory=PoseOptimizerConfig)
     """Whether and how the cameras' poses are refined in training."""
     background_color: Literal["black", "white"] = "black"
     """Colour behind the Gaussians."""
@@ -154,10 +167,9 @@ class SadgsModelConfig(InstantiateConfig):
         if not 0 < self.random_scale < math.inf:
             raise InputError(f"pipeline.model.random_scale must be positive and finite, got {self.random_scale:g}.")
         for name in ("trans_l2_penalty", "rot_l2_penalty"):
-            if not 0 <= (penalty := getattr(self.camera_optimizer, name)) < math.inf:
-                raise InputError(
-                    f"pipeline.model.camera_optimizer.{name} must be finite and not negative, got {penalty:g}."
-                )
+            if (penalty := getattr(self.camera_optimizer, name)) != getattr(PoseOptimizerConfig, name):
+                told = f"cannot be set, got {penalty:g}: leave it out."
+                raise InputError(f"pipeline.model.camera_optimizer.{name} {told}")
         try:
             self.strategy.check()
         except ValueError as error:
