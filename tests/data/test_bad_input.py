@@ -933,6 +933,8 @@ def test_a_run_checks_its_data_once_and_other_ways_to_a_pipeline_check_them_too(
     set_up(config)
     assert checked == [first, first]  # a program, ns-eval, python -m benchmarks
     config.save_config()
+    config.save_config()
+    assert "findings" not in (config.get_base_dir() / "config.yml").read_text()
     config.pipeline.datamanager.data = second
     (second / FIRST).unlink()
     with pytest.raises(InputError, match="does not exist"):

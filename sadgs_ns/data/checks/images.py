@@ -118,13 +118,13 @@ def check_images(frames: Sequence[Frame], source: Path, look_for_unused: bool = 
     for same in problems.values():
         path, text = same[0]
         yield Finding("error", f"{and_more(path, len(same))} {text}.")
-    if not problems and all(_is_of_one_colour(frame.image) for frame in frames):
+    if not problems and all(_is_flat(frame.image) for frame in frames):
         yield Finding(
             "error",
             f"{source} has {len(frames)} images that show a single colour and nothing else, such as {frames[0].image}: "
             "export them again.",
         )
-    if not problems and all(frame.mask is not None and _is_black(frame.mask) for frame in frames):
+    if not problems and all(frame.mask is not None and _is_flat(frame.mask, black=True) for frame in frames):
         yield Finding(
             "error",
             f"{source} has {len(frames)} masks that are all black, such as {frames[0].mask}, which leaves no pixel to "
@@ -232,25 +232,18 @@ def _ends_well(path: Path, image: Image.Image) -> bool:
     return False
 
 
-def _is_of_one_colour(path: Path) -> bool:
-    """Return whether all pixels of an image that can be seen have one colour.
+def _is_flat(path: Path, black: bool = False) -> bool:
+    """Return whether all pixels of an image that can be seen have one colour, or whether all of a mask are black.
 
-    The image is decoded for that, a JPEG at an eighth of its size.
+    The file is decoded for that, an image as JPEG at an eighth of its size.
     """
     try:
         with Image.open(path) as image:
-            image.draft(None, (image.width // 8, image.height // 8))
+            if not black:
+                image.draft(None, (image.width // 8, image.height // 8))
             seen = image.convert("RGBa") if image.mode == "RGBA" else image  # What is transparent becomes black.
             extrema: Any = seen.getextrema()
     except Exception:  # What a decoder stumbles over is no single colour; nerfstudio's reader may yet read it.
         return False
-    return all(low == high for low, high in (extrema if isinstance(extrema[0], tuple) else [extrema]))
-
-
-def _is_black(path: Path) -> bool:
-    """Return whether a mask, which is decoded for that, is 0 everywhere."""
-    try:
-        with Image.open(path) as image:
-            return image.getextrema() == (0, 0)
-    except Exception:  # As for an image.
-        return False
+    channels = extrema if isinstance(extrema[0], tuple) else [extrema]
+    return all(low == high and not (black and high) for low, high in channels)

@@ -49,6 +49,7 @@ def refuse_bad_data(config: FullImageDatamanagerConfig, open_images: bool = True
     Raises:
         InputError: With the first finding that does.
     """
+    vars(config).pop("findings", None)
     choose_parser(config)
     parser = config.dataparser
     data = Path(config.data or parser.data)
