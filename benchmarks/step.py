@@ -80,7 +80,6 @@ class Step:
         shards: The processes; None for one process.
         blocks: Number of shells, at least 1, each of which has as many Gaussians and views as another where it divides
             their numbers. Each process has as many Gaussians of a block as another process.
-        fused: Use our kernels, or what they are tested against.
     """
 
     def __init__(
@@ -92,9 +91,8 @@ class Step:
         device: torch.device | str = "cuda",
         shards: Shards | None = None,
         blocks: int = 1,
-        fused: bool = True,
     ) -> None:
-        self.shards, self.width, self.height, self.views, self.fused = shards, width, height, views, fused
+        self.shards, self.width, self.height, self.views = shards, width, height, views
         device = torch.device(device)
         part = slice(0, gaussians) if shards is None else shards.take_even_part(gaussians)
         number = part.stop - part.start
@@ -116,10 +114,11 @@ class Step:
             "opacities": torch.logit(uniform(0.05, 0.95, number, 1)),
         }
         self.params = {name: torch.nn.Parameter(value) for name, value in values.items()}
-        adam = FusedAdam if fused else partial(torch.optim.Adam, fused=True)
+        ours = not kernels.switched_off()
+        adam = FusedAdam if ours else partial(torch.optim.Adam, fused=True)
         self.optimizers: dict[str, Any] = {name: adam([p], lr=1e-6, eps=1e-15) for name, p in self.params.items()}
         log = NonFiniteLog(device, capacity=1)
-        for optimizer in self.optimizers.values() if fused else ():
+        for optimizer in self.optimizers.values() if ours else ():
             optimizer.log = log  # one for all, as in training: what shares it is updated in one launch
         self.state: dict[str, Any] = empty_statistics(number, device) | empty_gradients(number, device)
         numbers = torch.arange(views, device=device)
@@ -148,9 +147,7 @@ class Step:
             self.bands, self.start, info = rasterize_together(self.shards, *splats, sh_degree=3, absgrad=True)
             drawn = [colors for _, colors, _ in self.bands]
         else:
-            image, _, info = rasterize(
-                *splats, sh_degree=3, absgrad=True, tile_capacity=self.capacity, fused=self.fused
-            )
+            image, _, info = rasterize(*splats, sh_degree=3, absgrad=True, tile_capacity=self.capacity)
             keep_gradient(info["means2d"])
             if "pair_counts" in info and self.capacity is None:
                 self.capacity = int(ROOM * sum(info["pair_counts"].wait()))
@@ -161,7 +158,7 @@ class Step:
     def loss(self, drawn: list[Tensor]) -> Tensor:
         """The photometric loss of what `draw` gave; of several processes each has a part."""
         if self.shards is None:
-            return photometric_loss(drawn[0], self.images, fused=self.fused)[0]
+            return photometric_loss(drawn[0], self.images)[0]
         loss = self.start
         for (band, _, _), colors in zip(self.bands, drawn, strict=True):
             part, _ = photometric_part(
@@ -189,7 +186,7 @@ class Step:
     def observe(self) -> None:
         """One observation of η."""
         jitter = None if self.shards is None else self.shards.rand(self.views)
-        observe(self.state, self.params, self.info, jitter=jitter, fused=self.fused)  # type: ignore[arg-type]
+        observe(self.state, self.params, self.info, jitter=jitter)  # type: ignore[arg-type]
 
     def optimize(self) -> None:
         """Adam on all parameters that have gradients: our kernel in one launch, as in training."""
@@ -244,19 +241,20 @@ class Compare:
         gpu()
         for gaussians in self.gaussians:
             columns, seen = [], 0
-            for fused in (False, True):
-                step = Step(gaussians, self.width, self.height, fused=fused)
-                step()
-                parts = {
-                    "rasterize, forward and backward": step.render,
-                    "L1 + SSIM + ℓ2 with gradient": step.compare,
-                    "one observation of η": step.observe,
-                    "Adam, all parameters": step.optimize,
-                    f"whole step, η in every {ETA_EVERY}th": step,
-                }
-                columns.append({name: milliseconds(part) for name, part in parts.items()})
-                seen = int(visible(step.info).sum())
-                del step, parts
+            for triton in (False, True):
+                with kernels.triton_switched(triton):
+                    step = Step(gaussians, self.width, self.height)
+                    step()
+                    parts = {
+                        "rasterize, forward and backward": step.render,
+                        "L1 + SSIM + ℓ2 with gradient": step.compare,
+                        "one observation of η": step.observe,
+                        "Adam, all parameters": step.optimize,
+                        f"whole step, η in every {ETA_EVERY}th": step,
+                    }
+                    columns.append({name: milliseconds(part) for name, part in parts.items()})
+                    seen = int(visible(step.info).sum())
+                    del step, parts
             print(f"{gaussians:,} Gaussians, {seen:,} of them visible, a view of {self.width}×{self.height} px; ms:\n")
             lines = [(name, *(f"{column[name]:.2f}" for column in columns)) for name in columns[0]]
             print(grid(("part", "gsplat and torch", "with our kernels"), lines), end="\n\n", flush=True)
@@ -279,16 +277,17 @@ class Growth:
         first, *others = self.megapixels
         lines = ["gaussians,megapixels,ours_ms,gsplat_ms"]
         for number, size in [*((n, first) for n in self.gaussians), *((self.gaussians[0], size) for size in others)]:
-            times = (self.time(number, size, fused) for fused in (True, False))
+            times = (self.time(number, size, triton) for triton in (True, False))
             lines.append(",".join([str(number), str(size), *(f"{time:.4f}" for time in times)]))
             print(lines[-1], flush=True)
         self.output.write_text("\n".join(lines) + "\n")
         return 0
 
-    def time(self, gaussians: int, megapixels: float, fused: bool) -> float:
+    def time(self, gaussians: int, megapixels: float, triton: bool) -> float:
         """Milliseconds of a step of one view; NaN where the device's memory is too small."""
         try:
-            return milliseconds(Step(gaussians, *size_of(megapixels), fused=fused))
+            with kernels.triton_switched(triton):
+                return milliseconds(Step(gaussians, *size_of(megapixels)))
         except torch.cuda.OutOfMemoryError:
             return math.nan
 
@@ -306,7 +305,7 @@ class Memory:
 
     def __call__(self) -> int:
         gpu()
-        phases = list(memory.step_bytes(0, memory.StepSize()))
+        phases = list(memory.step_bytes(0, memory.StepSize(), torch.device("cuda")))
         header = ("Gaussians", "megapixels", "views", "million pairs (estimated)", *phases, "step", "plan / peak")
         lines = []
         for gaussians, megapixels, views in product(self.gaussians, self.megapixels, self.views):
@@ -328,7 +327,7 @@ def plan(step: Step) -> dict[str, float]:
     """Bytes of all that a step has at its peak in each phase, as the memory plan counts them."""
     n, size = len(step.params["means"]), memory.StepSize.of([step.info])
     kept = memory.kept_bytes(step.params, step.state) * n + step.images.numel() + step.codes.numel()  # type: ignore[arg-type]
-    return {name: kept + value for name, value in memory.step_bytes(n, size).items()}
+    return {name: kept + value for name, value in memory.step_bytes(n, size, step.images.device).items()}
 
 
 def peaks_of(step: Step) -> dict[str, float]:

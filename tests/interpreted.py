@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -71,7 +70,7 @@ def composite(
 
 def use_our_rasterizer(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have runs draw with it."""
-    monkeypatch.setattr(rasterization, "kernels", SimpleNamespace(available=lambda device: True))
+    monkeypatch.setattr(rasterization, "use_triton", lambda place: True)
     monkeypatch.setattr(gsplat_internals, "project", project)
     monkeypatch.setattr(compositing, "rasterize_to_pixels", composite)
     lanes = [(tiles, "_LANES"), (harmonics, "_LANES"), (harmonics, "_BACKWARD_LANES"), (projection, "_LANES")]

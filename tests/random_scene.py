@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sadgs_ns.kernels import triton_switched
 from sadgs_ns.render.rasterization import rasterize, visible
 
 _PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
@@ -43,16 +44,13 @@ def random_scene(gaussians: int, size: int, seed: int) -> dict[str, Tensor]:
     return {name: tensor.float().double() for name, tensor in scene.items()}
 
 
-def render_with_gradients(
-    scene: dict[str, Tensor], device: str, dtype: torch.dtype, fused: bool = False
-) -> dict[str, Tensor]:
+def render_with_gradients(scene: dict[str, Tensor], device: str, dtype: torch.dtype) -> dict[str, Tensor]:
     """Images, projections and gradients of mean(weights * colour^2), as float64 CPU tensors.
 
     Args:
         scene: From `random_scene`.
         device: "cuda" renders with gsplat, "cpu" with the splatter.
         dtype: Floating-point type to render in; gsplat needs float32.
-        fused: On CUDA, give gsplat exact tile lists.
 
     Returns:
         `visible` bool [1, N]; `colour`, `alpha`, `means2d`, `conics`, `absgrad`, and `gradient of ...` per parameter.
@@ -62,9 +60,8 @@ def render_with_gradients(
     for name in _PARAMETERS:
         arguments[name].requires_grad_()
     height, width = weights.shape[1:3]
-    colors, alphas, info = rasterize(
-        **arguments, width=width, height=height, sh_degree=3, absgrad=True, fused=fused
-    )  # fmt: skip
+    with triton_switched(False):
+        colors, alphas, info = rasterize(**arguments, width=width, height=height, sh_degree=3, absgrad=True)
     (weights * colors.square()).mean().backward()
     results = {"colour": colors, "alpha": alphas, "means2d": info["means2d"], "conics": info["conics"]}
     results |= {f"gradient of {name}": arguments[name].grad for name in _PARAMETERS}

@@ -104,7 +104,9 @@ def _check_cuda() -> Iterator[Finding]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         compiles = kernels.available(device)
-    if compiles:
+    if compiles and kernels.switched_off():
+        yield Finding("warning", f"Training will take twice as long: {kernels.SWITCH} is 0, unset it.")
+    elif compiles:
         yield Finding("note", "Triton compiles its kernels here.")
     else:
         why = "; ".join(str(warning.message) for warning in caught) or "Triton is not installed or failed before"

@@ -159,7 +159,7 @@ def screen_gradients(pipeline: SadgsPipeline, progress: Callable[[range], Iterab
             outputs = {"rgb": render[..., :3] + (1 - alpha) * model.background, "background": model.background}
             batch = {name: data[name][None].to(pipeline.device) for name in ("image", "mask") if name in data}
             model.get_loss_dict(outputs, batch)["main_loss"].backward()
-        accumulate_gradients(gradients, info, num_views=1, fused=model.strategy.fused)
+        accumulate_gradients(gradients, info, num_views=1)
         model.zero_grad(set_to_none=True)
     return gradients
 

@@ -10,10 +10,10 @@ import torch.distributed as dist
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sadgs_ns import kernels
 from sadgs_ns.distributed.bands import Band
 from sadgs_ns.distributed.shards import Shards
 from sadgs_ns.gsplat_internals import drawn
+from sadgs_ns.kernels import use_triton
 from sadgs_ns.render.projected import Projected
 
 _GRADIENTS = (2, 3, 1, 3, 2, 1)
@@ -40,16 +40,10 @@ class Exchange:
         shards: The processes.
         projected: The Gaussians of this process in all V views.
         bands: All bands, as `share_out` returns them.
-        fused: Whether rows are written and read by Triton kernels, where these run, and gradients travel in the rows of
-            our compositing; the same in all processes.
     """
 
-    def __init__(self, shards: Shards, projected: Projected, bands: Sequence[Band], *, fused: bool = True) -> None:
-        self.fused = (
-            fused
-            and projected.colors.shape[-1] == 3
-            and shards.agree_once("kernels", lambda: kernels.available(shards.device))
-        )
+    def __init__(self, shards: Shards, projected: Projected, bands: Sequence[Band]) -> None:
+        self.fused = projected.colors.shape[-1] == 3 and shards.agree_once("kernels", lambda: use_triton(shards.device))
         self.whole_views = len(bands) == len(projected.opacities)
         reached = _reached(projected, bands)  # [B, N]
         counted = torch.cat([reached.sum(1), torch.tensor([shards.request], device=shards.device)])

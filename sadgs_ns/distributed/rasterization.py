@@ -41,7 +41,6 @@ def rasterize(
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
     max_off_axis: float = 0.0,
     near_plane: float = NEAR_PLANE,
-    fused: bool = True,
 ) -> tuple[list[RenderedBand], Tensor, dict[str, Any]]:
     """Render the Gaussians of all processes into V pinhole cameras, of which each process composites its share.
 
@@ -51,7 +50,7 @@ def rasterize(
         shards: The processes, whose `sizes` are right.
         means, quats, scales, opacities, colors: The Gaussians of this process, as for `render.rasterization.rasterize`.
         viewmats, Ks, width, height: The same cameras in all processes; `viewmats` gets no gradient.
-        sh_degree, absgrad, rasterize_mode, max_off_axis, near_plane, fused: As for `render.rasterization.rasterize`,
+        sh_degree, absgrad, rasterize_mode, max_off_axis, near_plane: As for `render.rasterization.rasterize`,
             the same in all processes.
 
     Returns:
@@ -65,14 +64,13 @@ def rasterize(
     projected = project(
         means, quats, scales, opacities, colors, viewmats, Ks, width, height,
         sh_degree=sh_degree, rasterize_mode=rasterize_mode, max_off_axis=max_off_axis, near_plane=near_plane,
-        fused=fused,
     )  # fmt: skip
-    exchange = Exchange(shards, projected, share_out(len(viewmats), height, shards.num_ranks), fused=fused)
+    exchange = Exchange(shards, projected, share_out(len(viewmats), height, shards.num_ranks))
     anchor, received = exchange.send(projected, absgrad)
     rendered, num_pairs, num_pixels = [], 0, 0
     for band, splats in zip(exchange.bands, received, strict=True):
         rows = band.bottom - band.top
-        renders, alphas, info = composite(splats, width, rows, absgrad=absgrad, fused=fused)
+        renders, alphas, info = composite(splats, width, rows, absgrad=absgrad)
         rendered.append(RenderedBand(band, renders, alphas))
         num_pairs, num_pixels = num_pairs + len(info["flatten_ids"]), num_pixels + rows * width
     radii, means2d, depths, conics, opacities, _ = projected

@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from importlib.util import find_spec
 
 import torch
+from torch import Tensor
 
 from sadgs_ns.errors import reason
 
 OLDEST_TRITON = (3, 5)
 """Older versions do not compile all of the kernels: Triton 3.4 has no matrix products with 8 columns."""
 
+SWITCH = "SADGS_TRITON"
+"""Environment variable that keeps a process from using the kernels where it is 0."""
+
+_forced: bool | None = False if os.environ.get(SWITCH) == "0" else None
+"""What `use_triton` answers; None where the device decides."""
 _working: set[torch.device] = set()
 """Devices on which a kernel has run."""
 _asked: Counter[torch.device] = Counter()
@@ -23,6 +32,41 @@ _asked: Counter[torch.device] = Counter()
 def cdiv(number: int, block: int) -> int:
     """Return how many blocks cover a number. `triton.cdiv` takes the host some 5 µs, twenty times a step."""
     return -(-number // block)
+
+
+def switched_off() -> bool:
+    """Whether this process does without the kernels wherever it computes."""
+    return _forced is False
+
+
+def use_triton(place: torch.device | Tensor) -> bool:
+    """Whether to compute with the kernels of this package. Otherwise torch and gsplat compute the same, more slowly.
+
+    Args:
+        place: The device on which is computed, or a tensor that a kernel would read: the kernels know float32 alone.
+    """
+    if isinstance(place, Tensor):
+        if place.dtype != torch.float32:
+            return False
+        place = place.device
+    return available(place) if _forced is None else _forced
+
+
+@contextmanager
+def triton_switched(on: bool) -> Iterator[None]:
+    """Use the kernels on every device, or on none, within a block of code.
+
+    Without CUDA, Triton runs them in its interpreter if `TRITON_INTERPRET` is 1 when they are imported.
+
+    Args:
+        on: What `use_triton` answers, to tensors of float32 at least.
+    """
+    global _forced
+    before, _forced = _forced, on
+    try:
+        yield
+    finally:
+        _forced = before
 
 
 def available(device: torch.device) -> bool:

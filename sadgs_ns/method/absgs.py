@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from gsplat.strategy.ops import duplicate, split
 from torch import Tensor
 
-from sadgs_ns import kernels
+from sadgs_ns.kernels import use_triton
 from sadgs_ns.method.split import Params, grid_split, limit_growth
 from sadgs_ns.render.rasterization import visible
 
@@ -38,9 +38,7 @@ def keep_gradient(means2d: Tensor) -> None:
 
 
 @torch.no_grad()
-def accumulate_gradients(
-    gradients: MutableMapping[str, Tensor], info: Mapping[str, Any], num_views: int, *, fused: bool = True
-) -> None:
+def accumulate_gradients(gradients: MutableMapping[str, Tensor], info: Mapping[str, Any], num_views: int) -> None:
     """Add the screen-space gradients of one backward pass, in place.
 
     Gradients are normalised as in 3DGS: by half the image size, so that 1 is the gradient per half image, and by the
@@ -51,7 +49,6 @@ def accumulate_gradients(
         info: gsplat's meta, unpacked, whose `means2d` [C, N, 2] kept its `absgrad`, and its gradient as `keep_gradient`
             made it or in `grad`.
         num_views: Views that the loss is a mean of.
-        fused: Use the Triton kernel where it runs: CUDA, float32.
     """
     means2d = info["means2d"]
     gradient = getattr(means2d, "grad2d", None)
@@ -59,7 +56,7 @@ def accumulate_gradients(
         gradient = means2d.grad
     # Python numbers: a tensor made of them here would make the host wait for its copy to the device.
     scale_x, scale_y = info["width"] / 2.0 * num_views, info["height"] / 2.0 * num_views
-    if fused and means2d.dtype == torch.float32 and kernels.available(means2d.device):
+    if use_triton(means2d):
         from sadgs_ns.kernels import absgs as kernel
 
         sums = gradients["grad2d"], gradients["absgrad2d"], gradients["grad_count"]

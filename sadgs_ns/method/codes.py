@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sadgs_ns import kernels
+from sadgs_ns.kernels import use_triton
 
 MASKED = 255
 """Second byte of a masked pixel, whose S̄ is NaN; the codes of correlations end at 254."""
@@ -15,7 +15,7 @@ OCTAVES = 12.0
 """Frequencies down to 2⁻¹² of the highest one, which are wavelengths of 0.25 to 1,024 px, have codes of their own."""
 
 
-def encode(tensor: Tensor, fused: bool = True) -> Tensor:
+def encode(tensor: Tensor) -> Tensor:
     """Encode √xx and √yy on a logarithmic scale, and the correlation xy / √(xx yy) on a linear one.
 
     A logarithm keeps the relative error of every wavelength the same (at most 1.7 %), and a correlation within ±1 keeps
@@ -24,12 +24,11 @@ def encode(tensor: Tensor, fused: bool = True) -> Tensor:
 
     Args:
         tensor: S̄ as (xx, xy, yy) in 1/px², finite or NaN. [..., 3]
-        fused: Use our Triton kernel where it runs: CUDA, float32.
 
     Returns:
         uint8 [..., 3]
     """
-    if fused and tensor.dtype == torch.float32 and kernels.available(tensor.device):
+    if use_triton(tensor):
         from sadgs_ns.kernels import codes as kernel
 
         return kernel.encode(tensor, HIGHEST_FREQUENCY, OCTAVES, MASKED)

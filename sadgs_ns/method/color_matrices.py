@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sadgs_ns import kernels
+from sadgs_ns.kernels import use_triton
 
 
 def identities(views: int) -> Tensor:
@@ -42,8 +42,6 @@ def correct_colors(
     render: Tensor,  # [C, H, W, 3]
     alpha: Tensor,  # [C, H, W, 1]
     matrices: Tensor,  # [C, 3, 4]
-    *,
-    fused: bool = True,
 ) -> Tensor:
     """Apply an affine map to the colours of the Gaussians that a rendering shows: M c + α b.
 
@@ -54,7 +52,6 @@ def correct_colors(
         render: Renderings before a black background, not clamped. [C, H, W, 3]
         alpha: Accumulated opacity in [0, 1]. [C, H, W, 1]
         matrices: (M | b) of each view. [C, 3, 4]
-        fused: Use the Triton kernels where they run: CUDA, float32.
 
     Returns:
         [C, H, W, 3]
@@ -62,7 +59,7 @@ def correct_colors(
     Raises:
         InputError: If the views have more pixels than the Triton kernels can address (kernels/limits.py).
     """
-    if fused and render.dtype == torch.float32 and kernels.available(render.device):
+    if use_triton(render):
         from sadgs_ns.kernels.color_matrices import correct_colors as fused_correct_colors
 
         return fused_correct_colors(render, alpha, matrices)

@@ -9,7 +9,7 @@ from pytorch_msssim import ssim
 from pytorch_msssim.ssim import _fspecial_gauss_1d
 from torch import Tensor
 
-from sadgs_ns import kernels
+from sadgs_ns.kernels import use_triton
 
 WINDOW = tuple(_fspecial_gauss_1d(11, 1.5).flatten().tolist())
 """SSIM's window along one axis: a Gaussian of σ = 1.5 px on 11 px."""
@@ -28,7 +28,6 @@ def photometric_loss(
     ssim_lambda: float = 0.2,
     l2_lambda: float = 2.0,
     parts: Tensor | None = None,  # [P]
-    fused: bool = True,
 ) -> tuple[Tensor, Tensor]:
     """(1 − λ) L1 + λ (1 − SSIM) + λ_2 ℓ2, each a mean over views, pixels and channels.
 
@@ -41,7 +40,6 @@ def photometric_loss(
         l2_lambda: λ_2 ≥ 0.
         parts: Numbers whose sum is added to the loss, such as a penalty from `render.activations.activate`, which takes
             the Triton kernels no launch more. [P]
-        fused: Use the Triton kernels where they run (CUDA) and apply (float32, views of at least 11×11 px).
 
     Returns:
         The loss, and PSNR in dB for values in [0, 1], without gradient; both are scalars.
@@ -50,9 +48,8 @@ def photometric_loss(
         ValueError: From pytorch_msssim, if views are one pixel high or wide.
         InputError: If the views have more pixels than the Triton kernels can address (kernels/limits.py).
     """
-    suits = predicted.dtype == torch.float32 and target.dtype in (torch.float32, torch.uint8)
-    suits = suits and min(predicted.shape[1:3]) >= len(WINDOW)
-    if fused and suits and kernels.available(predicted.device):
+    suits = target.dtype in (torch.float32, torch.uint8) and min(predicted.shape[1:3]) >= len(WINDOW)
+    if suits and use_triton(predicted):
         from sadgs_ns.kernels.losses import photometric_loss as fused_photometric_loss
 
         return fused_photometric_loss(
@@ -82,7 +79,6 @@ def photometric_part(
     height: int,
     ssim_lambda: float = 0.2,
     l2_lambda: float = 2.0,
-    fused: bool = True,
 ) -> tuple[Tensor, Tensor]:
     """What some rows of a view add to its `photometric_loss`: over rows that cover the view, these parts sum to it.
 
@@ -96,7 +92,6 @@ def photometric_part(
         height: Of the view in px, at least 11 unless all rows count.
         ssim_lambda: As for `photometric_loss`.
         l2_lambda: As for `photometric_loss`.
-        fused: As for `photometric_loss`.
 
     Returns:
         The part of the loss, and that of the mean square error, without gradient; both are scalars.
@@ -107,16 +102,14 @@ def photometric_part(
     first, last = rows
     if last - first == height:
         loss, psnr = photometric_loss(
-            predicted, target, ssim_lambda=ssim_lambda, l2_lambda=l2_lambda, fused=fused
+            predicted, target, ssim_lambda=ssim_lambda, l2_lambda=l2_lambda
         )  # fmt: skip
         return loss, torch.pow(10, -psnr / 10)
     share, reach = (last - first) / height, len(WINDOW) // 2
     begin, end = max(first - reach, 0), min(last + reach, height)
     windows = (end - begin - 2 * reach) / (height - 2 * reach)
     inside = slice(begin - top, end - top)
-    dissimilarity, _ = photometric_loss(
-        predicted[:, inside], target[:, inside], ssim_lambda=1.0, l2_lambda=0.0, fused=fused
-    )
+    dissimilarity, _ = photometric_loss(predicted[:, inside], target[:, inside], ssim_lambda=1.0, l2_lambda=0.0)
     counted = slice(first - top, last - top)
     values = target[:, counted]
     difference = predicted[:, counted] - (values / 255.0 if values.dtype == torch.uint8 else values)

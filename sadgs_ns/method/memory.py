@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sadgs_ns.kernels import use_triton
 from sadgs_ns.method.host_memory import available_host_bytes as available_host_bytes
 from sadgs_ns.method.split import Params
 
@@ -130,23 +131,21 @@ def widest_bytes(params: Params) -> int:
     return max(map(_row_bytes, params.values()))
 
 
-def step_bytes(num_gaussians: int, size: StepSize, fused: bool = True) -> dict[str, float]:
+def step_bytes(num_gaussians: int, size: StepSize, device: torch.device) -> dict[str, float]:
     """Bytes that a step takes at its peak in each phase, besides what is kept between steps.
 
     Args:
         num_gaussians: Number of Gaussians, visible or not.
         size: What the step renders.
-        fused: Whether the loss is computed by our kernels.
+        device: Where it is trained.
 
     Returns:
         Bytes by the names of the phases: "tile lists", "loss" and "backward".
     """
-    return {name: a * num_gaussians + b + p * size.pairs for name, (a, b, p) in _phases(size, fused).items()}
+    return {name: a * num_gaussians + b + p * size.pairs for name, (a, b, p) in _phases(size, device).items()}
 
 
-def affordable_growth(
-    params: Params, state: Mapping[str, Any], free: float, size: StepSize, fused: bool = True
-) -> float:
+def affordable_growth(params: Params, state: Mapping[str, Any], free: float, size: StepSize) -> float:
     """How many Gaussians may be added so that adding them and the next training step fit.
 
     Added Gaussians bring `PAIRS_PER_GAUSSIAN` pairs each in every view.
@@ -156,7 +155,6 @@ def affordable_growth(
         state: The strategy's state; its tensors have leading dimension N, or 0 before the first step.
         free: Bytes left, as `free_bytes` counts them; infinity allows infinitely many.
         size: What the next step renders, with the pairs of the N Gaussians.
-        fused: Whether the loss is computed by our kernels.
 
     Returns:
         ≥ 0, a whole number or infinity.
@@ -167,15 +165,15 @@ def affordable_growth(
     kept = kept_bytes(params, state)
     growth = min(
         (free - n * (a + widest) - b - p * size.pairs) / (kept + widest + a + p * new_pairs)
-        for a, b, p in _phases(size, fused).values()
+        for a, b, p in _phases(size, params["means"].device).values()
     )
     return max(math.floor(growth), 0)
 
 
-def _phases(size: StepSize, fused: bool) -> dict[str, tuple[float, float, float]]:
+def _phases(size: StepSize, device: torch.device) -> dict[str, tuple[float, float, float]]:
     """Bytes per Gaussian, bytes besides and bytes per pair, in each phase."""
     projected = ACTIVATION_BYTES + (PROJECTION_BYTES + EXCHANGE_BYTES * size.exchanged) * size.views
-    loss = LOSS_PIXEL_BYTES if fused else TORCH_LOSS_PIXEL_BYTES
+    loss = LOSS_PIXEL_BYTES if use_triton(device) else TORCH_LOSS_PIXEL_BYTES
     gradients = ACTIVATION_GRADIENT_BYTES + PROJECTION_GRADIENT_BYTES * size.views
     return {
         "tile lists": (projected + DEPTH_SORT_BYTES * size.views, 0.0, PAIR_SORT_BYTES),

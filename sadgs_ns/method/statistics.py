@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sadgs_ns import kernels
+from sadgs_ns.kernels import use_triton
 from sadgs_ns.method.codes import HIGHEST_FREQUENCY, MASKED, OCTAVES
 from sadgs_ns.method.eta import (
     FRUSTUM_MARGIN,
@@ -51,7 +51,6 @@ def observe(
     *,
     generator: torch.Generator | None = None,
     jitter: Tensor | None = None,  # [C, N, 2]
-    fused: bool = True,
 ) -> None:
     """Add one forward pass: one jittered sample per visible Gaussian and view, counted in place.
 
@@ -65,12 +64,11 @@ def observe(
             `codes.encode`) [C, H, W, 3], `viewmats` [C, 4, 4] and `Ks` [C, 3, 3].
         generator: Source of the jitter.
         jitter: In [0, 1), where it is not to be drawn here. [C, N, 2]
-        fused: Use the Triton kernel where it runs: CUDA, float32.
     """
     means2d = info["means2d"]
     if jitter is None:
         jitter = torch.rand(means2d.shape, generator=generator, device=means2d.device)  # [C, N, 2]
-    if fused and kernels.available(means2d.device) and params["means"].dtype == torch.float32:
+    if use_triton(params["means"]):
         from sadgs_ns.kernels.statistics import observe_views
 
         observe_views(

@@ -97,8 +97,6 @@ class StructureAwareStrategy(Strategy):
     reset_every: int | None = None
     """Iterations between opacity resets inside the densification window; 0 turns them off.
     None is 12/30 of the run, and 0 in runs of fewer than 600 iterations, which would not recover."""
-    fused: bool = True
-    """Measure η, and add up AbsGS's gradients, in one Triton kernel each where these run (CUDA)."""
     # These two are no options, so that they have no annotation, which would make them fields.
     run_length = 3000
     """Iterations of the run, which `fit_to_run` sets: windows that are None follow it."""
@@ -213,7 +211,7 @@ class StructureAwareStrategy(Strategy):
                 keep_gradient(view["means2d"])
             if self.observes(step):
                 jitter = None if self.shards is None else self.shards.rand(view["n_cameras"])
-                observe(state, params, view, jitter=jitter, fused=self.fused)
+                observe(state, params, view, jitter=jitter)
 
     def step_post_backward(
         self,
@@ -238,7 +236,7 @@ class StructureAwareStrategy(Strategy):
         if self.needs_absgrad(step):
             num_views = sum(view["n_cameras"] for view in views)
             for view in views:
-                accumulate_gradients(state, view, num_views, fused=self.fused)
+                accumulate_gradients(state, view, num_views)
         if iteration >= windows.refine_start_iter:
             if _due(iteration, windows.structure_every):
                 self._structure_step(params, optimizers, state, iteration, views)
@@ -331,7 +329,7 @@ class StructureAwareStrategy(Strategy):
     def _room(self, params: Params, state: Mapping[str, Any], views: Sequence[Info]) -> tuple[int, float]:
         """How many Gaussians may be added under the cap, and how many fit in the devices' memory beside such views."""
         free = free_bytes(params["means"].device)
-        in_memory = affordable_growth(params, state, free, StepSize.of(views), self.fused)
+        in_memory = affordable_growth(params, state, free, StepSize.of(views))
         if self.shards is not None:  # The device with the least room bounds all, since shards are evened out.
             in_memory = self.shards.num_ranks * self.shards.least(in_memory)
         return self.max_gaussians - self._of_all(len(params["means"]))[0], in_memory

@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from sadgs_ns import kernels
+from sadgs_ns.kernels import use_triton
 
 NUM_LEVELS = 5
 """L + 1 levels, l = 0 … L with L = 4 (paper, section 3.2)."""
@@ -79,7 +79,6 @@ def multiscale_structure_tensor(
     energy_blur: float = ENERGY_BLUR,
     epsilon: float | None = None,
     truncation: float = TRUNCATION,
-    fused: bool = True,
     known_finite: bool = False,
 ) -> Tensor:
     """Aggregate the per-scale structure tensors of a batch of images of one size (paper, eq. 2–5).
@@ -100,7 +99,6 @@ def multiscale_structure_tensor(
         epsilon: ε > 0 of eq. 3 and 5 as the paper prints it, the same number for every image and level, in the units
             of the pixel values; the released code takes 1e-6 with values in [0, 1]. `noise_floor` then has no effect.
         truncation: Radius of every kernel, in multiples of its standard deviation.
-        fused: Use our Triton kernels where they run: CUDA, float32.
         known_finite: The valid pixels are known to be finite. To find that out, the host waits for the device.
 
     Returns:
@@ -123,7 +121,7 @@ def multiscale_structure_tensor(
         smallest = torch.finfo(image.dtype).tiny
         trace_floors = [(epsilon / brightest.square()).clamp_min(smallest)] * NUM_LEVELS
         weight_floor = (epsilon / brightest**GAMMA).clamp_min(smallest)
-    operations = _operations(fused, image)
+    operations = _operations(image)
     # Without masks the weights of all images are the same: one image's are kept.
     sums = _WeightedSums(valid[:1] if masks is None else valid, masks is not None, truncation, operations.correlate)
     numerator = torch.zeros_like(image[:, :1]).repeat(1, 3, 1, 1)  # [B, 3, H, W]
@@ -249,9 +247,9 @@ class _Operations:
     aggregate: Callable[..., None]
 
 
-def _operations(fused: bool, image: Tensor) -> _Operations:
-    """Triton's operations where they run and are wanted, else torch's."""
-    if not (fused and image.dtype == torch.float32 and kernels.available(image.device)):
+def _operations(image: Tensor) -> _Operations:
+    """Triton's operations where they run, else torch's."""
+    if not use_triton(image):
         return _Operations(_correlate, _differentiate, _aggregate)
     from sadgs_ns.kernels import limits
     from sadgs_ns.kernels import structure_tensor as kernel

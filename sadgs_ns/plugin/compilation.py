@@ -11,8 +11,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 from torch import Tensor
 
-from sadgs_ns import kernels
 from sadgs_ns.errors import reason
+from sadgs_ns.kernels import use_triton
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients
 from sadgs_ns.method.codes import encode
 from sadgs_ns.method.color_matrices import correct_colors, identities
@@ -49,8 +49,8 @@ def compile_kernels(
         cuda_graphs: Whether steps may be captured as CUDA graphs, whose Adam reads its rates from the device.
     """
     model, device = pipeline.model, pipeline.device
-    config, strategy = model.config, model.strategy
-    if not (config.fused and kernels.available(device)):
+    config = model.config
+    if not use_triton(device):
         return
     views, n = pipeline.views_per_iteration, _GAUSSIANS
     ramp = torch.linspace(-0.5, 0.5, n, device=device)
@@ -113,12 +113,12 @@ def compile_kernels(
         # The projection is differentiated elsewhere.
         (info["means2d"].grad2d,) = torch.autograd.grad(result, info["means2d"])
         if absgrad:
-            accumulate_gradients(empty_gradients(n, device), info, views, fused=strategy.fused)
+            accumulate_gradients(empty_gradients(n, device), info, views)
 
     def activations() -> None:
         for weight in (0.0, 1.0):  # The loss has a part with the mean opacity, but not to the end.
             parameters = scales.clone().requires_grad_(), opacities[:, None].clone().requires_grad_()
-            some = activate(*parameters, weight, fused=True)
+            some = activate(*parameters, weight)
             torch.autograd.backward([value.sum() for value in some if value is not None])
 
     def projection() -> None:
@@ -143,7 +143,6 @@ def compile_kernels(
             params,  # type: ignore[arg-type]
             info | {"structure_tensors": image.byte().repeat(views, 1, 1, 1), "viewmats": viewmats, "Ks": Ks},
             generator=torch.Generator(device).manual_seed(0),
-            fused=strategy.fused,
         )
 
     def exchange() -> None:

@@ -19,8 +19,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 from torch import Tensor
 
-from sadgs_ns import kernels
 from sadgs_ns.errors import reason
+from sadgs_ns.kernels import use_triton
 from sadgs_ns.method.absgs import accumulate_gradients, keep_gradient
 from sadgs_ns.plugin.model import SadgsModel, StepKind
 from sadgs_ns.plugin.optimizers import FusedAdam, RepeatedUpdate
@@ -177,7 +177,7 @@ def launch_step(
     gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
     update.launch(gradients, values[4:], inputs.factors)
     if kind.absgrad:
-        accumulate_gradients(dict(sums), info, len(inputs.viewmats), fused=model.strategy.fused)
+        accumulate_gradients(dict(sums), info, len(inputs.viewmats))
     # These are copies of memory. A kernel that no step has launched before would be loaded while it is captured.
     values[0].copy_(loss.detach())
     values[1].copy_(outputs["psnr"])
@@ -218,13 +218,13 @@ class GraphedSteps:
         """Return what graphs the steps of a run; None where its steps must always be launched one by one."""
         config, pipeline, optimizers = trainer.config, trainer.pipeline, trainer.optimizers
         model = pipeline.model
-        if not config.cuda_graphs or config.log_gradients or not model.config.fused:
+        if not config.cuda_graphs or config.log_gradients:
             return None
         # Several processes send each other Gaussians in a step, whose numbers the host must know.
         if pipeline.shards is not None:
             return None
         # Without a forecast the host waits in each step, and what a camera optimizer does is not in the graphs.
-        if not kernels.available(model.device) or model.tile_forecast is None:
+        if not use_triton(model.device) or model.tile_forecast is None:
             return None
         if model.camera_optimizer.config.mode != "off" or optimizers.optimizers.keys() != model.trained_params.keys():
             return None

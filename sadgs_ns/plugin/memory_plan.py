@@ -53,8 +53,6 @@ class TrainingSize:
     """Bytes of images and codes of S̄ on the training device."""
     step: StepSize
     """The largest step of the run, with the pairs of the initial Gaussians."""
-    fused: bool = True
-    """Whether the loss is computed by our kernels."""
     structure_bytes: float = 0.0
     """Bytes that S̄ of a step's images takes while it is computed, before they are rendered; 0 where that is done once,
     with the initial Gaussians."""
@@ -64,7 +62,6 @@ def training_size(
     datamanager: FullImageDatamanager,
     params: Params,
     views: int,
-    fused: bool,
     processes: int = 1,
     near_plane: float = NEAR_PLANE,
 ) -> TrainingSize:
@@ -74,7 +71,6 @@ def training_size(
         datamanager: Holds the cameras of the training and of the held-out images.
         params: The initial Gaussians of this process.
         views: Views rendered in a step.
-        fused: Whether the loss is computed by our kernels.
         processes: Number of processes among which the step is shared out.
         near_plane: Depth in world units from which Gaussians are drawn.
     """
@@ -92,7 +88,7 @@ def training_size(
         structure = float(STRUCTURE_PIXEL_BYTES * max(largest, min(PIXELS_PER_BATCH, here * largest)))
     # A process composites its share of the pixels, and as many pairs as its share of the Gaussians has in all views.
     pixels, pairs = -(-views * largest // processes), views * estimate_pairs(params, cameras, near_plane)
-    return TrainingSize(kept, StepSize(views, pixels, pairs, processes > 1), fused, structure)
+    return TrainingSize(kept, StepSize(views, pixels, pairs, processes > 1), structure)
 
 
 def image_bytes(datamanager: FullImageDatamanager) -> float:
@@ -230,7 +226,7 @@ def fit_to_memory(
     each = memory.kept_bytes(params, state) + memory.widest_bytes(params)
 
     def need(num_gaussians: int, step: StepSize) -> float:
-        working = max(size.structure_bytes, *memory.step_bytes(num_gaussians, step, size.fused).values())
+        working = max(size.structure_bytes, *memory.step_bytes(num_gaussians, step, device).values())
         return size.image_bytes + each * num_gaussians + working
 
     why = ""
@@ -238,7 +234,7 @@ def fit_to_memory(
         budget = PLANNED_SHARE * free if budget_gb is None else min(1e9 * budget_gb, free)
         none = {name: value[:0] for name, value in params.items()}
         left = budget - size.image_bytes
-        affordable = memory.affordable_growth(none, state, left, replace(size.step, pairs=0), size.fused)  # type: ignore[arg-type]
+        affordable = memory.affordable_growth(none, state, left, replace(size.step, pairs=0))  # type: ignore[arg-type]
         affordable = processes * min(affordable, (left - size.structure_bytes) / each)
         if budget_gb is not None and affordable < 1:
             fixed = need(0, replace(size.step, pairs=0))

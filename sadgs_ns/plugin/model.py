@@ -126,9 +126,6 @@ class SadgsModelConfig(InstantiateConfig):
     "affine" is a colour matrix."""
     color_corrected_metrics: bool = False
     """Also report metrics after fitting the colours of each rendering to its photo, as suits changing exposure."""
-    fused: bool = True
-    """Train with Triton kernels where they run (CUDA): tile lists, compositing, harmonics, loss, S̄, η, AbsGS and Adam.
-    Without, torch and gsplat compute the same, more slowly."""
 
     def check(self) -> None:
         """Check whether training can work with these options.
@@ -224,7 +221,6 @@ class SadgsModel(SplatfactoModel):
         config = self.config
         config.check()
         self.strategy = copy.deepcopy(config.strategy)
-        self.strategy.fused &= config.fused
         self.strategy_state = self.strategy.initialize_state()
         self.gauss_params = torch.nn.ParameterDict(
             {name: torch.nn.Parameter(value) for name, value in self._initial_gaussians().items()}
@@ -505,7 +501,6 @@ class SadgsModel(SplatfactoModel):
             height,
             render_mode=render_mode,
             absgrad=absgrad,
-            fused=self.config.fused,
             tile_capacity=tile_capacity,
             **options,
         )
@@ -529,8 +524,7 @@ class SadgsModel(SplatfactoModel):
             sh_degree = self.sh_degree_now if sh_degree is None else sh_degree
         else:
             colors, sh_degree = torch.sigmoid(params["features_dc"]), None  # [N, 3]
-        fused = self.config.fused
-        scales, opacities, penalty = activate(params["scales"], params["opacities"], opacity_reg, fused=fused)
+        scales, opacities, penalty = activate(params["scales"], params["opacities"], opacity_reg)
         splats = (params["means"], params["quats"], scales, opacities, colors)
         return splats, penalty, {"sh_degree": sh_degree, **self.drawing}
 
@@ -571,7 +565,7 @@ class SadgsModel(SplatfactoModel):
         )  # fmt: skip
         if view_numbers is not None:
             matrices = anchored(params["color_matrices"], view_numbers)
-            render = correct_colors(render, alpha, matrices, fused=self.config.fused)
+            render = correct_colors(render, alpha, matrices)
         penalty, background = info.pop("opacity_reg"), self.background
         outputs = {"rgb": self.before_background(render, alpha, background), "background": background}
         return outputs if penalty is None else outputs | {"opacity_reg": penalty}, info
@@ -771,7 +765,6 @@ class SadgsModel(SplatfactoModel):
             target.reshape(-1, height, width, 3),
             ssim_lambda=self.config.ssim_lambda,
             parts=outputs.get("opacity_reg") if self.training else None,
-            fused=self.config.fused,
         )
         losses = {"main_loss": loss}
         if self.training:

@@ -15,7 +15,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 from tyro.conf import Suppress
 
-from sadgs_ns import kernels
+from sadgs_ns.kernels import use_triton
 from sadgs_ns.plugin.nonfinite import MAX_GRADIENT, NonFiniteLog, leave_out_nonfinite
 
 _ONE = torch.tensor(1.0, device="cpu")
@@ -29,17 +29,16 @@ class FusedAdam(torch.optim.Adam):
 
     Args:
         params: Parameters, all on one device.
-        fused: Use the Triton kernel on CUDA, torch's fused implementation elsewhere.
         **options: Further options of torch's Adam.
     """
 
-    def __init__(self, params: Iterable[torch.Tensor], *, fused: bool = True, **options: Any) -> None:
+    def __init__(self, params: Iterable[torch.Tensor], **options: Any) -> None:
         parameters = list(params)
         plain = not any(options.get(name) for name in ("weight_decay", "amsgrad", "maximize"))
-        self.triton = fused and plain and kernels.available(parameters[0].device)
+        self.triton = plain and use_triton(parameters[0].device)
         """Whether the Triton kernel is used."""
         # torch's fused Adam keeps the step count on the device, and our kernel would make the host wait for it.
-        super().__init__(parameters, fused=fused and not self.triton, **options)
+        super().__init__(parameters, fused=not self.triton, **options)
         self.log = NonFiniteLog(parameters[0].device, capacity=1)
         """Log of gradients that were left out; the pipeline puts its own here."""
 
@@ -219,8 +218,6 @@ class FusedAdamOptimizerConfig(AdamOptimizerConfig):
     """Norm to which gradients are clipped."""
     weight_decay: Suppress[float] = 0.0
     """Adam's penalty on the size of parameters."""
-    fused: Suppress[bool] = True
-    """Update in a single kernel: ours for all parameters on CUDA, torch's for each elsewhere."""
 
 
 @dataclass

@@ -18,11 +18,11 @@ from rich.markup import escape
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from sadgs_ns import kernels
 from sadgs_ns.data.cameras import refuse_unsupported_cameras
 from sadgs_ns.data.checks.parsers import findings_of
 from sadgs_ns.distributed.shards import Shards
 from sadgs_ns.errors import InputError
+from sadgs_ns.kernels import use_triton
 from sadgs_ns.method.codes import HIGHEST_FREQUENCY
 from sadgs_ns.method.initialization import camera_extent
 from sadgs_ns.method.schedule import growth_threshold, schedule
@@ -136,10 +136,8 @@ class SadgsPipeline(VanillaPipeline):
                 f"[yellow]The images were put on {parsed_on}, the Gaussians lie on {config.model.background_color}: "
                 f"consider --pipeline.model.background-color {parsed_on}.[/]"
             )
-        if config.model.fused and self.device.type == "cuda" and not kernels.available(self.device):
-            CONSOLE.print(
-                "[yellow]Triton does not run here: without its kernels training takes about twice as long.[/]"
-            )
+        if self.device.type == "cuda" and not use_triton(self.device):
+            CONSOLE.print("[yellow]Triton's kernels are not used: training takes about twice as long without them.[/]")
         cameras = self.datamanager.train_dataset.cameras
         self.model.set_cameras(_positions(cameras))
         self.model.set_near_plane(
@@ -213,10 +211,10 @@ class SadgsPipeline(VanillaPipeline):
         """
         self._refuse_empty_views()
         if self.config.model.strategy.refine_stop_iter != 0:
-            model, fused = self.model, self.config.model.fused and kernels.available(self.device)
+            model = self.model
             processes, views = 1 if self.shards is None else self.shards.num_ranks, self.views_per_iteration
             gaussians: Any = model.gauss_params
-            size = training_size(self.datamanager, gaussians, views, fused, processes, model.near_plane)
+            size = training_size(self.datamanager, gaussians, views, processes, model.near_plane)
             try:
                 line, warning = fit_to_memory(
                     model.strategy,
@@ -466,7 +464,7 @@ class SadgsPipeline(VanillaPipeline):
     def _settings(self) -> dict[str, Any]:
         """Return the options that decide how training goes on from a checkpoint, by their names."""
         strategy = asdict(self.config.model.strategy)
-        settings = {f"model.strategy.{name}": strategy[name] for name in strategy if name != "fused"}
+        settings = {f"model.strategy.{name}": strategy[name] for name in strategy}
         own = {name: getattr(self.config, name) for name in ("views_per_iteration", "memory_budget_gb")}
         return {**own, **settings}
 

@@ -20,6 +20,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from sadgs_ns.distributed.shards import Shards
 from sadgs_ns.errors import InputError
+from sadgs_ns.kernels import SWITCH, switched_off
 
 if TYPE_CHECKING:
     from sadgs_ns.plugin.config import CheckedTrainerConfig
@@ -86,7 +87,7 @@ def check(config: CheckedTrainerConfig) -> None:
         ("pipeline.model.color_model", model.color_model not in ("none", "auto"), "set it to none"),
         ("pipeline.model.camera_optimizer.mode", model.camera_optimizer.mode != "off", "set it to off"),
         ("start_paused", config.start_paused, "leave it off, since the viewer is off, too"),
-        ("pipeline.model.fused", not model.fused and machine.device_type == "cuda", "leave it on"),
+        (f"{SWITCH}=0", switched_off() and machine.device_type == "cuda", "unset it"),
     ):
         if given:
             raise InputError(f"{name} works on one device only, and this run takes several: {remedy}.")

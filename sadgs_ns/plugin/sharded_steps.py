@@ -44,9 +44,7 @@ def losses_of_views(
     kind = model.kind_of_step(width, height, [index for index, _ in views])
     share = len(model.means) / shards.total
     splats, penalty, options = model.splats(kind.opacity_reg * share)
-    rendered, loss, info = rasterize(
-        shards, *splats, viewmats, Ks, width, height, absgrad=kind.absgrad, fused=model.config.fused, **options
-    )
+    rendered, loss, info = rasterize(shards, *splats, viewmats, Ks, width, height, absgrad=kind.absgrad, **options)
     model.show_to_strategy(info, viewmats, Ks, structure_tensors)
     background, error = model.background, torch.zeros((), device=shards.device)
     for band, colors, alphas in rendered:
@@ -57,7 +55,7 @@ def losses_of_views(
         predicted, target = model.compared({"rgb": rgb, "background": background}, batch)
         part, square = photometric_part(
             predicted, target, rows=(band.first, band.last), top=band.top, height=height,
-            ssim_lambda=model.config.ssim_lambda, fused=model.config.fused,
+            ssim_lambda=model.config.ssim_lambda,
         )  # fmt: skip
         loss, error = loss + part / len(views), error + square / len(views)
     if penalty is not None:

@@ -115,7 +115,7 @@ class StructureMaps:
         if any("mask" in d for d in data):
             everything = torch.ones(images.shape[1:3], dtype=torch.bool, device=images.device)
             masks = torch.stack([d["mask"][..., 0].to(images.device) if "mask" in d else everything for d in data])
-        return encode(self.of_images(images, masks, known_finite=True), self.views.model.config.fused)
+        return encode(self.of_images(images, masks, known_finite=True))
 
     def of_images(
         self,
@@ -128,7 +128,6 @@ class StructureMaps:
             images,
             masks,
             frequency_constant=self.frequency_constant,
-            fused=self.views.model.config.fused,
             known_finite=known_finite,
             **self.options,  # type: ignore[arg-type]
         )
@@ -162,7 +161,7 @@ def observe_training_views(maps: StructureMaps, progress: Callable[[range], Iter
     """
     views, model = maps.views, maps.views.model
     model.set_crop(None)  # the viewer sets its crop box anew whenever it renders
-    strategy, params = model.strategy, model.gauss_params
+    params = model.gauss_params
     generator = torch.Generator(model.device).manual_seed(0)
     statistics = empty_statistics(model.num_points, model.device)
     for index in progress(range(len(views))):
@@ -173,6 +172,5 @@ def observe_training_views(maps: StructureMaps, progress: Callable[[range], Iter
             params,
             info | {"viewmats": viewmats, "Ks": Ks, "structure_tensors": codes},
             generator=generator,
-            fused=strategy.fused,
         )
     return statistics

@@ -18,9 +18,9 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from sadgs_ns import kernels
 from sadgs_ns.atomic import atomic_path
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
+from sadgs_ns.kernels import use_triton
 from sadgs_ns.method.schedule import between_one_and_four, schedule
 from sadgs_ns.plugin import checkpoints, processes
 from sadgs_ns.plugin.compilation import compile_kernels
@@ -28,7 +28,7 @@ from sadgs_ns.plugin.config import CheckedTrainerConfig
 from sadgs_ns.plugin.graphed_steps import GraphedSteps
 from sadgs_ns.plugin.interrupts import HANG_UP, SIGNALS, Interrupted, Interrupts
 from sadgs_ns.plugin.lost_output import drop_lost_output, print_elsewhere_once_unread
-from sadgs_ns.plugin.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig, SadgsOptimizers
+from sadgs_ns.plugin.optimizers import RunLengthDecaySchedulerConfig, SadgsOptimizers
 from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.plugin.progress import about_cpu, remove_tables, what_next
 from sadgs_ns.plugin.stereo_start import start_from_stereo
@@ -83,7 +83,7 @@ class SadgsTrainer(Trainer):
         self._peers = None if self.shards is None else processes.Peers(self.shards)
         if self.shards is not None:
             with processes.first_of_each_machine_before_others(self.shards, local_rank):
-                kernels.available(self.shards.device)  # This compiles a kernel, and is asked for again below.
+                use_triton(self.shards.device)  # This compiles a kernel, and is asked for again below.
         config.pipeline.datamanager.train_cameras_sampling_seed = config.machine.seed
         self._vis: Any = config.vis
         # nerfstudio would wrap the pipeline for several devices in its own way.
@@ -255,7 +255,7 @@ class SadgsTrainer(Trainer):
             self.config.vis = others or "none"  # type: ignore[assignment]
 
     def setup_optimizers(self) -> SadgsOptimizers:
-        """Derive the run's length and build the optimizers with schedules as long as that, fused where the model is.
+        """Derive the run's length and build the optimizers with schedules as long as that.
 
         Raises:
             InputError: As `checkpoints.read_chosen`, since a run that goes on keeps its length.
@@ -277,9 +277,7 @@ class SadgsTrainer(Trainer):
                 optimizers[name]["scheduler"] = decay
                 decay.final_factor *= end / start
         for group in optimizers.values():
-            scheduler, optimizer = group.setdefault("scheduler", None), group["optimizer"]
-            if isinstance(optimizer, FusedAdamOptimizerConfig):
-                optimizer.fused &= self.config.pipeline.model.fused
+            scheduler = group.setdefault("scheduler", None)
             if not isinstance(scheduler, RunLengthDecaySchedulerConfig):
                 continue
             if self.config.rates_follow_views and scheduler.hold_share > 0:

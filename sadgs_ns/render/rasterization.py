@@ -8,8 +8,9 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from sadgs_ns import gsplat_internals, kernels
+from sadgs_ns import gsplat_internals
 from sadgs_ns.gsplat_internals import NEAR_PLANE
+from sadgs_ns.kernels import use_triton
 from sadgs_ns.render import splatter
 from sadgs_ns.render.off_axis import culling
 from sadgs_ns.render.projected import Projected
@@ -32,10 +33,11 @@ def rasterize(
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
     max_off_axis: float = 0.0,
     near_plane: float = NEAR_PLANE,
-    fused: bool = True,
     tile_capacity: int | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians into C pinhole cameras on the device of `means`, unpacked.
+
+    With our Triton kernels a tile lists only the Gaussians that reach it; what is drawn is the same as gsplat's.
 
     Args:
         means: Centres in world space. [N, 3]
@@ -44,7 +46,7 @@ def rasterize(
         opacities: In [0, 1]. [N]
         colors: Features [(C,) N, D] or, with `sh_degree`, spherical harmonics coefficients: [(C,) N, K, 3], or the pair
             of those of degree 0 [N, 3] and of the others [N, K − 1, 3].
-        viewmats: World-to-camera transforms, OpenCV axes (x right, y down, z forward). [C, 4, 4]
+        viewmats: Rigid world-to-camera transforms, OpenCV axes (x right, y down, z forward). [C, 4, 4]
         Ks: Intrinsics in pixels. [C, 3, 3]
         width: Image width in pixels.
         height: Image height in pixels.
@@ -55,8 +57,6 @@ def rasterize(
         max_off_axis: Gaussians whose centre is projected further from the image's centre, in half images along x or y,
             are culled (off_axis.py); 0 culls none.
         near_plane: Gaussians whose centre is nearer along the viewing axis are culled, in world units.
-        fused: On CUDA, list in each tile only the Gaussians that reach it, and differentiate the compositing of three
-            channels, with Triton kernels; what is drawn is the same. Assumes rigid viewmats.
         tile_capacity: Number of pairs of a Gaussian and a tile, in all views, for which the Triton kernels make room,
             so that the host does not wait for the exact number. If there are more, nothing is drawn, no gradient flows
             and all `radii` are 0. With None the host waits. gsplat and the splatter need no such number.
@@ -74,10 +74,10 @@ def rasterize(
     """
     options: dict[str, Any] = {"max_off_axis": max_off_axis}
     rasterization: Any = splatter.rasterization
-    fused = fused and kernels.available(means.device)
+    triton = use_triton(means.device)
     # gsplat compiles its CUDA kernels when they are first used. These imports stand here so that nothing touches them
     # without a GPU.
-    if fused:
+    if triton:
         from sadgs_ns.render.fused import rasterization
 
         options["tile_capacity"] = tile_capacity
@@ -85,7 +85,7 @@ def rasterize(
         import gsplat.rendering
 
         rasterization, options = culling(gsplat.rendering.rasterization, max_off_axis), {}
-    if isinstance(colors, tuple) and not fused:
+    if isinstance(colors, tuple) and not triton:
         colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
     return rasterization(
         means,
@@ -122,7 +122,6 @@ def project(
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
     max_off_axis: float = 0.0,
     near_plane: float = NEAR_PLANE,
-    fused: bool = True,
 ) -> Projected:
     """Do the first half of `rasterize`, whose arguments these are: project Gaussians and compute their colours.
 
@@ -132,7 +131,7 @@ def project(
         InputError: If there are more Gaussians than the Triton kernels can address (kernels/limits.py).
     """
     antialiased = rasterize_mode == "antialiased"
-    if fused and kernels.available(means.device):
+    if use_triton(means.device):
         from sadgs_ns.render.fused import project
 
         return project(
@@ -148,7 +147,7 @@ def project(
 
 
 def composite(
-    projected: Projected, width: int, height: int, *, absgrad: bool = False, fused: bool = True
+    projected: Projected, width: int, height: int, *, absgrad: bool = False
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Do the second half of `rasterize`, whose arguments and results these are, for colours alone.
 
@@ -157,12 +156,11 @@ def composite(
         width: Image width in pixels.
         height: Image height in pixels.
         absgrad: Whether `backward` sets `means2d.absgrad`. [C, N, 2]
-        fused: As for `rasterize`; it must be as it was for `project`.
 
     Raises:
         InputError: As `rasterize`.
     """
-    if fused and kernels.available(projected.means2d.device):
+    if use_triton(projected.means2d.device):
         from sadgs_ns.render.fused import composite
 
         return composite(projected, width, height, absgrad=absgrad)

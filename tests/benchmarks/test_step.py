@@ -44,8 +44,8 @@ def test_without_a_gpu_one_sentence_says_what_it_needs(
 def test_all_numbers_go_with_the_first_size_and_all_sizes_with_the_first_number(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    def time(_: Growth, gaussians: int, megapixels: float, fused: bool) -> float:
-        return float("nan") if gaussians > 1000 and not fused else (2 - fused) * (gaussians + megapixels)
+    def time(_: Growth, gaussians: int, megapixels: float, triton: bool) -> float:
+        return float("nan") if gaussians > 1000 and not triton else (2 - triton) * (gaussians + megapixels)
 
     monkeypatch.setattr(steps, "gpu", lambda: None)
     monkeypatch.setattr(Growth, "time", time)
@@ -63,18 +63,19 @@ def test_a_step_goes_through_the_phases_of_the_plan_and_has_their_size():
     before = step.params["means"].detach().clone()
     phases: list[str] = []
     step(phases.append)
-    assert phases == list(step_bytes(0, StepSize()))
+    assert phases == list(step_bytes(0, StepSize(), CPU))
     size = StepSize.of([step.info])
     assert (size.views, size.pixels) == (2, 2 * 40 * 30) and size.pairs > 400
     assert 0.5 < pairs_of(step) / size.pairs < 4
     assert not torch.equal(step.params["means"], before)
     assert step.state["n_total"].sum() > 0 and step.state["absgrad2d"].sum() > 0
     kept = 200 * (4 * 4 * 59 + 4 * 13) + 2 * 2 * 3 * 40 * 30
-    assert plan(step) == {name: kept + value for name, value in step_bytes(200, size).items()}
+    assert plan(step) == {name: kept + value for name, value in step_bytes(200, size, CPU).items()}
 
 
 def test_the_parts_of_a_step_can_be_called_alone():
-    step = Step(200, 40, 30, 1, CPU, fused=False)
+    with steps.kernels.triton_switched(False):
+        step = Step(200, 40, 30, 1, CPU)
     for part in (step, step.render, step.compare, step.observe, step.optimize):
         part()
     assert step.params["means"].grad is not None and step.rendered.grad is not None
@@ -82,7 +83,7 @@ def test_the_parts_of_a_step_can_be_called_alone():
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="a step is timed on CUDA")
 def test_a_step_is_timed_with_and_without_our_kernels():
-    assert all(0 < Growth().time(2_000, 0.02, fused) < 1_000 for fused in (True, False))
+    assert all(0 < Growth().time(2_000, 0.02, triton) < 1_000 for triton in (True, False))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="peaks are measured on CUDA")

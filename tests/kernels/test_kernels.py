@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 from collections import Counter
 from functools import partial
 from typing import Any
@@ -86,7 +89,8 @@ def test_the_loss_reads_bytes_as_the_floats_that_they_stand_for():
     rounding = 1e-6 if DEVICE.type == "cuda" else 0.0
     for of_bytes, of_floats in zip(*results, strict=True):
         torch.testing.assert_close(of_bytes, of_floats, atol=rounding * float(of_floats.abs().max()), rtol=0)
-    slow = losses.photometric_loss(predicted, images, ssim_lambda=0.3, l2_lambda=1.5, fused=False)
+    with kernels.triton_switched(False):
+        slow = losses.photometric_loss(predicted, images, ssim_lambda=0.3, l2_lambda=1.5)
     torch.testing.assert_close(results[0][:2], list(slow), atol=1e-5, rtol=1e-5)
 
 
@@ -110,7 +114,8 @@ def test_psnr_of_extreme_errors_is_torchs(value):
     x[0, 3, 4, 1] = value
     with np.errstate(all="ignore"):  # Triton's interpreter computes with numpy
         _, actual = fused_photometric_loss(x, torch.zeros_like(x), ssim_lambda=0.2, l2_lambda=2.0)
-    _, expected = losses.photometric_loss(x, torch.zeros_like(x), fused=False)
+    with kernels.triton_switched(False):
+        _, expected = losses.photometric_loss(x, torch.zeros_like(x))
     torch.testing.assert_close(actual, expected, rtol=1e-6, atol=0, equal_nan=True)
 
 
@@ -130,6 +135,27 @@ def test_partial_sums_are_added_as_accurately_as_torch_adds_them():
     expected = weights[0] * l1 + 0.2 - weights[1] * of_ssim + weights[2] * l2 + more
     assert float(loss) == pytest.approx(expected, abs=3e-8)
     assert float(psnr) == pytest.approx(-10 * math.log10(l2 / n), rel=1e-6)
+
+
+@pytest.mark.hard_case(
+    "a process started with `SADGS_TRITON=0`", "uses no Triton kernel, on whichever device it computes"
+)
+def test_the_environment_switches_the_kernels_off():
+    code = "import torch; from sadgs_ns import kernels; kernels.available = lambda device: True; "
+    code += "print(kernels.switched_off(), kernels.use_triton(torch.device('cuda')), kernels.use_triton(torch.ones(1)))"
+    for value, expected in (("0", "True False False"), ("1", "False True True")):
+        environment = {**os.environ, kernels.SWITCH: value}
+        process = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+        assert process.stdout.split("\n")[0] == expected, process.stderr
+
+
+def test_a_test_can_switch_the_kernels_either_way_but_doubles_never_reach_them():
+    floats, doubles = torch.ones(1), torch.ones(1, dtype=torch.float64)
+    for on in (True, False):
+        with kernels.triton_switched(on):
+            assert kernels.use_triton(floats) is kernels.use_triton(floats.device) is on
+            assert not kernels.use_triton(doubles)
+    assert kernels.use_triton(floats.device) is kernels.available(floats.device)
 
 
 def test_kernels_are_for_the_current_cuda_device_only(monkeypatch):
@@ -227,10 +253,11 @@ def test_codes_are_the_references_or_their_neighbours(monkeypatch):
     tensor = torch.rand((3, 100, 3), generator=torch.Generator().manual_seed(0)) ** 8 * torch.tensor([16.0, 1.0, 16.0])
     tensor[0, :4] = torch.tensor([[0.0, 0, 0], [64, 0, 1e-12], [0, 0.1, 1], [8, -9, 8]])
     tensor[1, :4] = torch.tensor([[math.nan] * 3, [math.nan, 0, 1], [1, math.nan, 1], [1, 0, math.nan]])  # masked
-    expected = encode(tensor, fused=False).int()
-    monkeypatch.setattr(kernels, "available", lambda device: True)
+    with kernels.triton_switched(False):
+        expected = encode(tensor).int()
     calls = recorded(monkeypatch, codes, "encode")
-    actual = encode(tensor.to(DEVICE)).cpu().int()
+    with kernels.triton_switched(True):
+        actual = encode(tensor.to(DEVICE)).cpu().int()
     assert len(calls) == 1
     assert (actual - expected).abs().max() <= 1 and (actual != expected).float().mean() < 0.01
     assert torch.equal(actual[:2, :4], expected[:2, :4])
@@ -289,21 +316,20 @@ def test_observation_equals_the_reference(monkeypatch, kept, per_axis_radii):
     tensors[:, :, 18:22] = math.nan  # masked
     info["structure_tensors"] = kept(tensors)
     results = []
-    monkeypatch.setattr(kernels, "available", lambda device: True)
     calls = recorded(monkeypatch, observation, "observe_views")
     for fused in (False, True):
         statistics = {k: v.to(DEVICE) for k, v in empty_statistics(n, torch.device("cpu")).items()}
         for seed in (1, 2):
-            observe(
-                statistics,
-                {name: torch.nn.Parameter(value.to(DEVICE)) for name, value in params.items()},
-                {
-                    name: value.detach().to(DEVICE) if isinstance(value, Tensor) else value
-                    for name, value in info.items()
-                },
-                generator=torch.Generator(DEVICE).manual_seed(seed),
-                fused=fused,
-            )
+            with kernels.triton_switched(fused):
+                observe(
+                    statistics,
+                    {name: torch.nn.Parameter(value.to(DEVICE)) for name, value in params.items()},
+                    {
+                        name: value.detach().to(DEVICE) if isinstance(value, Tensor) else value
+                        for name, value in info.items()
+                    },
+                    generator=torch.Generator(DEVICE).manual_seed(seed),
+                )
         results.append(statistics)
         assert len(calls) == 2 * fused
     reference, fast = results
@@ -331,7 +357,6 @@ def test_screen_gradients_add_up_as_in_the_reference(monkeypatch, per_axis_radii
     elif layout == "transposed":
         parts = [part.mT.contiguous().mT for part in parts]
     results = []
-    monkeypatch.setattr(kernels, "available", lambda device: True)
     calls = recorded(monkeypatch, screen_gradients, "accumulate_gradients")
     for fused in (False, True):
         means2d = torch.zeros((views, n, 2), device=DEVICE)
@@ -339,7 +364,8 @@ def test_screen_gradients_add_up_as_in_the_reference(monkeypatch, per_axis_radii
         info = {"means2d": means2d, "radii": radii.to(DEVICE), "width": 64, "height": 48}
         sums = empty_gradients(n, DEVICE)
         for _ in range(2):
-            accumulate_gradients(sums, info, num_views=views, fused=fused)
+            with kernels.triton_switched(fused):
+                accumulate_gradients(sums, info, num_views=views)
         results.append(sums)
         assert len(calls) == 2 * fused
     reference, fast = results
@@ -357,12 +383,12 @@ def test_activations_and_their_gradients_equal_torchs_in_float64(monkeypatch, n,
     log_scales, logits, weights = (torch.randn(shape, generator=generator) for shape in ((n, 3), (n, 1), (n, 12)))
     logits[0], log_scales[0] = -12.0, torch.tensor([-9.0, 3.0, 0.0])
     penalty = 0.3 if "penalty" in used else 0.0
-    monkeypatch.setattr(kernels, "available", lambda device: True)
     calls = recorded(monkeypatch, activations, "activate")
     results = []
     for fused, dtype in ((True, torch.float32), (False, torch.float64)):
         inputs = [value.to(DEVICE, dtype, copy=True).requires_grad_() for value in (log_scales, logits)]
-        scales, opacities, penalized = activate(inputs[0], inputs[1], penalty, fused=fused)
+        with kernels.triton_switched(fused):
+            scales, opacities, penalized = activate(inputs[0], inputs[1], penalty)
         assert scales.shape == (n, 3) and opacities.shape == (n,) and (penalized is None) is (penalty == 0)
         rows = weights.to(DEVICE, dtype)
         outputs = {"scales": (scales, rows[:, :3]), "opacities": (opacities, rows[:, 5])}  # as compositing returns them

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
+from sadgs_ns.kernels import triton_switched
 from sadgs_ns.method import color_matrices
 from sadgs_ns.method.color_matrices import anchored, correct_colors, identities
 
@@ -36,7 +36,7 @@ def reference(render: Tensor, alpha: Tensor, matrices: Tensor) -> Tensor:
 def test_colours_and_all_gradients_equal_the_float64_reference(
     monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int, int], kernels: bool
 ):
-    monkeypatch.setattr(color_matrices, "kernels", SimpleNamespace(available=lambda device: kernels))
+    monkeypatch.setattr(color_matrices, "use_triton", lambda place: kernels)
     *values, upstream = random_views(*shape)
     results = []
     for function, dtype in ((correct_colors, torch.float32), (reference, torch.float64)):
@@ -48,18 +48,18 @@ def test_colours_and_all_gradients_equal_the_float64_reference(
 
 
 def test_the_kernel_is_what_is_compared(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(color_matrices, "kernels", SimpleNamespace(available=lambda device: True))
     called: list[Any] = []
     monkeypatch.setattr(fused, "correct_colors", lambda *values: called.append(values))
-    correct_colors(*random_views(1, 2, 2)[:3])
-    correct_colors(*random_views(1, 2, 2)[:3], fused=False)
+    for on in (True, False):
+        with triton_switched(on):
+            correct_colors(*random_views(1, 2, 2)[:3])
     assert len(called) == 1
 
 
 @pytest.mark.parametrize("kernels", [False, True], ids=["torch", "Triton"])
 def test_what_is_not_drawn_stays_black_and_teaches_nothing(monkeypatch: pytest.MonkeyPatch, kernels: bool):
     """A step without enough places in its tile lists draws nothing, which no matrix may learn to brighten."""
-    monkeypatch.setattr(color_matrices, "kernels", SimpleNamespace(available=lambda device: kernels))
+    monkeypatch.setattr(color_matrices, "use_triton", lambda place: kernels)
     render, alpha, matrices, upstream = (value.to(DEVICE) for value in random_views(2, 6, 9))
     matrices.requires_grad_()
     corrected = correct_colors(torch.zeros_like(render), torch.zeros_like(alpha), matrices)

@@ -28,7 +28,8 @@ from PIL import Image
 from torch import Tensor
 
 from sadgs_ns.data.cameras import refuse_failed_undistortion, refuse_unsupported_cameras
-from sadgs_ns.method import losses, statistics
+from sadgs_ns.kernels import triton_switched
+from sadgs_ns.method import losses
 from sadgs_ns.method.eta import SCREEN_BLUR, eta, projected_axes, sample_footprint
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig
@@ -80,15 +81,13 @@ def observed(
     for fused in (False, True):
         state = {key: value.to(DEVICE) for key, value in empty_statistics(len(params["means"]), DEVICE).items()}
         # Triton's interpreter computes with numpy, which would warn of what a GPU computes in silence.
-        with pytest.MonkeyPatch.context() as patch, np.errstate(all="ignore"):
-            patch.setattr(statistics.kernels, "available", lambda device: True)
+        with triton_switched(fused), np.errstate(all="ignore"):
             for seed in range(rounds):
                 observe(
                     state,
                     {name: torch.nn.Parameter(value.detach().to(DEVICE)) for name, value in params.items()},
                     {k: v.detach().to(DEVICE) if isinstance(v, Tensor) else v for k, v in info.items()},
                     generator=torch.Generator(DEVICE).manual_seed(seed),
-                    fused=fused,
                     **options,
                 )
         assert all(value.isfinite().all() for value in state.values()), f"fused={fused}"

@@ -231,10 +231,10 @@ def test_what_is_kept_of_each_new_gaussian_is_counted():
     grown = len(params["means"]) - 50
     assert grown == 50 * 7
     size = StepSize(views=1)
-    at_first, later = (max(memory.step_bytes(n, size).values()) for n in (50, 50 + grown))
+    at_first, later = (max(memory.step_bytes(n, size, CPU).values()) for n in (50, 50 + grown))
     pairs = memory.PAIRS_PER_GAUSSIAN * grown * memory.PAIR_SORT_BYTES
     widest = 16  # quaternions
-    lists = memory.step_bytes(50 + grown, size)["tile lists"] + pairs
+    lists = memory.step_bytes(50 + grown, size, CPU)["tile lists"] + pairs
     needed = bytes_kept() - before + (50 + grown) * widest + max(lists, later)
     original = random_params(50)
     assert memory.affordable_growth(original, observed(50, 4.0), needed, size) == grown
@@ -253,7 +253,7 @@ def test_a_split_that_would_not_fit_in_memory_is_reduced_with_a_warning_and_trai
 ):
     asked: list[StepSize] = []
 
-    def scarce(params: Any, state: Any, free: float, size: StepSize, fused: bool) -> int:
+    def scarce(params: Any, state: Any, free: float, size: StepSize) -> int:
         asked.append(size)
         return room
 

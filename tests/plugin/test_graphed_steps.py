@@ -6,7 +6,6 @@ import copy
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -63,9 +62,8 @@ class Reruns:
 def without_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
     """Our rasterizer and Adam in Triton's interpreter, and graphs that are called again."""
     use_our_rasterizer(monkeypatch)
-    working = SimpleNamespace(available=lambda device: True)
-    monkeypatch.setattr(optimizers, "kernels", working)
-    monkeypatch.setattr(graphed_steps, "kernels", working)
+    for module in (optimizers, graphed_steps):
+        monkeypatch.setattr(module, "use_triton", lambda place: True)
     monkeypatch.setattr(graphed_steps, "CudaGraphs", Reruns)
     monkeypatch.setattr(adam, "_BLOCK", 2**16)  # The interpreter runs one program after the other.
 
@@ -300,14 +298,12 @@ def test_steps_of_many_gaussians_or_of_masked_views_or_that_are_taken_apart_are_
     [
         lambda config: setattr(config, "cuda_graphs", False),
         lambda config: setattr(config, "log_gradients", True),
-        lambda config: setattr(config.pipeline.model, "fused", False),
         lambda config: setattr(config.pipeline.model.camera_optimizer, "mode", "SO3xR3"),
         lambda config: setattr(config.optimizers["means"]["optimizer"], "max_norm", 1.0),
     ],
     ids=[
         "switched off",
         "gradients are logged",
-        "no kernels",
         "camera optimizer",
         "clipped gradients",
     ],
@@ -336,7 +332,7 @@ def test_a_gpu_trains_alike_with_graphs(colmap: ColmapDataParserConfig, tmp_path
     config.pipeline.views_per_iteration = views
     config.pipeline.model.color_model = color_model
     (_, expected), (replayed, found) = run(config, False), run(config, True)
-    if not kernels.available(replayed.pipeline.model.device):
+    if not kernels.use_triton(replayed.pipeline.model.device):
         pytest.skip("Triton does not run here")
     assert replayed.graphed is not None and replayed.graphed.failure == ""
     assert replayed.graphed.replayed > 150, f"of 300 steps {replayed.graphed.replayed} were replayed"

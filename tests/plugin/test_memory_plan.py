@@ -27,6 +27,7 @@ from scenes import camera, random_params, splat
 
 from examples.drawn_scene.scene import write_scene
 from sadgs_ns.errors import InputError
+from sadgs_ns.kernels import triton_switched
 from sadgs_ns.method import memory
 from sadgs_ns.method import strategy as strategy_module
 from sadgs_ns.method.memory import StepSize
@@ -86,7 +87,8 @@ def fit(
     """The cap, and what the user is told."""
     strategy = StructureAwareStrategy(**changes)
     size = TrainingSize(other, StepSize(views, pixels, pairs))
-    line, warning = fit_to_memory(strategy, params(n), size, budget_gb)  # type: ignore[arg-type]
+    with triton_switched(True):  # The loss is computed by our kernels, as on a card.
+        line, warning = fit_to_memory(strategy, params(n), size, budget_gb)  # type: ignore[arg-type]
     assert line is not None
     return strategy.max_gaussians, line, warning
 
@@ -98,13 +100,14 @@ def test_what_a_gaussian_takes_is_what_a_split_asks_for():
     assert memory.kept_bytes(params(), state) == KEPT  # type: ignore[arg-type]
     for grown in (0, 1, 7):
         free = lists + grown * each(2)
-        assert memory.affordable_growth(params(), state, free, size) == grown  # type: ignore[arg-type]
-        assert memory.affordable_growth(params(), state, free - 1, size) == max(grown - 1, 0)  # type: ignore[arg-type]
+        with triton_switched(True):
+            found = [memory.affordable_growth(params(), state, room, size) for room in (free, free - 1)]  # type: ignore[arg-type]
+        assert found == [grown, max(grown - 1, 0)]
 
 
 def test_each_phase_counts_what_it_grows_with():
     def peak(n: int = 1000, views: int = 1, pixels: int = 10**6, pairs: int = 10**5) -> dict[str, float]:
-        return memory.step_bytes(n, StepSize(views, pixels, pairs))
+        return memory.step_bytes(n, StepSize(views, pixels, pairs), torch.device("cpu"))
 
     assert all(peak(n=2000)[name] > value for name, value in peak().items())
     assert all(peak(views=4)[name] > value for name, value in peak().items())
@@ -279,18 +282,18 @@ def test_the_size_of_a_run_is_that_of_its_images_and_largest_step():
         eval_dataset=SimpleNamespace(cameras=held_out),
     )
     drawn: Any = spheres(10)
-    size = training_size(datamanager, drawn, views=2, fused=True)
+    size = training_size(datamanager, drawn, views=2)
     assert size.image_bytes == 3 * (3 * 64 * 48 + 2 * 1000) + 3 * 3 * 64 * 48
     assert size.step == StepSize(2, 2 * 64 * 48, 2 * estimate_pairs(drawn, train))
     datamanager.config.cache_images = "cpu"
-    size = training_size(datamanager, drawn, views=2, fused=True)
+    size = training_size(datamanager, drawn, views=2)
     assert size.image_bytes == 2 * 6 * 64 * 48  # of the next step
     assert size.structure_bytes == 300 * 2 * 64 * 48  # Only images on the device have theirs from the start.
-    size = training_size(datamanager, drawn, views=2, fused=True, processes=2)
+    size = training_size(datamanager, drawn, views=2, processes=2)
     assert size.image_bytes == (3 + 2 * 3) * 64 * 48  # Each process has one of the images, and the codes of both.
     assert size.structure_bytes == 300 * 64 * 48
     train.height = torch.tensor([[30], [48], [48]])  # Of two sizes each process may have a part of either.
-    assert training_size(datamanager, drawn, views=2, fused=True, processes=2).image_bytes == 2 * 6 * 64 * 48
+    assert training_size(datamanager, drawn, views=2, processes=2).image_bytes == 2 * 6 * 64 * 48
 
 
 def test_tiles_are_those_of_the_kernels():

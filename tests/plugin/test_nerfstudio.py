@@ -393,14 +393,6 @@ def test_the_position_rate_ends_at_a_hundredth_whatever_the_length_of_the_run(
     assert rates == pytest.approx([start, start / 100])
 
 
-def test_one_switch_takes_all_kernels_out(colmap: ColmapDataParserConfig, tmp_path: Path):
-    config = configure(tmp_path, colmap)
-    config.pipeline.model.fused = False
-    trainer = set_up(config)
-    assert not trainer.pipeline.model.strategy.fused
-    assert not any(optimizer.defaults["fused"] for optimizer in trainer.optimizers.optimizers.values())
-
-
 def test_a_training_step_updates_the_gaussians_in_one_launch(
     colmap: ColmapDataParserConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
