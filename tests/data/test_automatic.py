@@ -183,7 +183,7 @@ def test_large_images_are_taken_as_they_are_and_smaller_copies_where_they_exist(
 
 
 @pytest.mark.hard_case(
-    "the same with `colmap` named, which asks a question",
+    "images of more than 1600 px without smaller copies, with `colmap` named, which asks a question",
     "at a terminal a warning, then the question; without a terminal refused: `--downscale-factor 1`",
 )
 def test_a_question_that_a_named_parser_would_ask_nobody_is_an_error(large: Path, monkeypatch: pytest.MonkeyPatch):

@@ -786,7 +786,9 @@ CASES = {
 @pytest.mark.hard_case(
     "points more than 10⁵ times as far away as the cameras are apart", "refused", "points-too-far", "ply-too-far"
 )
-@pytest.mark.hard_case("the same, in `sadgs-doctor`", "a note", "point-wild", "point-beyond-bounds")
+@pytest.mark.hard_case(
+    "one point 10⁵ to 10²⁰⁰ units away, in `sadgs-doctor`", "a note", "point-wild", "point-beyond-bounds"
+)
 @pytest.mark.hard_case(
     "a corrupt COLMAP binary: cut off, empty, an unknown model, a count of 2⁶⁰",
     "refused: where it ends",
@@ -830,7 +832,7 @@ CASES = {
     "all images black, white or of one colour", "refused: they show a single colour and nothing else", "images-black"
 )
 @pytest.mark.hard_case(
-    "all images transparent", "refused, as above; colour under alpha 0 does not count", "json-transparent"
+    "all images transparent", "refused: they show nothing; colour under alpha 0 does not count", "json-transparent"
 )
 @pytest.mark.hard_case(
     "all masks black", "refused: no pixel is left; make white what is to be trained on", "json-masks-black"
@@ -1045,7 +1047,7 @@ def test_points_behind_some_cameras_are_a_warning(copied: Callable[[str], Path])
     assert re.fullmatch(r"\S+/p\.ply has points that only 40% of the cameras can see .*\.", finding.sentence)
 
 
-@pytest.mark.hard_case("points beside a Blender scene (`--ply-path`)", "checked in the same way")
+@pytest.mark.hard_case("points beside a Blender scene (`--ply-path`)", "checked as those of other data")
 def test_points_beside_a_blender_scene_are_checked(copied: Callable[[str], Path]):
     data = copied("blender")
 

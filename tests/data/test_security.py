@@ -98,7 +98,7 @@ def test_evaluating_a_hostile_checkpoint_executes_nothing(config: SadgsTrainerCo
 
 
 @pytest.mark.hard_case(
-    "the same commands with a hostile `config.yml`",
+    "`ns-eval`, `ns-render`, `ns-viewer`, `ns-export` with a hostile `config.yml`",
     "**it is executed**, by nerfstudio, before any code of ours; the README warns",
 )
 def test_nerfstudio_executes_what_a_config_yml_says_as_the_readme_warns(tmp_path: Path):
@@ -200,7 +200,7 @@ def test_an_image_apart_from_the_others_by_dots_is_refused(tmp_path: Path):
     assert len(SadgsDatamanagerConfig(dataparser=beside).setup(device="cpu").train_dataset) == 4  # as people have them
 
 
-@pytest.mark.hard_case("a saved config of an older version", "gets the datamanager with these checks, too")
+@pytest.mark.hard_case("a saved config of an older version", "gets the datamanager that checks the images' names")
 def test_saved_configs_make_the_datamanager_with_the_checks():
     for name in ("sadgs", "sadgs_paper", "sadgs_paper_indoor"):
         datamanager: FullImageDatamanagerConfig = getattr(presets, name).config.pipeline.datamanager
@@ -264,7 +264,7 @@ def test_the_viewer_answers_only_on_loopback_unless_told_otherwise(
         shut_down(trainer)
 
 
-@pytest.mark.hard_case("the help of `ns-train sadgs`", "shows that default")
+@pytest.mark.hard_case("the help of `ns-train sadgs`", "shows that the viewer listens on 127.0.0.1")
 @pytest.mark.parametrize("method", ["sadgs", "sadgs-paper"])
 def test_the_help_shows_that_the_viewer_listens_on_loopback(method: str, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit):

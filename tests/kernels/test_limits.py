@@ -46,7 +46,7 @@ def render(num_views: int, num_gaussians: int, side: int) -> None:
     )  # fmt: skip
 
 
-@pytest.mark.hard_case("more of them than the kernels address", "refused before anything runs")
+@pytest.mark.hard_case("more Gaussians, pixels or tile pairs than the kernels address", "refused before anything runs")
 def test_too_many_gaussians_pixels_or_tile_pairs_are_refused_before_anything_runs():
     with pytest.raises(InputError, match=r"4 × 200,000,000, are 800,000,000, and .*: take fewer views at once, or"):
         render(4, 200_000_000, 10)

@@ -499,7 +499,7 @@ def test_cameras_are_pinholes_or_undistorted_or_refused_by_name(
 
 
 @pytest.mark.hard_case(
-    "rendering such a camera (`ns-render camera-path`, the viewer's preview)",
+    "rendering a camera that is no pinhole (`ns-render camera-path`, the viewer's preview)",
     "ValueError; a viewer's page must then be loaded again",
 )
 def test_rendering_a_camera_that_is_no_pinhole_is_refused():

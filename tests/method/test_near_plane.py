@@ -35,7 +35,7 @@ def test_the_plane_is_a_share_of_the_depth_of_what_is_nearest():
     assert scene_near_plane(wall(8.0), *row_of_cameras()) == pytest.approx(8.0 * NEAR_SHARE)
 
 
-@pytest.mark.hard_case("the same scene in other units", "the near plane scales with the units")
+@pytest.mark.hard_case("a scene in other units", "the near plane scales with the units")
 @pytest.mark.parametrize("factor", [1e-3, 1e4])
 def test_a_scene_in_other_units_has_the_same_plane_in_them(factor: float):
     viewmats, Ks, sizes = row_of_cameras()
@@ -181,7 +181,9 @@ def test_a_wall_that_begins_at_the_image_s_border_is_not_in_the_empty_space():
     assert holds(space, middle).all()
 
 
-@pytest.mark.hard_case("a wall between two rooms with cameras on both sides", "is not in that empty space")
+@pytest.mark.hard_case(
+    "a wall between two rooms with cameras on both sides", "is not in the empty space before the cameras"
+)
 def test_a_wall_between_two_rooms_is_not_in_the_empty_space():
     """Cameras on both sides of a wall look the same way: the path between them leads through the wall."""
     points = torch.cat([wall(3.0, middle=0.0), wall(14.0, middle=0.0)])

@@ -231,7 +231,10 @@ def test_a_finished_run_is_the_mean_of_its_last_iterations_also_when_it_was_stop
     assert differences(checkpoint(train(config), last), checkpoint(whole, last)) == []
 
 
-@pytest.mark.hard_case("such Gaussians in a run", "are limited every 25 iterations and at the end")
+@pytest.mark.hard_case(
+    "Gaussians of a run that grow many times longer than their distance from the cameras",
+    "are limited every 25 iterations and at the end",
+)
 @pytest.mark.parametrize("limit", [0.0, 0.5])
 def test_no_gaussian_of_a_run_is_larger_than_its_distance_from_the_cameras_allows(
     limit: float, colmap: ColmapDataParserConfig, tmp_path: Path

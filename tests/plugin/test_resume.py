@@ -634,7 +634,7 @@ def test_a_checkpoint_of_another_capture_is_refused(finished: Path, tmp_path: Pa
     )
 
 
-@pytest.mark.hard_case("views added or taken away in the same world", "goes on")
+@pytest.mark.hard_case("a checkpoint after views were added or taken away in the same world", "goes on")
 @pytest.mark.parametrize(
     ("options", "goes_on"),
     [
@@ -698,7 +698,7 @@ def test_what_is_learned_of_each_view_goes_on_with_the_same_views_and_options_al
         set_up(config)
 
 
-@pytest.mark.hard_case("the same cameras, images of other names (a rig)", "goes on with a warning")
+@pytest.mark.hard_case("a checkpoint of the same cameras with images of other names (a rig)", "goes on with a warning")
 def test_images_with_other_names_at_the_same_cameras_are_told_of(
     finished: Path, config: SadgsTrainerConfig, capsys: pytest.CaptureFixture[str]
 ):
