@@ -21,7 +21,7 @@ from torch import Tensor
 from tyro.conf import Positional
 
 from benchmarks.table import grid
-from sadgs_ns.cli.export import export
+from sadgs_ns.cli.export import Export, export
 from sadgs_ns.data.run_cameras import RunCameras, read_cameras
 from sadgs_ns.formats import FORMATS
 from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world
@@ -77,7 +77,7 @@ class Command:
     def __call__(self) -> int:
         device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         paths = {suffix: self.output / f"splat{suffix}" for suffix in FORMATS}
-        counts = [export(self.run, path, data=self.data) for path in paths.values()]
+        counts = [export(Export(self.run, path, data=self.data)) for path in paths.values()]
         cameras = read_cameras(self.run if self.run.is_dir() else self.run.parent, self.data, split="test")
         photos = [torch.from_numpy(np.asarray(Image.open(p).convert("RGB")) / 255).float() for p in cameras.photos]
         before = render(paths[".ply"], cameras, device)

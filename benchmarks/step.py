@@ -26,7 +26,7 @@ from tyro.conf import Positional
 from benchmarks.evaluate import now
 from benchmarks.table import grid
 from sadgs_ns import kernels
-from sadgs_ns.cli.export import read_gaussians
+from sadgs_ns.cli.export import read_checkpoint
 from sadgs_ns.data.run_cameras import read_cameras
 from sadgs_ns.distributed.rasterization import rasterize as rasterize_together
 from sadgs_ns.distributed.shards import Shards
@@ -444,7 +444,7 @@ class Parts:
         if not kernels.available(device):
             raise ValueError("the parts are our Triton kernels, which need a CUDA device.")
         folder = self.run if self.run.is_dir() else self.run.parent
-        params = {name: value.to(device) for name, value in read_gaussians(folder).items()}
+        params = {name: value.to(device) for name, value in read_checkpoint(folder).params.items()}
         cameras = read_cameras(folder, self.data, split="train")
         same = [i for i, size in enumerate(cameras.sizes) if size == cameras.sizes[0]][: self.views]
         width, height = cameras.sizes[0]

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
@@ -36,6 +36,42 @@ _MAX_OFF_AXIS = 4.0
 _PREFIX = "_model.gauss_params."
 _REMEDY = "give another checkpoint step-*.ckpt of a run of sadgs or splatfacto"
 """What to do about a checkpoint that cannot be used."""
+
+
+@dataclass
+class Export:
+    """Write a trained run's Gaussians as a file for viewers of 3D Gaussian splatting.
+
+    The end of the file's name chooses the format: .ply, the largest, which all viewers read; .compressed.ply, .spz and
+    .sog, which are smaller and lose a little; .glb, which is glTF with KHR_gaussian_splatting; .html, a page that opens
+    in a browser without a network, for which Node.js must be installed. A name that ends in .mesh.ply is for a mesh
+    fused from rendered depth, for measuring and previews; splats keep no surface. A GPU is not needed, and nothing of
+    the run's files is executed. Lengths are in units of nerfstudio's frame.
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """Folder of a run, its config.yml, or one of its checkpoints."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE", help=_OUTPUT)]
+    frame: Frame = "nerfstudio"
+    """Coordinates: nerfstudio's, centred, upright and with cameras within ±1, or those of the COLMAP model or
+    transforms.json that the data came with."""
+    data: Annotated[Path | None, tyro.conf.arg(metavar="DATA")] = None
+    """Folder of the capture, for .html, .mesh.ply, --min-views and --dust; by default where it was in training."""
+    min_views: Annotated[int, tyro.conf.arg(metavar="K")] = 0
+    """Take away Gaussians that fewer than K training views see."""
+    max_extent: Annotated[float | None, tyro.conf.arg(metavar="UNITS")] = None
+    """Take away Gaussians whose longest standard deviation is more than this."""
+    crop: Annotated[Box | None, tyro.conf.arg(metavar="X Y Z X Y Z")] = None
+    """Take away Gaussians whose centre is outside the box from the lowest x, y and z to the highest."""
+    dust: Annotated[float, tyro.conf.arg(metavar="PX")] = 0.0
+    """Take away Gaussians that make up less than this many pixels of each training view: opacity times area, less what
+    others hide."""
+    voxel_size: Annotated[float | None, tyro.conf.arg(metavar="UNITS")] = None
+    """Edge of a voxel of a mesh; by default two pixels at the median depth, or more where the mesh would not fit in
+    memory."""
+    keep_empty_space: bool = False
+    """Keep Gaussians just before the cameras and on the paths between them, where the photos show nothing; without this
+    they are left out, because viewers would show them as haze."""
 
 
 def write_gaussians(
@@ -77,36 +113,11 @@ def _arrays(params: Mapping[str, Tensor]) -> dict[str, NDArray[np.floating]]:
     return {name: tensor.detach().cpu().numpy() for name, tensor in params.items()}
 
 
-def export(
-    run: Path,
-    output: Path,
-    frame: Frame = "nerfstudio",
-    data: Path | None = None,
-    min_views: int = 0,
-    max_extent: float | None = None,
-    crop: Box | None = None,
-    dust: float = 0.0,
-    voxel_size: float | None = None,
-    keep_empty_space: bool = False,
-) -> int:
+def export(given: Export) -> int:
     """Write the Gaussians of a run of sadgs or splatfacto, or a mesh, and say what was taken away of the Gaussians.
 
     Nothing in the run's folder is executed, not even its `config.yml`, and the data need not be there any more, except
     for `min_views` and `dust`, for a mesh, and for the camera with which an HTML page opens.
-
-    Args:
-        run: The run's folder, its `config.yml`, or one of its checkpoints; without one the latest is taken.
-        output: The file, whose name ends in a key of `FORMATS`, or in `MESH` for a triangle mesh.
-        frame: "nerfstudio" is the frame of training: centred, upright, cameras within ±1. "colmap" is that of the
-            COLMAP model, or of `transforms.json` where no COLMAP model stands behind it.
-        data: The capture's folder, where cameras are needed; None is where the run's `config.yml` says it was.
-        min_views: As in `Cleaning`, whose units are those of nerfstudio's frame, and so the next three.
-        max_extent: As in `Cleaning`.
-        crop: As in `Cleaning`.
-        dust: As in `Cleaning`.
-        voxel_size: Of a mesh, as for `write_mesh`; None derives it.
-        keep_empty_space: Whether to write Gaussians just before the cameras, too, which the run itself does not draw
-            from there, because viewers of files have no near plane.
 
     Returns:
         The number of Gaussians written, or of triangles.
@@ -115,56 +126,56 @@ def export(
         InputError: If the run, the capture, an option or the output cannot be used.
         WriteError: If the file could not be written.
     """
-    as_page, as_mesh = format_of(output) == ".html", format_of(output) == MESH
-    if as_page and frame != "nerfstudio":
+    is_page, is_mesh = format_of(given.output) == ".html", format_of(given.output) == MESH
+    if is_page and given.frame != "nerfstudio":
         raise InputError("--frame colmap is for files that other programs read: leave it out for a page.")
-    if voxel_size is not None and not as_mesh:
+    if given.voxel_size is not None and not is_mesh:
         raise InputError(f"--voxel-size is for meshes: let --output end in {MESH}, or leave it out.")
-    if voxel_size is not None and not 0 < voxel_size < math.inf:
-        raise InputError(f"--voxel-size {voxel_size:g} must be more than 0: leave it out to have it derived.")
-    if as_mesh:
+    if given.voxel_size is not None and not 0 < given.voxel_size < math.inf:
+        raise InputError(f"--voxel-size {given.voxel_size:g} must be more than 0: leave it out to have it derived.")
+    if is_mesh:
         load_open3d()  # A machine that lacks it is told before views are rendered.
-    checkpoint = _checkpoint_of(run)
+    folders = _checkpoint_of(given.run).absolute().parents[:2]
+    folder = next((folder for folder in folders if (folder / TRANSFORMS_NAME).is_file()), folders[-1])
     from sadgs_ns.method.cleaning import Cleaning  # It imports torch.
 
-    cleaning = Cleaning(min_views, max_extent, crop, dust)
-    folders = checkpoint.absolute().parents[:2]
-    folder = next((folder for folder in folders if (folder / TRANSFORMS_NAME).is_file()), folders[-1])
+    cleaning = Cleaning(given.min_views, given.max_extent, given.crop, given.dust)
     similarity = None
-    if frame == "colmap":
+    if given.frame == "colmap":
         if not (folder / TRANSFORMS_NAME).is_file():
             raise InputError(
                 f"{folder} holds no {TRANSFORMS_NAME}, where nerfstudio notes how it moved the data: give the run "
                 "where it was made, or export in nerfstudio's frame."
             )
         similarity = from_data(folder / TRANSFORMS_NAME).inverse()
-    params = read_gaussians(run)
-    near_plane, space = read_near_plane(run)
-    drawing = {"max_off_axis": _MAX_OFF_AXIS, "near_plane": near_plane}
-    if space is not None and not keep_empty_space:
-        params = _without_empty_space(params, space)
+    trained = read_checkpoint(given.run)
+    params, drawing = trained.params, {"max_off_axis": _MAX_OFF_AXIS, "near_plane": trained.near_plane}
+    if trained.space is not None and not given.keep_empty_space:
+        params = _without_empty_space(params, trained.space)
     if params["features_rest"].shape[1] == 0:  # then training holds colours' logits
         params["features_dc"] = (params["features_dc"].sigmoid() - 0.5) / DEGREE_0
-    start, cameras = None, None
-    if as_page or as_mesh or cleaning.needs_views:
+    cameras = None
+    if is_page or is_mesh or cleaning.needs_views:
         from sadgs_ns.data.run_cameras import read_cameras
 
-        cameras = read_cameras(folder, data)
+        cameras = read_cameras(folder, given.data)
     try:
         of_parameters(_arrays(params))  # It refuses shapes that do not fit.
         params = _cleaned(params, cleaning, cameras, drawing)
-        if as_mesh and cameras is not None:
+        if is_mesh and cameras is not None:
             from sadgs_ns.cli.meshing import write_mesh
 
-            return write_mesh(output, params, cameras, similarity, voxel_size, **drawing)
-        if as_page and cameras is not None:
+            return write_mesh(given.output, params, cameras, similarity, given.voxel_size, **drawing)
+        start = None
+        if is_page and cameras is not None:
             pose, K = cameras.camera_to_worlds[0].double().numpy(), cameras.Ks[0]
             start = html.start_at(pose, max(cameras.sizes[0]), float(K[0, 0]), params["means"].numpy())
-        return write_gaussians(output, params, frame, similarity, start)
+        return write_gaussians(given.output, params, given.frame, similarity, start)
     except InputError:
         raise
     except ValueError as error:
-        raise InputError(f"{checkpoint} holds no Gaussians that can be exported ({error}): {_REMEDY}.") from error
+        told = f"{trained.checkpoint} holds no Gaussians that can be exported ({error}): {_REMEDY}."
+        raise InputError(told) from error
 
 
 def _without_empty_space(params: dict[str, Tensor], space: EmptySpace) -> dict[str, Tensor]:
@@ -223,104 +234,61 @@ def _checkpoint_of(run: Path) -> Path:
     return max(found, key=lambda path: int(path.stem[5:]))
 
 
-def read_gaussians(run: Path) -> dict[str, Tensor]:
-    """Return the Gaussians' parameters, mapped from the file, so that what is not read takes no memory.
+@dataclass(frozen=True)
+class Trained:
+    """What a checkpoint says of its Gaussians."""
+
+    checkpoint: Path
+    params: dict[str, Tensor]
+    """`means` [N, 3], log `scales` [N, 3], `quats` [N, 4], logit `opacities` [N, 1] and coefficients of harmonics,
+    `features_dc` [N, 3] and `features_rest` [N, K − 1, 3], on the CPU."""
+    near_plane: float
+    """Depth from which the run draws, in world units."""
+    space: EmptySpace | None
+    """The empty space before the cameras; splatfacto knows of none."""
+
+
+def read_checkpoint(run: Path) -> Trained:
+    """Read a run's Gaussians, mapped from the file, so that what is not read takes no memory.
 
     Args:
-        run: As of `export`.
-
-    Returns:
-        `means` [N, 3], log `scales` [N, 3], `quats` [N, 4], logit `opacities` [N, 1] and coefficients of harmonics,
-        `features_dc` [N, 3] and `features_rest` [N, K − 1, 3], on the CPU.
+        run: As of `Export`.
 
     Raises:
         InputError: If there is no checkpoint of this method or of splatfacto.
     """
-    from torch import Tensor  # It takes seconds, and `--help` and a wrong path need not wait for it.
+    # These import torch, which takes seconds, and `--help` and a wrong path need not wait for it.
+    from torch import Tensor
 
-    checkpoint, loaded = _read_pipeline(run)
+    from sadgs_ns.gsplat_internals import NEAR_PLANE
+    from sadgs_ns.method.near_plane import EmptySpace
+    from sadgs_ns.plugin import checkpoints
+
+    checkpoint = _checkpoint_of(run)
+    folder, single = (None, checkpoint) if checkpoint == run else (checkpoint.parent, None)
+    chosen = checkpoints.read_chosen(folder, None, single, _REMEDY, mmap=True)
+    assert chosen is not None
+    checkpoint, loaded = chosen[0], chosen[1]["pipeline"]
+    loaded = loaded if isinstance(loaded, dict) else {}
     params = {}
     for name in ("means", "scales", "quats", "opacities", "features_dc", "features_rest"):
         value = loaded.get(_PREFIX + name)
         if not isinstance(value, Tensor) or value.dim() < 2:
             raise InputError(f"{checkpoint} holds no {name} of Gaussians, so another method made it: {_REMEDY}.")
         params[name] = value
-    return params
-
-
-def read_near_plane(run: Path) -> tuple[float, EmptySpace | None]:
-    """Return the depth from which a run's Gaussians are drawn, in world units, and the empty space before its cameras.
-
-    Where splatfacto made it, that is gsplat's depth, and no space.
-
-    Args:
-        run: As of `export`.
-
-    Raises:
-        InputError: As `read_gaussians`.
-    """
-    from sadgs_ns.gsplat_internals import NEAR_PLANE
-    from sadgs_ns.method.near_plane import EmptySpace
-
-    state = _read_pipeline(run)[1].get("_model._extra_state")
+    state = loaded.get("_model._extra_state")
     state = state if isinstance(state, dict) else {}
     space = state.get("empty_space")
-    return state.get("near_plane", NEAR_PLANE), None if space is None else EmptySpace(**space)
-
-
-def _read_pipeline(run: Path) -> tuple[Path, dict[str, Any]]:
-    """Return the checkpoint that `export`'s `run` names, and its pipeline's state, mapped from the file."""
-    from sadgs_ns.plugin import checkpoints  # It imports torch.
-
-    checkpoint = _checkpoint_of(run)
-    folder, single = (None, checkpoint) if checkpoint == run else (checkpoint.parent, None)
-    chosen = checkpoints.read_chosen(folder, None, single, _REMEDY, mmap=True)
-    assert chosen is not None
-    checkpoint, state = chosen
-    return checkpoint, state["pipeline"] if isinstance(state["pipeline"], dict) else {}
-
-
-@dataclass
-class Export:
-    """Write a trained run's Gaussians as a file for viewers of 3D Gaussian splatting.
-
-    The end of the file's name chooses the format: .ply, the largest, which all viewers read; .compressed.ply, .spz and
-    .sog, which are smaller and lose a little; .glb, which is glTF with KHR_gaussian_splatting; .html, a page that opens
-    in a browser without a network, for which Node.js must be installed. A name that ends in .mesh.ply is for a mesh
-    fused from rendered depth, for measuring and previews; splats keep no surface. A GPU is not needed, and nothing of
-    the run's files is executed. Lengths are in units of nerfstudio's frame.
-    """
-
-    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-    """Folder of a run, its config.yml, or one of its checkpoints."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE", help=_OUTPUT)]
-    frame: Frame = "nerfstudio"
-    """Coordinates: nerfstudio's, centred, upright and with cameras within ±1, or those of the COLMAP model or
-    transforms.json that the data came with."""
-    data: Annotated[Path | None, tyro.conf.arg(metavar="DATA")] = None
-    """Folder of the capture, for .html, .mesh.ply, --min-views and --dust; by default where it was in training."""
-    min_views: Annotated[int, tyro.conf.arg(metavar="K")] = 0
-    """Take away Gaussians that fewer than K training views see."""
-    max_extent: Annotated[float | None, tyro.conf.arg(metavar="UNITS")] = None
-    """Take away Gaussians whose longest standard deviation is more than this."""
-    crop: Annotated[Box | None, tyro.conf.arg(metavar="X Y Z X Y Z")] = None
-    """Take away Gaussians whose centre is outside the box from the lowest x, y and z to the highest."""
-    dust: Annotated[float, tyro.conf.arg(metavar="PX")] = 0.0
-    """Take away Gaussians that make up less than this many pixels of each training view: opacity times area, less what
-    others hide."""
-    voxel_size: Annotated[float | None, tyro.conf.arg(metavar="UNITS")] = None
-    """Edge of a voxel of a mesh; by default two pixels at the median depth, or more where the mesh would not fit in
-    memory."""
-    keep_empty_space: bool = False
-    """Keep Gaussians just before the cameras and on the paths between them, where the photos show nothing; without this
-    they are left out, because viewers would show them as haze."""
+    return Trained(
+        checkpoint, params, state.get("near_plane", NEAR_PLANE), None if space is None else EmptySpace(**space)
+    )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code, 2 if the run or the output cannot be used."""
     given = parse(Export, "sadgs-export", argv)
     try:
-        count = export(**vars(given))
+        count = export(given)
     except (InputError, RunError, WriteError) as error:
         print(f"sadgs-export: {error}", file=sys.stderr)
         return 2
@@ -328,7 +296,3 @@ def main(argv: Sequence[str] | None = None) -> int:
     what = "triangles fused from rendered depth" if format_of(given.output) == MESH else "Gaussians"
     print(f"{given.output}: {count:,} {what}, {size / 1e6:,.1f} MB, in the frame of {given.frame}")
     return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

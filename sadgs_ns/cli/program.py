@@ -60,8 +60,9 @@ def exit_code(name: str, folder: Path | None, run: Callable[[], int]) -> int:
     except (OSError, RunError) as error:
         told, code = str(error), 1
         if isinstance(error, OSError) and error.errno is not None:
-            where, folder = error.filename or folder, folder or Path()
-            told = f"{where}: {reason(error)} ({free_space(folder)} free there); the same command goes on."
+            folder = folder or Path()
+            told = f"{error.filename or folder}: {reason(error)} ({free_space(folder)} free there); the same command "
+            told += "goes on."
     except KeyboardInterrupt as stopped:
         told = "stopped; the same command goes on."
         code = 128 + (stopped.number if isinstance(stopped, Interrupted) else signal.SIGINT)

@@ -12,6 +12,7 @@ import os
 import pickle
 import pkgutil
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -33,6 +34,8 @@ _POLL_SECONDS = 0.1
 """Time between two looks at the events."""
 _KEPT_BYTES = 65536
 """How much of the end of what a process printed is looked at when it failed."""
+_PROMPT = "$ "
+"""What stands before a command in a log."""
 _PREFIX = re.compile(r"^(error|sadgs-[\w-]+): ")
 """What commands put before the sentence with which they end."""
 
@@ -68,7 +71,7 @@ class Worker:
     """
 
     def __init__(self, function: str, log: Path, keep_open: Sequence[int] = (), saves: bool = False) -> None:
-        self._log, self._events, self._saves = log, log.with_suffix(".events"), saves
+        self.log, self._events, self._saves = log, log.with_suffix(".events"), saves
         log.parent.mkdir(parents=True, exist_ok=True)
         self._events.write_bytes(b"")
         code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
@@ -93,13 +96,14 @@ class Worker:
         self._end(signal.SIGKILL)
         self._events.unlink(missing_ok=True)
 
-    def run(self, *arguments: Any, on_event: OnEvent, argv: Sequence[str] = ()) -> Any:
+    def run(self, *arguments: Any, on_event: OnEvent, command: Sequence[str] = ()) -> Any:
         """Call the function, and wait for its end.
 
         Args:
             arguments: The function's; they are pickled.
             on_event: Called here with each event. One that is named "stopping" comes when the process is interrupted.
-            argv: The command line, for a function that reads one.
+            command: The command line that does the same. It is noted in the log, and is what the function finds in
+                `sys.argv`.
 
         Returns:
             What the function returns, as JSON holds it: a dataclass as a dictionary.
@@ -109,9 +113,12 @@ class Worker:
             WorkerError: If the function raises anything else, or if its process ends.
         """
         assert self._process.stdin is not None
+        if command:
+            with self.log.open("ab") as log:
+                log.write(f"{_PROMPT}{shlex.join(command)}\n".encode())
         try:
             with suppress(BrokenPipeError):  # Its import may have failed.
-                self._process.stdin.write(pickle.dumps((list(argv), arguments)))
+                self._process.stdin.write(pickle.dumps((list(command), arguments)))
                 self._process.stdin.flush()
             return self._listen(on_event)
         except BaseException as error:
@@ -150,8 +157,8 @@ class Worker:
         raise WorkerError((sentence or _last_sentence(output.splitlines())).rstrip("."), exitcode, output)
 
     def _output(self) -> str:
-        with self._log.open("rb") as file:
-            file.seek(max(self._start, self._log.stat().st_size - _KEPT_BYTES))
+        with self.log.open("rb") as file:
+            file.seek(max(self._start, self.log.stat().st_size - _KEPT_BYTES))
             return file.read().decode(errors="replace")
 
     def _end(self, number: int) -> None:
@@ -176,7 +183,8 @@ def _last_sentence(lines: Sequence[str]) -> str:
         boxed = [line.strip("│ ") for line in lines if line.startswith("│ ")]
         paragraph = itertools.takewhile(lambda text: not text.startswith("──"), boxed)
         return " ".join(text for text in paragraph if text)
-    last = next((line.strip() for line in reversed(lines) if re.search(r"\w", line)), "it printed nothing")
+    told = (line.strip() for line in reversed(lines) if re.search(r"\w", line) and not line.startswith(_PROMPT))
+    last = next(told, "it printed nothing")
     return _PREFIX.sub("", last)
 
 
@@ -187,7 +195,7 @@ def main() -> None:
     try:
         function = pkgutil.resolve_name(sys.argv[1])
         with os.fdopen(channel, "rb", closefd=False) as given, suppress(EOFError):
-            sys.argv[1:], arguments = pickle.load(given)
+            sys.argv, arguments = pickle.load(given)
             threading.Thread(target=_end_with_parent, args=(channel,), daemon=True).start()
             events.report("result", value=function(*arguments))
     except KeyboardInterrupt:

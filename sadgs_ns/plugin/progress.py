@@ -16,6 +16,8 @@ from nerfstudio.utils.writer import EventName, LocalWriter
 from rich.live import Live
 from rich.text import Text
 
+from sadgs_ns.events import report
+
 COLUMNS = {"Step (% Done)": 18, "Loss": 9, "PSNR": 10, "Gaussians": 12, "Iteration": 11, "Time left": 10}
 """Columns of the table, each with its width. A terminal of 80 characters holds them in one line."""
 MEASURED_STEPS = 3
@@ -120,6 +122,7 @@ class ProgressTable(LocalWriter):
                 self._times.append((step, now))
             done = f"{step} ({step / writer.GLOBAL_BUFFER['max_iter']:.2%})"
             timing = ["", ""] if pace is None else [_short(pace), duration(pace * left)]
+            report("iteration", step=step, left=timing[1])
             self._show(_line([done, *cells, *timing]))
 
     @staticmethod

@@ -18,6 +18,7 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from sadgs_ns import events
 from sadgs_ns.atomic import atomic_path
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
 from sadgs_ns.kernels import use_triton
@@ -153,6 +154,7 @@ class SadgsTrainer(Trainer):
         if self.device == "cpu":
             lines.append(f"[yellow]{about_cpu(torch.get_num_threads())}[/]")
         CONSOLE.print("\n".join(lines), highlight=False, soft_wrap=True)
+        events.report("training begins", iterations=schedule.iterations, on_cpu=self.device == "cpu")
 
     def _pixels_of_a_view(self) -> float:
         """Return the mean number of pixels of the training views."""
@@ -164,6 +166,7 @@ class SadgsTrainer(Trainer):
         if not self.pipeline.stuck:
             text = what_next(self.base_dir / "config.yml", self.pipeline.model.num_gaussians)
             CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
+            events.report("training ends", gaussians=self.pipeline.model.num_gaussians)
 
     def _load_checkpoint(self) -> None:
         """Resume as nerfstudio does, but with the safe loader, and from an earlier checkpoint if the latest is damaged.

@@ -19,6 +19,7 @@ from plyfile import PlyData
 
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
 from sadgs_ns.cli import export
+from sadgs_ns.cli.export import Export
 from sadgs_ns.data.coordinates import Similarity, from_data, spherical_harmonics
 from sadgs_ns.data.run_cameras import find_capture, read_cameras
 from sadgs_ns.errors import InputError
@@ -218,7 +219,7 @@ def test_nerfstudio_s_frame_keeps_the_parameters_and_colmap_s_returns_to_the_poi
 ):
     scene, trainer = trained
     model = trainer.pipeline.model
-    assert export.export(trainer.base_dir, tmp_path / "splat.ply") == model.num_points
+    assert export.export(Export(trainer.base_dir, tmp_path / "splat.ply")) == model.num_points
     np.testing.assert_array_equal(read(tmp_path / "splat.ply", "x", "y", "z"), model.means.detach())
     np.testing.assert_array_equal(read(tmp_path / "splat.ply", "f_rest_17")[:, 0], model.shs_rest.detach()[:, 2, 1])
     # nerfstudio's own points, moved back, are COLMAP's.
@@ -235,7 +236,7 @@ def test_a_foreign_reader_finds_every_gaussian(n: int, tmp_path: Path):
     params = gaussians(n)
     transform = np.c_[SWAP, [1.0, 2, 3]]
     run = write_run(tmp_path / "run", params, transform, scale=0.5)
-    assert export.export(run, tmp_path / "splat.ply", "colmap") == n
+    assert export.export(Export(run, tmp_path / "splat.ply", "colmap")) == n
     cloud = trimesh.load(tmp_path / "splat.ply")
     expected = (params["means"].double().numpy() / 0.5 - [1, 2, 3]) @ SWAP
     np.testing.assert_allclose(cloud.vertices, expected, rtol=1e-6, atol=1e-6)  # type: ignore[union-attr]
@@ -252,7 +253,7 @@ def test_what_is_not_finite_is_dropped_in_every_part_of_the_file(tmp_path: Path,
     params["features_rest"][69_000:, 2, 1] = torch.inf  # the last part is empty, and the count has a digit less
     params["means"][5, 1] = 3e38  # finite, but not in a frame in which the unit is smaller
     run = write_run(tmp_path / "run", params, np.eye(3, 4), scale=0.1)
-    assert export.export(run, tmp_path / "splat.ply", "colmap") == 68_998
+    assert export.export(Export(run, tmp_path / "splat.ply", "colmap")) == 68_998
     assert "dropped 71002 of 140000 Gaussians that are not finite" in capsys.readouterr().out
     vertex = PlyData.read(str(tmp_path / "splat.ply"))["vertex"]
     assert vertex.count == 68_998 and all(np.isfinite(vertex[p.name]).all() for p in vertex.properties)
@@ -262,7 +263,7 @@ def test_what_is_not_finite_is_dropped_in_every_part_of_the_file(tmp_path: Path,
 def test_colours_without_harmonics_become_those_of_degree_0(tmp_path: Path):
     params = gaussians(5) | {"features_rest": torch.zeros(5, 0, 3)}
     run = write_run(tmp_path / "run", params, np.eye(3, 4))
-    export.export(run, tmp_path / "splat.ply", "colmap")
+    export.export(Export(run, tmp_path / "splat.ply", "colmap"))
     shown = 0.5 + 0.28209479 * read(tmp_path / "splat.ply", "f_dc_0", "f_dc_1", "f_dc_2")
     np.testing.assert_allclose(shown, torch.sigmoid(params["features_dc"]), atol=1e-6)
     assert "f_rest_0" not in {p.name for p in PlyData.read(str(tmp_path / "splat.ply"))["vertex"].properties}
@@ -272,7 +273,7 @@ def test_a_reflection_of_the_world_is_undone_as_well(tmp_path: Path):
     params = gaussians(5)
     mirror = np.diag([1.0, 1, -1])
     run = write_run(tmp_path / "run", params, np.c_[mirror, np.zeros(3)])
-    export.export(run, tmp_path / "splat.ply", "colmap")
+    export.export(Export(run, tmp_path / "splat.ply", "colmap"))
     np.testing.assert_allclose(read(tmp_path / "splat.ply", "x", "y", "z"), params["means"] @ mirror, atol=1e-6)
     # Of degree 1 only z, the second, changes sign.
     np.testing.assert_allclose(
@@ -432,15 +433,15 @@ def test_the_run_is_its_folder_its_config_or_a_checkpoint_and_the_latest_is_take
     later = torch.load(models / "step-000000007.ckpt", weights_only=True)
     later["pipeline"] = {f"_model.gauss_params.{name}": value for name, value in gaussians(9).items()}
     torch.save(later, models / "step-000000011.ckpt")
-    counts = [export.export(path, tmp_path / "a.ply") for path in (run, run / "config.yml", models)]
+    counts = [export.export(Export(path, tmp_path / "a.ply")) for path in (run, run / "config.yml", models)]
     assert counts == [9, 9, 9]
-    assert export.export(models / "step-000000007.ckpt", tmp_path / "a.ply") == 3
+    assert export.export(Export(models / "step-000000007.ckpt", tmp_path / "a.ply")) == 3
 
 
 def test_a_damaged_latest_checkpoint_is_passed_over_aloud(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     run = write_run(tmp_path / "run", gaussians(3))
     (run / "nerfstudio_models" / "step-000000011.ckpt").write_bytes(b"half")
-    assert export.export(run, tmp_path / "a.ply") == 3
+    assert export.export(Export(run, tmp_path / "a.ply")) == 3
     printed = " ".join(capsys.readouterr().out.split())
     assert "step-000000011.ckpt is cut off, damaged" in printed and "step-000000007.ckpt instead" in printed
 

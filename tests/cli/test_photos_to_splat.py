@@ -9,8 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +19,13 @@ from PIL import Image
 from rich.console import Console
 from room import draw_photos
 
-from sadgs_ns.cli import photos_to_splat, stage
-from sadgs_ns.cli.photos_to_splat import main
+from sadgs_ns.cli import photos_to_splat
+from sadgs_ns.cli.photos_to_splat import PhotosToSplat, Sadgs, main
+from sadgs_ns.cli.program import locked
+from sadgs_ns.cli.status_line import StatusLine
 from sadgs_ns.data.ply import read_points
-from sadgs_ns.errors import RunError
-from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
 
 TRAINING = ["--", "--max-num-iterations", "15"]
-BOX = "╭─ Wrong ─╮\n│ Wrong options: --a │\n│ or -b. │\n│ ── │\n│ For help │\n╰──╯"
-"""What a command prints of a wrong option."""
 
 
 @pytest.fixture(scope="module")
@@ -43,19 +40,19 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def stop(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     """Have the command get a SIGINT once a stage's line says what a pattern finds."""
-    tell = stage.Line.tell
+    update = StatusLine.update
 
     def stop_at(pattern: str) -> None:
         sent = False
 
-        def tell_and_stop(line: stage.Line, told: str) -> None:
+        def update_and_stop(line: StatusLine, status: str) -> None:
             nonlocal sent
-            tell(line, told)
-            if not sent and re.search(pattern, told):
+            update(line, status)
+            if not sent and re.search(pattern, status):
                 sent = True
                 os.kill(os.getpid(), signal.SIGINT)
 
-        monkeypatch.setattr(stage.Line, "tell", tell_and_stop)
+        monkeypatch.setattr(StatusLine, "update", update_and_stop)
 
     return stop_at
 
@@ -64,6 +61,12 @@ def lines_of(printed: str) -> dict[str, str]:
     """The last of each stage's lines, without its time, which must be there."""
     found = re.findall(r"^(cameras|training|export|in all) +(?:\d+:)?\d+:\d\d(?:  (.*))?$", printed, re.MULTILINE)
     return dict(found)
+
+
+def times_of_results(folder: Path) -> dict[Path, int]:
+    """When all but the settings and the logs of the command was changed, in ns."""
+    found = (path for path in folder.rglob("*") if path.suffix not in (".json", ".txt") and path.name != "log")
+    return {path: path.stat().st_mtime_ns for path in found}
 
 
 @pytest.mark.hard_case(
@@ -113,14 +116,15 @@ def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothin
     assert lines["in all"] == "The splat is my room-splat/splat.ply."
     assert len(read_points(folder / "splat.ply")[0]) > 0
 
-    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.suffix not in (".json", ".txt")}
+    before = times_of_results(folder)
     assert main(command) == 0
     lines = lines_of(capsys.readouterr().out)
     assert all(lines[name].endswith("; done before") for name in ("cameras", "training", "export"))
-    assert before == {path: path.stat().st_mtime_ns for path in before}
+    assert times_of_results(folder) == before
     read, written = os.pipe()
     os.close(read)  # as of `| head` that has read enough
-    words = [sys.executable, "-W", "ignore", "-m", photos_to_splat.__name__, *command]
+    code = f"from {photos_to_splat.__name__} import main; raise SystemExit(main({command}))"
+    words = [sys.executable, "-W", "ignore", "-c", code]
     unread = subprocess.run(words, stdout=written, stderr=subprocess.PIPE, text=True)
     os.close(written)
     assert (unread.returncode, lines_of(unread.stderr).keys()) == (0, lines.keys()), unread.stderr
@@ -180,11 +184,11 @@ def test_photos_that_are_added_are_registered_and_the_splat_is_trained_anew_wher
     assert described["test_filenames"] == [f"images/{sorted(set(names) - set(later))[i]}" for i in held_out]
     assert len(described["train_filenames"]) == 10 - len(held_out)
 
-    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.suffix not in (".json", ".txt")}
+    before = times_of_results(folder)
     assert main(command) == 0
     lines = lines_of(capsys.readouterr().out)
     assert all(lines[name].endswith("; done before") for name in ("cameras", "training", "export"))
-    assert before == {path: path.stat().st_mtime_ns for path in before}
+    assert times_of_results(folder) == before
     (source / "03.png").unlink()
     assert main(command) == 2
     told = "(photos removed: 1, such as 03.png); put these photos back, give another folder or delete it."
@@ -192,8 +196,7 @@ def test_photos_that_are_added_are_registered_and_the_splat_is_trained_anew_wher
 
 
 def test_photos_that_are_added_twice_before_anything_is_saved_are_all_in_the_split(photos: Path, tmp_path: Path):
-    with Interrupts(waiting=lambda: False) as interrupts:
-        work = photos_to_splat.PhotosToSplat(photos, tmp_path / "out", interrupts)
+    work = PhotosToSplat(Sadgs(photos, tmp_path / "out"), [], Console(quiet=True))
     work._scene.mkdir(parents=True)
 
     def choose(number: int) -> dict[str, Any]:
@@ -225,7 +228,7 @@ def test_photos_that_are_added_twice_before_anything_is_saved_are_all_in_the_spl
     "it ends before training, and says what helps; `--anyway` goes on",
 )
 def test_few_registered_photos_end_it_until_it_shall_go_on_anyway(
-    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], program
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     source = tmp_path / "photos"
     source.mkdir()
@@ -239,14 +242,13 @@ def test_few_registered_photos_end_it_until_it_shall_go_on_anyway(
     assert re.search(r"^sadgs: only \d of 11 photos registered, so .* go on with these with --anyway\.$", printed.err)
     assert "--matching" not in printed.err, "all pairs were compared"
     assert lines_of(printed.out) == {"cameras": f"{printed.err.split()[2]} of 11 photos registered"}
-    program(f"print({BOX!r}); raise SystemExit(2)")  # It takes the place of training.
-    monkeypatch.setattr(photos_to_splat, "_TRAINING", "program")
     assert main([*command, "--anyway", "--", "--no-such-option"]) == 2
     printed = capsys.readouterr()
     assert lines_of(printed.out)["cameras"].endswith(" of 11 photos registered; done before")
     log = tmp_path / "out" / "log" / "training.txt"
-    assert printed.err.startswith("sadgs: training: Wrong options: --a or -b. All that it printed is in")
-    assert str(log) in printed.err and " -m program sadgs --data " in log.read_text("utf8")
+    told = r"sadgs: training: Unrecognized options: --no-such-option\. All that it printed is in "
+    assert re.match(told, printed.err) and str(log) in printed.err
+    assert "$ ns-train sadgs --data " in log.read_text("utf8")
 
 
 @pytest.mark.hard_case(
@@ -276,12 +278,6 @@ def test_wrong_input_is_told_in_a_sentence_before_any_work(
         ([source, "-o", "damaged"], "damaged/settings.json is damaged (Expecting property name"),
         ([source, "--", "--load-dir=x"], "--load-dir is set by sadgs itself: leave it out, or use ns-train."),
         ([source, "--formats", "html,ply"], "a page is made with the help of Node.js: install version 22 or newer"),
-    ):
-        monkeypatch.setattr(photos_to_splat.shutil, "which", lambda _: None)
-        assert main(arguments) == 2, arguments
-        printed = capsys.readouterr().err
-        assert printed.startswith(f"sadgs: {told}") and printed.count("\n") == 1
-    for arguments, told in (
         (
             [source, "--formats", "ply,splat"],
             "--formats knows ply, compressed.ply, spz, sog, glb, html, mesh.ply, and not 'splat'",
@@ -289,9 +285,10 @@ def test_wrong_input_is_told_in_a_sentence_before_any_work(
         ([source, "--effort", "0"], "--effort must be more than 0"),
         ([source, "--max-size", "20"], "--max-size must be at least 64 px, or 0 to keep the photos' size"),
     ):
-        with pytest.raises(SystemExit) as ended:
-            main(arguments)
-        assert ended.value.code == 2 and told in capsys.readouterr().err
+        monkeypatch.setattr(photos_to_splat.shutil, "which", lambda _: None)
+        assert main(arguments) == 2, arguments
+        printed = capsys.readouterr().err
+        assert printed.startswith(f"sadgs: {told}") and printed.count("\n") == 1
     assert main([source, "-o", "others/letter.txt/below"]) == 1
     assert "could not be written (Not a directory" in capsys.readouterr().err
     assert sorted(tmp_path.rglob("*")) == before
@@ -302,121 +299,7 @@ def test_two_runs_do_not_work_in_one_folder(
     photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setattr(photos_to_splat, "_LOCK_SECONDS", 0.0)
-    with Interrupts(waiting=lambda: False) as interrupts:
-        work = photos_to_splat.PhotosToSplat(photos, tmp_path / "out", interrupts)
-        with work._alone():
-            assert main([str(photos), "-o", str(tmp_path / "out"), "--formats", "ply"]) == 2
+    (tmp_path / "out").mkdir()
+    with locked(tmp_path / "out", "refused"):
+        assert main([str(photos), "-o", str(tmp_path / "out"), "--formats", "ply"]) == 2
     assert f"another sadgs works in {tmp_path / 'out'}; wait for it, or stop it." in capsys.readouterr().err
-
-
-class Program:
-    """A module that a stage runs."""
-
-    def __init__(self, folder: Path, code: str) -> None:
-        (folder / "program.py").write_text(code)
-        self.log, self.heard = folder / "log.txt", []
-
-    def run(
-        self, arguments: list[str], interrupts: Interrupts, process: subprocess.Popen[bytes] | None = None
-    ) -> tuple[int, str]:
-        lock = os.open(self.log.parent, os.O_RDONLY)
-        try:
-            with stage.Line("stage", Console(quiet=True)) as line:
-                return stage.run_stage("program", arguments, self.log, line, self.hear, interrupts, lock, process)
-        finally:
-            os.close(lock)
-
-    def hear(self, printed: str) -> None:
-        self.heard.append(printed)
-        if printed == "ready":
-            os.kill(os.getpid(), signal.SIGTERM)
-
-
-@pytest.fixture
-def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Program]]:
-    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
-    yield lambda code: Program(tmp_path, code)
-
-
-@pytest.mark.parametrize(
-    ("code", "expected"),
-    [
-        ("print('one'); print('error: It is [so].')", (0, "It is [so]")),
-        ("import sys; print('sadgs-process: no photos.', file=sys.stderr); print(); sys.exit(2)", (2, "no photos")),
-        ("raise SystemExit(3)", (3, "it printed nothing")),
-        (
-            "print('╭─ Wrong ─╮\\n│ Wrong: --a │\\n│ or -b. │\\n│ ── │\\n│ Help │\\n╰────╯'); raise SystemExit(2)",
-            (2, "Wrong: --a or -b"),
-        ),
-    ],
-)
-def test_a_stage_ends_with_its_code_and_its_last_sentence(program, code: str, expected: tuple[int, str]):
-    ran = program(code)
-    assert ran.run(["a b"], Interrupts(waiting=lambda: False)) == expected
-    assert re.search(r"^\$ .* -m program 'a b'\n", ran.log.read_text("utf8"))
-
-
-def test_a_prepared_stage_has_imported_before_its_command_line_comes(program, tmp_path: Path):
-    ran = program(
-        "import heavy, sys\n"
-        "if __name__ == '__main__': print('ran with', *sys.argv[1:]); print('error: Wrong.'); raise SystemExit(3)"
-    )
-    (tmp_path / "heavy.py").write_text("print('imported')")
-    with stage.prepared("program", ran.log, 0) as process:
-        while "imported" not in ran.log.read_text("utf8"):
-            assert process.poll() is None
-            time.sleep(0.05)
-        assert ran.run(["a b", "ü"], Interrupts(waiting=lambda: False), process) == (3, "Wrong")
-    assert ran.log.read_text("utf8").count("imported") == 1 and ran.heard[0] == "ran with a b ü"
-    with stage.prepared("program", ran.log, 0) as unused:
-        pass
-    assert unused.returncode is not None and ran.log.read_text("utf8").count("ran with") == 1
-
-
-def test_a_prepared_stage_whose_import_failed_tells_why(program):
-    ran = program("raise SystemExit('error: Without numpy nothing works.')")
-    with stage.prepared("program", ran.log, 0) as process:
-        process.wait(30)
-        assert ran.run([], Interrupts(waiting=lambda: False), process) == (1, "Without numpy nothing works")
-
-
-@pytest.mark.hard_case("a signal to `sadgs`", "is passed on once, and the stage may save")
-def test_a_signal_is_passed_on_once_and_the_stage_may_save(program):
-    ran = program(
-        "import signal, sys, time\n"
-        "def save(*signal): time.sleep(0.5); print('saved'); sys.exit(143)\n"
-        "signal.signal(signal.SIGTERM, save)\nprint('ready')\ntime.sleep(60)"
-    )
-    with pytest.raises(Interrupted, match="SIGTERM"), Interrupts(waiting=lambda: False) as interrupts:
-        ran.run([], interrupts)
-    assert ran.log.read_text("utf8").endswith("ready\nsaved\n")
-
-
-@pytest.mark.hard_case("the training of `sadgs` is killed", "one sentence, and the same command goes on")
-def test_a_stage_that_is_killed_is_told_of(program):
-    ran = program("import os, signal; os.kill(os.getpid(), signal.SIGKILL)")
-    with pytest.raises(RunError, match="ended by SIGKILL, most likely for want of memory; all that it printed is in"):
-        ran.run([], Interrupts(waiting=lambda: False))
-
-
-@pytest.mark.hard_case("`sadgs` is killed", "the stage is stopped as by SIGTERM (Linux)")
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the lock keeps the next run away until the stage ends")
-def test_a_stage_does_not_outlive_the_command_that_is_killed(program, tmp_path: Path):
-    ran = program("import os, time\nprint(f'pid {os.getpid()}')\ntime.sleep(60)")
-    parent = (
-        "import os, pathlib; from rich.console import Console\n"
-        "from sadgs_ns.cli.stage import Line, run_stage; from sadgs_ns.plugin.interrupts import Interrupts\n"
-        "with Line('stage', Console()) as line:\n"
-        f"    log, lock = pathlib.Path({str(ran.log)!r}), os.open('/', os.O_RDONLY)\n"
-        "    run_stage('program', [], log, line, print, Interrupts(waiting=lambda: False), lock)"
-    )
-    command = subprocess.Popen([sys.executable, "-c", parent])
-    while not (ran.log.exists() and (found := re.search(r"^pid (\d+)$", ran.log.read_text("utf8"), re.MULTILINE))):
-        assert command.poll() is None
-        time.sleep(0.05)
-    command.kill()
-    command.wait()
-    end = time.monotonic() + 20
-    while Path(f"/proc/{found[1]}/stat").exists() and " Z " not in Path(f"/proc/{found[1]}/stat").read_text():
-        assert time.monotonic() < end
-        time.sleep(0.05)

@@ -19,7 +19,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
@@ -52,99 +52,122 @@ _SECONDS_PER_LINE = 1.0
 """Least time between two lines of a stage's progress in a file."""
 _KEPT_KEYS = (*FRAME_KEYS, "train_filenames", "val_filenames", "test_filenames")
 """Keys that a scene's `transforms.json` keeps when photos are added."""
-_MODEL = "model"
-"""Name of the model's folder in `work`; where photos were added, their number follows it."""
-_UNFINISHED = (
-    "frames.partial",
-    "photos.partial",
-    "alpha.partial",
-    "model.partial",
-    "models",
-    "undistorted",
-)
+_UNFINISHED = ("frames.partial", "photos.partial", "alpha.partial", "model.partial", "models", "undistorted")
 """Folders in `work` that are made anew by each run that needs them."""
 
 
-def _note(settings: dict, noted: Path) -> None:
-    """Write the settings that a scene is begun with, unless it was begun before."""
-    if not noted.exists():
-        with atomic_path(noted) as partial:
-            partial.write_text(json.dumps(settings))
+@dataclass
+class Process:
+    """From photos or a video to a scene for sadgs."""
+
+    source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS_OR_VIDEO")]
+    """Folder of photos, or a video."""
+    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
+    """Folder for the scene; an interrupted run goes on in it."""
+    matching: Matching = "auto"
+    """Which photos are compared; auto decides by their kind and number."""
+    frames: int = 200
+    """Frames to take of a video, at least 3."""
+    max_size: Annotated[int, tyro.conf.arg(metavar="PX")] = 1600
+    """Longest side of the result, at least 64, 0 to keep it."""
+    camera_per_photo: bool = False
+    """Every photo has its own zoom, and EXIF does not tell."""
 
 
-def _refuse_changes(out: Path, begun: dict, asked: dict, grows: bool) -> None:
-    """Compare the settings and photos that a scene was begun with to those of now.
-
-    Args:
-        out: The scene.
-        begun: The settings with which it was begun.
-        asked: Those of now.
-        grows: Whether photos may have been added.
-
-    Raises:
-        InputError: If they differ.
-    """
-    differing = [name for name in asked if begun.get(name) != asked[name]]
-    if "source" in differing:  # the rest follows from it
-        differing = ["source"]
-    told, photos, back = [], [], ""
-    if "source" not in differing and "photos" in asked:
-        photos += [("changed", changed_photos(Path(asked["source"]), begun.get("files", {})))]
-    for name in differing:
-        if name not in begun:
-            told.append(f"an earlier version began it and did not compare its {name}")
-        elif name == "photos":
-            before, now = set(begun[name]), set(asked[name])
-            photos += [("added", set() if grows else now - before), ("removed", before - now)]
-        else:
-            option = name if name == "source" else "--" + name.replace("_", "-")
-            told.append(f"{option} was {begun[name]}, is {asked[name]}")
-    for verb, names in photos:
-        if names:
-            told.append(f"photos {verb}: {len(names)}, such as {min(names)}")
-            back = back if verb == "added" else "put these photos back, "
-    if told:
-        raise InputError(
-            f"{out} was begun with other photos or settings ({'; '.join(told)}); {back}give another folder or delete "
-            "it."
-        )
-
-
-def photos_added(source: Path, out: Path) -> list[str]:
-    """Return the names of the photos that a folder holds more than those that its finished scene was made of.
+class _Scene:
+    """What was begun of a scene, and what is asked for now.
 
     Raises:
-        InputError: As `find_photos`, or if the scene's settings are damaged.
+        InputError: If the photos, the folder or the settings cannot be used.
     """
-    noted = out / "work" / "settings.json"
-    begun = _read_settings(noted) if noted.exists() and source.is_dir() else {}
-    known = begun.get("photos") if "finished" in begun else None
-    return [] if known is None else sorted(set(find_photos(source, out)) - set(known))
+
+    def __init__(self, given: Process) -> None:
+        self.given, self.work = given, given.out / "work"
+        self.noted = self.work / "settings.json"
+        out, source, self.is_video = given.out, given.source, given.source.is_file()
+        if out.is_file() or (not self.noted.exists() and any(not path.is_dir() for path in out.rglob("*"))):
+            raise InputError(f"{out} exists and is not a scene that sadgs-process began; give another folder.")
+        photos = [] if self.is_video else find_photos(source, out)
+        self.settings: dict[str, Any] = {
+            "source": os.path.realpath(source),
+            "camera_per_photo": given.camera_per_photo,
+            **({"frames": given.frames} if self.is_video else {"photos": photos}),
+        }
+        self.begun = _read_settings(self.noted)
+        self.finished = self.begun.get("finished") if (out / "transforms.json").exists() else None
+        if self.begun:
+            self._refuse_changes()
+        self.added, self.base, self.model = 0, None, "model"
+        if self.finished and not self.is_video:
+            self.added = len(set(photos) - set(self.begun["photos"]))
+        if self.added:
+            self.base, self.model = self.begun["model"], f"model-{len(photos)}"
+            if not ((self.work / self.base).exists() and (self.work / "database.db").exists()):
+                raise InputError(
+                    f"{self.work} holds the features and the model no more that photos could be added to: give another "
+                    "folder or delete it."
+                )
+
+    def _refuse_changes(self) -> None:
+        """Refuse other settings and photos than those that the scene was begun with."""
+        asked = dict(self.settings)
+        if self.finished:
+            asked["max_size"] = self.given.max_size
+        differing = [name for name in asked if self.begun.get(name) != asked[name]]
+        told, back = [], ""
+        if "source" in differing:  # The rest follows from it.
+            differing = ["source"]
+        elif not self.is_video:
+            before, now = set(self.begun["photos"]), set(asked["photos"])
+            for verb, names in (
+                ("changed", changed_photos(self.given.source, self.begun.get("files", {}))),
+                ("added", set() if self.finished else now - before),
+                ("removed", before - now),
+            ):
+                if names:
+                    told.append(f"photos {verb}: {len(names)}, such as {min(names)}")
+                    back = back if verb == "added" else "put these photos back, "
+        for name in differing:
+            if name != "photos":
+                option = name if name == "source" else "--" + name.replace("_", "-")
+                told.append(f"{option} was {self.begun.get(name)}, is {asked[name]}")
+        if told:
+            raise InputError(
+                f"{self.given.out} was begun with other photos or settings ({'; '.join(told)}); {back}give another "
+                "folder or delete it."
+            )
+
+    def note(self, **settings: Any) -> None:
+        """Write the settings."""
+        self.settings |= settings
+        with atomic_path(self.noted) as partial:
+            partial.write_text(json.dumps(self.settings))
+
+    @contextlib.contextmanager
+    def alone(self) -> Iterator[None]:
+        """Keep other runs away from the work folder, and leave nothing half-written there."""
+        if not self.begun:
+            self.note()
+        with locked(self.work, f"another sadgs-process works on {self.given.out}; wait for it, or stop it."):
+            try:
+                yield
+            finally:
+                for name in _UNFINISHED:
+                    shutil.rmtree(self.work / name, ignore_errors=True)
+                (self.work / "pairs.txt").unlink(missing_ok=True)
+
+    def remove_intermediate_files(self, model: str) -> None:
+        """Remove from the work folder of the finished scene what no photo that is added later needs."""
+        for path in self.work.iterdir():
+            if path.name not in (model, "database.db", "settings.json"):
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
-def process(
-    source: Path,
-    out: Path,
-    *,
-    matching: Matching = "auto",
-    frames: int = 200,
-    max_size: int = 1600,
-    camera_per_photo: bool = False,
-) -> Summary:
+def process(given: Process) -> Summary:
     """Make a scene of photos or a video, and say how far it is, in print and as events.
 
-    Args:
-        source: A folder of photos, searched with its subfolders, or a video.
-        out: Folder for the scene. It is made if it does not exist, and an interrupted run in it goes on. To a finished
-            scene photos are added that have come since, while its other cameras stay as they are; without any it is
-            left as it is.
-        matching: Which pairs are matched; "auto" is sequential for videos, exhaustive for at most
-            `plan.EXHAUSTIVE_LIMIT` photos, and by GPS positions or a vocabulary for more. Where there is no vocabulary,
-            it is sequential for numbered photos and exhaustive for others.
-        frames: How many frames of a video are taken.
-        max_size: Longest side of the undistorted photos in px; 0 keeps them as they are.
-        camera_per_photo: Whether every photo has a focal length of its own. Otherwise photos of one size share a
-            camera, unless EXIF tells of several cameras or focal lengths.
+    An interrupted run in the folder goes on. To a finished scene photos are added that have come since, while its other
+    cameras stay as they are; without any it is left as it is.
 
     Returns:
         What was registered and what was not.
@@ -156,133 +179,95 @@ def process(
         RunError: If COLMAP fails.
     """
     with Interrupts(waiting=lambda: True):
-        summary = _process(source, out, matching, frames, max_size, camera_per_photo)
+        scene = _Scene(given)
+        if scene.finished and not scene.added:
+            scene.remove_intermediate_files(scene.begun["model"])
+            _say("unchanged", f"{given.out} is finished; delete it to make it again.")
+            summary = Summary(**scene.finished)
+        else:
+            columns = (TextColumn("{task.description:>24}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+            with Progress(*columns, disable=not sys.stdout.isatty()) as progress:
+                summary = _make(scene, _reporter(progress))
     print(summary)
-    if source.is_dir() and (not_read := photos_not_read(source)):
+    if given.source.is_dir() and (not_read := photos_not_read(given.source)):
         print(not_read)
     return summary
 
 
-def _process(
-    source: Path, out: Path, matching: Matching, frames: int, max_size: int, camera_per_photo: bool
-) -> Summary:
-    work = out / "work"
-    noted = work / "settings.json"
-    if out.is_file() or (not noted.exists() and any(not path.is_dir() for path in out.rglob("*"))):
-        raise InputError(f"{out} exists and is not a scene that sadgs-process began; give another folder.")
-    is_video = source.is_file()
-    settings = {"source": os.path.realpath(source), "camera_per_photo": camera_per_photo}
-    settings |= {"frames": frames} if is_video else {"photos": find_photos(source, out)}
-    begun = _read_settings(noted) if noted.exists() else {}
-    finished = begun.get("finished") if (out / "transforms.json").exists() else None
-    asked = settings | ({"max_size": max_size} if finished else {})
-    if begun:
-        _refuse_changes(out, begun, asked, grows=bool(finished))
-    added = [] if is_video or not finished else sorted(set(settings["photos"]) - set(begun["photos"]))
-    base: str | None = begun.get("model", _MODEL) if added else None
-    if base is not None and not ((work / base).exists() and (work / "database.db").exists()):
-        raise InputError(
-            f"{out} was made by an earlier version, which kept nothing that photos could be added to: give another "
-            "folder or delete it."
-        )
-    model = f"{_MODEL}-{len(settings['photos'])}" if added else _MODEL
-    if finished and not added:
-        _remove_intermediate_files(work, begun)
-        _say("unchanged", f"{out} is finished; delete it to make it again.")
-        return Summary(**finished)
-    columns = (TextColumn("{task.description:>24}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, disable=not sys.stdout.isatty()) as progress, contextlib.ExitStack() as alone:
-        report = _reporter(progress)
-        if is_video:
+def _make(scene: _Scene, report: Report) -> Summary:
+    given, work = scene.given, scene.work
+
+    def fetch_vocabulary() -> None:
+        with tempfile.TemporaryDirectory() as scratch:
+            run_colmap("fetch_vocabulary", Path(scratch), folder=Path(scratch), report=report)
+
+    with contextlib.ExitStack() as alone:
+        folder, names = given.source, scene.settings.get("photos", [])
+        if scene.is_video:
             folder = work / "frames"
-            chosen = [] if folder.exists() else video_frames(source, frames)
-            _note(settings, noted)  # before anything else lies in the folder: an interrupted run goes on by it
-            alone.enter_context(_alone(work))
+            chosen = [] if folder.exists() else video_frames(given.source, given.frames)
+            alone.enter_context(scene.alone())  # It notes the settings, by which an interrupted run goes on.
             if not folder.exists():
                 partial = empty_folder(work / "frames.partial")
-                write_frames(chosen, partial, lambda done: report("frames", done, frames))
+                write_frames(chosen, partial, lambda done: report("frames", done, given.frames))
                 partial.rename(folder)
             names = sorted(photo.name for photo in folder.glob("*.jpg"))
-        else:
-            folder, names = source, settings["photos"]
         photos = read_photos(folder, names, report)
-        if not is_video:
-            settings["files"] = begun.get("files") or {}
-            settings["files"] |= photo_stamps(folder, [name for name in names if name not in settings["files"]])
-
-        def fetch_vocabulary() -> None:
-            with tempfile.TemporaryDirectory() as scratch:
-                run_colmap("fetch_vocabulary", Path(scratch), folder=Path(scratch), report=report)
-
-        chosen_matching, notice = choose_matching(matching, photos, is_video, fetch_vocabulary)
-        if not is_video:
-            _note(settings, noted)  # only now, when the photos are known to be readable
-            alone.enter_context(_alone(work))
-        known = len(photos) - len(added) if added else 0
-        if added:
-            told = f"{len(added)} photo{'s' * (len(added) > 1)} added to {known}"
-            _say("added", f"{told}.", told=told)
-        work_sentence, duration = expected_work(photos, chosen_matching, known)
-        _say("expected", f"{notice} {work_sentence}".lstrip(), duration=duration)
+        matching, notice = choose_matching(given.matching, photos, scene.is_video, fetch_vocabulary)
+        if not scene.is_video:
+            stamps = scene.begun.get("files", {})
+            scene.settings["files"] = stamps | photo_stamps(folder, [name for name in names if name not in stamps])
+            alone.enter_context(scene.alone())  # Only now, when the photos are known to be readable.
+        known = len(photos) - scene.added if scene.added else 0
+        if scene.added:
+            told = f"{scene.added} photo{'s' * (scene.added > 1)} added to {known}"
+            _say("added", f"{told}.", photos=told)
+        expected, duration = expected_work(photos, matching, known)
+        _say("expected", f"{notice} {expected}".lstrip(), duration=duration)
         folder, photos = convert_photos(folder, photos, work / "photos")
         if transparent := write_alpha(folder, photos, work / "alpha"):
             _say("transparent", f"{transparent} photos are partly transparent; their images in the scene are, too.")
-        groups = [[photo.name] for photo in photos] if camera_per_photo else photos_by_camera(photos)
-        if added:  # An interrupted run may have made a model without some of them.
-            shutil.rmtree(work / model, ignore_errors=True)
-        arguments = (folder, groups, chosen_matching, max_size, work / "alpha", work, model, base)
+        groups = [[photo.name] for photo in photos] if given.camera_per_photo else photos_by_camera(photos)
+        if scene.added:  # An interrupted run may have made a model without some of them.
+            shutil.rmtree(work / scene.model, ignore_errors=True)
+        arguments = (folder, groups, matching, given.max_size, work / "alpha", work, scene.model, scene.base)
         summary = Summary(**run_colmap("make_model", *arguments, folder=work, report=report))
-        _publish(work / "undistorted", out, bool(added))
-        if summary.is_poor and not added:  # the features serve another way of matching
-            shutil.rmtree(work / model)
+        _publish(work / "undistorted", given.out, bool(scene.added))
+        if summary.is_poor and not scene.added:  # the features serve another way of matching
+            shutil.rmtree(work / scene.model)
         else:
-            settings |= {"max_size": max_size, "finished": dataclasses.asdict(summary), "model": model}
-            with atomic_path(noted) as partial:
-                partial.write_text(json.dumps(settings))
-            _remove_intermediate_files(work, settings)
+            scene.note(max_size=given.max_size, finished=dataclasses.asdict(summary), model=scene.model)
+            scene.remove_intermediate_files(scene.model)
     return summary
 
 
-def _say(event: str, sentence: str, **fields: str) -> None:
-    """Print a sentence, and tell a listener of the event that it is about."""
-    print(sentence, flush=True)
-    events.report(event, **fields)
-
-
-@contextlib.contextmanager
-def _alone(work: Path) -> Iterator[None]:
-    """Keep other runs away from a work folder, and leave nothing half-written there.
+def photos_added(source: Path, out: Path) -> list[str]:
+    """Return the names of the photos that a folder holds more than those that its finished scene was made of.
 
     Raises:
-        InputError: If another run works there.
+        InputError: As `find_photos`, or if the scene's settings are damaged.
     """
-    with locked(work, f"another sadgs-process works on {work.parent}; wait for it, or stop it."):
-        try:
-            yield
-        finally:
-            for name in _UNFINISHED:
-                shutil.rmtree(work / name, ignore_errors=True)
-            (work / "pairs.txt").unlink(missing_ok=True)
+    begun = _read_settings(out / "work" / "settings.json")
+    if not source.is_dir() or "finished" not in begun:
+        return []
+    return sorted(set(find_photos(source, out)) - set(begun["photos"]))
 
 
-def _remove_intermediate_files(work: Path, settings: dict) -> None:
-    """Remove from a finished scene's work folder what no photo that is added later needs."""
-    for path in work.iterdir():
-        if path.name in (settings.get("model", _MODEL), "database.db", "settings.json"):
-            continue
-        if path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.unlink()
-
-
-def _read_settings(noted: Path) -> dict:
+def _read_settings(noted: Path) -> dict[str, Any]:
+    if not noted.exists():
+        return {}
     try:
         return dict(json.loads(noted.read_text()))
     except ValueError as error:
         raise InputError(
             f"{noted} is damaged ({reason(error)}): delete {noted.parent.parent} and begin again."
         ) from error
+
+
+def _say(event: str, sentence: str, **fields: str) -> None:
+    """Print a sentence, and tell a listener of the event that it is about."""
+    print(sentence, flush=True)
+    events.report(event, **fields)
 
 
 def _reporter(progress: Progress) -> Report:
@@ -344,52 +329,6 @@ def _publish(undistorted: Path, out: Path, grown: bool = False) -> None:
         (undistorted / name).rename(out / name)
 
 
-@dataclass
-class Process:
-    """From photos or a video to a scene for sadgs."""
-
-    source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS_OR_VIDEO")]
-    """Folder of photos, or a video."""
-    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
-    """Folder for the scene; an interrupted run goes on in it."""
-    matching: Matching = "auto"
-    """Which photos are compared; auto decides by their kind and number."""
-    frames: int = 200
-    """Frames to take of a video, at least 3."""
-    max_size: Annotated[int, tyro.conf.arg(metavar="PX")] = 1600
-    """Longest side of the result, at least 64, 0 to keep it."""
-    camera_per_photo: bool = False
-    """Every photo has its own zoom, and EXIF does not tell."""
-
-    def make(self) -> int:
-        """Make the scene, and return 0, or 1 where fewer than half of the photos registered."""
-        if self.frames < 3:
-            raise InputError("--frames must be at least 3.")
-        check_size(self.max_size)
-        if not (self.source.is_absolute() and self.out.is_absolute()):
-            try:
-                os.getcwd()
-            except FileNotFoundError:
-                raise InputError(
-                    "the working directory was deleted; change to another one, or give full paths."
-                ) from None
-        summary = process(**vars(self))
-        out = shlex.quote(str(self.out))
-        if not summary.is_poor:
-            print(
-                f"\nCheck machine and data before a long run:  sadgs-doctor {out}\nTrain:  ns-train sadgs --data {out}"
-            )
-            return 0
-        again = "the same command with --matching exhaustive, which uses the features found so far; or "
-        print(
-            f"warning: {self.out} shows only what {summary.registered} of {summary.photos} photos saw. Try "
-            f"{'' if summary.matching == 'exhaustive' else again}another folder with more photos between those that "
-            f"did not register, with two thirds of overlap. This trains on what is there: ns-train sadgs --data {out}",
-            file=sys.stderr,
-        )
-        return 1
-
-
 def check_size(max_size: int) -> None:
     """Raise an InputError if a longest side in px leaves no structure in the photos."""
     if max_size != 0 and max_size < MIN_SIZE:
@@ -403,8 +342,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     input is wrong, and 130, 143 or 129 after SIGINT, SIGTERM or SIGHUP.
     """
     given = parse(Process, "sadgs-process", argv)
-    return exit_code("sadgs-process", given.out, given.make)
+    return exit_code("sadgs-process", given.out, lambda: _run(given))
 
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+def _run(given: Process) -> int:
+    if given.frames < 3:
+        raise InputError("--frames must be at least 3.")
+    check_size(given.max_size)
+    if not (given.source.is_absolute() and given.out.is_absolute()):
+        try:
+            os.getcwd()
+        except FileNotFoundError:
+            raise InputError("the working directory was deleted; change to another one, or give full paths.") from None
+    summary, out = process(given), shlex.quote(str(given.out))
+    if not summary.is_poor:
+        print(f"\nCheck machine and data before a long run:  sadgs-doctor {out}\nTrain:  ns-train sadgs --data {out}")
+        return 0
+    again = "the same command with --matching exhaustive, which uses the features found so far; or "
+    print(
+        f"warning: {given.out} shows only what {summary.registered} of {summary.photos} photos saw. Try "
+        f"{'' if summary.matching == 'exhaustive' else again}another folder with more photos between those that "
+        f"did not register, with two thirds of overlap. This trains on what is there: ns-train sadgs --data {out}",
+        file=sys.stderr,
+    )
+    return 1

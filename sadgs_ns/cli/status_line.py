@@ -1,0 +1,57 @@
+"""One line that says how far a stage is."""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+
+class StatusLine:
+    """The name of a stage, the time it takes, and how far it is.
+
+    A terminal shows the line as it changes; elsewhere, as in a file, it is printed once, when the context ends.
+
+    Args:
+        name: The stage.
+        console: Where it is printed.
+    """
+
+    def __init__(self, name: str, console: Console) -> None:
+        self._name, self._console, self._status = name, console, ""
+        self._live = Live(console=console, get_renderable=self._text) if console.is_terminal else None
+
+    def __enter__(self) -> StatusLine:
+        self._start = time.monotonic()
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()
+        else:
+            self._console.print(self._text(), soft_wrap=True)
+
+    def update(self, status: str) -> None:
+        """Say how far the stage is."""
+        self._status = status
+
+    def print(self, sentence: str) -> None:
+        """Print a sentence above the line."""
+        self._console.print(Text(sentence), soft_wrap=True)
+
+    def _text(self) -> Text:
+        passed = clock(time.monotonic() - self._start)
+        return Text(f"{self._name:<9}{passed:>8}  {self._status}".rstrip(), no_wrap=True, overflow="ellipsis")
+
+
+def clock(seconds: float) -> str:
+    """Return a time as "1:02" or "1:00:02"."""
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02}:{rest:02}" if minutes >= 60 else f"{minutes}:{rest:02}"
