@@ -316,7 +316,8 @@ def test_everything_imported_is_required_by_us_or_by_nerfstudio():
     ours |= {"triton"}  # looked for before it is imported; torch has it
     folders = ("sadgs_ns", "benchmarks", "examples", "tests")
     # Python 3.10 has no tomllib, for which tomli stands there.
-    for_tests = ours | requirements(project["optional-dependencies"]["dev"])
+    extras = project["optional-dependencies"]
+    for_tests = ours | requirements(extras["dev"] + extras["docs"])
     local = {*folders, "tomllib", *(path.stem for path in (CHECKOUT / "tests").glob("*.py"))}
     distributions = packages_distributions()
     undeclared = []
