@@ -172,7 +172,7 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
         with phases.replaced(config.pipeline.model._target, "populate_modules", timed_initialization):
             trainer.setup(test_mode="test")  # "val" would evaluate on blender's validation views
     seconds["setup_seconds"] -= seconds["initialization_seconds"]
-    if devices > 1 and getattr(trainer, "shards", None) is None:
+    if devices > 1 and getattr(trainer, "world", None) is None:
         raise ValueError(
             f"row {job.row.label!r} on {job.scene.name!r} trains on one device, since its steps have few pixels or its "
             "method knows one only: measure it with one GPU, or set share_always to true."

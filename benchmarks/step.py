@@ -29,7 +29,7 @@ from sadgs_ns import kernels
 from sadgs_ns.cli.export import read_checkpoint
 from sadgs_ns.data.run_cameras import read_cameras
 from sadgs_ns.distributed.rasterization import rasterize as rasterize_together
-from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.distributed.world import World
 from sadgs_ns.method import memory
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, keep_gradient
 from sadgs_ns.method.losses import photometric_loss, photometric_part
@@ -77,7 +77,7 @@ class Step:
         height: px.
         views: Number V of views of a step.
         device: Where this process computes.
-        shards: The processes; None for one process.
+        world: The processes; None for one process.
         blocks: Number of shells, at least 1, each of which has as many Gaussians and views as another where it divides
             their numbers. Each process has as many Gaussians of a block as another process.
     """
@@ -89,12 +89,12 @@ class Step:
         height: int,
         views: int = 1,
         device: torch.device | str = "cuda",
-        shards: Shards | None = None,
+        world: World | None = None,
         blocks: int = 1,
     ) -> None:
-        self.shards, self.width, self.height, self.views = shards, width, height, views
+        self.world, self.width, self.height, self.views = world, width, height, views
         device = torch.device(device)
-        part = slice(0, gaussians) if shards is None else shards.take_even_part(gaussians)
+        part = slice(0, gaussians) if world is None else world.take_even_part(gaussians)
         number = part.stop - part.start
         generator = torch.Generator(device).manual_seed(part.start)
 
@@ -143,8 +143,8 @@ class Step:
             p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid().squeeze(-1),
             (p["features_dc"], p["features_rest"]), self.viewmats, self.Ks, self.width, self.height,
         )  # fmt: skip
-        if self.shards is not None:
-            self.bands, self.start, info = rasterize_together(self.shards, *splats, sh_degree=3, absgrad=True)
+        if self.world is not None:
+            self.bands, self.start, info = rasterize_together(self.world, *splats, sh_degree=3, absgrad=True)
             drawn = [colors for _, colors, _ in self.bands]
         else:
             image, _, info = rasterize(*splats, sh_degree=3, absgrad=True, tile_capacity=self.capacity)
@@ -157,7 +157,7 @@ class Step:
 
     def loss(self, drawn: list[Tensor]) -> Tensor:
         """The photometric loss of what `draw` gave; of several processes each has a part."""
-        if self.shards is None:
+        if self.world is None:
             return photometric_loss(drawn[0], self.images)[0]
         loss = self.start
         for (band, _, _), colors in zip(self.bands, drawn, strict=True):
@@ -185,7 +185,7 @@ class Step:
 
     def observe(self) -> None:
         """One observation of η."""
-        jitter = None if self.shards is None else self.shards.rand(self.views)
+        jitter = None if self.world is None else self.world.rand(self.views)
         observe(self.state, self.params, self.info, jitter=jitter)  # type: ignore[arg-type]
 
     def optimize(self) -> None:
@@ -378,29 +378,29 @@ class Together:
         if self.blocks < 1:
             raise ValueError(f"--blocks must be at least 1, got {self.blocks}.")
         number, local = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("LOCAL_RANK", "0"))
-        device, shards = torch.device("cpu"), None
+        device, world = torch.device("cpu"), None
         if torch.cuda.is_available():
             device = torch.device("cuda", local)
             torch.cuda.set_device(device)  # NCCL, and Triton, take the current device.
         if number > 1:
             dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
-            shards = Shards(device)
+            world = World(device)
         lines = []
         for gaussians, megapixels, views in product(self.gaussians, self.megapixels, self.views):
-            step = Step(gaussians, *size_of(megapixels), views, device, shards, self.blocks)
+            step = Step(gaussians, *size_of(megapixels), views, device, world, self.blocks)
             time, peak = step_time(step, self.repeats)
             peaks = torch.tensor([peak], device=device)
-            peaks = peaks if shards is None else shards.gather(peaks)[:, 0]
+            peaks = peaks if world is None else world.gather(peaks)[:, 0]
             each = ", ".join(f"{peak:.2f}" for peak in peaks.tolist())
             size = (str(number), f"{gaussians:,}", f"{megapixels:g}", str(views), str(self.blocks))
             lines.append((*size, f"{time:.2f}", each))
             del step
-        if shards is None or shards.rank == 0:
+        if world is None or world.rank == 0:
             name = torch.cuda.get_device_name() if device.type == "cuda" else "CPU"
             print(f"{number} × {name}, torch {torch.__version__}\n")
             header = ("devices", "Gaussians", "megapixels", "views", "blocks", "ms a step", "peak GB of each device")
             print(grid(header, lines, names=0), flush=True)
-        if shards is not None:
+        if world is not None:
             dist.destroy_process_group()
         return 0
 
@@ -415,8 +415,8 @@ def step_time(step: Step, repeats: int) -> tuple[float, float]:
     def steps() -> None:
         for _ in range(repeats):
             step()
-        if step.shards is not None:
-            step.shards.all(True)
+        if step.world is not None:
+            step.world.all(True)
 
     for _ in range(3):  # kernels are compiled
         step()

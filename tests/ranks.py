@@ -12,7 +12,7 @@ import torch
 import torch.distributed as dist
 from processes import start
 
-from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.distributed.world import World
 
 TIMEOUT = 400.0
 """Seconds after which processes are killed, so that no test waits for ever for a message that does not come."""
@@ -24,7 +24,7 @@ def run_ranks(
     """Call a function of a module in several processes.
 
     Args:
-        function: It is called with the process's `Shards` and the arguments; what it returns is written by torch.save.
+        function: It is called with the process's `World` and the arguments; what it returns is written by torch.save.
         number: Of processes.
         folder: For the files by which they meet and answer.
         arguments: What can be pickled.
@@ -50,7 +50,7 @@ def run_ranks(
 def _run(function: Callable[..., Any], rank: int, number: int, folder: str, arguments: tuple[Any, ...]) -> None:
     torch.set_num_threads(1)
     dist.init_process_group("gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=number)
-    result = function(Shards(torch.device("cpu")), *arguments)
+    result = function(World(torch.device("cpu")), *arguments)
     torch.save(result, Path(folder, f"{rank}.pt"))
     if not dist.is_initialized():  # The function has left the others.
         return

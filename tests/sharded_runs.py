@@ -10,7 +10,7 @@ import torch
 from kill_and_resume import configure
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.distributed.world import World
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 STRUCTURE_EVERY = 6
@@ -55,13 +55,13 @@ def record(trainer: SadgsTrainer) -> dict[str, Any]:
     return {"losses": losses, "statistics": statistics, "steps": steps, "gaussians": model.num_gaussians}
 
 
-def set_up_together(shards: Shards, config: SadgsTrainerConfig) -> SadgsTrainer:
+def set_up_together(world: World, config: SadgsTrainerConfig) -> SadgsTrainer:
     """The trainer of this process, which prints nothing."""
     CONSOLE.quiet = True
-    trainer = config.setup(local_rank=shards.rank, world_size=shards.num_ranks)
+    trainer = config.setup(local_rank=world.rank, world_size=world.num_ranks)
     trainer.setup()
     return trainer
 
 
-def record_together(shards: Shards, config: SadgsTrainerConfig) -> dict[str, Any]:
-    return record(set_up_together(shards, config))
+def record_together(world: World, config: SadgsTrainerConfig) -> dict[str, Any]:
+    return record(set_up_together(world, config))

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sadgs_ns.distributed.bands import Band
-from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.distributed.world import World
 from sadgs_ns.gsplat_internals import drawn
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.render.projected import Projected
@@ -37,31 +37,31 @@ class Exchange:
             none where nobody asked for them.
 
     Args:
-        shards: The processes.
+        world: The processes.
         projected: The Gaussians of this process in all V views.
         bands: All bands, as `share_out` returns them.
     """
 
-    def __init__(self, shards: Shards, projected: Projected, bands: Sequence[Band]) -> None:
-        self.fused = projected.colors.shape[-1] == 3 and shards.agree_once("kernels", lambda: use_triton(shards.device))
+    def __init__(self, world: World, projected: Projected, bands: Sequence[Band]) -> None:
+        self.fused = projected.colors.shape[-1] == 3 and world.agree_once("kernels", lambda: use_triton(world.device))
         self.whole_views = len(bands) == len(projected.opacities)
         reached = _reached(projected, bands)  # [B, N]
-        counted = torch.cat([reached.sum(1), torch.tensor([shards.request], device=shards.device)])
-        gathered = shards.gather(counted)  # [R, B + 1]
+        counted = torch.cat([reached.sum(1), torch.tensor([world.request], device=world.device)])
+        gathered = world.gather(counted)  # [R, B + 1]
         n = reached.shape[1]
         self.places = reached.flatten().nonzero()[:, 0]  # [M], in B · N
         if any(band.view != index for index, band in enumerate(bands)):
-            views = torch.tensor([band.view for band in bands], device=shards.device)
+            views = torch.tensor([band.view for band in bands], device=world.device)
             self.places = views[self.places // n] * n + self.places % n
         table = gathered.tolist()
         for row in table:
-            shards.heard |= row.pop()
-        mine = [index for index, band in enumerate(bands) if band.rank == shards.rank]
+            world.heard |= row.pop()
+        mine = [index for index, band in enumerate(bands) if band.rank == world.rank]
         self.bands = [bands[index] for index in mine]
         self.counts = [[row[index] for index in mine] for row in table]
         self._received = [sum(row) for row in self.counts]
-        self._sent = [0] * shards.num_ranks
-        for band, number in zip(bands, table[shards.rank], strict=True):
+        self._sent = [0] * world.num_ranks
+        for band, number in zip(bands, table[world.rank], strict=True):
             self._sent[band.rank] += number
         self.absolute: list[Tensor] = []
 

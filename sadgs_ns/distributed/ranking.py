@@ -5,14 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.distributed.world import World
 
 _DIGITS = ((20, 11), (10, 10), (0, 10))
 """Shifts and widths in bits of the parts of a positive float32's 31 bits, the most significant first."""
 
 
 @torch.no_grad()
-def limit_growth(shards: Shards, growth: Tensor, priority: Tensor, budget: float) -> Tensor:
+def limit_growth(world: World, growth: Tensor, priority: Tensor, budget: float) -> Tensor:
     """Do what `method.split.limit_growth` does for the Gaussians of all processes, in the order of their ranks.
 
     Nobody gathers the priorities. Where the budget does not suffice, histograms of them, summed over the processes,
@@ -20,7 +20,7 @@ def limit_growth(shards: Shards, growth: Tensor, priority: Tensor, budget: float
     sizes.
 
     Args:
-        shards: The processes.
+        world: The processes.
         growth: Gaussians that each one would add, ≥ 0. int64 [N]
         priority: Larger comes first, ≥ 0. [N]
         budget: Gaussians that may be added in all, the same in all processes; ≤ 0 allows none.
@@ -33,21 +33,21 @@ def limit_growth(shards: Shards, growth: Tensor, priority: Tensor, budget: float
     allowed = torch.zeros_like(growth, dtype=torch.bool)
     while True:
         fits = (growth > 0) & (growth <= budget) & ~allowed
-        if int(shards.sum(torch.where(fits, growth, 0).sum())) <= max(budget, 0):
+        if int(world.sum(torch.where(fits, growth, 0).sum())) <= max(budget, 0):
             return allowed | fits
-        taken = _up_to_first_that_does_not_fit(shards, torch.where(fits, growth, 0), bits, budget)
+        taken = _up_to_first_that_does_not_fit(world, torch.where(fits, growth, 0), bits, budget)
         allowed |= taken
-        budget -= int(shards.sum(growth[taken].sum()))
+        budget -= int(world.sum(growth[taken].sum()))
 
 
-def _up_to_first_that_does_not_fit(shards: Shards, growth: Tensor, bits: Tensor, budget: float) -> Tensor:
+def _up_to_first_that_does_not_fit(world: World, growth: Tensor, bits: Tensor, budget: float) -> Tensor:
     """Choose by priority all Gaussians before the first that does not fit; all together do not. bool [N]"""
     equal = growth > 0  # These agree in the digits so far with the first that does not fit.
     before, threshold = 0, 0
     for shift, width in _DIGITS:
         digits = ((bits >> shift) & ((1 << width) - 1)).long()
         histogram = growth.new_zeros(1 << width).scatter_add_(0, digits, torch.where(equal, growth, 0))
-        from_top = shards.sum(histogram).flip(0).cumsum(0)  # It grows as the digit falls.
+        from_top = world.sum(histogram).flip(0).cumsum(0)  # It grows as the digit falls.
         index = int((before + from_top <= budget).sum())
         before += int(from_top[index - 1]) if index > 0 else 0
         digit = (1 << width) - 1 - index
@@ -55,6 +55,6 @@ def _up_to_first_that_does_not_fit(shards: Shards, growth: Tensor, bits: Tensor,
         threshold |= digit << shift
     # Of equal priorities the first in the order of the ranks come first.
     ties = torch.where(equal, growth, 0)
-    totals = shards.gather(ties.sum()[None])[:, 0]
-    before += int(totals[: shards.rank].sum())
+    totals = world.gather(ties.sum()[None])[:, 0]
+    before += int(totals[: world.rank].sum())
     return (growth > 0) & ((bits > threshold) | equal & (before + ties.cumsum(0) <= budget))

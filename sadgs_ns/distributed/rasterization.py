@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sadgs_ns.distributed.bands import Band, share_out
 from sadgs_ns.distributed.exchange import Exchange
-from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.distributed.world import World
 from sadgs_ns.gsplat_internals import NEAR_PLANE
 from sadgs_ns.render.rasterization import composite, project
 
@@ -25,7 +25,7 @@ class RenderedBand(NamedTuple):
 
 
 def rasterize(
-    shards: Shards,
+    world: World,
     means: Tensor,  # [N, 3]
     quats: Tensor,  # [N, 4]
     scales: Tensor,  # [N, 3]
@@ -47,7 +47,7 @@ def rasterize(
     Every process must call this, and `backward` of something to which the anchor was added, in the same order.
 
     Args:
-        shards: The processes, whose `sizes` are right.
+        world: The processes, whose `sizes` are right.
         means, quats, scales, opacities, colors: The Gaussians of this process, as for `render.rasterization.rasterize`.
         viewmats, Ks, width, height: The same cameras in all processes; `viewmats` gets no gradient.
         sh_degree, absgrad, rasterize_mode, max_off_axis, near_plane: As for `render.rasterization.rasterize`,
@@ -65,7 +65,7 @@ def rasterize(
         means, quats, scales, opacities, colors, viewmats, Ks, width, height,
         sh_degree=sh_degree, rasterize_mode=rasterize_mode, max_off_axis=max_off_axis, near_plane=near_plane,
     )  # fmt: skip
-    exchange = Exchange(shards, projected, share_out(len(viewmats), height, shards.num_ranks))
+    exchange = Exchange(world, projected, share_out(len(viewmats), height, world.num_ranks))
     anchor, received = exchange.send(projected, absgrad)
     rendered, num_pairs, num_pixels = [], 0, 0
     for band, splats in zip(exchange.bands, received, strict=True):

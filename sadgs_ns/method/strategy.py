@@ -14,7 +14,7 @@ from gsplat.strategy.ops import remove
 from torch import Tensor
 
 from sadgs_ns.distributed import ranking
-from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.distributed.world import World
 from sadgs_ns.gsplat_internals import update_param_with_optimizer
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow, keep_gradient
 from sadgs_ns.method.memory import StepSize, affordable_growth, free_bytes
@@ -100,7 +100,7 @@ class StructureAwareStrategy(Strategy):
     # These two are no options, so that they have no annotation, which would make them fields.
     run_length = 3000
     """Iterations of the run, which `fit_to_run` sets: windows that are None follow it."""
-    shards = cast("Shards | None", None)
+    world = cast("World | None", None)
     """The processes among which the Gaussians are shared out; None where one process has all.
     The cap and the ranking of what may grow are then those of all, and densification ends with equal shards."""
 
@@ -210,7 +210,7 @@ class StructureAwareStrategy(Strategy):
             if self.needs_absgrad(step):
                 keep_gradient(view["means2d"])
             if self.observes(step):
-                jitter = None if self.shards is None else self.shards.rand(view["n_cameras"])
+                jitter = None if self.world is None else self.world.rand(view["n_cameras"])
                 observe(state, params, view, jitter=jitter)
 
     def step_post_backward(
@@ -252,7 +252,7 @@ class StructureAwareStrategy(Strategy):
                 iteration <= windows.refine_stop_iter - windows.reset_every // 4
             ):
                 self._map_opacities(params, optimizers, lambda opacities: opacities * RESET_FACTOR)
-            if self.shards is not None and self.densifies(step):
+            if self.world is not None and self.densifies(step):
                 self._even_out(params, optimizers, state)
 
     def consistently_low(self, statistics: Mapping[str, Tensor]) -> Tensor:
@@ -330,38 +330,38 @@ class StructureAwareStrategy(Strategy):
         """How many Gaussians may be added under the cap, and how many fit in the devices' memory beside such views."""
         free = free_bytes(params["means"].device)
         in_memory = affordable_growth(params, state, free, StepSize.of(views))
-        if self.shards is not None:  # The device with the least room bounds all, since shards are evened out.
-            in_memory = self.shards.num_ranks * self.shards.least(in_memory)
+        if self.world is not None:  # The device with the least room bounds all, since shards are evened out.
+            in_memory = self.world.num_ranks * self.world.least(in_memory)
         return self.max_gaussians - self._of_all(len(params["means"]))[0], in_memory
 
     def _of_all(self, *numbers: int) -> list[int]:
         """Sums of numbers of Gaussians over the processes, where there are several."""
-        if self.shards is None:
+        if self.world is None:
             return list(numbers)
-        return self.shards.sum(torch.tensor(numbers, device=self.shards.device)).tolist()
+        return self.world.sum(torch.tensor(numbers, device=self.world.device)).tolist()
 
     def _limit_growth(self, growth: Tensor, priority: Tensor, budget: float) -> Tensor:
         """`split.limit_growth` of the Gaussians of all processes."""
-        if self.shards is None:
+        if self.world is None:
             return limit_growth(growth, priority, budget)
-        return ranking.limit_growth(self.shards, growth, priority, budget)
+        return ranking.limit_growth(self.world, growth, priority, budget)
 
     def _even_out(self, params: Any, optimizers: Any, state: Any) -> None:
         """Count the Gaussians of the processes, and give each equally many where they differ by more than a tenth."""
-        shards = self.shards
-        assert shards is not None
-        shards.count(len(params["means"]))
-        if not shards.is_uneven():
+        world = self.world
+        assert world is not None
+        world.count(len(params["means"]))
+        if not world.is_uneven():
             return
 
         def param_fn(name: str, p: Tensor) -> Tensor:
-            return torch.nn.Parameter(shards.even_out(p.detach()), requires_grad=p.requires_grad)
+            return torch.nn.Parameter(world.even_out(p.detach()), requires_grad=p.requires_grad)
 
-        update_param_with_optimizer(param_fn, lambda key, v: shards.even_out(v), params, optimizers)
+        update_param_with_optimizer(param_fn, lambda key, v: world.even_out(v), params, optimizers)
         for key, value in state.items():
             if isinstance(value, Tensor):
-                state[key] = shards.even_out(value)
-        shards.count(len(params["means"]))
+                state[key] = world.even_out(value)
+        world.count(len(params["means"]))
 
     @staticmethod
     def _opacities(params: Params) -> Tensor:
@@ -374,7 +374,7 @@ class StructureAwareStrategy(Strategy):
         """
         n_prune = int(mask.sum())
         of_all, total = self._of_all(n_prune, len(mask))
-        if total - of_all < (1 if self.shards is None else self.shards.num_ranks):
+        if total - of_all < (1 if self.world is None else self.world.num_ranks):
             return 0
         if n_prune > 0:
             remove(params, optimizers, state, mask)

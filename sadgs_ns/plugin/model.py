@@ -24,7 +24,7 @@ from torch import Tensor
 from tyro.conf import Suppress
 
 from sadgs_ns.data.cameras import refuse_unsupported_cameras
-from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
 from sadgs_ns.gsplat_internals import NEAR_PLANE
 from sadgs_ns.method.averaging import RunningMean
@@ -357,22 +357,22 @@ class SadgsModel(SplatfactoModel):
         numbers = torch.arange(len(matrices), device=matrices.device)  # [V]
         self.register_buffer("view_numbers", numbers, persistent=False)
 
-    def share_out(self, shards: Shards) -> None:
+    def share_out(self, world: World) -> None:
         """Keep the part of the Gaussians that is this process's; call before optimizers are made.
 
         Args:
-            shards: The processes, all of which have the same Gaussians until now.
+            world: The processes, all of which have the same Gaussians until now.
         """
-        part = shards.take_even_part(self.num_points)
+        part = world.take_even_part(self.num_points)
         for parameter in self.gauss_params.values():
             parameter.data = parameter.data[part].clone()
-        self.strategy.shards = shards
+        self.strategy.world = world
         self.tile_forecast = None  # How many pairs a view has depends on the Gaussians of all.
 
     @property
     def num_gaussians(self) -> int:
         """Number of Gaussians of all processes."""
-        return self.num_points if self.strategy.shards is None else self.strategy.shards.total
+        return self.num_points if self.strategy.world is None else self.strategy.world.total
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from sadgs_ns.data.cameras import refuse_unsupported_cameras
 from sadgs_ns.data.checks.parsers import findings_of
-from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.method.codes import HIGHEST_FREQUENCY
@@ -155,7 +155,7 @@ class SadgsPipeline(VanillaPipeline):
         strategy, less = self.model.strategy, growth_threshold(config.effort)
         strategy.clone_grad2d, strategy.split_absgrad2d = less * strategy.clone_grad2d, less * strategy.split_absgrad2d
         self.log = NonFiniteLog(self.device)
-        self.shards: Shards | None = None
+        self.world: World | None = None
         """The processes among which the Gaussians are shared out; None where this one has all."""
         self.put_aside: Drawn | None = None
         """Views that were drawn for the present step and not rendered yet."""
@@ -183,14 +183,14 @@ class SadgsPipeline(VanillaPipeline):
         """The model, which is never wrapped for several devices."""
         return self._model  # type: ignore[return-value]
 
-    def share_out(self, shards: Shards) -> None:
+    def share_out(self, world: World) -> None:
         """Keep this process's part of the Gaussians; call before optimizers are made.
 
         Args:
-            shards: The processes, all of which have the same Gaussians until now.
+            world: The processes, all of which have the same Gaussians until now.
         """
-        self.shards = self.views.shards = shards
-        self.model.share_out(shards)
+        self.world = self.views.world = world
+        self.model.share_out(world)
 
     def train(self, mode: bool = True) -> SadgsPipeline:
         """Set the mode of all modules, unless they have it: nerfstudio asks before every step, and torch visits all."""
@@ -212,7 +212,7 @@ class SadgsPipeline(VanillaPipeline):
         self._refuse_empty_views()
         if self.config.model.strategy.refine_stop_iter != 0:
             model = self.model
-            processes, views = 1 if self.shards is None else self.shards.num_ranks, self.views_per_iteration
+            processes, views = 1 if self.world is None else self.world.num_ranks, self.views_per_iteration
             gaussians: Any = model.gauss_params
             size = training_size(self.datamanager, gaussians, views, processes, model.near_plane)
             try:
@@ -231,8 +231,8 @@ class SadgsPipeline(VanillaPipeline):
             CONSOLE.print(line, highlight=False, soft_wrap=True)
             if warning is not None:
                 CONSOLE.print(f"[yellow]{escape(warning)}[/]", soft_wrap=True)
-            if self.shards is not None:
-                model.strategy.max_gaussians = int(self.shards.least(model.strategy.max_gaussians))
+            if self.world is not None:
+                model.strategy.max_gaussians = int(self.world.least(model.strategy.max_gaussians))
             self._keep_cap()
             self.structure.set_max_gaussians.value = self.model.strategy.max_gaussians
         optimizers = training_callback_attributes.optimizers
@@ -261,8 +261,8 @@ class SadgsPipeline(VanillaPipeline):
         near = self.model.near_plane
         drawn = ((depths > near) & (depths < _FAR_PLANE)).any(dim=1)
         share = drawn.float().mean()
-        if self.shards is not None:
-            share = self.shards.sum(share.to(self.device)) / self.shards.num_ranks
+        if self.world is not None:
+            share = self.world.sum(share.to(self.device)) / self.world.num_ranks
         if share < 0.01:
             extent = float(self.model.strategy_state["scene_scale"])
             raise InputError(
@@ -308,7 +308,7 @@ class SadgsPipeline(VanillaPipeline):
         enough = nonfinite.HOPELESS_STEPS if not last else min(nonfinite.HOPELESS_STEPS, self.log.steps)
         gradient = self.model.means.grad
         stuck = bool(wrong) and self.log.streak >= enough and gradient is not None and nonfinite.is_useless(gradient)
-        if stuck if self.shards is None else self.shards.all(stuck):
+        if stuck if self.world is None else self.world.all(stuck):
             step, _, what = wrong[-1]
             names = [files[view].name for view in dict.fromkeys(view for _, views, _ in wrong for view in views)]
             more = f" and {len(names) - _NAMED_STEPS} more" if len(names) > _NAMED_STEPS else ""
@@ -343,7 +343,7 @@ class SadgsPipeline(VanillaPipeline):
             self._repeat_overflowed()
             drawn, wants = defaultdict(list), self.model.wants_structure_tensors
             for index, data in self.views.draw(self.views_per_iteration, (wants(step), wants(step + 1))):
-                shape = data["image"].shape if self.shards is None else self.views.sizes[index]
+                shape = data["image"].shape if self.world is None else self.views.sizes[index]
                 drawn[shape].append((index, data))
         return drawn
 
@@ -356,10 +356,10 @@ class SadgsPipeline(VanillaPipeline):
         # Several processes have the same groups, and autograd goes back through them in the reverse order in each.
         for (height, width, *_), views in groups.items():
             indices = [index for index, _ in views]
-            tensors = _stack(self.structure_maps.of_views(views, self.shards)) if observes else None
+            tensors = _stack(self.structure_maps.of_views(views, self.world)) if observes else None
             viewmats, Ks = self.views.stacked_cameras(indices)
-            if self.shards is not None:
-                parts = losses_of_views(self.model, self.shards, viewmats, Ks, width, height, views, tensors)
+            if self.world is not None:
+                parts = losses_of_views(self.model, self.world, viewmats, Ks, width, height, views, tensors)
             else:
                 batch = self._batch(views)
                 outputs = self.model.get_training_outputs(viewmats, Ks, width, height, indices, tensors)

@@ -18,7 +18,7 @@ import torch
 import torch.distributed as dist
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
 from sadgs_ns.kernels import SWITCH, switched_off
 
@@ -53,7 +53,7 @@ def least(number: float, device: torch.device) -> float:
         number: Any, also infinite.
         device: Where this process trains.
     """
-    return Shards(device).least(number) if dist.is_initialized() and dist.get_world_size() > 1 else number
+    return World(device).least(number) if dist.is_initialized() and dist.get_world_size() > 1 else number
 
 
 def check(config: CheckedTrainerConfig) -> None:
@@ -97,11 +97,11 @@ class Peers:
     """The processes of a run, as the operating system of this machine knows them.
 
     Args:
-        shards: The processes.
+        world: The processes.
     """
 
-    def __init__(self, shards: Shards) -> None:
-        self._rank, number = shards.rank, shards.num_ranks
+    def __init__(self, world: World) -> None:
+        self._rank, number = world.rank, world.num_ranks
         with tempfile.NamedTemporaryFile() as file:
             file.write(bytes(number))
             file.flush()
@@ -115,7 +115,7 @@ class Peers:
                 """1 for each process that ends because another has ended. uint8 [number of processes]"""
             except RuntimeError:  # This process has another folder of temporary files.
                 self._followed = torch.zeros(number, dtype=torch.uint8)
-            shards.all(True)  # The files go, and the memory stays as long as a process has it.
+            world.all(True)  # The files go, and the memory stays as long as a process has it.
 
     def all_here(self) -> bool:
         """Tell whether all processes run on this machine."""
@@ -166,7 +166,7 @@ def _exists(pid: int) -> bool:
     return True
 
 
-def join(config: CheckedTrainerConfig, local_rank: int) -> tuple[Shards | None, int]:
+def join(config: CheckedTrainerConfig, local_rank: int) -> tuple[World | None, int]:
     """Join the other processes of the run, where there are others.
 
     All processes draw the same random numbers, where nerfstudio seeds each in its own way. Those after the first print
@@ -195,40 +195,40 @@ def join(config: CheckedTrainerConfig, local_rank: int) -> tuple[Shards | None, 
     shared = [config.timestamp]
     dist.broadcast_object_list(shared, 0)
     config.timestamp = shared[0]
-    return Shards(torch.device("cuda", local_rank) if cuda else torch.device("cpu")), local_rank
+    return World(torch.device("cuda", local_rank) if cuda else torch.device("cpu")), local_rank
 
 
 @contextmanager
-def first_of_each_machine_before_others(shards: Shards | None, local_rank: int) -> Iterator[None]:
+def first_of_each_machine_before_others(world: World | None, local_rank: int) -> Iterator[None]:
     """Let the first process of each machine do something, such as compiling, before its others.
 
     Triton keeps what it compiles on the disk, where the others find it. Of 24 processes that compiled the same kernels
     at once two ended with a TypeError (docs/results.md#several-devices).
 
     Args:
-        shards: What this process knows of the others, all of which call this; None where it is alone.
+        world: What this process knows of the others, all of which call this; None where it is alone.
         local_rank: Number of this process on its machine.
     """
-    if shards is not None and local_rank > 0:
-        shards.all(True)
+    if world is not None and local_rank > 0:
+        world.all(True)
     yield
-    if shards is not None and local_rank == 0:
-        shards.all(True)
+    if world is not None and local_rank == 0:
+        world.all(True)
 
 
-def leave_the_rest_to_the_first(shards: Shards, peers: Peers) -> None:
+def leave_the_rest_to_the_first(world: World, peers: Peers) -> None:
     """Let the run go on in the first process, as if it were alone; the others wait for its end, and end.
 
     Args:
-        shards: What this process knows of the others, which nobody may use any more.
+        world: What this process knows of the others, which nobody may use any more.
         peers: The processes, all of which run on this machine.
 
     Raises:
         SystemExit: In the other processes, with exit code 0.
     """
-    shards.all(True)
+    world.all(True)
     dist.destroy_process_group()
-    if shards.rank > 0:
+    if world.rank > 0:
         peers.wait_for_the_first()
     os.environ.pop("LOCAL_WORLD_SIZE", None)  # torchrun's; nobody shares the host's memory any more.
     # nerfstudio takes leave of the others at the end, and a group of one process has none.

@@ -9,14 +9,14 @@ import torch
 from torch import Tensor
 
 from sadgs_ns.distributed.rasterization import rasterize
-from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.distributed.world import World
 from sadgs_ns.method.losses import photometric_part
 from sadgs_ns.plugin.model import SadgsModel
 
 
 def losses_of_views(
     model: SadgsModel,
-    shards: Shards,
+    world: World,
     viewmats: Tensor,
     Ks: Tensor,
     width: int,
@@ -28,7 +28,7 @@ def losses_of_views(
 
     Args:
         model: The model of this process's Gaussians.
-        shards: The processes, all of which call this with the same views.
+        world: The processes, all of which call this with the same views.
         viewmats: World to camera. [V, 4, 4]
         Ks: Intrinsics in px. [V, 3, 3]
         width: px.
@@ -42,11 +42,11 @@ def losses_of_views(
         of all: PSNR in dB, the number of Gaussians, and `loss`, that sum.
     """
     kind = model.kind_of_step(width, height, [index for index, _ in views])
-    share = len(model.means) / shards.total
+    share = len(model.means) / world.total
     splats, penalty, options = model.splats(kind.opacity_reg * share)
-    rendered, loss, info = rasterize(shards, *splats, viewmats, Ks, width, height, absgrad=kind.absgrad, **options)
+    rendered, loss, info = rasterize(world, *splats, viewmats, Ks, width, height, absgrad=kind.absgrad, **options)
     model.show_to_strategy(info, viewmats, Ks, structure_tensors)
-    background, error = model.background, torch.zeros((), device=shards.device)
+    background, error = model.background, torch.zeros((), device=world.device)
     for band, colors, alphas in rendered:
         rgb = model.before_background(colors, alphas, background)
         rows = slice(band.top, band.bottom)
@@ -60,6 +60,6 @@ def losses_of_views(
         loss, error = loss + part / len(views), error + square / len(views)
     if penalty is not None:
         loss = loss + penalty.sum()
-    of_all = shards.sum(torch.stack([loss.detach(), error]))
-    metrics = {"psnr": -10 * of_all[1].log10(), "gaussian_count": shards.total, "loss": of_all[0]}
+    of_all = world.sum(torch.stack([loss.detach(), error]))
+    metrics = {"psnr": -10 * of_all[1].log10(), "gaussian_count": world.total, "loss": of_all[0]}
     return {"main_loss": loss}, metrics

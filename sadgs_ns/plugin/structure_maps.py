@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from sadgs_ns.distributed.bands import first_ranks, share_out
-from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.distributed.world import World
 from sadgs_ns.method.codes import encode
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
@@ -56,7 +56,7 @@ class StructureMaps:
                 codes[index] = code
         return codes
 
-    def of_views(self, views: Sequence[tuple[int, dict[str, Any]]], shards: Shards | None = None) -> list[Tensor]:
+    def of_views(self, views: Sequence[tuple[int, dict[str, Any]]], world: World | None = None) -> list[Tensor]:
         """Codes of S̄ of a step's views, which have one size. uint8 [H, W, 3] each
 
         Where images are on the host, codes that are not known yet are computed, and kept where there is room. All of
@@ -64,7 +64,7 @@ class StructureMaps:
 
         Args:
             views: Number and data of each, as drawn.
-            shards: The processes of the run, all of which call this with the same views; None where there is one.
+            world: The processes of the run, all of which call this with the same views; None where there is one.
         """
         ahead = self.views.ahead
         if ahead is None:
@@ -75,18 +75,18 @@ class StructureMaps:
                 data["codes"] = kept
         missing = [position for position, (_, data) in enumerate(views) if "codes" not in data]
         ranks: dict[int, int] = {}
-        if shards is not None:
+        if world is not None:
             height, width = self.views.sizes[views[0][0]]
-            ranks = first_ranks(share_out(len(views), height, shards.num_ranks))
-        own = [views[p][1] for p in missing if shards is None or ranks[p] == shards.rank]
+            ranks = first_ranks(share_out(len(views), height, world.num_ranks))
+        own = [views[p][1] for p in missing if world is None or ranks[p] == world.rank]
         for data, codes in zip(own, self._in_batches(own), strict=True):
             data["codes"] = codes
         for position in missing:
             index, data = views[position]
-            if shards is not None:
-                if ranks[position] != shards.rank:
-                    data["codes"] = torch.empty((height, width, 3), dtype=torch.uint8, device=shards.device)
-                shards.broadcast(data["codes"], ranks[position])
+            if world is not None:
+                if ranks[position] != world.rank:
+                    data["codes"] = torch.empty((height, width, 3), dtype=torch.uint8, device=world.device)
+                world.broadcast(data["codes"], ranks[position])
             ahead.keep_codes(index, data["codes"])
         return [data["codes"] for _, data in views]
 

@@ -79,12 +79,12 @@ class SadgsTrainer(Trainer):
         print_elsewhere_once_unread(CONSOLE)
         config.check()
         config = copy.copy(config)  # Where there are several processes, they agree on what the file does not say.
-        self.shards, local_rank = processes.join(config, local_rank)
+        self.world, local_rank = processes.join(config, local_rank)
         """What this process knows of the others; None where it is alone."""
-        self._peers = None if self.shards is None else processes.Peers(self.shards)
-        if self.shards is not None:
-            with processes.first_of_each_machine_before_others(self.shards, local_rank):
-                use_triton(self.shards.device)  # This compiles a kernel, and is asked for again below.
+        self._peers = None if self.world is None else processes.Peers(self.world)
+        if self.world is not None:
+            with processes.first_of_each_machine_before_others(self.world, local_rank):
+                use_triton(self.world.device)  # This compiles a kernel, and is asked for again below.
         config.pipeline.datamanager.train_cameras_sampling_seed = config.machine.seed
         self._vis: Any = config.vis
         # nerfstudio would wrap the pipeline for several devices in its own way.
@@ -98,7 +98,7 @@ class SadgsTrainer(Trainer):
         self._save_due = math.inf
         # A run that is paused or done polls no signal, because nerfstudio waits for the viewer's user.
         self._interrupts = Interrupts(
-            waiting=lambda: self.training_state != "training" and not self._stepping, started=self.shards is not None
+            waiting=lambda: self.training_state != "training" and not self._stepping, started=self.world is not None
         )
 
     def setup(self, *args: Any, **kwargs: Any) -> None:
@@ -114,7 +114,7 @@ class SadgsTrainer(Trainer):
             self._say_what_was_chosen()
             last = [TrainingCallbackLocation.AFTER_TRAIN]
             self.callbacks.append(TrainingCallback(last, lambda step: self._say_what_is_next()))
-            with processes.first_of_each_machine_before_others(self.shards, self.local_rank):
+            with processes.first_of_each_machine_before_others(self.world, self.local_rank):
                 compile_kernels(self.pipeline, self.optimizers.optimizers, self.config.cuda_graphs)
             self.graphed = GraphedSteps.of(self)
         except torch.cuda.OutOfMemoryError as error:
@@ -179,8 +179,8 @@ class SadgsTrainer(Trainer):
         config, (path, state), self._checkpoint = self.config, self._checkpoint, None
         try:
             self._start_step = state["step"] + 1
-            if self.shards is not None:
-                part = self.shards.take_even_part(len(state["pipeline"]["_model.gauss_params.means"]))
+            if self.world is not None:
+                part = self.world.take_even_part(len(state["pipeline"]["_model.gauss_params.means"]))
                 state = checkpoints.of_gaussians(state, lambda rows: rows[part].clone())
             self.pipeline.load_pipeline(state["pipeline"], state["step"])
             if self.pipeline.checkpoint_views is not None:
@@ -235,9 +235,9 @@ class SadgsTrainer(Trainer):
         Raises:
             SystemExit: In the other processes, once the first has ended.
         """
-        if self.shards is None or self._peers is None or self.config.share_always or not self._peers.all_here():
+        if self.world is None or self._peers is None or self.config.share_always or not self._peers.all_here():
             return
-        devices, pixels = self.shards.num_ranks, self.pipeline.views_per_iteration * self._pixels_of_a_view()
+        devices, pixels = self.world.num_ranks, self.pipeline.views_per_iteration * self._pixels_of_a_view()
         if pixels >= LEAST_PIXELS * devices:
             return
         CONSOLE.print(
@@ -247,8 +247,8 @@ class SadgsTrainer(Trainer):
             highlight=False,
             soft_wrap=True,
         )
-        processes.leave_the_rest_to_the_first(self.shards, self._peers)
-        self.shards = self._peers = None
+        processes.leave_the_rest_to_the_first(self.world, self._peers)
+        self.world = self._peers = None
 
     def _turn_viewer_off(self) -> None:
         """Keep nerfstudio from starting a viewer, and say so where one was asked for."""
@@ -268,9 +268,9 @@ class SadgsTrainer(Trainer):
         start_from_stereo(self.pipeline, resumed=self._checkpoint is not None)
         self._derive_schedule()
         self._take_one_device_if_quicker()
-        if self.shards is not None:
+        if self.world is not None:
             self._turn_viewer_off()
-            self.pipeline.share_out(self.shards)
+            self.pipeline.share_out(self.world)
         optimizers: dict[str, Any] = copy.deepcopy(dict(self.config.optimizers))
         for name, at_four in RATES_OF_FOUR_VIEWS.items() if self.config.rates_follow_views else ():
             start, end = (between_one_and_four(self.pipeline.views_per_iteration, factor) for factor in at_four)
@@ -318,7 +318,7 @@ class SadgsTrainer(Trainer):
         try:
             with self._interrupts:
                 try:
-                    if self.shards is not None:  # nerfstudio's way to make it fails where another process is as fast.
+                    if self.world is not None:  # nerfstudio's way to make it fails where another process is as fast.
                         self.base_dir.mkdir(parents=True, exist_ok=True)
                     super().train()
                     self._stop_if_stuck()
@@ -330,7 +330,7 @@ class SadgsTrainer(Trainer):
                         raise
                     self._stop(interruption, total)
         except InputError as error:
-            if self._completed_step == self._saved_step or self.shards is not None:
+            if self._completed_step == self._saved_step or self.world is not None:
                 raise
             # An image that is decoded ahead of its step is gone or damaged, and no step is half done.
             self.save_checkpoint(self._completed_step)
@@ -345,7 +345,7 @@ class SadgsTrainer(Trainer):
             if error.errno is None:  # It is a WriteError, or it does not come from the disk.
                 raise
             # A logger, such as tensorboard's, could not write; its file may be on another disk, or its folder is gone.
-            if not self._stepping and self._completed_step > self._saved_step and self.shards is None:
+            if not self._stepping and self._completed_step > self._saved_step and self.world is None:
                 self.save_checkpoint(self._completed_step)
             raise WriteError(Path(os.fsdecode(error.filename or self.base_dir)), error) from error
         except RuntimeError as error:
@@ -385,7 +385,7 @@ class SadgsTrainer(Trainer):
             for state in states.values():
                 lengths |= {len(value) for value in state.values() if isinstance(value, torch.Tensor) and value.dim()}
         lengths |= {len(v) for v in model.strategy_state.values() if isinstance(v, torch.Tensor) and v.dim()}
-        if len(lengths) > 1 or self.step <= self._start_step or self.shards is not None:
+        if len(lengths) > 1 or self.step <= self._start_step or self.world is not None:
             kept = "nothing newer than the last checkpoint could be saved"
         else:
             try:
@@ -404,10 +404,10 @@ class SadgsTrainer(Trainer):
         No signal may stop the run from here to `_update_viewer_state`.
         """
         self._stepping = True
-        if (shards := self.shards) is not None:
+        if (world := self.world) is not None:
             # Processes agree on what to do after a step in the step itself. A signal has the bit of its number.
-            shards.heard, signalled = 0, self._interrupts.received
-            shards.request = int(time.monotonic() >= self._save_due) | (0 if signalled is None else 1 << signalled)
+            world.heard, signalled = 0, self._interrupts.received
+            world.request = int(time.monotonic() >= self._save_due) | (0 if signalled is None else 1 << signalled)
             _, _, metrics = super().train_iteration(step)
             return metrics["loss"], {"main_loss": metrics["loss"]}, metrics
         trained = None if self.graphed is None else self.graphed.train(step)
@@ -419,13 +419,13 @@ class SadgsTrainer(Trainer):
     def _update_viewer_state(self, step: int) -> None:
         """Stop or save where that is due; nerfstudio calls this after every step, when densification is done."""
         self._completed_step, self._stepping = step, False
-        if self.shards is None:
+        if self.world is None:
             self._interrupts.poll()
             due = time.monotonic() >= self._save_due
         else:
-            due = bool(self.shards.heard & 1)
+            due = bool(self.world.heard & 1)
             for number in SIGNALS:
-                if self.shards.heard >> number & 1:
+                if self.world.heard >> number & 1:
                     raise Interrupted(number)
         self._stop_if_stuck()
         if due:
@@ -434,7 +434,7 @@ class SadgsTrainer(Trainer):
 
     def eval_iteration(self, step: int) -> None:
         """Measure held-out views as nerfstudio does, unless no device holds all Gaussians."""
-        if self.shards is None:
+        if self.world is None:
             super().eval_iteration(step)
 
     def _train_complete_viewer(self) -> None:
@@ -471,8 +471,8 @@ class SadgsTrainer(Trainer):
         if interrupted.number == HANG_UP:  # Some systems send it before they take the terminal away.
             drop_lost_output()
         CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
-        if self.shards is not None:
-            self.shards.all(True)  # What starts the processes ends all as soon as one has ended.
+        if self.world is not None:
+            self.world.all(True)  # What starts the processes ends all as soon as one has ended.
         raise SystemExit(128 + interrupted.number)
 
     def _stop_if_stuck(self) -> None:
@@ -485,7 +485,7 @@ class SadgsTrainer(Trainer):
             return
         kept = "the Gaussians themselves are not finite: train anew, or from a checkpoint in which they are"
         finite = all(bool(parameter.isfinite().all()) for parameter in self.pipeline.model.gauss_params.values())
-        if finite if self.shards is None else self.shards.all(finite):
+        if finite if self.world is None else self.world.all(finite):
             if self._completed_step > self._saved_step:
                 self.save_checkpoint(self._completed_step)
             kept = f"the Gaussians as they are now are saved and go on with --load-dir {self.checkpoint_dir}"
@@ -507,8 +507,8 @@ class SadgsTrainer(Trainer):
         state = self._state(step)
         if processes.is_first():
             self._write_checkpoint(step, state)
-        if self.shards is not None:
-            self.shards.all(True)
+        if self.world is not None:
+            self.world.all(True)
         self._saved_step = step
         self._set_clock(time.monotonic() - start)
 
@@ -521,7 +521,7 @@ class SadgsTrainer(Trainer):
             "schedulers": {name: s.state_dict() for name, s in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),
         }
-        return state if self.shards is None else checkpoints.of_gaussians(state, self.shards.gather_rows)
+        return state if self.world is None else checkpoints.of_gaussians(state, self.world.gather_rows)
 
     def _write_checkpoint(self, step: int, state: dict[str, Any]) -> None:
         path: Path = self.checkpoint_dir / f"step-{step:09d}.ckpt"

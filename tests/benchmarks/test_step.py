@@ -15,7 +15,7 @@ from benchmarks import __main__ as bench
 from benchmarks import step as steps
 from benchmarks.step import REPEATS, Growth, Step, milliseconds, pairs_of, plan, step_time
 from examples.drawn_scene.scene import write_scene
-from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.distributed.world import World
 from sadgs_ns.method.memory import StepSize, step_bytes
 from sadgs_ns.render.rasterization import visible
 
@@ -93,8 +93,8 @@ def test_the_plan_is_near_the_peaks(capsys: pytest.CaptureFixture[str]):
     assert len(ratios) == 2 and all(0.9 < ratio < 1.5 for ratio in ratios)
 
 
-def train_together(shards: Shards) -> dict[str, Any]:
-    step = Step(300, 48, 32, 3, CPU, shards)
+def train_together(world: World) -> dict[str, Any]:
+    step = Step(300, 48, 32, 3, CPU, world)
     before = step.params["means"].detach().clone()
     time, _ = step_time(step, 1)
     moved = not torch.equal(step.params["means"], before)

@@ -17,7 +17,7 @@ import torch.distributed as dist
 from sharded_scene import GAUSSIANS, inputs, splats, weights
 
 from sadgs_ns.distributed.rasterization import rasterize
-from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.distributed.world import World
 from sadgs_ns.render.rasterization import rasterize as rasterize_alone
 from sadgs_ns.render.rasterization import visible
 
@@ -31,9 +31,9 @@ def run(command: list[str]) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240, check=False)
 
 
-def compare_with_one(shards: Shards, views: int) -> None:
+def compare_with_one(world: World, views: int) -> None:
     """Compare this process's part of images, gradients and absolute gradients with those of one process."""
-    device = shards.device
+    device = world.device
     weight = weights(views).to(device)
     alone = {name: value.detach().to(device).requires_grad_() for name, value in inputs().items()}
     colors, alphas, info = rasterize_alone(*splats(alone, views), sh_degree=1, absgrad=True)
@@ -41,9 +41,9 @@ def compare_with_one(shards: Shards, views: int) -> None:
     info["means2d"].grad2d = None
     (expected * weight).sum().backward()
 
-    part = shards.take_even_part(GAUSSIANS)
+    part = world.take_even_part(GAUSSIANS)
     mine = {name: value.detach().to(device).requires_grad_() for name, value in inputs(part).items()}
-    rendered, loss, own = rasterize(shards, *splats(mine, views), sh_degree=1, absgrad=True)
+    rendered, loss, own = rasterize(world, *splats(mine, views), sh_degree=1, absgrad=True)
     for band, colors, alphas in rendered:
         image = torch.cat([colors, alphas], dim=-1)[0, band.first - band.top : band.last - band.top]
         rows = slice(band.first, band.last)
@@ -113,10 +113,10 @@ def main() -> None:
     local = int(os.environ["LOCAL_RANK"])
     torch.cuda.set_device(local)
     dist.init_process_group("nccl")
-    shards = Shards(torch.device("cuda", local))
+    world = World(torch.device("cuda", local))
     for views in (1, 2, 3):
-        compare_with_one(shards, views)
-    print(f"Rank {shards.rank} draws and differentiates as one GPU does.", flush=True)
+        compare_with_one(world, views)
+    print(f"Rank {world.rank} draws and differentiates as one GPU does.", flush=True)
     dist.destroy_process_group()
 
 

@@ -13,25 +13,25 @@ from torch import Tensor
 
 from sadgs_ns.distributed.bands import ROWS, first_ranks, share_out, views_of_rank
 from sadgs_ns.distributed.rasterization import rasterize
-from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.distributed.world import World
 from sadgs_ns.render.rasterization import rasterize as rasterize_alone
 from sadgs_ns.render.rasterization import visible
 
 
-def draw_together(shards: Shards, views: int, mode: str, uneven: bool, fused: bool) -> dict[str, Any]:
+def draw_together(world: World, views: int, mode: str, uneven: bool, fused: bool) -> dict[str, Any]:
     if fused:
         from interpreted import use_our_rasterizer
 
         use_our_rasterizer(pytest.MonkeyPatch())
-    part = shards.take_even_part(GAUSSIANS)
+    part = world.take_even_part(GAUSSIANS)
     if uneven:  # The last process has nothing that anybody sees.
-        shards.sizes = [GAUSSIANS - 3 * (shards.num_ranks - 1), *[3] * (shards.num_ranks - 1)]
-        start = sum(shards.sizes[: shards.rank])
-        part = slice(start, start + shards.sizes[shards.rank])
+        world.sizes = [GAUSSIANS - 3 * (world.num_ranks - 1), *[3] * (world.num_ranks - 1)]
+        start = sum(world.sizes[: world.rank])
+        part = slice(start, start + world.sizes[world.rank])
     leaves = inputs(part)
     options: dict[str, Any] = {"sh_degree": 1, "absgrad": True, "rasterize_mode": mode, "max_off_axis": 1.5}
-    shards.request = 1 << shards.rank
-    rendered, loss, info = rasterize(shards, *splats(leaves, views), **options)
+    world.request = 1 << world.rank
+    rendered, loss, info = rasterize(world, *splats(leaves, views), **options)
     images = []
     for band, colors, alphas in rendered:
         rows = slice(band.first - band.top, band.last - band.top)
@@ -46,7 +46,7 @@ def draw_together(shards: Shards, views: int, mode: str, uneven: bool, fused: bo
         "absgrad": info["means2d"].absgrad,
         "grad2d": info["means2d"].grad2d,
         "visible": visible(info),
-        "heard": shards.heard,
+        "heard": world.heard,
     }
 
 

@@ -39,7 +39,7 @@ else:
     import tomli as tomllib
 
 CHECKOUT = Path(__file__).parents[2]
-NO_OPTIONS = {"run_length", "shards"}
+NO_OPTIONS = {"run_length", "world"}
 """Attributes of the strategy that are decided in each run."""
 METHODS = ("sadgs", "sadgs-paper", "sadgs-paper-indoor")
 CONFIG_CLASSES = (

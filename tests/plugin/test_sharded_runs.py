@@ -26,7 +26,7 @@ from scenes import HEIGHT, POINTS, WIDTH
 from sharded_runs import STRUCTURE_EVERY, few_steps, record, record_together, set_up_together
 from torch.multiprocessing.spawn import ProcessExitedException, ProcessRaisedException
 
-from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.plugin import trainer as trainer_module
 from sadgs_ns.plugin.presets import sadgs
@@ -99,14 +99,14 @@ def test_what_needs_one_device_is_refused_by_name(
         config.check()
 
 
-def train_until(shards: Shards, config: SadgsTrainerConfig, stop: int | None) -> dict[str, Any]:
+def train_until(world: World, config: SadgsTrainerConfig, stop: int | None) -> dict[str, Any]:
     """Train, until the last process alone is sent SIGTERM in the step `stop`.
 
     Returns:
         What the process held at the start and holds at the end, the exit code, and the last step's loss.
     """
-    trainer = set_up_together(shards, config)
-    return train_set_up(trainer, stop if shards.rank == shards.num_ranks - 1 else None)
+    trainer = set_up_together(world, config)
+    return train_set_up(trainer, stop if world.rank == world.num_ranks - 1 else None)
 
 
 def held(trainer: SadgsTrainer) -> dict[str, torch.Tensor]:
@@ -199,10 +199,10 @@ def test_a_whole_run_reaches_the_quality_of_one_process(scene: Path, tmp_path: P
     assert psnr[0] > 15 and abs(psnr[1] - psnr[0]) < 0.5, psnr
 
 
-def fade_and_train(shards: Shards, config: SadgsTrainerConfig, faint: tuple[int, ...]) -> dict[str, Any]:
+def fade_and_train(world: World, config: SadgsTrainerConfig, faint: tuple[int, ...]) -> dict[str, Any]:
     """Train, where at first all Gaussians of some processes are too faint to outlive the first pruning."""
-    trainer = set_up_together(shards, config)
-    if shards.rank in faint:
+    trainer = set_up_together(world, config)
+    if world.rank in faint:
         trainer.pipeline.model.gauss_params["opacities"].data[:] = -6.0
     return train_set_up(trainer, None)
 
@@ -219,18 +219,18 @@ def test_a_process_that_loses_all_its_gaussians_gets_others(faint: tuple[int, ..
     assert all(math.isfinite(result["loss"]) for result in results)
 
 
-def compile_together(shards: Shards, config: SadgsTrainerConfig) -> tuple[float, float]:
+def compile_together(world: World, config: SadgsTrainerConfig) -> tuple[float, float]:
     """When this process began and ended to compile kernels, which takes the first one half a second."""
     times: list[float] = []
 
     def compile_kernels(*_: Any) -> None:
         times.append(time.time())
-        time.sleep(0.5 if shards.rank == 0 else 0)
+        time.sleep(0.5 if world.rank == 0 else 0)
         times.append(time.time())
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(trainer_module, "compile_kernels", compile_kernels)
-        set_up_together(shards, config)
+        set_up_together(world, config)
     return times[0], times[1]
 
 
@@ -240,11 +240,11 @@ def test_the_first_process_compiles_before_the_others(scene: Path, tmp_path: Pat
     assert all(start >= first_end for start, _ in others)
 
 
-def die_in_setup(shards: Shards, config: SadgsTrainerConfig) -> str:
+def die_in_setup(world: World, config: SadgsTrainerConfig) -> str:
     """Be killed while compiling, or say by which error another process's end ends this one."""
     with pytest.MonkeyPatch.context() as patch, pytest.raises(RunError) as error:
         patch.setattr(trainer_module, "compile_kernels", lambda *_: os.kill(os.getpid(), signal.SIGKILL))
-        set_up_together(shards, config)
+        set_up_together(world, config)
     return str(error.value)
 
 
@@ -259,12 +259,12 @@ def test_a_process_that_is_killed_before_the_first_step_is_named(scene: Path, tm
         )
 
 
-def train_and_die(shards: Shards, config: SadgsTrainerConfig, doomed: int, killed: Path) -> tuple[str, float]:
+def train_and_die(world: World, config: SadgsTrainerConfig, doomed: int, killed: Path) -> tuple[str, float]:
     """Train, and let one process be killed in a step; by which error the others end, and how many seconds later."""
-    trainer = set_up_together(shards, config)
+    trainer = set_up_together(world, config)
 
     def die(step: int) -> None:
-        if step == 4 and shards.rank == doomed:
+        if step == 4 and world.rank == doomed:
             killed.touch()
             os.kill(os.getpid(), signal.SIGKILL)
 
@@ -287,15 +287,15 @@ def test_a_killed_process_ends_the_others_with_a_sentence_that_names_it(scene: P
     assert saved(config.get_checkpoint_dir())[0] == 3
 
 
-def train_where_it_is_quickest(shards: Shards, config: SadgsTrainerConfig) -> dict[str, Any]:
+def train_where_it_is_quickest(world: World, config: SadgsTrainerConfig) -> dict[str, Any]:
     """Train, and return what this process printed; the others wait until it has ended."""
     try:
-        trainer = config.setup(local_rank=shards.rank, world_size=shards.num_ranks)
+        trainer = config.setup(local_rank=world.rank, world_size=world.num_ranks)
         with CONSOLE.capture() as printed:
             trainer.setup()
     except SystemExit as ending:
         return {"code": ending.code, "ended": time.time()}
-    assert trainer.shards is None and torch.distributed.get_world_size() == 1
+    assert trainer.world is None and torch.distributed.get_world_size() == 1
     return train_set_up(trainer, None) | {"printed": printed.get(), "ended": time.time()}
 
 
@@ -314,12 +314,12 @@ def test_steps_of_few_pixels_train_on_one_device(scene: Path, tmp_path: Path):
     assert saved(configured("together").get_checkpoint_dir())[0] == 5
 
 
-def ask_for_a_viewer(shards: Shards, config: SadgsTrainerConfig) -> tuple[bool, str]:
+def ask_for_a_viewer(world: World, config: SadgsTrainerConfig) -> tuple[bool, str]:
     """Set a run up, in place of whose viewer stands another object; whether it was made, and what was printed."""
     with pytest.MonkeyPatch.context() as patch, CONSOLE.capture() as printed:
         patch.setattr(nerfstudio_trainer, "ViewerState", lambda *_, **__: SimpleNamespace(viewer_info=[]))
         try:
-            trainer = config.setup(local_rank=shards.rank, world_size=shards.num_ranks)
+            trainer = config.setup(local_rank=world.rank, world_size=world.num_ranks)
             trainer.setup()
         except SystemExit:  # It has waited for the first process, which goes on alone.
             return False, ""
@@ -335,14 +335,14 @@ def test_a_run_has_its_viewer_where_it_goes_on_with_one_device(share: bool, scen
     assert not second[0]
 
 
-def look_after_another_has_left(shards: Shards) -> list[int]:
+def look_after_another_has_left(world: World) -> list[int]:
     """Kill process 1; process 0 looks for it and ends, and only then process 2 looks, too."""
-    peers = Peers(shards)
-    pids: list[Any] = [None] * shards.num_ranks
+    peers = Peers(world)
+    pids: list[Any] = [None] * world.num_ranks
     torch.distributed.all_gather_object(pids, os.getpid())
-    if shards.rank == 1:
+    if world.rank == 1:
         os.kill(os.getpid(), signal.SIGKILL)
-    while shards.rank == 2 and Path(f"/proc/{pids[0]}").exists():
+    while world.rank == 2 and Path(f"/proc/{pids[0]}").exists():
         time.sleep(0.1)
     return peers.ended()
 

@@ -17,7 +17,7 @@ from runs import nerfstudio_data
 from scenes import HEIGHT, POINTS, VIEWS, WIDTH
 from sharded_runs import STRUCTURE_EVERY, few_steps, record, set_up_together
 
-from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.method import memory
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
@@ -39,7 +39,7 @@ def configured(folder: Path, parser: Any, tier: Any, views: int) -> SadgsTrainer
     return config
 
 
-def record_images(shards: Shards, config: SadgsTrainerConfig) -> dict[str, Any]:
+def record_images(world: World, config: SadgsTrainerConfig) -> dict[str, Any]:
     """Train, and note the views of each step, which of them came with an image, and what was decoded and computed."""
     patch = pytest.MonkeyPatch()
     steps: list[list[int]] = []
@@ -65,7 +65,7 @@ def record_images(shards: Shards, config: SadgsTrainerConfig) -> dict[str, Any]:
     patch.setattr(ImagesOnDemand, "__getitem__", lambda images, i: decoded.append(i) or decode(images, i))
     patch.setattr(StructureMaps, "codes_of", lambda maps, data: computed.append(len(data)) or codes_of(maps, data))
     patch.setattr(ImagesAhead, "close", noted_close)
-    trainer = set_up_together(shards, config)
+    trainer = set_up_together(world, config)
     result = record(trainer)
     parameters = {name: value.detach() for name, value in trainer.pipeline.model.gauss_params.items()}
     return result | {
@@ -112,10 +112,10 @@ def test_processes_that_decode_what_they_composite_train_as_if_each_had_all_imag
             assert [len(part) for part in parts] == [1] * ranks
 
 
-def train_until_an_image_is_lost(shards: Shards, config: SadgsTrainerConfig, folder: Path) -> tuple[str, int]:
+def train_until_an_image_is_lost(world: World, config: SadgsTrainerConfig, folder: Path) -> tuple[str, int]:
     """Train, while the last process cannot read images any more after three steps; by which error each ends."""
-    trainer = set_up_together(shards, config)
-    iterate, last = trainer.train_iteration, shards.rank == shards.num_ranks - 1
+    trainer = set_up_together(world, config)
+    iterate, last = trainer.train_iteration, world.rank == world.num_ranks - 1
 
     def fail(*args: Any, **options: Any) -> Any:
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
@@ -165,11 +165,11 @@ def sizes_of(number: int, side: int) -> Any:
     )
 
 
-def place_together(shards: Shards, asked: str) -> tuple[str, str | None]:
+def place_together(world: World, asked: str) -> tuple[str, str | None]:
     """Place images where the host has room for those of one process, and the last finds less of it than the others."""
     datamanager = sizes_of(10, 100)
     datamanager.config.cache_images = asked
-    free = 4.1 * image_bytes(datamanager) if shards.rank == 0 else 3.9 * image_bytes(datamanager)
+    free = 4.1 * image_bytes(datamanager) if world.rank == 0 else 3.9 * image_bytes(datamanager)
     pytest.MonkeyPatch().setattr(memory, "available_host_bytes", lambda: free)
     line = place_images(datamanager, torch.device("cpu"))
     return datamanager.config.cache_images, line

@@ -38,9 +38,9 @@ class Datamanager:
     sample_train_cameras = FullImageDatamanager.sample_train_cameras
 
 
-def views_of(datamanager: Any, shards: Any = None) -> TrainingViews:
+def views_of(datamanager: Any, world: Any = None) -> TrainingViews:
     views = TrainingViews(datamanager, SimpleNamespace(device=torch.device("cpu")))  # type: ignore[arg-type]
-    views.shards = shards
+    views.world = world
     return views
 
 

@@ -10,7 +10,7 @@ import torch
 from ranks import run_ranks
 
 from sadgs_ns.distributed.ranking import limit_growth
-from sadgs_ns.distributed.shards import Shards
+from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.split import limit_growth as limit_growth_alone
 from sadgs_ns.method.strategy import StructureAwareStrategy
@@ -30,9 +30,9 @@ def growths() -> list[tuple[torch.Tensor, torch.Tensor]]:
     return [(growth, ties), (growth, spread), (outgrown, spread), (torch.ones_like(growth), ties), (0 * growth, ties)]
 
 
-def limit_together(shards: Shards) -> list[torch.Tensor]:
-    part = shards.take_even_part(90)
-    return [limit_growth(shards, g[part], p[part], budget) for g, p in growths() for budget in BUDGETS]
+def limit_together(world: World) -> list[torch.Tensor]:
+    part = world.take_even_part(90)
+    return [limit_growth(world, g[part], p[part], budget) for g, p in growths() for budget in BUDGETS]
 
 
 def test_the_budget_goes_to_the_same_gaussians(tmp_path: Path):
@@ -42,22 +42,22 @@ def test_the_budget_goes_to_the_same_gaussians(tmp_path: Path):
         assert torch.equal(torch.cat([result[i] for result in results]), chosen), i
 
 
-def exchange_rows(shards: Shards) -> dict[str, Any]:
+def exchange_rows(world: World) -> dict[str, Any]:
     sizes = [5, 0, 17]
     rows = torch.arange(22.0).view(22, 1) + torch.tensor([0.0, 0.5])
-    start = sum(sizes[: shards.rank])
-    mine = rows[start : start + sizes[shards.rank]]
-    shards.count(len(mine))
-    uneven, gathered, evened = shards.is_uneven(), shards.gather_rows(mine), shards.even_out(mine)
-    shards.even_out(mine[:, :0])  # Coefficients of harmonics have no numbers where the degree is 0.
-    shards.count(len(evened))
+    start = sum(sizes[: world.rank])
+    mine = rows[start : start + sizes[world.rank]]
+    world.count(len(mine))
+    uneven, gathered, evened = world.is_uneven(), world.gather_rows(mine), world.even_out(mine)
+    world.even_out(mine[:, :0])  # Coefficients of harmonics have no numbers where the degree is 0.
+    world.count(len(evened))
     torch.manual_seed(4)
-    drawn = shards.rand(2)
+    drawn = world.rand(2)
     after = torch.rand(1)
     return {
-        "sizes": shards.sizes, "uneven": uneven, "even": not shards.is_uneven(), "gathered": gathered,
-        "evened": evened, "drawn": drawn, "after": after, "least": shards.least(3.0 - shards.rank),
-        "all": (shards.all(True), shards.all(shards.rank > 0)),
+        "sizes": world.sizes, "uneven": uneven, "even": not world.is_uneven(), "gathered": gathered,
+        "evened": evened, "drawn": drawn, "after": after, "least": world.least(3.0 - world.rank),
+        "all": (world.all(True), world.all(world.rank > 0)),
     }  # fmt: skip
 
 
@@ -76,16 +76,16 @@ def test_rows_are_gathered_and_evened_out_in_the_order_of_the_ranks(tmp_path: Pa
         assert result["all"] == (True, False)
 
 
-def prune_together(shards: Shards) -> list[int]:
+def prune_together(world: World) -> list[int]:
     """Numbers of Gaussians of this process after each of two prunings, and after the shards were evened out."""
     strategy = StructureAwareStrategy()
-    strategy.shards = shards
-    params = {"means": torch.nn.Parameter(torch.arange(12.0).view(4, 3) + 12 * shards.rank)}
+    strategy.world = world
+    params = {"means": torch.nn.Parameter(torch.arange(12.0).view(4, 3) + 12 * world.rank)}
     optimizers = {"means": torch.optim.Adam(params.values())}
     faint = torch.ones(4, dtype=torch.bool)
-    faint[3:] = shards.rank == 0
+    faint[3:] = world.rank == 0
     numbers = []
-    for mask in (faint, faint if shards.rank == 0 else ~faint):
+    for mask in (faint, faint if world.rank == 0 else ~faint):
         strategy._prune(params, optimizers, {}, mask)
         numbers.append(len(params["means"]))
     strategy._even_out(params, optimizers, {})
@@ -100,9 +100,9 @@ def test_each_process_keeps_a_gaussian(tmp_path: Path):
     assert run_ranks(prune_together, 2, tmp_path) == [[4, 0, 1], [4, 3, 2]]
 
 
-def share_out_too_few(shards: Shards) -> str:
+def share_out_too_few(world: World) -> str:
     with pytest.raises(InputError) as error:
-        shards.take_even_part(1)
+        world.take_even_part(1)
     return str(error.value)
 
 

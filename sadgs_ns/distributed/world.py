@@ -17,7 +17,7 @@ _ROWS_AT_ONCE = 1 << 20
 """Rows that are sent at once to where they are gathered, so that gathering takes little of the device's memory."""
 
 
-class Shards:
+class World:
     """The shards of a splat: the Gaussians of all processes, in the order of their ranks, are those of one process.
 
     Every method must be called by all processes, in the same order.
