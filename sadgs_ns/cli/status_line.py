@@ -21,11 +21,10 @@ class StatusLine:
     """
 
     def __init__(self, name: str, console: Console) -> None:
-        self._name, self._console, self._status = name, console, ""
+        self._name, self._console, self._status, self._start = name, console, "", time.monotonic()
         self._live = Live(console=console, get_renderable=self._text) if console.is_terminal else None
 
     def __enter__(self) -> StatusLine:
-        self._start = time.monotonic()
         if self._live is not None:
             self._live.start()
         return self

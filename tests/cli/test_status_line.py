@@ -1,0 +1,28 @@
+"""The line of a stage, in a terminal and in a file."""
+
+from __future__ import annotations
+
+import io
+import re
+
+import pytest
+from rich.console import Console
+
+from sadgs_ns.cli.status_line import StatusLine, clock
+
+
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_the_last_status_stays_below_what_was_printed(is_terminal: bool):
+    printed = io.StringIO()
+    console = Console(file=printed, force_terminal=is_terminal, highlight=False, width=80)
+    with StatusLine("cameras", console) as line:
+        line.update("features 1 of 9")
+        line.print("There is no GPU.")
+        line.update("done")
+    text = re.sub(r"\x1b\[[?\d;]*[a-zA-Z]", "", printed.getvalue())
+    assert re.search(r"There is no GPU\.\r?\n(.*[\r\n])*cameras +\d:\d\d  done *\n$", text)
+    assert is_terminal or text == "There is no GPU.\ncameras      0:00  done\n"
+
+
+def test_hours_are_shown_from_one_hour_on():
+    assert [clock(seconds) for seconds in (0.4, 61.6, 3599.6)] == ["0:00", "1:02", "1:00:00"]
