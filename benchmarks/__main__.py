@@ -18,19 +18,12 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import tyro
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich import progress as bars
 from tyro.conf import Positional
 
 from benchmarks import gate, protocol, results
@@ -50,7 +43,6 @@ COMMANDS = {
     "documents": ("documents:Command", "the tables and figures of the documents, from the rows of docs/results"),
     "approximations": ("approximations:Command", "speed against error of the frequency analysis"),
     "step": ("step:Compare", "the parts of a training step, with and without our Triton kernels (CUDA)"),
-    "parts": ("step:Parts", "the parts of a training step of a finished run, each by itself (CUDA)"),
     "growth": ("step:Growth", "a training step of more Gaussians, and of larger images, beside gsplat's (CUDA)"),
     "memory": ("step:Memory", "the memory plan beside the real peaks of training steps (CUDA)"),
     "shards": ("step:Together", "a training step of Gaussians that are spread over several devices, with torchrun"),
@@ -78,13 +70,9 @@ class _Run:
 
     def result(self, log: Path) -> Result:
         """What the process, which has ended, measured; the output of one that failed goes to the log."""
-        written = Path(self.folder.name, "result.json")
-        code = self.process.returncode
-        if written.exists():
-            measured = json.loads(written.read_text())
-        else:
-            measured = {"status": "failed", "error": f"the run ended with code {code} and no result; see {log}."}
-        output = Path(self.folder.name, "log")
+        written, output = Path(self.folder.name, "result.json"), Path(self.folder.name, "log")
+        error = f"the run ended with code {self.process.returncode} and no result; see {log}."
+        measured = json.loads(written.read_text()) if written.exists() else {"status": "failed", "error": error}
         if measured["status"] == "failed" and output.exists():
             with log.open("a") as file:
                 file.write(f"=== {self.job.key}\n{output.read_text(errors='replace')}\n")
@@ -121,15 +109,9 @@ def launcher(root: Path) -> Launch:
         if gpu is not None:
             environment["CUDA_VISIBLE_DEVICES"] = ",".join(devices)
         with (folder / "log").open("wb") as log:
-            # A session of its own, so that a compiler the run started can be ended with it.
-            return subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,  # no prompt of nerfstudio's may wait for somebody
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                env=environment,
-                start_new_session=True,
-            )
+            # No prompt of nerfstudio's may wait for somebody, and a compiler that the run started can be ended with it.
+            apart = partial(subprocess.Popen, stdin=subprocess.DEVNULL, start_new_session=True)
+            return apart(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
 
     return launch
 
@@ -194,7 +176,7 @@ def line(result: Result) -> str:
     )
 
 
-def progress_bar(total: int, done: int, **options: Any) -> tuple[Progress, TaskID]:
+def progress_bar(total: int, done: int, **options: Any) -> tuple[bars.Progress, bars.TaskID]:
     """A bar over all runs, and its task.
 
     The time left is estimated from the runs that have ended since it was made, on all GPUs together.
@@ -203,10 +185,10 @@ def progress_bar(total: int, done: int, **options: Any) -> tuple[Progress, TaskI
         done: Runs that had ended before.
         options: Of rich's Progress.
     """
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    left = (TextColumn("left"), TimeRemainingColumn())
+    columns = (bars.TextColumn("{task.description}"), bars.BarColumn(), bars.MofNCompleteColumn())
+    times = (bars.TimeElapsedColumn(), bars.TextColumn("left"), bars.TimeRemainingColumn())
     # rich would estimate from the last 30 s, in which at most one run ends.
-    progress = Progress(*columns, *left, speed_estimate_period=float("inf"), **options)
+    progress = bars.Progress(*columns, *times, speed_estimate_period=float("inf"), **options)
     task = progress.add_task("Runs", total=total, completed=done)
     progress.advance(task, 0)  # the moment from which the first run counts
     return progress, task

@@ -16,6 +16,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -47,29 +48,27 @@ def now() -> float:
 
 def load_lpips() -> LearnedPerceptualImagePatchSimilarity | None:
     """LPIPS with AlexNet, on the CPU, or None and one printed line where its weights cannot be had."""
-    return _load("alex", "AlexNet")
+    return _load("alex")
 
 
 def load_lpips_vgg() -> LearnedPerceptualImagePatchSimilarity | None:
-    """LPIPS with VGG, on the CPU, or None and one printed line unless its weights lie in $TORCH_HOME.
-
-    They are never downloaded: they have half a gigabyte.
-    """
+    """LPIPS with VGG, on the CPU, or None and one printed line unless its weights lie in $TORCH_HOME."""
     from torchvision.models import VGG16_Weights
 
     weights = Path(torch.hub.get_dir(), "checkpoints", Path(VGG16_Weights.DEFAULT.url).name)
-    if not weights.exists():
-        print(f"LPIPS with VGG is left out: there is no {weights}.")
-        return None
-    return _load("vgg", "VGG")
+    if weights.exists():
+        return _load("vgg")
+    print(f"LPIPS with VGG is left out: there is no {weights}.")
+    return None
 
 
-def _load(net: Literal["alex", "vgg"], name: str) -> LearnedPerceptualImagePatchSimilarity | None:
+def _load(net: Literal["alex", "vgg"]) -> LearnedPerceptualImagePatchSimilarity | None:
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
     try:
         return LearnedPerceptualImagePatchSimilarity(net_type=net, normalize=net == "alex")
     except (OSError, RuntimeError) as error:
+        name = {"alex": "AlexNet", "vgg": "VGG"}[net]
         print(f"LPIPS is left out, its {name} weights are not in $TORCH_HOME and not to be downloaded ({error}).")
         return None
 
@@ -99,11 +98,17 @@ def quality(model: Any, views: Iterable[View], networks: Networks) -> dict[str, 
     from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
     fits = getattr(model.config, "color_corrected_metrics", False)
-    names = ["psnr", "ssim", "ssim_padded", *networks]
-    values: dict[str, list[float]] = {name: [] for name in [*names, *(f"cc_{name}" for name in names if fits)]}
-    for network in networks.values():
-        if network is not None:
-            network.to(model.device)
+    used = {name: network.to(model.device) for name, network in networks.items() if network is not None}
+    window: Any = {"gaussian_kernel": True, "sigma": 1.5, "kernel_size": _WINDOW}
+    measures: dict[str, Any] = {
+        "psnr": partial(peak_signal_noise_ratio, data_range=1.0),
+        "ssim": partial(structural_similarity_index_measure, data_range=1.0, **window),
+        "ssim_padded": ssim_padded,
+        **used,
+    }
+    values: dict[str, list[float]] = {
+        f"{prefix}{name}": [] for prefix in ("", *(["cc_"] if fits else [])) for name in {**measures, **networks}
+    }
     # nerfstudio has cuDNN search for algorithms, with whatever memory is free as their workspace. Probably so a process
     # came to hold 133 GiB, for want of which another one on the same GPU failed here.
     cudnn = torch.backends.cudnn
@@ -111,18 +116,10 @@ def quality(model: Any, views: Iterable[View], networks: Networks) -> dict[str, 
         for view in views:
             rendered, truth = render(model, view)
             for prefix, image in (("", rendered), *([("cc_", fitted(rendered, truth))] if fits else [])):
-                values[f"{prefix}psnr"].append(float(peak_signal_noise_ratio(image, truth, data_range=1.0)))
-                similarity = structural_similarity_index_measure(
-                    image, truth, gaussian_kernel=True, sigma=1.5, kernel_size=_WINDOW, data_range=1.0
-                )
-                values[f"{prefix}ssim"].append(float(similarity))  # type: ignore[arg-type]
-                values[f"{prefix}ssim_padded"].append(float(ssim_padded(image, truth)))
-                for name, network in networks.items():
-                    if network is not None:
-                        values[f"{prefix}{name}"].append(float(network(image, truth)))
-    for network in networks.values():
-        if network is not None:
-            network.cpu()
+                for name, measure in measures.items():
+                    values[f"{prefix}{name}"].append(float(measure(image, truth)))
+    for network in used.values():
+        network.cpu()
     means = {name: statistics.fmean(of_views) if of_views else None for name, of_views in values.items()}
     return means | {"view_psnr": [round(psnr, 2) for psnr in values["psnr"]]}
 

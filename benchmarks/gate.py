@@ -21,6 +21,7 @@ from typing import Any
 
 from benchmarks.protocol import Job
 from benchmarks.results import Result
+from sadgs_ns.atomic import atomic_path
 
 DIRECTIONS = ("higher", "lower", "near")
 NEW_METRICS = {"psnr": ("higher", 0.4), "ssim": ("higher", 0.01), "lpips": ("lower", 0.01), "gaussians": ("near", 0.04)}
@@ -30,19 +31,16 @@ largest half-range between two seeds in docs/results.md: a start, to be set from
 
 @dataclass(frozen=True)
 class Metric:
-    """A metric of one row."""
+    """A metric of one row: its value, one of DIRECTIONS, and the largest move for the worse that passes."""
 
     value: float
     direction: str
-    """One of `DIRECTIONS`."""
     tolerance: float
-    """Largest move for the worse that passes, in the metric's unit."""
 
     def fails(self, value: float) -> bool:
         """Whether a value is worse than the tolerance allows; one that is no number always is."""
         moved = value - self.value
-        worse = {"higher": -moved, "lower": moved, "near": abs(moved)}[self.direction]
-        return not worse <= self.tolerance
+        return not {"higher": -moved, "lower": moved, "near": abs(moved)}[self.direction] <= self.tolerance
 
 
 Baseline = dict[str, dict[str, Metric]]
@@ -63,32 +61,19 @@ def read(path: Path) -> Baseline:
         raise ValueError(f"{path} is not JSON: {error}.") from error
     if not isinstance(content, dict) or not content:
         raise ValueError(f"{path} must be an object with a row or more, named scene/label.")
-    return {row: _metrics(metrics, f"{path}: {row}") for row, metrics in content.items()}
-
-
-def _metrics(metrics: Any, where: str) -> dict[str, Metric]:
-    if not isinstance(metrics, dict) or not metrics:
-        raise ValueError(f"{where} must be an object with a metric or more.")
-    for name, entry in metrics.items():
-        if not isinstance(entry, dict) or entry.keys() != {"value", "direction", "tolerance"}:
-            raise ValueError(f"{where}, {name} must have value, direction and tolerance, and nothing else.")
-        if entry["direction"] not in DIRECTIONS:
-            raise ValueError(f"{where}, {name}: direction must be one of {', '.join(DIRECTIONS)}.")
-        numbers = entry["value"], entry["tolerance"]
-        if not all(type(n) in (int, float) and math.isfinite(n) for n in numbers) or entry["tolerance"] < 0:
-            raise ValueError(f"{where}, {name}: value must be a number, and tolerance one from 0.")
-    return {name: Metric(**entry) for name, entry in metrics.items()}
-
-
-def write(path: Path, baseline: Baseline) -> None:
-    """Write a baseline; the file appears complete or not at all."""
-    from sadgs_ns.atomic import atomic_path
-
-    content = {
-        row: {name: dataclasses.asdict(metric) for name, metric in metrics.items()} for row, metrics in baseline.items()
-    }
-    with atomic_path(path) as partial:
-        partial.write_text(json.dumps(content, indent=2) + "\n")
+    for row, metrics in content.items():
+        if not isinstance(metrics, dict) or not metrics:
+            raise ValueError(f"{path}: {row} must be an object with a metric or more.")
+        for name, entry in metrics.items():
+            where = f"{path}: {row}, {name}"
+            if not isinstance(entry, dict) or entry.keys() != {"value", "direction", "tolerance"}:
+                raise ValueError(f"{where} must have value, direction and tolerance, and nothing else.")
+            if entry["direction"] not in DIRECTIONS:
+                raise ValueError(f"{where}: direction must be one of {', '.join(DIRECTIONS)}.")
+            numbers = entry["value"], entry["tolerance"]
+            if not all(type(n) in (int, float) and math.isfinite(n) for n in numbers) or entry["tolerance"] < 0:
+                raise ValueError(f"{where}: value must be a number, and tolerance one from 0.")
+    return {row: {name: Metric(**entry) for name, entry in metrics.items()} for row, metrics in content.items()}
 
 
 def regressions(baseline: Baseline, jobs: Iterable[Job], results: Iterable[Result]) -> list[str]:
@@ -98,8 +83,7 @@ def regressions(baseline: Baseline, jobs: Iterable[Job], results: Iterable[Resul
         jobs: The runs that should have been made.
         results: What they gave, and perhaps other results.
     """
-    runs = _runs(jobs, results)
-    lines = []
+    runs, lines = _runs(jobs, results), []
     for row, metrics in baseline.items():
         group = runs.get(row, [])
         measured = [result for result in group if result is not None]
@@ -120,35 +104,6 @@ def regressions(baseline: Baseline, jobs: Iterable[Job], results: Iterable[Resul
     return lines
 
 
-def updated(baseline: Baseline, jobs: Iterable[Job], results: Iterable[Result]) -> Baseline:
-    """The baseline with the results' values; directions and tolerances stay, and so do rows that were not asked for.
-
-    Rows that are new get `NEW_METRICS`, as far as they were measured.
-
-    Raises:
-        ValueError: A row's runs have not all ended well, or a metric was not measured.
-    """
-    new = dict(baseline)
-    for row, group in _runs(jobs, results).items():
-        measured = [result for result in group if result is not None]
-        if len(measured) < len(group):
-            raise ValueError(f"{row}: {len(group) - len(measured)} of {len(group)} runs have no result; finish them.")
-        if row in baseline:
-            means = {name: _mean(measured, name) for name in baseline[row]}
-            for name, mean in means.items():
-                if mean is None:
-                    raise ValueError(f"{row}: {name} was not measured; measure it or take it out of the baseline.")
-            entries = {name: dataclasses.replace(baseline[row][name], value=_rounded(means[name])) for name in means}
-        else:
-            entries = {}
-            for name, (direction, tolerance) in NEW_METRICS.items():
-                if (mean := _mean(measured, name)) is not None:
-                    scale = mean if name == "gaussians" else 1.0
-                    entries[name] = Metric(_rounded(mean), direction, _rounded(tolerance * scale))
-        new[row] = entries
-    return new
-
-
 def judge(path: Path, jobs: Sequence[Job], results: Sequence[Result]) -> bool:
     """Print how results compare with the baseline in a file; True if nothing got worse."""
     baseline = read(path)
@@ -163,15 +118,35 @@ def judge(path: Path, jobs: Sequence[Job], results: Sequence[Result]) -> bool:
 
 
 def renew(path: Path, jobs: Sequence[Job], results: Sequence[Result]) -> None:
-    """Rewrite the values in a baseline's file, or make one.
+    """Rewrite the values in a baseline's file, or make one; directions, tolerances and rows not asked for stay.
+
+    Rows that are new get `NEW_METRICS`, as far as they were measured.
 
     Raises:
-        ValueError: As `read` and `updated`; the file is then as it was.
+        ValueError: As `read`, a row's runs have not all ended well, or a metric was not measured; the file then stays.
     """
-    old = read(path) if path.exists() else {}
-    new = updated(old, jobs, results)
-    write(path, new)
-    added = [row for row in new if row not in old]
+    baseline = read(path) if path.exists() else {}
+    new, added = dict(baseline), []
+    for row, group in _runs(jobs, results).items():
+        measured = [result for result in group if result is not None]
+        if len(measured) < len(group):
+            raise ValueError(f"{row}: {len(group) - len(measured)} of {len(group)} runs have no result; finish them.")
+        means = {name: _mean(measured, name) for name in baseline.get(row, NEW_METRICS)}
+        if row not in baseline:
+            added.append(row)
+            new[row] = {}
+            for name, (direction, tolerance) in NEW_METRICS.items():
+                if (mean := means[name]) is not None:
+                    scaled = tolerance * (mean if name == "gaussians" else 1.0)
+                    new[row][name] = Metric(float(f"{mean:.6g}"), direction, float(f"{scaled:.6g}"))
+            continue
+        for name, mean in means.items():
+            if mean is None:
+                raise ValueError(f"{row}: {name} was not measured; measure it or take it out of the baseline.")
+            new[row] = {**new[row], name: dataclasses.replace(baseline[row][name], value=float(f"{mean:.6g}"))}
+    content = {row: {name: dataclasses.asdict(metric) for name, metric in of.items()} for row, of in new.items()}
+    with atomic_path(path) as partial:
+        partial.write_text(json.dumps(content, indent=2) + "\n")
     print(f"{path}: {len(new)} rows.")
     if added:
         print(f"New rows have default tolerances, to be set from several seeds: {', '.join(added)}.")
@@ -180,7 +155,7 @@ def renew(path: Path, jobs: Sequence[Job], results: Sequence[Result]) -> None:
 def _runs(jobs: Iterable[Job], results: Iterable[Result]) -> dict[str, list[Result | None]]:
     """By row, the result of each run, None where there is none that is ok."""
     ok = {result["key"]: result for result in results if result["status"] == "ok"}
-    runs: dict[str, list[Result | None]] = {}
+    runs: dict[str, list[Any]] = {}
     for job in jobs:
         runs.setdefault(f"{job.scene.name}/{job.row.label}", []).append(ok.get(job.key))
     return runs
@@ -189,7 +164,3 @@ def _runs(jobs: Iterable[Job], results: Iterable[Result]) -> dict[str, list[Resu
 def _mean(group: Sequence[Result], name: str) -> float | None:
     values = [result.get(name) for result in group]
     return None if None in values else statistics.fmean(values)  # type: ignore[arg-type]
-
-
-def _rounded(value: float | None) -> float:
-    return float(f"{value:.6g}")

@@ -29,7 +29,7 @@ _SCHEDULE = ("refine_every", "reset_every", "structure_every", "absgs_every", "r
 """Fields of a strategy, gsplat's or ours, that say when it densifies; ours derives those that are None."""
 _FAR = {"refine_stop_iter": sys.maxsize // 2, "absgs_every": sys.maxsize // 8}
 """Where they are put, if not to a quarter of the largest integer: the end lies behind all that is due, and the next
-AbsGS step before the next structure step, which would forget its gradients, so that they would not be computed."""
+AbsGS step before the next structure step, which would forget its gradients."""
 
 
 @contextlib.contextmanager
@@ -49,9 +49,8 @@ def replaced(owner: Any, name: str, wrap: Callable[[Callable[..., Any]], Callabl
 class Stopwatch:
     """Books the time between marks under phases.
 
-    On CUDA a mark is an event in the GPU's own queue, so that neither waits for the other and the steps take as long as
-    they always do; elsewhere it is the clock's time. Time in which the GPU waits for the host counts for the phase that
-    it waits in.
+    On CUDA a mark is an event in the GPU's own queue, so that neither waits for the other; elsewhere it is the clock's
+    time. Time in which the GPU waits for the host counts for the phase that it waits in.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -65,29 +64,31 @@ class Stopwatch:
 
     def restart(self) -> None:
         """Forget what was booked."""
-        if self._device.type == "cuda":
-            torch.cuda.synchronize(self._device)
+        self._wait()
         self._marks.clear()
         self.begin("rest")
 
     def begin(self, phase: str) -> None:
         """Book the time from now on under a phase."""
         if self._device.type == "cuda":
-            event = torch.cuda.Event(enable_timing=True)
-            event.record(torch.cuda.current_stream(self._device))
-            self._marks.append((phase, event))
+            when: Any = torch.cuda.Event(enable_timing=True)
+            when.record(torch.cuda.current_stream(self._device))
         else:
-            self._marks.append((phase, time.perf_counter()))
+            when = time.perf_counter()
+        self._marks.append((phase, when))
 
     def seconds(self) -> dict[str, float]:
         """Seconds of each phase since `restart`; they add up to all of the time since then."""
         self.begin(self.phase)
-        if self._device.type == "cuda":
-            torch.cuda.synchronize(self._device)
+        self._wait()
         total = dict.fromkeys(PHASES, 0.0)
         for (phase, start), (_, end) in zip(self._marks[:-1], self._marks[1:], strict=True):
             total[phase] += start.elapsed_time(end) / 1000 if self._device.type == "cuda" else end - start
         return total
+
+    def _wait(self) -> None:
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
 
     def during(self, phase: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
         """A decorator: the function's time is booked under a phase, and what follows as what came before."""
@@ -109,11 +110,7 @@ class Stopwatch:
     def when_gradient_arrives(self, tensor: Any, phase: str) -> None:
         """In the backward pass, book the time from the tensor's gradient on under a phase."""
         if isinstance(tensor, Tensor) and tensor.requires_grad:
-
-            def hook(_: Tensor) -> None:
-                self.begin(phase)
-
-            tensor.register_hook(hook)
+            tensor.register_hook(lambda _: self.begin(phase))
 
 
 @contextlib.contextmanager
@@ -140,15 +137,19 @@ def booked(trainer: Any, watch: Stopwatch) -> Iterator[None]:
 
     # sadgs trains on several views at once, which nerfstudio's method cannot express.
     render = "get_training_outputs" if hasattr(model, "get_training_outputs") else "get_outputs"
+    places: list[tuple[Any, str, Any]] = [
+        (model, render, rendering),
+        (model, "get_loss_dict", losing),
+        (torch.Tensor, "backward", watch.during("loss")),
+        (sadgs_ns.method.strategy, "observe", watch.during("eta")),
+    ]
+    for name in ("zero_grad_some", "optimizer_scaler_step_some", "scheduler_step_all"):
+        places.append((optimizers, name, watch.during("optimizer")))
+    if getattr(trainer, "graphed", None) is not None:  # A graph has no seams.
+        places.append((trainer, "graphed", lambda graphed: None))
     with contextlib.ExitStack() as stack:
-        stack.enter_context(replaced(model, render, rendering))
-        stack.enter_context(replaced(model, "get_loss_dict", losing))
-        stack.enter_context(replaced(torch.Tensor, "backward", watch.during("loss")))
-        stack.enter_context(replaced(sadgs_ns.method.strategy, "observe", watch.during("eta")))
-        for name in ("zero_grad_some", "optimizer_scaler_step_some", "scheduler_step_all"):
-            stack.enter_context(replaced(optimizers, name, watch.during("optimizer")))
-        if getattr(trainer, "graphed", None) is not None:  # A graph has no seams.
-            stack.enter_context(replaced(trainer, "graphed", lambda graphed: None))  # type: ignore[arg-type]
+        for place in places:
+            stack.enter_context(replaced(*place))
         yield
 
 
@@ -178,9 +179,8 @@ def within_densification(strategy: Any) -> Iterator[None]:
 def measure(trainer: Any, steps: int = STEPS) -> dict[str, float]:
     """Train some steps beyond the end of a run and take their time apart.
 
-    What is measured is a step with the trained model's Gaussians as within the densification window: the strategy
-    observes η and gathers gradients as in a step that AbsGS reads, but densifies nothing. It therefore takes longer
-    than the run's mean step: most of those had fewer Gaussians or no statistics to keep.
+    It is a step with the trained model's Gaussians as within the densification window, longer than the run's mean step:
+    the strategy observes η and gathers gradients as in a step that AbsGS reads, but densifies nothing.
 
     Phases:
         rasterize_forward: From the parameters to the image, activations and background included, η excluded.

@@ -13,12 +13,14 @@ Rows of different scenes may share a label. `source` says where the scenes come 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
 import hashlib
 import itertools
 import json
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -120,8 +122,7 @@ def parse(content: object) -> Protocol:
     Raises:
         ValueError: As `load`, without the file's name.
     """
-    optional = {"seeds", "source", "curve_every"}
-    top = _mapping(content, "the protocol", required={"scenes", "rows"}, optional=optional)
+    top = _mapping(content, "the protocol", {"scenes", "rows"}, {"seeds", "source", "curve_every"})
     scenes = {str(name): _scene(str(name), value) for name, value in _mapping(top["scenes"], "scenes").items()}
     if not scenes:
         raise ValueError("scenes is empty; name at least one scene.")
@@ -130,12 +131,11 @@ def parse(content: object) -> Protocol:
         for i, value in enumerate(_list(top["rows"], "rows"))
         for row in _rows({"curve_every": top.get("curve_every"), **_mapping(value, f"rows[{i}]")}, f"rows[{i}]", scenes)
     )
-    seen = set()
-    for label, scene in [(row.label, scene) for row in rows for scene in row.scenes or scenes]:
-        if (label, scene) in seen:
+    pairs = Counter((row.label, scene) for row in rows for scene in row.scenes or scenes)
+    for (label, scene), count in pairs.items():
+        if count > 1:
             raise ValueError(f"two rows have the label {label!r} for {scene}; give each its own.")
-        seen.add((label, scene))
-    source = None if top.get("source") is None else _text(top["source"], "source")
+    source = None if top.get("source") is None else _text(top, "source", "the protocol")
     return Protocol(scenes, rows, _seeds(top.get("seeds", [0, 1]), "seeds"), source)
 
 
@@ -163,12 +163,9 @@ def set_dotted(config: Any, path: str, value: Any) -> None:
 
 def _child(node: Any, name: str, path: str, parent: str) -> Any:
     where = parent or "the config"
-    if isinstance(node, dict):
-        names = [str(key) for key in node]
-    elif dataclasses.is_dataclass(node):
-        names = [f.name for f in dataclasses.fields(node)]
-    else:
+    if not isinstance(node, dict) and not dataclasses.is_dataclass(node):
         raise ValueError(f"override {path!r}: {where} is {node!r}, which has no settings; shorten the path.")
+    names = [str(key) for key in node] if isinstance(node, dict) else [f.name for f in dataclasses.fields(node)]
     if name not in names:
         similar = difflib.get_close_matches(name, names, n=1)
         remedy = f"did you mean {similar[0]!r}?" if similar else f"it has {', '.join(sorted(names))}."
@@ -177,74 +174,57 @@ def _child(node: Any, name: str, path: str, parent: str) -> Any:
 
 
 def _as_type_of(old: Any, value: Any, path: str) -> Any:
-    if old is None or value is None:
+    if old is None or value is None or (type(old) is type(value) and type(old) in (bool, int, float, str)):
         return value
-    if isinstance(old, bool) or isinstance(value, bool):
-        if isinstance(old, bool) and isinstance(value, bool):
+    if not isinstance(old, bool) and not isinstance(value, bool):
+        if isinstance(old, (int, float)) and isinstance(value, (int, float)):
             return value
-    elif isinstance(old, (int, float)):
-        if isinstance(value, (int, float)):
-            return value
-        # YAML 1.1 reads 1e-4 as text: a float needs a dot there.
         if isinstance(old, float) and isinstance(value, str):
-            try:
-                return float(value)
-            except ValueError:
-                pass
-    elif isinstance(old, Path) and isinstance(value, str):
-        return Path(value)
-    elif isinstance(old, (tuple, list)) and isinstance(value, list):
-        return type(old)(value)
-    elif isinstance(old, str) and isinstance(value, str):
-        return value
+            with contextlib.suppress(ValueError):
+                return float(value)  # YAML 1.1 reads 1e-4 as text: a float needs a dot there.
+        if isinstance(old, Path) and isinstance(value, str):
+            return Path(value)
+        if isinstance(old, (tuple, list)) and isinstance(value, list):
+            return type(old)(value)
     kind = "a group of settings" if isinstance(old, dict) or dataclasses.is_dataclass(old) else type(old).__name__
     raise ValueError(f"override {path!r}: {value!r} is {type(value).__name__}, but the setting is {kind}.")
 
 
-def _rows(value: object, where: str, scenes: Mapping[str, Scene]) -> list[Row]:
-    optional = {"scenes", "seeds", "overrides", "sweep", "curve_every"}
-    row = _mapping(value, where, required={"label", "method"}, optional=optional)
-    label, method = _text(row["label"], f"{where}.label"), _text(row["method"], f"{where}.method")
-    names = None
-    if row.get("scenes") is not None:
-        names = tuple(str(name) for name in _list(row["scenes"], f"{where}.scenes"))
-        for name in names:
-            if name not in scenes:
-                raise ValueError(f"{where}.scenes names {name!r}, which is not under scenes; add it there.")
+def _rows(value: Any, where: str, scenes: Mapping[str, Scene]) -> list[Row]:
+    row = _mapping(value, where, {"label", "method"}, {"scenes", "seeds", "overrides", "sweep", "curve_every"})
+    label, method = _text(row, "label", where), _text(row, "method", where)
+    names = None if row.get("scenes") is None else tuple(map(str, _list(row["scenes"], f"{where}.scenes")))
+    for name in names or ():
+        if name not in scenes:
+            raise ValueError(f"{where}.scenes names {name!r}, which is not under scenes; add it there.")
     seeds = None if row.get("seeds") is None else _seeds(row["seeds"], f"{where}.seeds")
+    every = row.get("curve_every")
+    if every is not None and (type(every) is not int or every < 1):
+        raise ValueError(f"curve_every must be a whole number of iterations from 1, not {every!r}.")
     overrides = _mapping(row.get("overrides") or {}, f"{where}.overrides")
-    curve_every = row.get("curve_every")
-    if curve_every is not None and (type(curve_every) is not int or curve_every < 1):
-        raise ValueError(f"curve_every must be a whole number of iterations from 1, not {curve_every!r}.")
     sweep = _mapping(row.get("sweep") or {}, f"{where}.sweep")
-    choices = [[(path, v) for v in _list(values, f"{where}.sweep.{path}")] for path, values in sweep.items()]
     rows = []
-    for combination in itertools.product(*choices):
-        suffix = ",".join(f"{path.rsplit('.', 1)[-1]}={v}" for path, v in combination)
+    for values in itertools.product(*(_list(choices, f"{where}.sweep.{path}") for path, choices in sweep.items())):
+        chosen = dict(zip(sweep, values, strict=True))
+        suffix = ",".join(f"{path.rsplit('.', 1)[-1]}={v}" for path, v in chosen.items())
         name = f"{label}[{suffix}]" if suffix else label
-        rows.append(Row(name, method, {**overrides, **dict(combination)}, names, seeds, curve_every))
+        rows.append(Row(name, method, {**overrides, **chosen}, names, seeds, every))
     return rows
 
 
 def _scene(name: str, value: object) -> Scene:
     where = f"scenes.{name}"
-    scene = _mapping(value, where, required={"data", "dataparser"}, optional={"options"})
+    scene = _mapping(value, where, {"data", "dataparser"}, {"options"})
     options = _mapping(scene.get("options") or {}, f"{where}.options")
-    return Scene(
-        name, _text(scene["data"], f"{where}.data"), _text(scene["dataparser"], f"{where}.dataparser"), options
-    )
+    return Scene(name, _text(scene, "data", where), _text(scene, "dataparser", where), options)
 
 
-def _mapping(
-    value: object, where: str, required: set[str] | None = None, optional: set[str] | None = None
-) -> dict[str, Any]:
+def _mapping(value: Any, where: str, required: set[str] | None = None, optional: Set[str] = frozenset()) -> Any:
     if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
         raise ValueError(f"{where} must be a mapping with names as keys, not {value!r}.")
     if required is not None:
-        allowed = required | (optional or set())
-        for key in value:
-            if key not in allowed:
-                raise ValueError(f"{where} has an unknown key {key!r}; it takes {', '.join(sorted(allowed))}.")
+        for key in sorted(value.keys() - required - optional):
+            raise ValueError(f"{where} has an unknown key {key!r}; it takes {', '.join(sorted(required | optional))}.")
         for key in sorted(required - value.keys()):
             raise ValueError(f"{where} lacks {key!r}; add it.")
     return value
@@ -256,14 +236,14 @@ def _list(value: object, where: str) -> list[Any]:
     return value
 
 
-def _text(value: object, where: str) -> str:
-    if not isinstance(value, str) or not value:
-        raise ValueError(f"{where} must be text, not {value!r}; put it in quotes.")
+def _text(mapping: Mapping[str, Any], key: str, where: str) -> str:
+    if not isinstance(value := mapping[key], str) or not value:
+        raise ValueError(f"{where}.{key} must be text, not {value!r}; put it in quotes.")
     return value
 
 
 def _seeds(value: object, where: str) -> tuple[int, ...]:
     seeds = _list(value, where)
-    if not all(isinstance(seed, int) and not isinstance(seed, bool) and seed >= 0 for seed in seeds):
+    if not all(type(seed) is int and seed >= 0 for seed in seeds):
         raise ValueError(f"{where} must be a list of whole numbers from 0, not {value!r}.")
     return tuple(seeds)

@@ -20,7 +20,7 @@ import tempfile
 import time
 import traceback
 import urllib.error
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -113,21 +113,15 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
             structure_tensor_seconds: One after the other, before the loop. `initialization` makes the model from the
                 points (with splatfacto it also loads LPIPS); `setup` is parsing the data and all else that nerfstudio
                 builds; `structure_tensor` is there only where the method has them.
-            loop_seconds: The training loop, nothing else.
-            train_seconds: The loop and the checkpoint after it.
+            loop_seconds: The training loop, nothing else; train_seconds: the loop and the checkpoint after it.
             wall_seconds: Everything from the first import to the saved checkpoint.
             compile_seconds: What Triton took to compile kernels, in a machine's first run, added up over those that are
                 compiled side by side in the setup; of them loop_compile_seconds in the loop.
-            evaluation_seconds: After it.
-        Over the held-out views: `psnr` in dB, `ssim`, `ssim_padded`, `lpips`, `lpips_vgg` (None without weights; see
-        `evaluate`); and `train_psnr` over some training views, `fps`, `gaussians`, `peak_gb`, how many views there
-        were, the machine's `gpu`.
-            view_psnr, ply_view_psnr: PSNR of each held-out view, and with the near plane of other programs' viewers.
-            view_names, view_angles, view_uncovered: Of each; see `coverage_of_views`.
-            phases: Milliseconds a step, by phase; see `phases.measure`.
-            launches: Launches, waits and the device's load in a step; see `launches.measure`. None without CUDA.
-            curve: Only if the job asks for it: the points of `curve.Curve`, the last one being the finished run.
-                None of the times above contains its evaluations.
+        Over the held-out views what `evaluate.quality` measures; `train_psnr` over some training views, `fps`,
+        `gaussians`, `peak_gb`, how many views there were, the machine's `gpu`. Of each held-out view `view_psnr`,
+        `ply_view_psnr` (with the near plane of other programs' viewers) and what `coverage_of_views` tells. `phases`
+        and `launches` as these modules measure them. `curve`, if the job asks for it, has the points of `curve.Curve`,
+        the last one being the finished run; no time above contains its evaluations.
         Where torchrun started several processes, which train one splat on `devices` of them, the first measures all
         but `phases`, `launches` and `curve`: its checkpoint is evaluated on one device, S̄ is computed in the loop, and
         `peak_gb` is the first device's. The others return nothing.
@@ -157,19 +151,12 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
         yield
         seconds[f"{name}_seconds"] = evaluate.now() - begin
 
-    def timed_initialization(populate_modules: Callable[[Any], None]) -> Callable[[Any], None]:
-        def populate(model: Any) -> None:
-            with timed("initialization"):
-                populate_modules(model)
-
-        return populate
-
     compiling = CompileTimer()
     with timed("setup"), compiling:
         config = build_config(job.scene, job.row, job.seed, root, work)
         _set_random_seed(job.seed)
         trainer: Any = config.setup(local_rank=int(os.environ.get("LOCAL_RANK", "0")), world_size=devices)
-        with phases.replaced(config.pipeline.model._target, "populate_modules", timed_initialization):
+        with phases.replaced(config.pipeline.model._target, "populate_modules", timed("initialization")):
             trainer.setup(test_mode="test")  # "val" would evaluate on blender's validation views
     seconds["setup_seconds"] -= seconds["initialization_seconds"]
     if devices > 1 and getattr(trainer, "world", None) is None:
@@ -285,10 +272,9 @@ def alone(job: Job, root: Path, work: Path, checkpoint: Path) -> Any:
     Args:
         checkpoint: Folder of the checkpoint that they wrote.
     """
-    for name in [
-        name for name in os.environ if name in ("RANK", "WORLD_SIZE") or name.startswith(("LOCAL_", "GROUP_"))
-    ]:
-        del os.environ[name]
+    for name in list(os.environ):
+        if name in ("RANK", "WORLD_SIZE") or name.startswith(("LOCAL_", "GROUP_")):
+            del os.environ[name]
     config = build_config(job.scene, job.row, job.seed, root, work)
     config.load_dir = checkpoint
     trainer = config.setup(local_rank=0, world_size=1)
@@ -325,12 +311,9 @@ def _commit(checkout: Path) -> str | None:
 def describe(error: Exception) -> str:
     """One sentence for a run that failed."""
     if isinstance(error, (urllib.error.URLError, ConnectionError, TimeoutError)):
-        return (
-            "nerfstudio could not download the LPIPS weights; set TORCH_HOME to a folder that holds "
-            "hub/checkpoints/alexnet-owt-7be5be79.pth."
-        )
-    lines = str(error).strip().splitlines()
-    message = lines[0] if lines else "no message"
+        file = "hub/checkpoints/alexnet-owt-7be5be79.pth"
+        return f"nerfstudio could not download the LPIPS weights; set TORCH_HOME to a folder that holds {file}."
+    message = (str(error).strip().splitlines() or ["no message"])[0]
     return message if isinstance(error, ValueError) else f"{type(error).__name__}: {message}"
 
 
@@ -342,11 +325,8 @@ def main() -> None:
     arguments, rank = parser.parse_args(), os.environ.get("RANK", "0")
     spec = json.loads(arguments.spec)
     job = Job(Scene(**spec["scene"]), Row(**spec["row"]), spec["seed"])
-    record = {
-        "status": "ok",
-        "error": None,
-        "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
-    }
+    date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
+    record: dict[str, Any] = {"status": "ok", "error": None, "date": date}
     with tempfile.TemporaryDirectory(dir=arguments.out.parent) as work:
         try:
             record |= run_row(job, Path(spec["root"]), Path(work))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 import statistics
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -21,13 +21,10 @@ import torch
 import torch.distributed as dist
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
-from tyro.conf import Positional
 
 from benchmarks.evaluate import now
 from benchmarks.table import grid
 from sadgs_ns import kernels
-from sadgs_ns.cli.export import read_checkpoint
-from sadgs_ns.data.run_cameras import read_cameras
 from sadgs_ns.distributed.rasterization import rasterize as rasterize_together
 from sadgs_ns.distributed.world import World
 from sadgs_ns.method import memory
@@ -37,7 +34,7 @@ from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.plugin.memory_plan import estimate_pairs
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
 from sadgs_ns.plugin.optimizers import FusedAdam, step_together
-from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world, visible
+from sadgs_ns.render.rasterization import rasterize, visible
 
 REPEATS = 20
 """Calls in a row that are timed together."""
@@ -424,101 +421,3 @@ def step_time(step: Step, repeats: int) -> tuple[float, float]:
         torch.cuda.reset_peak_memory_stats()
     time = milliseconds(steps, rounds=3, repeats=1) / repeats
     return time, torch.cuda.max_memory_allocated() / 1e9 if step.images.is_cuda else math.nan
-
-
-@dataclass
-class Parts:
-    """Time the parts of a training step of a finished run, each by itself (CUDA)."""
-
-    run: Positional[Path]
-    """folder of a run, or its config.yml"""
-    data: Path | None = None
-    """folder of the capture (default: where it was in training)"""
-    views: int = 1
-    """training views of a step"""
-    max_off_axis: float = 4.0
-    """as pipeline.model.max-off-axis"""
-
-    def __call__(self) -> int:
-        device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        if not kernels.available(device):
-            raise ValueError("the parts are our Triton kernels, which need a CUDA device.")
-        folder = self.run if self.run.is_dir() else self.run.parent
-        params = {name: value.to(device) for name, value in read_checkpoint(folder).params.items()}
-        cameras = read_cameras(folder, self.data, split="train")
-        same = [i for i, size in enumerate(cameras.sizes) if size == cameras.sizes[0]][: self.views]
-        width, height = cameras.sizes[0]
-        viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds[same]).to(device)
-        timed, pairs = parts(params, viewmats, cameras.Ks[same].to(device), width, height, self.max_off_axis)
-        print(
-            f"{len(params['means']):,} Gaussians, {len(same)} views of {width}×{height}, {pairs / 1e6:.2f} million "
-            f"pairs of a Gaussian and a tile, torch {torch.__version__}.\n"
-        )
-        print(grid(("part", "ms"), [(name, f"{milliseconds(part, 3):.3f}") for name, part in timed.items()]))
-        return 0
-
-
-def parts(
-    params: Mapping[str, Tensor],
-    viewmats: Tensor,  # [V, 4, 4]
-    Ks: Tensor,  # [V, 3, 3]
-    width: int,
-    height: int,
-    max_off_axis: float,
-) -> tuple[dict[str, Callable[[], object]], int]:
-    """Return the parts of a step by their names, each of which can be called again and again, and the number of pairs.
-
-    Args:
-        params: `means` [N, 3], `quats` [N, 4], log `scales` [N, 3], logit `opacities` [N, 1], `features_dc` [N, 3] and
-            `features_rest` [N, K − 1, 3] of degree 3 at most.
-        viewmats: World to camera. [V, 4, 4]
-        Ks: Intrinsics in px. [V, 3, 3]
-        width: px.
-        height: px.
-        max_off_axis: As `render.rasterization.rasterize` takes it.
-    """
-    from sadgs_ns.kernels import compositing
-    from sadgs_ns.kernels.compositing_forward import composite_forward
-    from sadgs_ns.kernels.harmonics import colors_from_harmonics
-    from sadgs_ns.kernels.projection import project
-    from sadgs_ns.kernels.tiles import intersect_tiles
-
-    views, degree = len(viewmats), round((params["features_rest"].shape[1] + 1) ** 0.5) - 1
-    geometry = [params["means"], params["quats"], params["scales"].exp()]
-    leaves = [value.clone().requires_grad_() for value in geometry]
-    first, rest = (params[name].clone().requires_grad_() for name in ("features_dc", "features_rest"))
-    opacities = params["opacities"].sigmoid().flatten()
-    cameras = viewmats, Ks, width, height
-
-    def projected() -> tuple[Tensor, ...]:
-        return project(*leaves, opacities, *cameras, False)[:4]  # type: ignore[return-value]
-
-    radii, means2d, depths, conics = (value.detach().contiguous() for value in projected())
-    each = torch.stack([opacities] * views)
-
-    def colored() -> Tensor:
-        return colors_from_harmonics(degree, leaves[0].detach(), first, rest, viewmats, radii)
-
-    ellipses = means2d, radii, depths, conics, each
-    counted = partial(intersect_tiles, *ellipses, width, height, compositing.TILE_SIZE, max_off_axis)
-    pending = counted()
-    pairs = sum(pending.pair_counts.wait())
-    capacity = int(ROOM * pairs) + 1
-    starts, ids = pending.lists(capacity)
-    splats = [value.detach().clone().requires_grad_() for value in (means2d, conics, colored(), each)]
-    drawn = [value.detach() for value in splats]
-    renders, _ = partial(compositing.rasterize_to_pixels, *splats)(width, height, starts, ids, False)
-    upstream, target = torch.rand_like(renders), torch.zeros_like(renders, dtype=torch.uint8)
-    image = renders.detach().requires_grad_()
-    return {
-        "projection": projected,
-        "projection, with gradient": lambda: torch.autograd.grad([v.sum() for v in projected()[1:]], leaves),
-        "harmonics": colored,
-        "harmonics, with gradient": lambda: torch.autograd.grad(colored().sum(), [first, rest]),
-        "tiles counted, order by depth": counted,
-        "tile lists": lambda: pending.lists(capacity),
-        "compositing": partial(composite_forward, *drawn, width, height, starts, ids),
-        "compositing's gradient": lambda: torch.autograd.grad(renders, splats, upstream, retain_graph=True),
-        "loss": lambda: photometric_loss(image, target),
-        "loss, with gradient": lambda: torch.autograd.grad(photometric_loss(image, target)[0], [image]),
-    }, pairs

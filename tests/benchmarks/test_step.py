@@ -7,14 +7,11 @@ from typing import Any
 
 import pytest
 import torch
-from interpreted import use_our_rasterizer
-from kill_and_resume import configure, set_up
 from ranks import run_ranks
 
 from benchmarks import __main__ as bench
 from benchmarks import step as steps
 from benchmarks.step import REPEATS, Growth, Step, milliseconds, pairs_of, plan, step_time
-from examples.drawn_scene.scene import write_scene
 from sadgs_ns.distributed.world import World
 from sadgs_ns.method.memory import StepSize, step_bytes
 from sadgs_ns.render.rasterization import visible
@@ -129,28 +126,3 @@ def test_one_process_prints_a_row_for_each_size(capsys: pytest.CaptureFixture[st
 def test_no_block_at_all_is_refused(capsys: pytest.CaptureFixture[str]):
     assert bench.main(["shards", "--blocks", "0"]) == 2
     assert "--blocks must be at least 1, got 0." in capsys.readouterr().err
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="Triton's interpreter is for machines without CUDA")
-def test_the_table_has_a_time_for_every_part(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    write_scene(tmp_path / "scene", 48, 36, 10, points=300)
-    trainer = set_up(configure(tmp_path / "scene", tmp_path / "runs", 3, save_every=0))
-    trainer.train()
-    trainer.config.write()
-    run = trainer.base_dir / "config.yml"
-    capsys.readouterr()
-    assert bench.main(["parts", str(run)]) == 2
-    told = "python -m benchmarks parts: the parts are our Triton kernels, which need a CUDA device.\n"
-    assert capsys.readouterr().err == told
-    use_our_rasterizer(monkeypatch)
-    monkeypatch.setattr(steps, "milliseconds", lambda function, rounds: 1.5 if function() is not None else 0.0)
-    monkeypatch.setattr(steps.kernels, "available", lambda device: True)
-    assert bench.main(["parts", str(run), "--views", "2"]) == 0
-    head, _, _, _, *rows = capsys.readouterr().out.splitlines()
-    assert head.startswith(f"{trainer.pipeline.model.num_points:,} Gaussians, 2 views of 48×36, 0.0")
-    assert [line.split("|")[1].strip() for line in rows][-2:] == ["loss", "loss, with gradient"]
-    assert len(rows) == 10 and all(float(line.split("|")[2]) == 1.5 for line in rows)
-    assert bench.main(["parts", str(tmp_path)]) == 2
-    assert "holds no checkpoint" in capsys.readouterr().err
