@@ -66,7 +66,7 @@ THIRD_PARTY_WARNINGS = (
     # Triton's interpreter makes Python numbers of arrays with one element.
     "ignore:Conversion of an array with ndim:DeprecationWarning",
     # numba, which gsply uses, finds the older TBB that open3d has loaded, and takes another of its threading layers.
-    "ignore:The TBB threading layer requires TBB version:Warning",
+    "ignore:.*The TBB threading layer requires TBB version:Warning",
     # torchmetrics makes AlexNet for LPIPS with torchvision's old arguments.
     "ignore:The parameter 'pretrained' is deprecated:UserWarning",
     "ignore:Arguments other than a weight enum:UserWarning",
