@@ -88,6 +88,12 @@ def test_the_method_knows_nothing_of_nerfstudio():
             assert not wrong, f"{name} must not import {wrong}"
 
 
+def test_the_package_knows_nothing_of_what_a_checkout_holds_beside_it():
+    for name, imported in IMPORTED.items():
+        wrong = [other for other in imported if other.partition(".")[0] in ("benchmarks", "examples", "tests")]
+        assert not wrong, f"{name} must not import {wrong}"
+
+
 def test_few_modules_lie_flat_in_the_package():
     assert len(list(ROOT.glob("*.py"))) <= MAX_FLAT
 
