@@ -127,21 +127,17 @@ def quality(model: Any, views: Iterable[View], networks: Networks) -> dict[str, 
 def view_psnr_in_viewers(model: Any, views: Iterable[View], view_psnr: list[float]) -> list[float]:
     """Return the PSNR of each view in dB as other programs' viewers show the exported file: from NEAR_PLANE on.
 
-    What the file leaves out, because it lies in the empty space before the cameras, is hidden meanwhile.
-
     Args:
         view_psnr: What `quality` measured; returned unless the model has a `near_plane` that lies beyond theirs.
     """
     near_plane = getattr(model, "near_plane", 0.0)
     if near_plane <= NEAR_PLANE:
         return view_psnr
-    opacities, space = model.opacities.data.clone(), model.empty_space
     model.near_plane = NEAR_PLANE
     try:
-        model.opacities.data[space.haze(model.means.detach(), model.scales.detach().exp())] = -torch.inf
         return quality(model, views, {})["view_psnr"]
     finally:
-        model.near_plane, model.opacities.data[:] = near_plane, opacities
+        model.near_plane = near_plane
 
 
 def fitted(image: Tensor, truth: Tensor) -> Tensor:

@@ -26,7 +26,6 @@ if TYPE_CHECKING:  # torch takes seconds, which `--help` and a wrong path need n
 
     from sadgs_ns.data.run_cameras import RunCameras
     from sadgs_ns.method.cleaning import Cleaning
-    from sadgs_ns.method.near_plane import EmptySpace
 
 Box = tuple[float, float, float, float, float, float]
 """Lowest x, y and z, and highest."""
@@ -69,9 +68,6 @@ class Export:
     voxel_size: Annotated[float | None, tyro.conf.arg(metavar="UNITS")] = None
     """Edge of a voxel of a mesh; by default two pixels at the median depth, or more where the mesh would not fit in
     memory."""
-    keep_empty_space: bool = False
-    """Keep Gaussians just before the cameras and on the paths between them, where the photos show nothing; without this
-    they are left out, because viewers would show them as haze."""
 
 
 def write_gaussians(
@@ -150,8 +146,6 @@ def export(given: Export) -> int:
         similarity = from_data(folder / TRANSFORMS_NAME).inverse()
     trained = read_checkpoint(given.run)
     params, drawing = trained.params, {"max_off_axis": _MAX_OFF_AXIS, "near_plane": trained.near_plane}
-    if trained.space is not None and not given.keep_empty_space:
-        params = _without_empty_space(params, trained.space)
     if params["features_rest"].shape[1] == 0:  # then training holds colours' logits
         params["features_dc"] = (params["features_dc"].sigmoid() - 0.5) / DEGREE_0
     cameras = None
@@ -176,19 +170,6 @@ def export(given: Export) -> int:
     except ValueError as error:
         told = f"{trained.checkpoint} holds no Gaussians that can be exported ({error}): {_REMEDY}."
         raise InputError(told) from error
-
-
-def _without_empty_space(params: dict[str, Tensor], space: EmptySpace) -> dict[str, Tensor]:
-    """Return the parameters of the Gaussians outside the empty space, and print how many lie in it."""
-    import torch
-
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    inside = space.haze(params["means"].to(device), params["scales"].to(device).exp()).cpu()
-    if not inside.any() or inside.all():
-        return params
-    number = int(inside.sum())
-    print(f"Left out: {number:,} Gaussian{'s' * (number > 1)} just before the cameras, where the photos show nothing.")
-    return {name: value[~inside] for name, value in params.items()}
 
 
 def _cleaned(
@@ -244,8 +225,6 @@ class Trained:
     `features_dc` [N, 3] and `features_rest` [N, K − 1, 3], on the CPU."""
     near_plane: float
     """Depth from which the run draws, in world units."""
-    space: EmptySpace | None
-    """The empty space before the cameras; splatfacto knows of none."""
 
 
 def read_checkpoint(run: Path) -> Trained:
@@ -261,7 +240,6 @@ def read_checkpoint(run: Path) -> Trained:
     from torch import Tensor
 
     from sadgs_ns.gsplat_internals import NEAR_PLANE
-    from sadgs_ns.method.near_plane import EmptySpace
     from sadgs_ns.plugin import checkpoints
 
     checkpoint = _checkpoint_of(run)
@@ -277,11 +255,8 @@ def read_checkpoint(run: Path) -> Trained:
             raise InputError(f"{checkpoint} holds no {name} of Gaussians, so another method made it: {_REMEDY}.")
         params[name] = value
     state = loaded.get("_model._extra_state")
-    state = state if isinstance(state, dict) else {}
-    space = state.get("empty_space")
-    return Trained(
-        checkpoint, params, state.get("near_plane", NEAR_PLANE), None if space is None else EmptySpace(**space)
-    )
+    near_plane = state.get("near_plane", NEAR_PLANE) if isinstance(state, dict) else NEAR_PLANE
+    return Trained(checkpoint, params, near_plane)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

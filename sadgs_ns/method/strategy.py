@@ -141,7 +141,8 @@ class StructureAwareStrategy(Strategy):
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
         """State to pass to the other methods; its tensors are made at the first step.
 
-        Each structure step appends its numbers of Gaussians to the list `structure_steps`.
+        Each structure step appends its numbers of Gaussians to the list `structure_steps`. With a `CameraPaths` under
+        `camera_paths`, each densification step prunes the haze near these, until densification ends.
 
         Args:
             scene_scale: Extent of the cameras in world units, as 3DGS defines it.
@@ -244,8 +245,9 @@ class StructureAwareStrategy(Strategy):
                 self._absgs_step(params, optimizers, state, iteration, views)
             if iteration == windows.refine_stop_iter:
                 if not _due(iteration, windows.structure_every):  # whose step has done so
-                    self._prune(params, optimizers, state, self._opacities(params) < FINAL_PRUNE_OPACITY)
-                for key in self._empty_state(0, torch.device("cpu")):
+                    gone = (self._opacities(params) < FINAL_PRUNE_OPACITY) | self._haze(params, state)
+                    self._prune(params, optimizers, state, gone)
+                for key in (*self._empty_state(0, torch.device("cpu")), "camera_paths"):
                     state.pop(key, None)  # nobody reads them any more: neither memory nor checkpoints should hold them
             # A reset just before the final prune would leave nothing that had time to recover.
             elif _due(iteration, windows.reset_every) and (
@@ -291,7 +293,8 @@ class StructureAwareStrategy(Strategy):
         n_before, n_low = len(is_low), int(is_low.sum())
         # The final prune, before children are made: those are fainter, and would go with what they replace.
         faint = max(self.min_opacity, FINAL_PRUNE_OPACITY if iteration == self.windows.refine_stop_iter else 0.0)
-        n_pruned = self._prune(params, optimizers, state, (opacities < faint) | (is_low & (opacities < PRUNE_OPACITY)))
+        gone = (opacities < faint) | (is_low & (opacities < PRUNE_OPACITY)) | self._haze(params, state)
+        n_pruned = self._prune(params, optimizers, state, gone)
         self._map_opacities(params, optimizers, lambda alpha: alpha.clamp_max(CLAMP_OPACITY))
         under_cap, in_memory = self._room(params, state, views)
         counts, allowed = self.split_plan(params, state, min(under_cap, in_memory))
@@ -323,7 +326,8 @@ class StructureAwareStrategy(Strategy):
         )
         if in_memory <= self._of_all(n_clone + n_split)[0] < under_cap:
             _warn_of_memory(iteration, in_memory)
-        self._prune(params, optimizers, state, self._opacities(params) < self.min_opacity)
+        gone = (self._opacities(params) < self.min_opacity) | self._haze(params, state)
+        self._prune(params, optimizers, state, gone)
         state.update(empty_gradients(len(params["means"]), params["means"].device))
 
     def _room(self, params: Params, state: Mapping[str, Any], views: Sequence[Info]) -> tuple[int, float]:
@@ -362,6 +366,14 @@ class StructureAwareStrategy(Strategy):
             if isinstance(value, Tensor):
                 state[key] = world.even_out(value)
         world.count(len(params["means"]))
+
+    @staticmethod
+    def _haze(params: Params, state: Mapping[str, Any]) -> Tensor:
+        """Gaussians that are haze near the cameras' paths, none where the state has no paths. bool [N]"""
+        means, paths = params["means"].detach(), state.get("camera_paths")
+        if paths is None:
+            return torch.zeros(len(means), dtype=torch.bool, device=means.device)
+        return paths.haze(means, params["scales"].detach().exp())
 
     @staticmethod
     def _opacities(params: Params) -> Tensor:

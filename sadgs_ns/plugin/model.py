@@ -28,6 +28,7 @@ from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
 from sadgs_ns.gsplat_internals import NEAR_PLANE
 from sadgs_ns.method.averaging import RunningMean
+from sadgs_ns.method.camera_paths import MOST_VIEWS, CameraPaths
 from sadgs_ns.method.clearance import clear_of_cameras, limit_scales
 from sadgs_ns.method.color_matrices import anchored, correct_colors, identities
 from sadgs_ns.method.initialization import (
@@ -38,7 +39,7 @@ from sadgs_ns.method.initialization import (
     starting_points,
 )
 from sadgs_ns.method.losses import photometric_loss
-from sadgs_ns.method.near_plane import EmptySpace, nearest_depths, scene_near_plane
+from sadgs_ns.method.near_plane import nearest_depths, scene_near_plane
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.outliers import POINT_SHARE, REACH
 from sadgs_ns.plugin import gaussian_maps
@@ -96,6 +97,9 @@ class SadgsModelConfig(InstantiateConfig):
     stereo_points: int | None = None
     """Points to start from beside the SfM points, at most, drawn from stereo depth of the training photos (CUDA).
     None is 150,000 where there are 3 to 60 training views, and otherwise none."""
+    clear_paths: bool | None = None
+    """Let each densification step prune what floats near the cameras' paths, which viewers of files show as haze.
+    None does so where there are at most 60 training views."""
     initial_opacity: float = POINT_OPACITY
     """Opacity at which SfM points start, in (0, 1); random ones start at 0.1.
     Half opaque ones mostly have a lower LPIPS and make more Gaussians (docs/results.md)."""
@@ -231,7 +235,6 @@ class SadgsModel(SplatfactoModel):
         self.step = 0
         self.average = RunningMean()
         self.camera_positions: Tensor | None = None  # [C, 3]
-        self.empty_space: EmptySpace | None = None
         self.near_plane = NEAR_PLANE if config.near_plane is None else config.near_plane
         """Depth in world units from which Gaussians are drawn."""
         self.infos: list[dict[str, Any]] = []
@@ -324,7 +327,6 @@ class SadgsModel(SplatfactoModel):
         depths = nearest_depths(points, viewmats, Ks, sizes)
         if self.config.near_plane is None:
             self.near_plane = scene_near_plane(depths, float(self.strategy_state["scene_scale"]))
-        self.empty_space = EmptySpace.of(points, viewmats, Ks, sizes, self.near_plane)
 
     def add_points(self, means: Tensor, colors: Tensor, scales: Tensor) -> int:
         """Start from more points, as many as the cap has room for; call before optimizers are made.
@@ -348,6 +350,19 @@ class SadgsModel(SplatfactoModel):
             parameter.data = torch.cat([parameter.data, added[name].to(parameter)])
         self.guessed = torch.cat([self.guessed, torch.zeros(room, dtype=torch.bool)])
         return room
+
+    def clear_paths(self, viewmats: Tensor) -> None:
+        """Let densification prune the haze near the cameras' paths, unless the run is told not to.
+
+        Call it once all initial Gaussians are there.
+
+        Args:
+            viewmats: World to camera, of the training views. [C, 4, 4]
+        """
+        asked = self.config.clear_paths
+        if len(viewmats) <= MOST_VIEWS if asked is None else asked:
+            surfaces = self.means.detach()[~self.guessed.to(self.device)]
+            self.strategy_state["camera_paths"] = CameraPaths.of(viewmats, self.near_plane, surfaces)
 
     def learn_color_matrices(self) -> None:
         """Learn a matrix of colours for each training view; call before optimizers are made."""
@@ -817,10 +832,12 @@ class SadgsModel(SplatfactoModel):
         """Return what a checkpoint needs besides parameters: the step, the strategy's state and the mean so far."""
         return {
             "step": self.step,
-            "strategy_state": dict(self.strategy_state),
+            "strategy_state": {
+                key: vars(value) if isinstance(value, CameraPaths) else value
+                for key, value in self.strategy_state.items()
+            },
             "average": self.average.state_dict(),
             "near_plane": self.near_plane,
-            "empty_space": None if self.empty_space is None else vars(self.empty_space),
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -828,12 +845,13 @@ class SadgsModel(SplatfactoModel):
         self.step = state["step"]
         if self.config.near_plane is None:
             self.near_plane = state.get("near_plane", self.near_plane)
-            space = state.get("empty_space")
-            self.empty_space = self.empty_space if space is None else EmptySpace(**space)
         self.strategy_state = {
             key: value.to(self.device) if isinstance(value, Tensor) else value
             for key, value in state["strategy_state"].items()
         }
+        if "camera_paths" in state["strategy_state"]:
+            paths = CameraPaths(**state["strategy_state"]["camera_paths"])
+            self.strategy_state["camera_paths"] = paths.to(self.device)
         if "average" in state:  # Earlier versions averaged nothing.
             self.average.load_state_dict(state["average"], self.device)
 

@@ -81,6 +81,7 @@ def paper_pipeline(views_per_iteration: int) -> SadgsPipelineConfig:
             max_off_axis=0.0,
             max_angular_scale=0.0,
             stereo_points=0,
+            clear_paths=False,
             color_model="none",
             strategy=StructureAwareStrategy(
                 eta_every=1,

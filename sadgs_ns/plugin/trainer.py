@@ -33,6 +33,7 @@ from sadgs_ns.plugin.optimizers import RunLengthDecaySchedulerConfig, SadgsOptim
 from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.plugin.progress import about_cpu, remove_tables, what_next
 from sadgs_ns.plugin.stereo_start import start_from_stereo
+from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 _LESS_MEMORY = (
     "lower --pipeline.model.strategy.max-gaussians or --pipeline.views-per-iteration, or take smaller images "
@@ -266,6 +267,9 @@ class SadgsTrainer(Trainer):
         config = self.config
         self._checkpoint = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
         start_from_stereo(self.pipeline, resumed=self._checkpoint is not None)
+        if self._checkpoint is None:
+            cameras = self.pipeline.datamanager.train_dataset.cameras
+            self.pipeline.model.clear_paths(viewmats_from_camera_to_world(cameras.camera_to_worlds))
         self._derive_schedule()
         self._take_one_device_if_quicker()
         if self.world is not None:

@@ -380,26 +380,6 @@ def test_what_is_taken_away_is_told_and_not_in_the_file(
     assert {tuple(row) for row in kept} <= known
 
 
-def test_what_lies_just_before_the_cameras_is_left_out_unless_it_is_to_be_kept(
-    trained: tuple[Path, SadgsTrainer], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    _, trainer = trained
-    path = next(trainer.checkpoint_dir.glob("step-*.ckpt"))
-    state = torch.load(path, weights_only=True)
-    means = state["pipeline"]["_model.gauss_params.means"]
-    pose = trainer.pipeline.datamanager.train_dataset.cameras.camera_to_worlds[0]
-    whole, before = len(means), pose[:, 3] - 0.3 * trainer.pipeline.model.near_plane * pose[:, 2]
-    means[0], state["pipeline"]["_model.gauss_params.scales"][0] = before, 0.0
-    (tmp_path / "run/nerfstudio_models").mkdir(parents=True)
-    torch.save(state, tmp_path / "run/nerfstudio_models" / path.name)
-    for options, number in (([], whole - 1), (["--keep-empty-space"], whole)):
-        assert export.main([str(tmp_path / "run"), "-o", str(tmp_path / "s.ply"), *options]) == 0
-        written = read(tmp_path / "s.ply", "x", "y", "z")
-        assert len(written) == number and (np.abs(written - before.numpy()).sum(1) < 1e-5).any() == bool(options)
-        said = "Left out: 1 Gaussian just before the cameras, where" in capsys.readouterr().out
-        assert said != bool(options)
-
-
 @pytest.mark.hard_case(
     "cleaning that takes everything away, a box that is reversed, numbers that are negative or NaN",
     "refused: names the option",

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from sadgs_ns.method import near_plane
-from sadgs_ns.method.near_plane import NEAR_SHARE, NEAREST_POINTS, UNKNOWN_SHARE, EmptySpace
+from sadgs_ns.method.near_plane import NEAR_SHARE, NEAREST_POINTS, UNKNOWN_SHARE
 from sadgs_ns.render.rasterization import rasterize
 
 EXTENT = 7.0
@@ -120,91 +120,3 @@ def test_a_faint_gaussian_before_a_camera_is_haze_without_the_plane_and_nothing_
     clean = draw(1, 0.01)
     assert (draw(2, 0.01) - clean).abs().mean() > 0.1
     torch.testing.assert_close(draw(2, 4.0), clean)
-
-
-def holds(space: EmptySpace, means: Tensor) -> Tensor:
-    """Which Gaussians are haze before its poses if they are large. bool [N]"""
-    return space.haze(means, torch.full_like(means, 1e3))
-
-
-def empty_space(points: Tensor, viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> EmptySpace:
-    return EmptySpace.of(points, viewmats, Ks, sizes, scene_near_plane(points, viewmats, Ks, sizes))
-
-
-def test_poses_lie_on_the_path_and_look_where_their_neighbours_look():
-    centres = torch.tensor([[4.0, 0, 0], [0, 4, 0], [-4, 0, 0], [0, -4, 0]])
-    viewmats = torch.cat([looking_at_the_origin(centres), looking_at_the_origin(1.01 * centres[:1])])
-    poses, ends, paths = near_plane.poses_of_path(viewmats, spacing=1.5)
-    # No two of the four look in similar directions; the first and the fifth are nearer than the spacing.
-    assert torch.equal(poses, viewmats) and ends.tolist() == [0, 1, 2, 3, 4] and (paths == -1).all()
-    angles = torch.deg2rad(torch.arange(0, 181, 30).float())
-    arc = looking_at_the_origin(4 * torch.stack([angles.cos(), angles.sin(), 0 * angles], dim=1))
-    poses, ends, paths = near_plane.poses_of_path(arc, spacing=1.1)
-    added = poses[7:]
-    rotations = added[:, :3, :3]
-    torch.testing.assert_close(rotations @ rotations.mT, torch.eye(3).expand_as(rotations), atol=1e-5, rtol=0)
-    positions = -(rotations.mT @ added[:, :3, 3:])[..., 0]
-    assert len(added) > 0 and (positions.norm(dim=1) < 4).all() and (positions.norm(dim=1) > 3.4).all()
-    towards = torch.nn.functional.cosine_similarity(rotations[:, 2], -positions)
-    assert (towards > 0.97).all(), "a pose between two that look at the origin should look there, too"
-    assert (ends[7:] < 7).all() and (paths[7:] >= 0).all()
-
-
-def test_gaussians_before_the_cameras_and_between_them_are_in_the_empty_space_and_surfaces_are_not():
-    cameras, points = row_of_cameras(), wall(8.0)  # 2 apart; the plane is at 4, and poses are 1 apart
-    space = empty_space(points, *cameras)
-    assert not holds(space, points).any()
-    x = torch.linspace(0, 10, 41)
-    before = torch.stack([x, 0 * x, torch.full_like(x, 1.1)], dim=1)
-    assert holds(space, before).all()
-    assert not holds(space, before - torch.tensor([0.0, 0, 2])).any(), "behind the cameras nothing is known"
-    assert not holds(space, before + torch.tensor([0.0, 30, 0])).any(), "nor beside them"
-    assert not holds(space, before + torch.tensor([0.0, 0, 4.0])).any(), "nor beyond the plane"
-
-
-@pytest.mark.hard_case(
-    "a wall that begins at an image's border",
-    "is not in the empty space before the cameras, whose large Gaussians files leave out",
-)
-def test_a_wall_that_begins_at_the_image_s_border_is_not_in_the_empty_space():
-    """A corridor along z: the nearest that a camera sees of its walls is where they enter its image."""
-    y, z = torch.meshgrid(torch.linspace(-0.3, 0.3, 15), torch.linspace(0, 20, 400), indexing="ij")
-    side = torch.stack([torch.full_like(y, 1.0), y, z], dim=-1).reshape(-1, 3)
-    walls = torch.cat([side, side * torch.tensor([-1.0, 1, 1])])
-    viewmats = torch.eye(4).repeat(8, 1, 1)
-    viewmats[:, 2, 3] = -torch.arange(8)
-    _, Ks, sizes = row_of_cameras(8)
-    space = empty_space(walls, viewmats, Ks, sizes)
-    assert 0.9 < space.near < 1.2
-    assert not holds(space, walls).any()
-    middle = torch.tensor([[0.0, 0.0, 3.2], [0.1, 0.1, 5.6]])
-    assert holds(space, middle).all()
-
-
-@pytest.mark.hard_case(
-    "a wall between two rooms with cameras on both sides", "is not in the empty space before the cameras"
-)
-def test_a_wall_between_two_rooms_is_not_in_the_empty_space():
-    """Cameras on both sides of a wall look the same way: the path between them leads through the wall."""
-    points = torch.cat([wall(3.0, middle=0.0), wall(14.0, middle=0.0)])
-    viewmats = torch.eye(4).repeat(2, 1, 1)
-    viewmats[1, 2, 3] = -6.0
-    _, Ks, sizes = row_of_cameras(2)
-    space = empty_space(points, viewmats, Ks, sizes)
-    assert len(space.viewmats) == 2, "the path through the wall should be left out"
-    assert not holds(space, points).any()
-    assert holds(space, torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.0, 6.5]])).all()
-
-
-@pytest.mark.parametrize("number", [0, 1])
-def test_without_points_or_with_one_camera_there_is_a_space_all_the_same(number: int):
-    viewmats, Ks, sizes = row_of_cameras(1)
-    space = empty_space(wall(8.0) if number else torch.zeros(0, 3), viewmats, Ks, sizes)
-    assert space.near == pytest.approx(4.0 if number else UNKNOWN_SHARE * EXTENT) and len(space.viewmats) == 1
-
-
-def test_gaussians_that_look_small_from_the_cameras_are_no_haze():
-    space = empty_space(wall(8.0), *row_of_cameras())
-    before = torch.tensor([[4.0, 0.1, 1.5]]).repeat(4, 1)
-    scales = torch.tensor([[0.01, 0.4, 0.01], [0.1, 0.1, 0.1], [0.4, 0.4, 0.4], [torch.nan] * 3])
-    assert space.haze(before, scales).tolist() == [True, False, True, False]

@@ -17,7 +17,7 @@ from scenes import HEIGHT, POINTS, WIDTH
 
 from examples.drawn_scene.scene import room_surfaces
 from sadgs_ns.errors import InputError
-from sadgs_ns.plugin import datamanager, pipeline, presets, stereo_start
+from sadgs_ns.plugin import datamanager, model, pipeline, presets, stereo_start
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 
@@ -101,7 +101,29 @@ def test_points_lie_where_two_views_are_not_masked(config: Any, scene: Path, tmp
 
 def test_the_paper_s_presets_start_as_the_paper_says():
     models: list[Any] = [p.config.pipeline.model for p in (presets.sadgs_paper, presets.sadgs_paper_indoor)]
-    assert [(m.stereo_points, m.near_plane) for m in models] == [(0, None)] * 2
+    assert [(m.stereo_points, m.clear_paths, m.near_plane) for m in models] == [(0, False, None)] * 2
+
+
+@pytest.mark.parametrize(
+    ("asked", "most", "kept"), [(None, 60, True), (None, 6, False), (True, 6, True), (False, 60, False)]
+)
+def test_the_paths_of_few_cameras_are_kept_clear_unless_somebody_says_otherwise(
+    asked: bool | None, most: int, kept: bool, config: Any, monkeypatch: pytest.MonkeyPatch
+):
+    config.pipeline.model.stereo_points, config.pipeline.model.clear_paths = 0, asked
+    monkeypatch.setattr(model, "MOST_VIEWS", most)
+    assert ("camera_paths" in set_up(config).pipeline.model.strategy_state) == kept
+
+
+def test_a_checkpoint_holds_the_paths(config: Any, tmp_path: Path):
+    config.pipeline.model.stereo_points = 0
+    started: Any = set_up(config).pipeline.model
+    torch.save(started.get_extra_state(), tmp_path / "state")
+    paths = started.strategy_state.pop("camera_paths")
+    started.set_extra_state(torch.load(tmp_path / "state", weights_only=True))
+    assert len(paths.points) > 0 and paths.near.any()
+    for name, value in vars(paths).items():
+        torch.testing.assert_close(getattr(started.strategy_state["camera_paths"], name), value, rtol=0, atol=0)
 
 
 def test_a_negative_number_of_points_is_refused(config: Any):

@@ -1,0 +1,131 @@
+"""The space along the cameras' paths, which stays empty while a run densifies.
+
+Nothing stands where somebody walked with a camera. Yet a faint Gaussian may float there, which makes up for something
+in a training view or two. A view from beside it shows it as haze over the whole image. Viewers of exported files show
+it, too, since they draw what is nearer than the run's near plane. Real surfaces near a path have SfM points.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+REACH = 1.5
+"""Distance from a path up to which space is empty, in near planes. With 2, one view of a flight lost 2.6 dB
+(docs/results.md#exported-files)."""
+HAZE_ANGLE = 0.1
+"""A Gaussian is haze if its longest standard deviation is more than this share of its distance from a path. With 0.2
+some of it stayed."""
+SUPPORT = 2.0
+"""A Gaussian stands for a surface if a point to start from lies within this many of its standard deviations."""
+MOST_VIEWS = 60
+"""Training views up to which a run prunes it, where nobody says. Of more views, files lost nothing without."""
+NEIGHBOURS = 4
+"""A path leads from each camera to so many of the others, the nearest that look in a similar direction."""
+SIMILAR_DEGREES = 60.0
+"""Largest angle between the viewing axes of two cameras with a path between them."""
+_CELLS = 32
+"""Cells on each side of a grid that tells which Gaussians may be near a path."""
+_PAIRS = 2**21
+"""Pairs of a point and a path, or of two points, that are computed at a time, in arrays of 25 MB."""
+
+
+@dataclass(frozen=True)
+class CameraPaths:
+    """E straight paths between cameras, and the points of surfaces near them."""
+
+    starts: Tensor
+    """World units. [E, 3]"""
+    ends: Tensor
+    """World units. [E, 3]"""
+    reach: float
+    """Distance up to which the space around the paths is empty, in world units."""
+    points: Tensor
+    """Points of surfaces that may be near enough to count. [P, 3]"""
+    corner: Tensor
+    """Smallest coordinates of a grid around the paths. [3]"""
+    cell: float
+    """Side of its cells, which are cubes."""
+    near: Tensor
+    """Which of its cells reach into the empty space. bool [32, 32, 32]"""
+
+    @staticmethod
+    def of(viewmats: Tensor, near_plane: float, points: Tensor) -> CameraPaths:
+        """Connect neighbouring cameras.
+
+        Args:
+            viewmats: World to camera. [C, 4, 4]
+            near_plane: Of the scene, in world units, > 0.
+            points: Points on surfaces, those that a run starts from. [P, 3]
+        """
+        rotations = viewmats[:, :3, :3].double().cpu()
+        centres = -(rotations.mT @ viewmats[:, :3, 3:].double().cpu())[..., 0]  # [C, 3]
+        distances = torch.cdist(centres, centres)
+        unlike = rotations[:, 2] @ rotations[:, 2].T < math.cos(math.radians(SIMILAR_DEGREES))
+        distances = distances.masked_fill(unlike, torch.inf).fill_diagonal_(torch.inf)
+        nearest = distances.topk(min(NEIGHBOURS, len(centres) - 1), largest=False)
+        first = torch.arange(len(centres))[:, None].expand_as(nearest.indices)
+        pairs = torch.stack([first, nearest.indices], dim=-1)[nearest.values.isfinite()].sort(dim=1).values
+        pairs = torch.cat([torch.arange(len(centres))[:, None].expand(-1, 2), pairs.unique(dim=0)])  # [E, 2]
+        starts, ends = centres[pairs].to(points).unbind(dim=1)
+        reach = REACH * near_plane
+        corner, far = starts.amin(dim=0) - reach, starts.amax(dim=0) + reach
+        cell = float((far - corner).max()) / _CELLS
+        middles = (torch.arange(_CELLS, device=points.device) + 0.5) * cell
+        grid = corner + torch.stack(torch.meshgrid(middles, middles, middles, indexing="ij"), dim=-1)  # [32, 32, 32, 3]
+        near = _distances(grid.view(-1, 3), starts, ends).view(grid.shape[:3]) <= reach + cell * math.sqrt(3) / 2
+        close = _distances(points, starts, ends) <= (1 + 2 * SUPPORT) * reach
+        return CameraPaths(starts, ends, reach, points[close], corner, cell, near)
+
+    def to(self, device: torch.device) -> CameraPaths:
+        """Return the same on a device."""
+        moved = {name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **moved)
+
+    @torch.no_grad()
+    def haze(self, means: Tensor, scales: Tensor) -> Tensor:
+        """Tell which Gaussians are haze near a path.
+
+        Args:
+            means: Centres in world units. [N, 3]
+            scales: Standard deviations in world units. [N, 3]
+
+        Returns:
+            bool [N], False where a centre is not finite.
+        """
+        cells = ((means - self.corner) / self.cell).nan_to_num(-1.0).clamp(-1, _CELLS).floor().long()  # [N, 3]
+        inside = ((cells >= 0) & (cells < _CELLS)).all(dim=1)
+        x, y, z = cells.clamp(0, _CELLS - 1).unbind(dim=1)
+        found = (inside & self.near[x, y, z]).nonzero()[:, 0]  # [n]
+        sizes, distances = scales[found].amax(dim=1), _distances(means[found], self.starts, self.ends)
+        large = (distances < self.reach) & (sizes > HAZE_ANGLE * distances)
+        found, sizes = found[large], sizes[large].clamp_max(2 * self.reach)
+        step = max(_PAIRS // max(len(self.points), 1), 1)
+        ways = [_least_distances(part, self.points) for part in means[found].split(step)]
+        haze = torch.zeros(len(means), dtype=torch.bool, device=means.device)
+        haze[found] = torch.cat([*ways, sizes[:0]]) > SUPPORT * sizes
+        return haze
+
+
+def _least_distances(positions: Tensor, points: Tensor) -> Tensor:
+    """Distances of positions [n, 3] from the nearest of points [P, 3], infinite where there are none. [n]"""
+    return (
+        torch.cdist(positions, points).amin(dim=1)
+        if len(points)
+        else positions.new_full(positions.shape[:1], torch.inf)
+    )
+
+
+def _distances(positions: Tensor, starts: Tensor, ends: Tensor) -> Tensor:
+    """Distances of positions [N, 3] from the nearest of the straight paths [E, 3] each. [N]"""
+    ways = ends - starts  # [E, 3]
+    squares = ways.square().sum(dim=1).clamp_min(torch.finfo(ways.dtype).tiny)
+    least = [positions[:0, 0]]
+    for part in positions.split(max(_PAIRS // len(starts), 1)):
+        away = part[:, None] - starts  # [n, E, 3]
+        along = ((away * ways).sum(dim=2) / squares).clamp(0, 1)
+        least.append(torch.addcmul(away, along[..., None], ways, value=-1).norm(dim=2).amin(dim=1))
+    return torch.cat(least)

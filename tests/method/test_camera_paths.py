@@ -1,0 +1,142 @@
+"""Haze along the cameras' paths: what floats there is found, and real surfaces are not."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from sadgs_ns.method.camera_paths import HAZE_ANGLE, REACH, SUPPORT, CameraPaths
+from sadgs_ns.method.strategy import StructureAwareStrategy
+
+NEAR = 2.0
+"""The near plane: space is empty up to 3 from the paths."""
+
+
+def row_of_cameras(number: int = 6, spacing: float = 2.0) -> Tensor:
+    """Viewmats of cameras in a row along x that look along z. [number, 4, 4]"""
+    viewmats = torch.eye(4).repeat(number, 1, 1)
+    viewmats[:, 0, 3] = -spacing * torch.arange(number)
+    return viewmats
+
+
+def wall(depth: float) -> Tensor:
+    """Points on a plane across the axes of the cameras. [P, 3]"""
+    x, y = torch.meshgrid(torch.linspace(-10, 20, 121), torch.linspace(-10, 10, 81), indexing="ij")
+    return torch.stack([x, y, torch.full_like(x, depth)], dim=-1).view(-1, 3)
+
+
+def haze(paths: CameraPaths, *places: tuple[float, float, float], scale: float = 0.5) -> list[bool]:
+    return paths.haze(torch.tensor(places), torch.full((len(places), 3), scale)).tolist()
+
+
+def reference(paths: CameraPaths, points: Tensor, means: Tensor, scales: Tensor) -> Tensor:
+    """`CameraPaths.haze` in float64, Gaussian by Gaussian and path by path, without a grid."""
+    found = []
+    for mean, scale in zip(means.double(), scales.double().amax(dim=1).tolist(), strict=True):
+        distance = math.inf
+        for start, end in zip(paths.starts.double(), paths.ends.double(), strict=True):
+            way = end - start
+            along = float((mean - start) @ way) / float(way @ way) if way.any() else 0.0
+            distance = min(distance, float((mean - start - min(max(along, 0.0), 1.0) * way).norm()))
+        support = SUPPORT * min(scale, 2 * paths.reach)
+        alone = float((points.double() - mean).norm(dim=1).min()) > support
+        found.append(distance < paths.reach and scale > HAZE_ANGLE * distance and alone)
+    return torch.tensor(found)
+
+
+@pytest.mark.hard_case(
+    "faint Gaussians between the cameras, which viewers of exported files draw",
+    "pruned while the run densifies, in runs of up to 60 views",
+)
+def test_what_floats_on_the_cameras_paths_is_haze_and_nothing_else_is():
+    paths = CameraPaths.of(row_of_cameras(), NEAR, wall(8.0))
+    assert paths.reach == REACH * NEAR
+    floating = [(x, y, z) for x in (-0.5, 3.0, 10.5) for y in (0.0, 1.5) for z in (-2.0, 0.1, 2.0)]
+    assert all(haze(paths, *floating))
+    assert not any(haze(paths, *floating[3:6], scale=0.1)), "they look small from each camera and each place between"
+    assert haze(paths, (3.0, 0.0, 0.5), scale=0.1) == [True]
+    others = [(3.0, 0.0, 3.1), (3.0, 3.1, 0.0), (-3.1, 0.0, 0.0), (3.0, 0.0, 8.0), (3.0, 0.0, 300.0)]
+    assert not any(haze(paths, *others, (float("nan"), 0.0, 0.0), (float("inf"), 0.0, 0.0)))
+
+
+@pytest.mark.hard_case(
+    "a wall between two rooms with cameras on both sides, and a wall beside the camera",
+    "their Gaussians stay, because points to start from lie near them",
+)
+def test_gaussians_of_surfaces_stay_however_near_the_path_leads_them():
+    viewmats = torch.eye(4).repeat(2, 1, 1)
+    viewmats[1, 2, 3] = -6.0
+    paths = CameraPaths.of(viewmats, NEAR, wall(3.0))  # The path leads through the wall.
+    assert haze(paths, (0.1, 0.1, 3.1), (0.1, 0.1, 2.4), (0.1, 0.1, 1.0)) == [False, False, True]
+    beside = wall(0.0)[:, [0, 2, 1]] + torch.tensor([0.0, -1.0, 0.0])
+    paths = CameraPaths.of(row_of_cameras(), NEAR, beside)
+    assert haze(paths, (3.0, -1.1, 0.5), (3.0, 1.1, 0.5)) == [False, True]
+
+
+def test_random_gaussians_are_found_as_a_loop_in_float64_finds_them():
+    generator = torch.Generator().manual_seed(0)
+    viewmats = row_of_cameras(8)
+    viewmats[:, 1:3, 3] = torch.rand((8, 2), generator=generator)
+    points = 30 * torch.rand((300, 3), generator=generator) - torch.tensor([8.0, 15.0, 15.0])
+    means = torch.rand((3000, 3), generator=generator) * torch.tensor([22.0, 9.0, 9.0]) - torch.tensor([4.0, 4.5, 4.5])
+    scales = 10 ** (2 * torch.rand((3000, 3), generator=generator) - 1.5)
+    paths = CameraPaths.of(viewmats, NEAR, points)
+    expected = reference(paths, points, means, scales)
+    assert torch.equal(paths.haze(means, scales), expected) and 300 < int(expected.sum()) < 1500
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e4])
+def test_a_scene_in_other_units_has_the_same_haze(factor: float):
+    generator = torch.Generator().manual_seed(1)
+    viewmats, points = row_of_cameras(), wall(4.0)
+    means = 12 * torch.rand((500, 3), generator=generator) - torch.tensor([1.0, 6.0, 6.0])
+    scales = torch.rand((500, 3), generator=generator)
+    expected = CameraPaths.of(viewmats, NEAR, points).haze(means, scales)
+    viewmats[:, :3, 3] *= factor
+    assert torch.equal(
+        CameraPaths.of(viewmats, factor * NEAR, factor * points).haze(factor * means, factor * scales), expected
+    )
+
+
+def test_paths_lead_to_the_nearest_cameras_that_look_in_a_similar_direction():
+    viewmats = row_of_cameras(7)
+    viewmats[6, :3, :3] = torch.diag(torch.tensor([-1.0, 1.0, -1.0]))  # The last one looks back.
+    viewmats[6, 0, 3] = 12.0
+    paths = CameraPaths.of(viewmats, NEAR, wall(8.0))
+    lengths = (paths.ends - paths.starts).norm(dim=1)
+    assert (lengths == 0).sum() == 7, "each camera is a path of its own"
+    assert (
+        len({tuple(row) for row in torch.cat([paths.starts, paths.ends], 1)[lengths > 0].tolist()}) == len(lengths) - 7
+    )
+    assert paths.ends[lengths > 0].amax() == 10 and lengths.max() == 8
+    assert haze(paths, (12.0, 0.0, 2.5), (11.0, 2.85, 0.0)) == [True, False]
+
+
+@pytest.mark.parametrize("points", [0, 3])
+def test_a_single_camera_or_two_in_one_place_have_a_space_all_the_same(points: int):
+    for number in (1, 2):
+        paths = CameraPaths.of(row_of_cameras(number, spacing=0.0), NEAR, wall(8.0)[:points])
+        assert haze(paths, (0.0, 0.0, 1.0), (0.0, 0.0, 4.0)) == [True, False] and not len(paths.points)
+        assert len(paths.haze(torch.zeros(0, 3), torch.zeros(0, 3))) == 0
+
+
+@pytest.mark.parametrize("iteration", [300, 500, 1600], ids=["AbsGS", "structure", "last"])
+def test_densification_steps_prune_haze_and_the_last_one_forgets_the_paths(iteration: int):
+    strategy = StructureAwareStrategy(reset_every=0, absgs_every=100, structure_every=500)
+    means = torch.tensor([[3.0, 0.0, 1.0], [3.0, 0.0, 8.0], [0.0, 0.0, 12.0]])
+    params = torch.nn.ParameterDict(
+        {"means": means, "scales": torch.zeros(3, 3), "quats": torch.eye(4)[:3], "opacities": torch.full((3,), 2.0)}
+    )
+    optimizers: dict[str, torch.optim.Optimizer] = {name: torch.optim.Adam([params[name]]) for name in params}
+    state: dict[str, Any] = strategy.initialize_state() | {
+        "camera_paths": CameraPaths.of(row_of_cameras(), NEAR, wall(8.0))
+    }
+    StructureAwareStrategy._ensure_statistics(params, state)
+    strategy.step_post_backward(params, optimizers, state, iteration - 1, [])
+    assert params["means"].tolist() == means[1:].tolist() and ("camera_paths" in state) == (iteration < 1600)
+    for step in state.get("structure_steps", []):
+        assert (step["before"], step["pruned"], step["after"]) == (3, 1, 2)
