@@ -230,7 +230,7 @@ def _make(scene: _Scene, report: Report) -> Summary:
         groups = [[photo.name] for photo in photos] if given.camera_per_photo else photos_by_camera(photos)
         if scene.added:  # An interrupted run may have made a model without some of them.
             shutil.rmtree(work / scene.model, ignore_errors=True)
-        arguments = (folder, groups, matching, given.max_size, work / "alpha", work, scene.model, scene.base)
+        arguments = (folder, groups, matching, given.max_size, work, scene.model, scene.base)
         summary = Summary(**run_colmap("make_model", *arguments, folder=work, report=report))
         _publish(work / "undistorted", given.out, bool(scene.added))
         if summary.is_poor and not scene.added:  # the features serve another way of matching

@@ -80,8 +80,13 @@ def find_photos(source: Path, out: Path) -> list[str]:
 
 def photo_stamps(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
     """Return size in bytes, time of the last change in ns and checksum of photos, by which they are known again."""
+
+    def stamp(name: str) -> list[int]:
+        status = (folder / name).stat()
+        return [status.st_size, status.st_mtime_ns, zlib.crc32((folder / name).read_bytes())]
+
     with _threads() as pool:
-        return dict(zip(names, pool.map(lambda name: _stamp(folder / name), names), strict=True))
+        return dict(zip(names, pool.map(stamp, names), strict=True))
 
 
 def changed_photos(folder: Path, stamps: Mapping[str, Sequence[int]]) -> list[str]:
@@ -89,28 +94,10 @@ def changed_photos(folder: Path, stamps: Mapping[str, Sequence[int]]) -> list[st
 
     Only those of another time are read: copying a photo changes its time and nothing else.
     """
-
-    def differs(name: str) -> bool:
-        size, time, checksum = stamps[name]
-        try:
-            status = (folder / name).stat()
-        except OSError:
-            return False  # It was removed, which others tell of.
-        if (status.st_size, status.st_mtime_ns) == (size, time):
-            return False
-        return status.st_size != size or _checksum(folder / name) != checksum
-
-    with _threads() as pool:
-        return [name for name, changed in zip(stamps, pool.map(differs, stamps), strict=True) if changed]
-
-
-def _stamp(path: Path) -> list[int]:
-    status = path.stat()
-    return [status.st_size, status.st_mtime_ns, _checksum(path)]
-
-
-def _checksum(path: Path) -> int:
-    return zlib.crc32(path.read_bytes())
+    there = {name: (folder / name).stat() for name in stamps if (folder / name).exists()}
+    touched = [name for name, now in there.items() if [now.st_size, now.st_mtime_ns] != list(stamps[name][:2])]
+    now = photo_stamps(folder, touched)
+    return [name for name in touched if (now[name][0], now[name][2]) != (stamps[name][0], stamps[name][2])]
 
 
 def read_photos(folder: Path, names: Sequence[str], report: Callable[[str, int, int], None]) -> list[Photo]:
@@ -175,9 +162,8 @@ def _read_photo(folder: Path, name: str) -> Photo:
             position.keys() >= {ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLongitude, ExifTags.GPS.GPSAltitude},
             image.has_transparency_data,
         )
-        image.draft(
-            "RGB", (image.width // 8, image.height // 8)
-        )  # an eighth of a JPEG's size tells whether it is whole
+        # An eighth of a JPEG's size tells whether it is whole.
+        image.draft("RGB", (image.width // 8, image.height // 8))
         image.load()
     return photo
 

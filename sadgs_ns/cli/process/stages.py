@@ -57,7 +57,6 @@ def make_model(
     groups: Sequence[Sequence[str]],
     matching: Matching,
     max_size: int,
-    alphas: Path,
     work: Path,
     model: str,
     base: str | None,
@@ -71,9 +70,8 @@ def make_model(
         groups: The photos' names, those of one camera together.
         matching: Which pairs are matched; any but "auto".
         max_size: Longest side of the undistorted photos in px; 0 keeps them as they are.
-        alphas: Folder of the photos' opacities as `write_alpha` writes it; they are undistorted into
-            `work/undistorted/alpha`.
-        work: Folder for all files; what an interrupted run left there is used again.
+        work: Folder for all files; what an interrupted run left there is used again. It has the photos' opacities in
+            `alpha`, as `write_alpha` writes them, which are undistorted, too.
         model: Name of the model's folder in `work`.
         base: Name of the earlier model's folder in `work`, whose cameras stay as they are; None begins anew.
 
@@ -90,7 +88,7 @@ def make_model(
         match(names, database, work / "pairs.txt", matching, gpu.result())
         place_cameras(photos, names, database, models, made, None if base is None else work / base)
     known = set() if base is None else registered_photos(pycolmap.Reconstruction(work / base))
-    undistort(photos, alphas, made, work / "undistorted", max_size, known)
+    undistort(photos, work / "alpha", made, work / "undistorted", max_size, known)
     describe(work / "undistorted")
     return dataclasses.replace(summarize(names, made, database), matching=matching)
 
