@@ -159,7 +159,8 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
         with phases.replaced(config.pipeline.model._target, "populate_modules", timed("initialization")):
             trainer.setup(test_mode="test")  # "val" would evaluate on blender's validation views
     seconds["setup_seconds"] -= seconds["initialization_seconds"]
-    if devices > 1 and getattr(trainer, "world", None) is None:
+    world = getattr(trainer, "world", None)
+    if devices > 1 and (world is None or world.alone):
         raise ValueError(
             f"row {job.row.label!r} on {job.scene.name!r} trains on one device, since its steps have few pixels or its "
             "method knows one only: measure it with one GPU, or set share_always to true."

@@ -74,7 +74,7 @@ class Step:
         height: px.
         views: Number V of views of a step.
         device: Where this process computes.
-        world: The processes; None for one process.
+        world: The processes; None for this one alone.
         blocks: Number of shells, at least 1, each of which has as many Gaussians and views as another where it divides
             their numbers. Each process has as many Gaussians of a block as another process.
     """
@@ -89,9 +89,9 @@ class Step:
         world: World | None = None,
         blocks: int = 1,
     ) -> None:
-        self.world, self.width, self.height, self.views = world, width, height, views
+        self.world, self.width, self.height, self.views = world or World(), width, height, views
         device = torch.device(device)
-        part = slice(0, gaussians) if world is None else world.take_even_part(gaussians)
+        part = self.world.take_even_part(gaussians)
         number = part.stop - part.start
         generator = torch.Generator(device).manual_seed(part.start)
 
@@ -140,7 +140,7 @@ class Step:
             p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid().squeeze(-1),
             (p["features_dc"], p["features_rest"]), self.viewmats, self.Ks, self.width, self.height,
         )  # fmt: skip
-        if self.world is not None:
+        if not self.world.alone:
             self.bands, self.start, info = rasterize_together(self.world, *splats, sh_degree=3, absgrad=True)
             drawn = [colors for _, colors, _ in self.bands]
         else:
@@ -154,7 +154,7 @@ class Step:
 
     def loss(self, drawn: list[Tensor]) -> Tensor:
         """The photometric loss of what `draw` gave; of several processes each has a part."""
-        if self.world is None:
+        if self.world.alone:
             return photometric_loss(drawn[0], self.images)[0]
         loss = self.start
         for (band, _, _), colors in zip(self.bands, drawn, strict=True):
@@ -182,7 +182,7 @@ class Step:
 
     def observe(self) -> None:
         """One observation of η."""
-        jitter = None if self.world is None else self.world.rand(self.views)
+        jitter = self.world.rand(self.info["means2d"])
         observe(self.state, self.params, self.info, jitter=jitter)  # type: ignore[arg-type]
 
     def optimize(self) -> None:
@@ -375,7 +375,7 @@ class Together:
         if self.blocks < 1:
             raise ValueError(f"--blocks must be at least 1, got {self.blocks}.")
         number, local = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("LOCAL_RANK", "0"))
-        device, world = torch.device("cpu"), None
+        device, world = torch.device("cpu"), World()
         if torch.cuda.is_available():
             device = torch.device("cuda", local)
             torch.cuda.set_device(device)  # NCCL, and Triton, take the current device.
@@ -387,17 +387,17 @@ class Together:
             step = Step(gaussians, *size_of(megapixels), views, device, world, self.blocks)
             time, peak = step_time(step, self.repeats)
             peaks = torch.tensor([peak], device=device)
-            peaks = peaks if world is None else world.gather(peaks)[:, 0]
+            peaks = world.gather(peaks)[:, 0]
             each = ", ".join(f"{peak:.2f}" for peak in peaks.tolist())
             size = (str(number), f"{gaussians:,}", f"{megapixels:g}", str(views), str(self.blocks))
             lines.append((*size, f"{time:.2f}", each))
             del step
-        if world is None or world.rank == 0:
+        if world.rank == 0:
             name = torch.cuda.get_device_name() if device.type == "cuda" else "CPU"
             print(f"{number} × {name}, torch {torch.__version__}\n")
             header = ("devices", "Gaussians", "megapixels", "views", "blocks", "ms a step", "peak GB of each device")
             print(grid(header, lines, names=0), flush=True)
-        if world is not None:
+        if not world.alone:
             dist.destroy_process_group()
         return 0
 
@@ -412,8 +412,7 @@ def step_time(step: Step, repeats: int) -> tuple[float, float]:
     def steps() -> None:
         for _ in range(repeats):
             step()
-        if step.world is not None:
-            step.world.all(True)
+        step.world.all(True)
 
     for _ in range(3):  # kernels are compiled
         step()

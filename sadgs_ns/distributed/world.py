@@ -18,9 +18,10 @@ _ROWS_AT_ONCE = 1 << 20
 
 
 class World:
-    """The shards of a splat: the Gaussians of all processes, in the order of their ranks, are those of one process.
+    """The processes that train a splat together, each of which holds a shard of it.
 
-    Every method must be called by all processes, in the same order.
+    The Gaussians of all processes, in the order of their ranks, are those of one process. Every method must be called
+    by all processes, in the same order. A world of one process asks nobody: its sums return their argument.
 
     Attributes:
         rank: Number of this process, from 0.
@@ -31,11 +32,13 @@ class World:
         heard: What any process has asked for since it was last set to 0.
 
     Args:
-        device: Where this process computes; for CUDA it must be torch's current device.
+        device: Where this process computes; for CUDA it must be torch's current device. None makes a world of this
+            process alone.
     """
 
-    def __init__(self, device: torch.device) -> None:
-        self.rank, self.num_ranks, self.device = dist.get_rank(), dist.get_world_size(), device
+    def __init__(self, device: torch.device | None = None) -> None:
+        self.rank, self.num_ranks = (0, 1) if device is None else (dist.get_rank(), dist.get_world_size())
+        self.device = torch.device("cpu") if device is None else device
         self.sizes: list[int] = [0] * self.num_ranks
         self.request = self.heard = 0
         self._agreed: dict[str, bool] = {}
@@ -50,6 +53,11 @@ class World:
         if question not in self._agreed:
             self._agreed[question] = self.all(answer())
         return self._agreed[question]
+
+    @property
+    def alone(self) -> bool:
+        """Whether this process holds all Gaussians."""
+        return self.num_ranks == 1
 
     @property
     def total(self) -> int:
@@ -92,6 +100,8 @@ class World:
         Returns:
             [R, n]
         """
+        if self.alone:
+            return values[None]
         gathered = values.new_empty(self.num_ranks * len(values))
         dist.all_gather_into_tensor(gathered, values)
         return gathered.view(self.num_ranks, -1)
@@ -102,8 +112,13 @@ class World:
         Args:
             values: Of one shape everywhere.
         """
-        dist.all_reduce(values)
+        if not self.alone:
+            dist.all_reduce(values)
         return values
+
+    def sums(self, *numbers: int) -> list[int]:
+        """Return the sums of whole numbers over the processes; one process needs no tensor for them."""
+        return list(numbers) if self.alone else self.sum(torch.tensor(numbers, device=self.device)).tolist()
 
     def broadcast(self, values: Tensor, rank: int) -> None:
         """Overwrite a tensor, in place, with what one process passes.
@@ -112,32 +127,36 @@ class World:
             values: Contiguous, and of one shape everywhere.
             rank: That process.
         """
-        dist.broadcast(values, rank)
+        if not self.alone:
+            dist.broadcast(values, rank)
 
     def least(self, number: float) -> float:
         """Return the least of the numbers that the processes pass, of which any may be infinite."""
+        if self.alone:
+            return number
         return float(self.gather(torch.tensor([number], dtype=torch.float64, device=self.device)).min())
 
     def all(self, condition: bool) -> bool:
         """Tell whether a condition holds in all processes."""
         return self.least(float(condition)) > 0
 
-    def rand(self, num_views: int, generator: torch.Generator | None = None) -> Tensor:
+    def rand(self, like: Tensor) -> Tensor:
         """Draw the part of this process of what one process would draw for all Gaussians.
 
         All processes draw all numbers, so that random generators in the same state stay so. On the CPU the numbers are
-        those that `torch.rand((num_views, total, 2))` draws.
+        those that `torch.rand((V, total, 2))` draws.
 
         Args:
-            num_views: Number V of views.
-            generator: Source of the numbers; None is torch's own.
+            like: A tensor of this process's Gaussians in V views, for its shape and device. [V, N, 2]
 
         Returns:
             In [0, 1). [V, N, 2]
         """
+        if self.alone:
+            return torch.rand(like.shape, device=like.device)
         kept = []
-        for _ in range(num_views):
-            drawn = (torch.rand((n, 2), generator=generator, device=self.device) for n in self.sizes)
+        for _ in range(len(like)):
+            drawn = (torch.rand((n, 2), device=like.device) for n in self.sizes)
             kept += [numbers for rank, numbers in enumerate(drawn) if rank == self.rank]
         return torch.stack(kept)
 

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import torch
 from gsplat.strategy.base import Strategy
@@ -100,9 +100,9 @@ class StructureAwareStrategy(Strategy):
     # These two are no options, so that they have no annotation, which would make them fields.
     run_length = 3000
     """Iterations of the run, which `fit_to_run` sets: windows that are None follow it."""
-    world = cast("World | None", None)
-    """The processes among which the Gaussians are shared out; None where one process has all.
-    The cap and the ranking of what may grow are then those of all, and densification ends with equal shards."""
+    world = World()
+    """The processes among which the Gaussians are shared out.
+    The cap and the ranking of what may grow are those of all, and densification ends with equal shards."""
 
     @property
     def windows(self) -> Windows:
@@ -211,8 +211,7 @@ class StructureAwareStrategy(Strategy):
             if self.needs_absgrad(step):
                 keep_gradient(view["means2d"])
             if self.observes(step):
-                jitter = None if self.world is None else self.world.rand(view["n_cameras"])
-                observe(state, params, view, jitter=jitter)
+                observe(state, params, view, jitter=self.world.rand(view["means2d"]))
 
     def step_post_backward(
         self,
@@ -254,7 +253,7 @@ class StructureAwareStrategy(Strategy):
                 iteration <= windows.refine_stop_iter - windows.reset_every // 4
             ):
                 self._map_opacities(params, optimizers, lambda opacities: opacities * RESET_FACTOR)
-            if self.world is not None and self.densifies(step):
+            if not self.world.alone and self.densifies(step):
                 self._even_out(params, optimizers, state)
 
     def consistently_low(self, statistics: Mapping[str, Tensor]) -> Tensor:
@@ -299,14 +298,14 @@ class StructureAwareStrategy(Strategy):
         under_cap, in_memory = self._room(params, state, views)
         counts, allowed = self.split_plan(params, state, min(under_cap, in_memory))
         n_parents, n_wanted = int(allowed.sum()), int((counts > 1).any(dim=1).sum())
-        if in_memory < min(self._of_all(int((num_children(counts) - 1).sum()))[0], under_cap):
+        if in_memory < min(self.world.sums(int((num_children(counts) - 1).sum()))[0], under_cap):
             _warn_of_memory(iteration, in_memory)
         if n_parents > 0:
             grid_split(params, optimizers, state, torch.where(allowed[:, None], counts, 1), self.child_scale)
         # What was learned about parents says nothing about their children.
         self._clear_statistics(params, state)
         names = ("before", "violating", "low", "split", "pruned", "after")
-        numbers = self._of_all(n_before, n_wanted, n_low, n_parents, n_pruned, len(params["means"]))
+        numbers = self.world.sums(n_before, n_wanted, n_low, n_parents, n_pruned, len(params["means"]))
         state.setdefault("structure_steps", []).append(
             {"iteration": iteration, **dict(zip(names, numbers, strict=True))}
         )
@@ -324,7 +323,7 @@ class StructureAwareStrategy(Strategy):
             long_axis=self.absgs_long_axis,
             limit=self._limit_growth,
         )
-        if in_memory <= self._of_all(n_clone + n_split)[0] < under_cap:
+        if in_memory <= self.world.sums(n_clone + n_split)[0] < under_cap:
             _warn_of_memory(iteration, in_memory)
         gone = (self._opacities(params) < self.min_opacity) | self._haze(params, state)
         self._prune(params, optimizers, state, gone)
@@ -334,26 +333,19 @@ class StructureAwareStrategy(Strategy):
         """How many Gaussians may be added under the cap, and how many fit in the devices' memory beside such views."""
         free = free_bytes(params["means"].device)
         in_memory = affordable_growth(params, state, free, StepSize.of(views))
-        if self.world is not None:  # The device with the least room bounds all, since shards are evened out.
-            in_memory = self.world.num_ranks * self.world.least(in_memory)
-        return self.max_gaussians - self._of_all(len(params["means"]))[0], in_memory
-
-    def _of_all(self, *numbers: int) -> list[int]:
-        """Sums of numbers of Gaussians over the processes, where there are several."""
-        if self.world is None:
-            return list(numbers)
-        return self.world.sum(torch.tensor(numbers, device=self.world.device)).tolist()
+        # The device with the least room bounds all, since shards are evened out.
+        in_memory = self.world.num_ranks * self.world.least(in_memory)
+        return self.max_gaussians - self.world.sums(len(params["means"]))[0], in_memory
 
     def _limit_growth(self, growth: Tensor, priority: Tensor, budget: float) -> Tensor:
         """`split.limit_growth` of the Gaussians of all processes."""
-        if self.world is None:
+        if self.world.alone:
             return limit_growth(growth, priority, budget)
         return ranking.limit_growth(self.world, growth, priority, budget)
 
     def _even_out(self, params: Any, optimizers: Any, state: Any) -> None:
         """Count the Gaussians of the processes, and give each equally many where they differ by more than a tenth."""
         world = self.world
-        assert world is not None
         world.count(len(params["means"]))
         if not world.is_uneven():
             return
@@ -385,8 +377,8 @@ class StructureAwareStrategy(Strategy):
         A process may lose all that it has until the shards are evened out.
         """
         n_prune = int(mask.sum())
-        of_all, total = self._of_all(n_prune, len(mask))
-        if total - of_all < (1 if self.world is None else self.world.num_ranks):
+        of_all, total = self.world.sums(n_prune, len(mask))
+        if total - of_all < self.world.num_ranks:
             return 0
         if n_prune > 0:
             remove(params, optimizers, state, mask)

@@ -181,7 +181,7 @@ def compile_kernels(
                 "compositing with AbsGS": pool.submit(composite, True),
                 "compositing": pool.submit(composite, False),
             }
-            if pipeline.world is not None:
+            if not pipeline.world.alone:
                 pending["what travels between devices"] = pool.submit(exchange)
         if wait(pending.values(), timeout=_PATIENCE).not_done:
             CONSOLE.print("Compiling kernels for this GPU, once …")

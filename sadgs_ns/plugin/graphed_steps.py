@@ -221,7 +221,7 @@ class GraphedSteps:
         if not config.cuda_graphs or config.log_gradients:
             return None
         # Several processes send each other Gaussians in a step, whose numbers the host must know.
-        if pipeline.world is not None:
+        if not pipeline.world.alone:
             return None
         # Without a forecast the host waits in each step, and what a camera optimizer does is not in the graphs.
         if not use_triton(model.device) or model.tile_forecast is None:

@@ -387,7 +387,7 @@ class SadgsModel(SplatfactoModel):
     @property
     def num_gaussians(self) -> int:
         """Number of Gaussians of all processes."""
-        return self.num_points if self.strategy.world is None else self.strategy.world.total
+        return self.num_points if self.strategy.world.alone else self.strategy.world.total
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes

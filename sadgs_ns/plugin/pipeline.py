@@ -155,8 +155,8 @@ class SadgsPipeline(VanillaPipeline):
         strategy, less = self.model.strategy, growth_threshold(config.effort)
         strategy.clone_grad2d, strategy.split_absgrad2d = less * strategy.clone_grad2d, less * strategy.split_absgrad2d
         self.log = NonFiniteLog(self.device)
-        self.world: World | None = None
-        """The processes among which the Gaussians are shared out; None where this one has all."""
+        self.world = World()
+        """The processes among which the Gaussians are shared out."""
         self.put_aside: Drawn | None = None
         """Views that were drawn for the present step and not rendered yet."""
         self._checkpoint_cap: int | None = None
@@ -212,7 +212,7 @@ class SadgsPipeline(VanillaPipeline):
         self._refuse_empty_views()
         if self.config.model.strategy.refine_stop_iter != 0:
             model = self.model
-            processes, views = 1 if self.world is None else self.world.num_ranks, self.views_per_iteration
+            processes, views = self.world.num_ranks, self.views_per_iteration
             gaussians: Any = model.gauss_params
             size = training_size(self.datamanager, gaussians, views, processes, model.near_plane)
             try:
@@ -231,8 +231,7 @@ class SadgsPipeline(VanillaPipeline):
             CONSOLE.print(line, highlight=False, soft_wrap=True)
             if warning is not None:
                 CONSOLE.print(f"[yellow]{escape(warning)}[/]", soft_wrap=True)
-            if self.world is not None:
-                model.strategy.max_gaussians = int(self.world.least(model.strategy.max_gaussians))
+            model.strategy.max_gaussians = int(self.world.least(model.strategy.max_gaussians))
             self._keep_cap()
             self.structure.set_max_gaussians.value = self.model.strategy.max_gaussians
         optimizers = training_callback_attributes.optimizers
@@ -260,9 +259,7 @@ class SadgsPipeline(VanillaPipeline):
         depths = means @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]  # [N, C]
         near = self.model.near_plane
         drawn = ((depths > near) & (depths < _FAR_PLANE)).any(dim=1)
-        share = drawn.float().mean()
-        if self.world is not None:
-            share = self.world.sum(share.to(self.device)) / self.world.num_ranks
+        share = self.world.sum(drawn.float().mean().to(self.world.device)) / self.world.num_ranks
         if share < 0.01:
             extent = float(self.model.strategy_state["scene_scale"])
             raise InputError(
@@ -308,7 +305,7 @@ class SadgsPipeline(VanillaPipeline):
         enough = nonfinite.HOPELESS_STEPS if not last else min(nonfinite.HOPELESS_STEPS, self.log.steps)
         gradient = self.model.means.grad
         stuck = bool(wrong) and self.log.streak >= enough and gradient is not None and nonfinite.is_useless(gradient)
-        if stuck if self.world is None else self.world.all(stuck):
+        if self.world.all(stuck):
             step, _, what = wrong[-1]
             names = [files[view].name for view in dict.fromkeys(view for _, views, _ in wrong for view in views)]
             more = f" and {len(names) - _NAMED_STEPS} more" if len(names) > _NAMED_STEPS else ""
@@ -343,7 +340,7 @@ class SadgsPipeline(VanillaPipeline):
             self._repeat_overflowed()
             drawn, wants = defaultdict(list), self.model.wants_structure_tensors
             for index, data in self.views.draw(self.views_per_iteration, (wants(step), wants(step + 1))):
-                shape = data["image"].shape if self.world is None else self.views.sizes[index]
+                shape = data["image"].shape if self.world.alone else self.views.sizes[index]
                 drawn[shape].append((index, data))
         return drawn
 
@@ -358,7 +355,7 @@ class SadgsPipeline(VanillaPipeline):
             indices = [index for index, _ in views]
             tensors = _stack(self.structure_maps.of_views(views, self.world)) if observes else None
             viewmats, Ks = self.views.stacked_cameras(indices)
-            if self.world is not None:
+            if not self.world.alone:
                 parts = losses_of_views(self.model, self.world, viewmats, Ks, width, height, views, tensors)
             else:
                 batch = self._batch(views)

@@ -53,7 +53,7 @@ def least(number: float, device: torch.device) -> float:
         number: Any, also infinite.
         device: Where this process trains.
     """
-    return World(device).least(number) if dist.is_initialized() and dist.get_world_size() > 1 else number
+    return World(device if dist.is_initialized() else None).least(number)
 
 
 def check(config: CheckedTrainerConfig) -> None:
@@ -166,7 +166,7 @@ def _exists(pid: int) -> bool:
     return True
 
 
-def join(config: CheckedTrainerConfig, local_rank: int) -> tuple[World | None, int]:
+def join(config: CheckedTrainerConfig, local_rank: int) -> tuple[World, int]:
     """Join the other processes of the run, where there are others.
 
     All processes draw the same random numbers, where nerfstudio seeds each in its own way. Those after the first print
@@ -177,10 +177,10 @@ def join(config: CheckedTrainerConfig, local_rank: int) -> tuple[World | None, i
         local_rank: Number of this process on its machine, as nerfstudio counts it.
 
     Returns:
-        What this process knows of the others, None where it is alone; and its number on its machine.
+        The processes of the run, and the number of this one on its machine.
     """
     if number_of_processes() == 1:
-        return None, local_rank
+        return World(), local_rank
     cuda = config.machine.device_type == "cuda"
     if not dist.is_initialized():
         local_rank = int(os.environ["LOCAL_RANK"])
@@ -199,20 +199,20 @@ def join(config: CheckedTrainerConfig, local_rank: int) -> tuple[World | None, i
 
 
 @contextmanager
-def first_of_each_machine_before_others(world: World | None, local_rank: int) -> Iterator[None]:
+def first_of_each_machine_before_others(world: World, local_rank: int) -> Iterator[None]:
     """Let the first process of each machine do something, such as compiling, before its others.
 
     Triton keeps what it compiles on the disk, where the others find it. Of 24 processes that compiled the same kernels
     at once two ended with a TypeError (docs/results.md#several-devices).
 
     Args:
-        world: What this process knows of the others, all of which call this; None where it is alone.
+        world: The processes, all of which call this.
         local_rank: Number of this process on its machine.
     """
-    if world is not None and local_rank > 0:
+    if local_rank > 0:
         world.all(True)
     yield
-    if world is not None and local_rank == 0:
+    if local_rank == 0:
         world.all(True)
 
 

@@ -56,7 +56,7 @@ class StructureMaps:
                 codes[index] = code
         return codes
 
-    def of_views(self, views: Sequence[tuple[int, dict[str, Any]]], world: World | None = None) -> list[Tensor]:
+    def of_views(self, views: Sequence[tuple[int, dict[str, Any]]], world: World) -> list[Tensor]:
         """Codes of S̄ of a step's views, which have one size. uint8 [H, W, 3] each
 
         Where images are on the host, codes that are not known yet are computed, and kept where there is room. All of
@@ -64,7 +64,7 @@ class StructureMaps:
 
         Args:
             views: Number and data of each, as drawn.
-            world: The processes of the run, all of which call this with the same views; None where there is one.
+            world: The processes of the run, all of which call this with the same views.
         """
         ahead = self.views.ahead
         if ahead is None:
@@ -74,19 +74,16 @@ class StructureMaps:
             if "codes" not in data and (kept := ahead.kept_codes(index)) is not None:
                 data["codes"] = kept
         missing = [position for position, (_, data) in enumerate(views) if "codes" not in data]
-        ranks: dict[int, int] = {}
-        if world is not None:
-            height, width = self.views.sizes[views[0][0]]
-            ranks = first_ranks(share_out(len(views), height, world.num_ranks))
-        own = [views[p][1] for p in missing if world is None or ranks[p] == world.rank]
+        height, width = self.views.sizes[views[0][0]]
+        ranks = first_ranks(share_out(len(views), height, world.num_ranks))
+        own = [views[p][1] for p in missing if ranks[p] == world.rank]
         for data, codes in zip(own, self._in_batches(own), strict=True):
             data["codes"] = codes
         for position in missing:
             index, data = views[position]
-            if world is not None:
-                if ranks[position] != world.rank:
-                    data["codes"] = torch.empty((height, width, 3), dtype=torch.uint8, device=world.device)
-                world.broadcast(data["codes"], ranks[position])
+            if ranks[position] != world.rank:
+                data["codes"] = torch.empty((height, width, 3), dtype=torch.uint8, device=world.device)
+            world.broadcast(data["codes"], ranks[position])
             ahead.keep_codes(index, data["codes"])
         return [data["codes"] for _, data in views]
 

@@ -20,6 +20,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from sadgs_ns import events
 from sadgs_ns.atomic import atomic_path
+from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.method.schedule import between_one_and_four, schedule
@@ -82,8 +83,8 @@ class SadgsTrainer(Trainer):
         config = copy.copy(config)  # Where there are several processes, they agree on what the file does not say.
         self.world, local_rank = processes.join(config, local_rank)
         """What this process knows of the others; None where it is alone."""
-        self._peers = None if self.world is None else processes.Peers(self.world)
-        if self.world is not None:
+        self._peers = None if self.world.alone else processes.Peers(self.world)
+        if not self.world.alone:
             with processes.first_of_each_machine_before_others(self.world, local_rank):
                 use_triton(self.world.device)  # This compiles a kernel, and is asked for again below.
         config.pipeline.datamanager.train_cameras_sampling_seed = config.machine.seed
@@ -99,7 +100,7 @@ class SadgsTrainer(Trainer):
         self._save_due = math.inf
         # A run that is paused or done polls no signal, because nerfstudio waits for the viewer's user.
         self._interrupts = Interrupts(
-            waiting=lambda: self.training_state != "training" and not self._stepping, started=self.world is not None
+            waiting=lambda: self.training_state != "training" and not self._stepping, started=not self.world.alone
         )
 
     def setup(self, *args: Any, **kwargs: Any) -> None:
@@ -180,7 +181,7 @@ class SadgsTrainer(Trainer):
         config, (path, state), self._checkpoint = self.config, self._checkpoint, None
         try:
             self._start_step = state["step"] + 1
-            if self.world is not None:
+            if not self.world.alone:
                 part = self.world.take_even_part(len(state["pipeline"]["_model.gauss_params.means"]))
                 state = checkpoints.of_gaussians(state, lambda rows: rows[part].clone())
             self.pipeline.load_pipeline(state["pipeline"], state["step"])
@@ -236,7 +237,7 @@ class SadgsTrainer(Trainer):
         Raises:
             SystemExit: In the other processes, once the first has ended.
         """
-        if self.world is None or self._peers is None or self.config.share_always or not self._peers.all_here():
+        if self._peers is None or self.config.share_always or not self._peers.all_here():
             return
         devices, pixels = self.world.num_ranks, self.pipeline.views_per_iteration * self._pixels_of_a_view()
         if pixels >= LEAST_PIXELS * devices:
@@ -249,7 +250,7 @@ class SadgsTrainer(Trainer):
             soft_wrap=True,
         )
         processes.leave_the_rest_to_the_first(self.world, self._peers)
-        self.world = self._peers = None
+        self.world, self._peers = World(), None
 
     def _turn_viewer_off(self) -> None:
         """Keep nerfstudio from starting a viewer, and say so where one was asked for."""
@@ -272,7 +273,7 @@ class SadgsTrainer(Trainer):
             self.pipeline.model.clear_paths(viewmats_from_camera_to_world(cameras.camera_to_worlds))
         self._derive_schedule()
         self._take_one_device_if_quicker()
-        if self.world is not None:
+        if not self.world.alone:
             self._turn_viewer_off()
             self.pipeline.share_out(self.world)
         optimizers: dict[str, Any] = copy.deepcopy(dict(self.config.optimizers))
@@ -322,7 +323,7 @@ class SadgsTrainer(Trainer):
         try:
             with self._interrupts:
                 try:
-                    if self.world is not None:  # nerfstudio's way to make it fails where another process is as fast.
+                    if not self.world.alone:  # nerfstudio's way to make it fails where another process is as fast.
                         self.base_dir.mkdir(parents=True, exist_ok=True)
                     super().train()
                     self._stop_if_stuck()
@@ -334,7 +335,7 @@ class SadgsTrainer(Trainer):
                         raise
                     self._stop(interruption, total)
         except InputError as error:
-            if self._completed_step == self._saved_step or self.world is not None:
+            if self._completed_step == self._saved_step or not self.world.alone:
                 raise
             # An image that is decoded ahead of its step is gone or damaged, and no step is half done.
             self.save_checkpoint(self._completed_step)
@@ -349,7 +350,7 @@ class SadgsTrainer(Trainer):
             if error.errno is None:  # It is a WriteError, or it does not come from the disk.
                 raise
             # A logger, such as tensorboard's, could not write; its file may be on another disk, or its folder is gone.
-            if not self._stepping and self._completed_step > self._saved_step and self.world is None:
+            if not self._stepping and self._completed_step > self._saved_step and self.world.alone:
                 self.save_checkpoint(self._completed_step)
             raise WriteError(Path(os.fsdecode(error.filename or self.base_dir)), error) from error
         except RuntimeError as error:
@@ -389,7 +390,7 @@ class SadgsTrainer(Trainer):
             for state in states.values():
                 lengths |= {len(value) for value in state.values() if isinstance(value, torch.Tensor) and value.dim()}
         lengths |= {len(v) for v in model.strategy_state.values() if isinstance(v, torch.Tensor) and v.dim()}
-        if len(lengths) > 1 or self.step <= self._start_step or self.world is not None:
+        if len(lengths) > 1 or self.step <= self._start_step or not self.world.alone:
             kept = "nothing newer than the last checkpoint could be saved"
         else:
             try:
@@ -408,10 +409,10 @@ class SadgsTrainer(Trainer):
         No signal may stop the run from here to `_update_viewer_state`.
         """
         self._stepping = True
-        if (world := self.world) is not None:
+        if not self.world.alone:
             # Processes agree on what to do after a step in the step itself. A signal has the bit of its number.
-            world.heard, signalled = 0, self._interrupts.received
-            world.request = int(time.monotonic() >= self._save_due) | (0 if signalled is None else 1 << signalled)
+            self.world.heard, signalled = 0, self._interrupts.received
+            self.world.request = int(time.monotonic() >= self._save_due) | (0 if signalled is None else 1 << signalled)
             _, _, metrics = super().train_iteration(step)
             return metrics["loss"], {"main_loss": metrics["loss"]}, metrics
         trained = None if self.graphed is None else self.graphed.train(step)
@@ -423,7 +424,7 @@ class SadgsTrainer(Trainer):
     def _update_viewer_state(self, step: int) -> None:
         """Stop or save where that is due; nerfstudio calls this after every step, when densification is done."""
         self._completed_step, self._stepping = step, False
-        if self.world is None:
+        if self.world.alone:
             self._interrupts.poll()
             due = time.monotonic() >= self._save_due
         else:
@@ -438,7 +439,7 @@ class SadgsTrainer(Trainer):
 
     def eval_iteration(self, step: int) -> None:
         """Measure held-out views as nerfstudio does, unless no device holds all Gaussians."""
-        if self.world is None:
+        if self.world.alone:
             super().eval_iteration(step)
 
     def _train_complete_viewer(self) -> None:
@@ -475,8 +476,7 @@ class SadgsTrainer(Trainer):
         if interrupted.number == HANG_UP:  # Some systems send it before they take the terminal away.
             drop_lost_output()
         CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
-        if self.world is not None:
-            self.world.all(True)  # What starts the processes ends all as soon as one has ended.
+        self.world.all(True)  # What starts the processes ends all as soon as one has ended.
         raise SystemExit(128 + interrupted.number)
 
     def _stop_if_stuck(self) -> None:
@@ -489,7 +489,7 @@ class SadgsTrainer(Trainer):
             return
         kept = "the Gaussians themselves are not finite: train anew, or from a checkpoint in which they are"
         finite = all(bool(parameter.isfinite().all()) for parameter in self.pipeline.model.gauss_params.values())
-        if finite if self.world is None else self.world.all(finite):
+        if self.world.all(finite):
             if self._completed_step > self._saved_step:
                 self.save_checkpoint(self._completed_step)
             kept = f"the Gaussians as they are now are saved and go on with --load-dir {self.checkpoint_dir}"
@@ -511,8 +511,7 @@ class SadgsTrainer(Trainer):
         state = self._state(step)
         if processes.is_first():
             self._write_checkpoint(step, state)
-        if self.world is not None:
-            self.world.all(True)
+        self.world.all(True)
         self._saved_step = step
         self._set_clock(time.monotonic() - start)
 
@@ -525,7 +524,7 @@ class SadgsTrainer(Trainer):
             "schedulers": {name: s.state_dict() for name, s in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),
         }
-        return state if self.world is None else checkpoints.of_gaussians(state, self.world.gather_rows)
+        return state if self.world.alone else checkpoints.of_gaussians(state, self.world.gather_rows)
 
     def _write_checkpoint(self, step: int, state: dict[str, Any]) -> None:
         path: Path = self.checkpoint_dir / f"step-{step:09d}.ckpt"

@@ -27,13 +27,13 @@ class TrainingViews:
         model: Its camera optimizer corrects the cameras, and its device is the training device.
 
     Attributes:
-        world: The processes of the run, of which each composites its share of a step; None where there is one.
+        world: The processes of the run, of which each composites its share of a step.
     """
 
     def __init__(self, datamanager: FullImageDatamanager, model: SadgsModel) -> None:
         self.datamanager = datamanager
         self.model = model
-        self.world: World | None = None
+        self.world = World()
         self._next_round: tuple[Any, list[int]] = None, []  # It is drawn from this state of the random generator.
         self._foreseen: deque[tuple[list[int], list[int]]] = deque()
         """Views of the next steps, and which of them this process composites."""
@@ -89,7 +89,7 @@ class TrainingViews:
         else:
             composited = self._composited(indices)
             # This does not change from step to step, so that no view is forgotten that was on its way.
-            share = -(-number // (1 if self.world is None else self.world.num_ranks))
+            share = -(-number // self.world.num_ranks)
             upcoming, following = self._upcoming(indices, ahead.threads + 2 * share)
             ahead.load([*composited, *upcoming])
             drawn = {index: {} for index in indices} | {i: ahead.take(i, codes[0]) for i in composited}
@@ -99,7 +99,7 @@ class TrainingViews:
 
     def _composited(self, indices: Sequence[int]) -> list[int]:
         """Return those of a step's views, each once, of which this process composites rows."""
-        if self.world is not None:
+        if not self.world.alone:
             of_step = views_of_rank([self.sizes[i] for i in indices], self.world.num_ranks, self.world.rank)
             indices = [indices[position] for position in of_step]
         return list(dict.fromkeys(indices))
@@ -147,7 +147,7 @@ class TrainingViews:
             while len(step) < number:
                 if not order and not more:
                     # Which part of a step this process composites depends on the views of all of it.
-                    if step and self.world is None:
+                    if step and self.world.alone:
                         yield step
                     return
                 if not order:

@@ -42,6 +42,19 @@ def test_the_budget_goes_to_the_same_gaussians(tmp_path: Path):
         assert torch.equal(torch.cat([result[i] for result in results]), chosen), i
 
 
+def test_a_world_of_one_process_asks_nobody():
+    world, values = World(), torch.tensor([3, 4])
+    assert world.alone and world.rank == 0 and world.take_even_part(5) == slice(0, 5) and world.total == 5
+    assert world.sum(values) is values and world.sums(3, 4) == [3, 4]
+    assert world.gather(values).tolist() == [[3, 4]] and values.data_ptr() == world.gather(values).data_ptr()
+    world.broadcast(values, 0)
+    assert values.tolist() == [3, 4] and world.least(2.5) == 2.5 and world.all(True) and not world.all(False)
+    torch.manual_seed(4)
+    drawn = world.rand(torch.empty((2, 22, 2)))
+    torch.manual_seed(4)
+    assert torch.equal(drawn, torch.rand((2, 22, 2)))
+
+
 def exchange_rows(world: World) -> dict[str, Any]:
     sizes = [5, 0, 17]
     rows = torch.arange(22.0).view(22, 1) + torch.tensor([0.0, 0.5])
@@ -52,7 +65,7 @@ def exchange_rows(world: World) -> dict[str, Any]:
     world.even_out(mine[:, :0])  # Coefficients of harmonics have no numbers where the degree is 0.
     world.count(len(evened))
     torch.manual_seed(4)
-    drawn = world.rand(2)
+    drawn = world.rand(torch.empty((2, len(evened), 2)))
     after = torch.rand(1)
     return {
         "sizes": world.sizes, "uneven": uneven, "even": not world.is_uneven(), "gathered": gathered,

@@ -11,6 +11,7 @@ import pytest
 import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 
+from sadgs_ns.distributed.world import World
 from sadgs_ns.method.schedule import Schedule
 from sadgs_ns.plugin.image_source import ImagesAhead
 from sadgs_ns.plugin.pipeline import SadgsPipeline
@@ -40,7 +41,7 @@ class Datamanager:
 
 def views_of(datamanager: Any, world: Any = None) -> TrainingViews:
     views = TrainingViews(datamanager, SimpleNamespace(device=torch.device("cpu")))  # type: ignore[arg-type]
-    views.world = world
+    views.world = world or views.world
     return views
 
 
@@ -94,7 +95,9 @@ def test_each_process_prepares_what_it_composites_and_nothing_else(
     for rank in range(ranks):
         datamanager = Datamanager(total, cache_images="cpu", **options)
         datamanager.cached_train = tuple(datamanager.cached_train)  # type: ignore[assignment]
-        views = views_of(datamanager, SimpleNamespace(rank=rank, num_ranks=ranks))
+        world = World()
+        world.rank, world.num_ranks = rank, ranks
+        views = views_of(datamanager, world)
         loaded.clear()
         awaited, taken = 0, Counter[int]()
         assert views.ahead is not None
