@@ -24,8 +24,9 @@ from torch import Tensor
 from benchmarks import results, table
 from examples.drawn_scene.drawing import render
 from examples.drawn_scene.scene import describe_scene
+from sadgs_ns.gsplat_internals import SCREEN_BLUR
 from sadgs_ns.method.codes import decode, encode
-from sadgs_ns.method.eta import SCREEN_BLUR, eta, sample_footprint, sample_map, wavelength
+from sadgs_ns.method.eta import eta, sample_footprint, sample_map, wavelength
 from sadgs_ns.method.statistics import HIGH_ETA
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 

@@ -10,6 +10,7 @@ from gsplat.cuda._torch_impl import _fully_fused_projection
 from torch import Tensor
 
 from sadgs_ns import gsplat_internals
+from sadgs_ns.kernels import TILE_SIZE
 from sadgs_ns.render import rasterization, splatter
 
 compositing = pytest.importorskip("sadgs_ns.kernels.compositing", reason="Triton is not installed")
@@ -56,7 +57,7 @@ def composite(
     absgrad: bool,
 ) -> tuple[Tensor, Tensor]:
     """`compositing.rasterize_to_pixels` in torch: a list ends where the next begins, and the last at the end."""
-    views, size = len(starts), compositing.TILE_SIZE
+    views, size = len(starts), TILE_SIZE
     rows, columns = -(-height // size), -(-width // size)
     ends = torch.cat([starts.flatten()[1:], torch.tensor([len(ids)])]).view_as(starts)
     starts, ends = (places[:, :rows].flatten().long() for places in (starts, ends))

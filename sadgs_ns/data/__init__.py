@@ -1,1 +1,4 @@
 """Readers and checks of captures: COLMAP, PLY, cameras and images."""
+
+IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"}
+"""Suffixes of the formats of photos that training reads."""

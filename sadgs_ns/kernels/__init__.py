@@ -18,6 +18,9 @@ from sadgs_ns.errors import reason
 OLDEST_TRITON = (3, 5)
 """Older versions do not compile all of the kernels: Triton 3.4 has no matrix products with 8 columns."""
 
+TILE_SIZE = 8
+"""Size of our rasterizer's tiles in px. gsplat's default of 16 saves list entries; with exact lists, saved pixels
+matter more (docs/results.md#parts-of-a-step). Each lane of the one warp that a tile gets has two pixels."""
 SWITCH = "SADGS_TRITON"
 """Environment variable that keeps a process from using the kernels where it is 0."""
 

@@ -25,9 +25,9 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from sadgs_ns.kernels import TILE_SIZE
 from sadgs_ns.kernels.compositing_blocks import (
     SCALE,
-    TILE_SIZE,
     alphas,
     highest_alpha,
     load_gaussians,

@@ -11,8 +11,6 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-TILE_SIZE = 8
-"""px. Each lane of the one warp that a tile gets has two pixels."""
 SCALE = tl.constexpr(0.8493218002880191)
 """√(log2(e) / 2), of offsets in px: exp(-σ) is then exp2 of a plain polynomial. It stands
 on the right of products, as Triton's interpreter needs it."""

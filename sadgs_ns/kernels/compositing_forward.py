@@ -14,9 +14,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from sadgs_ns.kernels import TILE_SIZE
 from sadgs_ns.kernels.compositing_blocks import (
     SCALE,
-    TILE_SIZE,
     alphas,
     highest_alpha,
     load_gaussians,

@@ -20,14 +20,12 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sadgs_ns import gsplat_internals
-from sadgs_ns.gsplat_internals import NEAR_PLANE
+from sadgs_ns.gsplat_internals import NEAR_PLANE, SCREEN_BLUR
 from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.visibility import drawn
 
 _LANES = 128
 """Gaussians that one program handles."""
-BLUR = 0.3
-"""px². gsplat adds it to the diagonal of each Σ2D."""
 
 
 @triton.jit
@@ -279,7 +277,8 @@ class _Project(torch.autograd.Function):
             means, quats, scales, viewmats, Ks, radii, conics, conics if compensations is None else compensations,
             v_means2d, v_conics, depths, by_compensation, passed, v_means, v_quats, v_scales,
             n, len(viewmats), *ctx.size, row2d, row_conic,
-            v_depths is not None, v_compensations is not None, v_passed is not None, radii.dim() - 1, BLUR, _LANES,
+            v_depths is not None, v_compensations is not None, v_passed is not None, radii.dim() - 1,
+            SCREEN_BLUR, _LANES,
         )  # fmt: skip
         return v_means, v_quats, v_scales, *[None] * 7
 

@@ -11,12 +11,11 @@ import torch.nn.functional as F
 from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 
+from sadgs_ns.gsplat_internals import SCREEN_BLUR
 from sadgs_ns.method.codes import decode
 
 WAVELENGTH_EPSILON = 1e-5
 """ε of Λ_min = 1 / (√λ_1 + ε) in 1/px: a textureless region has a wavelength of 10⁵ px, not infinity."""
-SCREEN_BLUR = 0.3
-"""What gsplat adds to the diagonal of Σ2D before it inverts it, its `eps2d`, in px²."""
 FRUSTUM_MARGIN = 0.3
 """gsplat evaluates the projection Jacobian at most this fraction of half the image beyond the image's border."""
 

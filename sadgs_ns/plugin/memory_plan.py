@@ -11,7 +11,8 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from torch import Tensor
 
 from sadgs_ns.distributed.bands import views_of_rank
-from sadgs_ns.gsplat_internals import NEAR_PLANE
+from sadgs_ns.gsplat_internals import NEAR_PLANE, SCREEN_BLUR
+from sadgs_ns.kernels import TILE_SIZE
 from sadgs_ns.method import memory
 from sadgs_ns.method.absgs import empty_gradients
 from sadgs_ns.method.memory import StepSize
@@ -30,8 +31,6 @@ STRUCTURE_PIXEL_BYTES = 300
 """Bytes that a pixel takes at most while S̄ is computed."""
 SAMPLED_CAMERAS = 8
 """Training cameras in which the pairs of the initial Gaussians are counted."""
-TILE_SIZE = 8
-"""Size of a tile in px, as `kernels.compositing.TILE_SIZE`, which cannot be imported without Triton."""
 MANY_IMAGES = 500
 """Number of training images up to which nerfstudio would keep them on the device, whatever their size."""
 IMAGE_SHARE = 0.25
@@ -41,8 +40,8 @@ FEW_IMAGES_SHARE = 0.5
 HOST_SHARE = 0.5
 """Share of the host's available memory up to which decoded images are kept in it. torch takes up to twice as much for
 pinned memory as is asked for, since it rounds up to powers of two."""
-_BLUR, _REACH = 0.3, 3.0
-"""gsplat's screen-space blur in px², and the standard deviations that it draws."""
+_REACH = 3.0
+"""Standard deviations of a Gaussian that gsplat draws."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +182,7 @@ def _count_pairs(
     depths = points[:, 2:]  # [N, 1]
     focals, center = K.diagonal()[:2], K[:2, 2]  # [2], [2]
     means2d = focals * points[:, :2] / depths + center  # [N, 2]
-    radii = reach[:, None] * ((focals * scales[:, None] / depths).square() + _BLUR).sqrt()  # [N, 2]
+    radii = reach[:, None] * ((focals * scales[:, None] / depths).square() + SCREEN_BLUR).sqrt()  # [N, 2]
     tiles = (size / TILE_SIZE).ceil()
     first = ((means2d - radii) / TILE_SIZE).floor().clamp_min(0).minimum(tiles)
     last = ((means2d + radii) / TILE_SIZE).ceil().clamp_min(0).minimum(tiles)

@@ -22,6 +22,7 @@ from sadgs_ns.data.cameras import refuse_unsupported_cameras
 from sadgs_ns.data.checks.parsers import findings_of
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
+from sadgs_ns.gsplat_internals import FAR_PLANE
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.method.codes import HIGHEST_FREQUENCY
 from sadgs_ns.method.initialization import camera_extent
@@ -49,8 +50,6 @@ _WIDEST_BLUR = 100
 """Largest window of `energy_blur`, which makes kernels of thousands of pixels."""
 _SAMPLED = 1000
 """About so many cameras, and Gaussians, are enough to find out whether training can see anything."""
-_FAR_PLANE = 1e10
-"""Depth in world units up to which gsplat and our splatter draw Gaussians."""
 Drawn = dict[tuple[int, ...], list[tuple[int, dict[str, Any]]]]
 """Indices and data of a step's views by the shapes of their images, [H, W, 3 or 4], or by height and width alone where
 several processes train, since one does not have the images that only others composite."""
@@ -258,12 +257,12 @@ class SadgsPipeline(VanillaPipeline):
         means = means[:: -(-len(means) // _SAMPLED)].to(viewmats)  # [N, 3]
         depths = means @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]  # [N, C]
         near = self.model.near_plane
-        drawn = ((depths > near) & (depths < _FAR_PLANE)).any(dim=1)
+        drawn = ((depths > near) & (depths < FAR_PLANE)).any(dim=1)
         share = self.world.sum(drawn.float().mean().to(self.world.device)) / self.world.num_ranks
         if share < 0.01:
             extent = float(self.model.strategy_state["scene_scale"])
             raise InputError(
-                f"The renderings would be empty, since a camera sees from {near:.2g} to {_FAR_PLANE:g} units and the "
+                f"The renderings would be empty, since a camera sees from {near:.2g} to {FAR_PLANE:g} units and the "
                 f"cameras lie within {extent:.2g}: set the parser's scale-factor so that they lie within about 1, or "
                 "leave its auto-scale-poses on."
             )

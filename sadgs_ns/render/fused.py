@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sadgs_ns import gsplat_internals
 from sadgs_ns.gsplat_internals import NEAR_PLANE
-from sadgs_ns.kernels import compositing
+from sadgs_ns.kernels import TILE_SIZE, compositing
 from sadgs_ns.kernels import projection as kernels_projection
 from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
 from sadgs_ns.kernels.limits import check_gaussians, check_pixels
@@ -20,9 +20,6 @@ from sadgs_ns.render.projected import Projected
 BACKWARD: Literal["moments", "gsplat"] = "moments"
 """Whose kernels differentiate the projection and the compositing of three channels: ours (projection.py,
 compositing.py), or gsplat's as a reference."""
-TILE_SIZE = compositing.TILE_SIZE
-"""px. gsplat's default of 16 saves list entries; with exact lists, saved pixels matter more
-(docs/results.md#parts-of-a-step)."""
 
 
 def rasterization(

@@ -20,7 +20,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sadgs_ns.gsplat_internals import (
+    FAR_PLANE,
+    NEAR_PLANE,
     RADII_PER_AXIS,
+    SCREEN_BLUR,
     torch_persp_proj,
     torch_quat_scale_to_covar_preci,
     torch_spherical_harmonics,
@@ -79,10 +82,10 @@ def rasterization(
     Ks: Tensor,  # [C, 3, 3]
     width: int,
     height: int,
-    near_plane: float = 0.01,
-    far_plane: float = 1e10,
+    near_plane: float = NEAR_PLANE,
+    far_plane: float = FAR_PLANE,
     radius_clip: float = 0.0,
-    eps2d: float = 0.3,
+    eps2d: float = SCREEN_BLUR,
     sh_degree: int | None = None,
     packed: bool = False,
     tile_size: int = 16,
@@ -175,9 +178,9 @@ def project(
     width: int,
     height: int,
     sh_degree: int | None,
-    eps2d: float = 0.3,
-    near_plane: float = 0.01,
-    far_plane: float = 1e10,
+    eps2d: float = SCREEN_BLUR,
+    near_plane: float = NEAR_PLANE,
+    far_plane: float = FAR_PLANE,
     radius_clip: float = 0.0,
     antialiased: bool = False,
     max_off_axis: float = 0.0,

@@ -38,11 +38,10 @@ from sadgs_ns.cli.process import command as program
 from sadgs_ns.cli.process import stages as colmap_stages
 from sadgs_ns.cli.process.colmap import run_colmap
 from sadgs_ns.cli.process.command import Process, main, photos_added, process
-from sadgs_ns.cli.process.photos import PHOTO_SUFFIXES, Photo, find_photos, photos_by_camera, read_photos
+from sadgs_ns.cli.process.photos import Photo, find_photos, photos_by_camera, read_photos
 from sadgs_ns.cli.process.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching, expected_work
 from sadgs_ns.cli.process.stages import check_written, fetch_vocabulary, match, sequential_pairs
 from sadgs_ns.cli.process.video import sharpest_frames
-from sadgs_ns.data.checks.images import IMAGE_SUFFIXES
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
 
@@ -482,10 +481,6 @@ def test_a_way_of_matching_that_cannot_work_is_told_before_any_work(photos: Path
         "Use --matching sequential for photos in the order of their taking, or exhaustive." in capsys.readouterr().err
     )
     assert not (tmp_path / "out").exists()
-
-
-def test_the_formats_are_those_that_training_reads():
-    assert PHOTO_SUFFIXES == IMAGE_SUFFIXES
 
 
 @pytest.mark.hard_case("GPS positions without altitude, which COLMAP does not use", "count as none, before any work")

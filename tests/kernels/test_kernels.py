@@ -738,7 +738,7 @@ def test_rasterization_equals_gsplats_own(render_mode, max_off_axis):
     shared = {"width": 128, "height": 128, "sh_degree": 3, "render_mode": render_mode, "packed": False}
     shared |= {"rasterize_mode": "antialiased", "absgrad": False}
     gsplats = culling(gsplats, max_off_axis)
-    expected, expected_alphas, _ = gsplats(**scene, **shared, tile_size=ours.TILE_SIZE)
+    expected, expected_alphas, _ = gsplats(**scene, **shared, tile_size=kernels.TILE_SIZE)
     renders, alphas, _ = ours.rasterization(**scene, **shared, max_off_axis=max_off_axis)
     # Rounding decides whether a Gaussian is drawn where its alpha is 1/255.
     for one, other in ((renders, expected), (alphas, expected_alphas)):

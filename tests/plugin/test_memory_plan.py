@@ -27,12 +27,11 @@ from scenes import camera, random_params, splat
 
 from examples.drawn_scene.scene import write_scene
 from sadgs_ns.errors import InputError
-from sadgs_ns.kernels import triton_switched
+from sadgs_ns.kernels import TILE_SIZE, triton_switched
 from sadgs_ns.method import memory
 from sadgs_ns.method import strategy as strategy_module
 from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.plugin import memory_plan
 from sadgs_ns.plugin.memory_plan import (
     TrainingSize,
     estimate_pairs,
@@ -233,7 +232,7 @@ def spheres(n: int) -> dict[str, torch.nn.Parameter]:
 
 
 def test_estimated_pairs_are_a_little_more_than_the_tiles_that_gaussians_show_in():
-    width, height, tile = 64, 48, memory_plan.TILE_SIZE
+    width, height, tile = 64, 48, TILE_SIZE
     drawn = spheres(60)
     _, _, info = splat(drawn, *camera(width, height), width, height)
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
@@ -294,13 +293,6 @@ def test_the_size_of_a_run_is_that_of_its_images_and_largest_step():
     assert size.structure_bytes == 300 * 64 * 48
     train.height = torch.tensor([[30], [48], [48]])  # Of two sizes each process may have a part of either.
     assert training_size(datamanager, drawn, views=2, processes=2).image_bytes == 2 * 6 * 64 * 48
-
-
-def test_tiles_are_those_of_the_kernels():
-    pytest.importorskip("triton", reason="Triton is not installed")
-    from sadgs_ns.kernels.compositing import TILE_SIZE
-
-    assert TILE_SIZE == memory_plan.TILE_SIZE
 
 
 # --- ns-train ---

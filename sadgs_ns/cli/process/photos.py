@@ -15,10 +15,9 @@ from pathlib import Path
 
 from PIL import ExifTags, Image, UnidentifiedImageError
 
+from sadgs_ns.data import IMAGE_SUFFIXES
 from sadgs_ns.errors import InputError, reason
 
-PHOTO_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"}
-"""Suffixes of the formats that training reads; the checks of data have the same set, but are slow to import."""
 _UNREAD_SUFFIXES = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"}
 """Suffixes of formats that phones and cameras write and that neither COLMAP nor Pillow surely reads."""
 _CONVERTED_SUFFIXES = {".webp"}
@@ -48,7 +47,7 @@ def photos_not_read(folder: Path) -> str:
     others = [path.suffix for path in folder.rglob("*") if path.suffix.lower() in _UNREAD_SUFFIXES]
     if not others:
         return ""
-    kinds = ", ".join(sorted(suffix[1:] for suffix in PHOTO_SUFFIXES))
+    kinds = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
     return f"Its {len(others)} {' and '.join(sorted(set(others)))} files are not read: convert them to one of {kinds}."
 
 
@@ -66,7 +65,7 @@ def find_photos(source: Path, out: Path) -> list[str]:
     found = [
         path.relative_to(folder)
         for path in folder.rglob("*")
-        if path.suffix.lower() in PHOTO_SUFFIXES and scene not in path.parents and not path.is_dir()
+        if path.suffix.lower() in IMAGE_SUFFIXES and scene not in path.parents and not path.is_dir()
     ]
     names = sorted(path.as_posix() for path in found if not any(part.startswith(".") for part in path.parts))
     if len(names) < 3:

@@ -14,10 +14,10 @@ from typing import Any, Literal
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
+from sadgs_ns.data import IMAGE_SUFFIXES
 from sadgs_ns.data.checks.findings import Finding, and_more
 from sadgs_ns.errors import reason
 
-IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"}
 MAX_AUTO_RESOLUTION = 1600
 """Longest side in px up to which nerfstudio looks for no smaller copies of images."""
 MASK_MODES = ("L", "1", "I;16", "I")
