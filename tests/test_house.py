@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import graphlib
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import sadgs_ns
@@ -26,19 +25,10 @@ USES = {
 MAX_FLAT = 6
 
 
-def nodes_that_run(tree: ast.AST) -> Iterator[ast.AST]:
-    """All nodes of a module, in functions too, except what is imported for type checkers alone."""
-    for node in ast.iter_child_nodes(tree):
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
-            continue
-        yield node
-        yield from nodes_that_run(node)
-
-
 def names_imported(path: Path) -> set[str]:
-    """What a file imports: modules, and the members of modules as if they were modules."""
+    """What a file imports, in functions and for type checkers, too: modules, and their members as if they were some."""
     names = set()
-    for node in nodes_that_run(ast.parse(path.read_text("utf8"))):
+    for node in ast.walk(ast.parse(path.read_text("utf8"))):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from typing import TYPE_CHECKING
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -20,11 +19,9 @@ from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
 from sadgs_ns.plugin.optimizers import FusedAdam, RepeatedUpdate, step_together
+from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.render.activations import activate
 from sadgs_ns.render.rasterization import rasterize
-
-if TYPE_CHECKING:
-    from sadgs_ns.plugin.pipeline import SadgsPipeline
 
 _GAUSSIANS, _SIZE = 64, 64
 """Number of Gaussians, and width and height in px, of the picture on which the kernels are tried."""

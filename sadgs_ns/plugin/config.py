@@ -20,6 +20,7 @@ from tyro.conf import Suppress
 from sadgs_ns.atomic import atomic_path
 from sadgs_ns.data.checks.parsers import keep_findings, refuse_bad_data
 from sadgs_ns.errors import InputError, reason
+from sadgs_ns.kernels import SWITCH, switched_off
 from sadgs_ns.plugin import checkpoints, processes
 from sadgs_ns.plugin.optimizers import RunLengthDecaySchedulerConfig
 from sadgs_ns.plugin.pipeline import SadgsPipelineConfig
@@ -192,8 +193,9 @@ class CheckedTrainerConfig(TrainerConfig):
         """Check whether training can work with these options.
 
         Raises:
-            InputError: If a number is out of its range, gradients would be scaled or accumulated, or the device is not
-                there; as `processes.check` and `SadgsPipelineConfig.check`.
+            InputError: If a number is out of its range, gradients would be scaled or accumulated, the device is not
+                there, or the run takes several and needs what only a run on one device has; as
+                `processes.check_devices` and `SadgsPipelineConfig.check`.
         """
         for name, count in (
             ("max_num_iterations", self.max_num_iterations),
@@ -234,8 +236,25 @@ class CheckedTrainerConfig(TrainerConfig):
                 "sadgs updates every parameter in every iteration, and densification would lose gradients that were "
                 "kept for later: leave gradient_accumulation_steps out, and set pipeline.views_per_iteration instead."
             )
-        processes.check(self)
+        if processes.check_devices(self.machine):
+            self._check_for_several_devices()
         self.pipeline.check()
+
+    def _check_for_several_devices(self) -> None:
+        """Check whether a run on several devices can work with these options.
+
+        Raises:
+            InputError: If it needs what only a run on one device has.
+        """
+        model = self.pipeline.model
+        for name, given, remedy in (
+            ("pipeline.model.color_model", model.color_model != "none", "set it to none"),
+            ("pipeline.model.camera_optimizer.mode", model.camera_optimizer.mode != "off", "set it to off"),
+            ("start_paused", self.start_paused, "leave it off, since the viewer is off, too"),
+            (f"{SWITCH}=0", switched_off() and self.machine.device_type == "cuda", "unset it"),
+        ):
+            if given:
+                raise InputError(f"{name} works on one device only, and this run takes several: {remedy}.")
 
     def _check_rates(self) -> None:
         """Check whether the learning rates can train anything.

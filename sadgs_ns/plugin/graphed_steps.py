@@ -12,9 +12,10 @@ import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
+from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 from torch import Tensor
@@ -22,12 +23,10 @@ from torch import Tensor
 from sadgs_ns.errors import reason
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.method.absgs import accumulate_gradients, keep_gradient
+from sadgs_ns.plugin.config import CheckedTrainerConfig
 from sadgs_ns.plugin.model import SadgsModel, StepKind
 from sadgs_ns.plugin.optimizers import FusedAdam, RepeatedUpdate
-
-if TYPE_CHECKING:
-    from sadgs_ns.plugin.pipeline import SadgsPipeline
-    from sadgs_ns.plugin.trainer import SadgsTrainer
+from sadgs_ns.plugin.pipeline import SadgsPipeline
 
 MOST_GAUSSIANS = 2**20
 """Steps of more Gaussians, counted once for each view, keep the GPU busy without a graph, which would only take memory
@@ -214,9 +213,8 @@ class GraphedSteps:
         self.failure = ""
 
     @staticmethod
-    def of(trainer: SadgsTrainer) -> GraphedSteps | None:
+    def of(config: CheckedTrainerConfig, pipeline: SadgsPipeline, optimizers: Optimizers) -> GraphedSteps | None:
         """Return what graphs the steps of a run; None where its steps must always be launched one by one."""
-        config, pipeline, optimizers = trainer.config, trainer.pipeline, trainer.optimizers
         model = pipeline.model
         if not config.cuda_graphs or config.log_gradients:
             return None

@@ -11,19 +11,17 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import timedelta
-from typing import TYPE_CHECKING, NoReturn
+from typing import NoReturn
 
 import numpy as np
 import torch
 import torch.distributed as dist
+from nerfstudio.configs.base_config import MachineConfig
+from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
-from sadgs_ns.kernels import SWITCH, switched_off
-
-if TYPE_CHECKING:
-    from sadgs_ns.plugin.config import CheckedTrainerConfig
 
 _REAPED_SECONDS = 5.0
 """Longest time from a message that fails because its process has ended to the operating system's forgetting that."""
@@ -56,13 +54,15 @@ def least(number: float, device: torch.device) -> float:
     return World(device if dist.is_initialized() else None).least(number)
 
 
-def check(config: CheckedTrainerConfig) -> None:
-    """Check whether a run on several devices can work with these options.
+def check_devices(machine: MachineConfig) -> bool:
+    """Check whether the devices that a run is to take are there.
+
+    Returns:
+        Whether they are several.
 
     Raises:
-        InputError: If it needs what only a run on one device has, or devices that are not there.
+        InputError: If one is missing, or the processes cannot be started in this way.
     """
-    machine, model = config.machine, config.pipeline.model
     if machine.num_machines != 1:
         raise InputError(
             f"machine.num_machines is {machine.num_machines}, and sadgs trains on several machines with torchrun: "
@@ -76,21 +76,14 @@ def check(config: CheckedTrainerConfig) -> None:
             "set it to 1, or start the run with torchrun."
         )
     if machine.num_devices == 1 and number_of_processes() == 1:
-        return
+        return False
     here = torch.cuda.device_count()
     if machine.device_type == "cuda" and max(machine.num_devices, processes_on_this_machine()) > here:
         raise InputError(
             f"The run is to take {max(machine.num_devices, processes_on_this_machine())} CUDA devices of this machine, "
             f"and torch finds {here}: lower machine.num_devices, or torchrun's --nproc-per-node."
         )
-    for name, given, remedy in (
-        ("pipeline.model.color_model", model.color_model not in ("none", "auto"), "set it to none"),
-        ("pipeline.model.camera_optimizer.mode", model.camera_optimizer.mode != "off", "set it to off"),
-        ("start_paused", config.start_paused, "leave it off, since the viewer is off, too"),
-        (f"{SWITCH}=0", switched_off() and machine.device_type == "cuda", "unset it"),
-    ):
-        if given:
-            raise InputError(f"{name} works on one device only, and this run takes several: {remedy}.")
+    return True
 
 
 class Peers:
@@ -166,7 +159,7 @@ def _exists(pid: int) -> bool:
     return True
 
 
-def join(config: CheckedTrainerConfig, local_rank: int) -> tuple[World, int]:
+def join(config: TrainerConfig, local_rank: int) -> tuple[World, int]:
     """Join the other processes of the run, where there are others.
 
     All processes draw the same random numbers, where nerfstudio seeds each in its own way. Those after the first print

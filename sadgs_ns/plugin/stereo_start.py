@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -14,10 +13,8 @@ from sadgs_ns.method.dense_start import NUMBER, dense_points
 from sadgs_ns.method.eta import wavelength
 from sadgs_ns.method.initialization import plausible_points
 from sadgs_ns.method.stereo import depth_maps
+from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
-
-if TYPE_CHECKING:
-    from sadgs_ns.plugin.pipeline import SadgsPipeline
 
 FEWEST_VIEWS, MOST_VIEWS = 3, 60
 """Numbers of training views between which a run starts from stereo depth, where nobody says. More views make up for

@@ -118,7 +118,7 @@ class SadgsTrainer(Trainer):
             self.callbacks.append(TrainingCallback(last, lambda step: self._say_what_is_next()))
             with processes.first_of_each_machine_before_others(self.world, self.local_rank):
                 compile_kernels(self.pipeline, self.optimizers.optimizers, self.config.cuda_graphs)
-            self.graphed = GraphedSteps.of(self)
+            self.graphed = GraphedSteps.of(self.config, self.pipeline, self.optimizers)
         except torch.cuda.OutOfMemoryError as error:
             raise RunError(f"The GPU's memory is too small to start ({_memory(error)}): {_LESS_MEMORY}.") from error
         except RunError:
