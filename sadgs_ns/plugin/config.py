@@ -23,10 +23,12 @@ from sadgs_ns.errors import InputError, reason
 from sadgs_ns.kernels import SWITCH, switched_off
 from sadgs_ns.plugin import checkpoints, processes
 from sadgs_ns.plugin.optimizers import RunLengthDecaySchedulerConfig
+from sadgs_ns.plugin.options import check_ranges, hide
 from sadgs_ns.plugin.pipeline import SadgsPipelineConfig
 from sadgs_ns.plugin.progress import ProgressTable
 
 
+@hide("num_machines", "machine_rank", "dist_url")
 @dataclass
 class SadgsMachineConfig(MachineConfig):
     """nerfstudio's options of the machine; those of several machines are not shown, since torchrun starts these."""
@@ -40,14 +42,10 @@ class SadgsMachineConfig(MachineConfig):
         default_factory=lambda: "cuda" if torch.cuda.is_available() else "cpu"
     )
     """Kind of device to train on; CUDA where there is one."""
-    num_machines: Suppress[int] = 1
-    """Number of machines; torchrun starts runs on several."""
-    machine_rank: Suppress[int] = 0
-    """Rank of this machine among several."""
-    dist_url: Suppress[str] = "auto"
-    """Where several devices meet."""
 
 
+@hide("websocket_port_default", "relative_log_filename", "num_rays_per_chunk")
+@hide("camera_frustum_scale", "default_composite_depth")
 @dataclass
 class SadgsViewerConfig(ViewerConfig):
     """nerfstudio's options of the viewer, which here listens on this machine only."""
@@ -62,18 +60,10 @@ class SadgsViewerConfig(ViewerConfig):
     """Number of training images shown as cameras in the viewer, -1 for all; training takes all images anyway."""
     make_share_url: bool = False
     """Print an address at which others can open the viewer, through a server of viser's makers."""
-    websocket_port_default: Suppress[int] = 7007
-    """Port that is tried first where `websocket_port` is None."""
-    relative_log_filename: Suppress[str] = "viewer_log_filename.txt"
-    """Name of the viewer's log."""
-    num_rays_per_chunk: Suppress[int] = 32768
-    """Gaussians are not drawn in rays."""
-    camera_frustum_scale: Suppress[float] = 0.1
-    """Size of the cameras at the start; a slider in the viewer sets it, too."""
-    default_composite_depth: Suppress[bool] = True
-    """Whether cameras behind the splat are hidden at the start; a box in the viewer sets it, too."""
 
 
+@hide("method_name", "prompt", "relative_model_dir", "load_scheduler", "log_gradients")
+@hide("mixed_precision", "use_grad_scaler", "gradient_accumulation_steps")  # The check below refuses them.
 @dataclass
 class CheckedTrainerConfig(TrainerConfig):
     """nerfstudio's options of a trainer with this method's defaults, checked before a run starts."""
@@ -133,28 +123,12 @@ class CheckedTrainerConfig(TrainerConfig):
     """The config.yml of a run whose options are taken, instead of all others; nerfstudio executes what it says."""
     start_paused: bool = False
     """Wait for a click in the viewer before training starts."""
-    method_name: Suppress[str | None] = None
-    """The preset's name."""
-    prompt: Suppress[str | None] = None
-    """Read by methods that make scenes from text."""
-    relative_model_dir: Suppress[Path] = Path("nerfstudio_models")
-    """Folder of the checkpoints inside the run's."""
-    load_scheduler: Suppress[bool] = True
-    """Whether schedules go on where the checkpoint left them."""
     logging: Suppress[LoggingConfig] = field(
         default_factory=lambda: LoggingConfig(
             local_writer=LocalWriterConfig(_target=ProgressTable, enable=True), profiler="none"
         )
     )
     """What is printed during training, and how often."""
-    mixed_precision: Suppress[bool] = False
-    """Refused: this method trains in float32."""
-    use_grad_scaler: Suppress[bool] = False
-    """Refused: densification reads gradients as they are."""
-    log_gradients: Suppress[bool] = False
-    """Whether gradients' norms are logged at each step."""
-    gradient_accumulation_steps: Suppress[dict[str, int]] = field(default_factory=dict)
-    """`pipeline.views_per_iteration` takes its place."""
 
     def __post_init__(self) -> None:
         """Check `load_config` before nerfstudio reads it, since nerfstudio then forgets all other options.
@@ -197,17 +171,12 @@ class CheckedTrainerConfig(TrainerConfig):
                 there, or the run takes several and needs what only a run on one device has; as
                 `processes.check_devices` and `SadgsPipelineConfig.check`.
         """
-        for name, count in (
-            ("max_num_iterations", self.max_num_iterations),
-            ("logging.steps_per_log", self.logging.steps_per_log),
-        ):
-            if count is not None and count < 1:
-                raise InputError(f"{name} must be at least 1, got {count}.")
-        for name in ("save", "eval_batch", "eval_image", "eval_all_images"):
-            if (steps := getattr(self, f"steps_per_{name}")) < 0:
-                raise InputError(f"steps_per_{name} must not be negative, got {steps}.")
-        if not self.seconds_per_save >= 0:
-            raise InputError(f"seconds_per_save must not be negative, got {self.seconds_per_save:g}.")
+        length, periods = self.max_num_iterations, ("save", "eval_batch", "eval_image", "eval_all_images")
+        check_ranges("", self, [("max_num_iterations", length is None or length >= 1, "at least 1")])
+        check_ranges("logging.", self.logging, [("steps_per_log", self.logging.steps_per_log >= 1, "at least 1")])
+        for name in (*(f"steps_per_{what}" for what in periods), "seconds_per_save"):
+            if not (value := getattr(self, name)) >= 0:
+                raise InputError(f"{name} must not be negative, got {value:g}.")
         if self.load_step is not None and self.load_dir is None:
             raise InputError(
                 f"load_step is {self.load_step}, but load_dir is not set: add --load-dir with the folder of a run."

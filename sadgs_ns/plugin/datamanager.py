@@ -32,28 +32,20 @@ from sadgs_ns.data.coordinates import FRAME_KEYS, Similarity, fixed_frame
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.memory import available_host_bytes
 from sadgs_ns.plugin.image_source import ImagesOnDemand, thread_count
+from sadgs_ns.plugin.options import check_ranges, hide
 from sadgs_ns.plugin.processes import processes_on_this_machine
 
 
+@hide("data", "train_cameras_sampling_seed")  # `--data` and `--machine.seed` set them.
+@hide("masks_on_gpu", "images_on_gpu", "max_thread_workers", "train_cameras_sampling_strategy", "fps_reset_every")
+@hide("eval_num_images_to_sample_from", "eval_num_times_to_repeat_images", "eval_image_indices")
 @dataclass
 class SadgsDatamanagerConfig(FullImageDatamanagerConfig):
     """nerfstudio's options, without those on the command line that its loader of whole images does not read."""
 
     _target: type = field(default_factory=lambda: SadgsDatamanager)
-    data: Suppress[Path | None] = None
-    """Folder of the data; `--data` sets it."""
     dataparser: AnyParserConfig = field(default_factory=AutomaticDataParserConfig)
     """How the folder is read: by default with the parser that fits what it holds."""
-    masks_on_gpu: Suppress[bool] = False
-    """Not read where whole images are cached."""
-    images_on_gpu: Suppress[bool] = False
-    """Not read where whole images are cached."""
-    eval_num_images_to_sample_from: Suppress[int] = -1
-    """Not read where whole images are cached."""
-    eval_num_times_to_repeat_images: Suppress[int] = -1
-    """Not read where whole images are cached."""
-    eval_image_indices: Suppress[tuple[int, ...] | None] = (0,)
-    """Not read where whole images are cached."""
     camera_res_scale_factor: float = 1.0
     """Factor by which images and cameras are scaled when they are loaded; 0.5 trains at half the resolution."""
     cache_images: Literal["gpu", "cpu", "compressed"] = "gpu"  # type: ignore[assignment]
@@ -61,14 +53,6 @@ class SadgsDatamanagerConfig(FullImageDatamanagerConfig):
     Otherwise it is "cpu", decoded in the host's memory, or "compressed", files that are decoded ahead of their step."""
     cache_images_type: Suppress[Literal["uint8", "float32"]] = "uint8"
     """Images are kept as bytes, as they are in files; another type is refused."""
-    max_thread_workers: Suppress[int | None] = None
-    """Threads that decode images; None is one for each core, up to 16."""
-    train_cameras_sampling_strategy: Suppress[Literal["random", "fps"]] = "random"
-    """Each view comes once a round; another order is refused."""
-    train_cameras_sampling_seed: Suppress[int] = 42
-    """Seed of the order of the training views; the trainer takes `machine.seed`."""
-    fps_reset_every: Suppress[int] = 100
-    """Not read where each view comes once a round."""
 
 
 KEPT_FILES_SHARE = 0.25
@@ -101,10 +85,8 @@ def check_options(config: FullImageDatamanagerConfig) -> None:
             f"pipeline.datamanager.train_cameras_sampling_strategy is {config.train_cameras_sampling_strategy}, and "
             "sadgs takes each view once a round: leave it out."
         )
-    if not 0 < config.camera_res_scale_factor <= 1:
-        raise InputError(
-            f"pipeline.datamanager.camera_res_scale_factor must be in (0, 1], got {config.camera_res_scale_factor:g}."
-        )
+    scale = config.camera_res_scale_factor
+    check_ranges("pipeline.datamanager.", config, [("camera_res_scale_factor", 0 < scale <= 1, "in (0, 1]")])
 
 
 class SadgsDatamanager(FullImageDatamanager[InputDataset]):

@@ -21,7 +21,6 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from pytorch_msssim import SSIM
 from rich.markup import escape
 from torch import Tensor
-from tyro.conf import Suppress
 
 from sadgs_ns.data.cameras import refuse_unsupported_cameras
 from sadgs_ns.distributed.world import World
@@ -43,6 +42,7 @@ from sadgs_ns.method.near_plane import nearest_depths, scene_near_plane
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.outliers import POINT_SHARE, REACH
 from sadgs_ns.plugin import gaussian_maps
+from sadgs_ns.plugin.options import check_ranges, hide
 from sadgs_ns.plugin.outputs import LazyOutputs
 from sadgs_ns.render.activations import activate
 from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world
@@ -59,16 +59,13 @@ _MOST_RANDOM = 10_000_000
 """Largest number of random points to start from; they take the host's memory before the cap thins them out."""
 
 
+@hide("trans_l2_penalty", "rot_l2_penalty")  # Others than nerfstudio's are refused below.
 @dataclass
 class PoseOptimizerConfig(CameraOptimizerConfig):
     """nerfstudio's options of learned camera poses, with its own penalties, which hold them near the given ones."""
 
     mode: Literal["off", "SO3xR3", "SE3"] = "off"
     """Whether and how the cameras' poses are refined; SO3xR3 turns and moves each camera."""
-    trans_l2_penalty: Suppress[float] = 1e-2
-    """Weight of the mean length of the translations in the loss; another is refused."""
-    rot_l2_penalty: Suppress[float] = 1e-3
-    """Weight of the mean length of the rotations in the loss; another is refused."""
 
 
 @dataclass
@@ -137,36 +134,23 @@ class SadgsModelConfig(InstantiateConfig):
         Raises:
             InputError: If one is out of its range.
         """
-        if not 0 <= self.ssim_lambda <= 1:
-            raise InputError(f"pipeline.model.ssim_lambda must be in [0, 1], got {self.ssim_lambda:g}.")
-        if self.background_color not in ("black", "white"):
-            raise InputError(f"pipeline.model.background_color must be black or white, got {self.background_color}.")
-        if not 0 < self.initial_opacity < 1:
-            raise InputError(f"pipeline.model.initial_opacity must be in (0, 1), got {self.initial_opacity:g}.")
-        if not 0 <= self.opacity_reg <= 100:
-            raise InputError(f"pipeline.model.opacity_reg must be in [0, 100], got {self.opacity_reg:g}.")
-        if not 0 <= self.averaged_share <= 0.3:
-            raise InputError(f"pipeline.model.averaged_share must be in [0, 0.3], got {self.averaged_share:g}.")
-        for name in ("max_off_axis", "max_angular_scale"):
-            value = getattr(self, name)
-            if not 0 <= value < math.inf:
-                raise InputError(f"pipeline.model.{name} must be finite and not negative, got {value:g}.")
-        if 0 < self.max_off_axis < 1:
-            raise InputError(
-                f"pipeline.model.max_off_axis must be 0, or at least 1, the image's border, got {self.max_off_axis:g}."
-            )
-        if self.near_plane is not None and not 0 < self.near_plane < math.inf:
-            raise InputError(f"pipeline.model.near_plane must be positive and finite, got {self.near_plane:g}.")
-        if not 0 <= self.sh_degree <= 3:
-            raise InputError(f"pipeline.model.sh_degree must be in [0, 3], got {self.sh_degree}.")
-        if not 1 <= self.num_random <= _MOST_RANDOM:
-            raise InputError(f"pipeline.model.num_random must be in [1, {_MOST_RANDOM:,}], got {self.num_random:,}.")
-        if self.stereo_points is not None and not 0 <= self.stereo_points <= _MOST_RANDOM:
-            raise InputError(
-                f"pipeline.model.stereo_points must be in [0, {_MOST_RANDOM:,}], got {self.stereo_points:,}."
-            )
-        if not 0 < self.random_scale < math.inf:
-            raise InputError(f"pipeline.model.random_scale must be positive and finite, got {self.random_scale:g}.")
+        near, stereo, off_axis, angle = self.near_plane, self.stereo_points, self.max_off_axis, self.max_angular_scale
+        ranges = [
+            ("ssim_lambda", 0 <= self.ssim_lambda <= 1, "in [0, 1]"),
+            ("background_color", self.background_color in ("black", "white"), "black or white"),
+            ("initial_opacity", 0 < self.initial_opacity < 1, "in (0, 1)"),
+            ("opacity_reg", 0 <= self.opacity_reg <= 100, "in [0, 100]"),
+            ("averaged_share", 0 <= self.averaged_share <= 0.3, "in [0, 0.3]"),
+            ("max_off_axis", 0 <= off_axis < math.inf, "finite and not negative"),
+            ("max_angular_scale", 0 <= angle < math.inf, "finite and not negative"),
+            ("max_off_axis", off_axis == 0 or off_axis >= 1, "0, or at least 1, the image's border"),
+            ("near_plane", near is None or 0 < near < math.inf, "positive and finite"),
+            ("sh_degree", 0 <= self.sh_degree <= 3, "in [0, 3]"),
+            ("num_random", 1 <= self.num_random <= _MOST_RANDOM, f"in [1, {_MOST_RANDOM:,}]"),
+            ("stereo_points", stereo is None or 0 <= stereo <= _MOST_RANDOM, f"in [0, {_MOST_RANDOM:,}]"),
+            ("random_scale", 0 < self.random_scale < math.inf, "positive and finite"),
+        ]
+        check_ranges("pipeline.model.", self, ranges)
         for name in ("trans_l2_penalty", "rot_l2_penalty"):
             if (penalty := getattr(self.camera_optimizer, name)) != getattr(PoseOptimizerConfig, name):
                 told = f"cannot be set, got {penalty:g}: leave it out."

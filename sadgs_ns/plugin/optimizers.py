@@ -17,6 +17,7 @@ from tyro.conf import Suppress
 
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.plugin.nonfinite import MAX_GRADIENT, NonFiniteLog, leave_out_nonfinite
+from sadgs_ns.plugin.options import hide
 
 _ONE = torch.tensor(1.0, device="cpu")
 """Adding it to the count of steps costs the host a third of adding Python's 1."""
@@ -205,6 +206,7 @@ class SadgsOptimizers(Optimizers):
         super().optimizer_scaler_step_some(grad_scaler, [name for name in param_groups if name not in together])
 
 
+@hide("max_norm", "weight_decay")
 @dataclass
 class FusedAdamOptimizerConfig(AdamOptimizerConfig):
     """Adam; only its rate is an option of the command line."""
@@ -214,10 +216,6 @@ class FusedAdamOptimizerConfig(AdamOptimizerConfig):
     """Learning rate; where there is a schedule, its factors multiply it."""
     eps: Suppress[float] = 1e-15
     """What Adam adds to the root of the second moment; as in 3DGS."""
-    max_norm: Suppress[float | None] = None
-    """Norm to which gradients are clipped."""
-    weight_decay: Suppress[float] = 0.0
-    """Adam's penalty on the size of parameters."""
 
 
 @dataclass
@@ -235,20 +233,16 @@ class RunLengthDecaySchedulerConfig(SchedulerConfig):
     """Iterations until `final_factor`; None is the length of the run."""
 
 
+@hide("lr")
 @dataclass
 class UnlistedAdamOptimizerConfig(FusedAdamOptimizerConfig):
     """Adam whose rate `--help` does not list; a config.yml, or a benchmark's protocol, can set it."""
 
-    lr: Suppress[float] = 1e-3
-    """Learning rate; where there is a schedule, its factors multiply it."""
 
-
+@hide("final_factor")
 @dataclass
 class UnlistedDecaySchedulerConfig(RunLengthDecaySchedulerConfig):
     """Exponential decay as above, whose factors `--help` does not list."""
-
-    final_factor: Suppress[float] = 1.0
-    """Learning rate at the last iteration, relative to the optimizer's."""
 
 
 class RunLengthDecayScheduler(Scheduler):

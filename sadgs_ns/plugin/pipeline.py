@@ -35,6 +35,7 @@ from sadgs_ns.plugin.memory_plan import fit_to_memory, place_images, training_si
 from sadgs_ns.plugin.model import NORMALS, SadgsModel, SadgsModelConfig, in_viewer
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
 from sadgs_ns.plugin.optimizers import FusedAdam
+from sadgs_ns.plugin.options import check_ranges
 from sadgs_ns.plugin.panel import StructurePanel
 from sadgs_ns.plugin.sharded_steps import losses_of_views
 from sadgs_ns.plugin.structure_maps import StructureMaps
@@ -89,19 +90,16 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
         Raises:
             InputError: If an option is out of its range; as `SadgsModelConfig.check`.
         """
-        if not 0 < self.effort <= _MOST_EFFORT:
-            raise InputError(f"pipeline.effort must be in (0, {_MOST_EFFORT}], got {self.effort:g}.")
-        if self.views_per_iteration is not None and self.views_per_iteration < 1:
-            raise InputError(f"pipeline.views_per_iteration must be at least 1, got {self.views_per_iteration}.")
-        if not 0 < self.frequency_constant <= HIGHEST_FREQUENCY:
-            raise InputError(
-                f"pipeline.frequency_constant must be in (0, {HIGHEST_FREQUENCY:g}], got {self.frequency_constant}."
-            )
-        if not 0 <= self.energy_blur <= _WIDEST_BLUR:
-            raise InputError(f"pipeline.energy_blur must be in [0, {_WIDEST_BLUR}], got {self.energy_blur:g}.")
-        for name in ("epsilon", "memory_budget_gb"):
-            if (value := getattr(self, name)) is not None and not 0 < value < math.inf:
-                raise InputError(f"pipeline.{name} must be positive and finite, got {value:g}.")
+        views, epsilon, budget = self.views_per_iteration, self.epsilon, self.memory_budget_gb
+        ranges = [
+            ("effort", 0 < self.effort <= _MOST_EFFORT, f"in (0, {_MOST_EFFORT}]"),
+            ("views_per_iteration", views is None or views >= 1, "at least 1"),
+            ("frequency_constant", 0 < self.frequency_constant <= HIGHEST_FREQUENCY, f"in (0, {HIGHEST_FREQUENCY:g}]"),
+            ("energy_blur", 0 <= self.energy_blur <= _WIDEST_BLUR, f"in [0, {_WIDEST_BLUR}]"),
+            ("epsilon", epsilon is None or 0 < epsilon < math.inf, "positive and finite"),
+            ("memory_budget_gb", budget is None or 0 < budget < math.inf, "positive and finite"),
+        ]
+        check_ranges("pipeline.", self, ranges)
         check_options(self.datamanager)
         self.model.check()
 
