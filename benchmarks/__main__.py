@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import importlib
+import itertools
 import json
 import os
 import re
@@ -20,10 +21,8 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import tyro
-from rich import progress as bars
 from tyro.conf import Positional
 
 from benchmarks import gate, protocol, results
@@ -123,24 +122,18 @@ def run_all(
     log: Path,
     gpus: Sequence[str | None] = (None,),
     jobs_per_gpu: int = 1,
-    time_limit: float = float("inf"),
-) -> int:
+) -> None:
     """Run jobs in their order, some at a time on each GPU; whatever ends this early also ends the runs.
 
     Args:
         finished: Called with each result as its run ends.
         log: Takes the output of runs that fail.
-        time_limit: Seconds after which no run starts.
-
-    Returns:
-        How many jobs were not started because of the time limit.
     """
-    deadline = time.monotonic() + time_limit
     pending, running = deque(jobs), list[_Run]()
     free = deque(gpu for _ in range(jobs_per_gpu) for gpu in gpus)
     try:
-        while running or (pending and time.monotonic() < deadline):
-            while pending and free and time.monotonic() < deadline:
+        while running or pending:
+            while pending and free:
                 folder = tempfile.TemporaryDirectory(prefix="benchmarks-", ignore_cleanup_errors=True)
                 job, gpu = pending.popleft(), free.popleft()
                 running.append(_Run(job, gpu, launch(job, gpu, Path(folder.name)), folder))
@@ -154,7 +147,6 @@ def run_all(
         for run in running:
             run.stop()
             run.folder.cleanup()
-    return len(pending)
 
 
 def unfinished(jobs: Sequence[Job], done: Sequence[Result]) -> list[Job]:
@@ -174,24 +166,6 @@ def line(result: Result) -> str:
         f"{name}: loop {result['loop_seconds']:.1f} s, PSNR {result['psnr']:.2f}, SSIM {result['ssim']:.4f}{lpips}, "
         f"{result['gaussians']:,} Gaussians{peak}"
     )
-
-
-def progress_bar(total: int, done: int, **options: Any) -> tuple[bars.Progress, bars.TaskID]:
-    """A bar over all runs, and its task.
-
-    The time left is estimated from the runs that have ended since it was made, on all GPUs together.
-
-    Args:
-        done: Runs that had ended before.
-        options: Of rich's Progress.
-    """
-    columns = (bars.TextColumn("{task.description}"), bars.BarColumn(), bars.MofNCompleteColumn())
-    times = (bars.TimeElapsedColumn(), bars.TextColumn("left"), bars.TimeRemainingColumn())
-    # rich would estimate from the last 30 s, in which at most one run ends.
-    progress = bars.Progress(*columns, *times, speed_estimate_period=float("inf"), **options)
-    task = progress.add_task("Runs", total=total, completed=done)
-    progress.advance(task, 0)  # the moment from which the first run counts
-    return progress, task
 
 
 @contextlib.contextmanager
@@ -220,20 +194,14 @@ class Benchmark:
     """times are only comparable with 1"""
     only: str = ""
     """regular expression: only runs whose scene/label/seed match"""
-    time_limit: float = float("inf")
-    """seconds after which no run starts"""
-    skip_missing: bool = False
-    """run the scenes that are there"""
     gate: Path | None = None
     """baseline in JSON: exit with 1 if results are worse"""
-    update_baseline: Path | None = None
-    """baseline that the results' values are written to"""
     reference: str | None = None
     """label of the row whose loop seconds are 1 in the column Ratio"""
 
     def selected(self) -> list[Job]:
         """The protocol's jobs that are asked for, all checked before the first one runs."""
-        from benchmarks.datasets import runnable
+        from benchmarks.datasets import check
 
         chosen = protocol.load(self.protocol)
         try:
@@ -244,15 +212,13 @@ class Benchmark:
             raise ValueError(f"--only {self.only!r} leaves no run; it is searched for in scene/label/seed.")
         if self.jobs_per_gpu < 1:
             raise ValueError(f"--jobs-per-gpu must be 1 or more, not {self.jobs_per_gpu}.")
-        return runnable(jobs, self.scenes, chosen.source, self.skip_missing)
+        check(jobs, self.scenes, chosen.source)
+        return jobs
 
     def __call__(self) -> int:
         """Run it; returns 0, 1 if a run failed or the gate found a regression, 130 after an interrupt."""
-        if self.gate is not None and self.update_baseline is not None:
-            raise ValueError("--gate and --update-baseline exclude each other.")
-        for baseline in (self.gate, self.update_baseline):
-            if baseline is not None and (baseline == self.gate or baseline.exists()):
-                gate.read(baseline)  # its errors now rather than after hours
+        if self.gate is not None:
+            gate.read(self.gate)  # its errors now rather than after hours
         jobs = self.selected()
         gpus = self.gpus.split(",") if self.gpus else (None,)
         devices = {max(len(devices_of(gpu)), 1) for gpu in gpus}
@@ -265,34 +231,24 @@ class Benchmark:
             )
         todo = unfinished(jobs, done)
         log = self.output.with_suffix(".log")
-        progress, task = progress_bar(len(jobs), len(jobs) - len(todo), disable=not sys.stdout.isatty())
-        with _sigterm_exits(), progress:
+        number = itertools.count(len(jobs) - len(todo) + 1)
 
-            def finished(result: Result) -> None:
-                results.append(self.output, result)
-                print(line(result), flush=True)
-                progress.advance(task)
+        def finished(result: Result) -> None:
+            results.append(self.output, result)
+            print(f"{next(number)}/{len(jobs)}  {line(result)}", flush=True)
 
-            self.output.parent.mkdir(parents=True, exist_ok=True)
-            launch = launcher(self.scenes.resolve())
+        self.output.parent.mkdir(parents=True, exist_ok=True)
+        with _sigterm_exits():
             try:
-                left = run_all(todo, launch, finished, log, gpus, self.jobs_per_gpu, self.time_limit)
+                run_all(todo, launcher(self.scenes.resolve()), finished, log, gpus, self.jobs_per_gpu)
             except KeyboardInterrupt:
                 return 130
-        if left:
-            print(f"{left} runs were not started within the time limit; the same command continues.")
         latest = {result["key"]: result for result in results.read(self.output)}
         rows = [latest[job.key] for job in jobs if job.key in latest]
         print(markdown(rows, self.reference))
         bad = any(row["status"] != "ok" for row in rows)
         if self.gate is not None:
             bad |= not gate.judge(self.gate, jobs, rows)
-        if self.update_baseline is not None:
-            try:
-                gate.renew(self.update_baseline, jobs, rows)
-            except ValueError as error:
-                print(f"python -m benchmarks: {error}", file=sys.stderr)
-                bad = True
         return int(bad)
 
 

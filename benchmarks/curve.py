@@ -52,7 +52,7 @@ class Curve:
         """By iterations: `step` (iterations done), `seconds` of the loop so far, `psnr`, `ssim`, `lpips` and
         `gaussians`. The run's last iteration is not among them: the evaluation after the run measures it."""
         self._every, self._timer = every, timer
-        self._networks: evaluate.Networks = {}
+        self._network: Any = None
 
     def attach(self, trainer: Any) -> None:
         """Register with a nerfstudio Trainer that is set up."""
@@ -61,9 +61,9 @@ class Curve:
         def measure(step: int) -> None:
             pipeline = trainer.pipeline
             with self._timer.stopped(), undisturbed(pipeline):
-                self._networks = self._networks or {"lpips": evaluate.load_lpips()}
+                self._network = self._network or evaluate.load_lpips()
                 views = pipeline.datamanager.fixed_indices_eval_dataloader
-                measured = evaluate.quality(pipeline.model, views, self._networks)
+                measured = evaluate.quality(pipeline.model, views, self._network)
             self.points.append(point(step + 1, self._timer.seconds, measured, int(pipeline.model.num_points)))
 
         iterations = tuple(range(self._every - 1, trainer.config.max_num_iterations - 1, self._every))

@@ -18,23 +18,21 @@ if TYPE_CHECKING:
     from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 
 
-def runnable(jobs: Sequence[Job], root: Path, source: str | None = None, skip_missing: bool = False) -> list[Job]:
-    """The jobs whose scenes are there, after building every config once.
+def check(jobs: Sequence[Job], root: Path, source: str | None = None) -> None:
+    """Check that the jobs' scenes are there, and build every config once.
 
     Args:
         root: Folder that holds all scenes.
         source: What the data are called and where they come from, for the error.
-        skip_missing: Leave out scenes that are missing, with a line on stderr, instead of raising.
 
     Raises:
-        ValueError: A scene is missing (all of them with `skip_missing`), or as `build_config`; one sentence.
+        ValueError: A scene is missing, or as `build_config`; one sentence.
     """
     from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 
     from benchmarks.run import build_config
 
-    missing = {}
-    checked = set()
+    missing, checked = {}, set()
     for job in {(job.scene.name, job.row.label): job for job in jobs}.values():
         name, folder = job.scene.name, root / job.scene.data
         if not folder.exists():
@@ -56,18 +54,9 @@ def runnable(jobs: Sequence[Job], root: Path, source: str | None = None, skip_mi
                 f"{parser.eval_interval}th view is not the one that papers hold out: compare with no published number.",
                 file=sys.stderr,
             )
-    if not missing:
-        return list(jobs)
-    what = ", ".join(f"scene {name!r}: {text}" for name, text in missing.items())
-    remedy = f"check --scenes or get {source}" if source else "check --scenes"
-    left = [job for job in jobs if job.scene.name not in missing]
-    if not left:
-        raise ValueError(f"{what}; {remedy}.")
-    there = ", ".join(dict.fromkeys(job.scene.name for job in left))
-    if not skip_missing:
-        raise ValueError(f"{what}; {remedy}. --skip-missing runs the others: {there}.")
-    print(f"Left out: {what}. Running {there}.", file=sys.stderr)
-    return left
+    if missing:
+        what = ", ".join(f"scene {name!r}: {text}" for name, text in missing.items())
+        raise ValueError(f"{what}; check --scenes{f' or get {source}' if source else ''}.")
 
 
 def image_names(parser: ColmapDataParserConfig, data: Path) -> list[str]:

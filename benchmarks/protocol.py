@@ -6,9 +6,9 @@
     rows:
       - {label: ours, method: sadgs, overrides: {max_num_iterations: 3000}}
 
-A row may name its own `scenes` and `seeds`, and `sweep: {dotted.path: [a, b]}` makes one row of each combination.
-Rows of different scenes may share a label. `source` says where the scenes come from, for whoever lacks them;
-`curve_every: 500`, for all rows or for one, also measures the held-out views every 500 iterations of each run.
+A row may name its own `scenes` and `seeds`; rows of different scenes may share a label. `source` says where the scenes
+come from, for whoever lacks them; `curve_every: 500`, for all rows or for one, also measures the held-out views every
+500 iterations of each run.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import contextlib
 import dataclasses
 import difflib
 import hashlib
-import itertools
 import json
 from collections import Counter
 from collections.abc import Mapping, Set
@@ -123,13 +122,13 @@ def parse(content: object) -> Protocol:
         ValueError: As `load`, without the file's name.
     """
     top = _mapping(content, "the protocol", {"scenes", "rows"}, {"seeds", "source", "curve_every"})
-    scenes = {str(name): _scene(str(name), value) for name, value in _mapping(top["scenes"], "scenes").items()}
+    scenes = {name: _scene(name, value) for name, value in _mapping(top["scenes"], "scenes").items()}
     if not scenes:
         raise ValueError("scenes is empty; name at least one scene.")
+    common = {"curve_every": top.get("curve_every")}
     rows = tuple(
-        row
+        _row({**common, **_mapping(value, f"rows[{i}]")}, f"rows[{i}]", scenes)
         for i, value in enumerate(_list(top["rows"], "rows"))
-        for row in _rows({"curve_every": top.get("curve_every"), **_mapping(value, f"rows[{i}]")}, f"rows[{i}]", scenes)
     )
     pairs = Counter((row.label, scene) for row in rows for scene in row.scenes or scenes)
     for (label, scene), count in pairs.items():
@@ -190,9 +189,8 @@ def _as_type_of(old: Any, value: Any, path: str) -> Any:
     raise ValueError(f"override {path!r}: {value!r} is {type(value).__name__}, but the setting is {kind}.")
 
 
-def _rows(value: Any, where: str, scenes: Mapping[str, Scene]) -> list[Row]:
-    row = _mapping(value, where, {"label", "method"}, {"scenes", "seeds", "overrides", "sweep", "curve_every"})
-    label, method = _text(row, "label", where), _text(row, "method", where)
+def _row(value: Any, where: str, scenes: Mapping[str, Scene]) -> Row:
+    row = _mapping(value, where, {"label", "method"}, {"scenes", "seeds", "overrides", "curve_every"})
     names = None if row.get("scenes") is None else tuple(map(str, _list(row["scenes"], f"{where}.scenes")))
     for name in names or ():
         if name not in scenes:
@@ -202,14 +200,7 @@ def _rows(value: Any, where: str, scenes: Mapping[str, Scene]) -> list[Row]:
     if every is not None and (type(every) is not int or every < 1):
         raise ValueError(f"curve_every must be a whole number of iterations from 1, not {every!r}.")
     overrides = _mapping(row.get("overrides") or {}, f"{where}.overrides")
-    sweep = _mapping(row.get("sweep") or {}, f"{where}.sweep")
-    rows = []
-    for values in itertools.product(*(_list(choices, f"{where}.sweep.{path}") for path, choices in sweep.items())):
-        chosen = dict(zip(sweep, values, strict=True))
-        suffix = ",".join(f"{path.rsplit('.', 1)[-1]}={v}" for path, v in chosen.items())
-        name = f"{label}[{suffix}]" if suffix else label
-        rows.append(Row(name, method, {**overrides, **chosen}, names, seeds, every))
-    return rows
+    return Row(_text(row, "label", where), _text(row, "method", where), overrides, names, seeds, every)
 
 
 def _scene(name: str, value: object) -> Scene:

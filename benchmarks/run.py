@@ -29,9 +29,6 @@ from benchmarks.protocol import Job, Row, Scene, set_dotted
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
 
-TRAIN_VIEWS = 4
-"""Training views whose PSNR is measured, to tell overfitting from underfitting."""
-
 
 def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> TrainerConfig:
     """The nerfstudio config of a run.
@@ -108,20 +105,13 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
         work: Folder for what nerfstudio writes; the caller deletes it.
 
     Returns:
-        JSON-ready. Times in s:
-            import_seconds, setup_seconds, initialization_seconds, load_seconds, warmup_seconds,
-            structure_tensor_seconds: One after the other, before the loop. `initialization` makes the model from the
-                points (with splatfacto it also loads LPIPS); `setup` is parsing the data and all else that nerfstudio
-                builds; `structure_tensor` is there only where the method has them.
-            loop_seconds: The training loop, nothing else; train_seconds: the loop and the checkpoint after it.
-            wall_seconds: Everything from the first import to the saved checkpoint.
-            compile_seconds: What Triton took to compile kernels, in a machine's first run, added up over those that are
-                compiled side by side in the setup; of them loop_compile_seconds in the loop.
-        Over the held-out views what `evaluate.quality` measures; `train_psnr` over some training views, `fps`,
-        `gaussians`, `peak_gb`, how many views there were, the machine's `gpu`. Of each held-out view `view_psnr`,
-        `ply_view_psnr` (with the near plane of other programs' viewers) and what `coverage_of_views` tells. `phases`
-        and `launches` as these modules measure them. `curve`, if the job asks for it, has the points of `curve.Curve`,
-        the last one being the finished run; no time above contains its evaluations.
+        JSON-ready. Seconds: `import_seconds`, `setup_seconds` (parsing the data and all else that nerfstudio builds),
+        `initialization_seconds` (the model from the points), `load_seconds`, `warmup_seconds` and, where the method has
+        them, `structure_tensor_seconds`, one after the other before the loop; `loop_seconds`, of the training loop
+        alone. Over the held-out views what `evaluate.quality` measures, and of each `ply_view_psnr` (with the near
+        plane of other programs' viewers) and what `coverage_of_views` tells. `phases` and `launches` as these modules
+        measure them. `curve`, if the job asks for it, has the points of `curve.Curve`, the last one being the finished
+        run; no time contains its evaluations.
         Where torchrun started several processes, which train one splat on `devices` of them, the first measures all
         but `phases`, `launches` and `curve`: its checkpoint is evaluated on one device, S̄ is computed in the loop, and
         `peak_gb` is the first device's. The others return nothing.
@@ -139,7 +129,7 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
 
     from benchmarks import evaluate, launches, phases
     from benchmarks.curve import Curve, point
-    from benchmarks.timer import CompileTimer, LoopTimer
+    from benchmarks.timer import LoopTimer
     from sadgs_ns.plugin import processes
 
     devices = processes.number_of_processes()
@@ -151,8 +141,7 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
         yield
         seconds[f"{name}_seconds"] = evaluate.now() - begin
 
-    compiling = CompileTimer()
-    with timed("setup"), compiling:
+    with timed("setup"):
         config = build_config(job.scene, job.row, job.seed, root, work)
         _set_random_seed(job.seed)
         trainer: Any = config.setup(local_rank=int(os.environ.get("LOCAL_RANK", "0")), world_size=devices)
@@ -170,7 +159,7 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
         train_images, _ = datamanager.cached_train, datamanager.cached_eval
     if devices == 1:  # A model that several processes share draws nothing alone, and compiles in the setup.
         # gsplat's, Triton's and torch.compile's kernels build at the first call, once per machine.
-        with timed("warmup"), compiling:
+        with timed("warmup"):
             camera = datamanager.train_dataset.cameras[:1].to(trainer.device)
             pipeline.eval()
             outputs = model.get_outputs(camera)
@@ -180,7 +169,7 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
                 model.get_outputs(camera)
             pipeline.train()
         if hasattr(pipeline, "structure_maps"):  # splatfacto's pipeline has none
-            with timed("structure_tensor"), compiling:
+            with timed("structure_tensor"):
                 _ = pipeline.structure_maps.codes
 
     timer, curve = LoopTimer(), None
@@ -188,11 +177,7 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
         curve = Curve(job.row.curve_every, timer)
         curve.attach(trainer)
     timer.attach(trainer)
-    before_loop = compiling.seconds
-    with timed("train"), compiling:
-        trainer.train()
-    seconds["train_seconds"] -= timer.stopped_seconds
-    wall = time.perf_counter() - start - timer.stopped_seconds
+    trainer.train()
     if not timer.finished:
         raise RuntimeError("the training loop stopped before its last iteration.")
     if devices > 1:
@@ -200,32 +185,19 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
             return {}
         trainer = alone(job, root, work, trainer.checkpoint_dir)
         pipeline, datamanager, model = trainer.pipeline, trainer.pipeline.datamanager, trainer.pipeline.model
-        train_images = datamanager.cached_train
 
     pipeline.eval()
     views = datamanager.fixed_indices_eval_dataloader
-    with timed("evaluation"):
-        networks = {"lpips": evaluate.load_lpips(), "lpips_vgg": evaluate.load_lpips_vgg()}
-        held_out = evaluate.quality(model, views, networks)
-        indices = torch.linspace(0, len(train_images) - 1, TRAIN_VIEWS).long().unique().tolist()
-        train_cameras = datamanager.train_dataset.cameras
-        train_views = [(train_cameras[i : i + 1].to(trainer.device), train_images[i]) for i in indices]
-        train_psnr = evaluate.quality(model, train_views, {})["psnr"]
-        fps = evaluate.frames_per_second(model, [camera for camera, _ in views])
-        held_out["ply_view_psnr"] = evaluate.view_psnr_in_viewers(model, views, held_out["view_psnr"])
+    held_out = evaluate.quality(model, views, evaluate.load_lpips())
+    held_out["ply_view_psnr"] = evaluate.view_psnr_in_viewers(model, views, held_out["view_psnr"])
     record = {
         "devices": devices,
         "iterations": trainer.config.max_num_iterations,
         "views_per_iteration": getattr(pipeline, "views_per_iteration", 1),
         "loop_seconds": timer.seconds,
         **seconds,
-        "wall_seconds": wall,
-        "compile_seconds": compiling.seconds,
-        "loop_compile_seconds": compiling.seconds - before_loop,
         **held_out,
         **coverage_of_views(datamanager, model),
-        "train_psnr": train_psnr,
-        "fps": fps,
         "gaussians": int(model.num_points),
         "peak_gb": timer.peak_gb,
         "train_views": len(train_images),

@@ -1,4 +1,4 @@
-"""The clocks of the training loop and of Triton's compiler."""
+"""The clock of the training loop."""
 
 from __future__ import annotations
 
@@ -20,8 +20,6 @@ class LoopTimer:
     def __init__(self) -> None:
         self.seconds: float = 0.0
         """Time in the loop, until it was last stopped."""
-        self.stopped_seconds: float = 0.0
-        """Time between the loop's start and end in which the timer was stopped."""
         self.peak_gb: float | None = None
         """Largest memory that tensors took in the loop, in 10⁹ bytes; None without a GPU."""
         self.finished: bool = False
@@ -41,9 +39,7 @@ class LoopTimer:
     def stopped(self) -> Iterator[None]:
         """Count neither the time nor the memory of what is done in the loop meanwhile."""
         self._stop()
-        begin = now()
         yield
-        self.stopped_seconds += now() - begin
         self._go()
 
     def _go(self) -> None:
@@ -59,36 +55,3 @@ class LoopTimer:
     def _end(self, step: int) -> None:
         self._stop()
         self.finished = True
-
-
-class CompileTimer(contextlib.AbstractContextManager):
-    """Times what Triton compiles while the context is open, however often it is opened.
-
-    Kernels that an earlier run on the machine has left in Triton's cache count as nothing.
-    """
-
-    def __init__(self) -> None:
-        self._times: list[float] = []  # a list, since threads compile side by side
-
-    @property
-    def seconds(self) -> float:
-        """Sum over the kernels, also over those that are compiled at the same time."""
-        return sum(self._times)
-
-    def __enter__(self) -> CompileTimer:
-        self._listen(self._note)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._listen(None)
-
-    def _listen(self, listener: Any) -> None:
-        try:
-            from triton import knobs
-        except ImportError:  # no Triton, or one too old for our kernels
-            return
-        knobs.compilation.listener = listener
-
-    def _note(self, *, times: Any, cache_hit: bool, **_: Any) -> None:
-        if not cache_hit:
-            self._times.append(times.total / 1e6)  # from µs

@@ -4,9 +4,8 @@ Test views are for tables alone. This writes a copy of each scene of a folder (i
 from 0, a test view, is gone, and every 8th from 4 is held out. Where the scene names its own test views (a
 `transforms.json` with lists of file names), every 8th training view from 4 is held out instead. With `--folds 2,4,6`,
 there are copies NAME-2, NAME-4 and NAME-6, in each of which every 8th view from that number is held out. Fold 0 holds
-out the test views and trains on all others, as the tables do. With `--masked`, a rectangle in each training view,
-somewhere else in each and a quarter of it in all, is masked; held-out views are whole. With `--noisy`, the camera of
-each training view is turned by a random angle, and those of held-out views are true.
+out the test views and trains on all others, as the tables do. With `--noisy`, the camera of each training view is
+turned by a random angle, and those of held-out views are true.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from pathlib import Path
 
 import numpy as np
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
-from PIL import Image
 from scipy.spatial.transform import Rotation
 from tyro.conf import Positional
 
@@ -29,20 +27,17 @@ SPARSE = Path("sparse/0")
 """Folder of a COLMAP scene's model."""
 INTERVAL, TEST, VALIDATION = 8, 0, 4
 """Every 8th view from 0 is a test view, every 8th from 4 a validation view."""
-MASKED_SHARE = 0.25
-"""Share of a training view's pixels that `--masked` masks."""
 NOISY_DEGREES = 0.1
 """Standard deviation of the angle by which `--noisy` turns a camera about each of its axes: 2 px at a focal length of
 1,150 px."""
 
 
-def write_colmap(scene: Path, out: Path, masked: bool = False, fold: int = VALIDATION) -> tuple[int, int]:
+def write_colmap(scene: Path, out: Path, fold: int = VALIDATION) -> tuple[int, int]:
     """Write one COLMAP scene with the lists that nerfstudio's parser reads.
 
     Args:
         scene: Folder with `images` and `sparse/0`.
         out: Folder to write; one that is there is replaced.
-        masked: Whether to write `masks`, too.
         fold: Number of the first view that is held out, in [0, 7]. Test views are in the training views of no fold.
 
     Returns:
@@ -60,17 +55,6 @@ def write_colmap(scene: Path, out: Path, masked: bool = False, fold: int = VALID
     train = [name for i, name in enumerate(names) if i % INTERVAL not in (TEST, fold)]
     for split, chosen in {"train": train, "test": held_out, "val": held_out}.items():
         (out / f"{split}_list.txt").write_text("\n".join(chosen))
-    for i, name in enumerate(names if masked else ()):
-        with Image.open(scene / "images" / name) as image:
-            mask = np.full(image.size[::-1], 255, np.uint8)
-        if name in train:
-            generator = np.random.default_rng(i)
-            height, width = (int(side * MASKED_SHARE**0.5) for side in mask.shape)
-            row, column = generator.integers(mask.shape[0] - height), generator.integers(mask.shape[1] - width)
-            mask[row : row + height, column : column + width] = 0
-        path = (out / "masks" / name).with_suffix(".png")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(mask).save(path)
     return len(train), len(held_out)
 
 
@@ -132,8 +116,6 @@ class Command:
     """folder for the copies"""
     folds: str | None = None
     """such as 2,4,6: write NAME-2, … with every 8th view from 2, … held out (default: 4, as NAME)"""
-    masked: tuple[str, ...] = ()
-    """scenes of which NAME-masked is written, too"""
     noisy: tuple[str, ...] = ()
     """scenes of which NAME-noisy is written, too"""
 
@@ -150,11 +132,9 @@ class Command:
         for scene, fold in product(scenes, map(int, folds)):
             name = scene.name if self.folds is None else f"{scene.name}-{fold}"
             if (scene / SPARSE).is_dir():
-                train, held_out = write_colmap(scene, self.out / name, fold=fold)
-                if scene.name in self.masked:
-                    write_colmap(scene, self.out / f"{name}-masked", masked=True, fold=fold)
+                train, held_out = write_colmap(scene, self.out / name, fold)
                 if scene.name in self.noisy:
-                    write_colmap(scene, self.out / f"{name}-noisy", fold=fold)
+                    write_colmap(scene, self.out / f"{name}-noisy", fold)
                     turn_cameras(self.out / f"{name}-noisy")
             else:
                 train, held_out = write_transforms(scene, self.out / name, fold)

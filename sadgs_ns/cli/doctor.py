@@ -24,8 +24,8 @@ from sadgs_ns.errors import free_space, reason
 
 PACKAGES = ("sadgs_ns", "torch", "torchvision", "gsplat", "nerfstudio", "triton", "pycolmap", "open3d")
 """Packages whose versions are printed."""
-_LPIPS_NETWORKS = {"AlexNet": "alexnet-owt-7be5be79.pth", "VGG": "vgg16-397923af.pth"}
-"""Networks of LPIPS, and the files in which torchvision keeps their weights."""
+_LPIPS_FILE = "alexnet-owt-7be5be79.pth"
+"""The file in which torchvision keeps the weights of LPIPS's AlexNet."""
 
 
 def versions() -> dict[str, str]:
@@ -135,17 +135,12 @@ def _check_lpips() -> Iterator[Finding]:
     """Check whether the weights of LPIPS are on the disk."""
     import torch
 
-    for name, file in _LPIPS_NETWORKS.items():
-        path = Path(torch.hub.get_dir(), "checkpoints", file)
-        if path.is_file():
-            yield Finding("note", f"LPIPS with {name} has its weights: {path}.")
-        elif name == "AlexNet":
-            yield Finding(
-                "warning",
-                f"LPIPS with {name} has no weights: the first `ns-eval` downloads them to {path}, or leaves it out.",
-            )
-        else:
-            yield Finding("note", f"LPIPS with {name}, for benchmarks alone, has no weights: put them at {path}.")
+    path = Path(torch.hub.get_dir(), "checkpoints", _LPIPS_FILE)
+    if path.is_file():
+        yield Finding("note", f"LPIPS with AlexNet has its weights: {path}.")
+    else:
+        sentence = f"LPIPS with AlexNet has no weights: the first `ns-eval` downloads them to {path}, or leaves it out."
+        yield Finding("warning", sentence)
 
 
 def check_all(data: Path | None) -> Iterator[Finding]:

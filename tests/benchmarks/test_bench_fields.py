@@ -90,7 +90,6 @@ class RestlessNetwork(torch.nn.Module):
 def replace_lpips(patch: pytest.MonkeyPatch) -> None:
     """LPIPS without weights, and a clock that an evaluation with it puts forward."""
     patch.setattr(evaluate, "load_lpips", RestlessNetwork)
-    patch.setattr(evaluate, "load_lpips_vgg", lambda: None)
 
     def now() -> float:
         return time.perf_counter() + 3600 * RestlessNetwork.hours
@@ -170,11 +169,11 @@ def test_no_time_contains_the_evaluation(runs: Runs):
     """Each of the curve's evaluations takes hours of the clock."""
     record, _ = runs["with"]
     times = [point["seconds"] for point in record["curve"]]
-    assert 0 < times[0] < times[1] < times[2] == record["loop_seconds"] < record["train_seconds"] < 600
+    assert 0 < times[0] < times[1] < times[2] == record["loop_seconds"] < 600
 
 
 def test_the_timer_stops(monkeypatch: pytest.MonkeyPatch):
-    clock = iter([1.0, 4.0, 5.0, 15.0, 16.0, 20.0])
+    clock = iter([1.0, 4.0, 16.0, 20.0])
     monkeypatch.setattr(timer, "now", lambda: next(clock))
     trainer = SimpleNamespace(config=SimpleNamespace(max_num_iterations=7), callbacks=[])
     watch = timer.LoopTimer()
@@ -186,7 +185,7 @@ def test_the_timer_stops(monkeypatch: pytest.MonkeyPatch):
     assert not watch.finished
     end.run_callback(5)
     end.run_callback(6)
-    assert (watch.seconds, watch.stopped_seconds, watch.finished) == (7.0, 10.0, True)
+    assert (watch.seconds, watch.finished) == (7.0, True)
 
 
 def test_undisturbed_restores_what_a_rendering_notes():
@@ -358,8 +357,7 @@ def written(root: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, A
 def test_a_record_holds_all_fields(written: dict[str, Any]):
     record = written
     assert record["status"] == "ok", record["error"]
-    assert record["lpips_vgg"] is None and "curve" not in record
-    assert record["ssim"] != record["ssim_padded"]
+    assert record["lpips"] is not None and "curve" not in record
     assert len(record["view_psnr"]) == record["eval_views"]
     assert sum(record["view_psnr"]) / record["eval_views"] == pytest.approx(record["psnr"], abs=0.005)
 
@@ -383,12 +381,10 @@ def test_each_held_out_view_is_told_in_the_order_of_its_psnr(runs: Runs, root: P
         assert told["view_angles"] == told["view_uncovered"] == [None] * 3
 
 
-def test_the_times_add_up(written: dict[str, Any]):
-    record = written
-    names = ("import", "setup", "initialization", "load", "warmup", "structure_tensor", "train")
-    parts = {name: record[f"{name}_seconds"] for name in names}
+def test_the_parts_before_the_loop_are_timed(written: dict[str, Any]):
+    names = ("import", "setup", "initialization", "load", "warmup", "structure_tensor", "loop")
+    parts = {name: written[f"{name}_seconds"] for name in names}
     assert parts["initialization"] >= INITIALIZATION_SECONDS and all(part > 0 for part in parts.values())
-    assert 0 <= record["wall_seconds"] - sum(parts.values()) < INITIALIZATION_SECONDS
 
 
 def test_two_processes_train_one_splat_whose_row_the_first_writes(
@@ -446,58 +442,6 @@ def test_the_near_plane_of_other_viewers_is_measured_and_put_back(near_plane: fl
     assert drawn == 2 * planes and model.near_plane == near_plane
 
 
-# Metrics
-
-
-def test_ssim_padded_is_the_one_of_3dgs():
-    generator = torch.Generator().manual_seed(0)
-    truth = torch.rand(1, 3, 30, 40, generator=generator)
-    image = (truth + 0.2 * torch.randn(truth.shape, generator=generator)).clamp(0, 1)
-    x = torch.arange(11.0) - 5
-    window = torch.exp(-(x**2) / (2 * 1.5**2))
-    window = (window[:, None] * window / window.sum() ** 2).expand(3, 1, 11, 11)
-
-    def blur(values: Tensor) -> Tensor:
-        return torch.nn.functional.conv2d(values, window, padding=5, groups=3)
-
-    mean1, mean2 = blur(image), blur(truth)
-    variance1, variance2 = blur(image**2) - mean1**2, blur(truth**2) - mean2**2
-    covariance = blur(image * truth) - mean1 * mean2
-    similarity = (2 * mean1 * mean2 + 0.01**2) * (2 * covariance + 0.03**2)
-    similarity /= (mean1**2 + mean2**2 + 0.01**2) * (variance1 + variance2 + 0.03**2)
-    torch.testing.assert_close(evaluate.ssim_padded(image, truth), similarity.mean(), rtol=1e-4, atol=1e-5)
-
-
-def test_vgg_is_never_downloaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    monkeypatch.setattr(torch.hub, "download_url_to_file", lambda *_, **__: pytest.fail("a download"))
-    assert evaluate.load_lpips_vgg() is None
-    assert f"there is no {tmp_path}/hub/checkpoints/vgg16-397923af.pth" in capsys.readouterr().out
-
-
-def test_vgg_is_loaded_from_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    import torchvision
-
-    weights = tmp_path / "hub" / "checkpoints" / "vgg16-397923af.pth"
-    weights.parent.mkdir(parents=True)
-    weights.touch()  # half a gigabyte, if it were real: random weights stand for it
-    untrained = torchvision.models.vgg16
-    loaded: list[str] = []
-
-    def vgg16(weights: Any) -> torch.nn.Module:
-        loaded.append(Path(weights.url).name)
-        torch.manual_seed(0)
-        return SimpleNamespace(features=untrained(weights=None, init_weights=False).features)  # type: ignore[return-value]
-
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    monkeypatch.setattr(torchvision.models, "vgg16", vgg16)
-    network = evaluate.load_lpips_vgg()
-    assert network is not None and loaded == [weights.name]
-    image = torch.rand(1, 3, 32, 32)
-    assert float(network(image, image)) == 0.0
-    assert network.normalize is False, "3DGS hands VGG images in [0, 1]"
-
-
 # Protocol and command
 
 
@@ -530,15 +474,6 @@ def test_curve_every_is_part_of_the_key_only_where_it_is_given():
 def test_curve_every_is_a_positive_whole_number(wrong: object):
     with pytest.raises(ValueError, match="curve_every must be a whole number of iterations from 1, not"):
         protocol.parse(content(curve_every=wrong))
-
-
-def test_the_bar_estimates_from_the_runs_that_ended():
-    clock = [0.0]
-    progress, task = bench.progress_bar(10, 4, disable=True, get_time=lambda: clock[0])
-    assert progress.tasks[0].time_remaining is None, "nothing is known before the first run has ended"
-    for clock[0], left in ((100.0, 500.0), (300.0, 600.0), (600.0, 600.0)):
-        progress.advance(task)
-        assert progress.tasks[0].time_remaining == left
 
 
 def test_a_strategy_that_was_never_fitted_to_a_run_is_left_as_it_was():

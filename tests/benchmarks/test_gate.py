@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import os
 import re
 import subprocess
 import warnings
@@ -77,70 +76,29 @@ def test_what_was_not_measured_fails(baseline: Path):
     for results in ([result(jobs[0])], [result(jobs[0]), failed]):
         (line,) = gate.regressions(content, jobs, results)
         assert line == "fox/ours is missing from the results: 1 of 2 runs ended well."
-    (line,) = gate.regressions(content, [job("other")], [result(job("other"))])
-    assert line == "fox/ours is missing from the results: no such run was asked for."
+    lines = gate.regressions(content, [job("other")], [result(job("other"))])
+    assert lines[1:] == ["fox/ours is missing from the results: no such run was asked for."]
     (line,) = gate.regressions(content, [job()], [result(job(), lpips=None)])
     assert line == "fox/ours: lpips was not measured; the baseline has 0.1."
-
-
-def test_an_update_keeps_directions_and_tolerances(baseline: Path):
-    before = json.loads(baseline.read_text())
-    before["south/ours"] = {"psnr": entry(18.0, "higher", 1.0)}
-    baseline.write_text(json.dumps(before))
-    jobs = [job(seed=0), job(seed=1)]
-    gate.renew(baseline, jobs, [result(jobs[0], psnr=20.0, lpips=0.3), result(jobs[1], psnr=21.0, lpips=0.3)])
-    before["fox/ours"]["psnr"]["value"], before["fox/ours"]["lpips"]["value"] = 20.5, 0.3
-    assert json.loads(baseline.read_text()) == before
-    assert [path.name for path in baseline.parent.iterdir()] == [baseline.name]
-    assert gate.judge(baseline, jobs, [result(j, psnr=20.5, lpips=0.3) for j in jobs]) is False  # south did not run
-
-
-def test_new_rows_get_defaults_for_what_was_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    path = tmp_path / "new" / "baseline.json"
-    gate.renew(path, [job()], [result(job(), ssim=0.9, lpips=None, gaussians=2000)])
-    assert json.loads(path.read_text()) == {
-        "fox/ours": {
-            "psnr": entry(30.0, "higher", 0.4),
-            "ssim": entry(0.9, "higher", 0.01),
-            "gaussians": entry(2000, "near", 80),
-        }
-    }
-    assert "New rows have default tolerances, to be set from several seeds: fox/ours." in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("results", "sentence"),
-    [
-        ([], "fox/ours: 1 of 1 runs have no result; finish them."),
-        ([result(job(), lpips=None)], "fox/ours: lpips was not measured"),
-    ],
-)
-def test_an_update_from_incomplete_results_changes_nothing(baseline: Path, results: list, sentence: str):
-    before = baseline.read_bytes()
-    with pytest.raises(ValueError, match=re.escape(sentence)):
-        gate.renew(baseline, [job()], results)
-    assert baseline.read_bytes() == before
-
-
-def test_a_failed_write_leaves_the_old_file(baseline: Path, monkeypatch: pytest.MonkeyPatch):
-    before = baseline.read_bytes()
-    monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(OSError("full")))
-    with pytest.raises(OSError, match="full"):
-        gate.renew(baseline, [job()], [result(job(), psnr=1.0)])
-    assert baseline.read_bytes() == before and len(list(baseline.parent.iterdir())) == 1
 
 
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
-        ("{", "b.json is not JSON"),
-        ("{}", "b.json must be an object with a row or more, named scene/label."),
-        ('{"a/b": {}}', "b.json: a/b must be an object with a metric or more."),
-        ('{"a/b": {"psnr": {"value": 3}}}', "b.json: a/b, psnr must have value, direction and tolerance"),
-        (json.dumps({"a/b": {"psnr": entry(3, "up", 1)}}), "direction must be one of higher, lower, near."),
-        (json.dumps({"a/b": {"psnr": entry(3, "near", -1)}}), "tolerance one from 0."),
-        ('{"a/b": {"psnr": {"value": NaN, "direction": "near", "tolerance": 1}}}', "value must be a number"),
-        ('{"a/b": {"psnr": {"value": true, "direction": "near", "tolerance": 1}}}', "value must be a number"),
+        ("{", "b.json is no baseline (Expecting"),
+        ("[]", "b.json is no baseline ('list' object"),
+        ('{"a/b": 3}', "b.json is no baseline ('int' object"),
+        ('{"a/b": {"psnr": {"value": 3}}}', "missing 2 required positional arguments"),
+        (json.dumps({"a/b": {"psnr": entry(3, "up", 1)}}), "direction must be one of higher, lower, near"),
+        (json.dumps({"a/b": {"psnr": entry(3, "near", -1)}}), "tolerance must be at least 0"),
+        (
+            '{"a/b": {"psnr": {"value": NaN, "direction": "near", "tolerance": 1}}}',
+            "value and tolerance must be numbers",
+        ),
+        (
+            '{"a/b": {"psnr": {"value": true, "direction": "near", "tolerance": 1}}}',
+            "value and tolerance must be numbers",
+        ),
     ],
 )
 def test_wrong_baselines_say_what_is_wrong(tmp_path: Path, content: str, sentence: str):
@@ -191,26 +149,18 @@ def test_the_command_exits_with_1_on_a_regression(command: Any, baseline: Path, 
     assert "Gate: FAILED" in said
 
 
-def test_the_command_updates_a_baseline_which_it_then_passes(command: Any, baseline: Path):
-    assert command("--update-baseline", str(baseline), psnr=29.4) == 0
-    assert gate.read(baseline)["fox/ours"]["psnr"] == Metric(29.4, "higher", 0.5)
-    assert command("--gate", str(baseline), psnr=29.4) == 0
-
-
 def test_rows_that_nothing_judges_are_told(command: Any, baseline: Path, capsys: pytest.CaptureFixture[str]):
     baseline.write_text(baseline.read_text().replace("fox/ours", "fox/theirs"))
     assert command("--gate", str(baseline)) == 1
     said = capsys.readouterr().out
-    assert "fox/theirs is missing from the results" in said and "fox/ours is not in" in said
+    assert "fox/theirs is missing from the results" in said and "fox/ours is not in the baseline" in said
 
 
 def test_a_wrong_baseline_is_told_before_anything_runs(
     command: Any, baseline: Path, capsys: pytest.CaptureFixture[str]
 ):
     assert command("--gate", str(baseline.with_name("no.json"))) == 2
-    assert "no.json cannot be read" in capsys.readouterr().err
-    baseline.write_text("{")
-    assert command("--update-baseline", str(baseline)) == 2
+    assert "no.json is no baseline ([Errno 2] No such file" in capsys.readouterr().err
     assert not command.started
 
 

@@ -16,7 +16,7 @@ from PIL import Image
 
 from benchmarks import __main__ as bench
 from benchmarks import protocol
-from benchmarks.datasets import image_names, runnable
+from benchmarks.datasets import check, image_names
 from benchmarks.protocol import Job, Row, Scene
 from benchmarks.run import build_config
 
@@ -160,14 +160,6 @@ def test_the_progressive_rows_add_one_thing_each(tmp_path: Path):
         assert [s.tau_split for s in strategies] == [0.8, 0.0, 0.8]
 
 
-def test_matched_counts_are_splatfactos_when_they_were_measured(tmp_path: Path):
-    measured = {"bonsai": 322_527, "fox": 152_390, "south": 604_755}  # on 2026-11-21; rows of commit 667700b
-    built = configs("matched-count", tmp_path)
-    for scene, count in measured.items():
-        assert built[scene, "sadgs-matched"].pipeline.model.strategy.max_gaussians == round(count, -3)
-        assert built[scene, "splatfacto"].max_num_iterations == 30000
-
-
 def of_sadgs(name: str, root: Path) -> dict[tuple[str, str], Any]:
     """Configs of the protocol's rows of `sadgs`."""
     return {key: config for key, config in configs(name, root).items() if config.method_name == "sadgs"}
@@ -254,26 +246,16 @@ def test_what_is_missing_in_a_scene_is_named(tmp_path: Path):
 
 def test_all_missing_scenes_are_one_sentence_with_their_source(tmp_path: Path):
     with pytest.raises(ValueError) as error:
-        runnable([job("garden"), job("stump")], tmp_path, "the data set Mip-NeRF 360", skip_missing=True)
+        check([job("garden"), job("stump")], tmp_path, "the data set Mip-NeRF 360")
     assert str(error.value) == (
         f"scene 'garden': {tmp_path / 'garden'} does not exist, scene 'stump': {tmp_path / 'stump'} does not exist; "
         "check --scenes or get the data set Mip-NeRF 360."
     )
 
 
-def test_scenes_that_are_there_run_if_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    colmap_scene(tmp_path / "garden")
-    jobs = [job("garden"), job("stump"), job("garden", downscale_factor=4)]
-    with pytest.raises(ValueError, match=r"stump does not exist; check --scenes\. --skip-missing .* others: garden\."):
-        runnable(jobs, tmp_path)
-    assert runnable(jobs, tmp_path, skip_missing=True) == [jobs[0], jobs[2]]
-    said = capsys.readouterr().err
-    assert said == f"Left out: scene 'stump': {tmp_path / 'stump'} does not exist. Running garden.\n"
-
-
 def test_another_order_of_the_images_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     colmap_scene(tmp_path / "garden", names=("b.jpg", "a.jpg"))
-    assert runnable([job()], tmp_path) == [job()]
+    check([job()], tmp_path)
     assert "scene 'garden': COLMAP numbered its images in another order" in capsys.readouterr().err
 
 

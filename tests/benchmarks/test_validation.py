@@ -10,27 +10,22 @@ import pytest
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
-from scenes import HEIGHT, VIEWS, WIDTH
+from scenes import VIEWS
 
 from benchmarks import __main__ as bench
 from benchmarks.datasets import image_names
-from benchmarks.validation import MASKED_SHARE, SPARSE
+from benchmarks.validation import SPARSE
 
 
 def test_a_colmap_scene_is_split_as_nerfstudio_then_reads_it(scene: Path, tmp_path: Path):
-    assert bench.main(["validation", str(scene.parent), str(tmp_path), "--masked", scene.name]) == 0
+    assert bench.main(["validation", str(scene.parent), str(tmp_path)]) == 0
     names = image_names(ColmapDataParserConfig(colmap_path=SPARSE, downscale_factor=1), scene)
-    for folder, masks in ((tmp_path / scene.name, None), (tmp_path / f"{scene.name}-masked", Path("masks"))):
-        parser = ColmapDataParserConfig(data=folder, colmap_path=SPARSE, downscale_factor=1, masks_path=masks).setup()
-        read = {}
-        for split in ("train", "val", "test"):
-            outputs = parser.get_dataparser_outputs(split)
-            read[split] = [path.name for path in outputs.image_filenames]
-            for path in outputs.mask_filenames or ():
-                masked = 1 - np.asarray(Image.open(path)).mean() / 255
-                assert masked == pytest.approx(MASKED_SHARE * (split == "train"), abs=2 / min(WIDTH, HEIGHT))
-        assert read["val"] == read["test"] == [names[i] for i in range(4, VIEWS, 8)]
-        assert read["train"] == [name for i, name in enumerate(names) if i % 8 not in (0, 4)]
+    parser = ColmapDataParserConfig(data=tmp_path / scene.name, colmap_path=SPARSE, downscale_factor=1).setup()
+    read = {}
+    for split in ("train", "val", "test"):
+        read[split] = [path.name for path in parser.get_dataparser_outputs(split).image_filenames]
+    assert read["val"] == read["test"] == [names[i] for i in range(4, VIEWS, 8)]
+    assert read["train"] == [name for i, name in enumerate(names) if i % 8 not in (0, 4)]
 
 
 def test_each_fold_holds_out_its_views_and_only_fold_0_holds_out_test_views(scene: Path, tmp_path: Path):

@@ -52,7 +52,7 @@ def without_densification(config: SadgsTrainerConfig) -> SadgsTrainerConfig:
 def measured(trainer: SadgsTrainer) -> dict[str, Any]:
     """Quality of the held-out views, as they are and with fitted colours."""
     trainer.pipeline.eval()
-    return quality(trainer.pipeline.model, trainer.pipeline.datamanager.fixed_indices_eval_dataloader, {})
+    return quality(trainer.pipeline.model, trainer.pipeline.datamanager.fixed_indices_eval_dataloader)
 
 
 def test_a_run_learns_the_known_gains_and_held_out_views_gain_without_a_fit_of_their_colours(

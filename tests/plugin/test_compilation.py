@@ -19,7 +19,7 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 from kill_and_resume import configure
-from benchmarks.timer import CompileTimer
+from compile_timer import CompileTimer
 from sadgs_ns.plugin.trainer import SadgsTrainer
 
 config = configure(Path(sys.argv[2]), Path(sys.argv[3]), 100, save_every=0)
