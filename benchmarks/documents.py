@@ -33,10 +33,9 @@ matplotlib's version.
 from __future__ import annotations
 
 import hashlib
-import inspect
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -65,9 +64,18 @@ class Source:
     """Names of the files that were read."""
 
     def read(self, *names: str) -> list[dict[str, Any]]:
-        """The rows of files in the folder."""
+        """The rows of files in the folder, of JSON lines or a table of numbers in CSV."""
         self.cited |= {*names}
-        return [row for name in names for row in table.read_rows(self.folder / name)]
+        rows: list[dict[str, Any]] = []
+        for path in (self.folder / name for name in names):
+            if not path.is_file():
+                raise ValueError(f"{path} is not there; rows lie in docs/results.")
+            lines = path.read_text("utf-8").splitlines()
+            if path.suffix == ".csv":
+                rows += [dict(zip(lines[0].split(","), map(float, line.split(",")), strict=True)) for line in lines[1:]]
+            else:
+                rows += map(json.loads, lines)
+        return rows
 
     def lines(
         self, rows: str, scenes: Sequence[str], labels: Mapping[str, str], reference: str | None = None
@@ -91,10 +99,7 @@ class Source:
     def approximations(self, rows: str, of: str, input: str, variants: Sequence[str] | None = None) -> str:
         """What `approximations` measured in an image, of some variants or of all."""
         found = {r["variant"]: r for r in self.read(rows) if (r["table"], r["input"]) == (of, input)}
-        names = list(found) if variants is None else variants
-        if not names or not found.keys() >= {*names}:
-            raise ValueError(f"{rows} has of {of!r} and {input!r} only {', '.join(found)}.")
-        return table.of_approximations([found[name] for name in names])
+        return table.of_approximations([found[name] for name in variants or found])
 
     def growth(self, rows: str) -> str:
         """What `growth` measured."""
@@ -104,8 +109,8 @@ class Source:
         self, cost: str, lines: Sequence[Mapping[str, Any]], elsewhere: Sequence[Mapping[str, Any]] = ()
     ) -> list[Any]:
         """Arguments of `plots.peers`."""
-        runs = [(run, here) for here, parts in ((True, lines), (False, elsewhere)) for line in parts
-                for run in self.lines(**line)]  # fmt: skip
+        runs = [(run, True) for line in lines for run in self.lines(**line)]
+        runs += [(run, False) for line in elsewhere for run in self.lines(**line)]
         return [[(run.name, here, *map(run.mean, (cost, "psnr", "lpips"))) for run, here in runs], cost]
 
     def quality_drawn(self, rows: str, cost: str) -> list[Any]:
@@ -117,30 +122,19 @@ class Source:
         return [self.read(rows)]
 
 
-KINDS: dict[str, dict[str, Callable[..., Any]]] = {
-    "table": {"runs": Source.runs, "sweep": Source.sweep, "approximations": Source.approximations,
-              "growth": Source.growth},
-    "figure": {"peers": Source.peers_drawn, "quality": Source.quality_drawn, "growth": Source.growth_drawn},
-}  # fmt: skip
-
-
 def made(source: Source, what: str, name: str, description: Any) -> Any:
-    """What one of KINDS gives for a description in tables.yaml.
+    """What a description in tables.yaml makes: the text of a table, or the arguments of a figure of `plots`.
+
+    Args:
+        what: `table` or `figure`.
 
     Raises:
         ValueError: The description is wrong, or a row lacks what it names; one sentence.
     """
     try:
-        if not isinstance(description, dict) or description.get("kind") not in KINDS[what]:
-            raise ValueError(f"{description!r} must be a mapping whose kind is one of {', '.join(KINDS[what])}.")
-        function, options = KINDS[what][description["kind"]], {k: v for k, v in description.items() if k != "kind"}
-        signature = inspect.signature(function)
-        try:
-            signature.bind(source, **options)
-        except TypeError as error:
-            names = ", ".join([*signature.parameters][1:])
-            raise ValueError(f"{options!r} must be a mapping of {names}.") from error
-        return function(source, **options)
+        options = dict(description)
+        kind = options.pop("kind")
+        return getattr(source, kind if what == "table" else f"{kind}_drawn")(**options)
     except ValueError as error:
         raise ValueError(f"{what} {name}: {error}") from error
     except (AttributeError, KeyError, TypeError) as error:
@@ -169,14 +163,10 @@ def write(checkout: Path, check: bool = False) -> list[str]:
         tables, figures = dict(content["tables"]), dict(content.get("figures", {}))
         source = Source(folder, content["megapixels"])
     except OSError as error:
-        raise ValueError(
-            f"{folder / TABLES} cannot be read ({error.strerror}); give the folder of a checkout."
-        ) from error
+        raise ValueError(f"{folder / TABLES} cannot be read ({error.strerror}); give a checkout's folder.") from error
     except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError) as error:
         told = " ".join(str(error).split())
-        raise ValueError(
-            f"{folder / TABLES} must be YAML with megapixels and tables, both mappings: {told}."
-        ) from error
+        raise ValueError(f"{folder / TABLES} must be YAML with mappings of megapixels and tables: {told}.") from error
 
     new = {name: f"\n{made(source, 'table', name, description)}\n\n" for name, description in tables.items()}
     drawn = {name: made(source, "figure", name, description) for name, description in figures.items()}
@@ -195,19 +185,19 @@ def write(checkout: Path, check: bool = False) -> list[str]:
         texts[path] = _MARKED.sub(lambda match: f"<!-- table: {match[1]} -->\n{new[match[1]]}<!-- end -->", text)
     if spare := tables.keys() - used:
         raise ValueError(f"{folder / TABLES}: no document holds {', '.join(sorted(spare))}; delete what none needs.")
-    stale = {}
-    for name, arguments in drawn.items():
-        path = checkout / FIGURES / f"{name}.png"
-        if plots.digest_in(path) != (digest := hashlib.sha256(json.dumps(arguments).encode()).hexdigest()):
-            stale[path] = (figures[name]["kind"], arguments, digest)
     for path, text in {} if check else texts.items():
         if text != path.read_text("utf-8"):
             with atomic_path(path) as partial:
                 partial.write_text(text, "utf-8")
-    for path, (kind, arguments, digest) in {} if check else stale.items():
-        with atomic_path(path) as partial:
-            plots.save(getattr(plots, kind)(*arguments), partial, digest)
-    return [*changed, *map(str, stale)]
+    for name, arguments in drawn.items():
+        path = checkout / FIGURES / f"{name}.png"
+        digest = hashlib.sha256(json.dumps(arguments).encode()).hexdigest()
+        if plots.digest_in(path) != digest:
+            changed.append(str(path))
+            if not check:
+                with atomic_path(path) as partial:
+                    plots.save(getattr(plots, figures[name]["kind"])(*arguments), partial, digest)
+    return changed
 
 
 @dataclass

@@ -1,20 +1,18 @@
 """Plots of a benchmark's results: quality against time and against the number of Gaussians, and growing steps.
 
-Every method has a colour (Okabe–Ito), a marker and a line style of its own on all plots, so that none needs the colour.
-7.2 in wide with text of 8 pt and more: true to size on a page of A4 or letter.
+Every method has a colour (Okabe–Ito) and a marker of its own on all plots, so that none needs the colour. 7.2 in wide
+with text of 8 pt and more: true to size on a page of A4 or letter.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -32,9 +30,7 @@ COSTS = {"loop_seconds": "Training loop [s]   ({})", "gaussians": "Gaussians   (
 """Fields that quality is drawn against, with the title of their axis."""
 
 _OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#000000", "#CC79A7", "#56B4E9", "#E69F00")  # yellow is too light
-_MARKERS = "os^DvPX*<>phd"
-_FILLS = ("full", "none", "left", "top", "right", "bottom")
-_LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)))
+_MARKERS = "os^DvPX*<>ph"
 _SHOWN_BELOW = {"psnr": 5.0, "ssim": 0.15, "lpips": 0.2}
 """How much worse than the worst final value a curve's beginning may be and still be shown."""
 _INK, _GREY = "#222222", "#767676"
@@ -70,41 +66,24 @@ _RC: Any = {
 _FRONT: dict[str, Any] = {"color": _GREY, "linewidth": 1.0, "drawstyle": "steps-post", "zorder": 1}
 _styled = matplotlib.rc_context(_RC)
 
-Points = Iterable[tuple[float | None, float | None]]
+Points = list[tuple[float, float]]
 
 
-class Style(NamedTuple):
-    """How a method is drawn; colours and line styles repeat, a marker with its filling does not before 78 methods."""
-
-    color: str
-    marker: str
-    fill: str
-    line: Any
-
-    def line2d(self, **changes: Any) -> dict[str, Any]:
-        """Arguments of `Axes.plot`."""
-        looks = {"color": self.color, "marker": self.marker, "fillstyle": self.fill, "linestyle": self.line}
-        return {**looks, "markerfacecoloralt": "white", **changes}
+def styles(labels: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Options of `Axes.plot` for each label, in their order; none is like another of the first 12."""
+    looks = zip(itertools.cycle(_OKABE_ITO), itertools.cycle(_MARKERS), strict=False)
+    named = zip(dict.fromkeys(labels), looks, strict=False)
+    return {label: {"color": color, "marker": marker} for label, (color, marker) in named}
 
 
-def styles(labels: Iterable[str]) -> dict[str, Style]:
-    """A style for each label, in their order."""
-    fills = itertools.cycle(itertools.product(_FILLS, _MARKERS))
-    looks = zip(itertools.cycle(_OKABE_ITO), fills, itertools.cycle(_LINES), strict=False)
-    return {
-        label: Style(color, marker, fill, line)
-        for label, (color, (fill, marker), line) in zip(dict.fromkeys(labels), looks, strict=False)
-    }
-
-
-def pareto_front(points: Iterable[tuple[float, float]], higher_is_better: bool) -> list[tuple[float, float]]:
+def pareto_front(points: Iterable[tuple[float, float]], higher_is_better: bool) -> Points:
     """The points (cost, quality) that no other point beats: none costs as little or less with better quality.
 
     Returns:
         By rising cost; of equal points one.
     """
     sign = 1 if higher_is_better else -1
-    front: list[tuple[float, float]] = []
+    front: Points = []
     for cost, quality in sorted(points, key=lambda point: (point[0], -sign * point[1])):
         if not front or sign * quality > sign * front[-1][1]:
             front.append((cost, quality))
@@ -122,39 +101,42 @@ def quality(results: Iterable[tuple[tuple[str, str], list[Result]]], cost: str) 
         cost: The field.
     """
     groups, timed = dict(results), cost == "loop_seconds"
-    scenes, labels = (list(dict.fromkeys(key[i] for key in groups)) for i in (0, 1))
-    looks, rows = styles(labels), [row for group in groups.values() for row in group]
-    figure = Figure(figsize=(_WIDTH, 1.9 * len(scenes) + 0.3))
-    grid = figure.subplots(len(scenes), len(METRICS), sharex="row", squeeze=False)
-    panels: dict[tuple[str, str], Axes] = dict(zip(itertools.product(scenes, METRICS), grid.flat, strict=True))
-    ends: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    scenes = list(dict.fromkeys(scene for scene, _ in groups))
+    looks = styles(label for _, label in groups)
+    figure = Figure(figsize=(_WIDTH, 1.9 * len(scenes) + 0.6))
+    panels = dict(
+        zip(
+            itertools.product(scenes, METRICS),
+            figure.subplots(len(scenes), len(METRICS), sharex="row", squeeze=False).flat,
+            strict=True,
+        )
+    )
     for (scene, metric), axes in panels.items():
-        here = {label: groups[scene, label] for label in labels if (scene, label) in groups}
-        end = [point for label, group in here.items() for point in _ends(axes, group, cost, metric, looks[label])]
-        for label, group in here.items() if timed else ():
-            for row in group if len(group) > 1 else []:
-                thin = looks[label].line2d(alpha=0.3, linewidth=0.7, marker="")
-                _plot(axes, _near(_curve([row], metric), end, metric), thin)
-            _plot(axes, _near(_curve(group, metric), end, metric), looks[label].line2d(markersize=3.5))
-        ends[scene, metric] = end
-    for scene, axes in zip(scenes, grid[:, 0], strict=True):
-        axes.set_title(scene)
-    _finish(panels)
-    for (scene, metric), axes in () if timed else panels.items():
-        if front := pareto_front(ends[scene, metric], METRICS[metric][1]):
+        here = [(label, group) for (where, label), group in groups.items() if where == scene]
+        ends = {label: _known([(mean(group, cost), mean(group, metric))]) for label, group in here}
+        for label, group in here:
+            seeds = _known([(row.get(cost), row.get(metric)) for row in group])
+            if len(group) > 1:
+                _plot(axes, seeds, **looks[label], alpha=0.4, markersize=3.5, linestyle="")
+            _plot(axes, ends[label], **looks[label], linestyle="", zorder=3)
+            if timed:
+                curve = _without_beginning(_curve(group, metric), itertools.chain(*ends.values()), metric)
+                _plot(axes, curve, **looks[label], markersize=3.5)
+        _finish(axes, metric)
+        front = [] if timed else pareto_front(itertools.chain(*ends.values()), METRICS[metric][1])
+        if front:
             worst, right = axes.get_ylim()[0 if METRICS[metric][1] else 1], axes.get_xlim()[1]
             steps = [(front[0][0], worst), *front, (right, front[-1][1])]
             axes.plot(*zip(*steps, strict=True), **_FRONT, scalex=False, scaley=False)
-    lines = timed and any(row.get("curve") for row in rows)
-    plain = {} if lines else {"linestyle": ""}
-    handles = [Line2D([], [], **looks[label].line2d(label=label, **plain)) for label in labels]
-    if any(len(group) > 1 for group in groups.values()):
-        seeds: dict[str, Any] = {"color": _GREY, "alpha": 0.6, "marker": "o", "markersize": 3.5, "linestyle": ""}
-        handles.append(Line2D([], [], **seeds, label="small: single seeds"))
+        if metric == "psnr":
+            axes.set_title(scene)
+    rows = [row for group in groups.values() for row in group]
+    line = "-" if timed and any(row.get("curve") for row in rows) else ""
+    handles = [Line2D([], [], **look, linestyle=line, label=label) for label, look in looks.items()]
     handles += [] if timed else [Line2D([], [], **_FRONT, label="Pareto front of the means")]
     shared = any(row.get("jobs_per_gpu", 1) > 1 for row in rows)
     remark = "runs shared a GPU: times are not comparable" if shared else "← less is better"
-    _finish_figure(figure, COSTS[cost].format(remark), handles, 3.2 if lines else 1.5)
+    _finish_figure(figure, COSTS[cost].format(remark), handles)
     return figure
 
 
@@ -169,19 +151,12 @@ def growth(rows: Sequence[Mapping[str, Any]]) -> Figure:
     number, size = rows[0]["gaussians"], rows[0]["megapixels"]
     figure = Figure(figsize=(_WIDTH, 2.8))
     left, right = figure.subplots(1, 2, sharey=True)
+    by_number = [(row["gaussians"], row) for row in rows if row["megapixels"] == size]
+    by_size = [(1e6 * row["megapixels"], row) for row in rows if row["gaussians"] == number]
     looks = styles(("ours", "gsplat and torch"))
-    panels = (
-        (left, [(row["gaussians"], row) for row in rows if row["megapixels"] == size], f"{size:g} megapixels"),
-        (
-            right,
-            [(1e6 * row["megapixels"], row) for row in rows if row["gaussians"] == number],
-            f"{number:,g} Gaussians",
-        ),
-    )
-    for axes, points, title in panels:
-        for label, field in (("ours", "ours_ms"), ("gsplat and torch", "gsplat_ms")):
-            timed = sorted((x, row[field]) for x, row in points if row[field] is not None)
-            axes.plot(*zip(*timed, strict=True), label=label, **looks[label].line2d())
+    for axes, points, title in ((left, by_number, f"{size:g} megapixels"), (right, by_size, f"{number:,g} Gaussians")):
+        for (label, look), field in zip(looks.items(), ("ours_ms", "gsplat_ms"), strict=True):
+            _plot(axes, sorted(_known((x, row[field]) for x, row in points)), label=label, **look)
         axes.set(xscale="log", yscale="log", title=title)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -203,21 +178,21 @@ def peers(points: Sequence[tuple[str, bool, float, float, float]], cost: str) ->
         cost: Field of COSTS that the points' cost is.
     """
     figure = Figure(figsize=(_WIDTH, 3.0))
-    panels = {("", metric): axes for metric, axes in zip(("psnr", "lpips"), figure.subplots(1, 2), strict=True)}
     methods = [name.split()[0].rstrip(",") for name, *_ in points]
     looks = styles(methods)
-    for column, axes in enumerate(panels.values(), 3):
+    panels = list(zip(figure.subplots(1, 2), ("psnr", "lpips"), (3, 4), strict=True))
+    for axes, metric, column in panels:
         for method, point in zip(methods, points, strict=True):
-            look = looks[method].line2d(linestyle="", fillstyle="full" if point[1] else "none")
-            axes.plot(point[2], point[column], **look)
-    _finish(panels)
+            fill = "full" if point[1] else "none"
+            axes.plot(point[2], point[column], **looks[method], linestyle="", fillstyle=fill)
+        _finish(axes, metric)
     grey: dict[str, Any] = {"color": _GREY, "marker": "o", "linestyle": ""}
     handles = [Line2D([], [], **grey, label="on one machine")]
     if not all(here for _, here, *_ in points):
         handles.append(Line2D([], [], **grey, fillstyle="none", label="on other machines"))
-    _finish_figure(figure, COSTS[cost].format("← less is better"), handles, 1.5)
+    _finish_figure(figure, COSTS[cost].format("← less is better"), handles)
     figure.draw_without_rendering()  # The panels then have their places, which names must not change.
-    for column, axes in enumerate(panels.values(), 3):
+    for axes, _, column in panels:
         _name_points(axes, [(point[0], point[2], point[column]) for point in points])  # type: ignore[misc]
     return figure
 
@@ -260,85 +235,61 @@ def digest_in(path: Path) -> str | None:
         return image.info.get("Description")
 
 
-def _finite(points: Points) -> list[tuple[float, float]]:
+def _known(points: Iterable[tuple[float | None, float | None]]) -> Points:
     """The points that a logarithmic x axis can show."""
     known = [(x, y) for x, y in points if x is not None and y is not None]
     return [(x, y) for x, y in known if math.isfinite(x) and x > 0 and math.isfinite(y)]
 
 
-def _plot(axes: Axes, points: Points, looks: dict[str, Any]) -> None:
-    if shown := _finite(points):
-        axes.plot(*zip(*shown, strict=True), **looks)
+def _plot(axes: Axes, points: Points, **looks: Any) -> None:
+    if points:
+        axes.plot(*zip(*points, strict=True), **looks)
 
 
-def _curve(group: list[Result], name: str) -> list[tuple[float | None, float | None]]:
-    """Mean (seconds, metric) at the steps that all of a group's curves have, and the end of the runs; empty without."""
+def _curve(group: list[Result], metric: str) -> Points:
+    """Mean (seconds, metric) at the steps that all of a group's curves have, the last of which is the run's end."""
     curves = [{point["step"]: point for point in row["curve"]} for row in group if row.get("curve")]
-    steps = sorted(set.intersection(*map(set, curves))) if curves else []
-    points = [[curve[step] for curve in curves] for step in steps]
-    curve = [(mean(point, "seconds"), mean(point, name)) for point in points]
-    end = mean(group, "loop_seconds") if curves else None
-    return [*curve, (end, mean(group, name))] if end and all(x is None or x < end for x, _ in curve) else curve
+    points = (
+        [[curve[step] for curve in curves] for step in sorted(set.intersection(*map(set, curves)))] if curves else []
+    )
+    return _known((mean(point, "seconds"), mean(point, metric)) for point in points)
 
 
-def _ends(axes: Axes, group: list[Result], cost: str, metric: str, style: Style) -> list[tuple[float, float]]:
-    """Draw the runs as small points and their mean as a large one, which is returned, if there is one."""
-    for row in group if len(group) > 1 else []:
-        _plot(axes, [(row.get(cost), row.get(metric))], style.line2d(alpha=0.4, markersize=3.5, linestyle=""))
-    average = [(mean(group, cost), mean(group, metric))]
-    _plot(axes, average, style.line2d(zorder=3, linestyle=""))
-    return _finite(average)
-
-
-def _near(curve: Points, ends: list[tuple[float, float]], metric: str) -> list[tuple[float, float]]:
+def _without_beginning(curve: Points, ends: Iterable[tuple[float, float]], metric: str) -> Points:
     """A curve without its far worse beginning, so that the ends can be told apart."""
-    sign, shown = (1 if METRICS[metric][1] else -1), _finite(curve)
-    worst = min((sign * value for _, value in ends or shown), default=0.0)
-    return [(x, value) for x, value in shown if sign * value >= worst - _SHOWN_BELOW[metric]]
+    sign = 1 if METRICS[metric][1] else -1
+    worst = min((sign * value for _, value in ends), default=-math.inf)
+    return [(x, value) for x, value in curve if sign * value >= worst - _SHOWN_BELOW[metric]]
 
 
-def _finish(panels: Mapping[tuple[str, str], Axes]) -> None:
+def _finish(axes: Axes, metric: str) -> None:
     """Titles, and a logarithmic x axis with two ticks or more."""
-    for (_, metric), axes in panels.items():
-        title, higher = METRICS[metric]
-        axes.set_ylabel(f"{title}   ({'↑' if higher else '↓'} better)")
-        axes.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], min_n_ticks=3))
-        if not axes.lines:
-            axes.text(0.5, 0.5, "not measured", transform=axes.transAxes, ha="center", va="center", color=_GREY)
-            axes.set_yticks([])
-        if not any(panel.lines for panel in axes.get_shared_x_axes().get_siblings(axes)):
-            axes.set_xticks([])
-            continue
-        axes.set_xscale("log")
-        low, high = axes.get_xlim()
-        widening = max(1.0, math.sqrt(_LEAST_RATIO / (high / low)))
-        axes.set_xlim(low / widening, high * widening)
-        ratio = high / low * widening**2
-        subs = next((subs for limit, subs in _TICKS.items() if ratio < limit), (1,))
-        axes.xaxis.set_major_locator(LogLocator(subs=subs))
-        axes.xaxis.set_minor_locator(NullLocator())
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    title, higher = METRICS[metric]
+    axes.set_ylabel(f"{title}   ({'↑' if higher else '↓'} better)")
+    axes.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], min_n_ticks=3))
+    if not axes.lines:
+        axes.text(0.5, 0.5, "not measured", transform=axes.transAxes, ha="center", va="center", color=_GREY)
+        return
+    axes.set_xscale("log")
+    low, high = axes.get_xlim()
+    widening = max(1.0, math.sqrt(_LEAST_RATIO / (high / low)))
+    axes.set_xlim(low / widening, high * widening)
+    ratio = high / low * widening**2
+    subs = next((subs for limit, subs in _TICKS.items() if ratio < limit), (1,))
+    axes.xaxis.set_major_locator(LogLocator(subs=subs))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
 
 
-def _finish_figure(figure: Figure, title: str, handles: Sequence[Artist], length: float) -> None:
-    """The title of x below all panels, and above them, which makes the figure taller, a legend in as few lines as fit.
-
-    Args:
-        length: Of the legend's handles, in units of the font's size.
-    """
+def _finish_figure(figure: Figure, title: str, handles: Sequence[Line2D]) -> None:
+    """The title of x below all panels, and a legend above them."""
     figure.supxlabel(title)
     figure.align_ylabels()
-    labels = [textwrap.fill(str(handle.get_label()), 60) for handle in handles]
-    height = 0.0
-    for lines in range(max(math.ceil(len(labels) / 6), 1), len(labels) + 1):
-        # The texts are set afterwards: matplotlib would leave labels out that start with an underscore.
-        names, columns = [str(i) for i in range(len(labels))], math.ceil(len(labels) / lines)
-        legend = figure.legend(handles, names, loc="outside upper left", ncols=columns, handlelength=length)
-        for text, label in zip(legend.get_texts(), labels, strict=True):
-            text.set_text(label)
-        box = legend.get_window_extent()
-        height = box.height / figure.dpi
-        if box.width < 0.98 * figure.bbox.width or columns == 1:
-            break
-        legend.remove()
-    figure.set_figheight(figure.get_figheight() + height)
+    # The texts are set afterwards: matplotlib would leave labels out that start with an underscore.
+    names = [str(i) for i in range(len(handles))]
+    longest = max(len(str(handle.get_label())) for handle in handles)
+    columns = max(1, int(_WIDTH / (0.5 + 0.065 * longest)))  # in, as are the letters' widths
+    legend = figure.legend(handles, names, loc="outside upper left", ncols=columns)
+    for text, handle in zip(legend.get_texts(), handles, strict=True):
+        text.set_text(str(handle.get_label()))
+    figure.set_figheight(figure.get_figheight() + 0.18 * (math.ceil(len(handles) / columns) - 1))

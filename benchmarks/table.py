@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -349,20 +348,3 @@ class Command:
             for name, cost in (("quality-time", "loop_seconds"), ("quality-count", "gaussians")):
                 plots.save(plots.quality(grouped.items(), cost), self.plots / f"{name}.png")
         return 0
-
-
-def read_rows(path: Path) -> list[dict[str, Any]]:
-    """The rows of a file of JSON lines, or of a table of numbers in CSV.
-
-    Raises:
-        ValueError: There is no such file, or a line of it is not JSON.
-    """
-    if not path.is_file():
-        raise ValueError(f"{path} is not there; rows lie in docs/results.")
-    lines = path.read_text("utf-8").splitlines()
-    try:
-        if path.suffix == ".csv":
-            return [dict(zip(lines[0].split(","), map(float, line.split(",")), strict=True)) for line in lines[1:]]
-        return [json.loads(line) for line in lines]
-    except ValueError as error:
-        raise ValueError(f"{path} holds a line that is no row; delete it.") from error

