@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import json
 import os
 import signal
 import sys
@@ -11,10 +12,11 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import tyro
 
+from sadgs_ns.atomic import atomic_path
 from sadgs_ns.errors import InputError, RunError, free_space, reason
 from sadgs_ns.plugin.interrupts import Interrupted
 
@@ -27,7 +29,7 @@ def parse(options: type[Options], name: str, argv: Sequence[str] | None) -> Opti
     Args:
         options: A dataclass; its docstring and those of its fields are the help.
         name: The command.
-        argv: The command line without the name; None is that of the process.
+        argv: What follows the command; None is that of the process.
 
     Raises:
         SystemExit: With code 0 after the help or the version, with code 2 if the command line is wrong.
@@ -44,14 +46,9 @@ def parse(options: type[Options], name: str, argv: Sequence[str] | None) -> Opti
 def exit_code(name: str, folder: Path | None, run: Callable[[], int]) -> int:
     """Run a command that goes on where it was stopped, and print the sentence with which it ended.
 
-    Args:
-        name: The command.
-        folder: Where it writes.
-        run: The command, which returns its exit code.
-
     Returns:
-        The exit code: 1 where a file could not be written or the run failed, 2 if the input is wrong, and 130, 143 or
-        129 after SIGINT, SIGTERM or SIGHUP.
+        What `run` returns, 1 where a file in `folder` could not be written or the run failed, 2 if the input is wrong,
+        and 130, 143 or 129 after SIGINT, SIGTERM or SIGHUP.
     """
     try:
         return run()
@@ -60,9 +57,8 @@ def exit_code(name: str, folder: Path | None, run: Callable[[], int]) -> int:
     except (OSError, RunError) as error:
         told, code = str(error), 1
         if isinstance(error, OSError) and error.errno is not None:
-            folder = folder or Path()
-            told = f"{error.filename or folder}: {reason(error)} ({free_space(folder)} free there); the same command "
-            told += "goes on."
+            where, free = error.filename or folder or Path(), free_space(folder or Path())
+            told = f"{where}: {reason(error)} ({free} free there); the same command goes on."
     except KeyboardInterrupt as stopped:
         told = "stopped; the same command goes on."
         code = 128 + (stopped.number if isinstance(stopped, Interrupted) else signal.SIGINT)
@@ -70,17 +66,30 @@ def exit_code(name: str, folder: Path | None, run: Callable[[], int]) -> int:
     return code
 
 
+def read_settings(file: Path, folder: Path) -> dict[str, Any]:
+    """Return the settings that a folder was begun with; they are empty where there is no file of them.
+
+    Raises:
+        InputError: If the file is damaged.
+    """
+    try:
+        return dict(json.loads(file.read_text("utf8"))) if file.exists() else {}
+    except ValueError as error:
+        raise InputError(f"{file} is damaged ({reason(error)}): delete {folder} and begin again.") from error
+
+
+def write_json(file: Path, value: Any) -> None:
+    """Write JSON; the file appears complete or not at all, or a WriteError is raised."""
+    with atomic_path(file) as partial:
+        partial.write_text(json.dumps(value), "utf8")
+
+
 @contextlib.contextmanager
 def locked(folder: Path, refusal: str, seconds: float = 0.0) -> Iterator[int]:
     """Keep others away from a folder, as long as a process lives that has the file descriptor which this yields.
 
-    Args:
-        folder: It must be there.
-        refusal: What to tell the user where somebody else works there.
-        seconds: How long to wait until the folder is free.
-
     Raises:
-        InputError: If it does not become free.
+        InputError: If it does not become free in these seconds; `refusal` is its message.
     """
     lock, end = os.open(folder, os.O_RDONLY), time.monotonic() + seconds
     try:

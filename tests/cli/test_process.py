@@ -323,16 +323,6 @@ def test_an_output_folder_that_is_a_loop_of_links_is_named(photos: Path, tmp_pat
     assert "out" in printed and printed.count("\n") == 1
 
 
-@pytest.mark.hard_case("a deleted working directory", "refused in one sentence (change to another, or give full paths)")
-def test_a_deleted_working_directory_is_told_in_a_sentence(tmp_path: Path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(os, "getcwd", lambda: os.stat(tmp_path / "deleted"))
-    assert main(["photos", "out"]) == 2
-    assert capsys.readouterr().err == (
-        "sadgs-process: the working directory was deleted; change to another one, or give full paths.\n"
-    )
-
-
 @pytest.mark.hard_case("`--max-size 5`, 63, −5", "refused: at least 64, or 0")
 @pytest.mark.parametrize("size", ["-5", "5", "63"])
 def test_a_size_without_structure_is_refused(tmp_path: Path, size: str, capsys):
@@ -371,7 +361,7 @@ def test_names_with_spaces_and_webp_and_transparent_photos(tmp_path: Path, capsy
 def test_names_with_spaces_are_matched_by_colmap_s_own_function(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     neighbours: list[Path] = []  # of a film: these photos' neighbours stand apart
     monkeypatch.setattr(pycolmap, "match_sequential", lambda database, **options: neighbours.append(database))
-    match(["a 1.png", "a 2.png"], tmp_path / "db", tmp_path / "pairs.txt", "sequential", None)
+    match(["a 1.png", "a 2.png"], tmp_path / "db", "sequential", None)
     assert neighbours == [tmp_path / "db"]
 
 
@@ -382,7 +372,7 @@ def test_names_with_spaces_are_matched_by_colmap_s_own_function(tmp_path: Path, 
 def test_numbered_photos_are_neighbours_in_the_order_of_their_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(pycolmap, "match_image_pairs", lambda database, **options: None)
     names = [f"{i}.png" for i in sorted(range(13), key=str)]
-    match(names, tmp_path / "db", tmp_path / "pairs.txt", "sequential", None)
+    match(names, tmp_path / "db", "sequential", None)
     assert "9.png 10.png\n" in (tmp_path / "pairs.txt").read_text()
 
 
@@ -641,7 +631,7 @@ def test_a_gpu_matches_the_pairs_that_colmap_verifies(tmp_path: Path, monkeypatc
     )
     monkeypatch.setattr(pycolmap, "match_image_pairs", lambda database, **options: calls.append(("verified",)))
     device = torch.device("cpu")
-    match(["a.png", "b.png"], tmp_path / "db", tmp_path / "pairs.txt", "exhaustive", device)
+    match(["a.png", "b.png"], tmp_path / "db", "exhaustive", device)
     assert calls == [(("a.png", "b.png"), device), ("verified",)]
 
 

@@ -27,16 +27,13 @@ _ERROR_LINE = re.compile(r"^[EF]\d{8} |^\s*what\(\): |Error: ")
 
 
 def run_colmap(function: str, *arguments: Any, folder: Path, report: Report) -> Any:
-    """Call a function of `stages.py` in another process, which is killed when this function is left by an exception.
+    """Call a function of `stages.py` by its name in another process, and return what it returns, as `Worker.run` does.
 
     Args:
-        function: Its name.
-        arguments: Its arguments.
+        function: The name.
+        arguments: Those of the function.
         folder: A folder that is there, to which the function writes; errors name it.
         report: Called in this process as the work goes on.
-
-    Returns:
-        What the function returns, as `Worker.run` does.
 
     Raises:
         InputError: If the function raises it.
@@ -60,7 +57,6 @@ def run_colmap(function: str, *arguments: Any, folder: Path, report: Report) -> 
 
 
 def _error_of(error: WorkerError, stage: str, folder: Path) -> Exception:
-    """Return the error that says why a process ended before its work was done."""
     told = [_LOG_PREFIX.sub("", line).strip() for line in error.output.splitlines() if _ERROR_LINE.search(line)]
     if _FULL_DISK.search(error.output) or shutil.disk_usage(folder).free < _FULL_BELOW:
         return OSError(

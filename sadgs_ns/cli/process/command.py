@@ -25,7 +25,6 @@ import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from sadgs_ns import events
-from sadgs_ns.atomic import atomic_path
 from sadgs_ns.cli.process.colmap import Report, run_colmap
 from sadgs_ns.cli.process.photos import (
     changed_photos,
@@ -41,9 +40,9 @@ from sadgs_ns.cli.process.photos import (
 )
 from sadgs_ns.cli.process.plan import Matching, Summary, choose_matching, expected_work
 from sadgs_ns.cli.process.video import video_frames, write_frames
-from sadgs_ns.cli.program import exit_code, locked, parse
+from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_json
 from sadgs_ns.data.coordinates import FRAME_KEYS
-from sadgs_ns.errors import InputError, WriteError, reason
+from sadgs_ns.errors import InputError, WriteError
 from sadgs_ns.plugin.interrupts import Interrupts
 
 MIN_SIZE = 64
@@ -93,26 +92,23 @@ class _Scene:
             "camera_per_photo": given.camera_per_photo,
             **({"frames": given.frames} if self.is_video else {"photos": photos}),
         }
-        self.begun = _read_settings(self.noted)
+        self.begun = read_settings(self.noted, out)
         self.finished = self.begun.get("finished") if (out / "transforms.json").exists() else None
         if self.begun:
             self._refuse_changes()
-        self.added, self.base, self.model = 0, None, "model"
-        if self.finished and not self.is_video:
-            self.added = len(set(photos) - set(self.begun["photos"]))
+        self.added, self.base, self.model = 0, None, self.work / "model"
+        if self.finished:
+            self.added, self.model = len({*photos} - {*self.begun.get("photos", [])}), self.work / self.begun["model"]
         if self.added:
-            self.base, self.model = self.begun["model"], f"model-{len(photos)}"
-            if not ((self.work / self.base).exists() and (self.work / "database.db").exists()):
+            self.base, self.model = self.model, self.work / f"model-{len(photos)}"
+            if not (self.base.exists() and (self.work / "database.db").exists()):
                 raise InputError(
                     f"{self.work} holds the features and the model no more that photos could be added to: give another "
                     "folder or delete it."
                 )
 
     def _refuse_changes(self) -> None:
-        """Refuse other settings and photos than those that the scene was begun with."""
-        asked = dict(self.settings)
-        if self.finished:
-            asked["max_size"] = self.given.max_size
+        asked: dict[str, Any] = self.settings | ({"max_size": self.given.max_size} if self.finished else {})
         differing = [name for name in asked if self.begun.get(name) != asked[name]]
         told, back = [], ""
         if "source" in differing:  # The rest follows from it.
@@ -127,10 +123,9 @@ class _Scene:
                 if names:
                     told.append(f"photos {verb}: {len(names)}, such as {min(names)}")
                     back = back if verb == "added" else "put these photos back, "
-        for name in differing:
-            if name != "photos":
-                option = name if name == "source" else "--" + name.replace("_", "-")
-                told.append(f"{option} was {self.begun.get(name)}, is {asked[name]}")
+        for name in (name for name in differing if name != "photos"):
+            option = name if name == "source" else "--" + name.replace("_", "-")
+            told.append(f"{option} was {self.begun.get(name)}, is {asked[name]}")
         if told:
             raise InputError(
                 f"{self.given.out} was begun with other photos or settings ({'; '.join(told)}); {back}give another "
@@ -138,10 +133,8 @@ class _Scene:
             )
 
     def note(self, **settings: Any) -> None:
-        """Write the settings."""
         self.settings |= settings
-        with atomic_path(self.noted) as partial:
-            partial.write_text(json.dumps(self.settings))
+        write_json(self.noted, self.settings)
 
     @contextlib.contextmanager
     def alone(self) -> Iterator[None]:
@@ -156,11 +149,10 @@ class _Scene:
                     shutil.rmtree(self.work / name, ignore_errors=True)
                 (self.work / "pairs.txt").unlink(missing_ok=True)
 
-    def remove_intermediate_files(self, model: str) -> None:
+    def remove_intermediate_files(self) -> None:
         """Remove from the work folder of the finished scene what no photo that is added later needs."""
-        for path in self.work.iterdir():
-            if path.name not in (model, "database.db", "settings.json"):
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
+        for path in {*self.work.iterdir()} - {self.model, self.work / "database.db", self.noted}:
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def process(given: Process) -> Summary:
@@ -168,9 +160,6 @@ def process(given: Process) -> Summary:
 
     An interrupted run in the folder goes on. To a finished scene photos are added that have come since, while its other
     cameras stay as they are; without any it is left as it is.
-
-    Returns:
-        What was registered and what was not.
 
     Raises:
         InputError: If the photos, the folder or the settings cannot be used.
@@ -181,7 +170,7 @@ def process(given: Process) -> Summary:
     with Interrupts(waiting=lambda: True):
         scene = _Scene(given)
         if scene.finished and not scene.added:
-            scene.remove_intermediate_files(scene.begun["model"])
+            scene.remove_intermediate_files()
             _say("unchanged", f"{given.out} is finished; delete it to make it again.")
             summary = Summary(**scene.finished)
         else:
@@ -229,39 +218,24 @@ def _make(scene: _Scene, report: Report) -> Summary:
             _say("transparent", f"{transparent} photos are partly transparent; their images in the scene are, too.")
         groups = [[photo.name] for photo in photos] if given.camera_per_photo else photos_by_camera(photos)
         if scene.added:  # An interrupted run may have made a model without some of them.
-            shutil.rmtree(work / scene.model, ignore_errors=True)
-        arguments = (folder, groups, matching, given.max_size, work, scene.model, scene.base)
+            shutil.rmtree(scene.model, ignore_errors=True)
+        arguments = (folder, groups, matching, given.max_size, scene.model, scene.base)
         summary = Summary(**run_colmap("make_model", *arguments, folder=work, report=report))
         _publish(work / "undistorted", given.out, bool(scene.added))
-        if summary.is_poor and not scene.added:  # the features serve another way of matching
-            shutil.rmtree(work / scene.model)
+        if summary.is_poor and not scene.added:  # The features serve another way of matching.
+            shutil.rmtree(scene.model)
         else:
-            scene.note(max_size=given.max_size, finished=dataclasses.asdict(summary), model=scene.model)
-            scene.remove_intermediate_files(scene.model)
+            scene.note(max_size=given.max_size, finished=dataclasses.asdict(summary), model=scene.model.name)
+            scene.remove_intermediate_files()
     return summary
 
 
 def photos_added(source: Path, out: Path) -> list[str]:
-    """Return the names of the photos that a folder holds more than those that its finished scene was made of.
-
-    Raises:
-        InputError: As `find_photos`, or if the scene's settings are damaged.
-    """
-    begun = _read_settings(out / "work" / "settings.json")
+    """Return the photos that came to a folder since its finished scene was made; raise as `find_photos`."""
+    begun = read_settings(out / "work" / "settings.json", out)
     if not source.is_dir() or "finished" not in begun:
         return []
     return sorted(set(find_photos(source, out)) - set(begun["photos"]))
-
-
-def _read_settings(noted: Path) -> dict[str, Any]:
-    if not noted.exists():
-        return {}
-    try:
-        return dict(json.loads(noted.read_text()))
-    except ValueError as error:
-        raise InputError(
-            f"{noted} is damaged ({reason(error)}): delete {noted.parent.parent} and begin again."
-        ) from error
 
 
 def _say(event: str, sentence: str, **fields: str) -> None:
@@ -292,16 +266,12 @@ def _reporter(progress: Progress) -> Report:
 def _publish(undistorted: Path, out: Path, grown: bool = False) -> None:
     """Move undistorted photos, their model and what nerfstudio reads of it to the scene's folder.
 
-    Args:
-        undistorted: The folder of all that.
-        out: The scene's folder.
-        grown: Whether the photos are added to those of a finished scene, which stays one until all are there.
+    A finished scene that has `grown` by these photos stays one until all are there.
 
     Raises:
         OSError: If a file cannot be written, or COLMAP could not write one.
     """
-    images = undistorted / "images"
-    described = json.loads((undistorted / "transforms.json").read_text())
+    images, described = undistorted / "images", json.loads((undistorted / "transforms.json").read_text())
     written = [frame["file_path"] for frame in described["frames"]]
     if grown:
         before = json.loads((out / "transforms.json").read_text())
@@ -336,11 +306,7 @@ def check_size(max_size: int) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Make a scene and return the exit code.
-
-    It is 0 for a scene of at least half of the photos, 1 for one of fewer, a full disk or a failure of COLMAP, 2 if the
-    input is wrong, and 130, 143 or 129 after SIGINT, SIGTERM or SIGHUP.
-    """
+    """Make a scene and return the exit code: as `exit_code`, and 1 for a scene of fewer than half of the photos."""
     given = parse(Process, "sadgs-process", argv)
     return exit_code("sadgs-process", given.out, lambda: _run(given))
 
@@ -349,11 +315,6 @@ def _run(given: Process) -> int:
     if given.frames < 3:
         raise InputError("--frames must be at least 3.")
     check_size(given.max_size)
-    if not (given.source.is_absolute() and given.out.is_absolute()):
-        try:
-            os.getcwd()
-        except FileNotFoundError:
-            raise InputError("the working directory was deleted; change to another one, or give full paths.") from None
     summary, out = process(given), shlex.quote(str(given.out))
     if not summary.is_poor:
         print(f"\nCheck machine and data before a long run:  sadgs-doctor {out}\nTrain:  ns-train sadgs --data {out}")

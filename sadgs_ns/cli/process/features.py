@@ -25,12 +25,10 @@ _BYTES_PER_PIXEL = 240
 
 
 def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path) -> None:
-    """Find SIFT features in the photos that have none yet; each group of photos shares a camera.
-
-    A photo that cannot be decoded gets no features.
+    """Find SIFT features in the photos of a folder that have none yet; one that cannot be decoded gets none.
 
     Args:
-        photos: The folder of the photos.
+        photos: The folder.
         groups: The photos' names, those of one camera together.
         database: COLMAP's database, which is made if it does not exist.
     """

@@ -1,8 +1,7 @@
 """Matches of SIFT features by a matrix product of their descriptors, on a GPU.
 
-COLMAP looks for neighbours in an index on the CPU, which takes most of the time in which pairs of photos are matched.
-Here all descriptors of two photos are compared; what counts as a match is COLMAP's, whose geometric verification
-follows.
+COLMAP looks for neighbours in an index on the CPU, which takes most of the time of matching. Here all descriptors of
+two photos are compared; COLMAP's criteria decide, and its geometric verification follows.
 """
 
 from __future__ import annotations
@@ -50,13 +49,7 @@ def _nearest(cosines: Tensor) -> Tensor:
 
 
 def write_matches(database: Path, pairs: Sequence[tuple[str, str]], device: torch.device) -> None:
-    """Match pairs of photos that have no matches yet, and write them to COLMAP's database, without verification.
-
-    Args:
-        database: COLMAP's database, which holds the photos' features.
-        pairs: Names of photos.
-        device: Where descriptors are compared.
-    """
+    """Match pairs of photos, by name, that have no matches in COLMAP's database yet, and write those, unverified."""
     with pycolmap.Database.open(database) as opened:
         ids = {image.name: image.image_id for image in opened.read_all_images()}
 

@@ -8,7 +8,6 @@ import os
 import re
 import shutil
 import zlib
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -102,39 +101,31 @@ def changed_photos(folder: Path, stamps: Mapping[str, Sequence[int]]) -> list[st
 def read_photos(folder: Path, names: Sequence[str], report: Callable[[str, int, int], None]) -> list[Photo]:
     """Read and decode photos, because COLMAP takes the missing end of a file for black pixels.
 
-    Args:
-        folder: The folder of the photos.
-        names: The photos, relative to it.
-        report: Called with a stage's name, how many photos are read, and how many there are.
-
     Raises:
         InputError: If some cannot be read or decoded; the message names them.
     """
     photos: list[Photo] = []
-    broken: dict[str, str] = {}
+    broken: list[str] = []
 
     def read(name: str) -> Photo | str:
         try:
             return _read_photo(folder, name)
         except UnidentifiedImageError:
-            return "no image that Pillow knows" if (folder / name).stat().st_size else "0 bytes"
+            why = "no image that Pillow knows" if (folder / name).stat().st_size else "0 bytes"
         except Exception as error:  # Decoders raise whatever they stumble over.
-            return reason(error)
+            why = reason(error)
+        return f"{name} ({why})"
 
     with _threads() as pool:
-        for name, found in zip(names, pool.map(read, names), strict=True):
-            if isinstance(found, Photo):
-                photos.append(found)
-            else:
-                broken[name] = found
-            report("photos", len(photos) + len(broken), len(names))
+        for done, found in enumerate(pool.map(read, names), 1):
+            photos.append(found) if isinstance(found, Photo) else broken.append(found)
+            report("photos", done, len(names))
     if broken:
-        named = [f"{name} ({why})" for name, why in list(broken.items())[:_NAMED]]
         more = [f"{len(broken) - _NAMED} more"] if len(broken) > _NAMED else []
         them = "it" if len(broken) == 1 else "them"
         raise InputError(
             f"{len(broken)} of the {len(names)} photos in {folder} cannot be read as a whole image: "
-            f"{', '.join(named + more)}; copy {them} again or remove {them}."
+            f"{', '.join(broken[:_NAMED] + more)}; copy {them} again or remove {them}."
         )
     return photos
 
@@ -172,14 +163,18 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
 
     Args:
         folder: The folder of the photos.
-        photos: The photos.
-        converted: The folder to make of conversions and of links to the other photos. It appears when it is complete,
-            and is left as it is if it exists.
+        photos: All of them.
+        converted: The folder to make of conversions and of links to the other photos, where there is none.
 
     Returns:
         The folder of photos that COLMAP reads, and the photos in it.
     """
-    new = [dataclasses.replace(photo, name=_converted_name(photo)) for photo in photos]
+
+    def converted_name(photo: Photo) -> str:
+        is_read = Path(photo.name).suffix.lower() not in _CONVERTED_SUFFIXES
+        return photo.name + ("" if is_read else ".png" if photo.has_alpha else ".jpg")
+
+    new = [dataclasses.replace(photo, name=converted_name(photo)) for photo in photos]
     if new == list(photos):
         return folder, new
     if converted.exists():
@@ -205,20 +200,13 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
     return converted, new
 
 
-def _converted_name(photo: Photo) -> str:
-    if Path(photo.name).suffix.lower() not in _CONVERTED_SUFFIXES:
-        return photo.name
-    return photo.name + (".png" if photo.has_alpha else ".jpg")
-
-
 def write_alpha(folder: Path, photos: Sequence[Photo], alphas: Path) -> int:
     """Write the opacity of photos that are partly transparent, which COLMAP leaves out, as grey images.
 
     Args:
         folder: The folder of the photos.
-        photos: The photos.
-        alphas: The folder to make; the opacity of `NAME` is in `NAME.png` there. It appears when it is complete, and is
-            left as it is if it exists.
+        photos: All of them.
+        alphas: The folder to make, where there is none; the opacity of `NAME` is in `NAME.png` there.
 
     Returns:
         How many photos are partly transparent.
@@ -238,12 +226,7 @@ def write_alpha(folder: Path, photos: Sequence[Photo], alphas: Path) -> int:
 
 
 def restore_alpha(images: Path, alphas: Path) -> None:
-    """Give images the opacity that `write_alpha` wrote beside them; both are of one size.
-
-    Args:
-        images: The folder of the images, which are changed.
-        alphas: The folder of the opacities, some of whose images may be missing.
-    """
+    """Give a folder's images the opacity that `write_alpha` wrote, of the same size; some images may be missing."""
     for path in alphas.rglob("*.png"):
         target = images / path.relative_to(alphas).with_suffix("")
         if target.exists():
@@ -262,9 +245,9 @@ def empty_folder(folder: Path) -> Path:
 
 def photos_by_camera(photos: Sequence[Photo]) -> list[list[str]]:
     """Group the names of photos that one camera at one focal length took, as far as their size and EXIF tell."""
-    groups: dict[tuple, list[str]] = defaultdict(list)
+    groups: dict[tuple, list[str]] = {}
     for photo in photos:
-        groups[photo.camera].append(photo.name)
+        groups.setdefault(photo.camera, []).append(photo.name)
     return list(groups.values())
 
 
@@ -275,6 +258,5 @@ def are_in_order(names: Sequence[str]) -> bool:
 
 def in_order(names: Sequence[str]) -> list[str]:
     """Sort names so that photo 10 comes after photo 9."""
-    return sorted(
-        names, key=lambda name: [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
-    )
+    parts = {name: re.split(r"(\d+)", name) for name in names}
+    return sorted(names, key=lambda name: [int(part) if part.isdecimal() else part for part in parts[name]])

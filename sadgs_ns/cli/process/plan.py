@@ -36,7 +36,7 @@ class Summary:
     """Mean over all observations, px."""
     left_out: dict[str, str]
     """Photos that were not registered, and why."""
-    matching: Matching = "exhaustive"
+    matching: Matching
     """Which pairs were matched."""
 
     def __str__(self) -> str:
@@ -55,12 +55,9 @@ class Summary:
 def choose_matching(
     asked: Matching, photos: Sequence[Photo], is_video: bool, fetch_vocabulary: Callable[[], None]
 ) -> tuple[Matching, str]:
-    """Decide which pairs of photos are matched.
+    """Decide which pairs of photos, or of frames of a video, are matched.
 
     Args:
-        asked: What the user asked for.
-        photos: The photos, or the frames of a video.
-        is_video: Whether they are frames of a video.
         fetch_vocabulary: Makes sure that COLMAP's vocabulary tree is on this machine; raises RunError if it cannot.
 
     Returns:
@@ -75,14 +72,10 @@ def choose_matching(
             f"--matching spatial needs a GPS position with altitude in the EXIF data of every photo, and "
             f"{len(nowhere)} of the {len(photos)} have none, such as {nowhere[0]}; use sequential, exhaustive or auto."
         )
+    if asked == "auto" and (is_video or len(photos) <= EXHAUSTIVE_LIMIT or not nowhere):
+        asked = "sequential" if is_video else "exhaustive" if len(photos) <= EXHAUSTIVE_LIMIT else "spatial"
     if asked not in ("auto", "vocabulary"):
         return asked, ""
-    if asked == "auto" and is_video:
-        return "sequential", ""
-    if asked == "auto" and len(photos) <= EXHAUSTIVE_LIMIT:
-        return "exhaustive", ""
-    if asked == "auto" and not nowhere:
-        return "spatial", ""
     try:
         fetch_vocabulary()
     except RunError as error:
@@ -113,13 +106,9 @@ def searched_pixels(size: tuple[int, int]) -> float:
 def expected_work(photos: Sequence[Photo], matching: str, known: int = 0) -> tuple[str, str]:
     """Return a sentence on how much there is to do, and how long it takes on this machine, as "roughly a minute".
 
-    Args:
-        photos: All photos.
-        matching: Which pairs are matched.
-        known: How many of the photos an earlier run has matched with each other.
+    An earlier run has matched `known` of the photos with each other.
     """
-    megapixels = sum(searched_pixels(photo.size) for photo in photos) / 1e6
-    new = len(photos) - known
+    new, megapixels = len(photos) - known, sum(searched_pixels(photo.size) for photo in photos) / 1e6
 
     def all_pairs(count: int) -> int:
         return min(count * _PAIRS_PER_PHOTO.get(matching, count), count * (count - 1) // 2)

@@ -7,7 +7,6 @@ module of the package may import this one.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import io
 import itertools
 import shutil
@@ -53,44 +52,40 @@ FEW_FEATURES = 500
 
 
 def make_model(
-    photos: Path,
-    groups: Sequence[Sequence[str]],
-    matching: Matching,
-    max_size: int,
-    work: Path,
-    model: str,
-    base: str | None,
+    photos: Path, groups: Sequence[Sequence[str]], matching: Matching, max_size: int, model: Path, base: Path | None
 ) -> Summary:
-    """Make a model of photos, and from it the undistorted scene in `work/undistorted`.
+    """Make a model of photos, and from it the undistorted scene in the folder `undistorted` beside it.
 
     Where an earlier model is given, the photos that are not in it are added to it, and they alone are undistorted.
 
     Args:
         photos: The folder of the photos.
         groups: The photos' names, those of one camera together.
-        matching: Which pairs are matched; any but "auto".
+        matching: Any but "auto".
         max_size: Longest side of the undistorted photos in px; 0 keeps them as they are.
-        work: Folder for all files; what an interrupted run left there is used again. It has the photos' opacities in
-            `alpha`, as `write_alpha` writes them, which are undistorted, too.
-        model: Name of the model's folder in `work`.
-        base: Name of the earlier model's folder in `work`, whose cameras stay as they are; None begins anew.
+        model: The model's folder. Beside it `alpha` holds the photos' opacities, as `write_alpha` writes them, and what
+            an interrupted run left there is used again.
+        base: The earlier model's folder, whose cameras stay as they are; None begins anew.
 
     Raises:
         InputError: If no two photos could be related, or none could be added.
     """
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
-    names = sorted(itertools.chain(*groups))
-    database, made, models = work / "database.db", work / model, work / "models"
-    if not made.exists():
+    names, database = sorted(itertools.chain(*groups)), model.with_name("database.db")
+    if not model.exists():
         with ThreadPoolExecutor(1) as pool:  # Features need no torch, whose import takes seconds.
             gpu = pool.submit(wake_gpu)
             extract(photos, groups, database)
-        match(names, database, work / "pairs.txt", matching, gpu.result())
-        place_cameras(photos, names, database, models, made, None if base is None else work / base)
-    known = set() if base is None else registered_photos(pycolmap.Reconstruction(work / base))
-    undistort(photos, work / "alpha", made, work / "undistorted", max_size, known)
-    describe(work / "undistorted")
-    return dataclasses.replace(summarize(names, made, database), matching=matching)
+        match(names, database, matching, gpu.result())
+        place_cameras(photos, names, database, model, base)
+    known = set() if base is None else registered_photos(pycolmap.Reconstruction(base))
+    made, undistorted = pycolmap.Reconstruction(model), model.with_name("undistorted")
+    undistort(photos, model, made, max_size, known)
+    from nerfstudio.process_data.colmap_utils import colmap_to_json  # It imports torch.
+
+    with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio prints all cameras where there are several.
+        colmap_to_json(undistorted / "sparse" / "0", undistorted)
+    return summarize(names, made, database, matching)
 
 
 def wake_gpu() -> torch.device | None:
@@ -105,10 +100,10 @@ def wake_gpu() -> torch.device | None:
 
 
 def fetch_vocabulary(folder: Path) -> None:
-    """Have COLMAP load its vocabulary tree, which it downloads if it must; the process aborts if it cannot.
+    """Have COLMAP load its vocabulary tree, or download it, for two made-up photos; the process aborts if it cannot.
 
     Args:
-        folder: An empty folder for a database of two made-up photos.
+        folder: An empty folder.
     """
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
     progress("vocabulary tree", 0, 1)
@@ -128,49 +123,30 @@ def fetch_vocabulary(folder: Path) -> None:
 
 
 def sequential_pairs(names: Sequence[str], overlap: int = 10) -> list[tuple[str, str]]:
-    """Return the pairs of each frame with the next ones and with ever fewer of those farther on, which close loops.
-
-    Args:
-        names: In the order of the video.
-        overlap: How many of the next frames each is matched with.
-    """
+    """Pair each frame with the next `overlap` ones and with ever fewer of those farther on, which close loops."""
     steps = sorted({*range(1, overlap + 1), *(2**k for k in range(4, 10))})
     return [(names[i], names[i + step]) for i in range(len(names)) for step in steps if i + step < len(names)]
 
 
-def match(
-    names: Sequence[str],
-    database: Path,
-    pair_list: Path,
-    matching: Matching,
-    gpu: torch.device | None,
-) -> None:
+def match(names: Sequence[str], database: Path, matching: Matching, gpu: torch.device | None) -> None:
     """Match features between photos; pairs that an earlier run matched are skipped.
-
-    A GPU compares the features, where there is one, unless COLMAP chooses the pairs.
 
     Args:
         names: All photos.
-        database: COLMAP's database, which holds their features.
-        pair_list: A file to write lists of pairs to.
-        matching: Which pairs are matched; any but "auto".
-        gpu: The device that compares features; None leaves them to COLMAP.
+        database: COLMAP's database, which holds their features. A file `pairs.txt` is written beside it.
+        matching: Any but "auto".
+        gpu: The device that compares features where COLMAP does not choose the pairs; None leaves all to COLMAP.
     """
-    stage = f"matches ({matching})"
+    stage, pair_list = f"matches ({matching})", database.with_name("pairs.txt")
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = _SEED
     verification.ransac.max_num_trials = _TRIALS
     # COLMAP separates the names in a list of pairs by spaces.
     listable = not any(character.isspace() for name in names for character in name)
-    if matching in ("spatial", "vocabulary") or not listable:  # these functions tell nothing of their progress
+    if matching in ("spatial", "vocabulary") or not listable:  # These functions tell nothing of their progress.
         progress(stage, 0, 1)
-        functions = {
-            "spatial": pycolmap.match_spatial,
-            "vocabulary": pycolmap.match_vocabtree,
-            "sequential": pycolmap.match_sequential,
-            "exhaustive": pycolmap.match_exhaustive,
-        }
-        functions[matching](database, verification_options=verification)
+        function = getattr(pycolmap, "match_vocabtree" if matching == "vocabulary" else f"match_{matching}")
+        function(database, verification_options=verification)
         progress(stage, 1, 1)
         return
     pairs = sequential_pairs(in_order(names)) if matching == "sequential" else list(itertools.combinations(names, 2))
@@ -188,21 +164,11 @@ def match(
         progress(stage, start + len(chunk), len(pairs))
 
 
-def place_cameras(
-    photos: Path, names: Sequence[str], database: Path, attempts: Path, model: Path, base: Path | None
-) -> None:
-    """Estimate cameras and points, and keep the model with the most photos if there are several.
+def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Path, base: Path | None) -> None:
+    """Estimate cameras and points, and write the model with the most photos; its folder appears when it is complete.
 
     Where there is an earlier model, photos are added to it: poses and intrinsics of the cameras that it has stay as
     they are, points are triangulated with the new photos, and photos that did not register before are tried again.
-
-    Args:
-        photos: The folder of the photos.
-        names: All photos.
-        database: COLMAP's database, which holds features and matches.
-        attempts: A folder for all models.
-        model: The folder to make of the best one; it appears when it is complete.
-        base: The folder of the model to add to; None begins anew.
 
     Raises:
         InputError: If no two photos could be related, or no photo could be added.
@@ -223,14 +189,9 @@ def place_cameras(
 
     advance(0)
     models = pycolmap.incremental_mapping(
-        database,
-        photos,
-        empty_folder(attempts),
-        options,
-        input_path=base or "",
-        initial_image_pair_callback=lambda: advance(2),
-        next_image_callback=lambda: advance(1),
-    )
+        database, photos, empty_folder(model.with_name("models")), options, input_path=base or "",
+        initial_image_pair_callback=lambda: advance(2), next_image_callback=lambda: advance(1),
+    )  # fmt: skip
     best = max(models.values(), key=lambda candidate: candidate.num_reg_images(), default=None)
     if before is None and best is None:
         with pycolmap.Database.open(database) as opened:
@@ -277,24 +238,21 @@ def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
         raise OSError(f"{folder} was not written completely: the disk is full")
 
 
-def undistort(
-    photos: Path, alphas: Path, model: Path, folder: Path, max_size: int, known: Collection[str] = ()
-) -> None:
-    """Write undistorted photos, their opacity and the model that fits them and those that are known.
+def undistort(photos: Path, model: Path, made: pycolmap.Reconstruction, max_size: int, known: Collection[str]) -> None:
+    """Write `images`, `alpha` and the model that fits them, `sparse/0`, to the folder `undistorted`, which is emptied.
 
     Args:
         photos: The folder of the photos.
-        alphas: The folder of their opacities.
-        model: The folder of their model.
-        folder: The folder to write `images`, `alpha` and `sparse/0` to; what is in it is removed before.
+        model: The folder of their model, with their opacities in `alpha` beside it.
+        made: That model.
         max_size: Longest side of the undistorted photos in px; 0 keeps them as they are.
         known: Names of photos that were undistorted before, by the same cameras.
 
     Raises:
         OSError: If the model could not be written.
     """
-    reconstruction = pycolmap.Reconstruction(model)
-    registered = [image for image in reconstruction.images.values() if image.has_pose and image.name not in known]
+    folder, alphas = model.with_name("undistorted"), model.with_name("alpha")
+    registered = [image for image in made.images.values() if image.has_pose and image.name not in known]
     progress("undistorted photos", 0, len(registered))
     shutil.rmtree(folder, ignore_errors=True)
     options = pycolmap.UndistortCameraOptions(max_image_size=max_size or -1)
@@ -320,27 +278,13 @@ def undistort(
     (sparse / "0").mkdir()
     for file in sparse.glob("*.bin"):
         file.rename(sparse / "0" / file.name)
-    check_written(sparse / "0", reconstruction)
+    check_written(sparse / "0", made)
     progress("undistorted photos", len(registered), len(registered))
 
 
-def describe(folder: Path) -> None:
-    """Write `transforms.json` and `sparse_pc.ply` beside undistorted photos, as nerfstudio reads them.
-
-    Args:
-        folder: The folder of the photos, with their model in `sparse/0`.
-    """
-    from nerfstudio.process_data.colmap_utils import colmap_to_json  # It imports torch.
-
-    with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio prints all cameras where there are several
-        colmap_to_json(folder / "sparse" / "0", folder)
-
-
-def summarize(names: Sequence[str], model: Path, database: Path) -> Summary:
+def summarize(names: Sequence[str], model: pycolmap.Reconstruction, database: Path, matching: Matching) -> Summary:
     """Count what was registered, and find out why the rest was not."""
-    reconstruction = pycolmap.Reconstruction(model)
-    registered = registered_photos(reconstruction)
-    left_out = {}
+    registered, left_out = registered_photos(model), {}
     with pycolmap.Database.open(database) as opened:
         identities = {image.name: image.image_id for image in opened.read_all_images()}
         pair_ids, inliers = opened.read_two_view_geometry_num_inliers()
@@ -358,10 +302,5 @@ def summarize(names: Sequence[str], model: Path, database: Path) -> Summary:
                 left_out[name] = "matches no other photo: too little overlap"
             else:
                 left_out[name] = "matches other photos, but its pose stayed ambiguous"
-    return Summary(
-        len(names),
-        len(registered),
-        reconstruction.num_points3D(),
-        reconstruction.compute_mean_reprojection_error(),
-        left_out,
-    )
+    error = model.compute_mean_reprojection_error()
+    return Summary(len(names), len(registered), model.num_points3D(), error, left_out, matching)

@@ -16,9 +16,9 @@ VIDEO_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"}
 
 
 def sharpest_frames(video: Path, count: int) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield number and picture [H, W, 3] of the sharpest frame of each of `count` stretches of a video.
+    """Yield number and picture of the sharpest frame of each of `count` stretches of a video.
 
-    The sharpest is the one whose Laplacian varies most.
+    The sharpest is the one whose Laplacian varies most. Pictures are BGR, uint8 [H, W, 3].
 
     Raises:
         InputError: If OpenCV cannot read the video.
@@ -28,19 +28,19 @@ def sharpest_frames(video: Path, count: int) -> Iterator[tuple[int, np.ndarray]]
     if not capture.isOpened() or total < 1:
         raise InputError(f"{video} cannot be read as a video; convert it to MP4 with H.264.")
     stretch = max(total / count, 1.0)
-    best: tuple[float, np.ndarray] | None = None
-    for i in itertools.count():
-        read, frame = capture.read()
-        number = int(i / stretch)
-        if best is not None and (not read or int((i - 1) / stretch) != number):
-            yield int((i - 1) / stretch), best[1]
-            best = None
-        if not read:
-            return
-        grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-        sharpness = float(cv2.Laplacian(grey, cv2.CV_64F).var())
-        if best is None or sharpness > best[0]:
-            best = (sharpness, frame)
+    frames = itertools.takewhile(lambda read: read[0], iter(capture.read, None))
+    for number, group in itertools.groupby(enumerate(frames), lambda numbered: int(numbered[0] / stretch)):
+        yield number, max((frame for _, (_, frame) in group), key=_sharpness)
+
+
+def _sharpness(frame: np.ndarray) -> float:
+    return float(cv2.Laplacian(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), cv2.CV_64F).var())
+
+
+def check_video(video: Path) -> None:
+    """Raise an InputError if a file's name is not that of a video."""
+    if video.suffix.lower() not in VIDEO_SUFFIXES:
+        raise InputError(f"{video} is neither a folder of photos nor a video ({', '.join(sorted(VIDEO_SUFFIXES))}).")
 
 
 def video_frames(video: Path, count: int) -> Iterator[tuple[int, np.ndarray]]:
@@ -49,8 +49,7 @@ def video_frames(video: Path, count: int) -> Iterator[tuple[int, np.ndarray]]:
     Raises:
         InputError: If the file is no video, or gives fewer than three frames.
     """
-    if video.suffix.lower() not in VIDEO_SUFFIXES:
-        raise InputError(f"{video} is neither a folder of photos nor a video ({', '.join(sorted(VIDEO_SUFFIXES))}).")
+    check_video(video)
     frames = sharpest_frames(video, count)
     first = list(itertools.islice(frames, 3))
     if len(first) < 3:
@@ -59,12 +58,7 @@ def video_frames(video: Path, count: int) -> Iterator[tuple[int, np.ndarray]]:
 
 
 def write_frames(frames: Iterable[tuple[int, np.ndarray]], folder: Path, report: Callable[[int], None]) -> None:
-    """Write frames to a folder as numbered photos.
-
-    Args:
-        frames: Number and picture [H, W, 3] of each, BGR and 8-bit, as OpenCV reads them.
-        folder: Where the photos go.
-        report: Called with the number of stretches of the video that are done.
+    """Write frames, as `video_frames` yields them, to a folder as numbered photos.
 
     Raises:
         WriteError: If one cannot be written.
