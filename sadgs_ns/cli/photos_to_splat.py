@@ -1,11 +1,10 @@
 """`sadgs PHOTOS_OR_VIDEO`: one command from photos or a video to a splat that opens in a browser.
 
 Its folder holds the cameras in `scene`, the run in `training`, all that was printed in `log`, the splats, and
-`settings.json`, by which the command knows the folder again and what of it is done.
+`settings.json`, which says what is done.
 
-Where photos were added since, their cameras are added to the scene, whose other cameras stay, and another run is
-trained in the same frame, with the same views held out. The earlier run is removed when the splats of the new one are
-written.
+Cameras of photos that were added since join those of the scene, which stay, and another run is trained in the same
+frame, with the same views held out. The earlier run is removed when the splats of the new one are written.
 """
 
 from __future__ import annotations
@@ -28,17 +27,16 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 
-from sadgs_ns.atomic import atomic_path
 from sadgs_ns.cli.export import Export
 from sadgs_ns.cli.process.command import Process, check_size, photos_added
 from sadgs_ns.cli.process.photos import find_photos
 from sadgs_ns.cli.process.plan import Summary
-from sadgs_ns.cli.process.video import VIDEO_SUFFIXES
-from sadgs_ns.cli.program import exit_code, locked, parse
+from sadgs_ns.cli.process.video import check_video
+from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_json
 from sadgs_ns.cli.status_line import StatusLine, clock
 from sadgs_ns.cli.worker import OnEvent, Worker, WorkerError
 from sadgs_ns.data.coordinates import FRAME_KEYS, TRANSFORMS_NAME
-from sadgs_ns.errors import InputError, RunError, WriteError, reason
+from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.formats import FORMATS, MESH
 from sadgs_ns.plugin.interrupts import Interrupts
 from sadgs_ns.plugin.lost_output import print_elsewhere_once_unread
@@ -91,14 +89,13 @@ class PhotosToSplat:
     """
 
     def __init__(self, given: Sadgs, options: Sequence[str], console: Console) -> None:
-        self.source, self.folder = given.source, given.output or _default_folder(given.source)
+        source = Path(os.path.realpath(given.source))
+        name = f"{(source.name if source.is_dir() else source.stem) or 'photos'}-splat"
+        self.source, self.folder = given.source, given.output or Path(name)
         self.given, self.options, self.console = given, options, console
         self._formats = sorted(_formats(given.formats, console), key=lambda name: name == "html")
-        self._scene, self._settings_file = self.folder / "scene", self.folder / "settings.json"
-        self._runs = self.folder / "training" / "sadgs"
+        self._scene, self._runs = self.folder / "scene", self.folder / "training" / "sadgs"
         self._settings: dict[str, Any] = {}
-        self._asked: dict[str, Any] = {"source": os.path.realpath(self.source), "--max-size": given.max_size}
-        self._asked |= {"--effort": given.effort, "options of ns-train": list(options)}
         if not 0 < given.effort < math.inf:
             raise InputError("--effort must be more than 0.")
         check_size(given.max_size)
@@ -106,62 +103,44 @@ class PhotosToSplat:
             name = option.partition("=")[0].lstrip("-").replace("_", "-")
             if option.startswith("--") and name in _OURS:
                 raise InputError(f"--{name} is set by sadgs itself: leave it out, or use ns-train.")
-        self._settings = self._read_settings()
-        self._check_source()
-
-    def _check_source(self) -> None:
+        self._read_settings()
         for path in (self.source, self.folder):
             if not str(path).isprintable():
                 raise InputError(f"{str(path)!a} has unprintable characters in its name: rename it.")
-        if self.source.is_file():
-            if self.source.suffix.lower() not in VIDEO_SUFFIXES:
-                kinds = ", ".join(sorted(VIDEO_SUFFIXES))
-                raise InputError(f"{self.source} is neither a folder of photos nor a video ({kinds}).")
-        else:
-            find_photos(self.source, self._scene)
+        check_video(self.source) if self.source.is_file() else find_photos(self.source, self._scene)
 
-    def _read_settings(self) -> dict[str, Any]:
-        """Return the settings that the folder was begun with, with what is not decided yet as it is asked for now.
+    def _read_settings(self) -> None:
+        """Read the settings that the folder was begun with, and take what is not decided yet as it is asked for now.
 
         Raises:
             InputError: If they are others than those asked for, or the folder is something else.
         """
-        folder, file = self.folder, self._settings_file
-        if not file.exists():
-            if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
-                raise InputError(f"{folder} exists and is not a folder that sadgs began; give another --output.")
-            return dict(self._asked)
-        try:
-            begun = dict(json.loads(file.read_text("utf8")))
-        except ValueError as error:
-            raise InputError(f"{file} is damaged ({reason(error)}): delete {folder} and begin again.") from error
-        self._settings = begun
-        decided = ["source"]
+        folder, given = self.folder, self.given
+        asked = {"source": os.path.realpath(self.source), "--max-size": given.max_size}
+        asked |= {"--effort": given.effort, "options of ns-train": list(self.options)}
+        self._settings = begun = read_settings(folder / "settings.json", folder)
+        if not begun and (folder.is_file() or (folder.is_dir() and any(folder.iterdir()))):
+            raise InputError(f"{folder} exists and is not a folder that sadgs began; give another --output.")
+        decided = ["source"] if begun else []
         decided += ["--max-size"] if (self._scene / "transforms.json").exists() else []
         decided += ["--effort", "options of ns-train"] if self._checkpoint() else []
-        changes = [
-            f"{name} was {_shown(begun.get(name))}, is {_shown(self._asked[name])}"
-            for name in decided
-            if begun.get(name) != self._asked[name]
-        ]
-        if changes:
+        differing = [name for name in decided if begun.get(name) != asked[name]]
+        if differing:
+            changes = [f"{name} was {_shown(begun.get(name))}, is {_shown(asked[name])}" for name in differing]
             raise InputError(
                 f"{folder} was begun with other settings ({'; '.join(changes)}); give another --output or delete it."
             )
-        return begun | self._asked
+        self._settings = begun | asked
 
     def _note(self, **settings: Any) -> None:
         self._settings |= settings
-        with atomic_path(self._settings_file) as partial:
-            partial.write_text(json.dumps(self._settings), "utf8")
+        write_json(self.folder / "settings.json", self._settings)
 
     @property
     def _run(self) -> Path:
-        """The present run's folder."""
         return self._runs / self._settings.get("run", "run")
 
     def _checkpoint(self) -> Path | None:
-        """Return the run's latest checkpoint, if it has any."""
         return max(self._run.glob("nerfstudio_models/step-*.ckpt"), default=None)
 
     def make(self) -> list[Path]:
@@ -180,10 +159,10 @@ class PhotosToSplat:
         # A stage has the lock, too, and keeps it until it has saved where this process was killed.
         refusal = f"another sadgs works in {self.folder}; wait for it, or stop it."
         with locked(self.folder, refusal, _LOCK_SECONDS) as self._lock, contextlib.ExitStack() as self._workers:
-            self._settings = self._read_settings()  # Another run may have gone on meanwhile.
+            self._read_settings()  # Another run may have gone on meanwhile.
             self._note()
             # Importing nerfstudio takes some 12 s, in which cameras can be found.
-            needs_training = not self._trained() or self._photos_added()
+            needs_training = not self._trained() or photos_added(self.source, self._scene)
             self._trainer = self._worker("training", _TRAINING) if needs_training else None
             stages: tuple[tuple[str, Callable[[StatusLine], str]], ...] = (
                 ("cameras", self._find_cameras),
@@ -200,11 +179,7 @@ class PhotosToSplat:
             for other in self._runs.glob("run*"):
                 if other != self._run and re.fullmatch(r"run(-\d+)?", other.name):
                     shutil.rmtree(other)
-            return [self._splat(name) for name in self._formats]
-
-    def _photos_added(self) -> bool:
-        """Whether photos were added since the cameras were found."""
-        return bool(photos_added(self.source, self._scene))
+            return [self.folder / f"splat.{name}" for name in self._formats]
 
     def _views(self) -> list[str]:
         """Return the scene's images, in the order in which nerfstudio chooses those that it holds out."""
@@ -222,13 +197,10 @@ class PhotosToSplat:
         self._note(views=views, **({"run": f"run-{len(views)}", "trained": None} if begun else {}))
 
     def _keep_frame_and_split(self, before: Sequence[str]) -> None:
-        """Note in the scene how the first run moved the data, and that what it held out is held out again.
+        """Note in the scene how the present run moved its images, `before`, and that those held out are so again.
 
         Of the photos that were added as many are held out as nerfstudio would. Where an option says which views are
         held out, that option decides. Before a run has begun there is nothing to keep.
-
-        Args:
-            before: The images of the present run.
         """
         from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fraction
 
@@ -248,17 +220,13 @@ class PhotosToSplat:
                 trained, held_out = trained + [new[i] for i in for_training], held_out + [new[i] for i in for_tests]
                 known.update(new)
             described |= {"train_filenames": trained, "val_filenames": held_out, "test_filenames": held_out}
-        with atomic_path(file) as partial:
-            partial.write_text(json.dumps(described), "utf8")
+        write_json(file, described)
 
     def _worker(self, stage: str, function: str) -> Worker:
-        """Start a process for a stage."""
         worker = Worker(function, self.folder / "log" / f"{stage}.txt", [self._lock], saves=True)
         return self._workers.enter_context(worker)
 
     def _call(self, worker: Worker, line: StatusLine, hear: OnEvent, command: Sequence[str], *arguments: Any) -> Any:
-        """Run a stage in its process, and raise as `make` does."""
-
         def on_event(event: str, **fields: Any) -> None:
             if event == "stopping":
                 line.update(event)
@@ -276,7 +244,7 @@ class PhotosToSplat:
 
     def _find_cameras(self, line: StatusLine) -> str:
         few = self._settings.get("few")
-        if few and (self.given.anyway or self._checkpoint()) and not self._photos_added():
+        if few and (self.given.anyway or self._checkpoint()) and not photos_added(self.source, self._scene):
             return f"{few}; done before"
         added, duration, done_before = "", "", ""
 
@@ -316,7 +284,7 @@ class PhotosToSplat:
         )
 
     def _trained(self) -> str | None:
-        """Return what a finished training said of itself."""
+        """Return what a finished training said."""
         return self._settings.get("trained") if self._checkpoint() else None
 
     def _train(self, line: StatusLine) -> str:
@@ -352,11 +320,8 @@ class PhotosToSplat:
         self._note(trained=told)
         return told
 
-    def _splat(self, name: str) -> Path:
-        return self.folder / f"splat.{name}"
-
     def _export(self, name: str, line: StatusLine) -> str:
-        output, checkpoint = self._splat(name), self._checkpoint()
+        output, checkpoint = self.folder / f"splat.{name}", self._checkpoint()
         if checkpoint and output.is_file() and output.stat().st_mtime >= checkpoint.stat().st_mtime:
             return f"{output}; done before"
         line.update(str(output))
@@ -364,12 +329,6 @@ class PhotosToSplat:
         command = ["sadgs-export", str(self._run), "--output", str(output)]
         self._call(worker, line, lambda event, **fields: None, command, Export(self._run, output))
         return f"{output}, {output.stat().st_size / 1e6:,.1f} MB"
-
-
-def _default_folder(source: Path) -> Path:
-    """Return the folder that is named after the photos or the video, in the working directory."""
-    source = Path(os.path.realpath(source))
-    return Path(f"{(source.name if source.is_dir() else source.stem) or 'photos'}-splat")
 
 
 def _shown(value: Any) -> str:
@@ -396,11 +355,7 @@ def _formats(asked: str | None, console: Console) -> list[str]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Make a splat and return the exit code.
-
-    It is 0 when all is done, 1 where a stage failed, fewer than half of the photos registered or a file could not be
-    written, 2 if the input is wrong, and 130, 143 or 129 after SIGINT, SIGTERM or SIGHUP.
-    """
+    """Make a splat and return the exit code, as `exit_code` says."""
     words, console, start = list(sys.argv[1:] if argv is None else argv), Console(highlight=False), time.monotonic()
     end = words.index("--") if "--" in words else len(words)
     given, options = parse(Sadgs, "sadgs", words[:end]), words[end + 1 :]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from types import TracebackType
 
 from rich.console import Console
 from rich.live import Live
@@ -14,10 +13,6 @@ class StatusLine:
     """The name of a stage, the time it takes, and how far it is.
 
     A terminal shows the line as it changes; elsewhere, as in a file, it is printed once, when the context ends.
-
-    Args:
-        name: The stage.
-        console: Where it is printed.
     """
 
     def __init__(self, name: str, console: Console) -> None:
@@ -29,9 +24,7 @@ class StatusLine:
             self._live.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._live is not None:
             self._live.stop()
         else:

@@ -21,7 +21,6 @@ import traceback as tracebacks
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from sadgs_ns import events
@@ -90,9 +89,7 @@ class Worker:
     def __enter__(self) -> Worker:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._end(signal.SIGKILL)
         self._events.unlink(missing_ok=True)
 
