@@ -94,12 +94,13 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
         ranges = [
             ("effort", 0 < self.effort <= _MOST_EFFORT, f"in (0, {_MOST_EFFORT}]"),
             ("views_per_iteration", views is None or views >= 1, "at least 1"),
-            ("frequency_constant", 0 < self.frequency_constant <= HIGHEST_FREQUENCY, f"in (0, {HIGHEST_FREQUENCY:g}]"),
             ("energy_blur", 0 <= self.energy_blur <= _WIDEST_BLUR, f"in [0, {_WIDEST_BLUR}]"),
             ("epsilon", epsilon is None or 0 < epsilon < math.inf, "positive and finite"),
             ("memory_budget_gb", budget is None or 0 < budget < math.inf, "positive and finite"),
         ]
         check_ranges("pipeline.", self, ranges)
+        if not 0 < (constant := self.frequency_constant) <= HIGHEST_FREQUENCY:
+            raise InputError(f"pipeline.frequency_constant must be in (0, {HIGHEST_FREQUENCY:g}], got {constant}.")
         check_options(self.datamanager)
         self.model.check()
 
