@@ -64,12 +64,7 @@ class RunError(RuntimeError):
 
 
 class WriteError(OSError):
-    """A file could not be written; the message names it, the free space and the remedy.
-
-    Args:
-        path: The file.
-        error: What writing it raised.
-    """
+    """A file could not be written for an error; the message names it, the free space and the remedy."""
 
     def __init__(self, path: Path, error: Exception) -> None:
         super().__init__(
@@ -79,12 +74,9 @@ class WriteError(OSError):
 
 
 def refuse_deleted_working_directory() -> None:
-    """Raise an error where the folder in which the process works was deleted.
+    """Raise InputError if the folder in which the process works was deleted.
 
     There MKL, a library of torch's, ends the process as soon as torch is imported, and it does not say why.
-
-    Raises:
-        InputError: If the folder was deleted.
     """
     try:
         os.getcwd()

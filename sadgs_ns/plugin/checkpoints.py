@@ -55,16 +55,12 @@ def checkpoint_paths(load_dir: Path | None, load_step: int | None, load_checkpoi
     """Return the checkpoints that nerfstudio's options for resuming name, in the order in which they are to be tried.
 
     Args:
-        load_dir: A folder of checkpoints, or the folder of a run, which holds one; None if `load_checkpoint` is given.
+        load_dir: A folder of checkpoints, or the folder of a run, which holds one.
         load_step: Step of the only checkpoint of `load_dir` to take; None takes all, the latest first.
-        load_checkpoint: A file; None if `load_dir` is given.
-
-    Returns:
-        Their paths; none if no option names any.
+        load_checkpoint: A file. If it and `load_dir` are None, no checkpoint is named.
 
     Raises:
-        InputError: If both are given, if what is named does not exist or holds no checkpoint, or if the folder holds
-            something else, too.
+        InputError: If both are given, what is named does not exist, or the folder does not hold checkpoints alone.
     """
     if load_dir is None:
         if load_checkpoint is None:
@@ -103,16 +99,10 @@ def checkpoint_paths(load_dir: Path | None, load_step: int | None, load_checkpoi
 
 
 def of_gaussians(state: dict[str, Any], change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
-    """Change the tensors of a checkpoint that have a row for each Gaussian, and nothing else.
+    """Return a checkpoint with changed tensors that have a row for each Gaussian; the rest is shared, not copied.
 
-    These are the parameters, Adam's moments, the statistics and the mean of the parameters.
-
-    Args:
-        state: What the trainer saves, which stays as it is.
-        change: Is called with each of these tensors [N, …], always in the same order.
-
-    Returns:
-        A state that shares what was not changed.
+    These are the parameters, Adam's moments, the statistics and the mean of the parameters. `change` is called with
+    each of them [N, …], always in the same order.
     """
     pipeline, optimizers = dict(state["pipeline"]), dict(state["optimizers"])
     names = sorted(name for name in pipeline if ".gauss_params." in name)
@@ -141,11 +131,7 @@ def _changed(value: Any, change: Callable[[Tensor], Tensor]) -> Any:
 
 
 def check_chosen(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> None:
-    """Check quickly, without reading what they hold, whether one of the files for `read_chosen` is whole.
-
-    Raises:
-        InputError: As `checkpoint_paths`, or if none of the files is whole.
-    """
+    """Raise InputError, without reading the files' content, if none of those for `read_chosen` is whole."""
     tried = checkpoint_paths(load_dir, load_step, load_checkpoint)
     if tried and not any(map(zipfile.is_zipfile, tried)):  # A zip file's table of contents is at its end.
         read(tried[0])  # It raises the error that says what is wrong.
@@ -165,10 +151,7 @@ def read_chosen(
         remedy, mmap: As for `read`.
 
     Returns:
-        Its path and content, or None if the options name none.
-
-    Raises:
-        InputError: As `checkpoint_paths`; if none can be read, as `read` of the first.
+        Its path and content, or None if the options name none. Raises as `checkpoint_paths` and `read`.
     """
     errors = []
     for path in checkpoint_paths(load_dir, load_step, load_checkpoint):

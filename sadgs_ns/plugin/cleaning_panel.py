@@ -41,12 +41,9 @@ class _Rows:
 
 
 class CleaningPanel(torch.nn.Module):
-    """Elements of the viewer, and the picture that they choose.
+    """Elements of the viewer, and the picture that they choose, of a run's model.
 
     It is a module because the viewer looks for elements in modules only; it has neither parameters nor state.
-
-    Args:
-        views: The training views, whose model is shown.
     """
 
     def __init__(self, views: TrainingViews) -> None:
@@ -76,11 +73,7 @@ class CleaningPanel(torch.nn.Module):
 
     @property
     def cleaning(self) -> Cleaning:
-        """What the elements ask for.
-
-        Raises:
-            InputError: If the box is reversed.
-        """
+        """What the elements ask for; raises InputError if the box is reversed."""
         low, high = self.crop_from.value, self.crop_to.value
         crop = None
         if (tuple(low), tuple(high)) != (NEAREST, FURTHEST):
@@ -98,11 +91,7 @@ class CleaningPanel(torch.nn.Module):
         show_output(self.viewer, "rgb" if self._shown == OFF else OUTPUT)
 
     def refresh(self) -> None:
-        """Find what stays of the present Gaussians.
-
-        Raises:
-            InputError: If the box is reversed.
-        """
+        """Find what stays of the present Gaussians; raises InputError if the box is reversed."""
         cleaning, model = self.cleaning, self._model
         params = dict(model.gauss_params.items())
         now = (model.num_points, model.step)  # While a run trains, what was seen becomes untrue.
@@ -127,14 +116,9 @@ class CleaningPanel(torch.nn.Module):
         self.text.refresh()
 
     def outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return what the viewer may show besides the model's own outputs; evaluation and `ns-render` get nothing.
+        """Return `cleaned` [H, W, 3] in [0, 1], which the viewer may show; evaluation and `ns-render` get nothing.
 
-        Args:
-            camera: One camera, shape [1].
-            rendered: The model's outputs, `rgb` [H, W, 3] in [0, 1] among them.
-
-        Returns:
-            `cleaned`, [H, W, 3] in [0, 1]; or nothing. It is `rgb` where densification has changed the Gaussians.
+        It is `rgb` of the model's outputs where densification has changed the Gaussians.
         """
         if not in_viewer():
             return {}

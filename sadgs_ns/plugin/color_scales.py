@@ -56,14 +56,7 @@ class Scale:
         return matplotlib.colormaps[self.colors].with_extremes(bad=NOTHING)
 
     def __call__(self, values: Tensor) -> Picture:
-        """Colour a map of values.
-
-        Args:
-            values: Values in the scale's unit; NaN becomes black. [H, W]
-
-        Returns:
-            The coloured map. [H, W, 3]
-        """
+        """Colour a map of values in the scale's unit; NaN becomes black. [H, W] → [H, W, 3]"""
         shown = self.norm(np.ma.masked_invalid(values.detach().float().cpu().numpy()))
         return self.colormap(shown, bytes=True)[..., :3]  # type: ignore[return-value]
 
@@ -81,15 +74,7 @@ def to_picture(image: Tensor) -> Picture:
 
 
 def bar(scale: Scale, width: int = 720) -> Picture:
-    """Return the scale's colours with its numbers below them, to be shown at about half its size.
-
-    Args:
-        scale: The scale.
-        width: Width in px.
-
-    Returns:
-        The picture. [H, W, 3]
-    """
+    """Return the scale's colours, so many px wide, with its numbers below them, to be shown at about half that size."""
     from matplotlib.font_manager import findfont
 
     size = width // 24
@@ -106,12 +91,7 @@ def bar(scale: Scale, width: int = 720) -> Picture:
 
 
 def legend(text: str, scale: Scale | None = None) -> str:
-    """Return a legend as Markdown: a line of text, and the scale's colours and numbers as an image in it.
-
-    Args:
-        text: One line.
-        scale: The scale to show, or None for the text alone.
-    """
+    """Return a line of text as Markdown and, if a scale is given, its colours and numbers as an image."""
     if scale is None:
         return text
     return f"{text}\n\n![{scale.label}](data:image/png;base64,{_encoded_bar(scale)})"
@@ -134,15 +114,12 @@ class Panel:
 
 
 def draw(path: Path, panels: Sequence[Panel], columns: int | None = None) -> None:
-    """Write pictures side by side as PNG, each with its title and a colour bar.
+    """Write pictures side by side as PNG, each with its title and a colour bar; the file appears whole or not at all.
 
     Args:
-        path: The file, which is written whole or not at all.
+        path: The file. If it cannot be written, this raises WriteError.
         panels: The pictures, at least one.
         columns: Pictures in a row; None puts all in one row.
-
-    Raises:
-        WriteError: If it cannot be written.
     """
     from matplotlib.figure import Figure
 

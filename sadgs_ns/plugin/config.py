@@ -131,11 +131,7 @@ class CheckedTrainerConfig(TrainerConfig):
     """What is printed during training, and how often."""
 
     def __post_init__(self) -> None:
-        """Check `load_config` before nerfstudio reads it, since nerfstudio then forgets all other options.
-
-        Raises:
-            InputError: If it is no config.yml, or other options were given beside it.
-        """
+        """Raise InputError if `load_config` is no config.yml, or if options are given that nerfstudio then forgets."""
         if self.load_config is None:
             return
         try:
@@ -158,19 +154,10 @@ class CheckedTrainerConfig(TrainerConfig):
             )
 
     def print_to_terminal(self) -> None:
-        """Print nothing, where nerfstudio prints 260 lines before it is known whether the run can start.
-
-        `config.yml` holds them all.
-        """
+        """Print nothing. nerfstudio prints all options, which `config.yml` holds, before a run is known to start."""
 
     def check(self) -> None:
-        """Check whether training can work with these options.
-
-        Raises:
-            InputError: If a number is out of its range, gradients would be scaled or accumulated, the device is not
-                there, or the run takes several and needs what only a run on one device has; as
-                `processes.check_devices` and `SadgsPipelineConfig.check`.
-        """
+        """Raise InputError if training cannot work with these options, or if the device is not there."""
         length, periods = self.max_num_iterations, ("save", "eval_batch", "eval_image", "eval_all_images")
         check_ranges("", self, [("max_num_iterations", length is None or length >= 1, "at least 1")])
         check_ranges("logging.", self.logging, [("steps_per_log", self.logging.steps_per_log >= 1, "at least 1")])
@@ -226,11 +213,7 @@ class CheckedTrainerConfig(TrainerConfig):
                 raise InputError(f"{name} works on one device only, and this run takes several: {remedy}.")
 
     def _check_rates(self) -> None:
-        """Check whether the learning rates can train anything.
-
-        Raises:
-            InputError: If one is not in [0, 1], now or where a schedule ends, or a factor is not positive and finite.
-        """
+        """Raise InputError if a learning rate ever leaves [0, 1], or a factor is not positive and finite."""
         for group, configs in self.optimizers.items():
             rate, scheduler = configs["optimizer"].lr, configs.get("scheduler")
             if not 0 <= rate <= 1:
@@ -248,11 +231,7 @@ class CheckedTrainerConfig(TrainerConfig):
                         )
 
     def _check_folder(self) -> None:
-        """Check whether the run would delete checkpoints of an earlier run in the same folder.
-
-        Raises:
-            InputError: If it would: the folder holds some, and the run does not go on from them.
-        """
+        """Raise InputError if the run would delete checkpoints of an earlier run in the same folder."""
         folder = self.get_checkpoint_dir()
         there = sorted(folder.glob("step-*.ckpt")) if os.path.isdir(folder) else []
         start = self.load_dir if self.load_checkpoint is None else self.load_checkpoint.parent
@@ -263,12 +242,9 @@ class CheckedTrainerConfig(TrainerConfig):
             )
 
     def _check_address(self) -> None:
-        """Check whether the viewer can listen where it is told to.
+        """Raise InputError if the viewer cannot listen where it is told to.
 
         viser would take the next free port, of which nerfstudio knows nothing, or look for one for ever.
-
-        Raises:
-            InputError: If it cannot.
         """
         host, port = self.viewer.websocket_host, self.viewer.websocket_port
         try:
@@ -311,11 +287,7 @@ class CheckedTrainerConfig(TrainerConfig):
         keep_findings(self.pipeline.datamanager, findings)  # After writing, so that `config.yml` holds none.
 
     def write(self) -> Path:
-        """Write `config.yml` and return its path.
-
-        Raises:
-            WriteError: If the disk is full or the folder cannot be written.
-        """
+        """Write `config.yml` and return its path. Raise WriteError if that is not possible."""
         path = self.get_base_dir() / "config.yml"
         with atomic_path(path) as partial:
             partial.write_text(yaml.dump(self), "utf8")

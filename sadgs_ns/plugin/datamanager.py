@@ -61,11 +61,7 @@ machine together; each may keep all of them in the course of a run."""
 
 
 def check_options(config: FullImageDatamanagerConfig) -> None:
-    """Check whether the options of a datamanager and of its parser of data make sense.
-
-    Raises:
-        InputError: If one is out of its range.
-    """
+    """Raise InputError if an option of a datamanager, or of its parser of data, is out of its range."""
     parser: Any = config.dataparser
     ranges = {
         "scale_factor": (lambda value: 0 < value < math.inf, "positive and finite"),
@@ -212,11 +208,7 @@ class _HeldOutViews(Sequence[tuple[Cameras, dict[str, Any]]]):
 
 
 def _check_sizes(dataset: InputDataset) -> None:
-    """Check whether images are large enough for the loss.
-
-    Raises:
-        InputError: If one is less than 2 px high or wide.
-    """
+    """Raise InputError if an image is less than 2 px high or wide, which is too small for the loss."""
     sizes = torch.cat([dataset.cameras.width, dataset.cameras.height], dim=-1)  # [C, 2] px
     for index in (sizes < 2).any(dim=-1).nonzero().flatten().tolist():
         width, height = sizes[index].tolist()
@@ -254,11 +246,7 @@ class _Nerfstudio(Nerfstudio):
 
 
 def _move_to_fixed_frame(outputs: DataparserOutputs, meta: dict[str, Any], path: Path) -> None:
-    """Move cameras and points of a parser from the frame that it chose to the one that `transforms.json` fixes.
-
-    Raises:
-        InputError: As `fixed_frame`.
-    """
+    """Move a parser's cameras and points to the frame that `transforms.json` fixes; raises as `fixed_frame`."""
     if (fixed := fixed_frame(meta, path)) is None:
         return
     chosen = Similarity.of(outputs.dataparser_scale * outputs.dataparser_transform.double().numpy())
@@ -275,13 +263,9 @@ def _move_to_fixed_frame(outputs: DataparserOutputs, meta: dict[str, Any], path:
 def _points_in_the_run(
     positions: NDArray[np.floating], colors: NDArray[np.uint8], transform: Tensor, scale: float
 ) -> dict[str, Tensor]:
-    """Return points as nerfstudio's metadata hold them.
+    """Return points [P, 3] and their colours in 0 … 255 [P, 3] as nerfstudio's metadata hold them.
 
-    Args:
-        positions: Positions in the data's frame. [P, 3]
-        colors: Colours in 0 … 255. [P, 3]
-        transform: Map from the data's frame to the run's. [3, 4]
-        scale: Factor that is applied after the transform.
+    The transform [3, 4] maps the data's frame to the run's; the scale is applied after it.
     """
     with np.errstate(over="ignore"):  # What is beyond float32 becomes infinite, and is left out later.
         positions = positions.astype(np.float32)

@@ -31,17 +31,15 @@ def blend(
     max_off_axis: float = 0.0,
     near_plane: float = NEAR_PLANE,
 ) -> tuple[Tensor, Tensor]:
-    """Blend values of Gaussians as their colours are blended, front to back.
+    """Blend D values of each Gaussian [N, D] as their colours are blended, front to back.
 
     Args:
         params: `means` [N, 3], `quats` [N, 4], log `scales` [N, 3], logit `opacities` [N] or [N, 1].
         values: D values for each Gaussian. [N, D]
         viewmat: World-to-camera matrix. [4, 4]
         K: Intrinsics in px. [3, 3]
-        width: Width of the image in px.
-        height: Height of the image in px.
-        rasterize_mode: As for `rasterize`.
-        max_off_axis, near_plane: As for `rasterize`.
+        width, height: Of the image, px.
+        rasterize_mode, max_off_axis, near_plane: As for `rasterize`.
 
     Returns:
         The blended values [H, W, D], and how much of each pixel is covered, in [0, 1] [H, W, 1].
@@ -64,15 +62,11 @@ def blend(
 
 
 def eta_map(params: Mapping[str, Tensor], statistics: Mapping[str, Tensor], *view, **options) -> Tensor:
-    """Return the largest η of the Gaussians that make up each pixel, as a geometric mean.
-
-    Each Gaussian's η weighs as much as the Gaussian adds to the pixel.
+    """Return the largest η of the Gaussians that make up each pixel, as a geometric mean by what each adds to it.
 
     Args:
-        params: As for `blend`.
+        params, view, options: As for `blend`, whose first two arguments come before `view`.
         statistics: `eta_max` [N, 3] and `n_total` [N]; Gaussians that were never observed count for nothing.
-        view: The positional arguments of `blend` after its first two.
-        options: The keyword arguments of `blend`.
 
     Returns:
         η, or NaN where hardly anything observed is drawn. [H, W]
@@ -88,10 +82,8 @@ def children_map(params: Mapping[str, Tensor], counts: Tensor, *view, **options)
     """Return the number of children of the Gaussians that make up each pixel, as a geometric mean.
 
     Args:
-        params: As for `blend`.
+        params, view, options: As for `eta_map`.
         counts: Number of children along each axis, ≥ 1. [N, 3]
-        view: The positional arguments of `blend` after its first two.
-        options: The keyword arguments of `blend`.
 
     Returns:
         A number ≥ 1, or NaN where hardly anything is drawn. [H, W]
@@ -104,10 +96,8 @@ def share_map(params: Mapping[str, Tensor], chosen: Tensor, *view, **options) ->
     """Return the share of what is drawn at each pixel that the chosen Gaussians make up.
 
     Args:
-        params: As for `blend`.
+        params, view, options: As for `eta_map`.
         chosen: Which Gaussians are chosen. bool [N]
-        view: The positional arguments of `blend` after its first two.
-        options: The keyword arguments of `blend`.
 
     Returns:
         A share in [0, 1], or NaN where hardly anything is drawn. [H, W]
@@ -118,16 +108,10 @@ def share_map(params: Mapping[str, Tensor], chosen: Tensor, *view, **options) ->
 
 @torch.no_grad()
 def normals_map(params: Mapping[str, Tensor], viewmat: Tensor, *view, **options) -> Tensor:
-    """Return the normals of the Gaussians that make up each pixel, blended as their colours are.
+    """Return the normals of the Gaussians that make up each pixel, blended as their colours are; arguments as `blend`.
 
     A Gaussian's normal is the axis of its smallest scale, turned towards the camera. Training does not flatten
     Gaussians, so that this is an estimate; normals of the depth map are rougher (docs/guide.md has both measured).
-
-    Args:
-        params: As for `blend`.
-        viewmat: As for `blend`.
-        view: The positional arguments of `blend` after `viewmat`.
-        options: The keyword arguments of `blend`.
 
     Returns:
         Vectors of unit length in world axes, and 0 where nothing is drawn. [H, W, 3]
@@ -141,15 +125,7 @@ def normals_map(params: Mapping[str, Tensor], viewmat: Tensor, *view, **options)
 
 
 def random_colors(number: int, generator: torch.Generator) -> Tensor:
-    """Return bright colours that tell neighbouring Gaussians apart.
-
-    Args:
-        number: Number of colours, N.
-        generator: A generator on the CPU.
-
-    Returns:
-        In [0, 1]. [N, 3]
-    """
+    """Return N bright colours in [0, 1] that tell neighbouring Gaussians apart, drawn on the CPU. [N, 3]"""
     hue, saturation, value = torch.rand((3, number), generator=generator)
     return torch.from_numpy(
         hsv_to_rgb(torch.stack([hue, 0.35 + 0.65 * saturation, 0.5 + 0.5 * value], -1).numpy())
@@ -163,9 +139,6 @@ def recolor(colors: Tensor, origins: Tensor, generator: torch.Generator) -> Tens
         colors: Colours before the step, in [0, 1]. [N, 3]
         origins: Index, before the step, of the Gaussian that each one was or came from. int64 [M]
         generator: A generator on the CPU.
-
-    Returns:
-        In [0, 1]. [M, 3]
     """
     is_child = torch.bincount(origins, minlength=len(colors))[origins] > 1  # [M]
     return torch.where(is_child[:, None], random_colors(len(origins), generator).to(colors), colors[origins])

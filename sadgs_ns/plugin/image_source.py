@@ -153,15 +153,10 @@ class ImagesOnDemand(Sequence[dict[str, Any]]):
 
 
 def _undistort_cameras(cameras: Cameras) -> list[_Lens | None]:
-    """Give cameras the intrinsics and sizes that they have once nerfstudio has undistorted their images.
+    """Give C cameras the intrinsics and sizes that they have once nerfstudio has undistorted their images.
 
-    Cameras that are alike, which most are, are computed once.
-
-    Args:
-        cameras: Cameras with distortion, which are changed. [C]
-
-    Returns:
-        What each camera was before, or None where nothing is to undo. [C]
+    Cameras that are alike, which most are, are computed once. Returns what each was before, or None where nothing is to
+    undo.
     """
     lenses: list[_Lens | None] = [None] * len(cameras)
     distortion = cameras.distortion_params  # [C, D]
@@ -187,12 +182,7 @@ def _undistort_cameras(cameras: Cameras) -> list[_Lens | None]:
 
 
 class _Files(Sequence[io.BytesIO]):
-    """The content of files in the place of their paths: Pillow opens both.
-
-    Args:
-        paths: The files.
-        kept: Where to keep what has been read, if anywhere.
-    """
+    """The content of files in the place of their paths, since Pillow opens both; `kept` keeps what has been read."""
 
     def __init__(self, paths: Sequence[Path], kept: dict[Path, bytes] | None) -> None:
         self._paths, self._kept = paths, kept
@@ -248,11 +238,9 @@ class ImagesAhead:
                     self._loading[index] = self._submit(index)
 
     def send(self, indices: Iterable[int], with_codes: bool) -> None:
-        """Start copying those images to the device that threads have loaded; this waits for nothing.
+        """Start copying the next step's images that threads have loaded to the device; this waits for nothing.
 
-        Args:
-            indices: Views of the next step.
-            with_codes: Whether that step needs the codes of S̄, too.
+        `with_codes` says whether that step needs the codes of S̄, too.
         """
         for index in dict.fromkeys(indices):
             if index not in self._sent and (self._ready or (index in self._loading and self._loading[index].done())):
@@ -261,13 +249,9 @@ class ImagesAhead:
     def take(self, index: int, with_codes: bool) -> dict[str, Any]:
         """Return a view's data on the device, and wait only where its image is not decoded yet.
 
-        Args:
-            index: Number of the view.
-            with_codes: Whether to add the codes of S̄ where they are known, `codes` uint8 [H, W, 3].
-
         Returns:
-            `image` [H, W, 3 or 4], boolean `mask` [H, W, 1] if there is one, and what else the dataset added. The
-            present stream may use it.
+            `image` [H, W, 3 or 4], boolean `mask` [H, W, 1] if there is one, what else the dataset added and, with
+            `with_codes`, `codes` uint8 [H, W, 3] of S̄ where they are known. The present stream may use it.
 
         Raises:
             InputError: As `ImagesOnDemand.__getitem__`.
@@ -282,13 +266,9 @@ class ImagesAhead:
         return data
 
     def keep_codes(self, index: int, codes: Tensor) -> None:
-        """Keep the codes of S̄ of a view on the host, if its image is kept there decoded and pinned.
+        """Keep a view's codes of S̄, uint8 [H, W, 3], on the host, if its image is there decoded and pinned.
 
         Beside images that are not decoded, codes would take more memory than the images; they are computed again.
-
-        Args:
-            index: Number of the view.
-            codes: On the device of training. uint8 [H, W, 3]
         """
         if not self._ready:
             return

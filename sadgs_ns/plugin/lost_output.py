@@ -17,13 +17,10 @@ def drop_lost_output() -> None:
 
 
 def print_elsewhere_once_unread(console: Console) -> None:
-    """Have a console print where errors go, or else nowhere, as soon as what read its output has ended.
+    """Have standard output's console print where errors go, or else nowhere, as soon as what read its output has ended.
 
     `head` ends when it has read enough, and `tee` ends by the same Ctrl-C as the program whose output it copies. rich
     would end the program then, wherever it is, with exit code 1 and without a word.
-
-    Args:
-        console: It prints on standard output, and is changed in place.
     """
 
     def print_elsewhere() -> None:

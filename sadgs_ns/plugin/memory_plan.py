@@ -91,11 +91,7 @@ def training_size(
 
 
 def image_bytes(datamanager: FullImageDatamanager) -> float:
-    """Bytes of all images, held-out ones too, and of the codes of S̄ of the training images.
-
-    Args:
-        datamanager: Holds the cameras.
-    """
+    """Bytes of all images, held-out ones too, and of the codes of S̄ of the training images."""
     train, held_out = (
         float((cameras.height * cameras.width).sum())
         for cameras in (datamanager.train_dataset.cameras, datamanager.eval_dataset.cameras)

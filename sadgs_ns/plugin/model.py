@@ -129,11 +129,7 @@ class SadgsModelConfig(InstantiateConfig):
     """Also report metrics after fitting the colours of each rendering to its photo, as suits changing exposure."""
 
     def check(self) -> None:
-        """Check whether training can work with these options.
-
-        Raises:
-            InputError: If one is out of its range.
-        """
+        """Raise InputError if an option is out of its range."""
         near, stereo, off_axis, angle = self.near_plane, self.stereo_points, self.max_off_axis, self.max_angular_scale
         ranges = [
             ("ssim_lambda", 0 <= self.ssim_lambda <= 1, "in [0, 1]"),
@@ -198,13 +194,9 @@ class SadgsModel(SplatfactoModel):
     near_plane: float
 
     def populate_modules(self) -> None:
-        """Make parameters, metrics and the strategy.
+        """Make parameters, metrics and the strategy, or raise InputError as `SadgsModelConfig.check`.
 
-        This replaces splatfacto's method, which needs CUDA and the weights of LPIPS. Here LPIPS is loaded when it is
-        first asked for.
-
-        Raises:
-            InputError: As `SadgsModelConfig.check`.
+        splatfacto's method needs CUDA and the weights of LPIPS, which are loaded here when they are first needed.
         """
         config = self.config
         config.check()
@@ -298,13 +290,10 @@ class SadgsModel(SplatfactoModel):
             self.guessed = self.guessed[keep.cpu()]
 
     def set_near_plane(self, viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> None:
-        """Derive the near plane from the SfM points before the training cameras, unless it is given.
-
-        Call it after `set_cameras`.
+        """Derive the near plane from the SfM points before the training cameras; call `set_cameras` before.
 
         Args:
-            viewmats: World to camera. [C, 4, 4]
-            Ks: Intrinsics in px. [C, 3, 3]
+            viewmats, Ks: As for `rasterize`, of C views.
             sizes: Width and height in px. [C, 2]
         """
         points = self.means.new_zeros((0, 3)) if self.seed_points is None else self.seed_points[0].to(self.means)
@@ -338,10 +327,7 @@ class SadgsModel(SplatfactoModel):
     def clear_paths(self, viewmats: Tensor) -> None:
         """Let densification prune the haze near the cameras' paths, unless the run is told not to.
 
-        Call it once all initial Gaussians are there.
-
-        Args:
-            viewmats: World to camera, of the training views. [C, 4, 4]
+        Call it once all initial Gaussians are there, with the training views' world-to-camera matrices. [C, 4, 4]
         """
         asked = self.config.clear_paths
         if len(viewmats) <= MOST_VIEWS if asked is None else asked:
@@ -357,11 +343,7 @@ class SadgsModel(SplatfactoModel):
         self.register_buffer("view_numbers", numbers, persistent=False)
 
     def share_out(self, world: World) -> None:
-        """Keep the part of the Gaussians that is this process's; call before optimizers are made.
-
-        Args:
-            world: The processes, all of which have the same Gaussians until now.
-        """
+        """Keep this process's part of the Gaussians, all of which it has until now; call before optimizers are made."""
         part = world.take_even_part(self.num_points)
         for parameter in self.gauss_params.values():
             parameter.data = parameter.data[part].clone()
@@ -420,11 +402,7 @@ class SadgsModel(SplatfactoModel):
         return groups  # type: ignore[return-value]
 
     def numbers_of(self, cam_indices: Sequence[int]) -> Tensor | None:
-        """Return indices of training views as a tensor on the model's device, without waiting for it.
-
-        Returns:
-            int64 [C]; None where a step does not read matrices of colours.
-        """
+        """Return indices of C views as int64 [C] on the device, without waiting; None without matrices of colours."""
         if self.color_matrices is None:
             return None
         return torch.cat([self.view_numbers[index : index + 1] for index in cam_indices])
@@ -434,11 +412,7 @@ class SadgsModel(SplatfactoModel):
         return self.strategy.observes(step)
 
     def cropped(self, values: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-        """Return the rows that belong to Gaussians inside the viewer's crop box; in training, all rows.
-
-        Args:
-            values: Tensors by name, each with one row per Gaussian. [N, …]
-        """
+        """Return the rows of tensors [N, …] of Gaussians in the viewer's crop box; in training, all rows."""
         if self.crop_box is None or self.training:
             return values
         inside = self.crop_box.within(self.means)
@@ -476,13 +450,8 @@ class SadgsModel(SplatfactoModel):
         """Rasterize the Gaussians; in the viewer, those inside its crop box.
 
         Args:
-            viewmats: World to camera. [C, 4, 4]
-            Ks: Intrinsics in px. [C, 3, 3]
-            width: px.
-            height: px.
+            viewmats, Ks, width, height, absgrad, tile_capacity: As for `rasterize`.
             render_mode: "RGB+ED" adds the expected depth as a fourth channel.
-            absgrad: Whether the backward pass also sums absolute screen gradients, for AbsGS.
-            tile_capacity: Places in the tile lists of our kernels, as in `rasterize`; None waits for the exact number.
             opacity_reg: Factor on the mean opacity.
             params: Parameters by name; None is the model's own.
             sh_degree: Degree of the harmonics; None is the present step's.
@@ -528,13 +497,7 @@ class SadgsModel(SplatfactoModel):
         return splats, penalty, {"sh_degree": sh_degree, **self.drawing}
 
     def kind_of_step(self, width: int, height: int, cam_indices: list[int]) -> StepKind:
-        """Return what the launches of this step depend on; the length of its tile lists is foreseen.
-
-        Args:
-            width: px.
-            height: px.
-            cam_indices: The views' indices among the training cameras.
-        """
+        """Return what the launches of a step depend on, whose views have one size in px."""
         forecast, capacity = self.tile_forecast, None
         if forecast is not None:
             capacity = forecast.capacity(cam_indices, (width, height), self.num_points)
@@ -549,14 +512,12 @@ class SadgsModel(SplatfactoModel):
 
         Args:
             kind: What `kind_of_step` returned.
-            viewmats: World to camera. [C, 4, 4]
-            Ks: Intrinsics in px. [C, 3, 3]
+            viewmats, Ks: As for `rasterize`.
             params: As `trained_params`.
             view_numbers: What `numbers_of` returned. int64 [C]
 
         Returns:
-            `rgb` [C, H, W, 3], not clamped, `background` [3] and, where the loss has that part, `opacity_reg`, numbers
-            [P] whose sum is that part; and gsplat's meta.
+            The outputs of `get_training_outputs`, and gsplat's meta.
         """
         render, alpha, info = self.render(
             viewmats, Ks, kind.width, kind.height, "RGB", kind.absgrad, kind.tile_capacity, kind.opacity_reg,
@@ -570,16 +531,7 @@ class SadgsModel(SplatfactoModel):
         return outputs if penalty is None else outputs | {"opacity_reg": penalty}, info
 
     def before_background(self, render: Tensor, alpha: Tensor, background: Tensor) -> Tensor:
-        """Put renderings before a background.
-
-        Args:
-            render: Colours, and perhaps more. [C, H, W, 3 or 4]
-            alpha: Accumulated opacity. [C, H, W, 1]
-            background: [3]
-
-        Returns:
-            [C, H, W, 3]
-        """
+        """Put renderings [C, H, W, ≥ 3] of accumulated opacity [C, H, W, 1] before a background [3]. → [C, H, W, 3]"""
         if self.config.background_color == "black":
             return render[..., :3]
         return render[..., :3] + (1 - alpha) * background
@@ -587,12 +539,7 @@ class SadgsModel(SplatfactoModel):
     def show_to_strategy(
         self, info: dict[str, Any], viewmats: Tensor, Ks: Tensor, structure_tensors: Tensor | None
     ) -> None:
-        """Let the strategy see a forward pass, as long as densification runs.
-
-        Args:
-            info: gsplat's meta.
-            viewmats, Ks, structure_tensors: As for `get_training_outputs`.
-        """
+        """Let the strategy see a forward pass and gsplat's meta of it, as long as densification runs."""
         if self.step < self.strategy.windows.refine_stop_iter:
             info |= {"viewmats": viewmats.detach(), "Ks": Ks, "structure_tensors": structure_tensors}
             self.strategy.step_pre_backward(self.gauss_params, self.optimizers, self.strategy_state, self.step, info)
@@ -613,10 +560,7 @@ class SadgsModel(SplatfactoModel):
         short nothing is drawn, no gradient flows and the strategy counts nothing; `tile_forecast` then names the views.
 
         Args:
-            viewmats: World to camera. [C, 4, 4]
-            Ks: Intrinsics in px. [C, 3, 3]
-            width: px.
-            height: px.
+            viewmats, Ks, width, height: As for `rasterize`.
             cam_indices: The views' indices among the training cameras, C of them.
             structure_tensors: S̄ of the views, or codes of it, [C, H, W, 3]; None where η is not observed.
 
@@ -632,17 +576,11 @@ class SadgsModel(SplatfactoModel):
         return outputs
 
     def get_outputs(self, camera: Cameras) -> dict[str, Any]:
-        """Render one camera for the viewer, evaluation and rendering.
-
-        Args:
-            camera: One camera, shape [1].
+        """Render one camera, shape [1], for the viewer, evaluation and rendering. Raise InputError if it is no pinhole.
 
         Returns:
             `rgb` [H, W, 3] in [0, 1]; `depth` [H, W, 1], the mean of the drawn Gaussians' depths along the viewing axis
             in the run's units, and the largest one where nothing is; `accumulation` [H, W, 1]; `background` [H, W, 3].
-
-        Raises:
-            ValueError: If the camera is no pinhole.
         """
         refuse_unsupported_cameras(camera)
         width, height = int(camera.width.item()), int(camera.height.item())
@@ -711,12 +649,9 @@ class SadgsModel(SplatfactoModel):
         return LazyOutputs({**outputs, NORMALS: lambda: self.get_normals(camera, params)})
 
     def get_gt_img(self, image: Tensor) -> Tensor:
-        """Return an image as the loss compares it, on the model's device and in [0, 1].
+        """Return an image, uint8 or floats in [0, 1] [H, W, 3 or 4], on the model's device and in [0, 1].
 
         splatfacto converts and divides bytes in two launches; this takes one.
-
-        Args:
-            image: uint8, or floats in [0, 1]. [H, W, 3 or 4]
         """
         image = image.to(self.device)
         return image / 255.0 if image.dtype == torch.uint8 else image
@@ -727,12 +662,7 @@ class SadgsModel(SplatfactoModel):
         return _constant_color(float(self.config.background_color == "white"), self.device)
 
     def composite_with_background(self, image: Tensor, background: Tensor) -> Tensor:
-        """Put images with an alpha channel before the background.
-
-        Args:
-            image: In [0, 1]. [..., H, W, 3 or 4]
-            background: [3] or [H, W, 3]
-        """
+        """Put images in [0, 1] [..., H, W, 3 or 4] before the background, [3] or [H, W, 3], if they have alpha."""
         if image.shape[-1] == 4:
             alpha = image[..., 3:]
             return alpha * image[..., :3] + (1 - alpha) * background

@@ -24,10 +24,6 @@ class NonFiniteLog:
         capacity: Number of steps that the log holds.
         steps: Number of all steps that have been read.
         streak: Number of the latest of these in a row in which something was not finite.
-
-    Args:
-        device: Where losses and gradients are.
-        capacity: Number of steps that the log holds.
     """
 
     def __init__(self, device: torch.device | str, capacity: int = 100) -> None:
@@ -45,13 +41,7 @@ class NonFiniteLog:
         return len(self._steps) >= self.capacity
 
     def begin_step(self, step: int, views: list[int], loss: Tensor) -> None:
-        """Note a step's loss, which takes the device no work.
-
-        Args:
-            step: The step, counted from 0.
-            views: Indices of the step's training views.
-            loss: The step's loss, a scalar that nobody changes in place.
-        """
+        """Note the loss of a step of these views, a scalar that nobody changes in place; the device has no work."""
         self._losses.append(loss.detach())
         self._steps.append((step, views))
 
@@ -91,9 +81,7 @@ class NonFiniteLog:
 def leave_out_nonfinite(gradient: Tensor, noted: Tensor) -> None:
     """Set gradients from which Adam could not recover to 0, in place, without waiting for the device.
 
-    Args:
-        gradient: Gradient of any shape.
-        noted: Becomes NaN if there was such a gradient, float32 [1].
+    `noted`, float32 [1], becomes NaN if there was such a gradient.
     """
     wrong = ~(gradient.abs() < MAX_GRADIENT)  # Comparing NaN gives False.
     gradient.masked_fill_(wrong, 0.0)
@@ -101,10 +89,6 @@ def leave_out_nonfinite(gradient: Tensor, noted: Tensor) -> None:
 
 
 def is_useless(gradient: Tensor) -> bool:
-    """Return whether no element of a gradient changes its parameter; this waits for the device.
-
-    Args:
-        gradient: Gradient of any shape, before or after `leave_out_nonfinite`.
-    """
+    """Return whether no element of a gradient changes its parameter; this waits for the device."""
     size = gradient.abs()
     return not bool(((size > 0) & (size < MAX_GRADIENT)).any())

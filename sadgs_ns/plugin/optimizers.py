@@ -251,10 +251,7 @@ class RunLengthDecayScheduler(Scheduler):
     config: RunLengthDecaySchedulerConfig
 
     def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LambdaLR:
-        """Make torch's scheduler.
-
-        Its state holds Python numbers only, so that checkpoints load with torch's safe loader.
-        """
+        """Make torch's scheduler. Its state holds Python numbers only, which torch's safe loader loads."""
         max_steps = self.config.max_steps
         if max_steps is None:
             raise ValueError("max_steps is unset: SadgsTrainer sets it to the length of the run.")

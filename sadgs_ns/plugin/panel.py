@@ -53,12 +53,7 @@ ROWS = 8
 
 
 def change(strategy: StructureAwareStrategy, name: str, value: float) -> None:
-    """Set one of `RANGES`' fields; the next densification acts on it.
-
-    Args:
-        strategy: The strategy that is changed.
-        name: Name of the field.
-        value: Its new value.
+    """Set one of `RANGES`' fields, on which the next densification acts.
 
     Raises:
         ValueError: If the value is no number in the field's range; the field is then as before.
@@ -72,13 +67,8 @@ def change(strategy: StructureAwareStrategy, name: str, value: float) -> None:
 def describe(strategy: StructureAwareStrategy, num_points: int, state: dict[str, Any]) -> str:
     """Return the number of Gaussians now, and a table of how the last structure steps changed it, as Markdown.
 
-    What AbsGS and pruning changed between the structure steps has rows of its own, so that each row begins where the
-    one above ends, and the last one ends with the number of now.
-
-    Args:
-        strategy: The strategy, whose cap is told.
-        num_points: Number of Gaussians.
-        state: The strategy's state, which lists the structure steps.
+    What AbsGS and pruning changed between the structure steps, which `state` lists, has rows of its own: each row
+    begins where the one above ends, and the last one ends with the number of now.
     """
     lines = [f"**{num_points:,} Gaussians** (cap {strategy.max_gaussians:,})", ""]
     steps = state.get("structure_steps", [])[-ROWS:]
@@ -115,12 +105,9 @@ def nearest_view(cameras: Tensor, camera: Tensor, extent: float) -> int:
 
 
 class StructurePanel(torch.nn.Module):
-    """Elements of the viewer, and the picture that they choose.
+    """Elements of the viewer, and the picture that they choose, of a run's structure tensors and its model.
 
     It is a module because the viewer looks for elements in modules only; it has neither parameters nor state.
-
-    Args:
-        maps: The run's structure tensors, whose views have the model that is shown and the strategy that is changed.
     """
 
     def __init__(self, maps: StructureMaps) -> None:
@@ -208,10 +195,9 @@ class StructurePanel(torch.nn.Module):
             self.table.refresh()
 
     def statistics(self) -> dict[str, Tensor] | None:
-        """Return the run's own observations since its last structure step, or else those of `observe_now`.
+        """Return observations as `empty_statistics`: the run's since its last structure step, or else `observe_now`'s.
 
-        Returns:
-            As `empty_statistics`, or None where neither is of the present Gaussians.
+        They are None where neither is of the present Gaussians.
         """
         model = self._model
         live, n = model.strategy_state, model.num_points
@@ -272,16 +258,13 @@ class StructurePanel(torch.nn.Module):
         show_output(self.viewer, "rgb" if chosen == OFF else OUTPUT)
 
     def outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return what the viewer may show besides the model's own outputs; evaluation and `ns-render` get nothing.
+        """Return `structure` [H, W, 3] in [0, 1], which the viewer may show; evaluation and `ns-render` get nothing.
 
         The output exists whatever is chosen, because the viewer's thread fails where one goes missing.
 
         Args:
             camera: One camera, shape [1].
             rendered: The model's outputs, `rgb` [H, W, 3] in [0, 1] among them.
-
-        Returns:
-            `structure`, [H, W, 3] in [0, 1]; or nothing.
         """
         if not in_viewer():
             return {}
@@ -298,16 +281,7 @@ class StructurePanel(torch.nn.Module):
 
     @torch.no_grad()
     def picture(self, choice: str, camera: Cameras, rgb: Tensor) -> Panel:
-        """Draw one of `CHOICES` as a camera sees it.
-
-        Args:
-            choice: Any of `CHOICES` but "off".
-            camera: One camera, shape [1].
-            rgb: What it sees, in [0, 1]. [H, W, 3]
-
-        Returns:
-            The picture [H, W, 3], what its legend says, and its scale.
-        """
+        """Draw one of `CHOICES`, but not "off", as a camera, shape [1], that sees `rgb` [H, W, 3] in [0, 1] sees it."""
         maps, datamanager, (height, width) = self._maps, self._maps.views.datamanager, rgb.shape[:2]
         constant = maps.frequency_constant
         if choice in OF_STATISTICS:

@@ -85,11 +85,7 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     None makes it relative to an image's contrast, so that the exposure of a photo does not decide what is split."""
 
     def check(self) -> None:
-        """Check whether training can work with these options.
-
-        Raises:
-            InputError: If an option is out of its range; as `SadgsModelConfig.check`.
-        """
+        """Raise InputError if an option is out of its range."""
         views, epsilon, budget = self.views_per_iteration, self.epsilon, self.memory_budget_gb
         ranges = [
             ("effort", 0 < self.effort <= _MOST_EFFORT, f"in (0, {_MOST_EFFORT}]"),
@@ -182,11 +178,7 @@ class SadgsPipeline(VanillaPipeline):
         return self._model  # type: ignore[return-value]
 
     def share_out(self, world: World) -> None:
-        """Keep this process's part of the Gaussians; call before optimizers are made.
-
-        Args:
-            world: The processes, all of which have the same Gaussians until now.
-        """
+        """Keep this process's part of the Gaussians, all of which it has until now; call before optimizers are made."""
         self.world = self.views.world = world
         self.model.share_out(world)
 
@@ -245,11 +237,7 @@ class SadgsPipeline(VanillaPipeline):
         return [read, *super().get_training_callbacks(training_callback_attributes), counts, last]
 
     def _refuse_empty_views(self) -> None:
-        """Check whether training can see anything.
-
-        Raises:
-            InputError: If fewer than 1 in 100 Gaussians are within the planes of a camera between which they are drawn.
-        """
+        """Raise InputError if fewer than 1 % of the Gaussians lie between the near and the far plane of any camera."""
         cameras = self.datamanager.train_dataset.cameras
         viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds[:: -(-len(cameras) // _SAMPLED)])
         means = self.model.means.detach()
@@ -383,10 +371,7 @@ class SadgsPipeline(VanillaPipeline):
     ) -> dict[str, float]:
         """Return the mean of each metric over the held-out views, and with `get_std` its standard deviation, too.
 
-        A single view has no deviation; nerfstudio would return NaN, which is no JSON.
-
-        Raises:
-            InputError: If no view is held out.
+        A single view has no deviation (nerfstudio would return NaN, which is no JSON). Raises InputError without views.
         """
         views = len(self.datamanager.eval_dataset)
         if views == 0:
@@ -397,12 +382,9 @@ class SadgsPipeline(VanillaPipeline):
         return super().get_average_eval_image_metrics(step, output_path, get_std and views > 1)
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
-        """Load a checkpoint's parameters and states.
+        """Load a checkpoint, or raise InputError if it is of another method or of other settings of the model.
 
-        nerfstudio would pass over missing ones: another method's checkpoint would go on from a mixture.
-
-        Raises:
-            InputError: If the checkpoint is of another method, or of other settings of the model.
+        nerfstudio would pass over missing parameters: another method's checkpoint would go on from a mixture.
         """
         loaded = {key.removeprefix("module."): value for key, value in loaded_state.items()}
         for name, parameter in self.model.gauss_params.items():

@@ -42,11 +42,7 @@ CONSTANT = {name: (RATES[name][0], 1.0, 1.0) for name in HELD}
 
 
 def optimizers(**rates: tuple[float, float, float]) -> dict[str, dict[str, Any]]:
-    """Adam for each group of parameters, and a schedule for those whose rate changes over the run.
-
-    Args:
-        **rates: What differs from `RATES`.
-    """
+    """Return Adam for each group of parameters, and a schedule if its rate changes. `rates` override `RATES`."""
     groups: dict[str, dict[str, Any]] = {}
     for name, (lr, initial_factor, final_factor) in (RATES | rates).items():
         adam, decay = FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
@@ -63,12 +59,10 @@ def optimizers(**rates: tuple[float, float, float]) -> dict[str, dict[str, Any]]
 
 
 def paper_pipeline(views_per_iteration: int) -> SadgsPipelineConfig:
-    """What the paper prints, and AbsGS's thresholds and the released code's window where it is silent.
+    """Return what the paper prints, and AbsGS's thresholds and the released code's window where it is silent.
 
-    It lacks what we added to need fewer Gaussians. docs/method.md lists what still departs from the paper.
-
-    Args:
-        views_per_iteration: 1 outdoors, 2 indoors.
+    It lacks what we added to need fewer Gaussians. docs/method.md lists what still departs from the paper, which takes
+    1 view per iteration outdoors and 2 indoors.
     """
     return SadgsPipelineConfig(
         views_per_iteration=views_per_iteration,

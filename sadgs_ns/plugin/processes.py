@@ -45,12 +45,7 @@ def processes_on_this_machine() -> int:
 
 
 def least(number: float, device: torch.device) -> float:
-    """Return the least of the numbers that the processes of the run pass, so that all decide alike.
-
-    Args:
-        number: Any, also infinite.
-        device: Where this process trains.
-    """
+    """Return the least of the numbers, which may be infinite, that all processes of the run pass: they decide alike."""
     return World(device if dist.is_initialized() else None).least(number)
 
 
@@ -87,11 +82,7 @@ def check_devices(machine: MachineConfig) -> bool:
 
 
 class Peers:
-    """The processes of a run, as the operating system of this machine knows them.
-
-    Args:
-        world: The processes.
-    """
+    """The processes of a run, as the operating system of this machine knows them."""
 
     def __init__(self, world: World) -> None:
         self._rank, number = world.rank, world.num_ranks
@@ -115,12 +106,9 @@ class Peers:
         return len({host for host, _, _ in self._places}) == 1
 
     def wait_for_the_first(self) -> NoReturn:
-        """Do nothing until the first process has ended, which must run on this machine; then end this process.
+        """Wait until the first process, of this machine, has ended; then end this process with exit code 0.
 
         What starts the processes would take the end of one for the end of all.
-
-        Raises:
-            SystemExit: With exit code 0.
         """
         for number in (signal.SIGINT, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)  # The first process saves, and ends.
@@ -193,14 +181,10 @@ def join(config: TrainerConfig, local_rank: int) -> tuple[World, int]:
 
 @contextmanager
 def first_of_each_machine_before_others(world: World, local_rank: int) -> Iterator[None]:
-    """Let the first process of each machine do something, such as compiling, before its others.
+    """Let the first process of each machine do something, such as compiling, before its others; all call this.
 
     Triton keeps what it compiles on the disk, where the others find it. Of 24 processes that compiled the same kernels
     at once two ended with a TypeError (docs/results.md#several-devices).
-
-    Args:
-        world: The processes, all of which call this.
-        local_rank: Number of this process on its machine.
     """
     if local_rank > 0:
         world.all(True)
@@ -210,14 +194,9 @@ def first_of_each_machine_before_others(world: World, local_rank: int) -> Iterat
 
 
 def leave_the_rest_to_the_first(world: World, peers: Peers) -> None:
-    """Let the run go on in the first process, as if it were alone; the others wait for its end, and end.
+    """Let the run go on in the first process, as if it were alone; the others wait for its end, and end with code 0.
 
-    Args:
-        world: What this process knows of the others, which nobody may use any more.
-        peers: The processes, all of which run on this machine.
-
-    Raises:
-        SystemExit: In the other processes, with exit code 0.
+    All processes run on this machine, and nobody may use their `World` any more.
     """
     world.all(True)
     dist.destroy_process_group()

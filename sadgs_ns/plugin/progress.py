@@ -38,11 +38,7 @@ def duration(seconds: float) -> str:
 
 
 def about_cpu(threads: int) -> str:
-    """Return what somebody should know who trains without a GPU.
-
-    Args:
-        threads: Number of threads that torch computes with.
-    """
+    """Return what somebody should know who trains without a GPU, with so many threads of torch."""
     text = (
         "This run trains on the CPU, which is for small scenes and tests: a GPU with CUDA is about a hundred times as "
         "fast. After the first iterations a line says how long the run will take."
@@ -56,12 +52,7 @@ def about_cpu(threads: int) -> str:
 
 
 def what_next(config: Path, gaussians: int) -> str:
-    """Return the commands for a finished run.
-
-    Args:
-        config: The run's `config.yml`.
-        gaussians: Number of Gaussians that it ended with.
-    """
+    """Return the commands for a finished run: its `config.yml`, and the number of Gaussians that it ended with."""
     commands = {
         ("ns-viewer", "--load-config", str(config)): "shows the Gaussians in a browser",
         ("ns-eval", "--load-config", str(config), "--output-path", str(config.with_name("eval.json"))): (
@@ -96,11 +87,7 @@ class ProgressTable(LocalWriter):
         self._live = Live(console=CONSOLE, auto_refresh=False) if in_place else None
 
     def write_stats_log(self, step: int) -> None:
-        """Add a row if the step is due for one; nerfstudio calls this after every step, and once after the last.
-
-        Args:
-            step: The step, counted from 0.
-        """
+        """Add a row if the step is due for one; nerfstudio calls this after every step, and once after the last."""
         events = {event["name"]: event["event"] for event in writer.EVENT_STORAGE}
         if EventName.ITER_TRAIN_TIME.value not in events:  # Training is over.
             self.stop()
@@ -139,13 +126,7 @@ class ProgressTable(LocalWriter):
 
     @staticmethod
     def _say_how_long(steps: int, pace: float, left: int) -> None:
-        """Print how long the rest of the run takes.
-
-        Args:
-            steps: Number of iterations that were measured.
-            pace: Seconds that an iteration took.
-            left: Number of iterations that are left.
-        """
+        """Print how long the `left` iterations take at the pace, in seconds, that was measured in so many steps."""
         if left > 0:
             CONSOLE.print(
                 f"{steps} iterations after the first took {_short(pace)} each: at this pace the {left:,} that are left "

@@ -41,13 +41,9 @@ def number_of_points(pipeline: SadgsPipeline) -> int:
 
 
 def start_from_stereo(pipeline: SadgsPipeline, resumed: bool) -> None:
-    """Start from points of stereo depth, too, where the run is to, and let it grow less.
+    """Start from points of stereo depth, too, where the run is to and is not resumed, and let it grow less.
 
-    Call it before optimizers are made.
-
-    Args:
-        pipeline: Its images are loaded, where they are not yet.
-        resumed: Whether the Gaussians come from a checkpoint.
+    Call it before optimizers are made. The images are loaded, where they are not yet.
     """
     number, strategy = number_of_points(pipeline), pipeline.model.strategy
     if number:

@@ -99,14 +99,7 @@ class StructureMaps:
         return model.composite_with_background(model.get_gt_img(data["image"]), model.background)
 
     def codes_of(self, data: Sequence[Mapping[str, Any]]) -> Tensor:
-        """Codes of S̄ of images of the datamanager that have one size.
-
-        Args:
-            data: The images, in bytes, with their masks where they have any.
-
-        Returns:
-            On the training device. uint8 [B, H, W, 3]
-        """
+        """Codes of S̄ of the datamanager's images of one size, within their masks, on the device. uint8 [B, H, W, 3]"""
         images = torch.stack([self.photo(d) for d in data])
         masks = None
         if any("mask" in d for d in data):
@@ -145,16 +138,10 @@ class _CodesOnDemand(Sequence[Tensor]):
 
 @torch.no_grad()
 def observe_training_views(maps: StructureMaps, progress: Callable[[range], Iterable[int]] = iter) -> dict[str, Tensor]:
-    """η's statistics of the Gaussians as they are, in one look at each training view.
+    """η's statistics of the Gaussians as they are, in one look at each training view, as `statistics.empty_statistics`.
 
-    The samples are drawn from a generator of their own: a run that is watched goes on as if it were not.
-
-    Args:
-        maps: The run's structure tensors.
-        progress: Wraps the numbers of the views, to show how far the work is.
-
-    Returns:
-        As `statistics.empty_statistics`.
+    The samples are drawn from a generator of their own: a run that is watched goes on as if it were not. `progress`
+    wraps the numbers of the views, to show how far the work is.
     """
     views, model = maps.views, maps.views.model
     model.set_crop(None)  # the viewer sets its crop box anew whenever it renders

@@ -91,7 +91,7 @@ def draw_ellipses(
     frequency_constant: float = FREQUENCY_CONSTANT,
     size: tuple[int, int] | None = None,
 ) -> Picture:
-    """Draw S̄⁻¹ as ellipses over an image, which is made dark grey.
+    """Draw S̄⁻¹ as ellipses over an image [H, W, 3], which is made dark grey.
 
     A circle as wide as the grid's spacing has the coarsest wavelength on both axes.
 
@@ -99,10 +99,7 @@ def draw_ellipses(
         image: The picture to draw on. [H, W, 3]
         structure_tensor: S̄ of the image. [H, W, 3]
         frequency_constant: c that S̄ was computed with, in 1/px.
-        size: Height and width of the picture in px; None keeps those of the image.
-
-    Returns:
-        The drawing. [H, W, 3]
+        size: Height and width of the drawing in px; None keeps those of the image.
     """
     ellipses = structure_ellipses(structure_tensor, frequency_constant)
     height, width = image.shape[:2] if size is None else size

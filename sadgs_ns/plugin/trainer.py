@@ -171,11 +171,7 @@ class SadgsTrainer(Trainer):
             events.report("training ends", gaussians=self.pipeline.model.num_gaussians)
 
     def _load_checkpoint(self) -> None:
-        """Resume as nerfstudio does, but with the safe loader, and from an earlier checkpoint if the latest is damaged.
-
-        Raises:
-            InputError: If there is none, none can be read, or it is not of this method.
-        """
+        """Resume as nerfstudio does, but with the safe loader. Raise InputError for another method's checkpoint."""
         if self._checkpoint is None:
             return super()._load_checkpoint()
         config, (path, state), self._checkpoint = self.config, self._checkpoint, None
@@ -232,10 +228,7 @@ class SadgsTrainer(Trainer):
     def _take_one_device_if_quicker(self) -> None:
         """Train on the first device alone, and say so, where a step has too few pixels for several.
 
-        On several machines all devices are kept.
-
-        Raises:
-            SystemExit: In the other processes, once the first has ended.
+        On several machines all devices are kept. The other processes end with SystemExit, once the first has ended.
         """
         if self._peers is None or self.config.share_always or not self._peers.all_here():
             return
@@ -260,11 +253,7 @@ class SadgsTrainer(Trainer):
             self.config.vis = others or "none"  # type: ignore[assignment]
 
     def setup_optimizers(self) -> SadgsOptimizers:
-        """Derive the run's length and build the optimizers with schedules as long as that.
-
-        Raises:
-            InputError: As `checkpoints.read_chosen`, since a run that goes on keeps its length.
-        """
+        """Derive the run's length and build optimizers with schedules as long; raises as `checkpoints.read_chosen`."""
         config = self.config
         self._checkpoint = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
         start_from_stereo(self.pipeline, resumed=self._checkpoint is not None)
@@ -480,11 +469,7 @@ class SadgsTrainer(Trainer):
         raise SystemExit(128 + interrupted.number)
 
     def _stop_if_stuck(self) -> None:
-        """Save the Gaussians and end the run if they learn nothing any more because gradients are not finite.
-
-        Raises:
-            RunError: If so.
-        """
+        """Save the Gaussians and raise RunError if they learn nothing any more because gradients are not finite."""
         if not self.pipeline.stuck:
             return
         kept = "the Gaussians themselves are not finite: train anew, or from a checkpoint in which they are"
@@ -502,10 +487,7 @@ class SadgsTrainer(Trainer):
         """Save under a temporary name and rename, so that a killed save leaves the previous checkpoint as it was.
 
         The temporary file lies beside the folder of checkpoints, because nerfstudio takes every file inside for one.
-        Where several processes train, the first one writes what all of them hold, and the others wait.
-
-        Raises:
-            WriteError: If the disk is full or the folder cannot be written.
+        Where several processes train, the first one writes what all of them hold. Raises WriteError.
         """
         start = time.monotonic()
         state = self._state(step)

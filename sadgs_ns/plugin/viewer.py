@@ -40,12 +40,7 @@ class ViewerMarkdown(ViewerElement[str]):
 
 
 def show_output(control: ViewerControl, name: str) -> None:
-    """Have the viewer show one of its output types, if there is a viewer and it knows the type already.
-
-    Args:
-        control: An element of the panel, which the viewer has met if it was made.
-        name: The output type.
-    """
+    """Have the viewer, if it has met the control, show one of its output types, if it knows that already."""
     viewer = getattr(control, "viewer", None)  # It is set when the viewer is made.
     if viewer is not None:
         output = viewer.control_panel._output_render  # nerfstudio 1.1 has no public way.
@@ -54,12 +49,7 @@ def show_output(control: ViewerControl, name: str) -> None:
 
 
 def shows_output(control: ViewerControl, name: str) -> bool:
-    """Tell whether the viewer shows one of its output types, in the whole window or in a half of it.
-
-    Args:
-        control: An element of the panel, which the viewer has met if it was made.
-        name: The output type.
-    """
+    """Tell whether the viewer shows one of its output types, in the whole window or in a half of it."""
     viewer = getattr(control, "viewer", None)
     if viewer is None:
         return False

@@ -165,11 +165,7 @@ class TrainingViews:
             vars(self)["ahead"].close()
 
     def put_back(self, indices: Sequence[int]) -> None:
-        """Let views be the first of the next step, since what was drawn of them did not count.
-
-        Args:
-            indices: Views that were drawn.
-        """
+        """Let drawn views be the first of the next step, since what was drawn of them did not count."""
         self.datamanager.train_unseen_cameras = [*indices, *self.datamanager.train_unseen_cameras]
 
     @cached_property
@@ -200,11 +196,7 @@ class TrainingViews:
         return viewmats_from_camera_to_world(optimizer.apply_to_camera(camera))[0]
 
     def stacked_cameras(self, indices: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """World-to-camera matrices [V, 4, 4] and intrinsics in px [V, 3, 3] of V training views.
-
-        Args:
-            indices: The views.
-        """
+        """World-to-camera matrices [V, 4, 4] and intrinsics in px [V, 3, 3] of V training views."""
         _, every_K = self.cameras
         viewmats, Ks = [self.viewmat(index) for index in indices], [every_K[index] for index in indices]
         n = len(indices)
