@@ -158,3 +158,9 @@ def test_what_nerfstudio_s_commands_need_is_looked_for(program: str, package: st
     monkeypatch.setattr(ctypes.util, "find_library", lambda name: None)
     severity, sentence = about(f"{program} is missing: ")
     assert severity == "warning" and sentence.endswith(f"install the system's package {package}.")
+
+
+@pytest.mark.hard_case("`sadgs-doctor` in an environment with `SADGS_TRITON=0`", "a warning names the variable")
+def test_kernels_that_are_switched_off_are_told(cuda: SimpleNamespace):
+    with kernels.triton_switched(False):
+        assert about("SADGS_TRITON") == ("warning", "Training will take twice as long: SADGS_TRITON is 0, unset it.")
