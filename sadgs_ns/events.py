@@ -13,12 +13,7 @@ FILE = "SADGS_EVENTS"
 
 
 def report(event: str, **fields: Any) -> None:
-    """Tell the listener of an event. Nothing is done without a listener, or where it is gone.
-
-    Args:
-        event: Its name.
-        fields: What JSON holds, and dataclasses.
-    """
+    """Tell the listener, if there is one, of an event, whose fields are what JSON holds and dataclasses."""
     if path := os.environ.get(FILE):
         line = json.dumps({"event": event, **fields}, default=dataclasses.asdict) + "\n"
         with suppress(OSError):

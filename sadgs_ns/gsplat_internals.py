@@ -61,12 +61,12 @@ SCREEN_BLUR = 0.3
 
 
 def project(
-    means: Tensor,  # [N, 3]
-    quats: Tensor,  # [N, 4]
-    scales: Tensor,  # [N, 3]
-    opacities: Tensor,  # [N]
-    viewmats: Tensor,  # [C, 4, 4]
-    Ks: Tensor,  # [C, 3, 3]
+    means: Tensor,  # [N, 3] in world space
+    quats: Tensor,  # [N, 4] wxyz, of any length
+    scales: Tensor,  # [N, 3] standard deviations in world units, > 0
+    opacities: Tensor,  # [N] in [0, 1]
+    viewmats: Tensor,  # [C, 4, 4] world to camera, OpenCV axes
+    Ks: Tensor,  # [C, 3, 3] px
     width: int,
     height: int,
     calc_compensations: bool,
@@ -75,18 +75,7 @@ def project(
     """Project Gaussians into pinhole cameras with a blur of 0.3 px², differentiably, as `gsplat.rasterization` does.
 
     This is gsplat's `fully_fused_projection`, in 1.4 and 1.5. A new gsplat may pass it more arguments than this does.
-
-    Args:
-        means: Centres in world space. [N, 3]
-        quats: Rotations as wxyz quaternions; need not have unit length. [N, 4]
-        scales: Standard deviations in world units, > 0. [N, 3]
-        opacities: In [0, 1]; they bound the radii of gsplat 1.5. [N]
-        viewmats: World-to-camera transforms, OpenCV axes. [C, 4, 4]
-        Ks: Intrinsics in px. [C, 3, 3]
-        width: px.
-        height: px.
-        calc_compensations: Whether to compute how much the blur must lower the opacities.
-        near_plane: Depth in world units from which Gaussians are drawn.
+    The opacities bound the radii of gsplat 1.5, and the compensations say how much the blur must lower them.
 
     Returns:
         radii, int32 px in the layout that RADII_PER_AXIS tells; means2d in px [C, N, 2]; depths in world units [C, N];
@@ -102,53 +91,32 @@ def project(
 
 def spherical_harmonics(
     degree: int,
-    dirs: Tensor,  # [C, N, 3]
-    coeffs: Tensor,  # [C, N, K, 3]
-    masks: Tensor,  # [C, N]
+    dirs: Tensor,  # [C, N, 3] from the cameras, of any length
+    coeffs: Tensor,  # [C, N, K ≥ (degree + 1)², 3]
+    masks: Tensor,  # bool [C, N], False where the result is not needed
 ) -> Tensor:
-    """Evaluate spherical harmonics, differentiably.
+    """Evaluate spherical harmonics of degree 0 to 4, differentiably, without a colour's 0.5. [C, N, 3]
 
     This is gsplat's function of that name, whose signature is the same in 1.4 and 1.5.
-
-    Args:
-        degree: 0 to 4, (degree + 1)² ≤ K.
-        dirs: Directions from the cameras, of any length. [C, N, 3]
-        coeffs: [C, N, K, 3]
-        masks: Where to evaluate; elsewhere the result means nothing. bool [C, N]
-
-    Returns:
-        [C, N, 3], without the 0.5 that makes it a colour.
     """
     return gsplat.spherical_harmonics(degree, dirs, coeffs, masks=masks)
 
 
 def rasterize_to_pixels(
-    means2d: Tensor,  # [C, N, 2]
-    conics: Tensor,  # [C, N, 3]
-    colors: Tensor,  # [C, N, D]
-    opacities: Tensor,  # [C, N]
+    means2d: Tensor,  # [C, N, 2] px
+    conics: Tensor,  # [C, N, 3] 1/px²
+    colors: Tensor,  # [C, N, D], D in 1 … 513
+    opacities: Tensor,  # [C, N] in [0, 1]
     width: int,
     height: int,
     tile_size: int,
-    isect_offsets: Tensor,  # [C, tile rows, tile columns]
-    flatten_ids: Tensor,  # [number of pairs]
+    isect_offsets: Tensor,  # int32 [C, tile rows, tile columns], where each tile's list starts
+    flatten_ids: Tensor,  # int32 [number of pairs], indices in C · N
     absgrad: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Composite Gaussians front to back, with gsplat's own backward pass.
+    """Composite Gaussians front to back. With `absgrad`, `backward` sets the attribute `absgrad` of `means2d`.
 
     This is gsplat's function of that name, whose signature is the same in 1.4 and 1.5.
-
-    Args:
-        means2d: px; with `absgrad`, `backward` sets its attribute of that name. [C, N, 2]
-        conics: In 1/px². [C, N, 3]
-        colors: Of D channels, 1 to 513. [C, N, D]
-        opacities: In [0, 1]. [C, N]
-        width: px.
-        height: px.
-        tile_size: px.
-        isect_offsets: Where each tile's list starts, int32 [C, tile rows, tile columns].
-        flatten_ids: Indices in C · N, int32 [number of pairs].
-        absgrad: Whether to sum the absolute gradients of the centres, too.
 
     Returns:
         Colours [C, height, width, D] and alphas [C, height, width, 1].
@@ -159,15 +127,10 @@ def rasterize_to_pixels(
 
 
 def cuda_extension() -> Any | None:
-    """Load gsplat's CUDA kernels, which compiles them where its wheel did not bring them.
-
-    They are `_C` of gsplat's private module `cuda._backend`, in 1.4 and 1.5.
+    """Load gsplat's CUDA kernels, `_C` of its module `cuda._backend` in 1.4 and 1.5; raises what compiling raises.
 
     Returns:
         The compiled module, or None where it neither came with the wheel nor can be compiled for lack of a toolkit.
-
-    Raises:
-        Exception: Of any kind, if compiling fails.
     """
     from gsplat.cuda import _backend
 

@@ -17,15 +17,14 @@ CAMERA_SHARE = 0.9
 
 
 def far_outliers(positions: NDArray[np.floating], share: float) -> NDArray[np.bool_]:
-    """Which positions are not finite, or lie more than `REACH` times as far from the median as most of them.
+    """Which positions are not finite, or lie more than `REACH` times as far from the median as most of them. bool [P]
+
+    Of fewer than four positions, and where most of them coincide, only those are that are not finite.
 
     Args:
         positions: Points or camera centres in any unit. [P, 3]
         share: The part of the positions, in (0, 1), that tells how far out is usual. At least one is never part of it,
             so that a single wild position is found among as few as four.
-
-    Returns:
-        bool [P]; of fewer than four positions, and where most of them coincide, only those that are not finite.
     """
     outliers = ~np.isfinite(positions).all(axis=-1)
     if (~outliers).sum() < 4:

@@ -44,9 +44,6 @@ else:
 def choose_parser(config: FullImageDatamanagerConfig) -> None:
     """Replace the automatic parser by the one that fits the data, so that a run's `config.yml` names that one.
 
-    Args:
-        config: Changed in place, unless a parser was named.
-
     Raises:
         InputError: If the folder cannot be read; as `chosen_factor`.
     """

@@ -15,16 +15,10 @@ _UNDISTORTED = (CameraType.FISHEYE, CameraType.FISHEYE624)
 
 
 def refuse_unsupported_cameras(cameras: Cameras) -> None:
-    """Refuse cameras that neither are pinholes nor become pinholes.
+    """Raise InputError for the first of C cameras that is no pinhole and becomes none, with its type and the remedy.
 
     nerfstudio gives full images of any camera type to a splatting model, and undistorts those of perspective and
     fisheye cameras that have a distortion coefficient other than 0. The others would be rendered, wrongly, as pinholes.
-
-    Args:
-        cameras: The cameras of one or several images, shape [C].
-
-    Raises:
-        InputError: Names the first such camera, its type and the remedy.
     """
     types = cameras.camera_type.flatten().cpu()  # [C]
     distorted = torch.zeros_like(types, dtype=torch.bool)
@@ -46,17 +40,10 @@ def refuse_unsupported_cameras(cameras: Cameras) -> None:
 
 
 def refuse_failed_undistortion(cameras: Cameras, names: Sequence[Path]) -> None:
-    """Refuse fisheye images that became black when nerfstudio undistorted them.
+    """Raise InputError for the first of C fisheye images that became black when nerfstudio undistorted them.
 
     Near a field of view of 180° OpenCV's new intrinsics have a focal length of almost 0, or their centre far outside
-    the image.
-
-    Args:
-        cameras: The cameras after their images were undistorted, shape [C].
-        names: Their image files, C of them.
-
-    Raises:
-        InputError: Names the first such file and the remedy.
+    the image. `cameras` are those after undistortion, and `names` their files.
     """
     sizes = torch.cat([cameras.width, cameras.height], dim=-1)  # [C, 2] px
     focals, centers = torch.cat([cameras.fx, cameras.fy], dim=-1), torch.cat([cameras.cx, cameras.cy], dim=-1)

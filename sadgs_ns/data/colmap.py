@@ -200,21 +200,14 @@ def _read_text_points(path: Path) -> Points:
 
 
 def read_cameras(path: Path) -> dict[int, Camera]:
-    """Return the cameras of a `cameras.bin` or `cameras.txt` by their ids.
-
-    Raises:
-        InputError: If the file cannot be read, is cut off or corrupt.
-    """
+    """Return the cameras of a `cameras.bin` or `cameras.txt` by their ids; raise InputError if it cannot be read."""
     return dict((_read_binary_cameras if path.suffix == ".bin" else _read_text_cameras)(path))
 
 
 def read_poses(path: Path) -> list[Pose]:
-    """Return name, camera id and pose [7] of the images of an `images.bin` or `images.txt`.
+    """Return name, camera id and pose [7] of the images of an `images.bin` or `images.txt`; raises as `read_cameras`.
 
     A pose is a wxyz quaternion and a translation, from world to camera.
-
-    Raises:
-        InputError: As `read_cameras`.
     """
     return list((_read_binary_poses if path.suffix == ".bin" else _read_text_poses)(path))
 
@@ -225,12 +218,5 @@ def points_file(model: Path) -> Path | None:
 
 
 def read_points(path: Path) -> Points:
-    """Return the points of a `points3D.bin` or `points3D.txt`.
-
-    Returns:
-        Positions [P, 3] in the reconstruction's world, and colours [P, 3] in 0 … 255.
-
-    Raises:
-        InputError: As `read_cameras`.
-    """
+    """Return positions [P, 3] and colours in 0 … 255 [P, 3] of a `points3D.bin` or `.txt`; raises as `read_cameras`."""
     return (_read_binary_points if path.suffix == ".bin" else _read_text_points)(path)

@@ -38,10 +38,7 @@ class Similarity:
 
     @staticmethod
     def of(transform: Array) -> Similarity:
-        """Return the similarity that a matrix is, up to rounding.
-
-        Args:
-            transform: Linear part and translation. [3, 4]
+        """Return the similarity that a matrix [3, 4] of linear part and translation is, up to rounding.
 
         Raises:
             ValueError: If the linear part is not finite, or stretches directions differently.
@@ -73,13 +70,9 @@ class Similarity:
         return scales + math.log(self.scale)
 
     def rotations(self, quats: Array) -> Array:
-        """Return rotations of Gaussians in the new frame; a Gaussian is its own point reflection.
+        """Return rotations of Gaussians, wxyz, in the new frame; a Gaussian is its own point reflection. [N, 4]
 
-        Args:
-            quats: wxyz, of any length. [N, 4]
-
-        Returns:
-            wxyz, of unit length; those without a direction stay as they are. [N, 4]
+        The results have unit length; those without a direction stay as they are.
         """
         from scipy.spatial.transform import (
             Rotation,  # It takes half a second to import, and few commands turn anything.
@@ -92,13 +85,10 @@ class Similarity:
         return turned
 
     def harmonics(self, degree: int) -> Array:
-        """Return the matrix D that takes coefficients c of colours to those in the new frame, c' = D c.
+        """Return the matrix D that takes coefficients c of colours of degree 0 … 3 to those in the new frame, c' = D c.
 
         By definition D = ∫ Y(d)ᵀ Y(Qᵀ d) over the unit sphere, Q being the orthogonal part; the quadrature, 4
         Gauss–Legendre nodes in z times 8 in azimuth, is exact for the polynomials of degree 2 · 3 in it.
-
-        Args:
-            degree: Degree of the harmonics, 0 … 3.
 
         Returns:
             [(degree + 1)², (degree + 1)²]
@@ -119,13 +109,10 @@ def spherical_harmonics(directions: Array, degree: int) -> Array:
 
     Args:
         directions: Unit vectors. [..., 3]
-        degree: Degree of the harmonics, 0 … 3.
+        degree: Degree of the harmonics, 0 … 3; another raises ValueError.
 
     Returns:
         Values of functions that are orthonormal on the unit sphere. [..., (degree + 1)²]
-
-    Raises:
-        ValueError: If the degree is another.
     """
     if not 0 <= degree <= 3:
         raise ValueError(f"spherical harmonics of degree {degree}: only 0 to 3 are known")
@@ -159,10 +146,7 @@ def from_data(path: Path) -> Similarity:
     """Return how nerfstudio moved the data's world (COLMAP's, or that of `transforms.json`) into its own.
 
     Args:
-        path: A run's `dataparser_transforms.json`.
-
-    Raises:
-        InputError: If the file cannot be read, or holds anything but a similarity.
+        path: A run's `dataparser_transforms.json`; without a similarity in it, this raises InputError.
     """
     try:
         content = json.loads(path.read_bytes())
@@ -177,12 +161,8 @@ def from_data(path: Path) -> Similarity:
 def fixed_frame(meta: Mapping[str, Any], path: Path) -> Similarity | None:
     """Return how the data of a `transforms.json` is to be moved, or None where nerfstudio's parser decides it.
 
-    Args:
-        meta: What the file holds.
-        path: The file.
-
     Raises:
-        InputError: If it holds anything but a similarity there.
+        InputError: If the file's content, `meta`, holds anything but a similarity there.
     """
     if not any(name in meta for name in FRAME_KEYS):
         return None

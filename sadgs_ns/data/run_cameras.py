@@ -44,14 +44,7 @@ _PlainLoader.add_multi_constructor("tag:yaml.org,2002:python/", _plain)
 
 
 def find_capture(run: Path) -> Path:
-    """Return the folder of the capture that a run was trained on, as its `config.yml` names it.
-
-    Args:
-        run: The run's folder.
-
-    Raises:
-        InputError: If the file names no folder that is there.
-    """
+    """Return the capture's folder that a run's `config.yml` names; raise InputError if it names none that exists."""
     path = run / "config.yml"
     try:
         manager = yaml.load(path.read_bytes(), Loader=_PlainLoader)["pipeline"]["datamanager"]

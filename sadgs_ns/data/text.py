@@ -8,15 +8,7 @@ from sadgs_ns.errors import InputError
 
 
 def refuse_byte_order_mark(text: str, path: Path) -> None:
-    """Check whether a text starts as nerfstudio can read it.
-
-    Args:
-        text: The text of the file, or its first line.
-        path: The file.
-
-    Raises:
-        InputError: If it starts with a byte order mark.
-    """
+    """Raise InputError if the text of a file, or its first line, starts with a byte order mark."""
     if text.startswith("\ufeff"):
         raise InputError(
             f"{path} starts with a byte order mark, which nerfstudio cannot read: save it as UTF-8 without one."

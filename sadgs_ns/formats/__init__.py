@@ -34,13 +34,10 @@ _TO_Y_UP = {"nerfstudio": (-(0.5**0.5), 0.0, 0.0, 0.5**0.5), "colmap": (1.0, 0.0
 
 
 def format_of(path: Path) -> str:
-    """Return a key of `FORMATS`, or `MESH`.
-
-    Args:
-        path: The file that is to be written.
+    """Return the key of `FORMATS`, or `MESH`, by which a file's name ends.
 
     Raises:
-        InputError: If its name has none of these ends, or it is a folder.
+        InputError: If it has none of these ends, or the file is a folder.
     """
     found = [suffix for suffix in (*FORMATS, MESH) if path.name.lower().endswith(suffix)]
     if not found:

@@ -22,12 +22,7 @@ _HARMONICS_SPAN = 8.0
 
 
 def write(file: IO[bytes], gaussians: Gaussians) -> None:
-    """Write Gaussians as compressed PLY, in an order that keeps neighbours in one chunk.
-
-    Args:
-        file: Open for writing.
-        gaussians: What is written, at least one.
-    """
+    """Write at least one Gaussian as compressed PLY, in an order that keeps neighbours in one chunk."""
     gaussians = gaussians[morton_order(gaussians.means)]
     count, bands = gaussians.features_rest.shape[:2]
     means, mean_extremes = _in_chunk(gaussians.means)

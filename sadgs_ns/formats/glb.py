@@ -21,17 +21,10 @@ _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
 def write(file: IO[bytes], gaussians: Gaussians, rotation: tuple[float, float, float, float]) -> None:
-    """Write Gaussians as the points of one mesh.
+    """Write at least one Gaussian as the points of one mesh; raise InputError beyond the 4 GB that the format can hold.
 
-    Viewers that do not know the extension show points of the Gaussians' colours.
-
-    Args:
-        file: Open for writing.
-        gaussians: What is written, at least one.
-        rotation: Of the node, xyzw: it turns the Gaussians' frame so that y is up, as in glTF.
-
-    Raises:
-        InputError: If they take more than the 4 GB that the format can hold.
+    Viewers that do not know the extension show points of the Gaussians' colours. The rotation, xyzw, of the node turns
+    the Gaussians' frame so that y is up, as in glTF.
     """
     attributes = _attributes(gaussians)
     arrays = list(attributes.values())

@@ -51,12 +51,7 @@ class Start:
 
 
 def write(file: IO[bytes], gaussians: Gaussians, start: Start | None) -> None:
-    """Write a page that shows Gaussians.
-
-    Args:
-        file: Open for writing.
-        gaussians: What is shown, in a frame in which z is up; at least one.
-        start: Where the page opens; it must be given.
+    """Write a page that shows at least one Gaussian, in a frame in which z is up; it opens at the start, not None.
 
     Raises:
         InputError: If Node.js or its package cannot be run, or there are more Gaussians than SOG can hold.
@@ -127,11 +122,8 @@ def start_at(
 ) -> Start:
     """Return the start at a camera, which looks at a point as deep as what it has in the middle of its view.
 
-    Args:
-        camera_to_world: Pose with OpenGL axes, in the Gaussians' frame. [3, 4]
-        side: Longer side of the image in px.
-        focal: Focal length in px.
-        means: Positions of the Gaussians. [N, 3]
+    The pose has OpenGL axes and the frame of the Gaussians' positions. `side` is the longer side of the image, and
+    `focal` the focal length, in px.
     """
     position, forward = camera_to_world[:, 3], -camera_to_world[:, 2]
     depths = (means - position) @ forward

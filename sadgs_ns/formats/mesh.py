@@ -57,14 +57,7 @@ class DepthView:
 
 
 class Fusion:
-    """Voxels into which depth maps are fused, on the CPU.
-
-    Args:
-        voxel_size: Edge of a voxel in world units, > 0.
-
-    Raises:
-        InputError: If open3d cannot be imported.
-    """
+    """Voxels of an edge in world units, into which depth maps are fused, on the CPU; raises as `load_open3d`."""
 
     def __init__(self, voxel_size: float) -> None:
         open3d = load_open3d()
@@ -99,11 +92,7 @@ class Fusion:
         return not found or 4 * len(np.unique(np.concatenate(found), axis=0)) * _RESOLUTION**3 <= MOST_VOXELS
 
     def add(self, view: DepthView) -> None:
-        """Fuse a view.
-
-        Raises:
-            InputError: If that takes more than `MOST_VOXELS`.
-        """
+        """Fuse a view; raise InputError if that takes more than `MOST_VOXELS`."""
         self._views += 1
         if (found := self._blocks(view)) is None:
             return
@@ -148,11 +137,7 @@ def moved(mesh: TriangleMesh, similarity: Similarity) -> TriangleMesh:
 
 
 def load_open3d() -> Any:
-    """Import open3d, which takes a second.
-
-    Raises:
-        InputError: If it cannot be imported.
-    """
+    """Import open3d, which takes a second; raise InputError if that fails."""
     try:
         import open3d
     except (ImportError, OSError) as error:
@@ -164,14 +149,7 @@ def load_open3d() -> Any:
 
 
 def write(file: IO[bytes], mesh: TriangleMesh) -> None:
-    """Write a mesh as binary little-endian PLY, with colours of vertices.
-
-    Open3D's own writer takes a full disk for success.
-
-    Args:
-        file: Open for writing.
-        mesh: What is written.
-    """
+    """Write a mesh as binary little-endian PLY, with colours. Open3D's own writer takes a full disk for success."""
     vertices = np.empty(len(mesh.vertices), [("position", "<f4", 3), ("color", "u1", 3)])
     vertices["position"], vertices["color"] = mesh.vertices, np.rint(255 * np.asarray(mesh.vertex_colors).clip(0, 1))
     faces = np.empty(len(mesh.triangles), [("corners", "u1"), ("indices", "<i4", 3)])

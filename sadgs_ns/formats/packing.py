@@ -18,14 +18,7 @@ _ROUNDS = 20
 
 
 def morton_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Return the order along a Z-shaped curve through space, which keeps neighbours together.
-
-    Args:
-        means: Positions. [N, 3]
-
-    Returns:
-        Indices. [N]
-    """
+    """Return the order [N] of positions [N, 3] along a Z-shaped curve in space, which keeps neighbours together."""
     low, high = means.min(axis=0), means.max(axis=0)
     cells = (means - low) / np.maximum(high - low, 1e-30).astype(np.float64)
     codes = np.zeros(len(means), np.uint64)
@@ -46,11 +39,7 @@ def morton_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
 def smallest_three(quats: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Return which component of each unit quaternion is the largest, and the others, signed so that it is positive.
 
-    Args:
-        quats: Unit quaternions, in any order of components. [N, 4]
-
-    Returns:
-        The index of the largest component [N], and the others, in ±√½, in their order [N, 3].
+    [N, 4] in any order of components → the index [N], and the others, in ±√½, in their order [N, 3]
     """
     largest = np.abs(quats).argmax(axis=1)
     rows = np.arange(len(quats))
@@ -60,17 +49,10 @@ def smallest_three(quats: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArr
 
 
 def codebook(values: NDArray[np.float32], size: int = 256) -> NDArray[np.float32]:
-    """Return levels that quantise values with little mean square error.
+    """Return levels, ascending, that quantise values of any shape, at least one, with little mean square error. [size]
 
     They begin with the cube root of the values' density, which is the best one where there are many levels, and a fifth
     of them evenly, so that no rare value is far from a level. Lloyd's algorithm makes them better.
-
-    Args:
-        values: Any number of them, at least one; of any shape.
-        size: Number of levels.
-
-    Returns:
-        The levels, ascending. [size]
     """
     counts, edges = np.histogram(values, _BINS)
     density = np.cbrt(counts)
@@ -85,15 +67,7 @@ def codebook(values: NDArray[np.float32], size: int = 256) -> NDArray[np.float32
 
 
 def nearest_level(values: NDArray[np.floating], levels: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Return the index of the level that is nearest to each value.
-
-    Args:
-        values: [...]
-        levels: Ascending, at most 256.
-
-    Returns:
-        [...]
-    """
+    """Return the index of the level, of at most 256 ascending ones, that is nearest to each value. [...] → [...]"""
     return np.searchsorted((levels[1:] + levels[:-1]) / 2, values).astype(np.uint8)
 
 

@@ -17,10 +17,6 @@ def write(file: IO[bytes], gaussians: Gaussians) -> None:
 
     The columns are x y z, nx ny nz (zero), f_dc_*, f_rest_* (all of red, then green, then blue), opacity, scale_* and
     rot_* (wxyz).
-
-    Args:
-        file: Open for writing.
-        gaussians: What is written.
     """
     names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
     names += [f"f_rest_{i}" for i in range(3 * gaussians.features_rest.shape[1])]

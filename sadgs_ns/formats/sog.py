@@ -35,11 +35,7 @@ _ROUNDS = 8
 
 
 def write(file: IO[bytes], gaussians: Gaussians) -> None:
-    """Write Gaussians as SOG, in an order that keeps neighbours together.
-
-    Args:
-        file: Open for writing.
-        gaussians: What is written, at least one.
+    """Write at least one Gaussian as SOG, in an order that keeps neighbours together.
 
     Raises:
         InputError: If there are more than fit into an image.
@@ -103,16 +99,10 @@ def _image(pixels: NDArray[np.uint8], width: int) -> Image.Image:
 
 
 def palette(vectors: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Return vectors that stand for all, at most `_PALETTE`, and which of them stands for each.
+    """Return vectors [P, D] that stand for all [N, D], at most `_PALETTE`, and which of them stands for each [N].
 
     k-means runs twice: it finds coarse clusters of a sample, and then, in each, as many fine ones as its members' share
     asks for. Compared with one k-means of all this takes the square root of the distances.
-
-    Args:
-        vectors: At least one. [N, D]
-
-    Returns:
-        The palette [P, D], and for each vector an index into it [N].
     """
     number = min(_PALETTE, len(vectors) // 2 + 1)
     generator = np.random.default_rng(0)

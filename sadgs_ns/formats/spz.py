@@ -34,11 +34,7 @@ _STEP = 4
 
 
 def write(file: IO[bytes], gaussians: Gaussians) -> None:
-    """Write Gaussians as SPZ.
-
-    Args:
-        file: Open for writing.
-        gaussians: What is written, at least one.
+    """Write at least one Gaussian as SPZ.
 
     Raises:
         InputError: If they reach so far that positions would be coarser than 1/256 of a unit.

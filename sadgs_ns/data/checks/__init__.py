@@ -17,14 +17,7 @@ from sadgs_ns.errors import InputError
 
 @collect_findings
 def check_data(data: Path) -> Iterator[Finding]:
-    """Check a folder in the layout that it has, as `ns-train` reads it where no parser is named.
-
-    Args:
-        data: The folder, or a file in the layout of `transforms.json`.
-
-    Returns:
-        What was found; notes alone if all is well.
-    """
+    """Return findings on a folder, or on a `transforms.json`, as `ns-train` reads it where no parser is named."""
     layout = layout_of(data)
     if layout == "nerfstudio":
         yield from check_nerfstudio(data, ParserOptions())

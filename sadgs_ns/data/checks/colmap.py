@@ -34,12 +34,7 @@ UNSUPPORTED_CAMERAS = {"FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}
 
 @collect_findings
 def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -> Iterator[Finding]:
-    """Check a COLMAP reconstruction, binary or text.
-
-    Args:
-        data: The folder that the options' paths are relative to.
-        options, open_images: As for `check_nerfstudio`.
-    """
+    """Check a COLMAP reconstruction, binary or text, in a folder that the options' paths are relative to."""
     images_folder, model_folder = data / options.images_path, data / options.colmap_path
     kind = next((kind for kind in ("txt", "bin") if (model_folder / f"cameras.{kind}").is_file()), None)
     if kind is None:
@@ -87,11 +82,7 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
 
 
 def _read_model(poses_path: Path, cameras_path: Path) -> tuple[list[colmap.Pose], dict[int, colmap.Camera]]:
-    """Return the poses, and the cameras that they use.
-
-    Raises:
-        InputError: If there is none, or one of them cannot be read or makes no sense.
-    """
+    """Return the poses, and the cameras that they use; raise InputError if one makes no sense or there is none."""
     cameras, poses = colmap.read_cameras(cameras_path), colmap.read_poses(poses_path)
     if not poses:
         raise InputError(f"{poses_path} holds no pose, so there is no image to train on: run COLMAP's mapper again.")
@@ -117,8 +108,7 @@ def _read_model(poses_path: Path, cameras_path: Path) -> tuple[list[colmap.Pose]
 def _check_factor(images_folder: Path, names: Sequence[str], options: ParserOptions) -> Generator[Finding, None, int]:
     """Return the factor by which the images that will be read are scaled down, after a check that they are there.
 
-    Raises:
-        InputError: If they are not, and nobody can answer nerfstudio's question whether to make them.
+    If they are not, this raises InputError where nobody can answer nerfstudio's question whether to make them.
     """
     factor = options.downscale_factor
     if factor is None:
@@ -140,17 +130,10 @@ def _check_factor(images_folder: Path, names: Sequence[str], options: ParserOpti
 
 
 def chosen_factor(data: Path, colmap_path: Path) -> int:
-    """Return the factor by which images are scaled down where no parser is named.
+    """Return the factor by which images are scaled down where no parser is named; raises as `colmap.read_poses`.
 
     nerfstudio's parser of COLMAP's files asks a question at the terminal where copies that it wants do not exist. So
     that it never has to, the images are taken at full resolution then, as they are beside a `transforms.json`.
-
-    Args:
-        data: The folder that holds the images.
-        colmap_path: Folder of the reconstruction, relative to it.
-
-    Raises:
-        InputError: As `colmap.read_poses`.
     """
     folder = data / colmap_path
     kind = "txt" if (folder / "cameras.txt").is_file() else "bin"
@@ -162,11 +145,7 @@ def chosen_factor(data: Path, colmap_path: Path) -> int:
 
 
 def _read_list(path: Path) -> list[str]:
-    """Return the names in a list of images.
-
-    Raises:
-        InputError: If the file cannot be read, is not UTF-8 or starts with a byte order mark.
-    """
+    """Return the names in a list of images; raise InputError if the file is not UTF-8 without a byte order mark."""
     try:
         text = path.read_text("utf8")
     except (OSError, UnicodeDecodeError) as error:
@@ -212,14 +191,7 @@ def _views(
 
 
 def _rotations(quats: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return quaternions as matrices; scipy, which could do it, takes half a second to import.
-
-    Args:
-        quats: wxyz, of any length but 0. [V, 4]
-
-    Returns:
-        Rotations. [V, 3, 3]
-    """
+    """Return wxyz quaternions [V, 4] as matrices [V, 3, 3]; scipy would take half a second to import."""
     w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -245,11 +217,7 @@ def _number_of_focals(model: str) -> int:
 
 
 def _check_points(model_folder: Path, views: Sequence[View], random: str) -> Iterator[Finding]:
-    """Check the SfM points and, if there are views, how the points lie to them.
-
-    Args:
-        random: How to do without these points, as the end of a sentence.
-    """
+    """Check the SfM points and, if there are views, how the points lie to them; `random` tells how to do without."""
     path = colmap.points_file(model_folder)
     if path is None:
         yield Finding(

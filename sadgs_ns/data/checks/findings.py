@@ -53,11 +53,7 @@ def and_more(where: object, count: int) -> str:
 
 
 def refuse(findings: Sequence[Finding], data: Path) -> None:
-    """Raise the first error among findings.
-
-    Raises:
-        InputError: With the error's sentence, and how many more there are.
-    """
+    """Raise InputError with the first error among findings, if there is one, and how many more there are."""
     errors = [finding.sentence for finding in findings if finding.severity == "error"]
     if errors:
         more = f" (`sadgs-doctor {data}` shows {len(errors) - 1} more.)" if len(errors) > 1 else ""

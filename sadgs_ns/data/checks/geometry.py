@@ -73,15 +73,9 @@ class View(NamedTuple):
 
 
 def check_positive(values: Mapping[str, Any], where: str, names: Sequence[str]) -> None:
-    """Check that values are there and finite, widths and heights whole, and all but the principal point positive.
+    """Raise InputError unless the named values are finite numbers, whole for sizes, and positive but for the centre.
 
-    Args:
-        values: Any JSON values.
-        where: The start of a sentence about them.
-        names: Those that must be there.
-
-    Raises:
-        InputError: If one is not.
+    `where` is the start of a sentence about them.
     """
     for name in names:
         if name not in values:
@@ -94,11 +88,7 @@ def check_positive(values: Mapping[str, Any], where: str, names: Sequence[str]) 
 
 
 def finite(value: Any, name: str, where: str) -> float:
-    """Return a JSON value that is a finite number.
-
-    Raises:
-        InputError: If it is not.
-    """
+    """Return a JSON value that is a finite number; raise InputError if it is not."""
     try:
         if not isinstance(value, bool) and isinstance(value, int | float) and math.isfinite(value):
             return value
@@ -108,12 +98,7 @@ def finite(value: Any, name: str, where: str) -> float:
 
 
 def check_views(views: Sequence[View], training: int, source: Path) -> Generator[Finding, None, bool]:
-    """Check number, cameras, rotations and positions of the views.
-
-    Args:
-        views: All of them.
-        training: How many are trained on.
-        source: The file that they are from.
+    """Check number, cameras, rotations and positions of all views of a file, so many of which are trained on.
 
     Returns:
         Whether all is right enough to compare points with them.

@@ -80,17 +80,14 @@ def no_copies(folder: Path, factor: int) -> tuple[str, str]:
 
 
 def existing_factor(size: Size, copy_of: Callable[[int], Path]) -> int:
-    """Return the factor by which images are scaled down where the user names none.
+    """Return the factor by which images are scaled down where the user names none, as nerfstudio chooses it, too.
 
-    nerfstudio's parser of `transforms.json` chooses it in the same way.
+    It is the smallest power of 2 that makes the image's sides 1600 px or less, or a smaller one if copies by that
+    factor do not exist; 1 if there are no copies.
 
     Args:
         size: That of an image at full resolution.
         copy_of: Where that image's copy would lie that is smaller by a factor.
-
-    Returns:
-        The smallest power of 2 that makes the image's sides 1600 px or less, or a smaller one if copies by that factor
-        do not exist; 1 if there are no copies.
     """
     factor = 1
     while max(size) / factor > MAX_AUTO_RESOLUTION and copy_of(2 * factor).exists():

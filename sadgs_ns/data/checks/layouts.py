@@ -18,11 +18,7 @@ GIVE_POSES = "compute poses with `sadgs-process PHOTOS FOLDER` or `ns-process-da
 
 @dataclass(frozen=True)
 class ParserOptions:
-    """Options of nerfstudio's parsers, by the names that they have there; each layout reads those of its parser.
-
-    Raises:
-        InputError: If the factor makes images larger.
-    """
+    """Options of nerfstudio's parsers, by the names that they have there; each layout reads those of its parser."""
 
     images_path: Path = Path("images")
     colmap_path: Path = Path(COLMAP_FOLDERS[0])
@@ -49,11 +45,7 @@ def find_reconstruction(data: Path) -> Path | None:
 
 
 def layout_of(data: Path) -> Literal["nerfstudio", "blender", "colmap"] | None:
-    """Return how a capture is laid out; None if nothing that is known lies there.
-
-    Args:
-        data: The folder, or a file in the layout of `transforms.json`.
-    """
+    """Return how a capture's folder, or file, is laid out; None if nothing that is known lies there."""
     if data.is_file() or (data / "transforms.json").is_file():
         return "nerfstudio"
     if (data / "transforms_train.json").is_file():

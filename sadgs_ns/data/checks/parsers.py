@@ -44,10 +44,7 @@ def refuse_bad_data(config: FullImageDatamanagerConfig, open_images: bool = True
         open_images: Whether to look into the images, too.
 
     Returns:
-        Findings that do not stop training.
-
-    Raises:
-        InputError: With the first finding that does.
+        Findings that do not stop training; the first one that does is raised as InputError.
     """
     vars(config).pop("findings", None)
     choose_parser(config)

@@ -87,16 +87,13 @@ def _count_training_images(names: Sequence[str], options: ParserOptions) -> int:
 
 
 def check_names(names: Iterable[str], source: Path) -> None:
-    """Refuse names of images that leave their folder, or that a shell would act on.
+    """Raise InputError for the first name of an image that leaves its folder, or that a shell would act on.
 
     nerfstudio gives its downscaled copies these names, and has a shell make them.
 
     Args:
         names: Relative to the folder of images.
         source: The file that holds them.
-
-    Raises:
-        InputError: Names the first such image.
     """
     for name in names:
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
@@ -106,12 +103,9 @@ def check_names(names: Iterable[str], source: Path) -> None:
 
 
 def check_paths(paths: Sequence[Path]) -> None:
-    """Refuse images if one of them leaves the folder that all have in common by "..".
+    """Raise InputError for the first image that leaves the folder that all have in common by "..".
 
     `ns-render dataset` writes each image below its output folder, under the image's path from that common folder.
-
-    Raises:
-        InputError: Names the first such path.
     """
     if not paths or len({path.is_absolute() for path in paths}) > 1:
         return  # Absolute and relative paths have no folder in common.

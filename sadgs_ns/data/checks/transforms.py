@@ -113,12 +113,7 @@ def _no_transforms(data: Path, path: Path) -> str:
 
 @collect_findings
 def check_blender(data: Path, options: ParserOptions, open_images: bool = True) -> Iterator[Finding]:
-    """Check a synthetic scene in the layout of NeRF's: `transforms_train.json` and its siblings.
-
-    Args:
-        data: The folder.
-        options, open_images: As for `check_nerfstudio`.
-    """
+    """Check a synthetic scene's folder in the layout of NeRF's: `transforms_train.json` and its siblings."""
     if not (data / "transforms_train.json").is_file():
         raise InputError(no_layout(data))
     for split in ("train", "val", "test"):
@@ -150,11 +145,7 @@ def check_blender(data: Path, options: ParserOptions, open_images: bool = True) 
 
 
 def _check_transform(meta: dict[str, Any], path: Path) -> None:
-    """Check whether what nerfstudio does to all poses makes sense.
-
-    Raises:
-        InputError: If it does not.
-    """
+    """Raise InputError if what nerfstudio does to all poses makes no sense."""
     try:
         applied = applied_transform(meta)
     except (TypeError, ValueError, OverflowError):
@@ -181,12 +172,7 @@ def applied_transform(meta: dict[str, Any]) -> NDArray[np.float64]:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return the object that a file holds in UTF-8.
-
-    Raises:
-        InputError: If the file cannot be read, is not UTF-8 or JSON, starts with a byte order mark, or holds something
-            else.
-    """
+    """Return the object that a file holds; raise InputError if it is none in JSON and plain UTF-8."""
     try:
         text = path.read_text("utf8")
         refuse_byte_order_mark(text, path)
@@ -205,11 +191,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def frames_of(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
-    """Return the frames, each with a file path and a pose that can be used.
-
-    Raises:
-        InputError: If there are none, or one of them has no such path or pose.
-    """
+    """Return the frames; raise InputError if there are none, or one has no file path and pose that can be used."""
     frames = meta.get("frames")
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{path} lists no frames, so there is no image to train on: {GIVE_POSES}.")
@@ -242,8 +224,7 @@ def view_of(frame: dict[str, Any], where: str, camera: Camera) -> View:
 def _distortion_of(values: dict[str, Any], where: Path | str) -> dict[str, Any]:
     """Return the coefficients that a frame, or all of them, have by name; nerfstudio takes all from one of the two.
 
-    Raises:
-        InputError: If they are listed, but not as nerfstudio reads them.
+    Raises InputError if they are listed, but not as nerfstudio reads them.
     """
     if "distortion_params" not in values:
         return {name: values[name] for name in _DISTORTION if name in values}
@@ -257,11 +238,7 @@ def _distortion_of(values: dict[str, Any], where: Path | str) -> dict[str, Any]:
 
 
 def _camera(values: dict[str, Any], distortion: dict[str, Any], model: str, where: str) -> Camera:
-    """Return the camera that good values stand for.
-
-    Raises:
-        InputError: If a distortion coefficient is no number, or one that nerfstudio does not support.
-    """
+    """Return the camera of good values; raise InputError for a distortion that nerfstudio does not support."""
     size = (int(values["w"]), int(values["h"]))
     pinhole = (*size, values["fl_x"], values["fl_y"], values["cx"], values["cy"])
     k1, k2, k3, k4, p1, p2 = (finite(distortion.get(name, 0.0), name, where) for name in _DISTORTION)
