@@ -141,6 +141,22 @@ def made(source: Source, what: str, name: str, description: Any) -> Any:
         raise ValueError(f"{what} {name}: its description or rows are not as expected ({error}).") from error
 
 
+def described(folder: Path) -> tuple[Source, dict[str, Any], dict[str, Any]]:
+    """The rows in a folder, and the descriptions of the tables and of the figures by their names.
+
+    Raises:
+        ValueError: The descriptions cannot be read.
+    """
+    try:
+        content = yaml.safe_load((folder / TABLES).read_text("utf-8"))
+        return Source(folder, content["megapixels"]), dict(content["tables"]), dict(content.get("figures", {}))
+    except OSError as error:
+        raise ValueError(f"{folder / TABLES} cannot be read ({error.strerror}); give a checkout's folder.") from error
+    except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError) as error:
+        told = " ".join(str(error).split())
+        raise ValueError(f"{folder / TABLES} must be YAML with mappings of megapixels and tables: {told}.") from error
+
+
 def write(checkout: Path, check: bool = False) -> list[str]:
     """Write the tables and figures of a checkout's documents, none where one of them is described wrongly.
 
@@ -158,16 +174,7 @@ def write(checkout: Path, check: bool = False) -> list[str]:
     from benchmarks import plots
 
     folder = checkout / RESULTS
-    try:
-        content = yaml.safe_load((folder / TABLES).read_text("utf-8"))
-        tables, figures = dict(content["tables"]), dict(content.get("figures", {}))
-        source = Source(folder, content["megapixels"])
-    except OSError as error:
-        raise ValueError(f"{folder / TABLES} cannot be read ({error.strerror}); give a checkout's folder.") from error
-    except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError) as error:
-        told = " ".join(str(error).split())
-        raise ValueError(f"{folder / TABLES} must be YAML with mappings of megapixels and tables: {told}.") from error
-
+    source, tables, figures = described(folder)
     new = {name: f"\n{made(source, 'table', name, description)}\n\n" for name, description in tables.items()}
     drawn = {name: made(source, "figure", name, description) for name, description in figures.items()}
     if spare := {path.name for path in folder.iterdir()} - source.cited:

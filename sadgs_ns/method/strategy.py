@@ -243,11 +243,7 @@ class StructureAwareStrategy(Strategy):
             elif _due(iteration, windows.absgs_every):
                 self._absgs_step(params, optimizers, state, iteration, views)
             if iteration == windows.refine_stop_iter:
-                if not _due(iteration, windows.structure_every):  # whose step has done so
-                    gone = (self._opacities(params) < FINAL_PRUNE_OPACITY) | self._haze(params, state)
-                    self._prune(params, optimizers, state, gone)
-                for key in (*self._empty_state(0, torch.device("cpu")), "camera_paths"):
-                    state.pop(key, None)  # nobody reads them any more: neither memory nor checkpoints should hold them
+                self._end(params, optimizers, state, iteration)
             # A reset just before the final prune would leave nothing that had time to recover.
             elif _due(iteration, windows.reset_every) and (
                 iteration <= windows.refine_stop_iter - windows.reset_every // 4
@@ -255,6 +251,14 @@ class StructureAwareStrategy(Strategy):
                 self._map_opacities(params, optimizers, lambda opacities: opacities * RESET_FACTOR)
             if not self.world.alone and self.densifies(step):
                 self._even_out(params, optimizers, state)
+
+    def _end(self, params: Any, optimizers: Any, state: Any, iteration: int) -> None:
+        """Prune what stays faint at the last iteration, and forget what densification alone reads."""
+        if not _due(iteration, self.windows.structure_every):  # whose step has pruned
+            gone = (self._opacities(params) < FINAL_PRUNE_OPACITY) | self._haze(params, state)
+            self._prune(params, optimizers, state, gone)
+        for key in (*self._empty_state(0, torch.device("cpu")), "camera_paths"):
+            state.pop(key, None)  # Neither memory nor checkpoints should hold them.
 
     def consistently_low(self, statistics: Mapping[str, Tensor]) -> Tensor:
         """Gaussians that answered low on all three axes in more than τ_prune of their observations. bool [N]"""

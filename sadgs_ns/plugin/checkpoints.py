@@ -63,15 +63,29 @@ def checkpoint_paths(load_dir: Path | None, load_step: int | None, load_checkpoi
         InputError: If both are given, what is named does not exist, or the folder does not hold checkpoints alone.
     """
     if load_dir is None:
-        if load_checkpoint is None:
-            return []
-        if load_checkpoint.is_dir():
-            raise InputError(f"{load_checkpoint} is a folder: give it to --load-dir instead of --load-checkpoint.")
-        if not load_checkpoint.is_file():
-            raise InputError(f"{load_checkpoint} does not exist: give --load-checkpoint a file step-*.ckpt of a run.")
-        return [load_checkpoint]
+        return [] if load_checkpoint is None else [_file(load_checkpoint)]
     if load_checkpoint is not None:
         raise InputError("load_dir and load_checkpoint both name where the run goes on: give one of them.")
+    steps = _checkpoints_in(load_dir)
+    if load_step is None:
+        return [steps[step] for step in sorted(steps, reverse=True)]
+    if load_step not in steps:
+        there = ", ".join(map(str, sorted(steps)))
+        raise InputError(f"{load_dir} holds no checkpoint of step {load_step}: give --load-step one of {there}.")
+    return [steps[load_step]]
+
+
+def _file(path: Path) -> Path:
+    """Return the path of a checkpoint, which must be a file."""
+    if path.is_dir():
+        raise InputError(f"{path} is a folder: give it to --load-dir instead of --load-checkpoint.")
+    if not path.is_file():
+        raise InputError(f"{path} does not exist: give --load-checkpoint a file step-*.ckpt of a run.")
+    return path
+
+
+def _checkpoints_in(load_dir: Path) -> dict[int, Path]:
+    """Return the checkpoints of a folder of them, or of a run's, by their steps."""
     if load_dir.is_file():
         raise InputError(f"{load_dir} is a file: give it to --load-checkpoint instead of --load-dir.")
     if (load_dir / _FOLDER).is_dir():
@@ -90,12 +104,7 @@ def checkpoint_paths(load_dir: Path | None, load_step: int | None, load_checkpoi
         raise InputError(f"{load_dir} holds no checkpoint: give --load-dir the folder of a run of sadgs{example}.")
     if others:
         raise InputError(f"{others[0]} lies among the checkpoints and is none: move it elsewhere.")
-    if load_step is None:
-        return [steps[step] for step in sorted(steps, reverse=True)]
-    if load_step not in steps:
-        there = ", ".join(map(str, sorted(steps)))
-        raise InputError(f"{load_dir} holds no checkpoint of step {load_step}: give --load-step one of {there}.")
-    return [steps[load_step]]
+    return steps
 
 
 def of_gaussians(state: dict[str, Any], change: Callable[[Tensor], Tensor]) -> dict[str, Any]:

@@ -171,16 +171,7 @@ class CheckedTrainerConfig(TrainerConfig):
         port = self.viewer.websocket_port
         if port is not None and not 1 <= port <= 65535:
             raise InputError(f"viewer.websocket_port must be in [1, 65535], got {port}.")
-        device = self.machine.device_type
-        available = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
-        if not available[device]:
-            name = device.upper()
-            raise InputError(
-                f"machine.device_type is {device}, but torch finds no {name} device: set it to cpu, or install torch "
-                f"for {name}."
-            )
-        if not 0 <= self.machine.seed < 2**32:
-            raise InputError(f"machine.seed must be in [0, 2³²), got {self.machine.seed}.")
+        self._check_machine()
         self._check_rates()
         if self.mixed_precision or self.use_grad_scaler:
             raise InputError(
@@ -192,22 +183,28 @@ class CheckedTrainerConfig(TrainerConfig):
                 "sadgs updates every parameter in every iteration, and densification would lose gradients that were "
                 "kept for later: leave gradient_accumulation_steps out, and set pipeline.views_per_iteration instead."
             )
-        if processes.check_devices(self.machine):
-            self._check_for_several_devices()
         self.pipeline.check()
 
-    def _check_for_several_devices(self) -> None:
-        """Check whether a run on several devices can work with these options.
-
-        Raises:
-            InputError: If it needs what only a run on one device has.
-        """
+    def _check_machine(self) -> None:
+        """Raise InputError if a device is not there, or several cannot work with these options."""
+        device = self.machine.device_type
+        available = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+        if not available[device]:
+            name = device.upper()
+            raise InputError(
+                f"machine.device_type is {device}, but torch finds no {name} device: set it to cpu, or install torch "
+                f"for {name}."
+            )
+        if not 0 <= self.machine.seed < 2**32:
+            raise InputError(f"machine.seed must be in [0, 2³²), got {self.machine.seed}.")
+        if not processes.check_devices(self.machine):
+            return
         model = self.pipeline.model
         for name, given, remedy in (
             ("pipeline.model.color_model", model.color_model != "none", "set it to none"),
             ("pipeline.model.camera_optimizer.mode", model.camera_optimizer.mode != "off", "set it to off"),
             ("start_paused", self.start_paused, "leave it off, since the viewer is off, too"),
-            (f"{SWITCH}=0", switched_off() and self.machine.device_type == "cuda", "unset it"),
+            (f"{SWITCH}=0", switched_off() and device == "cuda", "unset it"),
         ):
             if given:
                 raise InputError(f"{name} works on one device only, and this run takes several: {remedy}.")

@@ -310,19 +310,7 @@ class SadgsTrainer(Trainer):
         out_of_memory = ""
         self._set_clock(0.0)
         try:
-            with self._interrupts:
-                try:
-                    if not self.world.alone:  # nerfstudio's way to make it fails where another process is as fast.
-                        self.base_dir.mkdir(parents=True, exist_ok=True)
-                    super().train()
-                    self._stop_if_stuck()
-                except Interrupted as interrupted:
-                    self._stop(interrupted, total)
-                except OSError as error:
-                    interruption = self._interrupts.behind(error)
-                    if interruption is None or self._stepping:
-                        raise
-                    self._stop(interruption, total)
+            self._train_until_interrupted(total)
         except InputError as error:
             if self._completed_step == self._saved_step or not self.world.alone:
                 raise
@@ -354,6 +342,29 @@ class SadgsTrainer(Trainer):
         if out_of_memory:
             raise RunError(self._rescue(out_of_memory))
         processes.leave()
+
+    def _train_until_interrupted(self, total: int) -> None:
+        """Train as nerfstudio does, until the last iteration or a signal.
+
+        Args:
+            total: Iterations of the run.
+
+        Raises:
+            SystemExit: If a signal came, and what was trained is saved.
+        """
+        with self._interrupts:
+            try:
+                if not self.world.alone:  # nerfstudio's way to make it fails where another process is as fast.
+                    self.base_dir.mkdir(parents=True, exist_ok=True)
+                super().train()
+                self._stop_if_stuck()
+            except Interrupted as interrupted:
+                self._stop(interrupted, total)
+            except OSError as error:
+                interruption = self._interrupts.behind(error)
+                if interruption is None or self._stepping:
+                    raise
+                self._stop(interruption, total)
 
     def _ended(self) -> str | None:
         """Say which other processes ended by themselves, and with them this one; None where none did."""
