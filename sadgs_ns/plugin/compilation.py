@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from functools import partial
+from typing import Any
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -29,6 +31,155 @@ _PATIENCE = 2.0
 """Seconds after which the user is told what the run is waiting for."""
 
 
+class _Stages:
+    """The stages of a training step on a few Gaussians. Each method launches the kernels of one.
+
+    Args:
+        pipeline: As for `compile_kernels`, like what follows.
+    """
+
+    def __init__(
+        self, pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer], cuda_graphs: bool
+    ) -> None:
+        self.pipeline, self.optimizers, self.cuda_graphs = pipeline, optimizers, cuda_graphs
+        self.model, self.device, self.views = pipeline.model, pipeline.device, pipeline.views_per_iteration
+        n, device = _GAUSSIANS, pipeline.device
+        ramp = torch.linspace(-0.5, 0.5, n, device=device)
+        self.means = torch.stack([ramp, ramp.flip(0), torch.full_like(ramp, 2.0)], dim=-1)
+        self.quats = self.means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
+        self.scales, self.opacities = torch.full_like(self.means, 0.05), torch.full_like(ramp, 0.5)
+        self.viewmats = torch.eye(4, device=device).repeat(self.views, 1, 1)
+        intrinsics = [[_SIZE, 0.0, _SIZE / 2], [0.0, _SIZE, _SIZE / 2], [0.0, 0.0, 1.0]]
+        self.Ks = self.means.new_tensor(intrinsics).repeat(self.views, 1, 1)
+        self.image = torch.linspace(0.0, 1.0, 3 * _SIZE * _SIZE, device=device).view(1, _SIZE, _SIZE, 3)
+        self.camera = self.viewmats, self.Ks, _SIZE, _SIZE
+        self.info: dict[str, Any] = {}
+        """What `rasterize` says of the projection, once `project` was called."""
+
+    def alone(self) -> dict[str, Callable[[], None]]:
+        """Return the stages that need no projection, by what a user calls them."""
+        stages = {
+            "the loss": partial(self.loss, torch.uint8),
+            "S̄": self.structure,
+            "Adam": self.update,
+            "the loss of masked images": partial(self.loss, torch.float32),
+            "activations": self.activations,
+        }
+        return stages if self.model.color_matrices is None else stages | {"colour matrices": self.colors}
+
+    def after_projection(self) -> dict[str, Callable[[], None]]:
+        """Return the stages that read what `project` has computed."""
+        stages = {
+            "projection and spherical harmonics": self.projection,
+            "η": self.observation,
+            "tile lists": self.tile_lists,
+            "compositing with AbsGS": partial(self.composite, True),
+            "compositing": partial(self.composite, False),
+        }
+        return stages if self.pipeline.world.alone else stages | {"what travels between devices": self.exchange}
+
+    def project(self) -> None:
+        _, _, self.info = rasterize(
+            self.means, self.quats, self.scales, self.opacities, self.means, *self.camera,
+            max_off_axis=self.model.config.max_off_axis,
+        )  # fmt: skip
+
+    def tile_lists(self) -> None:
+        # The size is the run's: whether tiles are numbered in 16 or in 32 bits depends on how many there are, and lists
+        # of a given length have one more row of them.
+        cameras = self.pipeline.datamanager.train_dataset.cameras
+        width, height = int(cameras.width.max()), int(cameras.height.max())
+        for capacity in (None, 2**20):
+            rasterize(
+                self.means, self.quats, self.scales, self.opacities, self.means, self.viewmats, self.Ks, width, height,
+                tile_capacity=capacity, max_off_axis=self.model.config.max_off_axis,
+            )  # fmt: skip
+
+    def blank(self, name: str) -> Tensor:
+        return self.means.new_zeros((_GAUSSIANS, *self.model.gauss_params[name].shape[1:]))
+
+    def structure(self) -> None:
+        encode(self.pipeline.structure_maps.of_images(self.image))
+
+    def loss(self, dtype: torch.dtype) -> None:  # Images are bytes; a mask or transparency makes them floats.
+        predicted = self.image.repeat(self.views, 1, 1, 1).requires_grad_()
+        photometric_loss(predicted, torch.zeros_like(predicted, dtype=dtype))[0].backward()
+
+    def colors(self) -> None:
+        shape = self.views, _SIZE, _SIZE
+        renders, alphas = (torch.zeros((*shape, k), device=self.device, requires_grad=True) for k in (3, 1))
+        matrices = identities(self.views).to(self.device).requires_grad_()
+        correct_colors(renders, alphas, matrices).sum().backward()
+
+    def update(self) -> None:
+        log, twins = NonFiniteLog(self.device, capacity=1), {}
+        for name, optimizer in self.optimizers.items():
+            if name in self.model.trained_params and isinstance(optimizer, FusedAdam) and optimizer.triton:
+                # Matrices of colours are fewer than the Gaussians, and so updated in a launch of their own.
+                of_gaussians = name in self.model.gauss_params
+                value = self.blank(name) if of_gaussians else torch.zeros((1, 3, 4), device=self.device)
+                parameter = torch.nn.Parameter(value)
+                parameter.grad = torch.zeros_like(parameter)
+                twins[name] = FusedAdam([parameter], **{key: optimizer.defaults[key] for key in ("betas", "eps")})
+                twins[name].log = log  # all share one log, like the run's, and are stepped in one launch
+        step_together(twins.values())
+        if self.cuda_graphs and twins and (repeated := RepeatedUpdate(twins)).begun:
+            gradients = {name: torch.zeros_like(parameter) for name, parameter in repeated.parameters.items()}
+            repeated.launch(gradients, log.gradients, repeated.factors().to(self.device))
+
+    def composite(self, absgrad: bool) -> None:
+        centres = self.means.clone().requires_grad_()
+        renders, alphas, info = rasterize(
+            centres, self.quats, self.scales, self.opacities, self.means, *self.camera,
+            absgrad=absgrad, **self.model.drawing,
+        )  # fmt: skip
+        black = self.model.config.background_color == "black" and self.model.color_matrices is None
+        result = renders.sum() if black else renders.sum() + alphas.sum()
+        # The projection is differentiated elsewhere.
+        (info["means2d"].grad2d,) = torch.autograd.grad(result, info["means2d"])
+        if absgrad:
+            accumulate_gradients(empty_gradients(_GAUSSIANS, self.device), info, self.views)
+
+    def activations(self) -> None:
+        for weight in (0.0, 1.0):  # The loss has a part with the mean opacity, but not to the end.
+            parameters = self.scales.clone().requires_grad_(), self.opacities[:, None].clone().requires_grad_()
+            some = activate(*parameters, weight)
+            torch.autograd.backward([value.sum() for value in some if value is not None])
+
+    def projection(self) -> None:
+        from sadgs_ns.kernels.harmonics import colors_from_harmonics
+        from sadgs_ns.kernels.projection import project
+
+        config = self.model.config
+        centres, rotations, sizes = (value.clone().requires_grad_() for value in (self.means, self.quats, self.scales))
+        radii, means2d, _, conics, compensations, centres = project(
+            centres, rotations, sizes, self.opacities, *self.camera, config.rasterize_mode == "antialiased"
+        )
+        results = [means2d, conics] if compensations is None else [means2d, conics, compensations]
+        if config.sh_degree > 0:
+            coefficients = self.blank("features_dc"), self.blank("features_rest")
+            results.append(colors_from_harmonics(config.sh_degree, centres, *coefficients, self.viewmats, radii))
+        torch.autograd.backward([value.sum() for value in results])
+
+    def observation(self) -> None:
+        params = {"means": self.means, "quats": self.quats, "scales": self.scales.log()}
+        tensors = self.image.byte().repeat(self.views, 1, 1, 1)
+        observe(
+            empty_statistics(_GAUSSIANS, self.device),
+            params,  # type: ignore[arg-type]
+            self.info | {"structure_tensors": tensors, "viewmats": self.viewmats, "Ks": self.Ks},
+            generator=torch.Generator(self.device).manual_seed(0),
+        )
+
+    def exchange(self) -> None:
+        from sadgs_ns.kernels.exchange import pack, unpack
+
+        seen = [self.info[name].detach() for name in ("radii", "means2d", "depths", "conics", "opacities")]
+        places = torch.arange(self.views * _GAUSSIANS, device=self.device)
+        colors = self.means.expand(self.views, _GAUSSIANS, 3)
+        unpack(pack(*(value.contiguous() for value in (*seen, colors)), places=places), 0)
+
+
 def compile_kernels(
     pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer], cuda_graphs: bool = False
 ) -> None:
@@ -45,110 +196,10 @@ def compile_kernels(
         optimizers: The run's optimizers, by the names of their parameters.
         cuda_graphs: Whether steps may be captured as CUDA graphs, whose Adam reads its rates from the device.
     """
-    model, device = pipeline.model, pipeline.device
-    config = model.config
+    device = pipeline.device
     if not use_triton(device):
         return
-    views, n = pipeline.views_per_iteration, _GAUSSIANS
-    ramp = torch.linspace(-0.5, 0.5, n, device=device)
-    means = torch.stack([ramp, ramp.flip(0), torch.full_like(ramp, 2.0)], dim=-1)
-    quats = means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
-    scales, opacities = torch.full_like(means, 0.05), torch.full_like(ramp, 0.5)
-    viewmats = torch.eye(4, device=device).repeat(views, 1, 1)
-    half = _SIZE / 2
-    Ks = means.new_tensor([[_SIZE, 0.0, half], [0.0, _SIZE, half], [0.0, 0.0, 1.0]]).repeat(views, 1, 1)
-    image = torch.linspace(0.0, 1.0, 3 * _SIZE * _SIZE, device=device).view(1, _SIZE, _SIZE, 3)
-    camera = viewmats, Ks, _SIZE, _SIZE
-    cameras = pipeline.datamanager.train_dataset.cameras
-
-    def tile_lists() -> None:
-        # The size is the run's: whether tiles are numbered in 16 or in 32 bits depends on how many there are, and lists
-        # of a given length have one more row of them.
-        width, height = int(cameras.width.max()), int(cameras.height.max())
-        for capacity in (None, 2**20):
-            rasterize(
-                means, quats, scales, opacities, means, viewmats, Ks, width, height,
-                tile_capacity=capacity, max_off_axis=config.max_off_axis,
-            )  # fmt: skip
-
-    def blank(name: str) -> Tensor:
-        return means.new_zeros((n, *model.gauss_params[name].shape[1:]))
-
-    def structure() -> None:
-        encode(pipeline.structure_maps.of_images(image))
-
-    def loss(dtype: torch.dtype) -> None:  # Images are bytes; behind a mask or with transparency they become floats.
-        predicted = image.repeat(views, 1, 1, 1).requires_grad_()
-        photometric_loss(predicted, torch.zeros_like(predicted, dtype=dtype))[0].backward()
-
-    def colors() -> None:
-        renders, alphas = (torch.zeros((views, _SIZE, _SIZE, k), device=device, requires_grad=True) for k in (3, 1))
-        correct_colors(renders, alphas, identities(views).to(device).requires_grad_()).sum().backward()
-
-    def update() -> None:
-        log, twins = NonFiniteLog(device, capacity=1), {}
-        for name, optimizer in optimizers.items():
-            if name in model.trained_params and isinstance(optimizer, FusedAdam) and optimizer.triton:
-                # Matrices of colours are fewer than the Gaussians, and so updated in a launch of their own.
-                of_gaussians = name in model.gauss_params
-                parameter = torch.nn.Parameter(blank(name) if of_gaussians else torch.zeros((1, 3, 4), device=device))
-                parameter.grad = torch.zeros_like(parameter)
-                twins[name] = FusedAdam([parameter], **{key: optimizer.defaults[key] for key in ("betas", "eps")})
-                twins[name].log = log  # all share one log, like the run's, and are stepped in one launch
-        step_together(twins.values())
-        if cuda_graphs and twins and (repeated := RepeatedUpdate(twins)).begun:
-            gradients = {name: torch.zeros_like(parameter) for name, parameter in repeated.parameters.items()}
-            repeated.launch(gradients, log.gradients, repeated.factors().to(device))
-
-    def composite(absgrad: bool) -> None:
-        centres = means.clone().requires_grad_()
-        renders, alphas, info = rasterize(
-            centres, quats, scales, opacities, means, *camera, absgrad=absgrad, **model.drawing
-        )  # fmt: skip
-        black = config.background_color == "black" and model.color_matrices is None
-        result = renders.sum() if black else renders.sum() + alphas.sum()
-        # The projection is differentiated elsewhere.
-        (info["means2d"].grad2d,) = torch.autograd.grad(result, info["means2d"])
-        if absgrad:
-            accumulate_gradients(empty_gradients(n, device), info, views)
-
-    def activations() -> None:
-        for weight in (0.0, 1.0):  # The loss has a part with the mean opacity, but not to the end.
-            parameters = scales.clone().requires_grad_(), opacities[:, None].clone().requires_grad_()
-            some = activate(*parameters, weight)
-            torch.autograd.backward([value.sum() for value in some if value is not None])
-
-    def projection() -> None:
-        from sadgs_ns.kernels.harmonics import colors_from_harmonics
-        from sadgs_ns.kernels.projection import project
-
-        antialiased = config.rasterize_mode == "antialiased"
-        centres, rotations, sizes = (value.clone().requires_grad_() for value in (means, quats, scales))
-        radii, means2d, _, conics, compensations, centres = project(
-            centres, rotations, sizes, opacities, *camera, antialiased
-        )
-        results = [means2d, conics] if compensations is None else [means2d, conics, compensations]
-        if config.sh_degree > 0:
-            coefficients = blank("features_dc"), blank("features_rest")
-            results.append(colors_from_harmonics(config.sh_degree, centres, *coefficients, viewmats, radii))
-        torch.autograd.backward([value.sum() for value in results])
-
-    def observation() -> None:
-        params = {"means": means, "quats": quats, "scales": scales.log()}
-        observe(
-            empty_statistics(n, device),
-            params,  # type: ignore[arg-type]
-            info | {"structure_tensors": image.byte().repeat(views, 1, 1, 1), "viewmats": viewmats, "Ks": Ks},
-            generator=torch.Generator(device).manual_seed(0),
-        )
-
-    def exchange() -> None:
-        from sadgs_ns.kernels.exchange import pack, unpack
-
-        seen = [info[name].detach() for name in ("radii", "means2d", "depths", "conics", "opacities")]
-        places = torch.arange(views * n, device=device)
-        unpack(pack(*(value.contiguous() for value in (*seen, means.expand(views, n, 3))), places=places), 0)
-
+    stages = _Stages(pipeline, optimizers, cuda_graphs)
     failures: dict[str, BaseException] = {}
     pending: dict[str, Future[None]] = {}
 
@@ -157,29 +208,13 @@ def compile_kernels(
             torch.cuda.set_device(device)
 
     with ThreadPoolExecutor(initializer=take_device) as pool:  # which waits for its threads, whatever happens
-        pending |= {
-            "the loss": pool.submit(loss, torch.uint8),
-            "S̄": pool.submit(structure),
-            "Adam": pool.submit(update),
-            "the loss of masked images": pool.submit(loss, torch.float32),
-            "activations": pool.submit(activations),
-        }
-        if model.color_matrices is not None:
-            pending["colour matrices"] = pool.submit(colors)
-        try:  # the other stages read this projection
-            _, _, info = rasterize(means, quats, scales, opacities, means, *camera, max_off_axis=config.max_off_axis)
+        pending |= {name: pool.submit(stage) for name, stage in stages.alone().items()}
+        try:
+            stages.project()
         except Exception as error:
             failures["rasterization"] = error
         else:
-            pending |= {
-                "projection and spherical harmonics": pool.submit(projection),
-                "η": pool.submit(observation),
-                "tile lists": pool.submit(tile_lists),
-                "compositing with AbsGS": pool.submit(composite, True),
-                "compositing": pool.submit(composite, False),
-            }
-            if not pipeline.world.alone:
-                pending["what travels between devices"] = pool.submit(exchange)
+            pending |= {name: pool.submit(stage) for name, stage in stages.after_projection().items()}
         if wait(pending.values(), timeout=_PATIENCE).not_done:
             CONSOLE.print("Compiling kernels for this GPU, once …")
     failures |= {name: error for name, future in pending.items() if (error := future.exception()) is not None}
