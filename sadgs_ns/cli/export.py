@@ -123,12 +123,7 @@ def export(given: Export) -> int:
         WriteError: If the file could not be written.
     """
     is_page, is_mesh = format_of(given.output) == ".html", format_of(given.output) == MESH
-    if is_page and given.frame != "nerfstudio":
-        raise InputError("--frame colmap is for files that other programs read: leave it out for a page.")
-    if given.voxel_size is not None and not is_mesh:
-        raise InputError(f"--voxel-size is for meshes: let --output end in {MESH}, or leave it out.")
-    if given.voxel_size is not None and not 0 < given.voxel_size < math.inf:
-        raise InputError(f"--voxel-size {given.voxel_size:g} must be more than 0: leave it out to have it derived.")
+    _check(given)
     if is_mesh:
         load_open3d()  # A machine that lacks it is told before views are rendered.
     folders = _checkpoint_of(given.run).absolute().parents[:2]
@@ -170,6 +165,21 @@ def export(given: Export) -> int:
     except ValueError as error:
         told = f"{trained.checkpoint} holds no Gaussians that can be exported ({error}): {_REMEDY}."
         raise InputError(told) from error
+
+
+def _check(given: Export) -> None:
+    """Check whether the options suit the format.
+
+    Raises:
+        InputError: If not.
+    """
+    suffix, voxel_size = format_of(given.output), given.voxel_size
+    if suffix == ".html" and given.frame != "nerfstudio":
+        raise InputError("--frame colmap is for files that other programs read: leave it out for a page.")
+    if voxel_size is not None and suffix != MESH:
+        raise InputError(f"--voxel-size is for meshes: let --output end in {MESH}, or leave it out.")
+    if voxel_size is not None and not 0 < voxel_size < math.inf:
+        raise InputError(f"--voxel-size {voxel_size:g} must be more than 0: leave it out to have it derived.")
 
 
 def _cleaned(
