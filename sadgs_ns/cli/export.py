@@ -77,25 +77,18 @@ def write_gaussians(
     similarity: Similarity | None = None,
     start: html.Start | None = None,
 ) -> int:
-    """Write a model's Gaussians in the format that the file's name asks for.
+    """Write a model's Gaussians as `formats.write` does, and return how many.
 
-    Those with a value that is not finite are dropped, and one printed line says how many. The file appears complete or
-    not at all.
+    Those with a value that is not finite are dropped, and one printed line says how many.
 
     Args:
-        path: Created, with its parents, or replaced.
+        path, frame, start: As for `formats.write`.
         params: The parameters as training holds them, shaped as `of_parameters` takes them.
-        frame: The frame of the file.
         similarity: From the parameters' frame to the file's; None leaves them as they are.
-        start: Where an HTML page opens, in the file's frame; it must be given for one.
-
-    Returns:
-        The number of Gaussians written.
 
     Raises:
         ValueError: If a tensor has another shape than the number of means asks for, naming it.
-        InputError: If nothing is left to write, or the format cannot hold it.
-        WriteError: If the file could not be written.
+        InputError, WriteError: As `formats.write`.
     """
     gaussians = of_parameters(_arrays(params))
     sound = (gaussians if similarity is None else gaussians.moved(similarity)).finite()
@@ -112,8 +105,7 @@ def _arrays(params: Mapping[str, Tensor]) -> dict[str, NDArray[np.floating]]:
 def export(given: Export) -> int:
     """Write the Gaussians of a run of sadgs or splatfacto, or a mesh, and say what was taken away of the Gaussians.
 
-    Nothing in the run's folder is executed, not even its `config.yml`, and the data need not be there any more, except
-    for `min_views` and `dust`, for a mesh, and for the camera with which an HTML page opens.
+    Nothing in the run's folder is executed, not even its `config.yml`.
 
     Returns:
         The number of Gaussians written, or of triangles.
@@ -149,22 +141,19 @@ def export(given: Export) -> int:
 
         cameras = read_cameras(folder, given.data)
     try:
-        of_parameters(_arrays(params))  # It refuses shapes that do not fit.
-        params = _cleaned(params, cleaning, cameras, drawing)
-        if is_mesh and cameras is not None:
-            from sadgs_ns.cli.meshing import write_mesh
-
-            return write_mesh(given.output, params, cameras, similarity, given.voxel_size, **drawing)
-        start = None
-        if is_page and cameras is not None:
-            pose, K = cameras.camera_to_worlds[0].double().numpy(), cameras.Ks[0]
-            start = html.start_at(pose, max(cameras.sizes[0]), float(K[0, 0]), params["means"].numpy())
-        return write_gaussians(given.output, params, given.frame, similarity, start)
-    except InputError:
-        raise
+        of_parameters(_arrays(params))
     except ValueError as error:
         told = f"{trained.checkpoint} holds no Gaussians that can be exported ({error}): {_REMEDY}."
         raise InputError(told) from error
+    params, start = _cleaned(params, cleaning, cameras, drawing), None
+    if is_mesh and cameras is not None:
+        from sadgs_ns.cli.meshing import write_mesh
+
+        return write_mesh(given.output, params, cameras, similarity, given.voxel_size, **drawing)
+    if is_page and cameras is not None:
+        pose, K = cameras.camera_to_worlds[0].double().numpy(), cameras.Ks[0]
+        start = html.start_at(pose, max(cameras.sizes[0]), float(K[0, 0]), params["means"].numpy())
+    return write_gaussians(given.output, params, given.frame, similarity, start)
 
 
 def _check(given: Export) -> None:
@@ -185,7 +174,7 @@ def _check(given: Export) -> None:
 def _cleaned(
     params: dict[str, Tensor], cleaning: Cleaning, cameras: RunCameras | None, drawing: Mapping[str, float]
 ) -> dict[str, Tensor]:
-    """Return the parameters of the Gaussians that stay, and print how many each option takes away."""
+    """Print how many Gaussians each option takes away, and return the parameters of those that stay."""
     import torch
     from rich.console import Console
     from rich.progress import track
@@ -239,9 +228,6 @@ class Trained:
 
 def read_checkpoint(run: Path) -> Trained:
     """Read a run's Gaussians, mapped from the file, so that what is not read takes no memory.
-
-    Args:
-        run: As of `Export`.
 
     Raises:
         InputError: If there is no checkpoint of this method or of splatfacto.

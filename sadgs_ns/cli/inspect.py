@@ -45,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     from sadgs_ns.cli.inspection import inspect_run
 
     try:
-        written = inspect_run(given.config, given.view, given.split, given.output, given.load_step, given.data)
+        written = inspect_run(**vars(given))
     except (ValueError, OSError) as error:
         print(f"sadgs-inspect: {error}", file=sys.stderr)
         return 2

@@ -1,8 +1,4 @@
-"""The pictures of `sadgs-inspect`: what the method sees in a view of a run, and what one step would split.
-
-They are PNGs: S̄ as ellipses over the photo, the local wavelength, η of the Gaussians, how many children they would get,
-which are low, and one densification step, conventional against structure-aware.
-"""
+"""The pictures of `sadgs-inspect`: what the method sees in a view of a run, and what one step would split."""
 
 from __future__ import annotations
 
@@ -32,6 +28,7 @@ from sadgs_ns.plugin.structure_maps import observe_training_views
 from sadgs_ns.plugin.trainer import SadgsTrainerConfig
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
+Split = Literal["train", "eval"]
 SEED = 0
 """Seed of the random colours and of AbsGS's children."""
 MIN_SIDE = 900
@@ -59,7 +56,7 @@ class View:
 
     @property
     def camera(self) -> tuple[Tensor, Tensor, int, int]:
-        """Return viewmat, K, width and height, as `gaussian_maps.blend` takes them."""
+        """Viewmat, K, width and height, as `gaussian_maps.blend` takes them."""
         height, width = self.photo.shape[:2]
         return self.viewmat, self.K, width, height
 
@@ -70,9 +67,7 @@ def load_run(path: Path, load_step: int | None = None, data: Path | None = None)
     The file is read with PyYAML's full loader, which calls what it names. Checkpoints are looked for beside it.
 
     Args:
-        path: The run's config.yml, or its folder.
-        load_step: Of the checkpoint; None takes the latest that can be read.
-        data: The capture; None is where it was in training.
+        path, load_step, data: As for `sadgs-inspect`.
 
     Returns:
         The pipeline in evaluation mode, and the iterations that it was trained.
@@ -114,7 +109,7 @@ def load_run(path: Path, load_step: int | None = None, data: Path | None = None)
     return pipeline, state["step"] + 1
 
 
-def get_view(pipeline: SadgsPipeline, index: int, split: Literal["train", "eval"] = "train") -> View:
+def get_view(pipeline: SadgsPipeline, index: int, split: Split = "train") -> View:
     """Return a view by its number, counted from 0 in the order of the split.
 
     Raises:
@@ -140,12 +135,7 @@ def get_view(pipeline: SadgsPipeline, index: int, split: Literal["train", "eval"
 def screen_gradients(pipeline: SadgsPipeline, progress: Callable[[range], Iterable[int]] = iter) -> dict[str, Tensor]:
     """Return what AbsGS decides on: the loss's screen gradients of all training views, added up as in training.
 
-    Args:
-        pipeline: A loaded run.
-        progress: Wraps the numbers of the views, to show how far the work is.
-
-    Returns:
-        As `absgs.empty_gradients`.
+    They are laid out as by `absgs.empty_gradients`. `progress` wraps the numbers of the views.
     """
     model = pipeline.model
     gradients = empty_gradients(model.num_points, pipeline.device)
@@ -164,44 +154,36 @@ def screen_gradients(pipeline: SadgsPipeline, progress: Callable[[range], Iterab
     return gradients
 
 
-@dataclass(frozen=True)
-class Step:
-    """Gaussians after a densification step that was tried out."""
+def _try(model: SadgsModel, state: dict[str, Any], densify: Callable[[Any, Any, Any], Any]) -> dict[str, Tensor]:
+    """Call a function of parameters, optimizers and state that densifies copies of the model's Gaussians.
 
-    params: dict[str, Tensor]
-    """Raw parameters by name, leading dimension M."""
-    origins: Tensor
-    """Number of the Gaussian before the step that each one was or came from. int64 [M]"""
-
-
-def _try(model: SadgsModel, state: dict[str, Any], densify: Callable[[Any, Any, Any], Any]) -> Step:
-    """Call a function of parameters, optimizers and state that changes copies of the model's Gaussians."""
+    Returns:
+        The M Gaussians after that: raw parameters [M, …] by name, and as `origins` the number of the Gaussian before
+        the step that each one was or came from, int64 [M].
+    """
     params = {name: torch.nn.Parameter(value.detach().clone()) for name, value in model.gauss_params.items()}
     # The numbers are a parameter, since children take theirs from their parents, while rows of the state begin anew.
     # float64 counts exactly.
     numbers = torch.arange(model.num_points, device=params["means"].device, dtype=torch.float64)
     params["origins"] = torch.nn.Parameter(numbers)
     densify(params, {name: torch.optim.SGD([parameter], lr=0.0) for name, parameter in params.items()}, state)
-    origins = params.pop("origins").detach().long()
-    return Step({name: value.detach() for name, value in params.items()}, origins)
+    after = {name: value.detach() for name, value in params.items()}
+    return after | {"origins": after["origins"].long()}
 
 
-def structure_step(model: SadgsModel, statistics: dict[str, Tensor]) -> Step:
-    """Try a structure-aware step without its pruning, and return what it makes of the Gaussians."""
+def structure_step(model: SadgsModel, statistics: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Try a structure-aware step without its pruning, and return as `_try`."""
     counts = model.strategy.children_now(model.gauss_params, statistics)
     return _try(model, {}, partial(grid_split, counts=counts, child_scale=model.strategy.child_scale))
 
 
-def conventional_step(model: SadgsModel, gradients: dict[str, Tensor]) -> Step:
-    """Try a conventional step (AbsGS: clone, or split in two) without its pruning, and return what it makes."""
-    strategy = model.strategy
+def conventional_step(model: SadgsModel, gradients: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Try a conventional step (AbsGS: clone, or split in two) without its pruning, and return as `_try`."""
+    strategy, size = model.strategy, SMALL_SCALE * float(model.strategy_state["scene_scale"])
     densify = partial(
-        grow,
-        clone_threshold=strategy.clone_grad2d,
-        split_threshold=strategy.split_absgrad2d,
-        size_threshold=SMALL_SCALE * float(model.strategy_state["scene_scale"]),
+        grow, clone_threshold=strategy.clone_grad2d, split_threshold=strategy.split_absgrad2d, size_threshold=size,
         budget=strategy.max_gaussians - model.num_points,
-    )
+    )  # fmt: skip
     with torch.random.fork_rng(devices=[model.device] if model.device.type == "cuda" else []):
         torch.manual_seed(SEED)  # gsplat draws the children's places at random.
         return _try(model, dict(gradients), densify)
@@ -213,30 +195,34 @@ def view_panels(pipeline: SadgsPipeline, view: View, statistics: dict[str, Tenso
     params, options = dict(model.gauss_params.items()), model.drawing
     counts = model.strategy.children_now(model.gauss_params, statistics)
     is_low = model.strategy.consistently_low(statistics)
-    height, width = view.photo.shape[:2]
-    enlarge = max(MIN_SIDE / max(height, width), 1.0)
-    size = (round(enlarge * height), round(enlarge * width))
+    enlarge = max(MIN_SIDE / max(view.photo.shape), 1.0)
+    size = round(enlarge * view.photo.shape[0]), round(enlarge * view.photo.shape[1])
     split, added = int((counts > 1).any(dim=1).sum()), int((num_children(counts) - 1).sum())
     of_all = f"of {model.num_points:,} Gaussians"
-    ellipses = texture.draw_ellipses(to_picture(view.photo), view.structure_tensor, constant, size)
     period = texture.texture_period(view.structure_tensor, constant)
     eta = gaussian_maps.eta_map(params, statistics, *view.camera, **options)
     children = gaussian_maps.children_map(params, counts, *view.camera, **options)
     low = gaussian_maps.share_map(params, is_low, *view.camera, **options)
-    return {
-        "ellipses": Panel(f"{view.name}: the structure tensor, its inverse as ellipses", ellipses, PERIOD),
-        "wavelength": Panel(f"{view.name}: local wavelength", PERIOD(period), PERIOD),
-        "eta": Panel(f"{view.name}: η of the Gaussians, largest of their observations; over 1 violates", ETA(eta), ETA),
-        "children": Panel(f"{view.name}: {split:,} {of_all} would split, {added:,} more", CHILDREN(children), CHILDREN),
-        "low": Panel(f"{view.name}: {int(is_low.sum()):,} {of_all} are consistently low (η < 0.1)", LOW(low), LOW),
+    panels = {
+        name: Panel(f"{view.name}: {title}", scale(values), scale)
+        for name, title, scale, values in (
+            ("wavelength", "local wavelength", PERIOD, period),
+            ("eta", "η of the Gaussians, largest of their observations; over 1 violates", ETA, eta),
+            ("children", f"{split:,} {of_all} would split, {added:,} more", CHILDREN, children),
+            ("low", f"{int(is_low.sum()):,} {of_all} are consistently low (η < 0.1)", LOW, low),
+        )
     }
+    ellipses = texture.draw_ellipses(to_picture(view.photo), view.structure_tensor, constant, size)
+    title = f"{view.name}: the structure tensor, its inverse as ellipses"
+    return {"ellipses": Panel(title, ellipses, PERIOD)} | panels
 
 
-def step_panels(model: SadgsModel, view: View, conventional: Step, structure: Step) -> list[Panel]:
+def step_panels(
+    model: SadgsModel, view: View, conventional: dict[str, Tensor], structure: dict[str, Tensor]
+) -> list[Panel]:
     """Return the photo, and the Gaussians in random colours before and after a step of each kind (paper, figure 3)."""
     generator = torch.Generator().manual_seed(SEED)
     colors = gaussian_maps.random_colors(model.num_points, generator).to(model.device)
-
     viewmat, K, width, height = view.camera
     enlarge = max(math.ceil(MIN_RENDER_SIDE / max(height, width)), 1)
     camera = (viewmat, K * K.new_tensor([[enlarge], [enlarge], [1.0]]), enlarge * width, enlarge * height)
@@ -249,53 +235,35 @@ def step_panels(model: SadgsModel, view: View, conventional: Step, structure: St
         Panel(f"photo {view.name}", to_picture(view.photo).repeat(enlarge, axis=0).repeat(enlarge, axis=1)),
         panel("before", model.gauss_params, colors),
         *(
-            panel(title, step.params, gaussian_maps.recolor(colors, step.origins, generator))
+            panel(title, step, gaussian_maps.recolor(colors, step["origins"], generator))
             for title, step in (("one conventional step", conventional), ("one structure-aware step", structure))
         ),
     ]
 
 
 def inspect_run(
-    path: Path,
-    index: int,
-    split: Literal["train", "eval"] = "train",
-    output: Path | None = None,
-    load_step: int | None = None,
-    data: Path | None = None,
+    config: Path, view: int, split: Split, output: Path | None, load_step: int | None, data: Path | None
 ) -> list[Path]:
-    """Write all pictures of one view of a run.
-
-    Args:
-        path: The run's config.yml, or its folder.
-        index: The view's number in its split.
-        split: "train" or "eval".
-        output: Folder, made if need be; None is `inspect` beside the config.
-        load_step: Step of the checkpoint; None takes the latest.
-        data: The capture; None is where it was in training.
-
-    Returns:
-        The files.
+    """Write all pictures of one view of a run, as `sadgs_ns.cli.inspect.Inspect` asks for them; return their files.
 
     Raises:
         InputError: As `load_run` and `get_view`; nothing is written then.
         WriteError: If a file cannot be written.
     """
-    pipeline, iterations = load_run(path, load_step, data)
-    model, view = pipeline.model, get_view(pipeline, index, split)
-    progress = partial(track, transient=True)
-    statistics = observe_training_views(
-        pipeline.structure_maps, partial(progress, description="η in all training views")
-    )
-    gradients = screen_gradients(pipeline, partial(progress, description="gradients of all training views"))
+    pipeline, iterations = load_run(config, load_step, data)
+    model, shown = pipeline.model, get_view(pipeline, view, split)
+    eta, gradient = (f"{what} all training views" for what in ("η in", "gradients of"))
+    statistics = observe_training_views(pipeline.structure_maps, partial(track, transient=True, description=eta))
+    gradients = screen_gradients(pipeline, partial(track, transient=True, description=gradient))
     print(
-        f"{path}: {model.num_points} Gaussians after {iterations} iterations. In {len(pipeline.views)} training views "
-        f"{int((statistics['n_total'] > 0).sum())} were observed, "
+        f"{config}: {model.num_points} Gaussians after {iterations} iterations. In {len(pipeline.views)} training "
+        f"views {int((statistics['n_total'] > 0).sum())} were observed, "
         f"{int((statistics['eta_max'] > 1).any(dim=1).sum())} with η over 1 in one of them."
     )
-    folder = output or (path if path.is_dir() else path.parent) / "inspect"
-    pictures = {name: [panel] for name, panel in view_panels(pipeline, view, statistics).items()}
-    pictures["step"] = step_panels(model, view, conventional_step(model, gradients), structure_step(model, statistics))
-    written = {folder / f"{split}-{index:03d}-{name}.png": panels for name, panels in pictures.items()}
+    folder = output or (config if config.is_dir() else config.parent) / "inspect"
+    pictures = {name: [panel] for name, panel in view_panels(pipeline, shown, statistics).items()}
+    pictures["step"] = step_panels(model, shown, conventional_step(model, gradients), structure_step(model, statistics))
+    written = {folder / f"{split}-{view:03d}-{name}.png": panels for name, panels in pictures.items()}
     for file, panels in written.items():
         color_scales.draw(file, panels, columns=min(len(panels), 2))
     return list(written)

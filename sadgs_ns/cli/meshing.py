@@ -35,7 +35,7 @@ def write_mesh(
     voxel_size: float | None = None,
     **drawing: float,
 ) -> int:
-    """Fuse what the training views see into a mesh, and write it; the file appears complete or not at all.
+    """Fuse what the training views see into a mesh, write it whole or not at all, and return the number of triangles.
 
     Args:
         path: Created, with its parents, or replaced.
@@ -45,9 +45,6 @@ def write_mesh(
         similarity: From the parameters' frame to the file's; None leaves the mesh as it is.
         voxel_size: Edge of a voxel in the parameters' frame; None derives it from the median depth.
         drawing: `max_off_axis` and `near_plane`, as for `rasterize`.
-
-    Returns:
-        The number of triangles.
 
     Raises:
         InputError: If no view shows a surface, voxels do not fit in memory, or open3d cannot be imported.
@@ -79,10 +76,7 @@ def write_mesh(
 
 
 def derive_voxel_size(views: Sequence[DepthView]) -> float:
-    """Return an edge of two pixels at the median depth, or of as much more as a mesh of these views needs to fit.
-
-    Args:
-        views: Some of the views that will be fused.
+    """Return an edge of two pixels at the median depth, or of as much more as a mesh of such views needs to fit.
 
     Raises:
         InputError: If they see no surface, or open3d cannot be imported.
@@ -100,13 +94,9 @@ def derive_voxel_size(views: Sequence[DepthView]) -> float:
 def look(
     params: Mapping[str, Tensor], cameras: RunCameras, indices: Sequence[int], **drawing: Any
 ) -> Iterator[DepthView]:
-    """Render depth and colours, one view after the other; depth is the expected one along the viewing axis.
+    """Render colours and expected depth along the axis of some of the views; arguments are those of `write_mesh`.
 
-    Args:
-        params: As for `write_mesh`, all finite, on the device that renders.
-        cameras: C views.
-        indices: Which views.
-        drawing: As for `write_mesh`.
+    The parameters must be finite, and lie on the device that renders.
     """
     device = params["means"].device
     viewmats, Ks = viewmats_from_camera_to_world(cameras.camera_to_worlds), cameras.Ks
@@ -116,22 +106,11 @@ def look(
     colors = (first, rest) if degree else (0.5 + DEGREE_0 * first).clamp_min(0.0)
     for index in indices:
         width, height = cameras.sizes[index]
-        render, alpha, _ = rasterize(
-            params["means"],
-            quats,
-            scales,
-            opacities,
-            colors,
-            viewmats[index : index + 1].to(device),
-            Ks[index : index + 1].to(device),
-            width,
-            height,
-            sh_degree=degree or None,
-            render_mode="RGB+ED",
-            **drawing,
-        )
+        camera = viewmats[index : index + 1].to(device), Ks[index : index + 1].to(device), width, height
+        options = {"sh_degree": degree or None, "render_mode": "RGB+ED", **drawing}
+        render, alpha, _ = rasterize(params["means"], quats, scales, opacities, colors, *camera, **options)
         seen = alpha >= MIN_ALPHA  # [1, H, W, 1]
         own = (render[..., :3] / alpha.clamp_min(MIN_ALPHA)).clamp(0, 1)  # The background, black, is taken away.
         depth = torch.where(seen, render[..., 3:], 0.0)
-        view = np.asarray(viewmats[index], np.float64), np.asarray(Ks[index], np.float64)
-        yield DepthView(depth[0, ..., 0].cpu().numpy(), own[0].cpu().numpy(), view[1], view[0])
+        K, viewmat = np.asarray(Ks[index], np.float64), np.asarray(viewmats[index], np.float64)
+        yield DepthView(depth[0, ..., 0].cpu().numpy(), own[0].cpu().numpy(), K, viewmat)

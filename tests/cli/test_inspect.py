@@ -105,7 +105,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("undrawn")
 def test_held_out_views_and_earlier_checkpoints_can_be_asked_for(run: Path, tmp_path: Path):
-    written = inspection.inspect_run(run.parent, EVAL_VIEWS - 1, "eval", tmp_path, load_step=8)
+    written = inspection.inspect_run(run.parent, EVAL_VIEWS - 1, "eval", tmp_path, 8, None)
     assert all(path.name.startswith("eval-001-") and path.is_file() for path in written) and len(written) == 6
 
 
@@ -191,7 +191,7 @@ def test_checkpoints_that_cannot_be_used_are_named_with_options_that_there_are(
 def test_a_gpu_that_is_full_is_one_sentence(
     run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    def full(*_: Any) -> None:
+    def full(**_: Any) -> None:
         raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 22.00 MiB.")
 
     monkeypatch.setattr(inspection, "inspect_run", full)
@@ -240,9 +240,9 @@ def test_the_structure_step_makes_the_children_of_the_plan(early: SadgsPipeline)
     children = torch.where(fits, counts.prod(dim=1), 1)
     step = inspection.structure_step(model, statistics)
     assert int(children.max()) > 1
-    assert torch.equal(torch.bincount(step.origins, minlength=model.num_points), children)
-    whole = step.origins[torch.bincount(step.origins)[step.origins] == 1]
-    torch.testing.assert_close(step.params["means"][: len(whole)], model.means.detach()[whole])
+    assert torch.equal(torch.bincount(step["origins"], minlength=model.num_points), children)
+    whole = step["origins"][torch.bincount(step["origins"])[step["origins"]] == 1]
+    torch.testing.assert_close(step["means"][: len(whole)], model.means.detach()[whole])
 
 
 def test_the_conventional_step_clones_or_splits_in_two(early: SadgsPipeline):
@@ -250,10 +250,10 @@ def test_the_conventional_step_clones_or_splits_in_two(early: SadgsPipeline):
     assert float(gradients["grad_count"].max()) == TRAIN_VIEWS
     assert float(gradients["absgrad2d"].max()) > float(gradients["grad2d"].max()) > 0
     step = inspection.conventional_step(model, gradients)
-    sizes = torch.bincount(step.origins, minlength=model.num_points)
+    sizes = torch.bincount(step["origins"], minlength=model.num_points)
     assert set(sizes.unique().tolist()) == {1, 2}
-    assert len(step.params["means"]) == len(step.origins) > model.num_points
-    assert torch.equal(inspection.conventional_step(model, gradients).params["means"], step.params["means"])
+    assert len(step["means"]) == len(step["origins"]) > model.num_points
+    assert torch.equal(inspection.conventional_step(model, gradients)["means"], step["means"])
 
 
 def test_the_photo_and_its_camera_belong_together(early: SadgsPipeline):
