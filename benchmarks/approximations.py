@@ -1,7 +1,7 @@
 """`python -m benchmarks approximations`: speed against error of S̄ and of η, against float64 or brute force.
 
-Two tables: how S̄ is computed and stored, and how many samples a footprint gets. Times are medians, on a CPU of
-processor time, which other processes there do not disturb.
+Two tables: how S̄ is computed and stored, and how many samples a footprint gets. It runs on the CPU, and times are
+medians of processor time, which other processes do not disturb.
 """
 
 from __future__ import annotations
@@ -22,8 +22,6 @@ from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from benchmarks import results, table
-from examples.drawn_scene.drawing import render
-from examples.drawn_scene.scene import describe_scene
 from sadgs_ns.gsplat_internals import SCREEN_BLUR
 from sadgs_ns.method.codes import decode, encode
 from sadgs_ns.method.eta import eta, sample_footprint, sample_map, wavelength
@@ -32,23 +30,19 @@ from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 
 AXIS_LENGTHS = (3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)
 """Axes ‖v‖ in px whose η > 1 decision is compared at every pixel; c = 0.4 has no wavelength under 2.5 px."""
-SAMPLES, QUADRATURE_POINTS = (1, 4, 16), 1024
-"""Of a footprint, and of its exact average."""
+SAMPLES, QUADRATURE_POINTS, FOOTPRINTS = (1, 4, 16), 1024, 5000
+"""Of a footprint, of its exact average, and how many footprints there are."""
 Row = dict[str, Any]
 """`table`, `variant`, and the numbers of that table's columns."""
 
 
-def timed(function: Callable[[], Any], device: torch.device, repeats: int) -> tuple[Any, float]:
+def timed(function: Callable[[], Any], repeats: int) -> tuple[Any, float]:
     """What a function returns, and the median milliseconds of `repeats` calls after a first one."""
-    clock = time.perf_counter if device.type == "cuda" else time.process_time
-    synchronize = torch.cuda.synchronize if device.type == "cuda" else lambda: None
     result, seconds = function(), []
     for _ in range(repeats):
-        synchronize()
-        start = clock()
+        start = time.process_time()
         function()
-        synchronize()
-        seconds.append(clock() - start)
+        seconds.append(time.process_time() - start)
     return result, 1e3 * statistics.median(seconds)
 
 
@@ -70,7 +64,7 @@ def map_errors(tensor: Tensor, reference: Tensor) -> Row:
 
 def structure_tensor_rows(images: Tensor, repeats: int) -> Iterator[Row]:
     """How S̄ of images, float32 in [0, 1] [B, H, W, 3], is computed and stored; all against float64."""
-    measure = partial(timed, device=images.device, repeats=repeats)
+    measure = partial(timed, repeats=repeats)
     reference, ms = measure(lambda: multiscale_structure_tensor(images.double()))
     single = reference.float()
     variants: dict[str, tuple[Callable[[], Tensor], Callable[[Tensor], Tensor], int]] = {
@@ -115,8 +109,7 @@ def random_footprints(count: int, images: Tensor, seed: int = 0) -> Footprints:
     minor = major * 8.0**-ratio
     cos, sin = (math.pi * turn).cos(), (math.pi * turn).sin()
     axes = torch.stack([major * cos, major * sin, -minor * sin, minor * cos], -1).view(count, 2, 2)
-    parts = (image * batch).long(), torch.stack([x * width, y * height], -1), axes
-    return Footprints(*(part.to(images.device) for part in parts))
+    return Footprints((image * batch).long(), torch.stack([x * width, y * height], -1), axes)
 
 
 def average(tensors: Tensor, footprints: Footprints, positions: Iterator[Tensor]) -> tuple[Tensor, Tensor]:
@@ -159,7 +152,7 @@ def footprint_rows(tensors: Tensor, footprints: Footprints, repeats: int) -> Ite
 
     ways = {f"reference: {QUADRATURE_POINTS} points of quadrature": partial(quadrature, footprints)}
     ways |= {f"{samples} sample{'s' * (samples > 1)}": partial(jittered, samples) for samples in SAMPLES}
-    measured = {name: timed(partial(observed, way), tensors.device, repeats) for name, way in ways.items()}
+    measured = {name: timed(partial(observed, way), repeats) for name, way in ways.items()}
     (expected, expected_seen), _ = next(iter(measured.values()))
     for name, ((actual, seen), ms) in measured.items():
         both = seen & expected_seen
@@ -172,52 +165,32 @@ def footprint_rows(tensors: Tensor, footprints: Footprints, repeats: int) -> Ite
 class Command:
     """Tabulate what each shortcut in the frequency analysis gets wrong, beside what it costs."""
 
-    image: Path | None = None
-    """a photo (default: images of the drawn scene)"""
-    device: str = "cpu"
-    """cpu, cuda or cuda:N"""
+    image: Path
+    """a photo"""
     repeats: int = 5
-    """timed calls"""
-    gaussians: int = 5000
-    """whose footprints η is sampled in"""
-    width: int = 320
-    """of the drawn scene's images, in px"""
+    """timed calls, at least 1"""
     output: Path | None = None
     """JSON-lines file that the rows are added to"""
 
     def __call__(self) -> int:
-        for name, least in (("repeats", 1), ("gaussians", 10), ("width", 32)):
-            if getattr(self, name) < least:
-                raise ValueError(f"--{name} is {getattr(self, name)}; give at least {least}.")
-        try:
-            device = torch.zeros(1, dtype=torch.float64, device=self.device).device
-        except (RuntimeError, AssertionError, TypeError) as error:  # a torch without CUDA asserts
-            told = str(error).splitlines()[0].rstrip(".")
-            raise ValueError(f"--device {self.device!r} cannot be used ({told}); give cpu, cuda or cuda:N.") from error
-        images = (drawn(self.width) if self.image is None else read_photo(self.image)).to(device)
-        footprints = random_footprints(self.gaussians, images)
-        processor = f"CPU ({platform.machine()}, {torch.get_num_threads()} threads)"
-        where = torch.cuda.get_device_name(device) if device.type == "cuda" else processor
-        source = "demo" if self.image is None else self.image.name
-        print(f"{source} on {where}, torch {torch.__version__}, median of {self.repeats} calls\n", flush=True)
+        if self.repeats < 1:
+            raise ValueError(f"--repeats is {self.repeats}; give at least 1.")
+        images = read_photo(self.image)
+        footprints = random_footprints(FOOTPRINTS, images)
+        where = f"CPU ({platform.machine()}, {torch.get_num_threads()} threads)"
+        print(f"{self.image.name} on {where}, torch {torch.__version__}, median of {self.repeats} calls\n", flush=True)
+        common = {"input": self.image.name, "device": where, "torch": torch.__version__, "repeats": self.repeats}
         for rows in (
             structure_tensor_rows(images, self.repeats),
             footprint_rows(multiscale_structure_tensor(images), footprints, self.repeats),
         ):
             measured = list(rows)
             print(table.of_approximations(measured), end="\n\n", flush=True)
-            if self.output is not None:
-                common = {"input": source, "device": where, "torch": torch.__version__, "repeats": self.repeats}
-                for row in measured:
-                    key = "/".join((where, source, row["table"], row["variant"]))
+            for row in measured:
+                key = "/".join((where, self.image.name, row["table"], row["variant"]))
+                if self.output is not None:
                     results.append(self.output, {"key": key, **common, **row})
         return 0
-
-
-def drawn(width: int) -> Tensor:
-    """Two views of the drawn scene in [0, 1]. [2, H, W, 3]"""
-    scene = describe_scene(width, width * 3 // 4, 9)
-    return torch.from_numpy(np.stack([render(scene.surfaces, view) for view in scene.views[:2]])).float() / 255
 
 
 def read_photo(path: Path) -> Tensor:

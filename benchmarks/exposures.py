@@ -31,24 +31,11 @@ FILE = "exposures.json"
 """Name of the file with the gains."""
 JPEG: dict[str, Any] = {"quality": 98, "subsampling": 0}
 """Options with which JPEG files are written: the gains are to be the only difference that can be seen."""
+Array = NDArray[np.float64]
 
 
-def draw_gains(
-    views: int, spread: float, white_balance: float, mean: float, seed: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Draw the gains of photos.
-
-    Args:
-        views: Number of photos, at least 1.
-        spread: Largest gain over the smallest one, at least 1.
-        white_balance: Largest change of a channel as a share, in [0, 1).
-        mean: Geometric mean of the gains.
-        seed: Which photo gets which gain.
-
-    Returns:
-        Gains, the logarithms of which are evenly spread, [V] and the channels' factors, each photo's of product 1
-        [V, 3].
-    """
+def draw_gains(views: int, spread: float, white_balance: float, mean: float, seed: int) -> tuple[Array, Array]:
+    """Draw gains of photos, at least one, [V] and their channels' factors [V, 3], as at the top of this module."""
     generator = np.random.default_rng(seed)
     gains = mean * spread ** (generator.permutation(views) / max(views - 1, 1) - 0.5 * (views > 1))
     factors = generator.uniform(-1, 1, (views, 3))
@@ -57,38 +44,32 @@ def draw_gains(
     return gains, (1 + white_balance) ** (0.75 * factors)
 
 
-def linear_light(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def linear_light(values: Array) -> Array:
     """Return the linear light in [0, 1] that sRGB's values in [0, 1] stand for."""
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
-def srgb_values(light: NDArray[np.float64]) -> NDArray[np.float64]:
+def srgb_values(light: Array) -> Array:
     """Return sRGB's values in [0, 1] of linear light in [0, 1]; the inverse of `linear_light`."""
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
-def with_gains(image: NDArray[np.uint8], gains: NDArray[np.float64]) -> NDArray[np.uint8]:
+def with_gains(image: NDArray[np.uint8], gains: Array) -> NDArray[np.uint8]:
     """Multiply the linear light of an image [H, W, 3] by a gain for each channel [3]; what exceeds 1 saturates."""
     levels = linear_light(np.arange(256) / 255.0)  # [256]
     table = np.rint(255 * srgb_values((levels[:, None] * gains).clip(0, 1))).astype(np.uint8)  # [256, 3]
     return np.stack([table[image[..., channel], channel] for channel in range(3)], axis=-1)
 
 
-def write_scene(
-    scene: Path, out: Path, spread: float, white_balance: float, mean: float, seed: int
-) -> dict[str, dict[str, Any]]:
+def write_scene(scene: Path, out: Path, spread: float, white_balance: float, mean: float, seed: int = 0) -> None:
     """Write the copy; an earlier one is replaced.
-
-    Returns:
-        What the file of gains holds: gain and channels' factors of each photo by its name, and whether it is held out.
 
     Raises:
         FileNotFoundError: The model or an image is missing; names the path.
     """
     names = image_names(ColmapDataParserConfig(colmap_path=SPARSE, downscale_factor=1), scene)
     held_out = [i % INTERVAL in (TEST, VALIDATION) for i in range(len(names))]
-    gains, factors = draw_gains(held_out.count(False), spread, white_balance, mean, seed)
-    drawn = iter(zip(gains, factors, strict=True))
+    drawn = zip(*draw_gains(held_out.count(False), spread, white_balance, mean, seed), strict=True)
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
     (out / "sparse").symlink_to((scene / "sparse").resolve())
@@ -102,7 +83,6 @@ def write_scene(
         changed.save(path, **(JPEG if path.suffix.lower() in (".jpg", ".jpeg") else {}))
         written[name] = {"gain": float(gain), "channels": of_channels.tolist(), "held_out": holds_out}
     (out / FILE).write_text(json.dumps(written, indent=1) + "\n")
-    return written
 
 
 @dataclass
@@ -119,8 +99,6 @@ class Command:
     """largest change of a channel, a share"""
     mean: float | None = None
     """geometric mean of the gains (default: the largest at which nothing saturates)"""
-    seed: int = 0
-    """which photo gets which gain"""
 
     def __call__(self) -> int:
         largest = (1 + self.white_balance) ** -1 * max(self.spread, 1e-9) ** -0.5
@@ -131,10 +109,5 @@ class Command:
             raise ValueError(f"{self.out} is there and holds no {FILE}, so it is no earlier copy; give another folder.")
         if not (self.spread >= 1 and 0 <= self.white_balance < 1 and 0 < mean <= 1):
             raise ValueError("--spread must be at least 1, --white-balance in [0, 1), and --mean in (0, 1].")
-        written = write_scene(self.scene, self.out, self.spread, self.white_balance, mean, self.seed)
-        gains = [photo["gain"] for photo in written.values() if not photo["held_out"]]
-        print(
-            f"{self.out}: gains of {len(gains)} training photos from {min(gains):.3f} to {max(gains):.3f}, "
-            f"of {len(written) - len(gains)} held-out ones {mean:.3f}"
-        )
+        write_scene(self.scene, self.out, self.spread, self.white_balance, mean)
         return 0

@@ -19,7 +19,6 @@ from typing import Any
 
 import torch
 import torch.distributed as dist
-from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from benchmarks.evaluate import now
@@ -31,10 +30,9 @@ from sadgs_ns.method import memory
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, keep_gradient
 from sadgs_ns.method.losses import photometric_loss, photometric_part
 from sadgs_ns.method.statistics import empty_statistics, observe
-from sadgs_ns.plugin.memory_plan import estimate_pairs
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
 from sadgs_ns.plugin.optimizers import FusedAdam, step_together
-from sadgs_ns.render.rasterization import rasterize, visible
+from sadgs_ns.render.rasterization import rasterize
 
 REPEATS = 20
 """Calls in a row that are timed together."""
@@ -66,17 +64,10 @@ def size_of(megapixels: float) -> tuple[int, int]:
 
 
 class Step:
-    """A training step of which this process has its part, and whose parts can be called one by one.
+    """A training step of V views of `width` × `height` px, whose parts can be called one by one.
 
-    Args:
-        gaussians: Number of the Gaussians of all processes, of degree 3.
-        width: px.
-        height: px.
-        views: Number V of views of a step.
-        device: Where this process computes.
-        world: The processes; None for this one alone.
-        blocks: Number of shells, at least 1, each of which has as many Gaussians and views as another where it divides
-            their numbers. Each process has as many Gaussians of a block as another process.
+    All processes of `world` have `gaussians` of degree 3 together, each as many as another. They lie in `blocks`
+    shells, each of which has as many Gaussians and views as another where it divides their numbers.
     """
 
     def __init__(
@@ -111,11 +102,10 @@ class Step:
             "opacities": torch.logit(uniform(0.05, 0.95, number, 1)),
         }
         self.params = {name: torch.nn.Parameter(value) for name, value in values.items()}
-        ours = not kernels.switched_off()
+        ours, log = not kernels.switched_off(), NonFiniteLog(device, capacity=1)
         adam = FusedAdam if ours else partial(torch.optim.Adam, fused=True)
-        self.optimizers: dict[str, Any] = {name: adam([p], lr=1e-6, eps=1e-15) for name, p in self.params.items()}
-        log = NonFiniteLog(device, capacity=1)
-        for optimizer in self.optimizers.values() if ours else ():
+        self.optimizers: list[Any] = [adam([p], lr=1e-6, eps=1e-15) for p in self.params.values()]
+        for optimizer in self.optimizers if ours else ():
             optimizer.log = log  # one for all, as in training: what shares it is updated in one launch
         self.state: dict[str, Any] = empty_statistics(number, device) | empty_gradients(number, device)
         numbers = torch.arange(views, device=device)
@@ -127,7 +117,7 @@ class Step:
         K = torch.tensor([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]], device=device)
         self.Ks = K.repeat(views, 1, 1)
         self.images = torch.full((views, height, width, 3), 100, dtype=torch.uint8, device=device)
-        self.codes = torch.full((views, height, width, 3), 60, dtype=torch.uint8, device=device)
+        self.codes = torch.full_like(self.images, 60)
         self.rendered = (self.images / 255).requires_grad_()
         self.capacity: int | None = None
         self.count = 0
@@ -187,9 +177,9 @@ class Step:
 
     def optimize(self) -> None:
         """Adam on all parameters that have gradients: our kernel in one launch, as in training."""
-        together = [o for o in self.optimizers.values() if isinstance(o, FusedAdam) and o.triton]
+        together = [o for o in self.optimizers if isinstance(o, FusedAdam) and o.triton]
         step_together(together)
-        for optimizer in () if together else self.optimizers.values():
+        for optimizer in () if together else self.optimizers:
             optimizer.step()
 
     def __call__(self, after: Callable[[str], None] = lambda phase: None) -> None:
@@ -237,7 +227,7 @@ class Compare:
     def __call__(self) -> int:
         gpu()
         for gaussians in self.gaussians:
-            columns, seen = [], 0
+            columns = []
             for triton in (False, True):
                 with kernels.triton_switched(triton):
                     step = Step(gaussians, self.width, self.height)
@@ -250,9 +240,8 @@ class Compare:
                         f"whole step, η in every {ETA_EVERY}th": step,
                     }
                     columns.append({name: milliseconds(part) for name, part in parts.items()})
-                    seen = int(visible(step.info).sum())
                     del step, parts
-            print(f"{gaussians:,} Gaussians, {seen:,} of them visible, a view of {self.width}×{self.height} px; ms:\n")
+            print(f"{gaussians:,} Gaussians, a view of {self.width}×{self.height} px; ms:\n")
             lines = [(name, *(f"{column[name]:.2f}" for column in columns)) for name in columns[0]]
             print(grid(("part", "gsplat and torch", "with our kernels"), lines), end="\n\n", flush=True)
         return 0
@@ -302,21 +291,18 @@ class Memory:
 
     def __call__(self) -> int:
         gpu()
-        phases = list(memory.step_bytes(0, memory.StepSize(), torch.device("cuda")))
-        header = ("Gaussians", "megapixels", "views", "million pairs (estimated)", *phases, "step", "plan / peak")
+        phases = (*memory.step_bytes(0, memory.StepSize(), torch.device("cuda")), "step")
         lines = []
         for gaussians, megapixels, views in product(self.gaussians, self.megapixels, self.views):
             step = Step(gaussians, *size_of(megapixels), views)
-            peaks, pairs = peaks_of(step), pairs_of(step)
-            planned = plan(step)
+            peaks, planned = peaks_of(step), plan(step)
             planned["step"], peaks["step"] = max(planned.values()), max(peaks.values())
-            cells = [f"{planned[name] / 1e9:.2f} / {peaks[name] / 1e9:.2f}" for name in planned]
-            told = f"{memory.StepSize.of([step.info]).pairs / 1e6:.1f} ({pairs / 1e6:.1f})"
+            cells = [f"{planned[name] / 1e9:.2f} / {peaks[name] / 1e9:.2f}" for name in phases]
             ratio = f"{planned['step'] / peaks['step']:.2f}"
-            lines.append((f"{gaussians:,}", f"{megapixels:g}", str(views), told, *cells, ratio))
+            lines.append((f"{gaussians:,}", f"{megapixels:g}", str(views), *cells, ratio))
             del step
             torch.cuda.empty_cache()
-        print(grid(header, lines, names=0))
+        print(grid(("Gaussians", "megapixels", "views", *phases, "plan / peak"), lines, names=0))
         return 0
 
 
@@ -342,14 +328,6 @@ def peaks_of(step: Step) -> dict[str, float]:
     torch.cuda.reset_peak_memory_stats()
     step(note)
     return peaks
-
-
-def pairs_of(step: Step) -> float:
-    """Pairs of a Gaussian and a tile in all views of a step, as the plan estimates them before the first one."""
-    poses = step.viewmats.inverse()[:, :3].cpu() * torch.tensor([1.0, -1.0, -1.0, 1.0])  # OpenCV's axes to OpenGL's
-    focal, centre = 0.8 * step.width, (step.width / 2, step.height / 2)
-    cameras = Cameras(poses, focal, focal, *centre, step.width, step.height)
-    return step.views * estimate_pairs(step.params, cameras)  # type: ignore[arg-type]
 
 
 @dataclass
@@ -386,11 +364,9 @@ class Together:
         for gaussians, megapixels, views in product(self.gaussians, self.megapixels, self.views):
             step = Step(gaussians, *size_of(megapixels), views, device, world, self.blocks)
             time, peak = step_time(step, self.repeats)
-            peaks = torch.tensor([peak], device=device)
-            peaks = world.gather(peaks)[:, 0]
-            each = ", ".join(f"{peak:.2f}" for peak in peaks.tolist())
+            peaks = world.gather(torch.tensor([peak], device=device))[:, 0].tolist()
             size = (str(number), f"{gaussians:,}", f"{megapixels:g}", str(views), str(self.blocks))
-            lines.append((*size, f"{time:.2f}", each))
+            lines.append((*size, f"{time:.2f}", ", ".join(f"{peak:.2f}" for peak in peaks)))
             del step
         if world.rank == 0:
             name = torch.cuda.get_device_name() if device.type == "cuda" else "CPU"
@@ -403,11 +379,7 @@ class Together:
 
 
 def step_time(step: Step, repeats: int) -> tuple[float, float]:
-    """Time steps that follow each other in all processes.
-
-    Returns:
-        Milliseconds a step, and the peak of this process's memory on the device in 10⁹ bytes, NaN without CUDA.
-    """
+    """Milliseconds a step, and the peak of this process's memory on the device in 10⁹ bytes, NaN without CUDA."""
 
     def steps() -> None:
         for _ in range(repeats):

@@ -11,7 +11,7 @@ from ranks import run_ranks
 
 from benchmarks import __main__ as bench
 from benchmarks import step as steps
-from benchmarks.step import REPEATS, Growth, Step, milliseconds, pairs_of, plan, step_time
+from benchmarks.step import REPEATS, Growth, Step, milliseconds, plan, step_time
 from sadgs_ns.distributed.world import World
 from sadgs_ns.method.memory import StepSize, step_bytes
 from sadgs_ns.render.rasterization import visible
@@ -63,7 +63,6 @@ def test_a_step_goes_through_the_phases_of_the_plan_and_has_their_size():
     assert phases == list(step_bytes(0, StepSize(), CPU))
     size = StepSize.of([step.info])
     assert (size.views, size.pixels) == (2, 2 * 40 * 30) and size.pairs > 400
-    assert 0.5 < pairs_of(step) / size.pairs < 4
     assert not torch.equal(step.params["means"], before)
     assert step.state["n_total"].sum() > 0 and step.state["absgrad2d"].sum() > 0
     kept = 200 * (4 * 4 * 59 + 4 * 13) + 2 * 2 * 3 * 40 * 30
