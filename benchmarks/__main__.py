@@ -12,6 +12,7 @@ import itertools
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -31,10 +32,9 @@ from benchmarks.results import Result
 from benchmarks.table import markdown
 
 POLL_SECONDS = 0.2
-KILL_SECONDS = 10.0
-"""How long a run may take to end when it is asked to, before it is killed."""
-TORCHRUN_SECONDS = 40.0
-"""The same of a run on several GPUs: torchrun kills its processes, which have sessions of their own, after 30 s."""
+KILL_SECONDS = 40.0
+"""How long a run may take to end when it is asked to, before it is killed: torchrun kills its processes, which have
+sessions of their own, after 30 s."""
 
 COMMANDS = {
     "table": ("table:Command", "the table of a results file, and plots of quality against time and Gaussians"),
@@ -60,35 +60,28 @@ def devices_of(gpu: str | None) -> list[str]:
     return [] if gpu is None else gpu.split("+")
 
 
-@dataclasses.dataclass
-class _Run:
-    job: Job
-    gpu: str | None
-    process: subprocess.Popen[bytes]
-    folder: tempfile.TemporaryDirectory[str]
+def _result(job: Job, code: int, folder: Path, log: Path) -> Result:
+    """What a process that has ended measured; the output of one that failed goes to the log."""
+    written, output = folder / "result.json", folder / "log"
+    error = f"the run ended with code {code} and no result; see {log}."
+    measured = json.loads(written.read_text()) if written.exists() else {"status": "failed", "error": error}
+    if measured["status"] == "failed" and output.exists():
+        with log.open("a") as file:
+            file.write(f"=== {job.key}\n{output.read_text(errors='replace')}\n")
+    identity = {"scene": job.scene.name, "label": job.row.label, "method": job.row.method, "seed": job.seed}
+    return {"key": job.key, **identity, "overrides": job.row.overrides, **measured}
 
-    def result(self, log: Path) -> Result:
-        """What the process, which has ended, measured; the output of one that failed goes to the log."""
-        written, output = Path(self.folder.name, "result.json"), Path(self.folder.name, "log")
-        error = f"the run ended with code {self.process.returncode} and no result; see {log}."
-        measured = json.loads(written.read_text()) if written.exists() else {"status": "failed", "error": error}
-        if measured["status"] == "failed" and output.exists():
-            with log.open("a") as file:
-                file.write(f"=== {self.job.key}\n{output.read_text(errors='replace')}\n")
-        row = self.job.row
-        identity = {"scene": self.job.scene.name, "label": row.label, "method": row.method, "seed": self.job.seed}
-        return {"key": self.job.key, **identity, "overrides": row.overrides, **measured}
 
-    def stop(self) -> None:
-        """End the process and what it started."""
-        try:
-            os.killpg(self.process.pid, signal.SIGTERM)
-            self.process.wait(TORCHRUN_SECONDS if len(devices_of(self.gpu)) > 1 else KILL_SECONDS)
-        except ProcessLookupError:
-            pass
-        except subprocess.TimeoutExpired:
-            os.killpg(self.process.pid, signal.SIGKILL)
-            self.process.wait()
+def _stop(process: subprocess.Popen[bytes]) -> None:
+    """End a process and what it started."""
+    try:
+        os.killpg(process.pid, signal.SIGTERM)
+        process.wait(KILL_SECONDS)
+    except ProcessLookupError:
+        pass
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
 
 
 def launcher(root: Path) -> Launch:
@@ -129,24 +122,24 @@ def run_all(
         finished: Called with each result as its run ends.
         log: Takes the output of runs that fail.
     """
-    pending, running = deque(jobs), list[_Run]()
-    free = deque(gpu for _ in range(jobs_per_gpu) for gpu in gpus)
-    try:
-        while running or pending:
-            while pending and free:
-                folder = tempfile.TemporaryDirectory(prefix="benchmarks-", ignore_cleanup_errors=True)
-                job, gpu = pending.popleft(), free.popleft()
-                running.append(_Run(job, gpu, launch(job, gpu, Path(folder.name)), folder))
-            for run in [run for run in running if run.process.poll() is not None]:
-                finished({**run.result(log), "jobs_per_gpu": jobs_per_gpu})
-                running.remove(run)
-                free.append(run.gpu)
-                run.folder.cleanup()
-            time.sleep(POLL_SECONDS if running else 0)
-    finally:
-        for run in running:
-            run.stop()
-            run.folder.cleanup()
+    pending, free = deque(jobs), deque(gpu for _ in range(jobs_per_gpu) for gpu in gpus)
+    running: list[tuple[subprocess.Popen[bytes], Job, str | None, Path]] = []
+    with tempfile.TemporaryDirectory(prefix="benchmarks-", ignore_cleanup_errors=True) as work:
+        try:
+            while running or pending:
+                while pending and free:
+                    job, gpu, folder = pending.popleft(), free.popleft(), Path(tempfile.mkdtemp(dir=work))
+                    running.append((launch(job, gpu, folder), job, gpu, folder))
+                for run in [run for run in running if run[0].poll() is not None]:
+                    process, job, gpu, folder = run
+                    finished({**_result(job, process.returncode, folder, log), "jobs_per_gpu": jobs_per_gpu})
+                    running.remove(run)
+                    free.append(gpu)
+                    shutil.rmtree(folder, ignore_errors=True)
+                time.sleep(POLL_SECONDS if running else 0)
+        finally:
+            for process, *_ in running:
+                _stop(process)
 
 
 def unfinished(jobs: Sequence[Job], done: Sequence[Result]) -> list[Job]:
@@ -222,7 +215,7 @@ class Benchmark:
         jobs = self.selected()
         gpus = self.gpus.split(",") if self.gpus else (None,)
         devices = {max(len(devices_of(gpu)), 1) for gpu in gpus}
-        done = results.read(self.output)
+        done = results.read(self.output, missing_ok=True)
         devices |= {result["devices"] for result in done if result.get("devices") is not None}
         if len(devices) > 1:
             raise ValueError(

@@ -3,31 +3,12 @@
 A table stands between `<!-- table: NAME -->` and `<!-- end -->`. What it is made of is in docs/results/tables.yaml:
 
     megapixels: {fox: 0.68}
-    tables:
-      main:                     # a run a line; several seeds are a mean ± half their range
-        kind: runs
-        columns: [scene, method, loop, ratio, psnr]
-        lines:
-          - {rows: beside.jsonl, scenes: [fox], labels: {splatfacto: splatfacto, ours: sadgs}, reference: splatfacto}
-      thresholds:               # a setting a line, as its difference from the first one
-        kind: sweep
-        rows: [sweep.jsonl]
-        labels: {T1: × 1, T2: × 2}
-        scenes: {fox: [fox], castle: [castle, castle-2]}   # a column each, of the mean of these scenes
-      storage: {kind: approximations, rows: approximations.jsonl, of: structure_tensor, input: demo}
-      growth: {kind: growth, rows: growth.csv}
-    figures:                    # docs/figures/NAME.png
-      peers-time:               # quality against the field `cost`, a run a point
-        kind: peers
-        cost: loop_seconds
-        lines: [{rows: peers.jsonl, scenes: [fox], labels: {splatfacto: splatfacto}}]
-        elsewhere: [{rows: ours.jsonl, scenes: [fox], labels: {ours: sadgs}}]
-      quality-time: {kind: quality, cost: loop_seconds, rows: beside.jsonl}
-      growth: {kind: growth, rows: growth.csv}
+    tables: {NAME: {kind: runs, …}}     # of the methods of `Source`
+    figures: {NAME: {kind: peers, …}}   # of those whose names end in `_drawn`: docs/figures/NAME.png
 
-Labels are those of the rows, with the name that the table gives them, or the figure, where names of one method begin
-with the same word. A figure holds a digest of what it was drawn from, which is compared, since pixels depend on
-matplotlib's version.
+`kind` is the method and the other keys are its arguments, `lines` being those of `Source.lines`. Labels are those of
+the rows, with the name that the table gives them, or the figure, where names of one method begin with the same word. A
+figure holds a digest of what it was drawn from, which is compared, since pixels depend on matplotlib's version.
 """
 
 from __future__ import annotations

@@ -34,10 +34,9 @@ class Metric:
     def __post_init__(self) -> None:
         if self.direction not in DIRECTIONS:
             raise ValueError(f"direction must be one of {', '.join(DIRECTIONS)}")
-        if not all(type(n) in (int, float) and math.isfinite(n) for n in (self.value, self.tolerance)):
-            raise ValueError("value and tolerance must be numbers")
-        if self.tolerance < 0:
-            raise ValueError("tolerance must be at least 0")
+        numbers = (self.value, self.tolerance)
+        if not all(type(n) in (int, float) and math.isfinite(n) for n in numbers) or self.tolerance < 0:
+            raise ValueError("value must be a number, and tolerance one from 0")
 
     def fails(self, value: float) -> bool:
         """Whether a value is worse than the tolerance allows; one that is no number always is."""

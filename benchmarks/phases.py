@@ -7,17 +7,19 @@ backward pass and the optimizers. Whatever lies between them is the rest, so the
 from __future__ import annotations
 
 import contextlib
-import functools
+import itertools
 import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 import sadgs_ns.method.strategy
+from benchmarks.evaluate import now
 
 PHASES: tuple[str, ...] = ("rasterize_forward", "rasterize_backward", "loss", "eta", "optimizer", "rest")
 STEPS = 30
@@ -55,16 +57,16 @@ class Stopwatch:
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
-        self._marks: list[tuple[str, Any]] = []  # the phase that begins, and when
+        self._marks: list[tuple[str, Any]] = [("rest", None)]  # the phase that begins, and when
 
     @property
     def phase(self) -> str:
         """What time is booked under now."""
-        return self._marks[-1][0] if self._marks else "rest"
+        return self._marks[-1][0]
 
     def restart(self) -> None:
         """Forget what was booked."""
-        self._wait()
+        now()
         self._marks.clear()
         self.begin("rest")
 
@@ -80,32 +82,24 @@ class Stopwatch:
     def seconds(self) -> dict[str, float]:
         """Seconds of each phase since `restart`; they add up to all of the time since then."""
         self.begin(self.phase)
-        self._wait()
+        now()
         total = dict.fromkeys(PHASES, 0.0)
-        for (phase, start), (_, end) in zip(self._marks[:-1], self._marks[1:], strict=True):
+        for (phase, start), (_, end) in itertools.pairwise(self._marks):
             total[phase] += start.elapsed_time(end) / 1000 if self._device.type == "cuda" else end - start
         return total
 
-    def _wait(self) -> None:
-        if self._device.type == "cuda":
-            torch.cuda.synchronize(self._device)
+    def during(self, phase: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """A function whose time is booked under a phase, and what follows it as what came before."""
 
-    def during(self, phase: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-        """A decorator: the function's time is booked under a phase, and what follows as what came before."""
+        def booked(*args: Any, **kwargs: Any) -> Any:
+            before = self.phase
+            self.begin(phase)
+            try:
+                return function(*args, **kwargs)
+            finally:
+                self.begin(before)
 
-        def wrap(function: Callable[..., Any]) -> Callable[..., Any]:
-            @functools.wraps(function)
-            def booked(*args: Any, **kwargs: Any) -> Any:
-                before = self.phase
-                self.begin(phase)
-                try:
-                    return function(*args, **kwargs)
-                finally:
-                    self.begin(before)
-
-            return booked
-
-        return wrap
+        return booked
 
     def when_gradient_arrives(self, tensor: Any, phase: str) -> None:
         """In the backward pass, book the time from the tensor's gradient on under a phase."""
@@ -120,7 +114,7 @@ def booked(trainer: Any, watch: Stopwatch) -> Iterator[None]:
 
     def rendering(function: Callable[..., Any]) -> Callable[..., Any]:
         def render(*args: Any, **kwargs: Any) -> Any:
-            outputs = watch.during("rasterize_forward")(function)(*args, **kwargs)
+            outputs = watch.during("rasterize_forward", function)(*args, **kwargs)
             watch.when_gradient_arrives(outputs["rgb"], "rasterize_backward")
             return outputs
 
@@ -128,7 +122,7 @@ def booked(trainer: Any, watch: Stopwatch) -> Iterator[None]:
 
     def losing(function: Callable[..., Any]) -> Callable[..., Any]:
         def lose(*args: Any, **kwargs: Any) -> Any:
-            losses = watch.during("loss")(function)(*args, **kwargs)
+            losses = watch.during("loss", function)(*args, **kwargs)
             for loss in losses.values():  # with several renderings a step, this one's backward pass begins here
                 watch.when_gradient_arrives(loss, "loss")
             return losses
@@ -140,11 +134,11 @@ def booked(trainer: Any, watch: Stopwatch) -> Iterator[None]:
     places: list[tuple[Any, str, Any]] = [
         (model, render, rendering),
         (model, "get_loss_dict", losing),
-        (torch.Tensor, "backward", watch.during("loss")),
-        (sadgs_ns.method.strategy, "observe", watch.during("eta")),
+        (torch.Tensor, "backward", partial(watch.during, "loss")),
+        (sadgs_ns.method.strategy, "observe", partial(watch.during, "eta")),
     ]
-    for name in ("zero_grad_some", "optimizer_scaler_step_some", "scheduler_step_all"):
-        places.append((optimizers, name, watch.during("optimizer")))
+    zeroing_and_steps = ("zero_grad_some", "optimizer_scaler_step_some", "scheduler_step_all")
+    places += [(optimizers, name, partial(watch.during, "optimizer")) for name in zeroing_and_steps]
     if getattr(trainer, "graphed", None) is not None:  # A graph has no seams.
         places.append((trainer, "graphed", lambda graphed: None))
     with contextlib.ExitStack() as stack:
@@ -182,13 +176,9 @@ def measure(trainer: Any, steps: int = STEPS) -> dict[str, float]:
     It is a step with the trained model's Gaussians as within the densification window, longer than the run's mean step:
     the strategy observes η and gathers gradients as in a step that AbsGS reads, but densifies nothing.
 
-    Phases:
-        rasterize_forward: From the parameters to the image, activations and background included, η excluded.
-        rasterize_backward: From the image's gradient to the parameters' gradients.
-        loss: From the image and the photograph to the loss, and from there to the image's gradient.
-        eta: Observing η. It is due every `eta_every` steps; this is its share of each. 0 without such a strategy.
-        optimizer: Zeroing gradients, the optimizers, and the learning rates' schedules.
-        rest: Choosing views, metrics, gathering structure tensors and gradient statistics, nerfstudio's overhead.
+    `rasterize_forward` ends with the image, `rasterize_backward` begins with its gradient, and `loss` is what lies
+    between, forth and back. `eta` is the observation's share of each step, `optimizer` includes zeroing gradients and
+    the rates' schedules, and `rest` is choosing views, metrics, gradient statistics and nerfstudio's overhead.
 
     Args:
         trainer: A nerfstudio Trainer after `train`; its model goes on training.

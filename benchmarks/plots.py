@@ -33,35 +33,18 @@ _OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#000000", "#CC79A7", "#56B4E9", 
 _MARKERS = "os^DvPX*<>ph"
 _SHOWN_BELOW = {"psnr": 5.0, "ssim": 0.15, "lpips": 0.2}
 """How much worse than the worst final value a curve's beginning may be and still be shown."""
-_INK, _GREY = "#222222", "#767676"
-_WIDTH = 7.2
+_GREY, _WIDTH = "#767676", 7.2
 _LEAST_RATIO = 5.0
 """Between the ends of a logarithmic axis; the ticks below then are at least three."""
 _TICKS = {12: (1, 2, 3, 5), 50: (1, 2, 5), 500: (1, 3)}
 """Where a logarithmic axis has ticks within a decade, by the ratio that its ends stay below."""
 _RC: Any = {
-    "font.size": 8,
-    "axes.titlesize": 9,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": _GREY,
-    "axes.labelcolor": _INK,
-    "text.color": _INK,
-    "xtick.color": _INK,
-    "ytick.color": _INK,
-    "axes.xmargin": 0.08,
-    "axes.ymargin": 0.08,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#e4e4e4",
-    "grid.linewidth": 0.6,
-    "legend.frameon": False,
-    "figure.labelsize": 8,
+    **{"font.size": 8, "figure.labelsize": 8, "axes.titlesize": 9, "axes.titleweight": "bold"},
+    **{"axes.titlelocation": "left", "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": _GREY},
+    **{"axes.xmargin": 0.08, "axes.ymargin": 0.08, "axes.grid": True, "axes.axisbelow": True},
+    **{"grid.color": "#e4e4e4", "grid.linewidth": 0.6, "legend.frameon": False, "savefig.facecolor": "white"},
     "figure.constrained_layout.use": True,
     "text.parse_math": False,  # a label may hold dollars
-    "savefig.facecolor": "white",
 }
 _FRONT: dict[str, Any] = {"color": _GREY, "linewidth": 1.0, "drawstyle": "steps-post", "zorder": 1}
 _styled = matplotlib.rc_context(_RC)
@@ -104,14 +87,8 @@ def quality(results: Iterable[tuple[tuple[str, str], list[Result]]], cost: str) 
     scenes = list(dict.fromkeys(scene for scene, _ in groups))
     looks = styles(label for _, label in groups)
     figure = Figure(figsize=(_WIDTH, 1.9 * len(scenes) + 0.6))
-    panels = dict(
-        zip(
-            itertools.product(scenes, METRICS),
-            figure.subplots(len(scenes), len(METRICS), sharex="row", squeeze=False).flat,
-            strict=True,
-        )
-    )
-    for (scene, metric), axes in panels.items():
+    grid = figure.subplots(len(scenes), len(METRICS), sharex="row", squeeze=False)
+    for (scene, metric), axes in zip(itertools.product(scenes, METRICS), grid.flat, strict=True):
         here = [(label, group) for (where, label), group in groups.items() if where == scene]
         ends = {label: _known([(mean(group, cost), mean(group, metric))]) for label, group in here}
         for label, group in here:

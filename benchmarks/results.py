@@ -10,38 +10,34 @@ from typing import Any
 
 Result = dict[str, Any]
 """What `benchmarks.run` measured, with `key`, `status` ("ok" or "failed") and `error`."""
-_IDENTITY = ("key", "scene", "label", "seed", "status")
 
 
-def read(path: Path, strict: bool = False) -> list[Result]:
-    """Results in the order they ended; the last one of each key, none if there is no file.
+def read(path: Path, missing_ok: bool = False) -> list[Result]:
+    """Results in the order they ended; the last one of each key.
 
-    A line that a killed benchmark left half-written is reported on stderr and ignored.
-
-    Args:
-        strict: Whether such a line, one that does not say whose result it is, or no file is an error.
+    A line that is no result, such as one that a killed benchmark left half-written, is reported on stderr and ignored.
 
     Raises:
-        ValueError: With `strict`; names the file and the line.
+        ValueError: There is no such file, unless `missing_ok`, or it is not text.
     """
-    if strict and not path.is_file():
+    if not path.is_file():
+        if missing_ok:
+            return []
         raise ValueError(f"{path} is not a file; give one that python -m benchmarks wrote.")
     results: dict[str, Result] = {}
     try:
-        lines = path.read_text("utf-8").splitlines() if path.exists() else []
+        lines = path.read_text("utf-8").splitlines()
     except UnicodeDecodeError as error:
         raise ValueError(f"{path} is not text; give a file that python -m benchmarks wrote.") from error
     for number, line in enumerate(lines, 1):
         try:
             result = json.loads(line)
-            for name in _IDENTITY if strict else ():
-                result[name]
-            results.pop(result["key"], None)
-            results[result["key"]] = result
-        except (ValueError, KeyError, TypeError) as error:
-            if strict:
-                raise ValueError(f"{path}:{number} is not a benchmark's result; delete that line.") from error
+            key, *_ = (result[name] for name in ("key", "scene", "label", "seed", "status"))
+        except (ValueError, KeyError, TypeError):
             print(f"{path}:{number} is not a result and is ignored.", file=sys.stderr)
+            continue
+        results.pop(key, None)
+        results[key] = result
     return list(results.values())
 
 

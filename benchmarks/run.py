@@ -128,8 +128,7 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
     from nerfstudio.scripts.train import _set_random_seed
 
     from benchmarks import evaluate, launches, phases
-    from benchmarks.curve import Curve, point
-    from benchmarks.timer import LoopTimer
+    from benchmarks.curve import Curve, LoopTimer, point
     from sadgs_ns.plugin import processes
 
     devices = processes.number_of_processes()
@@ -256,37 +255,25 @@ def alone(job: Job, root: Path, work: Path, checkpoint: Path) -> Any:
 
 
 def software() -> dict[str, str | None]:
-    """Versions, of what was imported where that tells its own, and the git commit if this package is a checkout."""
+    """Versions, of what was imported where that tells its own, and the commit of this checkout, if git knows it."""
     versions: dict[str, str | None] = {}
     for name in ("torch", "gsplat", "nerfstudio", "sadgs_ns"):
-        try:
-            # Two installations in one folder have two metadata, of which the first need not be what runs.
-            versions[name] = getattr(sys.modules.get(name), "__version__", None) or importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            versions[name] = None
-    return {**versions, "commit": _commit(Path(__file__).resolve().parents[1])}
-
-
-def _commit(checkout: Path) -> str | None:
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(checkout), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-
-    try:
-        # Not the commit of some repository that happens to hold a virtual environment.
-        if Path(git("rev-parse", "--show-toplevel")) != checkout:
-            return None
-        return git("describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
-    except (OSError, subprocess.CalledProcessError):
-        return None
+        # Two installations in one folder have two metadata, of which the first need not be what runs.
+        versions[name] = getattr(sys.modules.get(name), "__version__", None)
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            versions[name] = versions[name] or importlib.metadata.version(name)
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    with contextlib.suppress(OSError):  # there is no git
+        versions["commit"] = subprocess.run(command, capture_output=True, text=True).stdout.strip() or None
+    return versions
 
 
 def describe(error: Exception) -> str:
     """One sentence for a run that failed."""
+    message = (str(error).strip().splitlines() or ["no message"])[0]
     if isinstance(error, (urllib.error.URLError, ConnectionError, TimeoutError)):
         file = "hub/checkpoints/alexnet-owt-7be5be79.pth"
         return f"nerfstudio could not download the LPIPS weights; set TORCH_HOME to a folder that holds {file}."
-    message = (str(error).strip().splitlines() or ["no message"])[0]
     return message if isinstance(error, ValueError) else f"{type(error).__name__}: {message}"
 
 

@@ -103,6 +103,12 @@ class Run:
             raise ValueError(f"{self.group[0]['key']} has no {field}; leave that column out.")
         return value
 
+    def spread(self, field: str, digits: int) -> str:
+        """The mean ± half the range of the seeds."""
+        several = len(values(self.group, field)) > 1
+        spread = f" ± {number(half_range(self.group, field), digits)}" if several else ""
+        return number(self.mean(field), digits) + spread
+
     def seconds(self) -> str:
         """Loop seconds of which three digits count."""
         return number(self.mean("loop_seconds"), 0 if self.mean("loop_seconds") >= 100 else 1)
@@ -119,14 +125,7 @@ class Run:
 
 
 def _spread(field: str, digits: int) -> Callable[[Run], str]:
-    """A cell: the mean ± half the range of the seeds."""
-
-    def cell(run: Run) -> str:
-        several = len(values(run.group, field)) > 1
-        spread = f" ± {number(half_range(run.group, field), digits)}" if several else ""
-        return number(run.mean(field), digits) + spread
-
-    return cell
+    return lambda run: run.spread(field, digits)
 
 
 def _fraction(ratio: float) -> str:
@@ -178,9 +177,8 @@ def of_runs(runs: Iterable[Run], columns: Sequence[str | Sequence[str]], strict:
                 raise
             return NOTHING
 
-    for name in columns:
-        if isinstance(name, str) and name not in COLUMNS:
-            raise ValueError(f"there is no column {name!r}; there are {', '.join(COLUMNS)}.")
+    if unknown := {name for name in columns if isinstance(name, str)} - COLUMNS.keys():
+        raise ValueError(f"there is no column {', '.join(map(repr, unknown))}; there are {', '.join(COLUMNS)}.")
     known = [COLUMNS[name] if isinstance(name, str) else (name[0], _spread(name[1], 1)) for name in columns]
     lines = ([cell(column, run) for _, column in known] for run in runs)
     return grid([header for header, _ in known], lines, sum(name in WORDS for name in columns))
@@ -295,30 +293,25 @@ def _short(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.2g}"
 
 
-def _percent(value: float) -> str:
-    return f"{_short(100 * value)} %"
-
-
-def _errors(of: str) -> dict[str, tuple[str, Callable[[Any], str]]]:
-    names = {"median": f"{of}, median", "p95": f"{of}, 95 %", "max": f"{of}, max", "flips": "η > 1 flips"}
-    return {field: (name, _percent) for field, name in names.items()}
-
-
-APPROXIMATIONS: dict[str, dict[str, tuple[str, Callable[[Any], str]]]] = {
-    "structure_tensor": {"bytes": ("Bytes/px", str), **_errors("Λ"), "ms": ("ms an image", _short)},
-    "footprint": {**_errors("η"), "ms": ("ms a view", _short)},
-}
-"""Header and form of each number of the tables that `approximations` measures."""
+_ERRORS = {"median": "{}, median", "p95": "{}, 95 %", "max": "{}, max", "flips": "η > 1 flips"}
+APPROXIMATIONS: dict[str, dict[str, str]] = {
+    "structure_tensor": {
+        "bytes": "Bytes/px", **{name: header.format("Λ") for name, header in _ERRORS.items()}, "ms": "ms an image"
+    },
+    "footprint": {**{name: header.format("η") for name, header in _ERRORS.items()}, "ms": "ms a view"},
+}  # fmt: skip
+"""Headers of the numbers of the tables that `approximations` measures."""
 
 
 def of_approximations(rows: Sequence[Mapping[str, Any]]) -> str:
     """Rows of one of `approximations`' tables; a number that is None is a dash."""
+
+    def cell(name: str, value: float | None) -> str:
+        return NOTHING if value is None else f"{_short(100 * value)} %" if name in _ERRORS else _short(value)
+
     columns = APPROXIMATIONS[rows[0]["table"]]
-    lines = (
-        (row["variant"], *(NOTHING if row[name] is None else form(row[name]) for name, (_, form) in columns.items()))
-        for row in rows
-    )
-    return grid(("Variant", *(header for header, _ in columns.values())), lines)
+    lines = ((row["variant"], *(cell(name, row[name]) for name in columns)) for row in rows)
+    return grid(("Variant", *columns.values()), lines)
 
 
 @dataclass
@@ -333,7 +326,7 @@ class Command:
     """folder that takes quality-time.png and quality-count.png"""
 
     def __call__(self) -> int:
-        rows = results.read(self.results, strict=True)
+        rows = results.read(self.results)
         grouped = groups(latest(rows))
         if not grouped:
             raise ValueError(f"{self.results} has no successful run among its {len(rows)}.")

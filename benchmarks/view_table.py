@@ -28,9 +28,9 @@ def load(paths: Iterable[Path]) -> dict[str, dict[str, list[Result]]]:
     """Read the latest runs by scene and label; those without `view_psnr` are left out with one line on stderr.
 
     Raises:
-        ValueError: A file is missing, or a line of it is no result; names it.
+        ValueError: A file is missing; names it.
     """
-    rows = [row for path in paths for row in results.read(path, strict=True)]
+    rows = [row for path in paths for row in results.read(path)]
     found: dict[str, dict[str, list[Result]]] = {}
     for row in (latest := table.latest(rows)):
         if row.get("view_psnr"):

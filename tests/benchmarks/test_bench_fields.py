@@ -21,7 +21,7 @@ from PIL import Image
 from torch import Tensor
 
 from benchmarks import __main__ as bench
-from benchmarks import evaluate, phases, protocol, run, timer
+from benchmarks import curve, evaluate, phases, protocol, run
 from benchmarks.curve import undisturbed
 from benchmarks.phases import PHASES, Stopwatch
 from benchmarks.protocol import Job, Row, Scene
@@ -95,7 +95,7 @@ def replace_lpips(patch: pytest.MonkeyPatch) -> None:
         return time.perf_counter() + 3600 * RestlessNetwork.hours
 
     patch.setattr(evaluate, "now", now)
-    patch.setattr(timer, "now", now)
+    patch.setattr(curve, "now", now)
 
 
 def replace_gsplat(patch: pytest.MonkeyPatch) -> None:
@@ -155,13 +155,13 @@ def test_the_curve_changes_nothing_in_the_training(runs: Runs):
 
 def test_the_curve_ends_in_the_finished_run(runs: Runs):
     record, _ = runs["with"]
-    curve = record["curve"]
-    assert [set(point) for point in curve] == [{"step", "seconds", "psnr", "ssim", "lpips", "gaussians"}] * 3
-    assert [point["step"] for point in curve] == [5, 10, ITERATIONS]
+    points = record["curve"]
+    assert [set(point) for point in points] == [{"step", "seconds", "psnr", "ssim", "lpips", "gaussians"}] * 3
+    assert [point["step"] for point in points] == [5, 10, ITERATIONS]
     assert {name: record[name] for name in ("psnr", "ssim", "lpips", "gaussians")} == {
-        name: curve[-1][name] for name in ("psnr", "ssim", "lpips", "gaussians")
+        name: points[-1][name] for name in ("psnr", "ssim", "lpips", "gaussians")
     }
-    assert curve[0]["psnr"] != curve[-1]["psnr"]
+    assert points[0]["psnr"] != points[-1]["psnr"]
     assert "curve" not in runs["without"][0]
 
 
@@ -174,9 +174,9 @@ def test_no_time_contains_the_evaluation(runs: Runs):
 
 def test_the_timer_stops(monkeypatch: pytest.MonkeyPatch):
     clock = iter([1.0, 4.0, 16.0, 20.0])
-    monkeypatch.setattr(timer, "now", lambda: next(clock))
+    monkeypatch.setattr(curve, "now", lambda: next(clock))
     trainer = SimpleNamespace(config=SimpleNamespace(max_num_iterations=7), callbacks=[])
-    watch = timer.LoopTimer()
+    watch = curve.LoopTimer()
     watch.attach(trainer)
     begin, end = trainer.callbacks
     begin.run_callback(0)
@@ -290,8 +290,8 @@ def test_stopwatch_books_everything(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(phases, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
     watch = Stopwatch(torch.device("cpu"))
     watch.restart()
-    inner = watch.during("eta")(lambda: watch.phase)
-    assert watch.during("rasterize_forward")(inner)() == "eta"
+    inner = watch.during("eta", lambda: watch.phase)
+    assert watch.during("rasterize_forward", inner)() == "eta"
     assert watch.seconds() == {**dict.fromkeys(PHASES, 0.0), "rasterize_forward": 3.0, "eta": 3.0, "rest": 9.0}
 
 
