@@ -46,14 +46,13 @@ def bounding_box_points(points: Tensor, grid: int = FACE_GRID) -> tuple[Tensor, 
     return placed, float((high - low).mean()) / grid
 
 
-def neighbour_scales(points: Tensor, neighbours: int = 3) -> Tensor:
-    """The initial scale of each point, which is the mean distance to its nearest neighbours (3DGS, splatfacto).
+def neighbour_scales(points: Tensor) -> Tensor:
+    """The initial scale of each point, which is the mean distance to its 3 nearest neighbours (3DGS, splatfacto).
 
     Duplicates have distance 0; the scale is then a millionth of the cloud's extent, so that its logarithm is finite.
 
     Args:
         points: World units. [P, 3]
-        neighbours: How many neighbours count, or all others where the cloud is smaller.
 
     Returns:
         World units, > 0. [P]
@@ -64,7 +63,7 @@ def neighbour_scales(points: Tensor, neighbours: int = 3) -> Tensor:
     if len(points) == 0:
         raise ValueError("There are no points to start from: give SfM points, or set pipeline.model.random-init True.")
     extent = float((points.amax(0) - points.amin(0)).norm()) or 1.0
-    k = min(neighbours, len(points) - 1)
+    k = min(3, len(points) - 1)
     if k < 1:
         return torch.full_like(points[:, 0], 0.01 * extent)
     array = points.detach().cpu().numpy()

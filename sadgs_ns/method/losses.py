@@ -13,6 +13,8 @@ from sadgs_ns.kernels import use_triton
 
 WINDOW = tuple(_fspecial_gauss_1d(11, 1.5).flatten().tolist())
 """SSIM's window along one axis: a Gaussian of σ = 1.5 px on 11 px."""
+L2_LAMBDA = 2.0
+"""Factor on the mean square error in the loss."""
 
 
 @lru_cache(maxsize=8)
@@ -26,7 +28,7 @@ def photometric_loss(
     target: Tensor,  # [C, H, W, 3]
     *,
     ssim_lambda: float = 0.2,
-    l2_lambda: float = 2.0,
+    l2_lambda: float = L2_LAMBDA,
     parts: Tensor | None = None,  # [P]
 ) -> tuple[Tensor, Tensor]:
     """(1 − λ) L1 + λ (1 − SSIM) + λ_2 ℓ2, each a mean over views, pixels and channels.
@@ -78,7 +80,6 @@ def photometric_part(
     top: int,
     height: int,
     ssim_lambda: float = 0.2,
-    l2_lambda: float = 2.0,
 ) -> tuple[Tensor, Tensor]:
     """What some rows of a view add to its `photometric_loss`: over rows that cover the view, these parts sum to it.
 
@@ -91,7 +92,6 @@ def photometric_part(
         top: Which row of the view is the first of `predicted`.
         height: Of the view in px, at least 11 unless all rows count.
         ssim_lambda: As for `photometric_loss`.
-        l2_lambda: As for `photometric_loss`.
 
     Returns:
         The part of the loss, and that of the mean square error, without gradient; both are scalars.
@@ -101,9 +101,7 @@ def photometric_part(
     """
     first, last = rows
     if last - first == height:
-        loss, psnr = photometric_loss(
-            predicted, target, ssim_lambda=ssim_lambda, l2_lambda=l2_lambda
-        )  # fmt: skip
+        loss, psnr = photometric_loss(predicted, target, ssim_lambda=ssim_lambda)
         return loss, torch.pow(10, -psnr / 10)
     share, reach = (last - first) / height, len(WINDOW) // 2
     begin, end = max(first - reach, 0), min(last + reach, height)
@@ -114,5 +112,5 @@ def photometric_part(
     values = target[:, counted]
     difference = predicted[:, counted] - (values / 255.0 if values.dtype == torch.uint8 else values)
     l1, l2 = difference.abs().mean(), difference.square().mean()
-    loss = share * ((1 - ssim_lambda) * l1 + l2_lambda * l2) + windows * ssim_lambda * dissimilarity
+    loss = share * ((1 - ssim_lambda) * l1 + L2_LAMBDA * l2) + windows * ssim_lambda * dissimilarity
     return loss, share * l2.detach()

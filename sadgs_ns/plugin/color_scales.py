@@ -73,13 +73,13 @@ def to_picture(image: Tensor) -> Picture:
     return (255 * image.detach().float().clamp(0, 1)).round().byte().cpu().numpy()
 
 
-def bar(scale: Scale, width: int = 720) -> Picture:
-    """Return the scale's colours, so many px wide, with its numbers below them, to be shown at about half that size."""
+def bar(scale: Scale) -> Picture:
+    """Return the scale's colours, 720 px wide, with its numbers below them, to be shown at about half that size."""
     from matplotlib.font_manager import findfont
 
-    size = width // 24
-    font, x0, length = ImageFont.truetype(findfont("DejaVu Sans"), size), size, width - 3 * size
-    image = Image.new("RGB", (width, 3 * size), (20, 20, 20))
+    size, length = 30, 630
+    font, x0 = ImageFont.truetype(findfont("DejaVu Sans"), size), size
+    image = Image.new("RGB", (length + 3 * size, 3 * size), (20, 20, 20))
     ramp = scale.colormap(np.linspace(0, 1, length), bytes=True)[None, :, :3]
     image.paste(Image.fromarray(np.repeat(ramp, size, axis=0)), (x0, size // 3))
     pen = ImageDraw.Draw(image)
