@@ -51,19 +51,12 @@ def measure(trainer: Any, steps: int = STEPS) -> dict[str, Any] | None:
 
 
 def summarize(events: Iterable[Any]) -> dict[str, Any]:
-    """Count what happened in the steps of a profile.
+    """Return means of a step in a profile of torch's, whose events have times in µs.
 
-    Args:
-        events: torch's profiler events, each with `name`, `device_type`, `is_user_annotation` and `time_range` in µs.
-
-    Returns:
-        Means of a step:
-            launches: Kernels, copies and fills that the host asked for; a graph is one.
-            calls: The same by the name of CUDA's function; Triton launches with `cuLaunchKernelEx`.
-            waits: Calls in which the host waited for the device.
-            wait_milliseconds: How long these took.
-            busy: Share of the time from the first step's start to the last one's end in which the device worked; None
-                where the profiler saw nothing of the device, which some drivers forbid.
+    `launches` counts kernels, copies and fills that the host asked for, a graph as one, and `calls` the same by the
+    name of CUDA's function. `waits` counts calls in which the host waited for the device, for `wait_milliseconds`.
+    `busy` is the share of all steps' time in which the device worked; None where the profiler saw nothing of it, which
+    some drivers forbid.
     """
     events = list(events)
     ranges = [e.time_range for e in events if e.name == _STEP and e.device_type.name == "CPU"]

@@ -199,7 +199,7 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
         **coverage_of_views(datamanager, model),
         "gaussians": int(model.num_points),
         "peak_gb": timer.peak_gb,
-        "train_views": len(train_images),
+        "train_views": len(datamanager.train_dataset),
         "eval_views": len(views),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
     }
