@@ -40,11 +40,7 @@ def versions() -> dict[str, str]:
 
 
 def check_machine() -> Iterator[Finding]:
-    """Check torch, its device, the kernels, LPIPS's weights and what nerfstudio's commands need.
-
-    Notes say what is in order. Nothing is downloaded; on CUDA a small kernel is compiled, and gsplat's, if they never
-    were.
-    """
+    """Check torch, its device, the kernels, LPIPS's weights and what nerfstudio's commands need; download nothing."""
     try:
         import torch
 

@@ -103,12 +103,9 @@ def _arrays(params: Mapping[str, Tensor]) -> dict[str, NDArray[np.floating]]:
 
 
 def export(given: Export) -> int:
-    """Write the Gaussians of a run of sadgs or splatfacto, or a mesh, and say what was taken away of the Gaussians.
+    """Write the Gaussians of a run of sadgs or splatfacto, or a mesh; return the number of Gaussians or triangles.
 
-    Nothing in the run's folder is executed, not even its `config.yml`.
-
-    Returns:
-        The number of Gaussians written, or of triangles.
+    One printed line says what each option took away. Nothing in the run's folder is executed, not even `config.yml`.
 
     Raises:
         InputError: If the run, the capture, an option or the output cannot be used.
@@ -131,8 +128,8 @@ def export(given: Export) -> int:
                 "where it was made, or export in nerfstudio's frame."
             )
         similarity = from_data(folder / TRANSFORMS_NAME).inverse()
-    trained = read_checkpoint(given.run)
-    params, drawing = trained.params, {"max_off_axis": _MAX_OFF_AXIS, "near_plane": trained.near_plane}
+    checkpoint, params, near_plane = read_checkpoint(given.run)
+    drawing = {"max_off_axis": _MAX_OFF_AXIS, "near_plane": near_plane}
     if params["features_rest"].shape[1] == 0:  # then training holds colours' logits
         params["features_dc"] = (params["features_dc"].sigmoid() - 0.5) / DEGREE_0
     cameras = None
@@ -143,7 +140,7 @@ def export(given: Export) -> int:
     try:
         of_parameters(_arrays(params))
     except ValueError as error:
-        told = f"{trained.checkpoint} holds no Gaussians that can be exported ({error}): {_REMEDY}."
+        told = f"{checkpoint} holds no Gaussians that can be exported ({error}): {_REMEDY}."
         raise InputError(told) from error
     params, start = _cleaned(params, cleaning, cameras, drawing), None
     if is_mesh and cameras is not None:
@@ -206,28 +203,19 @@ def _checkpoint_of(run: Path) -> Path:
     if run.suffix == ".ckpt" and run.is_file():
         return run
     folder = run.parent if run.is_file() else run
-    found = [*folder.glob("step-*.ckpt"), *folder.glob("*/step-*.ckpt")]
-    found = [path for path in found if path.stem[5:].isdecimal()]
+    found = [path for depth in ("", "*/") for path in folder.glob(f"{depth}step-*.ckpt") if path.stem[5:].isdecimal()]
     if not found:
         what = "does not exist" if not run.exists() else "holds no checkpoint"
         raise InputError(f"{run} {what}: give the folder of a run, its config.yml or a checkpoint step-*.ckpt.")
     return max(found, key=lambda path: int(path.stem[5:]))
 
 
-@dataclass(frozen=True)
-class Trained:
-    """What a checkpoint says of its Gaussians."""
-
-    checkpoint: Path
-    params: dict[str, Tensor]
-    """`means` [N, 3], log `scales` [N, 3], `quats` [N, 4], logit `opacities` [N, 1] and coefficients of harmonics,
-    `features_dc` [N, 3] and `features_rest` [N, K − 1, 3], on the CPU."""
-    near_plane: float
-    """Depth from which the run draws, in world units."""
-
-
-def read_checkpoint(run: Path) -> Trained:
+def read_checkpoint(run: Path) -> tuple[Path, dict[str, Tensor], float]:
     """Read a run's Gaussians, mapped from the file, so that what is not read takes no memory.
+
+    Returns:
+        The checkpoint; its `means` [N, 3], log `scales` [N, 3], `quats` [N, 4], logit `opacities` [N, 1], and harmonics
+        `features_dc` [N, 3] and `features_rest` [N, K, 3], on the CPU; and the run's near plane in world units.
 
     Raises:
         InputError: If there is no checkpoint of this method or of splatfacto.
@@ -252,7 +240,7 @@ def read_checkpoint(run: Path) -> Trained:
         params[name] = value
     state = loaded.get("_model._extra_state")
     near_plane = state.get("near_plane", NEAR_PLANE) if isinstance(state, dict) else NEAR_PLANE
-    return Trained(checkpoint, params, near_plane)
+    return checkpoint, params, near_plane
 
 
 def main(argv: Sequence[str] | None = None) -> int:

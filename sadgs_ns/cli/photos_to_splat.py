@@ -77,12 +77,7 @@ class Sadgs:
 
 
 class PhotosToSplat:
-    """One run of the command; `make` does all of it.
-
-    Args:
-        given: The command line.
-        options: More options for ns-train.
-        console: Where the stages' lines are printed.
+    """One run of the command, with more options for ns-train; `make` does all of it.
 
     Raises:
         InputError: If the source, the folder or an option cannot be used; nothing is written then.
@@ -144,14 +139,7 @@ class PhotosToSplat:
         return max(self._run.glob("nerfstudio_models/step-*.ckpt"), default=None)
 
     def make(self) -> list[Path]:
-        """Do what is not done yet, and return the splats.
-
-        Raises:
-            InputError: If a stage cannot use what it is given.
-            Interrupted: If a signal came; what the stages did is saved.
-            OSError: If a file cannot be written.
-            RunError: If a stage fails, or few photos registered.
-        """
+        """Do what is not done yet, and return the splats. `exit_code` knows all errors that this raises."""
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -270,18 +258,15 @@ class PhotosToSplat:
             self._note(few=found)
             if not self.given.anyway:
                 line.update(found)
-                raise self._few_registered(summary)
+                command = ["sadgs-process", str(self.source), str(self._scene), "--matching", "exhaustive"]
+                again = f"or compare more pairs of them with `{shlex.join(command)}`, and give the same command again; "
+                raise RunError(
+                    f"only {found}, so the splat would show only what these saw: take more photos between the others, "
+                    "with two thirds of overlap, and begin another --output; "
+                    f"{again * (summary.matching != 'exhaustive')}or go on with these with --anyway."
+                )
         missing = "" if summary.registered == summary.photos else ", log/cameras.txt tells of the others"
         return found + missing + done_before
-
-    def _few_registered(self, summary: Summary) -> RunError:
-        command = shlex.join(["sadgs-process", str(self.source), str(self._scene), "--matching", "exhaustive"])
-        again = f"or compare more pairs of them with `{command}`, and give the same command again; "
-        again *= summary.matching != "exhaustive"
-        return RunError(
-            f"only {self._settings['few']}, so the splat would show only what these saw: take more photos between the "
-            f"others, with two thirds of overlap, and begin another --output; {again}or go on with these with --anyway."
-        )
 
     def _trained(self) -> str | None:
         """Return what a finished training said."""
@@ -336,11 +321,7 @@ def _shown(value: Any) -> str:
 
 
 def _formats(asked: str | None, console: Console) -> list[str]:
-    """Return the formats to export.
-
-    Raises:
-        InputError: If one is not known, or a page is asked for and Node.js is not there.
-    """
+    """Return the formats to export; raise an InputError for an unknown one, or for a page without Node.js."""
     has_node = shutil.which("npx") is not None
     if asked is None:
         if not has_node:

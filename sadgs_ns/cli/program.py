@@ -67,11 +67,7 @@ def exit_code(name: str, folder: Path | None, run: Callable[[], int]) -> int:
 
 
 def read_settings(file: Path, folder: Path) -> dict[str, Any]:
-    """Return the settings that a folder was begun with; they are empty where there is no file of them.
-
-    Raises:
-        InputError: If the file is damaged.
-    """
+    """Return the settings that a folder was begun with, none without a file of them; a damaged one is an InputError."""
     try:
         return dict(json.loads(file.read_text("utf8"))) if file.exists() else {}
     except ValueError as error:

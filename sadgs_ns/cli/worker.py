@@ -40,12 +40,9 @@ _PREFIX = re.compile(r"^(error|sadgs-[\w-]+): ")
 
 
 class WorkerError(RunError):
-    """A function raised something else than an InputError, or its process ended.
+    """A function raised something else than an InputError, or its process ended; the sentence has no full stop.
 
-    Args:
-        sentence: Says why, without a full stop.
-        exitcode: Of the process; negative is the signal that ended it.
-        output: The end of what the process printed.
+    A negative `exitcode` is the signal that ended the process, and `output` is the end of what it printed.
     """
 
     def __init__(self, sentence: str, exitcode: int, output: str) -> None:

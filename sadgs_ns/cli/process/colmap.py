@@ -29,11 +29,7 @@ _ERROR_LINE = re.compile(r"^[EF]\d{8} |^\s*what\(\): |Error: ")
 def run_colmap(function: str, *arguments: Any, folder: Path, report: Report) -> Any:
     """Call a function of `stages.py` by its name in another process, and return what it returns, as `Worker.run` does.
 
-    Args:
-        function: The name.
-        arguments: Those of the function.
-        folder: A folder that is there, to which the function writes; errors name it.
-        report: Called in this process as the work goes on.
+    The function writes to `folder`, which is there and which errors name. `report` is called in this process.
 
     Raises:
         InputError: If the function raises it.

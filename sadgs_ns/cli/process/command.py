@@ -286,14 +286,12 @@ def _publish(undistorted: Path, out: Path, grown: bool = False) -> None:
     except InputError as error:  # COLMAP does not say when a disk is full
         raise WriteError(images, OSError("the disk is full")) from error
     restore_alpha(images, undistorted / "alpha")
-    if grown:
-        for name in written:
-            (out / name).parent.mkdir(parents=True, exist_ok=True)
-            (undistorted / name).replace(out / name)
-    else:
-        (out / "transforms.json").unlink(missing_ok=True)  # its presence says that all the others are there
+    if not grown:
+        (out / "transforms.json").unlink(missing_ok=True)  # Its presence says that all the others are there.
         shutil.rmtree(out / "images", ignore_errors=True)
-        images.rename(out / "images")
+    for name in written:
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (undistorted / name).replace(out / name)
     shutil.rmtree(out / "sparse", ignore_errors=True)
     for name in ("sparse", "sparse_pc.ply", "transforms.json"):
         (undistorted / name).rename(out / name)

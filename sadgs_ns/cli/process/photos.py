@@ -251,11 +251,6 @@ def photos_by_camera(photos: Sequence[Photo]) -> list[list[str]]:
     return list(groups.values())
 
 
-def are_in_order(names: Sequence[str]) -> bool:
-    """Whether photos are named by their numbers alone, as cameras number them in the order of their taking."""
-    return len({re.sub(r"\d+", "0", name) for name in names}) == 1
-
-
 def in_order(names: Sequence[str]) -> list[str]:
     """Sort names so that photo 10 comes after photo 9."""
     parts = {name: re.split(r"(\d+)", name) for name in names}

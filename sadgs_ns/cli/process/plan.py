@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from sadgs_ns.cli.process.photos import Photo, are_in_order
+from sadgs_ns.cli.process.photos import Photo
 from sadgs_ns.errors import InputError, RunError
 
 EXHAUSTIVE_LIMIT = 200
@@ -85,7 +86,7 @@ def choose_matching(
             raise InputError(
                 f"{lacking} Use --matching sequential for photos in the order of their taking, or exhaustive."
             ) from error
-        if are_in_order([photo.name for photo in photos]):
+        if len({re.sub(r"\d+", "0", photo.name) for photo in photos}) == 1:
             return "sequential", (
                 f"{lacking} The photos are numbered, so each is matched with those that follow it "
                 "(--matching sequential); if many do not register, use --matching exhaustive."

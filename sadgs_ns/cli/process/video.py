@@ -58,11 +58,7 @@ def video_frames(video: Path, count: int) -> Iterator[tuple[int, np.ndarray]]:
 
 
 def write_frames(frames: Iterable[tuple[int, np.ndarray]], folder: Path, report: Callable[[int], None]) -> None:
-    """Write frames, as `video_frames` yields them, to a folder as numbered photos.
-
-    Raises:
-        WriteError: If one cannot be written.
-    """
+    """Write frames, as `video_frames` yields them, to a folder as numbered photos; raise a WriteError if one fails."""
     for number, frame in frames:
         with atomic_path(folder / f"{number:05d}.jpg") as partial:
             # OpenCV's own writing of files does not tell of a full disk.
