@@ -85,18 +85,14 @@ def _load_torchvision() -> None:
 
 
 def _check_cuda() -> Iterator[Finding]:
-    """Check the GPU, Triton and gsplat."""
     import torch
 
     from sadgs_ns import kernels
 
     device = torch.device("cuda")
-    free, total = torch.cuda.mem_get_info(device)
-    yield Finding(
-        "note",
-        f"GPU: {torch.cuda.get_device_name(device)}, {free / 1e9:.1f} of {total / 1e9:.1f} GB free, CUDA "
-        f"{torch.version.cuda}.",
-    )
+    name, (free, total) = torch.cuda.get_device_name(device), torch.cuda.mem_get_info(device)
+    memory = f"{free / 1e9:.1f} of {total / 1e9:.1f} GB free"
+    yield Finding("note", f"GPU: {name}, {memory}, CUDA {torch.version.cuda}.")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         compiles = kernels.available(device)
@@ -121,14 +117,11 @@ def _check_cuda() -> Iterator[Finding]:
     if problem is None:
         yield Finding("note", "gsplat has its CUDA kernels.")
     else:
-        yield Finding(
-            "error",
-            f"gsplat has no CUDA kernels ({problem}): install its wheel for this torch, or the CUDA toolkit.",
-        )
+        remedy = "install its wheel for this torch, or the CUDA toolkit"
+        yield Finding("error", f"gsplat has no CUDA kernels ({problem}): {remedy}.")
 
 
 def _check_lpips() -> Iterator[Finding]:
-    """Check whether the weights of LPIPS are on the disk."""
     import torch
 
     path = Path(torch.hub.get_dir(), "checkpoints", _LPIPS_FILE)

@@ -84,10 +84,8 @@ def sift(photo: Path) -> tuple[np.ndarray, np.ndarray]:
     if image is None or values is None:
         return np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8)
     stretch = np.array([width / image.shape[1], height / image.shape[0]])
-    keypoints = np.zeros((len(points), 4), np.float32)
-    keypoints[:, :2] = (np.array([point.pt for point in points]) + 0.5) * stretch
-    keypoints[:, 2] = [point.size / 2 * stretch[0] for point in points]
-    keypoints[:, 3] = [math.radians(point.angle) for point in points]
+    found = np.array([(*point.pt, point.size, math.radians(point.angle)) for point in points])
+    keypoints = np.c_[(found[:, :2] + 0.5) * stretch, found[:, 2] / 2 * stretch[0], found[:, 3]].astype(np.float32)
     roots = np.sqrt(values / np.maximum(values.sum(axis=1, keepdims=True), 1e-6))
     return keypoints, np.clip(np.round(512 * roots), 0, 255).astype(np.uint8)
 
