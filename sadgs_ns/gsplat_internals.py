@@ -147,16 +147,12 @@ def with_changed_radii(
 
     In 1.4 and 1.5 it is a plain function, which finds `fully_fused_projection` among its module's names and passes it
     width and height as the seventh and eighth positional arguments. A gsplat that projects elsewhere, as 1.6 may, needs
-    another way in.
+    another way in. The module's own names stay as they are, since the viewer renders in another thread.
 
     Args:
         rasterization: `gsplat.rendering.rasterization`.
         change: Is called with radii as RADII_PER_AXIS tells, means2d in px [C, N, 2], width and height in px; returns
             radii of the same shape and type.
-
-    Returns:
-        gsplat's own code, in which the name of the projection stands for one whose radii are changed. The module's own
-        names stay as they are, since the viewer renders in another thread.
     """
     assert isinstance(rasterization, FunctionType)
     project_all = rasterization.__globals__["fully_fused_projection"]

@@ -74,9 +74,7 @@ class Similarity:
 
         The results have unit length; those without a direction stay as they are.
         """
-        from scipy.spatial.transform import (
-            Rotation,  # It takes half a second to import, and few commands turn anything.
-        )
+        from scipy.spatial.transform import Rotation  # It takes half a second to import.
 
         turn = Rotation.from_matrix(self.orthogonal * np.sign(np.linalg.det(self.orthogonal)))
         lengths, turned = np.linalg.norm(quats, axis=1), quats.copy()

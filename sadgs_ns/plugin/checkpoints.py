@@ -147,11 +147,7 @@ def check_chosen(load_dir: Path | None, load_step: int | None, load_checkpoint: 
 
 
 def read_chosen(
-    load_dir: Path | None,
-    load_step: int | None,
-    load_checkpoint: Path | None,
-    remedy: str = REMEDY,
-    mmap: bool = False,
+    load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None, remedy: str = REMEDY, mmap: bool = False
 ) -> tuple[Path, dict[str, Any]] | None:
     """Read the checkpoint that these options name, or the one before it if it is damaged and no step was asked for.
 

@@ -194,7 +194,7 @@ def compile_kernels(
     Args:
         pipeline: A pipeline whose model and data are set up.
         optimizers: The run's optimizers, by the names of their parameters.
-        cuda_graphs: Whether steps may be captured as CUDA graphs, whose Adam reads its rates from the device.
+        cuda_graphs: Whether steps may be captured, whose Adam reads its rates from the device.
     """
     device = pipeline.device
     if not use_triton(device):

@@ -150,14 +150,10 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         device, dataset = torch.device(self.device), self.train_dataset if split == "train" else self.eval_dataset
         on_demand = cache_images_device == "compressed"
         # Of several processes each would come to hold all files, which the system's cache of files holds once.
-        keep = (
-            on_demand
-            and processes_on_this_machine() == 1
-            and (
-                sum(path.stat().st_size for path in dataset.image_filenames)
-                <= KEPT_FILES_SHARE * available_host_bytes()
-            )
-        )
+        keep = on_demand and processes_on_this_machine() == 1
+        if keep:
+            size = sum(path.stat().st_size for path in dataset.image_filenames)
+            keep = size <= KEPT_FILES_SHARE * available_host_bytes()
         images = ImagesOnDemand(dataset, keep)
         self.train_cameras = self.train_dataset.cameras
         if on_demand:

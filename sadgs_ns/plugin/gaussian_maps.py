@@ -62,14 +62,10 @@ def blend(
 
 
 def eta_map(params: Mapping[str, Tensor], statistics: Mapping[str, Tensor], *view, **options) -> Tensor:
-    """Return the largest η of the Gaussians that make up each pixel, as a geometric mean by what each adds to it.
+    """Return the largest η [H, W] of the Gaussians of each pixel, as a geometric mean by what each adds to it.
 
-    Args:
-        params, view, options: As for `blend`, whose first two arguments come before `view`.
-        statistics: `eta_max` [N, 3] and `n_total` [N]; Gaussians that were never observed count for nothing.
-
-    Returns:
-        η, or NaN where hardly anything observed is drawn. [H, W]
+    It is NaN where hardly anything observed is drawn. `statistics` holds `eta_max` [N, 3] and `n_total` [N]. `view` and
+    `options` are, here and below, what `blend` takes after its first two arguments.
     """
     largest = statistics["eta_max"].amax(dim=1)
     known = ((statistics["n_total"] > 0) & (largest > 0)).float()
@@ -79,28 +75,18 @@ def eta_map(params: Mapping[str, Tensor], statistics: Mapping[str, Tensor], *vie
 
 
 def children_map(params: Mapping[str, Tensor], counts: Tensor, *view, **options) -> Tensor:
-    """Return the number of children of the Gaussians that make up each pixel, as a geometric mean.
+    """Return the number of children, ≥ 1 along each axis [N, 3], of each pixel's Gaussians, as a geometric mean. [H, W]
 
-    Args:
-        params, view, options: As for `eta_map`.
-        counts: Number of children along each axis, ≥ 1. [N, 3]
-
-    Returns:
-        A number ≥ 1, or NaN where hardly anything is drawn. [H, W]
+    It is NaN where hardly anything is drawn.
     """
     total, cover = blend(params, num_children(counts)[:, None].float().log(), *view, **options)
     return torch.where(cover > MIN_COVER, (total / cover).exp(), torch.nan)[..., 0]
 
 
 def share_map(params: Mapping[str, Tensor], chosen: Tensor, *view, **options) -> Tensor:
-    """Return the share of what is drawn at each pixel that the chosen Gaussians make up.
+    """Return the share of what is drawn at each pixel that the chosen Gaussians, bool [N], make up. [H, W]
 
-    Args:
-        params, view, options: As for `eta_map`.
-        chosen: Which Gaussians are chosen. bool [N]
-
-    Returns:
-        A share in [0, 1], or NaN where hardly anything is drawn. [H, W]
+    It is NaN where hardly anything is drawn.
     """
     total, cover = blend(params, chosen[:, None].float(), *view, **options)
     return torch.where(cover > MIN_COVER, total / cover, torch.nan)[..., 0]
@@ -108,13 +94,11 @@ def share_map(params: Mapping[str, Tensor], chosen: Tensor, *view, **options) ->
 
 @torch.no_grad()
 def normals_map(params: Mapping[str, Tensor], viewmat: Tensor, *view, **options) -> Tensor:
-    """Return the normals of the Gaussians that make up each pixel, blended as their colours are; arguments as `blend`.
+    """Return the normals of the Gaussians that make up each pixel, blended as their colours are. [H, W, 3]
 
-    A Gaussian's normal is the axis of its smallest scale, turned towards the camera. Training does not flatten
-    Gaussians, so that this is an estimate; normals of the depth map are rougher (docs/guide.md has both measured).
-
-    Returns:
-        Vectors of unit length in world axes, and 0 where nothing is drawn. [H, W, 3]
+    They have unit length and world axes, and are 0 where nothing is drawn. A Gaussian's normal is the axis of its
+    smallest scale, turned towards the camera. Training does not flatten Gaussians, so that this is an estimate; normals
+    of the depth map are rougher (docs/guide.md has both measured).
     """
     rotmats = normalized_quat_to_rotmat(F.normalize(params["quats"], dim=-1))  # [N, 3, 3]
     thinnest = params["scales"].argmin(dim=1)[:, None, None].expand(-1, 3, 1)  # [N, 3, 1]

@@ -10,7 +10,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import cv2
 import numpy as np
@@ -87,13 +87,7 @@ class ImagesOnDemand(Sequence[dict[str, Any]]):
     def __len__(self) -> int:
         return len(self._names)
 
-    @overload
-    def __getitem__(self, index: int) -> dict[str, Any]: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[dict[str, Any]]: ...
-
-    def __getitem__(self, index: int | slice) -> dict[str, Any] | Sequence[dict[str, Any]]:
+    def __getitem__(self, index: Any) -> Any:
         """Decode an image and undistort it.
 
         Returns:
@@ -103,8 +97,6 @@ class ImagesOnDemand(Sequence[dict[str, Any]]):
         Raises:
             InputError: If the image or its mask cannot be read any more, or has another size than its camera.
         """
-        if isinstance(index, slice):
-            return [self[position] for position in range(len(self))[index]]
         name, size, lens = self._names[index], tuple(self._sizes[index]), self._lenses[index]
         try:
             data = self._dataset.get_data(index, image_type="uint8")

@@ -45,15 +45,11 @@ class Interrupts:
         self._waiting = waiting
         self._repeated = {HANG_UP, signal.SIGTERM} if started else {HANG_UP}
         self._previous: dict[int, Any] = {}
-        self._received: int | None = None
-
-    @property
-    def received(self) -> int | None:
+        self.received: int | None = None
         """The first signal that has come, None where none has."""
-        return self._received
 
     def __enter__(self) -> Interrupts:
-        self._received = None
+        self.received = None
         if threading.current_thread() is threading.main_thread():
             default = (signal.SIG_DFL, signal.default_int_handler)
             self._previous = {s: old for s in SIGNALS if (old := signal.getsignal(s)) in default}
@@ -70,8 +66,8 @@ class Interrupts:
 
     def poll(self) -> None:
         """Raise Interrupted if a signal has come."""
-        if self._received is not None:
-            raise Interrupted(self._received)
+        if self.received is not None:
+            raise Interrupted(self.received)
 
     def behind(self, error: OSError) -> Interrupted | None:
         """Return the interruption that made a write fail, or None if the error has another cause.
@@ -80,14 +76,14 @@ class Interrupts:
         """
         if error.errno == errno.EIO and HANG_UP in self._previous:
             end = time.monotonic() + _HANG_UP_SECONDS
-            while self._received is None and time.monotonic() < end:
+            while self.received is None and time.monotonic() < end:
                 time.sleep(0.01)
-        return None if self._received is None or self._received != HANG_UP else Interrupted(self._received)
+        return None if self.received is None or self.received != HANG_UP else Interrupted(self.received)
 
     def _handle(self, number: int, frame: object) -> None:
-        if self._received is not None:
+        if self.received is not None:
             return  # Where a connection drops, the shell sends one SIGHUP and the kernel another.
-        self._received = number
+        self.received = number
         for another in self._previous.keys() - self._repeated:
             signal.signal(another, self._previous[another])
         if number == HANG_UP:

@@ -58,11 +58,7 @@ class TrainingSize:
 
 
 def training_size(
-    datamanager: FullImageDatamanager,
-    params: Params,
-    views: int,
-    processes: int = 1,
-    near_plane: float = NEAR_PLANE,
+    datamanager: FullImageDatamanager, params: Params, views: int, processes: int = 1, near_plane: float = NEAR_PLANE
 ) -> TrainingSize:
     """Measure a run before its first step; no image is opened for it.
 

@@ -600,15 +600,10 @@ class SadgsModel(SplatfactoModel):
 
     @torch.no_grad()
     def get_normals(self, camera: Cameras, params: Mapping[str, Tensor] | None = None) -> Tensor:
-        """Render the normals of one camera, which takes about as long as its colours.
+        """Render the normals of one camera, shape [1], which takes about as long as its colours. [H, W, 3]
 
-        Args:
-            camera: One camera, shape [1].
-            params: Parameters by name; None is the model's own, inside the viewer's crop box.
-
-        Returns:
-            0.5 + 0.5 n, n being what `gaussian_maps.normals_map` returns, in the axes of the run's world; black where
-            nothing is. [H, W, 3]
+        They are 0.5 + 0.5 n, n being what `gaussian_maps.normals_map` returns, in the axes of the run's world, and
+        black where nothing is. `params` are by name; None is the model's own, inside the viewer's crop box.
         """
         params = self.cropped(dict(self.gauss_params.items())) if params is None else params
         width, height = int(camera.width.item()), int(camera.height.item())
@@ -622,16 +617,10 @@ class SadgsModel(SplatfactoModel):
     def get_outputs_for_camera(  # type: ignore[override]
         self, camera: Cameras, obb_box: OrientedBox | None = None
     ) -> MutableMapping[str, Tensor]:
-        """Render one camera as `get_outputs` does, inside a crop box, and add the pictures of the viewer's panel.
+        """Render one camera, shape [1], as `get_outputs` does, inside a crop box, and add the pictures of the panels.
 
-        Outside the viewer, `get_normals` is added as `normals`, and computed when it is first read.
-
-        Args:
-            camera: One camera, shape [1].
-            obb_box: The crop box; None renders all Gaussians.
-
-        Raises:
-            InputError: If the camera is no pinhole; the viewer, whose thread would end, is shown nothing instead.
+        Outside the viewer, `get_normals` is added as `normals`, and computed when it is first read. A camera that is no
+        pinhole raises InputError; the viewer, whose thread would end, is shown nothing instead.
         """
         try:
             outputs: dict[str, Any] = super().get_outputs_for_camera(camera, obb_box)
@@ -704,11 +693,8 @@ class SadgsModel(SplatfactoModel):
     def compared(self, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
         """Return a rendering and its photo as the loss compares them: within the mask, before the same background.
 
-        Args:
-            outputs, batch: As for `get_loss_dict`; they may hold some rows of the views only.
-
-        Returns:
-            Both on the model's device, the photo as floats in [0, 1] or as bytes. […, H, W, 3]
+        The arguments are as for `get_loss_dict`, or some of their rows. Both results are on the model's device, the
+        photo as floats in [0, 1] or as bytes. […, H, W, 3]
         """
         target, predicted = batch["image"].to(self.device), outputs["rgb"]
         if "mask" in batch or target.shape[-1] == 4:  # Otherwise the loss reads bytes as they are.
@@ -758,7 +744,7 @@ class SadgsModel(SplatfactoModel):
         """Restore what `get_extra_state` saved."""
         self.step = state["step"]
         if self.config.near_plane is None:
-            self.near_plane = state.get("near_plane", self.near_plane)
+            self.near_plane = state["near_plane"]
         self.strategy_state = {
             key: value.to(self.device) if isinstance(value, Tensor) else value
             for key, value in state["strategy_state"].items()
@@ -766,8 +752,7 @@ class SadgsModel(SplatfactoModel):
         if "camera_paths" in state["strategy_state"]:
             paths = CameraPaths(**state["strategy_state"]["camera_paths"])
             self.strategy_state["camera_paths"] = paths.to(self.device)
-        if "average" in state:  # Earlier versions averaged nothing.
-            self.average.load_state_dict(state["average"], self.device)
+        self.average.load_state_dict(state["average"], self.device)
 
     def load_state_dict(self, dict: dict[str, Any], **kwargs: Any) -> Any:  # type: ignore[override]
         """Load a checkpoint of any number of Gaussians.

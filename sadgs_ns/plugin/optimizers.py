@@ -26,11 +26,8 @@ _ONE = torch.tensor(1.0, device="cpu")
 class FusedAdam(torch.optim.Adam):
     """torch's Adam, updated by our Triton kernel where that runs; its state and its results are torch's.
 
-    Gradients that are NaN, infinite or beyond `nonfinite.MAX_GRADIENT` count as 0: parameters and moments stay finite.
-
-    Args:
-        params: Parameters, all on one device.
-        **options: Further options of torch's Adam.
+    Gradients that are NaN, infinite or beyond `nonfinite.MAX_GRADIENT` count as 0: parameters, all on one device, and
+    moments stay finite.
     """
 
     def __init__(self, params: Iterable[torch.Tensor], **options: Any) -> None:
@@ -63,12 +60,9 @@ class FusedAdam(torch.optim.Adam):
 
 
 def step_together(optimizers: Iterable[FusedAdam]) -> None:
-    """Step several optimizers; parameters of one length whose betas, eps and log agree are updated in one launch.
+    """Step several optimizers that use Triton, equal to the bit to one after the other.
 
-    The results equal, to the bit, those of one optimizer after the other.
-
-    Args:
-        optimizers: Optimizers that use the Triton kernel.
+    Parameters of one length whose betas, eps and log agree are updated in one launch.
     """
     from sadgs_ns.kernels.adam import adam_step
 

@@ -94,10 +94,7 @@ def _between(when: str, before: int, after: int) -> str:
 def nearest_view(cameras: Tensor, camera: Tensor, extent: float) -> int:
     """Return the index of the training view that is most like a camera's: near it, and looking in the same direction.
 
-    Args:
-        cameras: Camera-to-world poses of the training views. [C, 3, 4]
-        camera: Camera-to-world pose of the camera. [3, 4]
-        extent: Extent of the training cameras in world units: the distance that counts as much as 1 rad.
+    The camera-to-world poses are [C, 3, 4] and [3, 4]; the extent is the distance that counts as much as 1 rad.
     """
     distance = (cameras[:, :, 3] - camera[:, 3]).norm(dim=-1) / max(extent, 1e-12)
     angle = (cameras[:, :, 2] @ camera[:, 2]).clamp(-1, 1).acos()
@@ -134,23 +131,18 @@ class StructurePanel(torch.nn.Module):
             cb_hook=lambda element: self._change("max_gaussians", element),
             hint="Hard cap, from the next densification on",
         )
-        self.set_tau_split = self._slider(
-            "tau_split", "Share of observations that must violate, at the next structure step"
+        low, high = RANGES["tau_split"]
+        self.set_tau_split = ViewerSlider(
+            "tau_split",
+            strategy.tau_split,
+            min(low, strategy.tau_split),  # The run's own options may lie beyond the range.
+            max(high, strategy.tau_split),
+            0.05,
+            cb_hook=lambda element: self._change("tau_split", element),
+            hint="Share of observations that must violate, at the next structure step",
         )
         self.table = ViewerMarkdown("counts", self._describe)
         self.viewer = ViewerControl()
-
-    def _slider(self, name: str, hint: str) -> ViewerSlider[float]:
-        value, (low, high) = float(getattr(self._model.strategy, name)), RANGES[name]
-        return ViewerSlider(
-            name,
-            value,
-            min(low, value),  # The run's own options may lie beyond the range.
-            max(high, value),
-            0.05,
-            cb_hook=lambda element: self._change(name, element),
-            hint=hint,
-        )
 
     @property
     def _model(self) -> SadgsModel:
@@ -261,10 +253,6 @@ class StructurePanel(torch.nn.Module):
         """Return `structure` [H, W, 3] in [0, 1], which the viewer may show; evaluation and `ns-render` get nothing.
 
         The output exists whatever is chosen, because the viewer's thread fails where one goes missing.
-
-        Args:
-            camera: One camera, shape [1].
-            rendered: The model's outputs, `rgb` [H, W, 3] in [0, 1] among them.
         """
         if not in_viewer():
             return {}
@@ -298,10 +286,8 @@ class StructurePanel(torch.nn.Module):
         scale = min(height / photo.shape[0], width / photo.shape[1])
         size = max(round(scale * photo.shape[0]), 1), max(round(scale * photo.shape[1]), 1)
         if choice in (ELLIPSES_HERE, ELLIPSES_NEAR):
-            drawn, what = (
-                texture.draw_ellipses(photo, tensor, constant, size),
-                "S̄⁻¹ as ellipses, coloured by period,",
-            )
+            drawn = texture.draw_ellipses(photo, tensor, constant, size)
+            what = "S̄⁻¹ as ellipses, coloured by period,"
         else:
             drawn = cv2.resize(PERIOD(texture.texture_period(tensor, constant)), size[::-1])
             what = "Period of the texture, px,"

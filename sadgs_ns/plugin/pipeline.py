@@ -274,10 +274,8 @@ class SadgsPipeline(VanillaPipeline):
     def _report_nonfinite(self, last: bool = False) -> None:
         """Say in which of the last iterations, and with which images, a loss or gradient was not finite.
 
-        Where that lasts, and the present gradients move nothing, `stuck` becomes the sentence that says so.
-
-        Args:
-            last: Whether the run ends here: then it may have been too short for `nonfinite.HOPELESS_STEPS`.
+        Where that lasts, and the present gradients move nothing, `stuck` becomes the sentence that says so. The last of
+        all reports, at the run's end, may be of too few iterations for `nonfinite.HOPELESS_STEPS`.
         """
         wrong = self.log.read()
         files = self.datamanager.train_dataset.image_filenames
@@ -470,7 +468,7 @@ class SadgsPipeline(VanillaPipeline):
 
         A line says where densification goes on with other settings than the checkpoint's run had.
         """
-        now, before = self._settings(), state.get("settings", {})
+        now, before = self._settings(), state["settings"]
         changed = [name for name in before if name in now and now[name] != before[name]]
         if changed:
             listed = ", ".join(f"pipeline.{name} was {before[name]} and is {now[name]}" for name in changed)
@@ -479,9 +477,8 @@ class SadgsPipeline(VanillaPipeline):
                 soft_wrap=True,
             )
         if not any(name.endswith(("max_gaussians", "memory_budget_gb")) for name in changed):
-            self._checkpoint_cap = state.get("max_gaussians")
-        if "images" in state:  # Earlier versions did not save it.
-            self.checkpoint_views = state["images"], state["camera_positions"]
+            self._checkpoint_cap = state["max_gaussians"]
+        self.checkpoint_views = state["images"], state["camera_positions"]
         torch.set_rng_state(state["torch"].cpu())
         if max(state["view_order"], default=0) < len(self.datamanager.train_dataset):
             self.datamanager.train_unseen_cameras = list(state["view_order"])

@@ -50,13 +50,10 @@ def least(number: float, device: torch.device) -> float:
 
 
 def check_devices(machine: MachineConfig) -> bool:
-    """Check whether the devices that a run is to take are there.
-
-    Returns:
-        Whether they are several.
+    """Return whether the devices that a run is to take are several.
 
     Raises:
-        InputError: If one is missing, or the processes cannot be started in this way.
+        InputError: If one is not there, or the processes cannot be started in this way.
     """
     if machine.num_machines != 1:
         raise InputError(

@@ -101,7 +101,9 @@ class ProgressTable(LocalWriter):
         first, start = self._times[0]
         pace = (now - start) / (step - first) if step > first else None
         left = writer.GLOBAL_BUFFER["max_iter"] - step - 1
-        if not self._estimated and pace is not None and (due or _is_slow(step - first, now - start)):
+        # Nobody should have to wait for the next row of a table where so few iterations take so long.
+        few_are_slow = step - first >= MEASURED_STEPS and now - start >= MEASURED_SECONDS
+        if not self._estimated and pace is not None and (due or few_are_slow):
             self._estimated = True
             self._say_how_long(step - first, pace, left)
         if due:
@@ -158,11 +160,6 @@ def _line(cells: list[str]) -> str:
 
 def _short(seconds: float) -> str:
     return f"{1000 * seconds:.0f} ms" if seconds < 1 else f"{seconds:.1f} s"
-
-
-def _is_slow(steps: int, seconds: float) -> bool:
-    """Return whether so few iterations took so long that nobody should have to wait for the table's next row."""
-    return steps >= MEASURED_STEPS and seconds >= MEASURED_SECONDS
 
 
 def remove_tables() -> None:

@@ -29,10 +29,7 @@ def losses_of_views(
     Args:
         model: The model of this process's Gaussians.
         world: The processes, all of which call this with the same views.
-        viewmats: World to camera. [V, 4, 4]
-        Ks: Intrinsics in px. [V, 3, 3]
-        width: px.
-        height: px.
+        viewmats, Ks, width, height: As for `rasterize`, of V views.
         views: Index and data of each view; the images of those of which this process composites rows are on the
             training device.
         structure_tensors: S̄ of the views, or codes of it, [V, H, W, 3]; None where η is not observed.

@@ -26,10 +26,7 @@ PIXELS_PER_BATCH = 4_000_000
 class StructureMaps:
     """Computes S̄ of images with a run's settings, and keeps its codes for the training images.
 
-    Args:
-        views: The training views.
-        frequency_constant: c of ω_l = c / σ_l in 1/px.
-        options: What else `multiscale_structure_tensor` is called with.
+    The frequency constant is c of ω_l = c / σ_l in 1/px, and the options are others of `multiscale_structure_tensor`.
     """
 
     def __init__(self, views: TrainingViews, frequency_constant: float, **options: float | None) -> None:
@@ -152,9 +149,6 @@ def observe_training_views(maps: StructureMaps, progress: Callable[[range], Iter
         codes, (viewmats, Ks) = maps.codes[index].to(model.device)[None], views.stacked_cameras([index])
         _, _, info = model.render(viewmats, Ks, codes.shape[2], codes.shape[1], "RGB")
         observe(
-            statistics,
-            params,
-            info | {"viewmats": viewmats, "Ks": Ks, "structure_tensors": codes},
-            generator=generator,
+            statistics, params, info | {"viewmats": viewmats, "Ks": Ks, "structure_tensors": codes}, generator=generator
         )
     return statistics

@@ -19,16 +19,10 @@ ELLIPSES_ACROSS = 28
 
 
 def texture_period(structure_tensor: Tensor, frequency_constant: float = FREQUENCY_CONSTANT) -> Tensor:
-    """Return the period of the finest texture at each pixel, 2π c Λ_min.
+    """Return the period of the finest texture in px at each pixel, 2π c Λ_min, or NaN without texture. [..., 3] → [...]
 
-    The structure tensor measures ω = c / σ, and a sine of period P answers most at σ = P / 2π.
-
-    Args:
-        structure_tensor: S̄ as (xx, xy, yy) in 1/px². [..., 3]
-        frequency_constant: c that S̄ was computed with, in 1/px.
-
-    Returns:
-        The period in px, or NaN where S̄ is 0, that is without texture or masked. [...]
+    The structure tensor, as (xx, xy, yy) in 1/px², measures ω = c / σ, and a sine of period P answers most at σ = P /
+    2π.
     """
     period = wavelength(structure_tensor)
     return torch.where(period < 0.999 / WAVELENGTH_EPSILON, 2 * torch.pi * frequency_constant * period, torch.nan)
@@ -57,10 +51,8 @@ def structure_ellipses(
 ) -> Ellipses:
     """Return S̄⁻¹ on a regular grid of pixels, without those where there is no texture.
 
-    Args:
-        structure_tensor: S̄ as (xx, xy, yy) in 1/px². [H, W, 3]
-        frequency_constant: c that S̄ was computed with, in 1/px.
-        spacing: Spacing of the grid in px, ≥ 1; None puts `ELLIPSES_ACROSS` along the shorter side.
+    S̄ is given as (xx, xy, yy) in 1/px² [H, W, 3], c in 1/px, and the grid's spacing, ≥ 1, in px; None puts
+    `ELLIPSES_ACROSS` along the shorter side.
     """
     height, width = structure_tensor.shape[:2]
     spacing = max(min(height, width) / ELLIPSES_ACROSS, 1.0) if spacing is None else spacing
@@ -91,15 +83,10 @@ def draw_ellipses(
     frequency_constant: float = FREQUENCY_CONSTANT,
     size: tuple[int, int] | None = None,
 ) -> Picture:
-    """Draw S̄⁻¹ as ellipses over an image [H, W, 3], which is made dark grey.
+    """Draw S̄⁻¹ as ellipses over an image, which is made dark grey. Both are [H, W, 3].
 
-    A circle as wide as the grid's spacing has the coarsest wavelength on both axes.
-
-    Args:
-        image: The picture to draw on. [H, W, 3]
-        structure_tensor: S̄ of the image. [H, W, 3]
-        frequency_constant: c that S̄ was computed with, in 1/px.
-        size: Height and width of the drawing in px; None keeps those of the image.
+    A circle as wide as the grid's spacing has the coarsest wavelength on both axes. `size` is the height and width of
+    the drawing in px; None keeps those of the image.
     """
     ellipses = structure_ellipses(structure_tensor, frequency_constant)
     height, width = image.shape[:2] if size is None else size

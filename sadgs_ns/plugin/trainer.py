@@ -69,9 +69,6 @@ class SadgsTrainer(Trainer):
     """A trainer for one model on one device, or on several, each with a process and a part of the Gaussians.
 
     Where there are several, all processes call the same methods, and the first one alone prints and writes files.
-
-    Raises:
-        InputError: As `SadgsTrainerConfig.check`.
     """
 
     config: SadgsTrainerConfig
@@ -214,7 +211,7 @@ class SadgsTrainer(Trainer):
             loaded = self._checkpoint[1]["pipeline"]
             before = loaded.get("_extra_state", {}).get("schedule", {}) if isinstance(loaded, dict) else {}
         if before.get("effort") != config.pipeline.effort:
-            before = {}  # Another effort is asked for, or an earlier version saved none.
+            before = {}
         asked = config.pipeline.views_per_iteration
         pipeline.schedule = schedule(
             len(pipeline.datamanager.train_dataset),

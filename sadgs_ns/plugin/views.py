@@ -173,10 +173,7 @@ class TrainingViews:
         """World-to-camera matrices [4, 4] and intrinsics in px [3, 3] of all training views, each a tensor of its own.
 
         They are made once, because asking nerfstudio's cameras for them in each step makes the host wait for the
-        device.
-
-        Raises:
-            InputError: If undistorting an image failed.
+        device. Raises InputError if undistorting an image failed.
         """
         dataset = self.datamanager.train_dataset
         _ = self.datamanager.cached_train  # Undistorting the images has changed the intrinsics.

@@ -719,18 +719,6 @@ def test_images_with_other_names_at_the_same_cameras_are_told_of(
     assert "same cameras" not in capsys.readouterr().out
 
 
-def test_a_checkpoint_of_an_earlier_version_does_not_say_its_cameras(
-    finished: Path, config: SadgsTrainerConfig, tmp_path: Path
-):
-    (saved,) = (finished / "nerfstudio_models").iterdir()
-    state = torch.load(saved, weights_only=True)
-    for name in ("images", "camera_positions"):
-        del state["pipeline"]["_extra_state"][name]
-    torch.save(state, tmp_path / saved.name)
-    config.load_checkpoint = tmp_path / saved.name
-    assert set_up(config)._start_step == ITERATIONS
-
-
 # --- the cap that the device's memory gives ---
 
 

@@ -37,11 +37,8 @@ def check_splits(
         options: How the images are divided where there are no lists.
 
     Returns:
-        How many images are trained on.
-
-    Raises:
-        InputError: If training or evaluation on the way lacks its list, if one of the lists names no such image, or if
-            names shall divide the images and one of them does not say where it belongs.
+        How many images are trained on. InputError is raised if "train" or "val" has no list beside others, a list names
+        an unknown image, or a name that shall divide the images does not say where it belongs.
     """
     if not lists:
         return _count_training_images(names, options)
@@ -87,13 +84,9 @@ def _count_training_images(names: Sequence[str], options: ParserOptions) -> int:
 
 
 def check_names(names: Iterable[str], source: Path) -> None:
-    """Raise InputError for the first name of an image that leaves its folder, or that a shell would act on.
+    """Raise InputError for the first name of an image in a source that leaves its folder, or that a shell would act on.
 
     nerfstudio gives its downscaled copies these names, and has a shell make them.
-
-    Args:
-        names: Relative to the folder of images.
-        source: The file that holds them.
     """
     for name in names:
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
