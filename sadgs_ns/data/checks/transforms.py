@@ -56,9 +56,7 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
     _check_transform(meta, path)
     factor = options.downscale_factor
     if factor is None:
-        first, factor = Path(described[0]["file_path"]), 1
-        if open_images:  # Like nerfstudio's own parser, take smaller copies only where they exist.
-            factor = existing_factor(image_size(folder / first), lambda by: folder / f"images_{by}" / first.name)
+        factor = _smaller_copies(folder, Path(described[0]["file_path"])) if open_images else 1
     if factor > 1 and not (folder / f"images_{factor}").is_dir():
         raise InputError(": ".join(no_copies(folder / f"images_{factor}", factor)) + ".")
     shared = _distortion_of(meta, path)
@@ -259,3 +257,8 @@ def _check_ply(meta: dict[str, Any], path: Path, views: Sequence[View]) -> Itera
         yield from check_points(positions @ transform[:, :3].T + transform[:, 3], views, source)
     else:
         yield Finding("note", f"{path} has no ply_file_path: training will start from random points.")
+
+
+def _smaller_copies(folder: Path, image: Path) -> int:
+    """Return the factor that nerfstudio's own parser chooses: it takes smaller copies only where they exist."""
+    return existing_factor(image_size(folder / image), lambda factor: folder / f"images_{factor}" / image.name)
