@@ -96,8 +96,7 @@ class Worker:
         Args:
             arguments: The function's; they are pickled.
             on_event: Called here with each event. One that is named "stopping" comes when the process is interrupted.
-            command: The command line that does the same. It is noted in the log, and is what the function finds in
-                `sys.argv`.
+            command: The command line that does the same, for the log and the function's `sys.argv`.
 
         Returns:
             What the function returns, as JSON holds it: a dataclass as a dictionary.

@@ -27,10 +27,7 @@ _BYTES_PER_PIXEL = 240
 def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path) -> None:
     """Find SIFT features in the photos of a folder that have none yet; one that cannot be decoded gets none.
 
-    Args:
-        photos: The folder.
-        groups: The photos' names, those of one camera together.
-        database: COLMAP's database, which is made if it does not exist.
+    In `groups` the names of one camera's photos are together. COLMAP's database is made if it does not exist.
     """
     total = sum(map(len, groups))
     progress("features", 0, total)

@@ -159,12 +159,9 @@ def _read_photo(folder: Path, name: str) -> Photo:
 
 
 def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tuple[Path, list[Photo]]:
-    """Convert photos in formats that COLMAP does not read, if there are any.
+    """Convert a folder's photos in formats that COLMAP does not read, if there are any.
 
-    Args:
-        folder: The folder of the photos.
-        photos: All of them.
-        converted: The folder to make of conversions and of links to the other photos, where there is none.
+    `converted` is made of conversions and of links to the other photos, where there is no such folder yet.
 
     Returns:
         The folder of photos that COLMAP reads, and the photos in it.
@@ -201,15 +198,9 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
 
 
 def write_alpha(folder: Path, photos: Sequence[Photo], alphas: Path) -> int:
-    """Write the opacity of photos that are partly transparent, which COLMAP leaves out, as grey images.
+    """Write the opacity of a folder's photos that are partly transparent, which COLMAP leaves out, as grey images.
 
-    Args:
-        folder: The folder of the photos.
-        photos: All of them.
-        alphas: The folder to make, where there is none; the opacity of `NAME` is in `NAME.png` there.
-
-    Returns:
-        How many photos are partly transparent.
+    That of `NAME` is `NAME.png` in the folder `alphas`, which is made where there is none. Return how many these are.
     """
     if not alphas.exists():
         partial = empty_folder(alphas.with_name(f"{alphas.name}.partial"))
