@@ -38,11 +38,7 @@ class Similarity:
 
     @staticmethod
     def of(transform: Array) -> Similarity:
-        """Return the similarity that a matrix [3, 4] of linear part and translation is, up to rounding.
-
-        Raises:
-            ValueError: If the linear part is not finite, or stretches directions differently.
-        """
+        """Return the similarity that a matrix [3, 4] is, up to rounding; raise ValueError if it is none."""
         linear = np.asarray(transform[:, :3], dtype=np.float64)
         if np.isfinite(transform).all() and (scale := abs(np.linalg.det(linear)) ** (1 / 3)) > 0:
             left, _, right = np.linalg.svd(linear)
@@ -141,11 +137,7 @@ def spherical_harmonics(directions: Array, degree: int) -> Array:
 
 
 def from_data(path: Path) -> Similarity:
-    """Return how nerfstudio moved the data's world (COLMAP's, or that of `transforms.json`) into its own.
-
-    Args:
-        path: A run's `dataparser_transforms.json`; without a similarity in it, this raises InputError.
-    """
+    """Return how nerfstudio moved the data's world into its own, or raise InputError if a run's file does not tell."""
     try:
         content = json.loads(path.read_bytes())
         return _moved_by(content["transform"], content["scale"])

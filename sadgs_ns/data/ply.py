@@ -17,13 +17,10 @@ GREY = 127
 
 
 def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Return positions [P, 3] in the file's frame and colours in 0 … 255 [P, 3] of the vertices.
+    """Return positions [P, 3] in the file's frame and colours in 0 … 255 [P, 3] of a PLY file, text or binary.
 
-    Args:
-        path: A PLY file, text or binary; colours are numbers of 0 … 255, or floating-point ones of 0 … 1.
-
-    Raises:
-        InputError: If the file cannot be read, is cut off or is not a PLY file of points.
+    Colours in the file are numbers of 0 … 255, or floating-point ones of 0 … 1. InputError is raised if the file cannot
+    be read, is cut off or holds no points.
     """
     try:
         vertices = _read_vertices(path)

@@ -60,13 +60,8 @@ def find_capture(run: Path) -> Path:
 def read_cameras(run: Path, data: Path | None = None, split: str = "train") -> RunCameras:
     """Read a run's cameras, in its frame, with the parser that fits the capture's folder.
 
-    Args:
-        run: The run's folder.
-        data: The capture's folder; None is where the run's `config.yml` says it was.
-        split: "train", or "test" for the views that are held out.
-
-    Raises:
-        InputError: If the capture is not there or cannot be read, or the run does not tell how it was moved.
+    `data` is that folder; None is where the run's `config.yml` says it was. `split` is "train", or "test" for the views
+    that are held out. InputError is raised if the capture cannot be read, or the run does not tell how it was moved.
     """
     # nerfstudio takes ten seconds to import, which `--help` and wrong arguments need not wait for.
     from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig

@@ -34,11 +34,7 @@ _TO_Y_UP = {"nerfstudio": (-(0.5**0.5), 0.0, 0.0, 0.5**0.5), "colmap": (1.0, 0.0
 
 
 def format_of(path: Path) -> str:
-    """Return the key of `FORMATS`, or `MESH`, by which a file's name ends.
-
-    Raises:
-        InputError: If it has none of these ends, or the file is a folder.
-    """
+    """Return the key of `FORMATS`, or `MESH`, that ends a file's name; raise InputError for others and folders."""
     found = [suffix for suffix in (*FORMATS, MESH) if path.name.lower().endswith(suffix)]
     if not found:
         raise InputError(f"--output {path} must end in {', '.join(FORMATS)} or {MESH}.")
@@ -50,15 +46,8 @@ def format_of(path: Path) -> str:
 def write(path: Path, gaussians: Gaussians, frame: Frame = "nerfstudio", start: html.Start | None = None) -> None:
     """Write Gaussians in the format that the file's name asks for; the file appears complete or not at all.
 
-    Args:
-        path: Created, with its parents, or replaced.
-        gaussians: What is written, at least one unless it is a PLY.
-        frame: The frame in which they are.
-        start: Where an HTML page opens; it must be given for one.
-
-    Raises:
-        InputError: If there is nothing to write, or the format cannot hold it.
-        WriteError: If the file could not be written.
+    Only a PLY may hold none, and an HTML page needs a start. InputError is raised if there is nothing to write, or the
+    format cannot hold it, and WriteError if the file cannot be written.
     """
     suffix = format_of(path)
     if not len(gaussians) and suffix != ".ply":

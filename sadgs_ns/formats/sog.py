@@ -35,11 +35,7 @@ _ROUNDS = 8
 
 
 def write(file: IO[bytes], gaussians: Gaussians) -> None:
-    """Write at least one Gaussian as SOG, in an order that keeps neighbours together.
-
-    Raises:
-        InputError: If there are more than fit into an image.
-    """
+    """Write at least one Gaussian as SOG, neighbours together; raise InputError if more than fit into an image."""
     gaussians = gaussians[morton_order(gaussians.means)]
     count = len(gaussians)
     width = 4 * math.ceil(math.sqrt(count) / 4)

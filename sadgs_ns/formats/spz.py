@@ -34,11 +34,7 @@ _STEP = 4
 
 
 def write(file: IO[bytes], gaussians: Gaussians) -> None:
-    """Write at least one Gaussian as SPZ.
-
-    Raises:
-        InputError: If they reach so far that positions would be coarser than 1/256 of a unit.
-    """
+    """Write at least one Gaussian as SPZ; raise InputError if positions would be coarser than 1/256 of a unit."""
     bits = _fractional_bits(float(np.abs(gaussians.means).max()))
     fixed = np.rint(gaussians.means * np.float64(1 << bits)).clip(1 - _RANGE, _RANGE - 1).astype("<i4")
     largest, others = smallest_three(gaussians.quats[:, [1, 2, 3, 0]])

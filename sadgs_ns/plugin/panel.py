@@ -53,11 +53,7 @@ ROWS = 8
 
 
 def change(strategy: StructureAwareStrategy, name: str, value: float) -> None:
-    """Set one of `RANGES`' fields, on which the next densification acts.
-
-    Raises:
-        ValueError: If the value is no number in the field's range; the field is then as before.
-    """
+    """Set one of `RANGES`' fields, on which the next densification acts; raise ValueError if it is out of range."""
     low, high = RANGES[name]
     if not (isinstance(value, int | float) and math.isfinite(value) and low <= value <= high):
         raise ValueError(f"{name} must be in {low} … {high}, got {value}; it stays {getattr(strategy, name)}.")

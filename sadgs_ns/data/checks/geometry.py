@@ -98,11 +98,7 @@ def finite(value: Any, name: str, where: str) -> float:
 
 
 def check_views(views: Sequence[View], training: int, source: Path) -> Generator[Finding, None, bool]:
-    """Check number, cameras, rotations and positions of all views of a file, so many of which are trained on.
-
-    Returns:
-        Whether all is right enough to compare points with them.
-    """
+    """Check number, cameras, rotations and positions of a file's views; return whether points can be compared."""
     findings = [*_check_number(len(views), training, source), *check_rotations(views), *_check_centres(views, source)]
     first = {view.camera: view.where_camera for view in reversed(views)}  # Of views with one camera the first is named.
     findings += [finding for camera, where in first.items() for finding in _check_camera(camera, where)]

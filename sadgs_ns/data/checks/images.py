@@ -96,14 +96,10 @@ def existing_factor(size: Size, copy_of: Callable[[int], Path]) -> int:
 
 
 def check_images(frames: Sequence[Frame], source: Path, look_for_unused: bool = False) -> Iterator[Finding]:
-    """Check the frames' images and masks, and say in a note what they are.
+    """Check the frames' images and masks, whose sizes are from a source, and say in a note what they are.
 
-    Images are decoded until one shows something, and masks until one leaves a pixel to train on.
-
-    Args:
-        frames: All frames.
-        source: The file that the frames' sizes are from.
-        look_for_unused: Whether to warn of images beside the frames' that no frame uses.
+    Images are decoded until one shows something, and masks until one leaves a pixel to train on. A warning tells, where
+    asked, of images beside the frames' that no frame uses.
     """
     with ThreadPoolExecutor() as pool:
         images = list(pool.map(_inspect, (frame.image for frame in frames)))

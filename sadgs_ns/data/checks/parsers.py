@@ -39,12 +39,8 @@ def findings_of(config: FullImageDatamanagerConfig, open_images: bool = True) ->
 def refuse_bad_data(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[Finding]:
     """Choose the parser where none was named, and check the data before nerfstudio parses them.
 
-    Args:
-        config: Its parser is replaced where it is the automatic one.
-        open_images: Whether to look into the images, too.
-
-    Returns:
-        Findings that do not stop training; the first one that does is raised as InputError.
+    Returns the findings that do not stop training, and raises the first other one as InputError. The parser in `config`
+    is replaced where it is the automatic one.
     """
     vars(config).pop("findings", None)
     choose_parser(config)
