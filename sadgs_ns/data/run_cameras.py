@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import copy
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -28,51 +29,83 @@ class RunCameras:
     """The image files. C of them"""
 
 
+_CLASS = "<class>"
+"""Key under which an object's mapping has the name of its class."""
+
+
 class _PlainLoader(yaml.SafeLoader):
-    """Reads Python objects as the mappings, lists and texts that they are written as, and makes none."""
+    """Reads Python objects as the mappings, lists, paths and texts that they are written as, and makes none."""
 
 
-def _plain(loader: _PlainLoader, _: str, node: yaml.Node) -> Any:
+def _plain(loader: _PlainLoader, kind: str, node: yaml.Node) -> Any:
     if isinstance(node, yaml.MappingNode):
-        return loader.construct_mapping(node, deep=True)
+        return loader.construct_mapping(node, deep=True) | {_CLASS: kind.removeprefix("object:")}
     if isinstance(node, yaml.SequenceNode):
-        return loader.construct_sequence(node, deep=True)
+        values = loader.construct_sequence(node, deep=True)
+        return Path(*values) if kind.startswith("object/apply:pathlib.") else values
     return loader.construct_scalar(node)  # type: ignore[arg-type]
 
 
 _PlainLoader.add_multi_constructor("tag:yaml.org,2002:python/", _plain)
 
 
-def find_capture(run: Path) -> Path:
-    """Return the capture's folder that a run's `config.yml` names; raise InputError if it names none that exists."""
+def _noted(run: Path) -> tuple[Path, dict[str, Any]]:
+    """Return the capture's folder and the parser's settings of a run's `config.yml`, or raise InputError."""
     path = run / "config.yml"
     try:
         manager = yaml.load(path.read_bytes(), Loader=_PlainLoader)["pipeline"]["datamanager"]
-        data = Path(*(manager.get("data") or manager["dataparser"]["data"]))
+        parser = manager["dataparser"]
+        data = Path(manager.get("data") or parser["data"])
     except (OSError, yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
         what = type(error).__name__ if isinstance(error, KeyError) else reason(error)
         raise InputError(f"{path} does not tell where the capture is ({what}): give its folder with --data.") from error
+    return data, parser
+
+
+def find_capture(run: Path) -> Path:
+    """Return the capture's folder that a run's `config.yml` names; raise InputError if it names none that exists."""
+    data, _ = _noted(run)
     if not data.exists():
         raise InputError(f"{data}, on which {run} was trained, is not there: give the capture's folder with --data.")
     return data
 
 
+def _parser(run: Path, data: Path) -> Any:
+    """Return the configuration of the parser with which a run read its capture, or of the one that fits the folder."""
+    # nerfstudio takes ten seconds to import, which `--help` and wrong arguments need not wait for.
+    from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
+
+    from sadgs_ns.data.automatic import PARSERS, AutomaticDataParserConfig, choose_parser
+
+    try:
+        _, noted = _noted(run)
+    except InputError:
+        noted = {}
+    known = {f"{type(parser).__module__}.{type(parser).__qualname__}": parser for parser in PARSERS.values()}
+    parser = copy.deepcopy(known.get(noted.get(_CLASS, ""), AutomaticDataParserConfig()))
+    for field in fields(parser):
+        if field.name in noted and not field.name.startswith("_"):
+            setattr(parser, field.name, noted[field.name])
+    parser.data = data
+    config = FullImageDatamanagerConfig(data=data, dataparser=parser)  # type: ignore[arg-type]
+    choose_parser(config)
+    parser = config.dataparser
+    # Points are not needed. nerfstudio reads some with open3d, which a machine may lack, or asks whether to make a PLY.
+    for name, value in (("load_3D_points", False), ("ply_path", None)):
+        if hasattr(parser, name):
+            setattr(parser, name, value)
+    return parser
+
+
 def read_cameras(run: Path, data: Path | None = None, split: str = "train") -> RunCameras:
-    """Read a run's cameras, in its frame, with the parser that fits the capture's folder.
+    """Read a run's cameras, in its frame, as the run read them; where it does not tell how, as fits the folder.
 
     `data` is that folder; None is where the run's `config.yml` says it was. `split` is "train", or "test" for the views
     that are held out. InputError is raised if the capture cannot be read, or the run does not tell how it was moved.
     """
-    # nerfstudio takes ten seconds to import, which `--help` and wrong arguments need not wait for.
-    from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
-
-    from sadgs_ns.data.automatic import AutomaticDataParserConfig, choose_parser
-
     data = find_capture(run) if data is None else data
-    config = FullImageDatamanagerConfig(data=data, dataparser=AutomaticDataParserConfig(data=data))  # type: ignore[arg-type]
     try:
-        choose_parser(config)
-        outputs = config.dataparser.setup().get_dataparser_outputs(split=split)
+        outputs = _parser(run, data).setup().get_dataparser_outputs(split=split)
     except InputError:
         raise
     except Exception as error:  # The parsers' errors are of every kind.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,13 @@ import pycolmap
 import pytest
 import torch
 import trimesh
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
-from kill_and_resume import configure, set_up
+from kill_and_resume import configure, parser_of, set_up
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from plyfile import PlyData
+from runs import nerfstudio_data
 
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
 from sadgs_ns.cli import export
@@ -309,6 +313,51 @@ def test_the_cameras_of_a_run_are_those_of_training_however_it_moved_the_capture
     assert found.sizes == [(WIDTH, HEIGHT)] * len(expected) and found.photos == expected.image_filenames
     held_out = {path.name for path in read_cameras(trainer.base_dir, scene, split="test").photos}
     assert held_out and not held_out & {path.name for path in found.photos}
+
+
+def write_config(run: Path, parser: Any) -> None:
+    """What nerfstudio writes of a run, as far as its cameras need it."""
+    run.mkdir()
+    manager = FullImageDatamanagerConfig(data=None, dataparser=parser)
+    (run / "config.yml").write_text(yaml.dump({"pipeline": {"datamanager": manager}}))
+
+
+@pytest.mark.hard_case(
+    "a run on `colmap --colmap-path sparse/1` beside another model, and options that decide which views are held out",
+    "files, pages and cleaning use the cameras that the run had",
+)
+def test_the_cameras_are_read_as_the_run_read_them(tmp_path: Path):
+    write_scene(tmp_path / "scene", WIDTH, HEIGHT, VIEWS, points=300)
+    (tmp_path / "scene/sparse/0").rename(tmp_path / "scene/sparse/1")
+    write_scene(tmp_path / "other", WIDTH, HEIGHT, VIEWS - 1, points=300)
+    (tmp_path / "other/sparse/0").rename(tmp_path / "scene/sparse/0")
+    parser = parser_of(tmp_path / "scene")
+    parser.colmap_path, parser.eval_interval = Path("sparse/1"), 3
+    expected = parser.setup().get_dataparser_outputs("train").cameras
+    write_config(tmp_path / "run", parser)
+    found = read_cameras(tmp_path / "run")
+    assert len(found.photos) == len(expected) == VIEWS - len(range(0, VIEWS, 3))
+    np.testing.assert_array_equal(found.camera_to_worlds, expected.camera_to_worlds)
+
+
+@pytest.mark.hard_case(
+    "a page or cleaning of a capture with transforms.json, without libusb-1.0 or without a PLY of its points",
+    "the cameras are read without the points: open3d is not imported, nothing is asked and nothing is written",
+)
+@pytest.mark.parametrize("ply", [True, False])
+def test_cameras_are_read_without_their_points(ply: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    parser = nerfstudio_data(tmp_path / "data")
+    meta = json.loads((tmp_path / "data/transforms.json").read_text())
+    meta.pop("ply_file_path", None)
+    (tmp_path / "data/transforms.json").write_text(json.dumps(meta | ({"ply_file_path": "points.ply"} if ply else {})))
+    (tmp_path / "data/colmap/sparse/0").mkdir(parents=True)
+    parser.load_3D_points = True
+    write_config(tmp_path / "run", parser)
+    before = sorted((path, path.stat().st_mtime_ns) for path in (tmp_path / "data").rglob("*"))
+    monkeypatch.setitem(sys.modules, "open3d", None)  # type: ignore[arg-type]  # Importing it raises ImportError.
+    monkeypatch.setattr("rich.prompt.Confirm.ask", None)
+    assert len(read_cameras(tmp_path / "run").photos) > 1
+    assert sorted((path, path.stat().st_mtime_ns) for path in (tmp_path / "data").rglob("*")) == before
 
 
 def test_a_page_opens_at_the_first_training_camera(
