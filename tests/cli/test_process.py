@@ -31,6 +31,7 @@ import pytest
 import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 from rich.progress import Progress
 from room import HEIGHT, VIEWS, WIDTH, camera_centres, draw_photos
 
@@ -481,6 +482,23 @@ def test_photos_with_gps_positions_are_known(tmp_path: Path):
         Image.new("RGB", (8, 8)).save(tmp_path / f"{i}.jpg", exif=exif)
     read = read_photos(tmp_path, [f"{i}.jpg" for i in range(3)], lambda *step: None)
     assert [photo.has_position for photo in read] == [True, True, False]
+
+
+@pytest.mark.hard_case(
+    "EXIF with a focal length or a GPS position of 0/0, and without one",
+    "count as unknown: the photos are of one camera, and have no position",
+)
+@pytest.mark.parametrize("focal", [IFDRational(0, 0), IFDRational(5, 0), IFDRational(0, 1), None])
+def test_a_focal_length_that_is_no_number_is_none(focal: Any, tmp_path: Path):
+    for i in range(3):
+        exif = Image.Exif()
+        exif[0x8769] = {} if focal is None else {0x920A: focal}
+        unknown = IFDRational(0, 0)
+        exif[0x8825] = {1: "N", 2: (48.0, unknown, 1.0), 3: "E", 4: (11.0, 0.0, 0.0), 6: 500.0 if i else unknown}
+        Image.new("RGB", (8, 8)).save(tmp_path / f"{i}.jpg", exif=exif)
+    names = [f"{i}.jpg" for i in range(3)]
+    read = read_photos(tmp_path, names, lambda *step: None)
+    assert photos_by_camera(read) == [names] and not any(photo.has_position for photo in read)
 
 
 @pytest.mark.hard_case("COLMAP aborts", "one sentence with the stage and COLMAP's own words")

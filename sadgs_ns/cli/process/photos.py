@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import os
 import re
 import shutil
@@ -11,6 +12,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 from PIL import ExifTags, Image, UnidentifiedImageError
 
@@ -21,6 +23,7 @@ _UNREAD_SUFFIXES = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", "
 """Suffixes of formats that phones and cameras write and that neither COLMAP nor Pillow surely reads."""
 _CONVERTED_SUFFIXES = {".webp"}
 """Suffixes of formats that training and Pillow read, but COLMAP does not."""
+_POSITION = (ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLongitude, ExifTags.GPS.GPSAltitude)
 _NAMED = 20
 """How many unreadable photos a message names."""
 
@@ -143,19 +146,28 @@ def _threads() -> Iterator[ThreadPoolExecutor]:
 def _read_photo(folder: Path, name: str) -> Photo:
     with Image.open(folder / name) as image:
         exif = image.getexif()
-        lens = exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLength)
+        focal = _numbers(exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLength))  # mm; 0 is unknown, too
         position = exif.get_ifd(ExifTags.IFD.GPSInfo)
         photo = Photo(
             name,
             image.size,
-            (image.size, *(exif.get(tag) for tag in (ExifTags.Base.Make, ExifTags.Base.Model)), lens),
-            position.keys() >= {ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLongitude, ExifTags.GPS.GPSAltitude},
+            (image.size, *(exif.get(tag) for tag in (ExifTags.Base.Make, ExifTags.Base.Model)), max((0.0, *focal))),
+            all(_numbers(position.get(tag)) for tag in _POSITION),
             image.has_transparency_data,
         )
         # An eighth of a JPEG's size tells whether it is whole.
         image.draft("RGB", (image.width // 8, image.height // 8))
         image.load()
     return photo
+
+
+def _numbers(value: Any) -> tuple[float, ...]:
+    """Return EXIF's number or numbers, and none where there is none or one of them is not finite, as 0/0 is not."""
+    try:
+        numbers = tuple(float(number) for number in (value if isinstance(value, tuple) else (value,)))
+    except (TypeError, ValueError, ZeroDivisionError):
+        return ()
+    return numbers if all(map(math.isfinite, numbers)) else ()
 
 
 def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tuple[Path, list[Photo]]:
