@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from sadgs_ns.errors import InputError, reason
 
+COLORS = (("red", "green", "blue"), ("r", "g", "b"))
+"""Names that programs give to colours, in small letters; some put `diffuse_` before them."""
 GREY = 127
 """Colour that is given to points without one, in 0 … 255."""
 
@@ -19,8 +21,9 @@ GREY = 127
 def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return positions [P, 3] in the file's frame and colours in 0 … 255 [P, 3] of a PLY file, text or binary.
 
-    Colours in the file are numbers of 0 … 255, or floating-point ones of 0 … 1. InputError is raised if the file cannot
-    be read, is cut off or holds no points.
+    Colours in the file may be of any type and reach to 1 (where they are floating-point numbers), to 255 or to 65,535:
+    the largest one tells. Points without colours are grey. InputError is raised if the file cannot be read, is cut off
+    or holds no points.
     """
     try:
         vertices = _read_vertices(path)
@@ -32,12 +35,15 @@ def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         raise InputError(f"{path} cannot be read ({reason(error)}): restore it.") from error
     except Exception as error:  # What a damaged header leads plyfile's parser to is open.
         raise InputError(f"{path} is not a PLY file of points ({reason(error)}): restore it.") from error
-    if not {"red", "green", "blue"} <= set(vertices.dtype.names or ()):
+    named = {name.lower().removeprefix("diffuse_"): name for name in vertices.dtype.names or ()}
+    channels = next((names for names in COLORS if named.keys() >= set(names)), None)
+    if channels is None:
         return positions, np.full(positions.shape, GREY, np.uint8)
-    colors = np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=-1)
-    if colors.dtype.kind == "f":
-        colors = np.rint(255 * colors.clip(0, 1))
-    return positions, colors.clip(0, 255).astype(np.uint8)
+    colors = np.stack([vertices[named[channel]] for channel in channels], axis=-1).astype(np.float64)
+    largest = colors[np.isfinite(colors)].max(initial=0.0)
+    is_share = vertices.dtype[named[channels[0]]].kind == "f" and largest <= 1
+    colors *= 255 if is_share else 1 if largest <= 255 else 255 / 65535
+    return positions, np.rint(np.nan_to_num(colors)).clip(0, 255).astype(np.uint8)
 
 
 def _read_vertices(path: Path) -> NDArray[Any]:

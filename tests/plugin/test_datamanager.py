@@ -7,7 +7,7 @@ import dataclasses
 import json
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from runs import blender_data, nerfstudio_data
 
 from examples.drawn_scene.scene import SPARSE_FOLDER
 from sadgs_ns.data import ply
+from sadgs_ns.data.checks.geometry import check_ply
 from sadgs_ns.data.checks.parsers import refuse_bad_data
 from sadgs_ns.errors import InputError
 from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig
@@ -216,17 +217,22 @@ POSITIONS = np.array([[0.0, 0.0, 1.0], [1.0, 0.5, 1.0], [-2.0, 0.25, 3.0]])
 COLORS = np.array([[9, 120, 255], [0, 1, 2], [254, 128, 77]])
 
 
-def ply_scene(folder: Path, text: bool = False, colors: np.ndarray | None = COLORS) -> DataParserConfig:
+def ply_scene(
+    folder: Path,
+    text: bool = False,
+    colors: np.ndarray | None = COLORS,
+    names: Sequence[str] = ("red", "green", "blue"),
+) -> DataParserConfig:
     """A dataset with the points above in a PLY file."""
     parser = nerfstudio_data(folder)
     path = folder / "transforms.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "ply_file_path": "points.ply"}))
-    kind = [] if colors is None else [(name, colors.dtype.str) for name in ("red", "green", "blue")]
+    kind = [] if colors is None else [(name, colors.dtype.str) for name in names]
     vertices = np.empty(len(POSITIONS), [(axis, "<f8") for axis in "xyz"] + kind)
     for k in range(3):
         vertices["xyz"[k]] = POSITIONS[:, k]
         if colors is not None:
-            vertices[("red", "green", "blue")[k]] = colors[:, k]
+            vertices[names[k]] = colors[:, k]
     PlyData([PlyElement.describe(vertices, "vertex")], text=text).write(str(folder / "points.ply"))
     return parser
 
@@ -264,12 +270,33 @@ def test_points_of_a_ply_file_are_nerfstudio_s(tmp_path: Path, open3d: None):
         (None, [[ply.GREY] * 3] * 3),
         (COLORS.astype(np.float32) / 255, COLORS.tolist()),
         (COLORS.astype(np.uint16), COLORS.tolist()),
+        (COLORS.astype(np.uint16) * 257, COLORS.tolist()),
+        (COLORS.astype(np.float32), COLORS.tolist()),
     ],
-    ids=["none", "fractions", "wide"],
+    ids=["none", "fractions", "wide", "65,535", "floats to 255"],
+)
+@pytest.mark.hard_case(
+    "a PLY of points whose colours are floating-point numbers to 1 or 255, or integers to 255 or 65,535",
+    "read as they are meant, by the largest of them; grey where there are none",
 )
 def test_colours_of_a_ply_file(colors: np.ndarray | None, expected: list, tmp_path: Path):
     metadata = load(ply_scene(tmp_path, colors=colors)).train_dataset.metadata
     assert metadata["points3D_rgb"].dtype == torch.uint8 and metadata["points3D_rgb"].tolist() == expected
+
+
+@pytest.mark.hard_case("a PLY of points whose colours are named r, g, b, or Red, or diffuse_red", "read")
+@pytest.mark.parametrize("names", ["rgb", ("Red", "Green", "Blue"), ("diffuse_red", "diffuse_green", "diffuse_blue")])
+def test_colours_are_known_by_the_names_in_use(names: Sequence[str], tmp_path: Path):
+    ply_scene(tmp_path, colors=COLORS.astype(np.uint8), names=names)
+    assert ply.read_points(tmp_path / "points.ply")[1].tolist() == COLORS.tolist()
+
+
+@pytest.mark.hard_case("a PLY of points without colours", "trains from grey points; the check notes it")
+@pytest.mark.parametrize("colors", [None, COLORS.astype(np.uint8)], ids=["without", "with"])
+def test_points_without_colours_are_noted(colors: np.ndarray | None, tmp_path: Path):
+    ply_scene(tmp_path, colors=colors)
+    notes = [finding.sentence for finding in check_ply(tmp_path / "points.ply", [], "restore it")]
+    assert any("without colours" in note for note in notes) == (colors is None)
 
 
 def test_what_is_no_ply_file_of_points_is_named(tmp_path: Path):

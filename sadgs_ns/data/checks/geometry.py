@@ -209,7 +209,7 @@ def _can_be_undone(camera: Camera, radius: float) -> bool:
 def check_ply(path: Path, views: Sequence[View], remedy: str) -> Iterator[Finding]:
     """Check a PLY file of SfM points and, if there are views, how the points lie to them."""
     try:
-        positions, _ = ply.read_points(path)
+        positions, colors = ply.read_points(path)
     except InputError as error:
         problem = str(error).removeprefix(f"{path} ").rpartition(": ")[0]
     else:
@@ -218,6 +218,8 @@ def check_ply(path: Path, views: Sequence[View], remedy: str) -> Iterator[Findin
             problem = "has NaN or infinity in a point"
         elif problem is None:
             yield from check_points(positions, views, path)
+            if (colors == ply.GREY).all():
+                yield Finding("note", f"{path} has points without colours, which start grey.")
     if problem is not None:
         yield Finding("error", f"{path} should hold the SfM points but {problem}: {remedy}.")
 
