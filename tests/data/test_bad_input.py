@@ -1195,6 +1195,26 @@ def test_one_or_two_training_views_train_with_a_warning(
     assert f"leaves {training} training view{'s' * (training > 1)}: so few fix no shape; take 20 or more." in printed
 
 
+@pytest.mark.hard_case(
+    "an images.txt without its second lines, as other programs write it, or with a line too few or too many",
+    "refused: each image needs a line of keypoints, which may be empty",
+)
+def test_an_images_txt_without_lines_of_keypoints_is_refused(tmp_path: Path):
+    images = [f"{i} 1 0 0 0 0 0 {i} 1 00{i}.png\n" for i in range(4)]
+    path = tmp_path / "images.txt"
+    for text in ("".join(images), images[0] + "\n" + images[1] + images[2], images[0] + "\n3 4\n"):
+        path.write_text(text)
+        told = (
+            r"images\.txt: the line after image '00[01]\.png' does not hold its keypoints: each image needs such a line"
+        )
+        if text.endswith("3 4\n"):
+            told = "is not COLMAP's text"
+        with pytest.raises(InputError, match=told):
+            colmap.read_poses(path)
+    path.write_text("# comments\n" + "\n".join(images) + "1.5 2.5 -1 3.5 4.5 7")
+    assert [name for name, _, _ in colmap.read_poses(path)] == ["000.png", "001.png", "002.png", "003.png"]
+
+
 # --- what the checks assume of others ---
 
 
