@@ -6,7 +6,9 @@ at ±3.33, and quaternions 9 bits and a sign for each of the three smallest comp
 ±1, with steps of 1/32. Niantic's own writer takes 1/16 in degree 1 and 1/8 above, to which most of what a short run has
 learned there is zero.
 
-The format names no axes. They are those of the PLY, as other converters of Gaussians leave them, too.
+Axes are those of the PLY, and a record of Adobe's at the end says so. Without it some readers take a file's axes for a
+PLY's (splat-transform from version 3, SuperSplat) and others for OpenGL's, half a turn around x away (Niantic's library
+and splat-transform 2 before a PLY is written); with it all of these leave the SPZ where the PLY is.
 """
 
 from __future__ import annotations
@@ -29,6 +31,10 @@ _MOST_BITS, _LEAST_BITS = 20, 8
 _RANGE = 1 << 23
 _COLOR = 0.15 * 255
 """Steps in a unit of the harmonic of degree 0."""
+_AXES = struct.pack("<III", 0xADBE0003, 4, 6)
+"""Record `SPZ_ADOBE_coordinate_system`: its type, its length and x right, y down, z forward, a PLY's axes."""
+_HAS_RECORDS = 2
+"""Flag of a file with records after the Gaussians; readers that know none stop before them."""
 _STEP = 4
 """Steps of the higher harmonics, in 128ths; gzip makes use of the bits that are always zero."""
 
@@ -49,9 +55,12 @@ def write(file: IO[bytes], gaussians: Gaussians) -> None:
         to_bytes(128 + _STEP * np.rint(128 / _STEP * gaussians.features_rest)),
     ]
     with gzip.GzipFile(fileobj=file, mode="wb", compresslevel=6, mtime=0) as compressed:
-        compressed.write(struct.pack("<IIIBBBB", _MAGIC, _VERSION, len(gaussians), gaussians.degree, bits, 0, 0))
+        compressed.write(
+            struct.pack("<IIIBBBB", _MAGIC, _VERSION, len(gaussians), gaussians.degree, bits, _HAS_RECORDS, 0)
+        )
         for part in parts:
             compressed.write(part.tobytes())
+        compressed.write(_AXES)
 
 
 def _fractional_bits(reach: float) -> int:

@@ -1,11 +1,16 @@
-"""The formats, read back by readers that are not ours: gsply for PLY, SPZ and SOG, and glTF by its specification."""
+"""The formats, read back by readers that are not ours: gsply for PLY, SPZ and SOG, and glTF by its specification.
+
+PlayCanvas's splat-transform, a program for Node.js, reads them too where npx can fetch it.
+"""
 
 from __future__ import annotations
 
 import base64
+import gzip
 import io
 import json
 import re
+import shutil
 import struct
 import subprocess
 from collections.abc import Callable
@@ -184,6 +189,38 @@ def test_positions_of_spz_are_as_fine_as_the_furthest_one_leaves(tmp_path: Path)
     ):
         formats.write(tmp_path / "far.spz", written)
     assert [path.name for path in tmp_path.iterdir()] == ["splat.spz"]
+
+
+@pytest.mark.hard_case(
+    "an SPZ beside the PLY of its run, in a reader that turns SPZ", "both lie alike; it was upside down"
+)
+def test_an_spz_says_that_its_axes_are_those_of_a_ply(tmp_path: Path):
+    written = random_gaussians(4)
+    formats.write(tmp_path / "splat.spz", written)
+    content = gzip.decompress((tmp_path / "splat.spz").read_bytes())
+    assert content[14] == 2, "the flag of records at the end"
+    assert len(content) == 16 + 4 * (9 + 1 + 3 + 3 + 4 + 45) + 12
+    assert struct.unpack("<III", content[-12:]) == (0xADBE0003, 4, 6)  # SPZ_ADOBE_coordinate_system, 4 bytes, RDF
+    assert errors(written, read(tmp_path / "splat.spz"))["means"] <= 2.0**-20
+
+
+@pytest.mark.hard_case("PLY, compressed PLY, SPZ and SOG in splat-transform 2 and 3, which take SPZ's axes differently",
+                       "the same Gaussians, turned alike")  # fmt: skip
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("npx") is None, reason="needs Node.js")
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".sog"])
+@pytest.mark.parametrize("program", ["@playcanvas/splat-transform@2.7.1", html.VIEWER])
+def test_splat_transform_finds_the_same_gaussians_in_every_format(program: str, suffix: str, tmp_path: Path):
+    written, path = random_gaussians(300), tmp_path / f"splat{suffix}"
+    formats.write(path, written)
+    command = ["npx", "--yes", program, "--quiet", str(path), str(tmp_path / "read.ply")]
+    run = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    if "ENOTFOUND" in run.stderr or "EAI_AGAIN" in run.stderr:
+        pytest.skip("needs a network")
+    assert run.returncode == 0, run.stderr
+    bounds = BOUNDS[suffix] | ({"means": 6 / 1023} if suffix == ".compressed.ply" else {})
+    for name, error in errors(written, read(tmp_path / "read.ply")).items():
+        assert error <= bounds[name], (name, error)
 
 
 def test_values_beyond_a_format_s_range_are_cut_and_not_wrapped(tmp_path: Path):
