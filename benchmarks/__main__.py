@@ -42,7 +42,6 @@ COMMANDS = {
     "documents": ("documents:Command", "the tables and figures of the documents, from the rows of docs/results"),
     "approximations": ("approximations:Command", "speed against error of the frequency analysis"),
     "step": ("step:Compare", "the parts of a training step, with and without our Triton kernels (CUDA)"),
-    "growth": ("step:Growth", "a training step of more Gaussians, and of larger images, beside gsplat's (CUDA)"),
     "memory": ("step:Memory", "the memory plan beside the real peaks of training steps (CUDA)"),
     "shards": ("step:Together", "a training step of Gaussians that are spread over several devices, with torchrun"),
     "validation": ("validation:Command", "copies of scenes whose validation views are held out"),

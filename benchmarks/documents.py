@@ -83,7 +83,7 @@ class Source:
         return table.of_approximations([found[name] for name in variants or found])
 
     def growth(self, rows: str) -> str:
-        """What `growth` measured."""
+        """Milliseconds of a step by Gaussians and by pixels."""
         return table.of_growth(self.read(rows))
 
     def peers_drawn(
@@ -97,10 +97,6 @@ class Source:
     def quality_drawn(self, rows: str, cost: str) -> list[Any]:
         """Arguments of `plots.quality`."""
         return [list(table.groups(self.read(rows)).items()), cost]
-
-    def growth_drawn(self, rows: str) -> list[Any]:
-        """Arguments of `plots.growth`."""
-        return [self.read(rows)]
 
 
 def made(source: Source, what: str, name: str, description: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Plots of a benchmark's results: quality against time and against the number of Gaussians, and growing steps.
+"""Plots of a benchmark's results: quality against time and against the number of Gaussians.
 
 Every method has a colour (Okabe–Ito) and a marker of its own on all plots, so that none needs the colour. 7.2 in wide
 with text of 8 pt and more: true to size on a page of A4 or letter.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -114,34 +114,6 @@ def quality(results: Iterable[tuple[tuple[str, str], list[Result]]], cost: str) 
     shared = any(row.get("jobs_per_gpu", 1) > 1 for row in rows)
     remark = "runs shared a GPU: times are not comparable" if shared else "← less is better"
     _finish_figure(figure, COSTS[cost].format(remark), handles)
-    return figure
-
-
-@_styled
-def growth(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Milliseconds of a step against the number of Gaussians, and against pixels, both axes logarithmic.
-
-    Args:
-        rows: `gaussians`, `megapixels`, `ours_ms` and `gsplat_ms`, None where the memory was too small. The first row's
-            size goes with all numbers of Gaussians, and its number with all sizes.
-    """
-    number, size = rows[0]["gaussians"], rows[0]["megapixels"]
-    figure = Figure(figsize=(_WIDTH, 2.8))
-    left, right = figure.subplots(1, 2, sharey=True)
-    by_number = [(row["gaussians"], row) for row in rows if row["megapixels"] == size]
-    by_size = [(1e6 * row["megapixels"], row) for row in rows if row["gaussians"] == number]
-    looks = styles(("ours", "gsplat and torch"))
-    for axes, points, title in ((left, by_number, f"{size:g} megapixels"), (right, by_size, f"{number:,g} Gaussians")):
-        for (label, look), field in zip(looks.items(), ("ours_ms", "gsplat_ms"), strict=True):
-            _plot(axes, sorted(_known((x, row[field]) for x, row in points)), label=label, **look)
-        axes.set(xscale="log", yscale="log", title=title)
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axes.yaxis.set_minor_locator(NullLocator())
-        axes.yaxis.set_major_formatter(EngFormatter(sep=""))
-    left.set(xlabel="Gaussians", ylabel="Milliseconds a training step")
-    right.set_xlabel("Pixels")
-    left.legend()
     return figure
 
 

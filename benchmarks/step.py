@@ -14,7 +14,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -245,37 +244,6 @@ class Compare:
             lines = [(name, *(f"{column[name]:.2f}" for column in columns)) for name in columns[0]]
             print(grid(("part", "gsplat and torch", "with our kernels"), lines), end="\n\n", flush=True)
         return 0
-
-
-@dataclass
-class Growth:
-    """Time training steps of more and more Gaussians, and of larger images, beside gsplat's (CUDA)."""
-
-    gaussians: tuple[int, ...] = (1_000_000, 100_000, 300_000, 4_000_000, 16_000_000)
-    """the first of them goes with all sizes"""
-    megapixels: tuple[float, ...] = (2.0, 0.3, 1.0, 4.0, 8.0, 16.0)
-    """the first of them goes with all numbers of Gaussians"""
-    output: Path = Path("growth.csv")
-    """takes the table"""
-
-    def __call__(self) -> int:
-        gpu()
-        first, *others = self.megapixels
-        lines = ["gaussians,megapixels,ours_ms,gsplat_ms"]
-        for number, size in [*((n, first) for n in self.gaussians), *((self.gaussians[0], size) for size in others)]:
-            times = (self.time(number, size, triton) for triton in (True, False))
-            lines.append(",".join([str(number), str(size), *(f"{time:.4f}" for time in times)]))
-            print(lines[-1], flush=True)
-        self.output.write_text("\n".join(lines) + "\n")
-        return 0
-
-    def time(self, gaussians: int, megapixels: float, triton: bool) -> float:
-        """Milliseconds of a step of one view; NaN where the device's memory is too small."""
-        try:
-            with kernels.triton_switched(triton):
-                return milliseconds(Step(gaussians, *size_of(megapixels)))
-        except torch.cuda.OutOfMemoryError:
-            return math.nan
 
 
 @dataclass

@@ -278,7 +278,7 @@ def _difference(cell: Sequence[Sequence[Result]], base: Sequence[Sequence[Result
 
 
 def of_growth(rows: Sequence[Mapping[str, Any]]) -> str:
-    """What `growth` measured, its numbers of Gaussians before its sizes."""
+    """Milliseconds of a step, those by numbers of Gaussians before those by sizes of the image."""
     fewest = min(row["megapixels"] for row in rows if row["gaussians"] != rows[0]["gaussians"])
     ordered = sorted(rows, key=lambda row: (row["megapixels"] != fewest, row["gaussians"], row["megapixels"]))
     lines = (

@@ -109,7 +109,7 @@ def test_a_difference_that_rests_on_a_single_run_is_marked(tmp_path: Path):
     assert "| × 2 | 0.00 / .0000 / .0000 / ×1.00 ¹ |" in (folder / "README.md").read_text("utf8")
 
 
-def test_approximations_and_growth_are_printed_as_their_commands_do(tmp_path: Path):
+def test_approximations_are_printed_as_their_command_does_and_growth_by_its_two_sizes(tmp_path: Path):
     common = {"table": "footprint", "input": "demo", "median": 0.1, "p95": 0.2, "max": 0.3, "flips": 0.0, "ms": 1234.5}
     rows = [{**common, "variant": "1 sample"}, {**common, "variant": "4 samples", "ms": None}]
     tables = {

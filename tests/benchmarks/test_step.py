@@ -11,7 +11,7 @@ from ranks import run_ranks
 
 from benchmarks import __main__ as bench
 from benchmarks import step as steps
-from benchmarks.step import REPEATS, Growth, Step, milliseconds, plan, step_time
+from benchmarks.step import REPEATS, Step, milliseconds, plan, step_time
 from sadgs_ns.distributed.world import World
 from sadgs_ns.method.memory import StepSize, step_bytes
 from sadgs_ns.render.rasterization import visible
@@ -28,7 +28,7 @@ def test_a_time_is_the_median_of_rounds_after_the_first(monkeypatch: pytest.Monk
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="here it would measure")
-@pytest.mark.parametrize("command", ["step", "growth", "memory"])
+@pytest.mark.parametrize("command", ["step", "memory"])
 def test_without_a_gpu_one_sentence_says_what_it_needs(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -36,23 +36,6 @@ def test_without_a_gpu_one_sentence_says_what_it_needs(
     assert bench.main([command]) == 2
     told = f"python -m benchmarks {command}: this needs a CUDA device, and torch finds none.\n"
     assert capsys.readouterr() == ("", told) and not list(tmp_path.iterdir())
-
-
-def test_all_numbers_go_with_the_first_size_and_all_sizes_with_the_first_number(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    def time(_: Growth, gaussians: int, megapixels: float, triton: bool) -> float:
-        return float("nan") if gaussians > 1000 and not triton else (2 - triton) * (gaussians + megapixels)
-
-    monkeypatch.setattr(steps, "gpu", lambda: None)
-    monkeypatch.setattr(Growth, "time", time)
-    table = tmp_path / "growth.csv"
-    options = ["--gaussians", "1000", "100", "4000", "--megapixels", "2", "8", "--output", str(table)]
-    assert bench.main(["growth", *options]) == 0
-    assert table.read_text().splitlines()[1:] == [
-        "1000,2.0,1002.0000,2004.0000", "100,2.0,102.0000,204.0000", "4000,2.0,4002.0000,nan",
-        "1000,8.0,1008.0000,2016.0000",
-    ]  # fmt: skip
 
 
 def test_a_step_goes_through_the_phases_of_the_plan_and_has_their_size():
@@ -75,11 +58,6 @@ def test_the_parts_of_a_step_can_be_called_alone():
     for part in (step, step.render, step.compare, step.observe, step.optimize):
         part()
     assert step.params["means"].grad is not None and step.rendered.grad is not None
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="a step is timed on CUDA")
-def test_a_step_is_timed_with_and_without_our_kernels():
-    assert all(0 < Growth().time(2_000, 0.02, triton) < 1_000 for triton in (True, False))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="peaks are measured on CUDA")

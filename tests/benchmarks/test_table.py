@@ -84,15 +84,6 @@ def test_wrong_input_is_one_sentence_and_writes_nothing(
     assert not (tmp_path / "out").exists()
 
 
-def test_growth_has_a_panel_for_gaussians_and_one_for_pixels():
-    rows = [(1e6, 2.0, 4.0, 8.0), (1e5, 2.0, 3.1, 6.2), (4e6, 2.0, 7.0, None), (1e6, 8.0, 10.0, 20.0)]
-    names = ("gaussians", "megapixels", "ours_ms", "gsplat_ms")
-    figure = plots.growth([dict(zip(names, row, strict=True)) for row in rows])
-    lines = [[np.asarray(line.get_xydata()).tolist() for line in axes.lines] for axes in figure.axes]
-    assert lines[0] == [[[1e5, 3.1], [1e6, 4.0], [4e6, 7.0]], [[1e5, 6.2], [1e6, 8.0]]]
-    assert lines[1] == [[[2e6, 4.0], [8e6, 10.0]], [[2e6, 8.0], [8e6, 20.0]]]
-
-
 def test_pareto_front_of_a_hand_made_case():
     points = [(3.0, 30.0), (1.0, 20.0), (2.0, 30.0), (2.0, 25.0), (4.0, 29.0), (5.0, 31.0), (1.0, 20.0)]
     assert plots.pareto_front(points, higher_is_better=True) == [(1.0, 20.0), (2.0, 30.0), (5.0, 31.0)]
