@@ -43,7 +43,6 @@ COMMANDS = {
     "approximations": ("approximations:Command", "speed against error of the frequency analysis"),
     "step": ("step:Compare", "the parts of a training step, with and without our Triton kernels (CUDA)"),
     "memory": ("step:Memory", "the memory plan beside the real peaks of training steps (CUDA)"),
-    "shards": ("step:Together", "a training step of Gaussians that are spread over several devices, with torchrun"),
     "validation": ("validation:Command", "copies of scenes whose validation views are held out"),
     "exposures": ("exposures:Command", "a copy of a scene whose photos have known exposures"),
     "formats": ("formats:Command", "what the files that sadgs-export writes take and lose, on a run's held-out views"),

@@ -1,14 +1,12 @@
-"""A training step on made-up Gaussians, its parts with and without our kernels, and how it grows.
+"""A training step on made-up Gaussians: its parts with and without our kernels, and its peaks beside the memory plan.
 
-The Gaussians are a spherical shell, which cameras around it look at, or several shells that no camera sees two of, as a
-view of a city sees a part of it. Calls follow each other, so that the host's work counts only where it takes longer
-than the GPU's.
+The Gaussians are a spherical shell, which cameras around it look at. Calls follow each other, so that the host's work
+counts only where it takes longer than the GPU's.
 """
 
 from __future__ import annotations
 
 import math
-import os
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,17 +15,14 @@ from itertools import product
 from typing import Any
 
 import torch
-import torch.distributed as dist
 from torch import Tensor
 
 from benchmarks.evaluate import now
 from benchmarks.table import grid
 from sadgs_ns import kernels
-from sadgs_ns.distributed.rasterization import rasterize as rasterize_together
-from sadgs_ns.distributed.world import World
 from sadgs_ns.method import memory
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, keep_gradient
-from sadgs_ns.method.losses import photometric_loss, photometric_part
+from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
 from sadgs_ns.plugin.optimizers import FusedAdam, step_together
@@ -39,8 +34,6 @@ ETA_EVERY = 10
 """Steps between two that observe η, about as many as in a run of 3,000 iterations."""
 ASPECT = 1.5
 """Width of the images, relative to their height."""
-BLOCKS_APART = 10.0
-"""Distance between the centres of two blocks, in radii of one."""
 ROOM = 1.25
 """Places in the tile lists, relative to the pairs of the first step: as in training, later ones do not wait."""
 
@@ -63,42 +56,27 @@ def size_of(megapixels: float) -> tuple[int, int]:
 
 
 class Step:
-    """A training step of V views of `width` × `height` px, whose parts can be called one by one.
-
-    All processes of `world` have `gaussians` of degree 3 together, each as many as another. They lie in `blocks`
-    shells, each of which has as many Gaussians and views as another where it divides their numbers.
-    """
+    """A training step of Gaussians of degree 3 in V views of `width` × `height` px, whose parts can be called alone."""
 
     def __init__(
-        self,
-        gaussians: int,
-        width: int,
-        height: int,
-        views: int = 1,
-        device: torch.device | str = "cuda",
-        world: World | None = None,
-        blocks: int = 1,
+        self, gaussians: int, width: int, height: int, views: int = 1, device: torch.device | str = "cuda"
     ) -> None:
-        self.world, self.width, self.height, self.views = world or World(), width, height, views
+        self.width, self.height, self.views = width, height, views
         device = torch.device(device)
-        part = self.world.take_even_part(gaussians)
-        number = part.stop - part.start
-        generator = torch.Generator(device).manual_seed(part.start)
+        generator = torch.Generator(device).manual_seed(0)
 
         def uniform(low: float, high: float, *shape: int) -> Tensor:
             return torch.empty(shape, device=device).uniform_(low, high, generator=generator)
 
-        directions = torch.empty((number, 3), device=device).normal_(generator=generator)
-        spacing = math.sqrt(4 * math.pi * blocks / gaussians)  # of points on the unit sphere
-        means = torch.nn.functional.normalize(directions, dim=-1) * uniform(0.95, 1.05, number, 1)
-        means[:, 1] += BLOCKS_APART * (torch.arange(number, device=device) % blocks)
+        directions = torch.empty((gaussians, 3), device=device).normal_(generator=generator)
+        spacing = math.sqrt(4 * math.pi / gaussians)  # of points on the unit sphere
         values = {
-            "means": means,
-            "scales": torch.log(spacing * uniform(0.3, 1.2, number, 3)),
-            "quats": uniform(-1.0, 1.0, number, 4),
-            "features_dc": uniform(-1.0, 1.0, number, 3),
-            "features_rest": uniform(-0.1, 0.1, number, 15, 3),
-            "opacities": torch.logit(uniform(0.05, 0.95, number, 1)),
+            "means": torch.nn.functional.normalize(directions, dim=-1) * uniform(0.95, 1.05, gaussians, 1),
+            "scales": torch.log(spacing * uniform(0.3, 1.2, gaussians, 3)),
+            "quats": uniform(-1.0, 1.0, gaussians, 4),
+            "features_dc": uniform(-1.0, 1.0, gaussians, 3),
+            "features_rest": uniform(-0.1, 0.1, gaussians, 15, 3),
+            "opacities": torch.logit(uniform(0.05, 0.95, gaussians, 1)),
         }
         self.params = {name: torch.nn.Parameter(value) for name, value in values.items()}
         ours, log = not kernels.switched_off(), NonFiniteLog(device, capacity=1)
@@ -106,13 +84,12 @@ class Step:
         self.optimizers: list[Any] = [adam([p], lr=1e-6, eps=1e-15) for p in self.params.values()]
         for optimizer in self.optimizers if ours else ():
             optimizer.log = log  # one for all, as in training: what shares it is updated in one launch
-        self.state: dict[str, Any] = empty_statistics(number, device) | empty_gradients(number, device)
-        numbers = torch.arange(views, device=device)
-        angles = (numbers // blocks) * (2 * math.pi * blocks / views)
+        self.state: dict[str, Any] = empty_statistics(gaussians, device) | empty_gradients(gaussians, device)
+        angles = torch.arange(views, device=device) * (2 * math.pi / views)
         self.viewmats = torch.eye(4, device=device).repeat(views, 1, 1)
         self.viewmats[:, 0, 0] = self.viewmats[:, 2, 2] = angles.cos()
         self.viewmats[:, 0, 2], self.viewmats[:, 2, 0] = angles.sin(), -angles.sin()
-        self.viewmats[:, 1, 3], self.viewmats[:, 2, 3] = -BLOCKS_APART * (numbers % blocks), 1.6
+        self.viewmats[:, 2, 3] = 1.6
         K = torch.tensor([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]], device=device)
         self.Ks = K.repeat(views, 1, 1)
         self.images = torch.full((views, height, width, 3), 100, dtype=torch.uint8, device=device)
@@ -122,37 +99,19 @@ class Step:
         self.count = 0
         self.info: dict[str, Any] = {}
 
-    def draw(self) -> list[Tensor]:
-        """Rasterize: the views [V, H, W, 3] of one process, or the bands of views that this one of several has."""
+    def draw(self) -> Tensor:
+        """Rasterize the views. [V, H, W, 3]"""
         p = self.params
         splats: Any = (
             p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid().squeeze(-1),
             (p["features_dc"], p["features_rest"]), self.viewmats, self.Ks, self.width, self.height,
         )  # fmt: skip
-        if not self.world.alone:
-            self.bands, self.start, info = rasterize_together(self.world, *splats, sh_degree=3, absgrad=True)
-            drawn = [colors for _, colors, _ in self.bands]
-        else:
-            image, _, info = rasterize(*splats, sh_degree=3, absgrad=True, tile_capacity=self.capacity)
-            keep_gradient(info["means2d"])
-            if "pair_counts" in info and self.capacity is None:
-                self.capacity = int(ROOM * sum(info["pair_counts"].wait()))
-            drawn = [image]
+        drawn, _, info = rasterize(*splats, sh_degree=3, absgrad=True, tile_capacity=self.capacity)
+        keep_gradient(info["means2d"])
+        if "pair_counts" in info and self.capacity is None:
+            self.capacity = int(ROOM * sum(info["pair_counts"].wait()))
         self.info = {**info, "viewmats": self.viewmats, "Ks": self.Ks, "structure_tensors": self.codes}
         return drawn
-
-    def loss(self, drawn: list[Tensor]) -> Tensor:
-        """The photometric loss of what `draw` gave; of several processes each has a part."""
-        if self.world.alone:
-            return photometric_loss(drawn[0], self.images)[0]
-        loss = self.start
-        for (band, _, _), colors in zip(self.bands, drawn, strict=True):
-            part, _ = photometric_part(
-                colors, self.images[band.view][None, band.top : band.bottom],
-                rows=(band.first, band.last), top=band.top, height=self.height,
-            )  # fmt: skip
-            loss = loss + part / self.views
-        return loss
 
     def forget_gradients(self) -> None:
         """As a step begins."""
@@ -162,16 +121,16 @@ class Step:
     def render(self) -> None:
         """Rasterize forward and backward."""
         self.forget_gradients()
-        self.draw()[0].sum().backward()
+        self.draw().sum().backward()
 
     def compare(self) -> None:
         """The photometric loss with its gradient."""
         self.rendered.grad = None
-        self.loss([self.rendered]).backward()
+        photometric_loss(self.rendered, self.images)[0].backward()
 
     def observe(self) -> None:
         """One observation of η."""
-        jitter = self.world.rand(self.info["means2d"])
+        jitter = torch.rand_like(self.info["means2d"])
         observe(self.state, self.params, self.info, jitter=jitter)  # type: ignore[arg-type]
 
     def optimize(self) -> None:
@@ -193,7 +152,7 @@ class Step:
             self.observe()
         self.count += 1
         after("tile lists")
-        loss = self.loss(drawn)
+        loss, _ = photometric_loss(drawn, self.images)
         after("loss")
         loss.backward()
         accumulate_gradients(self.state, self.info, self.views)
@@ -296,67 +255,3 @@ def peaks_of(step: Step) -> dict[str, float]:
     torch.cuda.reset_peak_memory_stats()
     step(note)
     return peaks
-
-
-@dataclass
-class Together:
-    """Time training steps of made-up Gaussians that are spread over the devices of the processes that torchrun starts;
-    without torchrun, on one device.
-
-    With as many blocks and views as devices this tells how much longer a step takes where the scene grows with them.
-    """
-
-    gaussians: tuple[int, ...] = (8_000_000,)
-    """of all devices together"""
-    megapixels: tuple[float, ...] = (2.0, 8.0)
-    """sizes of a view"""
-    views: tuple[int, ...] = (2,)
-    """of a step"""
-    blocks: int = 1
-    """parts of the scene, of which a view sees one"""
-    repeats: int = 10
-    """steps in each of three rounds"""
-
-    def __call__(self) -> int:
-        if self.blocks < 1:
-            raise ValueError(f"--blocks must be at least 1, got {self.blocks}.")
-        number, local = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("LOCAL_RANK", "0"))
-        device, world = torch.device("cpu"), World()
-        if torch.cuda.is_available():
-            device = torch.device("cuda", local)
-            torch.cuda.set_device(device)  # NCCL, and Triton, take the current device.
-        if number > 1:
-            dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
-            world = World(device)
-        lines = []
-        for gaussians, megapixels, views in product(self.gaussians, self.megapixels, self.views):
-            step = Step(gaussians, *size_of(megapixels), views, device, world, self.blocks)
-            time, peak = step_time(step, self.repeats)
-            peaks = world.gather(torch.tensor([peak], device=device))[:, 0].tolist()
-            size = (str(number), f"{gaussians:,}", f"{megapixels:g}", str(views), str(self.blocks))
-            lines.append((*size, f"{time:.2f}", ", ".join(f"{peak:.2f}" for peak in peaks)))
-            del step
-        if world.rank == 0:
-            name = torch.cuda.get_device_name() if device.type == "cuda" else "CPU"
-            print(f"{number} × {name}, torch {torch.__version__}\n")
-            header = ("devices", "Gaussians", "megapixels", "views", "blocks", "ms a step", "peak GB of each device")
-            print(grid(header, lines, names=0), flush=True)
-        if not world.alone:
-            dist.destroy_process_group()
-        return 0
-
-
-def step_time(step: Step, repeats: int) -> tuple[float, float]:
-    """Milliseconds a step, and the peak of this process's memory on the device in 10⁹ bytes, NaN without CUDA."""
-
-    def steps() -> None:
-        for _ in range(repeats):
-            step()
-        step.world.all(True)
-
-    for _ in range(3):  # kernels are compiled
-        step()
-    if step.images.is_cuda:
-        torch.cuda.reset_peak_memory_stats()
-    time = milliseconds(steps, rounds=3, repeats=1) / repeats
-    return time, torch.cuda.max_memory_allocated() / 1e9 if step.images.is_cuda else math.nan
