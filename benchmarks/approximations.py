@@ -99,10 +99,10 @@ class Footprints:
         return torch.linalg.inv(covariances).flatten(1)[:, [0, 1, 3]].to(self.axes)
 
 
-def random_footprints(count: int, images: Tensor, seed: int = 0) -> Footprints:
+def random_footprints(count: int, images: Tensor) -> Footprints:
     """Footprints anywhere in images [B, H, W, C], of 1 to 32 px along the major axis, up to 8 times less along the
     minor one."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     batch, height, width = images.shape[:3]
     x, y, size, ratio, turn, image = torch.rand((6, count), generator=generator)
     major = 32.0**size  # log-uniform

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 _BITS = 21
 """Bits of each coordinate in a Morton code of 63 bits."""
+_LEVELS = 256
+"""Of a codebook, as one byte tells apart."""
 _BINS = 256
 """Bins of the histogram from which a codebook begins."""
 _SAMPLE = 1 << 18
@@ -48,8 +50,8 @@ def smallest_three(quats: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArr
     return largest, quats[rows[:, None], others] * signs[:, None]
 
 
-def codebook(values: NDArray[np.float32], size: int = 256) -> NDArray[np.float32]:
-    """Return levels, ascending, that quantise values of any shape, at least one, with little mean square error. [size]
+def codebook(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return levels, ascending, that quantise values of any shape, at least one, with little mean square error. [256]
 
     They begin with the cube root of the values' density, which is the best one where there are many levels, and a fifth
     of them evenly, so that no rare value is far from a level. Lloyd's algorithm makes them better.
@@ -58,11 +60,11 @@ def codebook(values: NDArray[np.float32], size: int = 256) -> NDArray[np.float32
     density = np.cbrt(counts)
     mass = np.concatenate([[0.0], np.cumsum(density + 0.25 * density.mean())])
     values = values.flatten()[:: math.ceil(values.size / _SAMPLE)]
-    levels = np.interp((np.arange(size) + 0.5) / size * mass[-1], mass, edges)
+    levels = np.interp((np.arange(_LEVELS) + 0.5) / _LEVELS * mass[-1], mass, edges)
     for _ in range(_ROUNDS):
         labels = nearest_level(values, levels)
-        numbers = np.bincount(labels, minlength=size)
-        levels = np.where(numbers > 0, np.bincount(labels, values, size) / np.maximum(numbers, 1), levels)
+        numbers = np.bincount(labels, minlength=_LEVELS)
+        levels = np.where(numbers > 0, np.bincount(labels, values, _LEVELS) / np.maximum(numbers, 1), levels)
     return levels.astype(np.float32)
 
 
