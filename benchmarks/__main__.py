@@ -45,7 +45,6 @@ COMMANDS = {
     "memory": ("step:Memory", "the memory plan beside the real peaks of training steps (CUDA)"),
     "validation": ("validation:Command", "copies of scenes whose validation views are held out"),
     "exposures": ("exposures:Command", "a copy of a scene whose photos have known exposures"),
-    "formats": ("formats:Command", "what the files that sadgs-export writes take and lose, on a run's held-out views"),
 }
 """What is done besides running a protocol, and the class that does it."""
 

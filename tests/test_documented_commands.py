@@ -53,8 +53,6 @@ RUN_BY = {
     "sadgs-export outputs/demo/sadgs/run/config.yml --output splat.ply --crop": "tests/cli/test_export.py::"
     "test_what_is_taken_away_is_told_and_not_in_the_file",
     "python -m benchmarks PROTOCOL.yaml": "Makefile",
-    "python -m benchmarks formats": "tests/benchmarks/test_formats_table.py::"
-    "test_the_table_has_every_format_with_its_size_and_loss",
     "python -m benchmarks approximations": "tests/benchmarks/test_approximations.py::"
     "test_every_row_is_printed_and_written",
     "python -m benchmarks table": "tests/benchmarks/test_table.py::"
