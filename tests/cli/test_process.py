@@ -3,8 +3,7 @@
 Tried by hand: a downloaded vocabulary tree that is damaged (wrong SHA-256) counts as none, and the sentence says that
 it does not match. SIGKILL of the command ends COLMAP's process, too. If COLMAP's process is killed for want of memory,
 one sentence names the stage and the remedy. In both cases the same command goes on. CMYK, palette, grey, 16-bit PNG and
-TIFF, LZW TIFF and BMP become 8-bit RGB in the scene. Despite EXIF orientation, pixels stay as they are stored, in
-images and cameras.
+TIFF, LZW TIFF and BMP become 8-bit RGB in the scene.
 """
 
 from __future__ import annotations
@@ -43,6 +42,8 @@ from sadgs_ns.cli.process.photos import Photo, find_photos, photos_by_camera, re
 from sadgs_ns.cli.process.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching, expected_work
 from sadgs_ns.cli.process.stages import check_written, fetch_vocabulary, match, sequential_pairs
 from sadgs_ns.cli.process.video import sharpest_frames
+from sadgs_ns.data.checks.layouts import ParserOptions
+from sadgs_ns.data.checks.transforms import check_nerfstudio
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
 
@@ -149,7 +150,7 @@ def errors_of_centres(out: Path) -> np.ndarray:
     """Distances of the room's cameras from where they are, as shares of the largest from their centre. [VIEWS]"""
     model = pycolmap.Reconstruction(out / "sparse" / "0")
     by_name = {image.name: image.projection_center() for image in model.images.values()}
-    found, expected = np.stack([by_name[f"{i:02d}.png"] for i in range(VIEWS)]), camera_centres()
+    found, expected = np.stack([by_name[name] for name in sorted(by_name)]), camera_centres()
     # Umeyama's similarity between the two sets of centres.
     found, expected = found - found.mean(0), expected - expected.mean(0)
     u, s, vt = np.linalg.svd(expected.T @ found)
@@ -357,6 +358,75 @@ def test_names_with_spaces_and_webp_and_transparent_photos(tmp_path: Path, capsy
                 opacity = np.asarray(image.getchannel("A"))
                 assert not opacity[:, :15].any() and (opacity[10:-10, 25:-10] == 255).all()
     assert sorted(transparent) == ["my photo 1.png", "my photo 2.webp.png"]
+
+
+TURNS = {  # EXIF's orientation: how Pillow undoes what it tells
+    2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180, 6: Image.Transpose.ROTATE_90,
+    7: Image.Transpose.TRANSVERSE, 8: Image.Transpose.ROTATE_270,
+}  # fmt: skip
+
+
+def lying(photo: Image.Image, orientation: int, path: Path) -> None:
+    """Store a photo turned or mirrored, as EXIF then tells."""
+    exif = Image.Exif()
+    exif[0x112] = orientation
+    photo.transpose(TURNS[orientation]).save(path, exif=exif, quality=97)
+
+
+@pytest.mark.hard_case(
+    "EXIF orientations of 6, 8, 3, and mirrored (2, 7), in JPEG and PNG, beside upright photos",
+    "the scene's images are upright and without the tag, all of one camera",
+)
+def test_photos_that_lie_on_their_side_by_exif_become_upright(tmp_path: Path):
+    (tmp_path / "photos").mkdir()
+    drawn = dict(enumerate(draw_photos()))
+    for i, photo in drawn.items():
+        path = tmp_path / "photos" / f"{i:02d}.{'jpg' if i % 2 else 'png'}"
+        lying(photo, [*TURNS][i], path) if i < len(TURNS) else photo.save(path, quality=97)
+    summary = process(Process(tmp_path / "photos", tmp_path / "out"))
+    assert summary.registered == VIEWS and errors_of_centres(tmp_path / "out").max() < 0.05
+    described = json.loads((tmp_path / "out" / "transforms.json").read_text())
+    assert described["w"] > described["h"]
+    for name in (frame["file_path"] for frame in described["frames"]):
+        with Image.open(tmp_path / "out" / name) as image:
+            assert image.getexif().get(0x112, 1) == 1
+            actual, expected = (
+                np.ravel(np.asarray(shown.convert("L").resize((32, 24)))) for shown in (image, drawn[int(name[-6:-4])])
+            )
+        assert np.corrcoef(actual, expected)[0, 1] > 0.9
+    assert not any("EXIF" in finding.sentence for finding in check_nerfstudio(tmp_path / "out", ParserOptions()))
+
+
+@pytest.mark.hard_case(
+    "photos with an EXIF orientation, some of them added to a scene of an earlier version, which ignored it",
+    "the added ones are turned; those that were there stay as its cameras know them",
+)
+def test_photos_are_turned_unless_their_scene_knows_them_otherwise(
+    tmp_path: Path, registered: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
+):
+    source, out, photo = tmp_path / "photos", tmp_path / "out", next(draw_photos())
+    source.mkdir()
+    for name, orientation in (("a.jpg", 6), ("b.jpg", 8), ("c.jpg", 3)):
+        lying(photo, orientation, source / name)
+    registered(9)
+    process(Process(source, out))
+    (out / "transforms.json").write_text("{}")
+    settings = json.loads((out / "work" / "settings.json").read_text())
+    assert settings.pop("as_stored") == []
+    (out / "work" / "settings.json").write_text(json.dumps(settings))
+    lying(photo, 6, source / "d.jpg")
+    made: dict[str, tuple[int, int]] = {}
+
+    def look(function: str, photos: Path, groups: list[list[str]], *others: object, **named: object) -> None:
+        assert groups == [["a.jpg", "b.jpg"], ["c.jpg", "d.jpg"]]
+        for name in itertools.chain(*groups):
+            with Image.open(photos / name) as image:
+                made[name] = image.size
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(program, "run_colmap", look)
+    assert main([str(source), str(out)]) == 130
+    assert made == {"a.jpg": (HEIGHT, WIDTH), "b.jpg": (HEIGHT, WIDTH)} | dict.fromkeys(("c.jpg", "d.jpg"), photo.size)
 
 
 def test_names_with_spaces_are_matched_by_colmap_s_own_function(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

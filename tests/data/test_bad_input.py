@@ -247,6 +247,19 @@ def repaint(mode: str, color: Any) -> Callable[[Path], Any]:
     return lambda data: [picture(f"images/{path.name}", mode=mode, color=color)(data) for path in images(data)]
 
 
+def store_turned(size: tuple[int, int], orientation: int) -> Callable[[Path], None]:
+    """Give all images a size and an orientation by EXIF."""
+
+    def spoil(data: Path) -> None:
+        exif = Image.Exif()
+        exif[0x112] = orientation
+        for path in images(data):
+            with Image.open(path) as image:
+                image.resize(size).save(path, exif=exif)
+
+    return spoil
+
+
 def images(data: Path) -> list[Path]:
     return sorted((data / "images").glob("*.png"))
 
@@ -289,6 +302,11 @@ COLMAP = {
     "image-size": (
         picture(FIRST, (40, 30)),
         r"\S+/000\.png has 40 × 30 px, but its camera in \S+/images\.bin 48 × 36: use the images that .*\.",
+    ),
+    "image-orientation": (
+        store_turned((36, 48), 6),
+        r"\S+/000\.png \(and 9 more\) has EXIF orientation 6, and as training reads it 36 × 48 px, but "
+        r"its camera in \S+/images\.bin 48 × 36: turn their pixels as those .*\.",
     ),
     "image-mode": (picture(FIRST, mode="P"), r"\S+/000\.png has pixels of Pillow's mode P: convert it .*\."),
     "image-loop": (
@@ -872,6 +890,9 @@ CASES = {
 @pytest.mark.hard_case("fx and fy that differ by more than 2 times", "a warning", "camera-stretched")
 @pytest.mark.hard_case("an image 1 px wide", "refused", "image-line")
 @pytest.mark.hard_case(
+    "EXIF orientation 6, and poses of the upright images", "refused by that tag", "image-orientation"
+)
+@pytest.mark.hard_case(
     "`applied_transform` of another shape; `applied_scale` of 0, NaN or text; an unknown "
     "`orientation_override`; `fisheye_crop_radius` of text",
     "refused by name",
@@ -949,6 +970,15 @@ def test_a_run_checks_its_data_once_and_other_ways_to_a_pipeline_check_them_too(
         set_up(config)  # what was good before does not count
 
 
+@pytest.mark.hard_case("square images with an EXIF orientation, or turned as their cameras are", "a warning, or none")
+def test_an_orientation_that_a_size_tells_of_is_no_warning(copied: Callable[[str], Path]):
+    data = copied("nerfstudio")
+    for side, told in ((HEIGHT, 1), (HEIGHT - 2, 0)):
+        store_turned((side, HEIGHT), 8)(data)
+        meta(lambda m, side=side: [frame.update(w=side, cx=side / 2) for frame in [*m["frames"], m]])(data)
+        assert sum("EXIF orientation" in finding.sentence for finding in remarks(data)) == told
+
+
 @pytest.mark.hard_case("several bad images", "one sentence for each kind: the first, and how many more")
 def test_several_problems_of_one_kind_are_one_finding_and_other_kinds_are_counted(copied: Callable[[str], Path]):
     data = copied("nerfstudio")
@@ -966,6 +996,11 @@ def test_several_problems_of_one_kind_are_one_finding_and_other_kinds_are_counte
 # --- what is unlikely ---
 
 UNLIKELY = {
+    "image-orientation": (
+        store_turned((WIDTH, HEIGHT), 3),
+        "warning",
+        r"\S+/000\.png \(and 9 more\) has an EXIF orientation that would turn it, which training ignores, as .*\.",
+    ),
     "camera-center": (
         set_camera("PINHOLE", 40, 40, 60, 18),
         "warning",
@@ -1015,6 +1050,7 @@ UNLIKELY = {
     "cameras are apart",
     "trains, with a warning",
 )
+@pytest.mark.hard_case("EXIF orientation 3 in a reconstruction", "trains, with a warning", "image-orientation")
 @pytest.mark.parametrize("case", UNLIKELY)
 def test_unlikely_data_are_told_of_in_one_sentence(case: str, copied: Callable[[str], Path]):
     spoil, severity, sentence = UNLIKELY[case]

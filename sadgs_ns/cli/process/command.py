@@ -96,6 +96,8 @@ class _Scene:
         self.finished = self.begun.get("finished") if (out / "transforms.json").exists() else None
         if self.begun:
             self._refuse_changes()
+        # Photos of a scene that an earlier version began, whose cameras are those of the pixels as they are stored.
+        self.settings["as_stored"] = self.begun.get("as_stored", self.begun.get("photos", []))
         self.added, self.base, self.model = 0, None, self.work / "model"
         if self.finished:
             self.added, self.model = len({*photos} - {*self.begun.get("photos", [])}), self.work / self.begun["model"]
@@ -201,7 +203,7 @@ def _make(scene: _Scene, report: Report) -> Summary:
                 write_frames(chosen, partial, lambda done: report("frames", done, given.frames))
                 partial.rename(folder)
             names = sorted(photo.name for photo in folder.glob("*.jpg"))
-        photos = read_photos(folder, names, report)
+        photos = read_photos(folder, names, report, scene.settings["as_stored"])
         matching, notice = choose_matching(given.matching, photos, scene.is_video, fetch_vocabulary)
         if not scene.is_video:
             stamps = scene.begun.get("files", {})
@@ -213,12 +215,13 @@ def _make(scene: _Scene, report: Report) -> Summary:
             _say("added", f"{told}.", photos=told)
         expected, duration = expected_work(photos, matching, known)
         _say("expected", f"{notice} {expected}".lstrip(), duration=duration)
+        if scene.added:  # An interrupted run may have made these without some of them.
+            for path in (scene.model, work / "photos", work / "alpha"):
+                shutil.rmtree(path, ignore_errors=True)
         folder, photos = convert_photos(folder, photos, work / "photos")
         if transparent := write_alpha(folder, photos, work / "alpha"):
             _say("transparent", f"{transparent} photos are partly transparent; their images in the scene are, too.")
         groups = [[photo.name] for photo in photos] if given.camera_per_photo else photos_by_camera(photos)
-        if scene.added:  # An interrupted run may have made a model without some of them.
-            shutil.rmtree(scene.model, ignore_errors=True)
         arguments = (folder, groups, matching, given.max_size, scene.model, scene.base)
         summary = Summary(**run_colmap("make_model", *arguments, folder=work, report=report))
         _publish(work / "undistorted", given.out, bool(scene.added))

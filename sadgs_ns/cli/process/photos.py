@@ -9,14 +9,14 @@ import os
 import re
 import shutil
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
-from sadgs_ns.data import IMAGE_SUFFIXES
+from sadgs_ns.data import IMAGE_SUFFIXES, SIDEWAYS, TURNED
 from sadgs_ns.errors import InputError, reason
 
 _UNREAD_SUFFIXES = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"}
@@ -35,13 +35,15 @@ class Photo:
     name: str
     """Relative to the folder of the photos."""
     size: tuple[int, int]
-    """Width and height in px, as the pixels are stored."""
+    """Width and height in px, upright."""
     camera: tuple
     """Equal for photos that one camera at one focal length took, as far as size and EXIF tell."""
     has_position: bool
     """Whether EXIF holds GPS coordinates with an altitude; COLMAP uses none without it."""
     has_alpha: bool
     """Whether some pixels may be transparent."""
+    lies: bool = False
+    """Whether the pixels have to be turned or mirrored to be upright, as EXIF tells."""
 
 
 def photos_not_read(folder: Path) -> str:
@@ -101,8 +103,12 @@ def changed_photos(folder: Path, stamps: Mapping[str, Sequence[int]]) -> list[st
     return [name for name in touched if (now[name][0], now[name][2]) != (stamps[name][0], stamps[name][2])]
 
 
-def read_photos(folder: Path, names: Sequence[str], report: Callable[[str, int, int], None]) -> list[Photo]:
+def read_photos(
+    folder: Path, names: Sequence[str], report: Callable[[str, int, int], None], as_stored: Collection[str] = ()
+) -> list[Photo]:
     """Read and decode photos, because COLMAP takes the missing end of a file for black pixels.
+
+    EXIF's orientation counts, but for those of the photos that are taken `as_stored`.
 
     Raises:
         InputError: If some cannot be read or decoded; the message names them.
@@ -112,7 +118,7 @@ def read_photos(folder: Path, names: Sequence[str], report: Callable[[str, int, 
 
     def read(name: str) -> Photo | str:
         try:
-            return _read_photo(folder, name)
+            return _read_photo(folder, name, name in as_stored)
         except UnidentifiedImageError:
             why = "no image that Pillow knows" if (folder / name).stat().st_size else "0 bytes"
         except Exception as error:  # Decoders raise whatever they stumble over.
@@ -143,17 +149,21 @@ def _threads() -> Iterator[ThreadPoolExecutor]:
         pool.shutdown(cancel_futures=True)
 
 
-def _read_photo(folder: Path, name: str) -> Photo:
+def _read_photo(folder: Path, name: str, as_stored: bool) -> Photo:
     with Image.open(folder / name) as image:
         exif = image.getexif()
+        orientation = 1 if as_stored else exif.get(ExifTags.Base.Orientation)
+        width, height = image.size  # Pillow turns TIFF by itself.
+        size = (height, width) if orientation in SIDEWAYS and image.format != "TIFF" else image.size
         focal = _numbers(exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLength))  # mm; 0 is unknown, too
         position = exif.get_ifd(ExifTags.IFD.GPSInfo)
         photo = Photo(
             name,
-            image.size,
-            (image.size, *(exif.get(tag) for tag in (ExifTags.Base.Make, ExifTags.Base.Model)), max((0.0, *focal))),
+            size,
+            (size, *(exif.get(tag) for tag in (ExifTags.Base.Make, ExifTags.Base.Model)), max((0.0, *focal))),
             all(_numbers(position.get(tag)) for tag in _POSITION),
             image.has_transparency_data,
+            orientation in TURNED,
         )
         # An eighth of a JPEG's size tells whether it is whole.
         image.draft("RGB", (image.width // 8, image.height // 8))
@@ -171,7 +181,7 @@ def _numbers(value: Any) -> tuple[float, ...]:
 
 
 def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tuple[Path, list[Photo]]:
-    """Convert a folder's photos in formats that COLMAP does not read, if there are any.
+    """Convert a folder's photos in formats that COLMAP does not read, and turn those that lie, if there are any.
 
     `converted` is made of conversions and of links to the other photos, where there is no such folder yet.
 
@@ -184,7 +194,7 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
         return photo.name + ("" if is_read else ".png" if photo.has_alpha else ".jpg")
 
     new = [dataclasses.replace(photo, name=converted_name(photo)) for photo in photos]
-    if new == list(photos):
+    if new == list(photos) and not any(photo.lies for photo in photos):
         return folder, new
     if converted.exists():
         return converted, new
@@ -193,10 +203,20 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
     def convert(photo: Photo, name: str) -> None:
         source, target = Path(os.path.realpath(folder / photo.name)), partial / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        if name != photo.name:
+        if name != photo.name or photo.lies:
             with Image.open(source) as image:
-                pixels = image.convert("RGBA" if photo.has_alpha else "RGB")
-                pixels.save(target, exif=image.getexif(), quality=97, subsampling=0)  # the latter two for JPEG alone
+                is_tiff = image.format == "TIFF"  # Its tags tell of its pixels, and Pillow turns it by itself.
+                exif = Image.Exif() if is_tiff else image.getexif()
+                image.info.pop("exif", None)  # Pillow would write it anew, which fails where it is damaged.
+                pixels = ImageOps.exif_transpose(image) if photo.lies and not is_tiff else image
+                exif.pop(ExifTags.Base.Orientation, None)
+                try:
+                    exif.tobytes()
+                except Exception:  # Pillow raises anything where EXIF is damaged.
+                    exif = Image.Exif()
+                if pixels.mode != "I;16":
+                    pixels = pixels.convert("RGBA" if photo.has_alpha else "RGB")
+                pixels.save(target, exif=exif, quality=97, subsampling=0)  # the latter two for JPEG alone
             return
         try:
             target.symlink_to(source)

@@ -7,14 +7,15 @@ import os
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import ExifTags, Image, UnidentifiedImageError
 
-from sadgs_ns.data import IMAGE_SUFFIXES
+from sadgs_ns.data import IMAGE_SUFFIXES, SIDEWAYS, TURNED
 from sadgs_ns.data.checks.findings import Finding, and_more
 from sadgs_ns.errors import reason
 
@@ -22,6 +23,7 @@ MAX_AUTO_RESOLUTION = 1600
 """Longest side in px up to which nerfstudio looks for no smaller copies of images."""
 MASK_MODES = ("L", "1", "I;16", "I")
 """Pillow's modes that masks may have; nerfstudio trains on every pixel that is not 0."""
+_TURN = "turn their pixels as those poses want it, and take the tag away, as ImageMagick's `mogrify -auto-orient` does"
 Rounding = Literal["floor", "round", "ceil"]
 Size = tuple[int, int]
 """Width and height in px."""
@@ -49,8 +51,16 @@ class _Image:
     """Pillow's name for the kind of pixels."""
     format: str = ""
     """Pillow's name for the format of the file."""
+    orientation: int = 1
+    """EXIF's number, from 1 to 8, which nerfstudio and COLMAP ignore, but for TIFF, which Pillow turns."""
     problem: str = ""
     """The rest of a sentence that starts with the file; empty for a good image."""
+
+    @property
+    def may_lie(self) -> bool:
+        """Whether EXIF turns the image, and its size does not tell whether its camera is of the turned one."""
+        is_told = self.orientation in SIDEWAYS and self.size[0] != self.size[1]
+        return self.orientation in TURNED and self.format != "TIFF" and not is_told
 
 
 def image_size(path: Path) -> Size:
@@ -123,6 +133,12 @@ def check_images(frames: Sequence[Frame], source: Path, look_for_unused: bool = 
             f"{source} has {len(frames)} masks that are all black, such as {frames[0].mask}, which leaves no pixel to "
             "train on: make white what is to be trained on.",
         )
+    if not problems and (lying := [frame.image for frame, image in zip(frames, images, strict=True) if image.may_lie]):
+        yield Finding(
+            "warning",
+            f"{and_more(lying[0], len(lying))} has an EXIF orientation that would turn it, which training ignores, as "
+            f"COLMAP does: if the poses are those of the turned images, {_TURN}.",
+        )
     if look_for_unused and (unused := unused_images(frames, source)) is not None:
         yield Finding("warning", unused)
     if not problems:
@@ -139,6 +155,9 @@ def _problem(frame: Frame, image: _Image, mask: _Image | None, source: Path) -> 
         return "small", frame.image, "has {} × {} px: leave it out of the reconstruction".format(*image.size)
     if frame.size not in (None, image.size):
         sizes = "{} × {} px, but its camera in {} {} × {}".format(*image.size, source, *frame.size)
+        if image.orientation in SIDEWAYS and frame.size == image.size[::-1]:
+            tag = f"has EXIF orientation {image.orientation}, and as training reads it"
+            return "orientation", frame.image, f"{tag} {sizes}: {_TURN}"
         return "size", frame.image, f"has {sizes}: use the images that the poses were computed from"
     if frame.mask is None or mask is None:
         return None
@@ -196,7 +215,9 @@ def _inspect(path: Path) -> _Image:
         if path.stat().st_size == 0:
             return _Image(problem=f"has 0 bytes: {again}")
         with Image.open(path) as image:
-            size, mode, kind = image.size, image.mode, image.format or ""
+            size, mode, kind, orientation = image.size, image.mode, image.format or "", 1
+            with suppress(Exception):  # Damaged EXIF matters to no one. A PNG's own method would decode the image.
+                orientation = Image.Image.getexif(image).get(ExifTags.Base.Orientation, 1)
             whole = _ends_well(path, image)
         if not whole:
             with Image.open(path) as image:
@@ -207,7 +228,7 @@ def _inspect(path: Path) -> _Image:
         return _Image(problem=f"is no image that Pillow knows: {again}")
     except Exception as error:  # Decoders raise OSError, SyntaxError, struct.error, …
         return _Image(problem=f"cannot be read as an image ({reason(error)}): {again}")
-    return _Image(size, mode, kind)
+    return _Image(size, mode, kind, orientation)
 
 
 def _ends_well(path: Path, image: Image.Image) -> bool:
