@@ -14,7 +14,7 @@ from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConf
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
-from sadgs_ns.data.checks.colmap import chosen_factor
+from sadgs_ns.data.checks.colmap import automatic_options
 from sadgs_ns.data.checks.findings import unreadable
 from sadgs_ns.data.checks.layouts import find_reconstruction, layout_of
 from sadgs_ns.errors import InputError
@@ -45,7 +45,7 @@ def choose_parser(config: FullImageDatamanagerConfig) -> None:
     """Replace the automatic parser by the one that fits the data, so that a run's `config.yml` names that one.
 
     Raises:
-        InputError: If the folder cannot be read; as `chosen_factor`.
+        InputError: If the folder cannot be read; as `automatic_options`.
     """
     if not isinstance(config.dataparser, AutomaticDataParserConfig):
         return
@@ -57,7 +57,12 @@ def choose_parser(config: FullImageDatamanagerConfig) -> None:
     if layout == "blender":
         config.dataparser = BlenderDataParserConfig(data=data)
     elif layout == "colmap" and folder is not None:
-        factor = chosen_factor(data, folder)
-        config.dataparser = ColmapDataParserConfig(data=data, colmap_path=folder, downscale_factor=factor)
+        options = automatic_options(data, folder)
+        config.dataparser = ColmapDataParserConfig(
+            data=data,
+            colmap_path=folder,
+            images_path=options.images_path,
+            downscale_factor=options.downscale_factor,
+        )
     else:
         config.dataparser = NerfstudioDataParserConfig(data=data, load_3D_points=True)

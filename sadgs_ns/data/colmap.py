@@ -203,6 +203,16 @@ def _read_text_points(path: Path) -> Points:
     return values[:, :3], colors.astype(np.uint8)
 
 
+def model_kind(model: Path) -> str | None:
+    """Return how a folder's reconstruction is written, "txt", which nerfstudio prefers, or "bin"; None if none is."""
+    return next((kind for kind in ("txt", "bin") if (model / f"cameras.{kind}").is_file()), None)
+
+
+def image_names(model: Path) -> list[str]:
+    """Return the names of the images of a reconstruction in a folder; raises as `read_cameras`."""
+    return [name for name, _, _ in read_poses(model / f"images.{model_kind(model) or 'bin'}")]
+
+
 def read_cameras(path: Path) -> dict[int, Camera]:
     """Return the cameras of a `cameras.bin` or `cameras.txt` by their ids; raise InputError if it cannot be read."""
     return dict((_read_binary_cameras if path.suffix == ".bin" else _read_text_cameras)(path))

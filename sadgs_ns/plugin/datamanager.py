@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -26,6 +27,7 @@ from tyro.conf import Suppress
 from sadgs_ns.data import colmap, ply
 from sadgs_ns.data.automatic import AnyParserConfig, AutomaticDataParserConfig, choose_parser
 from sadgs_ns.data.checks import splits
+from sadgs_ns.data.checks.images import mask_name
 from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS
 from sadgs_ns.data.checks.transforms import read_json
 from sadgs_ns.data.coordinates import FRAME_KEYS, Similarity, fixed_frame
@@ -104,15 +106,14 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         """COLMAP's points, where nerfstudio does not read them itself."""
         if isinstance(parser, ColmapDataParserConfig):  # These checks precede the making of smaller images.
             model = (config.data or parser.data) / parser.colmap_path
-            kind = "txt" if (model / "cameras.txt").exists() else "bin"
-            if (source := model / f"images.{kind}").is_file():
+            if (source := model / f"images.{colmap.model_kind(model)}").is_file():
                 splits.check_names((name for name, _, _ in colmap.read_poses(source)), source)
             plain = parser._target is ColmapDataParser and parser.max_2D_matches_per_3D_point == 0
             if plain and parser.load_3D_points:
                 self._points = colmap.points_file(model)
                 parser.load_3D_points = self._points is None
-        if parser._target is Nerfstudio:
-            parser._target = _Nerfstudio
+        own: dict[type, type] = {Nerfstudio: _Nerfstudio, ColmapDataParser: _Colmap}
+        parser._target = own.get(parser._target, parser._target)
         config.dataparser = parser
         # nerfstudio would keep more than 500 images on the host, whatever their size, and say so in a line.
         asked, config.cache_images = config.cache_images, "cpu"
@@ -239,6 +240,18 @@ class _Nerfstudio(Nerfstudio):
     ) -> dict[str, Tensor] | None:
         positions, colors = ply.read_points(ply_file_path)
         return _points_in_the_run(positions, colors, transform_matrix, scale_factor) if len(positions) else None
+
+
+class _Colmap(ColmapDataParser):
+    """nerfstudio's parser of COLMAP's files, which also finds masks by COLMAP's names."""
+
+    def _get_all_images_and_cameras(self, recon_dir: Path) -> dict[str, Any]:
+        described, config = super()._get_all_images_and_cameras(recon_dir), self.config
+        if config.masks_path is not None:
+            masks, images = config.data / config.masks_path, (config.data / config.images_path).as_posix()
+            for frame in described["frames"]:
+                frame["mask_path"] = (masks / mask_name(masks, os.path.relpath(frame["file_path"], images))).as_posix()
+        return described
 
 
 def _move_to_fixed_frame(outputs: DataparserOutputs, meta: dict[str, Any], path: Path) -> None:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import copy
 import json
+import re
+import shlex
 import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pycolmap
 import pytest
 import tyro
 import yaml
@@ -21,6 +24,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 from runs import blender_data, configure, nerfstudio_data, train
+from scenes import HEIGHT, VIEWS, WIDTH
 
 from examples.drawn_scene.scene import SPARSE_FOLDER
 from sadgs_ns.data.automatic import AutomaticDataParserConfig, choose_parser
@@ -45,6 +49,28 @@ def beside_a_reconstruction(scene: Path, data: Path) -> None:
     shutil.copytree(scene / SPARSE_FOLDER, data / "colmap/sparse/0")
 
 
+def named_with_folder(scene: Path, data: Path) -> None:
+    """Lay a drawn scene out with a model whose names of images begin with their folder, as some programs write it."""
+    colmap_in("sparse/1")(scene, data)
+    model = pycolmap.Reconstruction(data / "sparse/1")
+    for image in model.images.values():
+        image.name = f"images/{image.name}"
+    model.write(data / "sparse/1")
+
+
+def colmap_layout(model: str, images: str, lay_out: Callable[[Path, Path], None] | None = None) -> Any:
+    """A layout with its reconstruction and its images in other folders than the usual ones."""
+
+    def lay_out_there(scene: Path, data: Path) -> None:
+        shutil.copytree(scene / "images", data / images)
+        shutil.copytree(scene / SPARSE_FOLDER, data / model, dirs_exist_ok=True)
+
+    def expected(data: Path) -> DataParserConfig:
+        return ColmapDataParserConfig(data=data, colmap_path=Path(model), images_path=Path(images), downscale_factor=1)
+
+    return lay_out or lay_out_there, expected
+
+
 LAYOUTS: dict[str, tuple[Callable[[Path, Path], Any], Callable[[Path], DataParserConfig]]] = {
     **{
         folder: (
@@ -53,6 +79,13 @@ LAYOUTS: dict[str, tuple[Callable[[Path, Path], Any], Callable[[Path], DataParse
         )
         for folder in ("sparse/0", "colmap/sparse/0", "sparse")
     },
+    "beside the images": colmap_layout("", "images"),
+    "among the images": colmap_layout("", ""),
+    "among the images in their folder": colmap_layout("images", "images"),
+    "sparse/1": colmap_layout("sparse/1", "images"),
+    "images named with their folder": colmap_layout("sparse/1", "", named_with_folder),
+    "images in a folder of another name": colmap_layout("sparse/0", "my photos"),
+    "images beside the model": colmap_layout("colmap/sparse/0", "colmap/images"),
     "transforms.json": (
         lambda scene, data: nerfstudio_data(data),
         lambda data: NerfstudioDataParserConfig(data=data, load_3D_points=True),
@@ -67,6 +100,11 @@ LAYOUTS: dict[str, tuple[Callable[[Path, Path], Any], Callable[[Path], DataParse
     "`transforms.json`, Blender",
     "trains",
 )
+@pytest.mark.hard_case(
+    "a COLMAP model beside its images or among them, in `sparse/1` alone; images in a folder of another name; names of "
+    "images that begin with that folder's",
+    "trains: model and images are found",
+)
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_the_parser_is_chosen_by_what_the_folder_holds(layout: str, scene: Path, tmp_path: Path):
     data = tmp_path / "capture"
@@ -76,6 +114,68 @@ def test_the_parser_is_chosen_by_what_the_folder_holds(layout: str, scene: Path,
     assert [finding for finding in check_data(data) if finding.severity != "note"] == []
     assert [finding for finding in refuse_bad_data(config) if finding.severity != "note"] == []
     assert config.dataparser == expected(data)
+    if isinstance(config.dataparser, ColmapDataParserConfig):
+        parsed = config.dataparser.setup().get_dataparser_outputs()
+        assert len(parsed.image_filenames) == 8 and all(path.is_file() for path in parsed.image_filenames)
+
+
+@pytest.mark.hard_case(
+    "a parser named without the folders of model and images, where these lie elsewhere",
+    "refused: says which options to add, with which it trains",
+)
+@pytest.mark.parametrize("layout", [name for name, (_, expected) in LAYOUTS.items() if "images" in name])
+def test_the_options_that_a_named_parser_lacks_are_told(layout: str, scene: Path, tmp_path: Path):
+    data, (lay_out, expected) = tmp_path / "capture", LAYOUTS[layout]
+    lay_out(scene, data)
+    with pytest.raises(InputError, match=r": add `.*` after `colmap`\.$") as refused:
+        refuse_bad_data(SadgsDatamanagerConfig(dataparser=ColmapDataParserConfig(data=data)))
+    config = parsed("colmap", *shlex.split(str(refused.value).split("`")[1]))
+    config.data = data
+    assert [finding for finding in refuse_bad_data(config) if finding.severity != "note"] == []
+    expected_parser = expected(data)
+    assert isinstance(config.dataparser, ColmapDataParserConfig) and isinstance(expected_parser, ColmapDataParserConfig)
+    assert config.dataparser.colmap_path == expected_parser.colmap_path
+    assert config.dataparser.images_path == expected_parser.images_path
+
+
+@pytest.mark.hard_case("`sparse/1` has more images than `sparse/0`", "a warning: names the options that train on it")
+def test_a_larger_model_is_told(scene: Path, tmp_path: Path):
+    colmap_in("sparse/1")(scene, tmp_path)
+    smaller = pycolmap.Reconstruction(tmp_path / "sparse/1")
+    smaller.deregister_frame(next(iter(smaller.frames)))
+    (tmp_path / "sparse/0").mkdir()
+    smaller.write(tmp_path / "sparse/0")
+    sentences = [finding.sentence for finding in check_data(tmp_path) if finding.severity == "warning"]
+    model = tmp_path / "sparse"
+    assert (
+        f"{model}/0/images.bin has {VIEWS - 1} images, {model}/1 has {VIEWS}: end the command with `colmap "
+        "--colmap-path sparse/1` to train on those."
+    ) in sentences
+    config = parsed("colmap", "--colmap-path", "sparse/1")
+    config.data = tmp_path
+    assert [finding for finding in refuse_bad_data(config) if finding.severity != "note"] == []
+
+
+@pytest.mark.hard_case(
+    "masks of a COLMAP model called `NAME.png`, `NAME.jpg.png` (COLMAP), `NAME_mask.png`, `NAME.mask.png`", "are read"
+)
+@pytest.mark.parametrize("called", ["{stem}.png", "{stem}.png.png", "{stem}_mask.png", "{stem}.mask.png"])
+def test_masks_are_read_by_the_names_in_use(called: str, scene: Path, tmp_path: Path):
+    data = Path(shutil.copytree(scene, tmp_path / "capture"))
+    (data / "masks").mkdir()
+    for index, image in enumerate(sorted((data / "images").iterdir())):
+        mask = Image.new("L", (WIDTH, HEIGHT), 255)
+        mask.paste(0, (0, 0, index + 1, 1))
+        mask.save(data / "masks" / called.format(stem=image.stem))
+    (warning,) = [finding.sentence for finding in check_data(data) if finding.severity == "warning"]
+    words = re.findall("`(.*)`", warning)[0].split()
+    assert words[-2:] == ["--masks-path", "masks"]
+    config = parsed(*words, "--downscale-factor", "1")  # nerfstudio leaves open what it measures without it.
+    config.data = data
+    notes = [finding.sentence for finding in refuse_bad_data(config)]
+    assert any(f"with {VIEWS} masks" in note for note in notes)
+    loaded = config.setup(device="cpu").cached_train
+    assert [int((~view["mask"]).sum()) for view in loaded] == [2, 3, 4, 5, 6, 7, 8, 10]
 
 
 @pytest.mark.hard_case(

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from sadgs_ns.data.checks.colmap import check_colmap, chosen_factor
+from sadgs_ns.data.checks.colmap import automatic_options, check_colmap
 from sadgs_ns.data.checks.findings import Finding, collect_findings
 from sadgs_ns.data.checks.layouts import ParserOptions, find_reconstruction, layout_of, no_layout
 from sadgs_ns.data.checks.transforms import check_blender, check_nerfstudio
@@ -24,7 +24,6 @@ def check_data(data: Path) -> Iterator[Finding]:
     elif layout == "blender":
         yield from check_blender(data, ParserOptions())
     elif (folder := find_reconstruction(data)) is not None:
-        factor = chosen_factor(data, folder)
-        yield from check_colmap(data, ParserOptions(colmap_path=folder, downscale_factor=factor, eval_mode="interval"))
+        yield from check_colmap(data, automatic_options(data, folder))
     else:
         raise InputError(no_layout(data))

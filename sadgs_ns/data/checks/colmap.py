@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import os
+import shlex
 import sys
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -19,11 +22,18 @@ from sadgs_ns.data.checks.images import (
     existing_factor,
     image_size,
     images_in,
+    mask_name,
     no_copies,
     scaled_size,
     smaller_folder,
 )
-from sadgs_ns.data.checks.layouts import ParserOptions, find_reconstruction, no_layout
+from sadgs_ns.data.checks.layouts import (
+    ParserOptions,
+    find_reconstruction,
+    find_reconstructions,
+    images_folder,
+    no_layout,
+)
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
 from sadgs_ns.data.text import refuse_byte_order_mark
 from sadgs_ns.errors import InputError, reason
@@ -35,27 +45,21 @@ UNSUPPORTED_CAMERAS = {"FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}
 @collect_findings
 def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -> Iterator[Finding]:
     """Check a COLMAP reconstruction, binary or text, in a folder that the options' paths are relative to."""
-    images_folder, model_folder = data / options.images_path, data / options.colmap_path
-    kind = next((kind for kind in ("txt", "bin") if (model_folder / f"cameras.{kind}").is_file()), None)
+    images, model_folder = data / options.images_path, data / options.colmap_path
+    kind = colmap.model_kind(model_folder)
     if kind is None:
         if (found := find_reconstruction(data)) is not None:
-            raise InputError(
-                f"{model_folder} holds no COLMAP reconstruction, but {data / found} does: add `--colmap-path {found}` "
-                "after `colmap`."
-            )
+            told = f"{model_folder} holds no COLMAP reconstruction, but {data / found} does"
+            raise InputError(f"{told}: add `{_words(data, automatic_options(data, found))}` after `colmap`.")
         raise InputError(no_layout(data))
     cameras_path, poses_path = model_folder / f"cameras.{kind}", model_folder / f"images.{kind}"
     poses, cameras = _read_model(poses_path, cameras_path)
-    this_model = f"end the command with `colmap --colmap-path {options.colmap_path}"
-    if not images_folder.is_dir():
-        raise InputError(
-            f"{poses_path} has poses of {len(poses)} images, but there is no folder {images_folder}: put them there, "
-            f"or {this_model} --images-path FOLDER`."
-        )
     names = [name for name, _, _ in poses]
+    this_model = f"end the command with `colmap {_words(data, options)}"
+    yield from _check_folders(data, options, names, poses_path)
     lists = {split: _read_list(path) for split in SPLITS if (path := data / f"{split}_list.txt").is_file()}
     training = yield from check_splits(
-        names, lists, lambda split: f"{data / split}_list.txt", lambda name: images_folder / name, options
+        names, lists, lambda split: f"{data / split}_list.txt", lambda name: images / name, options
     )
     views = _views(poses, cameras, poses_path, cameras_path)
     sound = yield from check_views(views, training, poses_path)
@@ -70,15 +74,55 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
         )
     if not open_images:
         return
-    factor = yield from _check_factor(images_folder, names, options)
+    factor = yield from _check_factor(images, names, options)
     frames = []
     for name, camera_id, _ in poses:
         camera, mask = cameras[camera_id], None
         size = scaled_size((camera.width, camera.height), factor, options.downscale_rounding_mode)
         if options.masks_path is not None:
-            mask = (smaller_folder(data / options.masks_path, factor) / name).with_suffix(".png")
-        frames.append(Frame(smaller_folder(images_folder, factor) / name, size, mask))
+            masks = data / options.masks_path
+            mask = smaller_folder(masks, factor) / mask_name(masks, name)
+        frames.append(Frame(smaller_folder(images, factor) / name, size, mask))
     yield from check_images(frames, poses_path, look_for_unused=factor == 1)
+
+
+def _check_folders(data: Path, options: ParserOptions, names: Sequence[str], poses: Path) -> Iterator[Finding]:
+    """Refuse a folder of images that are not those of the model, and warn of a larger model beside it."""
+    images = data / options.images_path
+    if not any(os.path.isfile(images / name) for name in names):
+        if (found := images_folder(data, options.colmap_path)) is not None:
+            remedy = _words(data, dataclasses.replace(options, images_path=found))
+            raise InputError(
+                f"{poses}: image {names[0]} is not in {images}, but in {data / found}: add `{remedy}` after `colmap`."
+            )
+        if not images.is_dir():
+            raise InputError(
+                f"{poses} has poses of {len(names)} images, but there is no folder {images}: put them there, or end "
+                f"the command with `colmap {_words(data, options)} --images-path FOLDER`."
+            )
+    for other, count in find_reconstructions(data).items():
+        if count > len(names):
+            told = f"{poses} has {len(names)} images, {data / other} has {count}"
+            remedy = f"end the command with `colmap {_words(data, dataclasses.replace(options, colmap_path=other))}`"
+            yield Finding("warning", f"{told}: {remedy} to train on those.")
+
+
+def _words(data: Path, options: ParserOptions) -> str:
+    """Return the options that nerfstudio's parser of COLMAP's files needs to read images and model from here."""
+    words, names = ["--colmap-path", str(options.colmap_path)], colmap.image_names(data / options.colmap_path)
+    if options.images_path != ParserOptions.images_path:
+        words += ["--images-path", str(options.images_path)]
+    if options.downscale_factor not in (None, _automatic_factor(data / options.images_path / [*names, ""][0])):
+        words += ["--downscale-factor", str(options.downscale_factor)]
+    return shlex.join(words)
+
+
+def _automatic_factor(image: Path) -> int:
+    """Return the factor by which nerfstudio's parser scales images down where it is named without one."""
+    factor, size = 1, image_size(image)
+    while max(size) / factor > MAX_AUTO_RESOLUTION:
+        factor *= 2
+    return factor
 
 
 def _read_model(poses_path: Path, cameras_path: Path) -> tuple[list[colmap.Pose], dict[int, colmap.Camera]]:
@@ -110,13 +154,9 @@ def _check_factor(images_folder: Path, names: Sequence[str], options: ParserOpti
 
     If they are not, this raises InputError where nobody can answer nerfstudio's question whether to make them.
     """
-    factor = options.downscale_factor
-    if factor is None:
-        factor, size = 1, image_size(images_folder / names[0])
-        while max(size) / factor > MAX_AUTO_RESOLUTION:
-            factor *= 2
+    factor = options.downscale_factor or _automatic_factor(images_folder / names[0])
     smaller = smaller_folder(images_folder, factor)
-    if all((smaller / name).parent.exists() for name in names):
+    if factor == 1 or all((smaller / name).parent.exists() for name in names):
         return factor
     if options.downscale_factor is not None:
         problem, remedy = no_copies(smaller, factor)
@@ -129,19 +169,17 @@ def _check_factor(images_folder: Path, names: Sequence[str], options: ParserOpti
     return 1
 
 
-def chosen_factor(data: Path, colmap_path: Path) -> int:
-    """Return the factor by which images are scaled down where no parser is named; raises as `colmap.read_poses`.
+def automatic_options(data: Path, model: Path) -> ParserOptions:
+    """Return how a reconstruction is read where no parser is named; raises as `colmap.read_poses`.
 
     nerfstudio's parser of COLMAP's files asks a question at the terminal where copies that it wants do not exist. So
     that it never has to, the images are taken at full resolution then, as they are beside a `transforms.json`.
     """
-    folder = data / colmap_path
-    kind = "txt" if (folder / "cameras.txt").is_file() else "bin"
-    names = [name for name, _, _ in colmap.read_poses(folder / f"images.{kind}")]
-    images = data / "images"
-    if not names:
-        return 1
-    return existing_factor(image_size(images / names[0]), lambda factor: smaller_folder(images, factor) / names[0])
+    names, folder, factor = colmap.image_names(data / model), images_folder(data, model) or Path("images"), 1
+    images = data / folder
+    if names and folder != Path():  # The smaller copies of images right in the capture would lie outside of it.
+        factor = existing_factor(image_size(images / names[0]), lambda by: smaller_folder(images, by) / names[0])
+    return ParserOptions(images_path=folder, colmap_path=model, downscale_factor=factor, eval_mode="interval")
 
 
 def _read_list(path: Path) -> list[str]:

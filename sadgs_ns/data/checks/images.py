@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import numpy as np
@@ -78,6 +78,17 @@ def scaled_size(size: Size, factor: int, rounding: Rounding) -> Size:
 def smaller_folder(folder: Path, factor: int) -> Path:
     """Return the folder in which nerfstudio keeps copies of a folder's images that are smaller by a factor."""
     return folder.with_name(f"{folder.name}_{factor}") if factor > 1 else folder
+
+
+def mask_name(folder: Path, image: str) -> Path:
+    """Return an image's mask in a folder of masks, relative to it.
+
+    It is called as the image, with .png instead of its suffix (nerfstudio), or after it (COLMAP), or with _mask.png
+    (Metashape) or .mask.png; the first that exists, else the first.
+    """
+    stem = PurePosixPath(image).with_suffix("")
+    names = [Path(f"{start}.png") for start in (stem, image, f"{stem}_mask", f"{stem}.mask", f"{image}.mask")]
+    return next((name for name in names if (folder / name).is_file()), names[0])
 
 
 def no_copies(folder: Path, factor: int) -> tuple[str, str]:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import re
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from sadgs_ns.data import colmap
 from sadgs_ns.data.checks.images import Rounding, images_in
 from sadgs_ns.errors import InputError
 
@@ -37,11 +41,38 @@ class ParserOptions:
 
 
 def find_reconstruction(data: Path) -> Path | None:
-    """Return the folder of a COLMAP reconstruction, relative to the data, or None."""
-    for folder in COLMAP_FOLDERS:
-        if any((data / folder / f"cameras.{kind}").is_file() for kind in ("txt", "bin")):
-            return Path(folder)
-    return None
+    """Return the folder of the COLMAP reconstruction to read, the first of `find_reconstructions`, or None."""
+    return next(iter(find_reconstructions(data)), None)
+
+
+def find_reconstructions(data: Path) -> dict[Path, int]:
+    """Return the folders of COLMAP's reconstructions, relative to the data, and how many images each has.
+
+    The usual places come first, then others, beginning with the most images; one right in the data's folder counts
+    where there is no other and its images are at hand. The number is 0 where a reconstruction cannot be read.
+    """
+    numbered = [path for place in ("colmap/sparse", "sparse") for path in sorted((data / place).glob("[0-9]*"))]
+    folders = (*map(Path, COLMAP_FOLDERS), Path("images"), *(path.relative_to(data) for path in numbered))
+    counts = {folder: 0 for folder in folders if colmap.model_kind(data / folder)}
+    if not counts and (kind := colmap.model_kind(data)) and (data / f"images.{kind}").is_file():
+        return {Path(): 0} if images_folder(data, Path()) else {}
+    for folder in counts:
+        with contextlib.suppress(InputError):
+            counts[folder] = len(colmap.image_names(data / folder))
+    order = sorted(counts, key=lambda folder: 0 if folder.as_posix() in COLMAP_FOLDERS else 1 / (counts[folder] + 1))
+    return {folder: counts[folder] for folder in order}
+
+
+def images_folder(data: Path, model: Path) -> Path | None:
+    """Return the folder that has images of a reconstruction, both relative to the data; None if none has any.
+
+    Images beside the model or in a folder of any name are found, also where their names begin with that folder's.
+    """
+    names = colmap.image_names(data / model)
+    others = [path.name for path in data.iterdir() if not re.search(r"mask|depth|normal|_\d+$", path.name)]
+    beside = [folder / "images" for folder in (model, *model.parents)]
+    folders = map(Path, ("images", "", model, *beside, *sorted(others)))
+    return next((folder for folder in folders if any(os.path.isfile(data / folder / name) for name in names)), None)
 
 
 def layout_of(data: Path) -> Literal["nerfstudio", "blender", "colmap"] | None:
@@ -69,6 +100,9 @@ def no_layout(data: Path) -> str:
         inside = around.relative_to(other).parts[0]
         if (inside.startswith("images") or inside in ("masks", "sparse", "colmap")) and layout_of(other) is not None:
             return f"{data} is a part of the capture {other}: give --data that folder."
+    if kind := colmap.model_kind(data):
+        first = colmap.image_names(data)[:1]
+        return f"{data}/images.{kind} has poses, but its images, such as {first}, are not in {data}: put them there."
     for photos in (data, data / "images"):
         if images := images_in(photos):
             command = f"`sadgs-process {shlex.quote(str(photos))} FOLDER`"
