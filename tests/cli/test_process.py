@@ -236,7 +236,7 @@ def test_photos_of_one_size_and_lens_share_a_camera(tmp_path: Path):
     [
         (lambda folder: None, "photos does not exist; give a folder of photos or a video."),
         (lambda folder: folder.mkdir(), "photos holds 0 photos; a reconstruction needs at least 3"),
-        (lambda folder: heic(folder), "Its 4 .HEIC files are not read: convert them to one of bmp, jpeg, jpg, png"),
+        (lambda folder: heic(folder), "4 of its files are not read, such as IMG_0.HEIC: convert them to JPEG or PNG"),
         (lambda folder: folder.write_text("x"), "photos is neither a folder of photos nor a video"),
         (lambda folder: broken(folder), "1 of the 3 photos in "),
         (lambda folder: broken(folder), "whole image: 2.png (no image that Pillow knows); copy it again or remove it."),
@@ -254,18 +254,27 @@ def test_bad_photos_are_told_in_a_sentence(tmp_path: Path, prepare, sentence: st
 def heic(folder: Path) -> None:
     folder.mkdir()
     for i in range(4):
-        (folder / f"IMG_{i}.HEIC").write_bytes(b"ftypheic")
+        (folder / f"IMG_{i}.{'jpg' if i == 3 else 'HEIC'}").write_bytes(b"\0\0\0\x18ftypheic")
 
 
+@pytest.mark.hard_case(
+    "images that are not read: HEIC, also named `.jpg`, raw files, JPEG XL, GIF, and JPEG of an unknown suffix",
+    "counted in a line; the others are used",
+)
 def test_photos_that_are_not_read_are_told_beside_those_that_are(
     tmp_path: Path, registered: Callable[[int], None], capsys
 ):
-    heic(tmp_path / "photos")
-    black(tmp_path / "photos", "a.png", "b.png", "c.png")
+    folder = tmp_path / "photos"
+    heic(folder)
+    black(folder, "a.png", "b.png", "c.png", "d.gif", "e.jpg")
+    (folder / "e.jpg").rename(folder / "e.jpg_large")
+    shutil.copy(folder / "a.png", folder / "f.NEF")
+    (folder / "g.jxl").write_bytes(b"\xff\x0a")
+    (folder / "notes.txt").write_text("no image")
     registered(9)
-    assert main([str(tmp_path / "photos"), str(tmp_path / "out")]) == 0
+    assert main([str(folder), str(tmp_path / "out")]) == 0
     assert "9 of 12 photos registered" in (printed := capsys.readouterr().out)
-    assert "Its 4 .HEIC files are not read: convert them to one of bmp, jpeg, jpg, png" in printed
+    assert "8 of its files are not read, such as IMG_0.HEIC: convert them to JPEG or PNG, with .jpg or .png" in printed
 
 
 def broken(folder: Path) -> None:
@@ -334,16 +343,24 @@ def test_a_size_without_structure_is_refused(tmp_path: Path, size: str, capsys):
 
 @pytest.mark.hard_case("transparent photos", "alpha is kept: the scene's images are RGBA, a line says how many")
 @pytest.mark.hard_case("a folder of WebP (COLMAP reads none), or a mixed one", "converted")
+@pytest.mark.hard_case(
+    "WebP and AVIF named `.jpg`, JPEG named `.jfif` and `.HEIC`, PNG named `.jpg` that is transparent",
+    "read by what they hold",
+)
 @pytest.mark.hard_case("names with spaces, quotes, umlauts, Chinese; suffixes in capitals; folders in folders", "work")
 def test_names_with_spaces_and_webp_and_transparent_photos(tmp_path: Path, capsys):
-    """COLMAP reads no WebP and leaves out alpha, both without a word."""
+    """COLMAP reads neither WebP nor AVIF and leaves out alpha, all without a word."""
+    kinds = [("webp", "WEBP"), ("jpg", "PNG"), ("webp", "WEBP"), ("jpg", "WEBP"), ("jfif", "JPEG"), ("HEIC", "JPEG")]
+    if "AVIF" in Image.SAVE:  # since Pillow 11.3
+        kinds[4:] = [("JPG", "AVIF"), ("HEIC", "JPEG")]
     (tmp_path / "photos").mkdir()
     for i, photo in enumerate(itertools.islice(draw_photos(), 6)):
         alpha = Image.new("L", photo.size, 255)
         alpha.paste(0, (0, 0, WIDTH // 4, HEIGHT))
         if i in (1, 2):
             photo.putalpha(alpha)
-        photo.save(tmp_path / "photos" / f"my photo {i}.{'png' if i == 1 else 'webp'}", lossless=True)
+        suffix, kind = kinds[i]
+        photo.save(tmp_path / "photos" / f"my photo {i}.{suffix}", kind, lossless=kind == "WEBP", quality=98)
     summary = process(Process(tmp_path / "photos", tmp_path / "out", max_size=80))
     assert "2 photos are partly transparent" in capsys.readouterr().out
     assert summary.registered == 6 and not summary.left_out
@@ -357,7 +374,7 @@ def test_names_with_spaces_and_webp_and_transparent_photos(tmp_path: Path, capsy
                 transparent.append(Path(frame["file_path"]).name)
                 opacity = np.asarray(image.getchannel("A"))
                 assert not opacity[:, :15].any() and (opacity[10:-10, 25:-10] == 255).all()
-    assert sorted(transparent) == ["my photo 1.png", "my photo 2.webp.png"]
+    assert sorted(transparent) == ["my photo 1.jpg.png", "my photo 2.webp.png"]
 
 
 TURNS = {  # EXIF's orientation: how Pillow undoes what it tells

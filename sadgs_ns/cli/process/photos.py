@@ -12,17 +12,24 @@ import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from sadgs_ns.data import IMAGE_SUFFIXES, SIDEWAYS, TURNED
 from sadgs_ns.errors import InputError, reason
 
-_UNREAD_SUFFIXES = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"}
-"""Suffixes of formats that phones and cameras write and that neither COLMAP nor Pillow surely reads."""
-_CONVERTED_SUFFIXES = {".webp"}
-"""Suffixes of formats that training and Pillow read, but COLMAP does not."""
+_RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"}
+"""Suffixes of cameras' raw files, of some of which Pillow reads a small preview as TIFF."""
+_UNREAD_SUFFIXES = {".heic", ".heif", ".hif", ".jxl"}
+"""Suffixes of formats that Pillow does not read; phones and apps give them to JPEG, too."""
+_COLMAP_FORMATS = {"JPEG", "MPO", "PNG", "TIFF", "BMP"}
+"""Pillow's names of the formats that COLMAP and OpenCV read."""
+_FORMATS = _COLMAP_FORMATS | {"WEBP", "AVIF"}
+_UNREAD_FORMATS = {"GIF", "JPEG2000", "PSD", "PPM"}
+"""Pillow's names of further formats, whose files are told of."""
+_KEPT_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
+"""Suffixes by which COLMAP knows in which format to write; it reads by what a file holds."""
 _POSITION = (ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLongitude, ExifTags.GPS.GPSAltitude)
 _NAMED = 20
 """How many unreadable photos a message names."""
@@ -42,17 +49,47 @@ class Photo:
     """Whether EXIF holds GPS coordinates with an altitude; COLMAP uses none without it."""
     has_alpha: bool
     """Whether some pixels may be transparent."""
+    is_read: bool = True
+    """Whether COLMAP reads its format."""
     lies: bool = False
     """Whether the pixels have to be turned or mirrored to be upright, as EXIF tells."""
 
 
 def photos_not_read(folder: Path) -> str:
-    """Return a sentence on the photos in formats that are not read; it is empty if there are none."""
-    others = [path.suffix for path in folder.rglob("*") if path.suffix.lower() in _UNREAD_SUFFIXES]
-    if not others:
+    """Return a sentence on the images in formats that are not read; it is empty if there are none."""
+    unread = sorted(path for path in folder.rglob("*") if _kind(path) == "unread")
+    if not unread:
         return ""
-    kinds = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
-    return f"Its {len(others)} {' and '.join(sorted(set(others)))} files are not read: convert them to one of {kinds}."
+    return (
+        f"{len(unread)} of its files are not read, such as {unread[0].relative_to(folder)}: convert them to JPEG or "
+        "PNG, with .jpg or .png at the end of their names."
+    )
+
+
+def _kind(path: Path) -> Literal["photo", "unread", "other"]:
+    """Return whether a file is a photo, by its suffix and by what it holds, or an image that is not read.
+
+    A photo may yet be damaged.
+    """
+    suffix = path.suffix.lower()
+    if path.name.startswith(".") or (path.exists() and not path.is_file()):
+        return "other"
+    if suffix in _RAW_SUFFIXES:
+        return "unread"
+    try:
+        with path.open("rb") as file:
+            start = file.read(12)
+    except OSError:  # It is named when it is read.
+        start = b""
+    if suffix in IMAGE_SUFFIXES and start[4:8] not in (b"ftyp", b"JXL ") and start[:2] != b"\xff\x0a":
+        return "photo"
+    may_be_photo = suffix in IMAGE_SUFFIXES or suffix in _UNREAD_SUFFIXES
+    try:
+        with Image.open(path) as image:  # HEIC, AVIF or JPEG XL, or a file with any other suffix
+            kind = image.format
+    except Exception:  # Decoders raise anything.
+        return "unread" if may_be_photo else "other"
+    return "photo" if may_be_photo and kind in _FORMATS else "unread" if kind in _FORMATS | _UNREAD_FORMATS else "other"
 
 
 def find_photos(source: Path, out: Path) -> list[str]:
@@ -67,9 +104,7 @@ def find_photos(source: Path, out: Path) -> list[str]:
         raise InputError(f"{source} does not exist; give a folder of photos or a video.")
     folder, scene = Path(os.path.realpath(source)), Path(os.path.realpath(out))
     found = [
-        path.relative_to(folder)
-        for path in folder.rglob("*")
-        if path.suffix.lower() in IMAGE_SUFFIXES and scene not in path.parents and not path.is_dir()
+        path.relative_to(folder) for path in folder.rglob("*") if scene not in path.parents and _kind(path) == "photo"
     ]
     names = sorted(path.as_posix() for path in found if not any(part.startswith(".") for part in path.parts))
     if len(names) < 3:
@@ -163,6 +198,7 @@ def _read_photo(folder: Path, name: str, as_stored: bool) -> Photo:
             (size, *(exif.get(tag) for tag in (ExifTags.Base.Make, ExifTags.Base.Model)), max((0.0, *focal))),
             all(_numbers(position.get(tag)) for tag in _POSITION),
             image.has_transparency_data,
+            image.format in _COLMAP_FORMATS,
             orientation in TURNED,
         )
         # An eighth of a JPEG's size tells whether it is whole.
@@ -190,11 +226,13 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
     """
 
     def converted_name(photo: Photo) -> str:
-        is_read = Path(photo.name).suffix.lower() not in _CONVERTED_SUFFIXES
-        return photo.name + ("" if is_read else ".png" if photo.has_alpha else ".jpg")
+        suffix = Path(photo.name).suffix.lower()
+        if suffix in _KEPT_SUFFIXES and not (photo.has_alpha and suffix in (".jpg", ".jpeg")):
+            return photo.name
+        return photo.name + (".png" if photo.has_alpha else ".jpg")
 
     new = [dataclasses.replace(photo, name=converted_name(photo)) for photo in photos]
-    if new == list(photos) and not any(photo.lies for photo in photos):
+    if new == list(photos) and all(photo.is_read and not photo.lies for photo in photos):
         return folder, new
     if converted.exists():
         return converted, new
@@ -203,7 +241,7 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
     def convert(photo: Photo, name: str) -> None:
         source, target = Path(os.path.realpath(folder / photo.name)), partial / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        if name != photo.name or photo.lies:
+        if photo.lies or not photo.is_read:
             with Image.open(source) as image:
                 is_tiff = image.format == "TIFF"  # Its tags tell of its pixels, and Pillow turns it by itself.
                 exif = Image.Exif() if is_tiff else image.getexif()
@@ -211,12 +249,12 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
                 pixels = ImageOps.exif_transpose(image) if photo.lies and not is_tiff else image
                 exif.pop(ExifTags.Base.Orientation, None)
                 try:
-                    exif.tobytes()
+                    kept = exif.tobytes()
                 except Exception:  # Pillow raises anything where EXIF is damaged.
-                    exif = Image.Exif()
+                    kept = b""
                 if pixels.mode != "I;16":
                     pixels = pixels.convert("RGBA" if photo.has_alpha else "RGB")
-                pixels.save(target, exif=exif, quality=97, subsampling=0)  # the latter two for JPEG alone
+                pixels.save(target, exif=kept, quality=97, subsampling=0)  # the latter two for JPEG alone
             return
         try:
             target.symlink_to(source)
