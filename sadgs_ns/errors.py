@@ -40,6 +40,19 @@ _NERFSTUDIOS: tuple[tuple[str, str, type[Exception], str, str], ...] = (
     ),
     *(
         (
+            module, function, Exception, part,
+            "`ns-export pointcloud`, `poisson`, `tsdf` and `marching-cubes` are for fields of density, and a splat has "
+            "none: `sadgs-export RUN --output room.mesh.ply` writes a mesh, and to a .ply the Gaussians.",
+        )
+        for module, function, part in (
+            ("nerfstudio.models.base_model", "forward", "camera_type"),
+            ("nerfstudio.models.base_model", "get_outputs_for_camera_ray_bundle", "eval_num_rays_per_chunk"),
+            ("nerfstudio.scripts.exporter", "main", "train_pixel_sampler"),
+            ("nerfstudio.scripts.exporter", "main", "SDF field"),
+        )
+    ),
+    *(
+        (
             "nerfstudio.scripts.train", "launch", Exception, part,
             "A process of the run ended, and the others with it ({reason}): what the last checkpoint holds goes on "
             "with --load-dir and the run's folder.",

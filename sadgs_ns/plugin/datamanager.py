@@ -121,6 +121,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         self.config.cache_images = asked
         for dataset in (self.train_dataset, self.eval_dataset):
             splits.check_paths(dataset.image_filenames)
+            dataset.cameras.metadata = dataset.cameras.metadata or {}  # `ns-export cameras` needs one.
             _check_sizes(dataset)
 
     def create_train_dataset(self) -> InputDataset:

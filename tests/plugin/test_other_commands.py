@@ -49,7 +49,7 @@ def no_programs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def said_of(command: Any) -> str | None:
     """What is printed in place of the traceback."""
-    with pytest.raises((ValueError, OSError, AssertionError)) as failed:
+    with pytest.raises((ValueError, OSError, AssertionError, AttributeError)) as failed:
         command.main()
     return errors.sentence_of(failed.value)
 
@@ -86,6 +86,29 @@ def test_views_that_nerfstudio_cannot_render_are_one_sentence(run: tuple[int, Pa
         assert said == (
             "The run holds out no view that could be rendered: add --split train, which takes the training views."
         )
+
+
+@pytest.mark.hard_case(
+    "`ns-export pointcloud`, `poisson`, `tsdf` and `marching-cubes`; `cameras` of a COLMAP capture",
+    "one sentence, which names `sadgs-export … .mesh.ply`, where a traceback was; the cameras' poses",
+)
+@pytest.mark.usefixtures("open3d")
+@pytest.mark.parametrize("run", [1], indirect=True)
+def test_exports_of_fields_name_the_one_of_splats(run: tuple[int, Path], tmp_path: Path):
+    from nerfstudio.scripts import exporter
+
+    for command in (
+        exporter.ExportPointCloud(run[1], tmp_path),
+        exporter.ExportPointCloud(run[1], tmp_path, normal_method="open3d"),
+        exporter.ExportPoissonMesh(run[1], tmp_path),
+        exporter.ExportTSDFMesh(run[1], tmp_path),
+        exporter.ExportMarchingCubesMesh(run[1], tmp_path),
+    ):
+        said = said_of(command)
+        assert said is not None and "`sadgs-export RUN --output room.mesh.ply` writes a mesh" in said, command
+    exporter.ExportCameraPoses(run[1], tmp_path).main()
+    counts = [len(json.loads((tmp_path / f"transforms_{part}.json").read_text())) for part in ("train", "eval")]
+    assert counts == [9, 1]
 
 
 @pytest.mark.hard_case(
