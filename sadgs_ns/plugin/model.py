@@ -6,7 +6,7 @@ import copy
 import math
 import threading
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
@@ -733,7 +733,7 @@ class SadgsModel(SplatfactoModel):
         return {
             "step": self.step,
             "strategy_state": {
-                key: vars(value) if isinstance(value, CameraPaths) else value
+                key: asdict(value) if isinstance(value, CameraPaths) else value
                 for key, value in self.strategy_state.items()
             },
             "average": self.average.state_dict(),
