@@ -29,9 +29,9 @@ from rich.console import Console
 
 from sadgs_ns.cli.export import Export
 from sadgs_ns.cli.process.command import Process, check_size, photos_added
-from sadgs_ns.cli.process.photos import find_photos
+from sadgs_ns.cli.process.photos import find_source
 from sadgs_ns.cli.process.plan import Summary
-from sadgs_ns.cli.process.video import check_video
+from sadgs_ns.cli.process.video import count_frames
 from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_json
 from sadgs_ns.cli.status_line import StatusLine, clock
 from sadgs_ns.cli.worker import OnEvent, Worker, WorkerError
@@ -61,7 +61,7 @@ class Sadgs:
     --max-num-iterations 500`."""
 
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS_OR_VIDEO")]
-    """Folder of photos, or a video."""
+    """Folder of photos or of videos, or a video."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = None
     """Folder for all that is made; by default the source's name and -splat, in the working directory."""
     effort: Annotated[float, tyro.conf.arg(metavar="X")] = 1.0
@@ -102,7 +102,7 @@ class PhotosToSplat:
         for path in (self.source, self.folder):
             if not str(path).isprintable():
                 raise InputError(f"{str(path)!a} has unprintable characters in its name: rename it.")
-        check_video(self.source) if self.source.is_file() else find_photos(self.source, self._scene)
+        count_frames(self.source) if self.source.is_file() else find_source(self.source, self._scene)
 
     def _read_settings(self) -> None:
         """Read the settings that the folder was begun with, and take what is not decided yet as it is asked for now.

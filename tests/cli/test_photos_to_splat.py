@@ -268,9 +268,9 @@ def test_wrong_input_is_told_in_a_sentence_before_any_work(
     before = sorted(tmp_path.rglob("*"))
     source = str(photos)
     for arguments, told in (
-        (["nowhere"], "nowhere does not exist; give a folder of photos or a video."),
-        (["others/letter.txt"], "others/letter.txt is neither a folder of photos nor a video (.avi"),
-        (["loop"], "loop does not exist; give a folder of photos or a video."),
+        (["nowhere"], "nowhere does not exist; give a folder of photos or of videos, or a video."),
+        (["others/letter.txt"], "others/letter.txt cannot be read as a video (Invalid data found when"),
+        (["loop"], "loop does not exist; give a folder of photos or of videos, or a video."),
         ([source, "-o", "a\udcffb"], "'a\\udcffb' has unprintable characters in its name: rename it."),
         (["empty"], "empty holds 0 photos; a reconstruction needs at least 3"),
         ([source, "-o", "others"], "others exists and is not a folder that sadgs began; give another --output."),

@@ -17,12 +17,14 @@ import os
 import resource
 import shutil
 import signal
+import struct
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 import pycolmap
@@ -41,7 +43,7 @@ from sadgs_ns.cli.process.command import Process, main, photos_added, process
 from sadgs_ns.cli.process.photos import Photo, find_photos, photos_by_camera, read_photos
 from sadgs_ns.cli.process.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching, expected_work
 from sadgs_ns.cli.process.stages import check_written, fetch_vocabulary, match, sequential_pairs
-from sadgs_ns.cli.process.video import sharpest_frames
+from sadgs_ns.cli.process.video import sharpest_frames, video_frames
 from sadgs_ns.data.checks.layouts import ParserOptions
 from sadgs_ns.data.checks.transforms import check_nerfstudio
 from sadgs_ns.errors import InputError, RunError
@@ -206,7 +208,7 @@ def test_a_film_gives_its_sharpest_frames(scene: Path, tmp_path: Path):
         for sigma in (4, 0, 4):  # sharp in the middle of each stretch
             writer.write(cv2.GaussianBlur(frame, (0, 0), sigma) if sigma else frame)
     writer.release()
-    chosen = list(sharpest_frames(tmp_path / "film.avi", 6))
+    chosen = list(sharpest_frames(tmp_path / "film.avi", 6, 18))
     assert [number for number, _ in chosen] == list(range(6))
     for (_, actual), expected in zip(chosen, frames, strict=True):
         assert np.abs(actual.astype(float) - expected).mean() < 8
@@ -234,13 +236,13 @@ def test_photos_of_one_size_and_lens_share_a_camera(tmp_path: Path):
 @pytest.mark.parametrize(
     ("prepare", "sentence"),
     [
-        (lambda folder: None, "photos does not exist; give a folder of photos or a video."),
+        (lambda folder: None, "photos does not exist; give a folder of photos or of videos, or a video."),
         (lambda folder: folder.mkdir(), "photos holds 0 photos; a reconstruction needs at least 3"),
         (lambda folder: heic(folder), "4 of its files are not read, such as IMG_0.HEIC: convert them to JPEG or PNG"),
-        (lambda folder: folder.write_text("x"), "photos is neither a folder of photos nor a video"),
+        (lambda folder: folder.write_text("x"), "photos cannot be read as a video (Invalid data found when processing"),
         (lambda folder: broken(folder), "1 of the 3 photos in "),
         (lambda folder: broken(folder), "whole image: 2.png (no image that Pillow knows); copy it again or remove it."),
-        (lambda folder: link(folder), "photos does not exist; give a folder of photos or a video."),
+        (lambda folder: link(folder), "photos does not exist; give a folder of photos or of videos, or a video."),
     ],
 )
 def test_bad_photos_are_told_in_a_sentence(tmp_path: Path, prepare, sentence: str, capsys):
@@ -763,11 +765,109 @@ def test_other_folders_and_settings_are_left_alone(run: Run, photos: Path, tmp_p
     assert "was begun with other photos or settings" in capsys.readouterr().err
 
 
+class Pipe:
+    """What cannot go back, as a browser writes its recording, so that no length comes into its header."""
+
+    def __init__(self) -> None:
+        self.content = bytearray()
+
+    def write(self, content: Any) -> int:
+        self.content += content
+        return len(content)
+
+
+def record(path: Path, codec: str, kind: str, levels: Sequence[int], options: dict[str, str] | None = None) -> Path:
+    """Write a video of 48 × 32 px with a frame of each of these levels of grey, red in the upper left."""
+    pipe = Pipe()
+    with av.open(pipe, "w", format=kind, options=options or {}) as container:
+        stream: Any = container.add_stream(codec, rate=10)
+        stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p"
+        for level in levels:
+            pixels = np.full((32, 48, 3), level, np.uint8)
+            pixels[:16, :24] = (200, 0, 0)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+        container.mux(stream.encode())
+    path.write_bytes(pipe.content)
+    return path
+
+
+@pytest.mark.hard_case("WebM and MKV without a length in the header, as browsers record them", "frames are counted")
+@pytest.mark.hard_case("AV1; fragmented MP4; MPEG-TS, as camcorders write it, also named without a suffix", "read")
+@pytest.mark.parametrize(
+    ("name", "codec", "kind", "options"),
+    [
+        ("live.webm", "libvpx", "webm", {}),
+        ("live.mkv", "libx264", "matroska", {}),
+        ("av1.mp4", "libsvtav1", "mp4", {"movflags": "frag_keyframe+empty_moov"}),
+        ("live.mp4", "libx264", "mp4", {"movflags": "frag_keyframe+empty_moov"}),
+        ("00001.MTS", "libx264", "mpegts", {}),
+        ("film", "libx264", "mpegts", {}),
+    ],
+)
+def test_a_film_gives_its_frames_whatever_its_header_says(name, codec, kind, options, tmp_path: Path):
+    film = record(tmp_path / name, codec, kind, range(0, 240, 20), options)
+    frames = list(video_frames(film, [], 6))
+    assert [name for name, _ in frames] == [f"{i:05d}.jpg" for i in range(6)]
+    for i, (_, frame) in enumerate(frames):
+        assert frame.shape == (32, 48, 3)
+        assert min(abs(frame[24:, 24:].mean() - level) for level in (40 * i, 40 * i + 20)) < 6
+
+
+@pytest.mark.hard_case("a phone's video held upright", "its frames are turned as a player turns them")
+@pytest.mark.parametrize(("matrix", "corner"), [((0, 1, -1, 0), (0, 1)), ((-1, 0, 0, -1), (1, 1))])
+def test_frames_are_turned_as_players_show_them(matrix: tuple[int, ...], corner: tuple[int, int], tmp_path: Path):
+    film = record(tmp_path / "film.mp4", "libx264", "mp4", [90] * 3, {"movflags": "frag_keyframe+empty_moov"})
+
+    def header(a: int, b: int, c: int, d: int) -> bytes:
+        return struct.pack(">9i", a << 16, b << 16, 0, c << 16, d << 16, 0, 0, 0, 1 << 30)
+
+    content, unturned = film.read_bytes(), header(1, 0, 0, 1)
+    start = content.index(unturned, content.index(b"tkhd"))
+    film.write_bytes(content[:start] + header(*matrix) + content[start + len(unturned) :])
+    (_, frame), *_ = video_frames(film, [], 3)
+    height, width = (48, 32) if matrix[0] == 0 else (32, 48)
+    assert frame.shape == (height, width, 3)
+    redness = frame[:, :, 2].astype(int) - frame[:, :, 1]
+    quarters = [redness[: height // 2], redness[height // 2 :]]
+    red = [[half[:, : width // 2].mean(), half[:, width // 2 :].mean()] for half in quarters]
+    assert np.unravel_index(np.argmax(red), (2, 2)) == corner
+
+
+@pytest.mark.hard_case(
+    "a folder of videos, of which one is short; the same name with two suffixes",
+    "each gives a share of the frames by its length and has a camera of its own; photos beside them are told of",
+)
+def test_a_folder_of_films_gives_frames_of_each(tmp_path: Path, taken: list[list[str]], capsys):
+    folder = tmp_path / "films"
+    black(folder, "still.png", "._a.webm/x.png")
+    for name, length in (("a.mkv", 12), ("a.webm", 6), ("day/b.webm", 1)):
+        (folder / name).parent.mkdir(exist_ok=True)
+        record(folder / name, "libvpx", "matroska", range(0, 10 * length, 10))
+    command = [str(folder), str(tmp_path / "out"), "--frames", "9"]
+    assert main(command) == main(command) == 130 and taken[0] == taken[1]
+    assert taken[0] == [f"a.mkv/{i:05d}.jpg" for i in range(5)] + ["a.webm/00000.jpg", "a.webm/00001.jpg"] + [
+        "day/b.webm/00000.jpg"
+    ]
+    assert "Frames of 3 videos are taken, each with a camera of its own" in capsys.readouterr().out
+    record(folder / "c.webm", "libvpx", "webm", [0])
+    assert main(command) == 2
+    assert "settings (videos added: 1, such as c.webm); give another folder or delete" in capsys.readouterr().err
+
+
+@pytest.mark.hard_case("videos beside the photos of a folder, as iPhones keep them", "left out, and told of")
+def test_films_beside_photos_are_told_of(tmp_path: Path, registered: Callable[[int], None], capsys):
+    photos = black(tmp_path / "photos", "a.png", "b.png", "c.png")
+    (photos / "a.MOV").write_bytes(b"a film")
+    registered(9)
+    assert main([str(photos), str(tmp_path / "out")]) == 0
+    assert "Its videos (1, such as a.MOV) are not used: give them in a folder of" in capsys.readouterr().out
+
+
 @pytest.mark.hard_case("a cut video, one of two frames, a photo as the video", "refused in a sentence")
 def test_a_film_that_is_none_is_told_in_a_sentence(tmp_path: Path, capsys):
     (tmp_path / "film.mp4").write_bytes(b"no film")
     assert main([str(tmp_path / "film.mp4"), str(tmp_path / "out")]) == 2
-    assert "film.mp4 cannot be read as a video" in capsys.readouterr().err
+    assert "film.mp4 cannot be read as a video (Invalid data found" in capsys.readouterr().err
     film(tmp_path / "short.avi", 2)
     assert main([str(tmp_path / "short.avi"), str(tmp_path / "out")]) == 2
     assert "short.avi gives 2 frames; a reconstruction needs at least 3" in capsys.readouterr().err
@@ -807,8 +907,8 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
 def test_a_film_whose_frames_were_being_written_goes_on(tmp_path: Path, monkeypatch, taken: list[list[str]]):
     command = [str(film(tmp_path / "film.avi", 6)), str(tmp_path / "out"), "--frames", "6"]
 
-    def interrupted(video: Path, count: int):
-        yield from itertools.islice(sharpest_frames(video, count), 4)
+    def interrupted(video: Path, count: int, total: int):
+        yield from itertools.islice(sharpest_frames(video, count, total), 4)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:

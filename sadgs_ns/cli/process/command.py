@@ -30,7 +30,7 @@ from sadgs_ns.cli.process.photos import (
     changed_photos,
     convert_photos,
     empty_folder,
-    find_photos,
+    find_source,
     photo_stamps,
     photos_by_camera,
     photos_not_read,
@@ -39,7 +39,7 @@ from sadgs_ns.cli.process.photos import (
     write_alpha,
 )
 from sadgs_ns.cli.process.plan import Matching, Summary, choose_matching, expected_work
-from sadgs_ns.cli.process.video import video_frames, write_frames
+from sadgs_ns.cli.process.video import find_videos, video_frames, write_frames
 from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_json
 from sadgs_ns.data.coordinates import FRAME_KEYS
 from sadgs_ns.errors import InputError, WriteError
@@ -60,7 +60,7 @@ class Process:
     """From photos or a video to a scene for sadgs."""
 
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS_OR_VIDEO")]
-    """Folder of photos, or a video."""
+    """Folder of photos or of videos, or a video."""
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
     """Folder for the scene; an interrupted run goes on in it."""
     matching: Matching = "auto"
@@ -83,14 +83,15 @@ class _Scene:
     def __init__(self, given: Process) -> None:
         self.given, self.work = given, given.out / "work"
         self.noted = self.work / "settings.json"
-        out, source, self.is_video = given.out, given.source, given.source.is_file()
+        out, source = given.out, given.source
         if out.is_file() or (not self.noted.exists() and any(not path.is_dir() for path in out.rglob("*"))):
             raise InputError(f"{out} exists and is not a scene that sadgs-process began; give another folder.")
-        photos = [] if self.is_video else find_photos(source, out)
+        photos, self.is_video = find_source(source, out)
         self.settings: dict[str, Any] = {
             "source": os.path.realpath(source),
             "camera_per_photo": given.camera_per_photo,
-            **({"frames": given.frames} if self.is_video else {"photos": photos}),
+            "photos": photos,
+            **({"frames": given.frames} if self.is_video else {}),
         }
         self.begun = read_settings(self.noted, out)
         self.finished = self.begun.get("finished") if (out / "transforms.json").exists() else None
@@ -112,19 +113,19 @@ class _Scene:
     def _refuse_changes(self) -> None:
         asked: dict[str, Any] = self.settings | ({"max_size": self.given.max_size} if self.finished else {})
         differing = [name for name in asked if self.begun.get(name) != asked[name]]
-        told, back = [], ""
+        told, back, kind = [], "", "videos" if self.is_video else "photos"
         if "source" in differing:  # The rest follows from it.
             differing = ["source"]
-        elif not self.is_video:
-            before, now = set(self.begun["photos"]), set(asked["photos"])
+        else:
+            before, now = {*self.begun.get("photos", [])}, {*asked["photos"]}
             for verb, names in (
                 ("changed", changed_photos(self.given.source, self.begun.get("files", {}))),
-                ("added", set() if self.finished else now - before),
+                ("added", set() if self.finished and not self.is_video else now - before),
                 ("removed", before - now),
             ):
                 if names:
-                    told.append(f"photos {verb}: {len(names)}, such as {min(names)}")
-                    back = back if verb == "added" else "put these photos back, "
+                    told.append(f"{kind} {verb}: {len(names)}, such as {min(names)}")
+                    back = back if verb == "added" else f"put these {kind} back, "
         for name in (name for name in differing if name != "photos"):
             option = name if name == "source" else "--" + name.replace("_", "-")
             told.append(f"{option} was {self.begun.get(name)}, is {asked[name]}")
@@ -182,6 +183,8 @@ def process(given: Process) -> Summary:
     print(summary)
     if given.source.is_dir() and (not_read := photos_not_read(given.source)):
         print(not_read)
+    if not scene.is_video and (videos := find_videos(given.source)):
+        print(f"Its videos ({len(videos)}, such as {videos[0]}) are not used: give them in a folder of their own.")
     return summary
 
 
@@ -193,18 +196,22 @@ def _make(scene: _Scene, report: Report) -> Summary:
             run_colmap("fetch_vocabulary", Path(scratch), folder=Path(scratch), report=report)
 
     with contextlib.ExitStack() as alone:
-        folder, names = given.source, scene.settings.get("photos", [])
+        folder, names = given.source, scene.settings["photos"]
         if scene.is_video:
             folder = work / "frames"
-            chosen = [] if folder.exists() else video_frames(given.source, given.frames)
+            if names:
+                _say("videos", f"Frames of {len(names)} videos are taken, each with a camera of its own.")
+            chosen = [] if folder.exists() else video_frames(given.source, names, given.frames)
             alone.enter_context(scene.alone())  # It notes the settings, by which an interrupted run goes on.
             if not folder.exists():
                 partial = empty_folder(work / "frames.partial")
                 write_frames(chosen, partial, lambda done: report("frames", done, given.frames))
                 partial.rename(folder)
-            names = sorted(photo.name for photo in folder.glob("*.jpg"))
+            names = sorted(photo.relative_to(folder).as_posix() for photo in folder.rglob("*.jpg"))
         photos = read_photos(folder, names, report, scene.settings["as_stored"])
-        matching, notice = choose_matching(given.matching, photos, scene.is_video, fetch_vocabulary)
+        if scene.is_video:
+            photos = [dataclasses.replace(photo, camera=(os.path.dirname(photo.name), photo.size)) for photo in photos]
+        matching, notice = choose_matching(given.matching, photos, given.source.is_file(), fetch_vocabulary)
         if not scene.is_video:
             stamps = scene.begun.get("files", {})
             scene.settings["files"] = stamps | photo_stamps(folder, [name for name in names if name not in stamps])
@@ -234,11 +241,9 @@ def _make(scene: _Scene, report: Report) -> Summary:
 
 
 def photos_added(source: Path, out: Path) -> list[str]:
-    """Return the photos that came to a folder since its finished scene was made; raise as `find_photos`."""
+    """Return the photos that came to a folder since its finished scene was made; raise as `find_source`."""
     begun = read_settings(out / "work" / "settings.json", out)
-    if not source.is_dir() or "finished" not in begun:
-        return []
-    return sorted(set(find_photos(source, out)) - set(begun["photos"]))
+    return sorted({*find_source(source, out)[0]} - {*begun.get("photos", [])}) if "finished" in begun else []
 
 
 def _say(event: str, sentence: str, **fields: str) -> None:

@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
+from sadgs_ns.cli.process.video import find_videos
 from sadgs_ns.data import IMAGE_SUFFIXES, SIDEWAYS, TURNED
 from sadgs_ns.errors import InputError, reason
 
@@ -92,6 +93,21 @@ def _kind(path: Path) -> Literal["photo", "unread", "other"]:
     return "photo" if may_be_photo and kind in _FORMATS else "unread" if kind in _FORMATS | _UNREAD_FORMATS else "other"
 
 
+def find_source(source: Path, out: Path) -> tuple[list[str], bool]:
+    """Return the photos of a folder, or its videos where it has fewer than three photos, and whether these are videos.
+
+    A single video has no names. Raise as `find_photos`, which looks for the photos.
+    """
+    if source.is_file():
+        return [], True
+    try:
+        return find_photos(source, out), False
+    except InputError:
+        if videos := find_videos(source):
+            return videos, True
+        raise
+
+
 def find_photos(source: Path, out: Path) -> list[str]:
     """Return the sorted names of a folder's photos, relative to it.
 
@@ -101,7 +117,7 @@ def find_photos(source: Path, out: Path) -> list[str]:
         InputError: If there are fewer than three photos, or one has a name that is no Unicode.
     """
     if not source.is_dir():
-        raise InputError(f"{source} does not exist; give a folder of photos or a video.")
+        raise InputError(f"{source} does not exist; give a folder of photos or of videos, or a video.")
     folder, scene = Path(os.path.realpath(source)), Path(os.path.realpath(out))
     found = [
         path.relative_to(folder) for path in folder.rglob("*") if scene not in path.parents and _kind(path) == "photo"

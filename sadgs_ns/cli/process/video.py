@@ -1,66 +1,110 @@
-"""Photos from a video: the sharpest frame of each of its stretches."""
+"""Photos from videos: the sharpest frame of each of their stretches."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
+from av.error import InvalidDataError
 
 from sadgs_ns.atomic import atomic_path
 from sadgs_ns.errors import InputError
 
-VIDEO_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"}
+VIDEO_SUFFIXES = (".3gp", ".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".mts", ".ogv", ".webm", ".wmv")
 
 
-def sharpest_frames(video: Path, count: int) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield number and picture of the sharpest frame of each of `count` stretches of a video.
+def find_videos(folder: Path) -> list[str]:
+    """Return the sorted names of a folder's videos, relative to it, without hidden ones."""
+    found = [path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in VIDEO_SUFFIXES]
+    names = sorted(path.as_posix() for path in found if not (folder / path).is_dir())
+    return [name for name in names if not any(part.startswith(".") for part in name.split("/"))]
 
-    The sharpest is the one whose Laplacian varies most. Pictures are BGR, uint8 [H, W, 3].
+
+def count_frames(video: Path) -> int:
+    """Return the number of a video's frames, which are counted where its header does not tell, as in recordings.
 
     Raises:
-        InputError: If OpenCV cannot read the video.
+        InputError: If it cannot be opened as a video.
     """
-    capture = cv2.VideoCapture(str(video))
-    total = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-    if not capture.isOpened() or total < 1:
-        raise InputError(f"{video} cannot be read as a video; convert it to MP4 with H.264.")
-    stretch = max(total / count, 1.0)
-    frames = itertools.takewhile(lambda read: read[0], iter(capture.read, None))
-    for number, group in itertools.groupby(enumerate(frames), lambda numbered: int(numbered[0] / stretch)):
-        yield number, max((frame for _, (_, frame) in group), key=_sharpness)
+    try:
+        with av.open(os.fspath(video)) as container:
+            stream = container.streams.best("video")
+            assert isinstance(stream, av.VideoStream)
+            return stream.frames or sum(packet.size > 0 for packet in container.demux(stream))
+    except Exception as error:  # FFmpeg has many.
+        why = getattr(error, "strerror", None) or "it shows nothing"
+        raise InputError(
+            f"{video} cannot be read as a video ({why}); give a folder of photos or of videos, or convert a video to "
+            "MP4 with H.264."
+        ) from error
+
+
+def read_frames(video: Path) -> Iterator[np.ndarray]:
+    """Yield the frames of a video as a player shows them: upright, and without damaged ones. BGR, uint8 [H, W, 3]"""
+    with av.open(os.fspath(video)) as container:
+        stream = container.streams.best("video")
+        assert isinstance(stream, av.VideoStream)  # `count_frames` was called before.
+        stream.codec_context.thread_type = "AUTO"
+        for packet in container.demux(stream):
+            try:
+                frames = stream.decode(packet)
+            except InvalidDataError:
+                continue
+            for frame in frames:
+                yield np.rot90(frame.to_ndarray(format="bgr24"), frame.rotation // 90)
+
+
+def sharpest_frames(video: Path, count: int, total: int) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield number and picture of the sharpest frame of each of `count` stretches of a video of `total` frames.
+
+    The sharpest is the one whose Laplacian varies most. Pictures are BGR, uint8 [H, W, 3].
+    """
+    stretches = itertools.groupby(enumerate(read_frames(video)), lambda numbered: numbered[0] * count // total)
+    for number, group in itertools.takewhile(lambda stretch: stretch[0] < count, stretches):
+        yield number, max((frame for _, frame in group), key=_sharpness)
 
 
 def _sharpness(frame: np.ndarray) -> float:
     return float(cv2.Laplacian(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), cv2.CV_64F).var())
 
 
-def check_video(video: Path) -> None:
-    """Raise an InputError if a file's name is not that of a video."""
-    if video.suffix.lower() not in VIDEO_SUFFIXES:
-        raise InputError(f"{video} is neither a folder of photos nor a video ({', '.join(sorted(VIDEO_SUFFIXES))}).")
+def video_frames(source: Path, names: Sequence[str], count: int) -> Iterator[tuple[str, np.ndarray]]:
+    """Return names and pictures of the `sharpest_frames` of videos, each of which gives a share by its length.
 
-
-def video_frames(video: Path, count: int) -> Iterator[tuple[int, np.ndarray]]:
-    """Return the `sharpest_frames` of a video, of which there are at least three.
+    Args:
+        source: A video, or a folder of some.
+        names: Of the videos in the folder, by which those of their frames begin; none for a single video.
+        count: Frames of all together, at least three.
 
     Raises:
-        InputError: If the file is no video, or gives fewer than three frames.
+        InputError: If a file is no video, or they give fewer than three frames.
     """
-    check_video(video)
-    frames = sharpest_frames(video, count)
+    totals = {name: count_frames(source / name) for name in names or [""]}
+    everything = max(sum(totals.values()), 1)
+
+    def all_frames() -> Iterator[tuple[str, np.ndarray]]:
+        for name, total in totals.items():
+            share = max(1, min(total, count * total // everything))
+            for number, frame in sharpest_frames(source / name, share, max(total, 1)):
+                yield f"{name}/{number:05d}.jpg".lstrip("/"), frame
+
+    frames = all_frames()
     first = list(itertools.islice(frames, 3))
     if len(first) < 3:
-        raise InputError(f"{video} gives {len(first)} frames; a reconstruction needs at least 3, better 30 or more.")
+        raise InputError(f"{source} gives {len(first)} frames; a reconstruction needs at least 3, better 30 or more.")
     return itertools.chain(first, frames)
 
 
-def write_frames(frames: Iterable[tuple[int, np.ndarray]], folder: Path, report: Callable[[int], None]) -> None:
-    """Write frames, as `video_frames` yields them, to a folder as numbered photos; raise a WriteError if one fails."""
-    for number, frame in frames:
-        with atomic_path(folder / f"{number:05d}.jpg") as partial:
+def write_frames(frames: Iterable[tuple[str, np.ndarray]], folder: Path, report: Callable[[int], None]) -> None:
+    """Write frames, as `video_frames` yields them, to a folder as photos; raise a WriteError if one fails."""
+    for done, (name, frame) in enumerate(frames, 1):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(folder / name) as partial:
             # OpenCV's own writing of files does not tell of a full disk.
             partial.write_bytes(cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 97])[1].tobytes())
-        report(number + 1)
+        report(done)
