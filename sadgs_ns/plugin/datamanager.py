@@ -4,33 +4,25 @@ from __future__ import annotations
 
 import copy
 import math
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
-from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, ColmapDataParserConfig
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 from nerfstudio.data.datasets.base_dataset import InputDataset
-from numpy.typing import NDArray
 from rich.progress import track
 from torch import Tensor
 from tyro.conf import Suppress
 
-from sadgs_ns.data import colmap, ply
+from sadgs_ns.data import colmap
 from sadgs_ns.data.automatic import AnyParserConfig, AutomaticDataParserConfig, choose_parser
 from sadgs_ns.data.checks import splits
-from sadgs_ns.data.checks.images import mask_name
-from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS
-from sadgs_ns.data.checks.transforms import read_json
-from sadgs_ns.data.coordinates import FRAME_KEYS, Similarity, fixed_frame
+from sadgs_ns.data.parsers import OWN, points_in_the_run
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.memory import available_host_bytes
 from sadgs_ns.plugin.image_source import ImagesOnDemand, thread_count
@@ -112,8 +104,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
             if plain and parser.load_3D_points:
                 self._points = colmap.points_file(model)
                 parser.load_3D_points = self._points is None
-        own: dict[type, type] = {Nerfstudio: _Nerfstudio, ColmapDataParser: _Colmap}
-        parser._target = own.get(parser._target, parser._target)
+        parser._target = OWN.get(parser._target, parser._target)
         config.dataparser = parser
         # nerfstudio would keep more than 500 images on the host, whatever their size, and say so in a line.
         asked, config.cache_images = config.cache_images, "cpu"
@@ -129,7 +120,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         if self._points is not None:
             outputs = self.train_dataparser_outputs
             points = colmap.read_points(self._points)
-            outputs.metadata |= _points_in_the_run(*points, outputs.dataparser_transform, outputs.dataparser_scale)
+            outputs.metadata |= points_in_the_run(*points, outputs.dataparser_transform, outputs.dataparser_scale)
         return super().create_train_dataset()
 
     def create_eval_dataset(self) -> InputDataset:
@@ -215,69 +206,3 @@ def _check_sizes(dataset: InputDataset) -> None:
             "needed: take a larger image, or scale it down less with pipeline.datamanager.camera-res-scale-factor or "
             "the parser's downscale-factor."
         )
-
-
-class _Nerfstudio(Nerfstudio):
-    """nerfstudio's parser of transforms.json, which alone reads points with open3d and asks whether to make a PLY.
-
-    Where the file fixes the frame (`coordinates.FRAME_KEYS`), this parser moves cameras and points there.
-    """
-
-    def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
-        model = self.config.data / COLMAP_FOLDERS[0]
-        if model.exists():
-            self.prompted_user, self.create_pc = True, False  # The answer no; the points are read below.
-        outputs = super()._generate_dataparser_outputs(split)
-        path = self.config.data if self.config.data.suffix == ".json" else self.config.data / "transforms.json"
-        _move_to_fixed_frame(outputs, read_json(path), path)
-        source = colmap.points_file(model)
-        if self.config.load_3D_points and "points3D_xyz" not in outputs.metadata and source is not None:
-            points = colmap.read_points(source)
-            outputs.metadata |= _points_in_the_run(*points, outputs.dataparser_transform, outputs.dataparser_scale)
-        return outputs
-
-    def _load_3D_points(
-        self, ply_file_path: Path, transform_matrix: Tensor, scale_factor: float
-    ) -> dict[str, Tensor] | None:
-        positions, colors = ply.read_points(ply_file_path)
-        return _points_in_the_run(positions, colors, transform_matrix, scale_factor) if len(positions) else None
-
-
-class _Colmap(ColmapDataParser):
-    """nerfstudio's parser of COLMAP's files, which also finds masks by COLMAP's names."""
-
-    def _get_all_images_and_cameras(self, recon_dir: Path) -> dict[str, Any]:
-        described, config = super()._get_all_images_and_cameras(recon_dir), self.config
-        if config.masks_path is not None:
-            masks, images = config.data / config.masks_path, (config.data / config.images_path).as_posix()
-            for frame in described["frames"]:
-                frame["mask_path"] = (masks / mask_name(masks, os.path.relpath(frame["file_path"], images))).as_posix()
-        return described
-
-
-def _move_to_fixed_frame(outputs: DataparserOutputs, meta: dict[str, Any], path: Path) -> None:
-    """Move a parser's cameras and points to the frame that `transforms.json` fixes; raises as `fixed_frame`."""
-    if (fixed := fixed_frame(meta, path)) is None:
-        return
-    chosen = Similarity.of(outputs.dataparser_scale * outputs.dataparser_transform.double().numpy())
-    cameras, metadata = outputs.cameras, outputs.metadata
-    poses = fixed.poses(chosen.inverse().poses(cameras.camera_to_worlds.double().numpy()))
-    cameras.camera_to_worlds = torch.from_numpy(poses).float()
-    if "points3D_xyz" in metadata:
-        points = metadata["points3D_xyz"].double().numpy()
-        metadata["points3D_xyz"] = torch.from_numpy(fixed.positions(chosen.inverse().positions(points))).float()
-    transform, scale = (meta[name] for name in FRAME_KEYS)
-    outputs.dataparser_transform, outputs.dataparser_scale = torch.tensor(transform), float(scale)
-
-
-def _points_in_the_run(
-    positions: NDArray[np.floating], colors: NDArray[np.uint8], transform: Tensor, scale: float
-) -> dict[str, Tensor]:
-    """Return points [P, 3] and their colours in 0 … 255 [P, 3] as nerfstudio's metadata hold them.
-
-    The transform [3, 4] maps the data's frame to the run's; the scale is applied after it.
-    """
-    with np.errstate(over="ignore"):  # What is beyond float32 becomes infinite, and is left out later.
-        positions = positions.astype(np.float32)
-    homogeneous = torch.from_numpy(np.pad(positions, ((0, 0), (0, 1)), constant_values=1))
-    return {"points3D_xyz": homogeneous @ transform.T * scale, "points3D_rgb": torch.from_numpy(colors)}

@@ -16,6 +16,7 @@ from runs import TRAIN_VIEWS, configure, nerfstudio_data, train
 from scenes import HEIGHT, POINTS, WIDTH
 
 from examples.drawn_scene.scene import room_surfaces
+from sadgs_ns.data.parsers import points_in_the_run
 from sadgs_ns.errors import InputError
 from sadgs_ns.plugin import datamanager, model, pipeline, presets, stereo_start
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
@@ -43,7 +44,7 @@ def test_points_near_the_surfaces_are_added_to_the_initial_ones_whatever_the_see
     data, rng = started.datamanager.train_dataparser_outputs, np.random.default_rng(0)
     samples = [(points := surface.sample(5000, rng), surface.colour(points)) for surface in room_surfaces()]
     positions, colors = (np.concatenate(parts) for parts in zip(*samples, strict=True))
-    drawn = datamanager._points_in_the_run(positions, colors, data.dataparser_transform, data.dataparser_scale)
+    drawn = points_in_the_run(positions, colors, data.dataparser_transform, data.dataparser_scale)
     distances, nearest = torch.cdist(added["means"], drawn["points3D_xyz"].double()).min(dim=1)
     colors = SH2RGB(added["features_dc"])
     assert distances.median() < 0.05 and colors.min() > -1e-5 and colors.max() < 1 + 1e-5
