@@ -1,7 +1,8 @@
-"""Photos of the corner of a drawn room, whose poses are known, for tests that find cameras."""
+"""Photos of the corner of a drawn room and panoramas of a hall, whose poses are known, for tests that find cameras."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 
 import cv2
@@ -44,3 +45,60 @@ def draw_photos() -> Iterator[Image.Image]:
             homography = cv2.getPerspectiveTransform(corners, (projected[:, :2] / projected[:, 2:]).astype(np.float32))
             cv2.warpPerspective(texture, homography, (WIDTH, HEIGHT), photo, borderMode=cv2.BORDER_TRANSPARENT)
         yield Image.fromarray(photo)
+
+
+HALL = np.array([6.0, 4.0, 3.0])
+"""Width, depth and height of a hall that is closed all around."""
+
+
+def panorama_centres(count: int) -> np.ndarray:
+    """Where the panoramas of the hall are taken, on an arc at the height of a head. [count, 3]"""
+    angles = np.linspace(0, 4, count)
+    return np.stack([3 + 1.4 * np.cos(angles), 2 + np.sin(angles), 1.5 + 0.1 * np.sin(3 * angles)], 1)
+
+
+@functools.cache
+def hall_textures() -> list[np.ndarray]:
+    """Noise of a texel of 1 cm for the two walls across each axis: dark and bright spots of 10 cm, and finer ones."""
+    random, textures = np.random.default_rng(1), []
+    for axis in (0, 0, 1, 1, 2, 2):
+        across, up = np.delete(HALL, axis) * 100
+        texture = np.full((int(up), int(across), 3), 127.0)
+        for sigma, strength in ((24, 40), (6, 9)):
+            noise = random.normal(0, 60, texture.shape)
+            texture += strength / 2 * cv2.GaussianBlur(noise, (0, 0), sigma)
+        textures.append(np.clip(texture, 0, 255).astype(np.uint8))
+    return textures
+
+
+def draw_hall(centre: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Colours of the hall that are seen from a centre along rays in its axes (z up). [H, W, 3] → uint8 [H, W, 3]"""
+    with np.errstate(divide="ignore"):
+        distance = np.where(rays > 0, HALL - centre, -centre) / rays
+    axis = distance.argmin(-1)
+    hits = centre + rays * distance.min(-1, keepdims=True)
+    colours = np.zeros(rays.shape, np.uint8)
+    for wall, texture in enumerate(hall_textures()):
+        seen = (axis == wall // 2) & (np.take_along_axis(rays, axis[..., None], -1)[..., 0] * (wall % 2 - 0.5) > 0)
+        across, up = (100 * np.delete(hits, wall // 2, -1) - 0.5).astype(np.float32).transpose(2, 0, 1)
+        colours[seen] = cv2.remap(texture, across, up, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[seen]
+    return colours
+
+
+def draw_panorama(centre: np.ndarray, height: int, yaw: float = 0.0) -> np.ndarray:
+    """A panorama of the hall, whose middle looks along y turned by an angle in rad. uint8 [height, 2 · height, 3]"""
+    longitude = (np.arange(2 * height) + 0.5) / height * np.pi - np.pi + yaw
+    latitude = np.pi / 2 - (np.arange(height) + 0.5) / height * np.pi
+    longitude, latitude = np.meshgrid(longitude, latitude)
+    level = np.cos(latitude)
+    rays = np.stack([level * np.sin(longitude), level * np.cos(longitude), np.sin(latitude)], -1)
+    return draw_hall(centre, rays)
+
+
+def draw_photo(centre: np.ndarray, rotation: np.ndarray, side: int, yaw: float = 0.0) -> np.ndarray:
+    """A photo of 90° of the hall, turned by a rotation to the axes of the panorama there. uint8 [side, side, 3]"""
+    across = (np.arange(side) + 0.5) / side * 2 - 1
+    rays = np.stack([*np.meshgrid(across, across), np.ones((side, side))], -1)
+    x, down, ahead = np.moveaxis(rays @ rotation.T, -1, 0)
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    return draw_hall(centre, np.stack([cosine * x + sine * ahead, cosine * ahead - sine * x, -down], -1))

@@ -240,6 +240,8 @@ class PhotosToSplat:
             nonlocal added, duration, done_before
             if event == "added":
                 added = f"{fields['photos']}: "
+            elif event == "panoramas":
+                line.print(fields["told"])
             elif event == "expected":
                 duration = f" ({fields['duration']} in all)"
             elif event == "unchanged":

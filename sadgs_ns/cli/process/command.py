@@ -26,7 +26,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from sadgs_ns import events
 from sadgs_ns.cli.process.colmap import Report, run_colmap
+from sadgs_ns.cli.process.panoramas import VIEWS
 from sadgs_ns.cli.process.photos import (
+    Photo,
     changed_photos,
     convert_photos,
     empty_folder,
@@ -211,25 +213,23 @@ def _make(scene: _Scene, report: Report) -> Summary:
         photos = read_photos(folder, names, report, scene.settings["as_stored"])
         if scene.is_video:
             photos = [dataclasses.replace(photo, camera=(os.path.dirname(photo.name), photo.size)) for photo in photos]
-        matching, notice = choose_matching(given.matching, photos, given.source.is_file(), fetch_vocabulary)
+        views = [view for photo in photos for view in photo.views]
+        matching, notice = choose_matching(given.matching, views, given.source.is_file(), fetch_vocabulary)
         if not scene.is_video:
             stamps = scene.begun.get("files", {})
             scene.settings["files"] = stamps | photo_stamps(folder, [name for name in names if name not in stamps])
             alone.enter_context(scene.alone())  # Only now, when the photos are known to be readable.
-        known = len(photos) - scene.added if scene.added else 0
-        if scene.added:
-            told = f"{scene.added} photo{'s' * (scene.added > 1)} added to {known}"
-            _say("added", f"{told}.", photos=told)
-        expected, duration = expected_work(photos, matching, known)
-        _say("expected", f"{notice} {expected}".lstrip(), duration=duration)
+        _tell_work(scene, photos, matching, notice)
         if scene.added:  # An interrupted run may have made these without some of them.
             for path in (scene.model, work / "photos", work / "alpha"):
                 shutil.rmtree(path, ignore_errors=True)
+        rigs = [[view.name for view in photo.views] for photo in photos if photo.is_panorama]
         folder, photos = convert_photos(folder, photos, work / "photos")
         if transparent := write_alpha(folder, photos, work / "alpha"):
             _say("transparent", f"{transparent} photos are partly transparent; their images in the scene are, too.")
+        photos = [photo for photo in photos if photo.camera]  # without the views
         groups = [[photo.name] for photo in photos] if given.camera_per_photo else photos_by_camera(photos)
-        arguments = (folder, groups, matching, given.max_size, scene.model, scene.base)
+        arguments = (folder, groups, matching, given.max_size, scene.model, scene.base, rigs)
         summary = Summary(**run_colmap("make_model", *arguments, folder=work, report=report))
         _publish(work / "undistorted", given.out, bool(scene.added))
         if summary.is_poor and not scene.added:  # The features serve another way of matching.
@@ -238,6 +238,23 @@ def _make(scene: _Scene, report: Report) -> Summary:
             scene.note(max_size=given.max_size, finished=dataclasses.asdict(summary), model=scene.model.name)
             scene.remove_intermediate_files()
     return summary
+
+
+def _tell_work(scene: _Scene, photos: Sequence[Photo], matching: Matching, notice: str) -> None:
+    before = {*scene.begun["photos"]} if scene.added else set()
+    if scene.added:
+        told = f"{scene.added} photo{'s' * (scene.added > 1)} added to {len(before)}"
+        _say("added", f"{told}.", photos=told)
+    if panoramas := sum(photo.is_panorama for photo in photos):
+        told = (
+            f"{panoramas} of the {len(photos)} photos are panoramas: each is cut into {VIEWS} views of 90°, which "
+            "leave out 30° about the zenith and the nadir, and all views of a panorama are held out, or none."
+        )
+        _say("panoramas", told, told=told)
+    views = [view for photo in photos for view in photo.views]
+    known = sum(len(photo.views) for photo in photos if photo.name in before)
+    expected, duration = expected_work(views, matching, known)
+    _say("expected", f"{notice} {expected}".lstrip(), duration=duration)
 
 
 def photos_added(source: Path, out: Path) -> list[str]:
@@ -287,6 +304,8 @@ def _publish(undistorted: Path, out: Path, grown: bool = False) -> None:
         for frame in described["frames"]:  # Computing a pose again rounds it.
             frame["transform_matrix"] = poses.get(frame["file_path"], frame["transform_matrix"])
         kept = {name: before[name] for name in _KEPT_KEYS if name in before}
+        for name in kept.keys() & described.keys() - {*FRAME_KEYS}:  # The new views of panoramas are divided, too.
+            kept[name] = kept[name] + [view for view in described[name] if view not in poses]
         (undistorted / "transforms.json").write_text(json.dumps(described | kept))
         written = [name for name in written if (undistorted / name).exists() or name not in poses]
     try:

@@ -11,7 +11,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pycolmap
+from PIL import Image
 
+from sadgs_ns.cli.process.panoramas import VIEWS, rotations
 from sadgs_ns.cli.process.plan import MAX_SIDE, searched_pixels
 from sadgs_ns.events import progress
 from sadgs_ns.method.host_memory import available_host_bytes
@@ -24,12 +26,13 @@ _BYTES_PER_PIXEL = 240
 """Memory that OpenCV takes for features, as measured; it doubles the photo's size first."""
 
 
-def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path) -> None:
+def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, rigs: Sequence[Sequence[str]] = ()) -> None:
     """Find SIFT features in the photos of a folder that have none yet; one that cannot be decoded gets none.
 
-    In `groups` the names of one camera's photos are together. COLMAP's database is made if it does not exist.
+    In `groups` the names of one camera's photos are together, in `rigs` those of one panorama's views. COLMAP's
+    database is made if it does not exist.
     """
-    total = sum(map(len, groups))
+    total = sum(map(len, [*groups, *rigs]))
     progress("features", 0, total)
     with pycolmap.Database.open(database) as opened:
         known = {image.name: image.camera_id for image in opened.read_all_images()}
@@ -40,6 +43,9 @@ def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path) -> No
             reader.existing_camera_id = next((known[name] for name in group if name in known), -1)
             pycolmap.import_images(database, photos, pycolmap.CameraMode.SINGLE, missing, reader)
     with pycolmap.Database.open(database) as opened:
+        for views in (views for views in rigs if views[0] not in known):
+            with pycolmap.DatabaseTransaction(opened):
+                _add_panorama(opened, photos, views)
         images = [image for image in opened.read_all_images() if not opened.exists_descriptors(image.image_id)]
         done = total - len(images)
         cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
@@ -54,6 +60,27 @@ def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path) -> No
                     opened.write_descriptors(image.image_id, features)
                 done += 1
                 progress("features", done, total)
+
+
+def _add_panorama(opened: pycolmap.Database, photos: Path, views: Sequence[str]) -> None:
+    """Write the views of a panorama to COLMAP's database as a frame of the rig for their size."""
+    with Image.open(photos / views[0]) as image:
+        side = image.width
+    rigs = [rig for rig in opened.read_all_rigs() if rig.num_sensors() == VIEWS]
+    rig = next((rig for rig in rigs if opened.read_camera(rig.ref_sensor_id.id).width == side), None)
+    if rig is None:
+        camera = pycolmap.Camera(model="PINHOLE", width=side, height=side, params=[side / 2] * 4)
+        ids, to_panorama, rig = [opened.write_camera(camera) for _ in views], rotations(), pycolmap.Rig()
+        sensors = [pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id) for camera_id in ids]
+        rig.add_ref_sensor(sensors[0])
+        for sensor, rotation in zip(sensors[1:], to_panorama[1:], strict=True):
+            rig.add_sensor(sensor, pycolmap.Rigid3d(pycolmap.Rotation3d(rotation.T @ to_panorama[0]), np.zeros(3)))
+        rig.rig_id = opened.write_rig(rig)
+    frame = pycolmap.Frame(rig_id=rig.rig_id)
+    for sensor, name in zip(sorted(rig.sensor_ids(), key=lambda sensor: sensor.id), views, strict=True):
+        image_id = opened.write_image(pycolmap.Image(name=name, camera_id=sensor.id))
+        frame.add_data_id(pycolmap.data_t(sensor, image_id))
+    opened.write_frame(frame)
 
 
 def sift(photo: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -14,8 +14,10 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
+from sadgs_ns.cli.process.panoramas import VIEWS, cut, is_panorama
 from sadgs_ns.cli.process.video import find_videos
 from sadgs_ns.data import IMAGE_SUFFIXES, SIDEWAYS, TURNED
 from sadgs_ns.errors import InputError, reason
@@ -54,6 +56,15 @@ class Photo:
     """Whether COLMAP reads its format."""
     lies: bool = False
     """Whether the pixels have to be turned or mirrored to be upright, as EXIF tells."""
+    is_panorama: bool = False
+    """Whether it shows everything around."""
+
+    @property
+    def views(self) -> list[Photo]:
+        """The views that a panorama is cut into, which have no camera of their own; another photo is its own view."""
+        suffix, size = "png" if self.has_alpha else "jpg", (self.size[1] // 2, self.size[1] // 2)
+        names = [f"{self.name}/{i}.{suffix}" for i in range(VIEWS)]
+        return [Photo(name, size, (), False, self.has_alpha) for name in names] if self.is_panorama else [self]
 
 
 def photos_not_read(folder: Path) -> str:
@@ -187,7 +198,11 @@ def read_photos(
             f"{len(broken)} of the {len(names)} photos in {folder} cannot be read as a whole image: "
             f"{', '.join(broken[:_NAMED] + more)}; copy {them} again or remove {them}."
         )
-    return photos
+    looks: dict[tuple[int, int], list[bool]] = {}
+    for photo in photos:
+        looks.setdefault(photo.size, []).append(photo.is_panorama)
+    # Of one size all are panoramas or none is, for single ones may look otherwise.
+    return [dataclasses.replace(photo, is_panorama=bool(np.mean(looks[photo.size]) >= 0.5)) for photo in photos]
 
 
 @contextlib.contextmanager
@@ -220,7 +235,7 @@ def _read_photo(folder: Path, name: str, as_stored: bool) -> Photo:
         # An eighth of a JPEG's size tells whether it is whole.
         image.draft("RGB", (image.width // 8, image.height // 8))
         image.load()
-    return photo
+        return dataclasses.replace(photo, is_panorama=is_panorama(image, size))
 
 
 def _numbers(value: Any) -> tuple[float, ...]:
@@ -233,12 +248,12 @@ def _numbers(value: Any) -> tuple[float, ...]:
 
 
 def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tuple[Path, list[Photo]]:
-    """Convert a folder's photos in formats that COLMAP does not read, and turn those that lie, if there are any.
+    """Convert photos in formats that COLMAP does not read, turn those that lie and cut panoramas, if there are any.
 
     `converted` is made of conversions and of links to the other photos, where there is no such folder yet.
 
     Returns:
-        The folder of photos that COLMAP reads, and the photos in it.
+        The folder of photos that COLMAP reads, and the photos and views in it.
     """
 
     def converted_name(photo: Photo) -> str:
@@ -247,17 +262,20 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
             return photo.name
         return photo.name + (".png" if photo.has_alpha else ".jpg")
 
-    new = [dataclasses.replace(photo, name=converted_name(photo)) for photo in photos]
+    views = [view for photo in photos for view in photo.views]
+    new = [dataclasses.replace(view, name=converted_name(view)) for view in views]
     if new == list(photos) and all(photo.is_read and not photo.lies for photo in photos):
         return folder, new
     if converted.exists():
         return converted, new
     partial = empty_folder(converted.with_name(f"{converted.name}.partial"))
 
-    def convert(photo: Photo, name: str) -> None:
-        source, target = Path(os.path.realpath(folder / photo.name)), partial / name
+    def convert(photo: Photo) -> None:
+        source = Path(os.path.realpath(folder / photo.name))
+        targets = [partial / converted_name(view) for view in photo.views]
+        target = targets[0]
         target.parent.mkdir(parents=True, exist_ok=True)
-        if photo.lies or not photo.is_read:
+        if photo.lies or not photo.is_read or photo.is_panorama:
             with Image.open(source) as image:
                 is_tiff = image.format == "TIFF"  # Its tags tell of its pixels, and Pillow turns it by itself.
                 exif = Image.Exif() if is_tiff else image.getexif()
@@ -270,7 +288,8 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
                     kept = b""
                 if pixels.mode != "I;16":
                     pixels = pixels.convert("RGBA" if photo.has_alpha else "RGB")
-                pixels.save(target, exif=kept, quality=97, subsampling=0)  # the latter two for JPEG alone
+                for part, target in zip(cut(pixels) if photo.is_panorama else [pixels], targets, strict=True):
+                    part.save(target, exif=kept, quality=97, subsampling=0)  # the latter two for JPEG alone
             return
         try:
             target.symlink_to(source)
@@ -278,7 +297,7 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
             shutil.copyfile(source, target)
 
     with _threads() as pool:
-        list(pool.map(convert, photos, [photo.name for photo in new]))
+        list(pool.map(convert, photos))
     partial.rename(converted)
     return converted, new
 

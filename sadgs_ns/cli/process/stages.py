@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import itertools
+import json
 import shutil
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -19,6 +20,7 @@ import numpy as np
 import pycolmap
 
 from sadgs_ns.cli.process.features import extract
+from sadgs_ns.cli.process.panoramas import rotations
 from sadgs_ns.cli.process.photos import empty_folder, in_order
 from sadgs_ns.cli.process.plan import Matching, Summary
 from sadgs_ns.errors import InputError
@@ -52,8 +54,9 @@ FEW_FEATURES = 500
 
 
 def make_model(
-    photos: Path, groups: Sequence[Sequence[str]], matching: Matching, max_size: int, model: Path, base: Path | None
-) -> Summary:
+    photos: Path, groups: Sequence[Sequence[str]], matching: Matching, max_size: int, model: Path, base: Path | None,
+    rigs: Sequence[Sequence[str]],
+) -> Summary:  # fmt: skip
     """Make a model of photos, and from it the undistorted scene in the folder `undistorted` beside it.
 
     Where an earlier model is given, the photos that are not in it are added to it, and they alone are undistorted.
@@ -66,17 +69,18 @@ def make_model(
         model: The model's folder. Beside it `alpha` holds the photos' opacities, as `write_alpha` writes them, and what
             an interrupted run left there is used again.
         base: The earlier model's folder, whose cameras stay as they are; None begins anew.
+        rigs: The names of the views of each panorama.
 
     Raises:
         InputError: If no two photos could be related, or none could be added.
     """
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
-    names, database = sorted(itertools.chain(*groups)), model.with_name("database.db")
+    names, database = sorted(itertools.chain(*groups, *rigs)), model.with_name("database.db")
     if not model.exists():
         with ThreadPoolExecutor(1) as pool:  # Features need no torch, whose import takes seconds.
             gpu = pool.submit(wake_gpu)
-            extract(photos, groups, database)
-        match(names, database, matching, gpu.result())
+            extract(photos, groups, database, rigs)
+        match(names, database, matching, gpu.result(), rigs)
         place_cameras(photos, names, database, model, base)
     known = set() if base is None else registered_photos(pycolmap.Reconstruction(base))
     made, undistorted = pycolmap.Reconstruction(model), model.with_name("undistorted")
@@ -85,6 +89,8 @@ def make_model(
 
     with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio prints all cameras where there are several.
         colmap_to_json(undistorted / "sparse" / "0", undistorted)
+    if rigs:
+        hold_out_panoramas(undistorted / "transforms.json", rigs)
     return summarize(names, made, database, matching)
 
 
@@ -122,13 +128,49 @@ def fetch_vocabulary(folder: Path) -> None:
     progress("vocabulary tree", 1, 1)
 
 
+def hold_out_panoramas(file: Path, rigs: Sequence[Sequence[str]]) -> None:
+    """Hold every tenth panorama or photo out, from the fifth, in a `transforms.json`; nerfstudio would divide the views
+    of a panorama. Where there are fewer, it does."""
+    described, first = json.loads(file.read_text()), {view: views[0] for views in rigs for view in views}
+    names = in_order([frame["file_path"] for frame in described["frames"]])
+    whole = {name: first.get(name.removeprefix("images/"), name) for name in names}
+    chosen = list(dict.fromkeys(whole.values()))[4::10]
+    if held_out := [name for name in names if whole[name] in chosen]:
+        described["train_filenames"] = [name for name in names if whole[name] not in chosen]
+        described |= {"val_filenames": held_out, "test_filenames": held_out}
+        file.write_text(json.dumps(described, indent=4))
+
+
+def choose_pairs(names: Sequence[str], rigs: Sequence[Sequence[str]], matching: Matching) -> list[tuple[str, str]]:
+    """Pair all photos, or each with some that follow it for "sequential".
+
+    The views of a panorama, which have one centre, are not paired with each other. For "sequential" those of two
+    panoramas are paired that look the same way, and fewer panoramas follow, because each overlaps with many.
+    """
+    in_turn, units = matching == "sequential", {views[0]: views for views in rigs}
+    first, axes = {view: views[0] for views in rigs for view in views}, rotations()[:, :, 2]
+    order = list(dict.fromkeys(first.get(name, name) for name in (in_order(names) if in_turn else names)))
+    pairs: list[tuple[str, str]] = []
+    for a, b in sequential_pairs(order, 2 if rigs else 10) if in_turn else itertools.combinations(order, 2):
+        views = itertools.product(units.get(a, [a]), units.get(b, [b]))
+        both = in_turn and a in units and b in units
+        pairs += itertools.compress(views, (axes @ axes.T > 0.4).flat) if both else views
+    return pairs
+
+
 def sequential_pairs(names: Sequence[str], overlap: int = 10) -> list[tuple[str, str]]:
     """Pair each frame with the next `overlap` ones and with ever fewer of those farther on, which close loops."""
     steps = sorted({*range(1, overlap + 1), *(2**k for k in range(4, 10))})
     return [(names[i], names[i + step]) for i in range(len(names)) for step in steps if i + step < len(names)]
 
 
-def match(names: Sequence[str], database: Path, matching: Matching, gpu: torch.device | None) -> None:
+def match(
+    names: Sequence[str],
+    database: Path,
+    matching: Matching,
+    gpu: torch.device | None,
+    rigs: Sequence[Sequence[str]] = (),
+) -> None:
     """Match features between photos; pairs that an earlier run matched are skipped.
 
     Args:
@@ -136,6 +178,7 @@ def match(names: Sequence[str], database: Path, matching: Matching, gpu: torch.d
         database: COLMAP's database, which holds their features. A file `pairs.txt` is written beside it.
         matching: Any but "auto".
         gpu: The device that compares features where COLMAP does not choose the pairs; None leaves all to COLMAP.
+        rigs: The names of the views of each panorama.
     """
     stage, pair_list = f"matches ({matching})", database.with_name("pairs.txt")
     verification = pycolmap.TwoViewGeometryOptions()
@@ -149,7 +192,7 @@ def match(names: Sequence[str], database: Path, matching: Matching, gpu: torch.d
         function(database, verification_options=verification)
         progress(stage, 1, 1)
         return
-    pairs = sequential_pairs(in_order(names)) if matching == "sequential" else list(itertools.combinations(names, 2))
+    pairs = choose_pairs(names, rigs, matching)
     progress(stage, 0, len(pairs))
     at_once = _PAIRS_ON_GPU if gpu is not None else _PAIRS
     for start in range(0, len(pairs), at_once):
@@ -174,18 +217,22 @@ def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Pat
         InputError: If no two photos could be related, or no photo could be added.
     """
     before = None if base is None else pycolmap.Reconstruction(base)
-    registered = 0 if before is None else before.num_reg_images()
+    registered = 0 if before is None else before.num_reg_frames()
+    with pycolmap.Database.open(database) as opened:
+        count, rigs = opened.num_frames(), [rig for rig in opened.read_all_rigs() if rig.num_sensors() > 1]
+    fixed = {sensor.id for rig in rigs for sensor in rig.sensor_ids()}  # Panoramas are cut for these cameras.
     others: dict[str, Any] = {"min_model_size": 3}
     if before is not None:
         others = {"multiple_models": False, "fix_existing_frames": True, "image_names": list(names)}
-        others["constant_cameras"] = set(before.cameras)
+        fixed |= set(before.cameras)
+    others |= {"constant_cameras": fixed, "ba_refine_sensor_from_rig": False}
     options = pycolmap.IncrementalPipelineOptions(random_seed=_SEED, **_ADJUSTMENT, **others)
     options.mapper.ba_local_num_images = _ADJUSTED_PHOTOS
 
     def advance(more: int) -> None:
         nonlocal registered
-        registered = min(registered + more, len(names))  # COLMAP counts on where it begins another model.
-        progress("cameras", registered, len(names))
+        registered = min(registered + more, count)  # COLMAP counts on where it begins another model.
+        progress("cameras", registered, count)
 
     advance(0)
     models = pycolmap.incremental_mapping(
@@ -213,7 +260,7 @@ def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Pat
     best.write(partial)
     check_written(partial, best)
     partial.rename(model)
-    progress("cameras", len(names), len(names))
+    progress("cameras", count, count)
 
 
 def registered_photos(model: pycolmap.Reconstruction) -> set[str]:

@@ -1,0 +1,67 @@
+"""Panoramas of 2:1, which show everything around a camera, and the pinhole views that they are cut into."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from PIL import Image
+
+VIEWS = 8
+"""Views of a panorama: four above the horizon, and four below it that look between those. A view of 90° in both
+directions has a quarter of the panorama's width, so nearly as many pixels as the panorama has there."""
+_PITCH = 22.5
+"""Degrees above and below the horizon. The views show all directions up to a latitude of 60°, and none over 68°: a
+tripod or a hand is not seen."""
+_LEVELS = 12.0
+"""Most levels of grey, of 255, between the two ends of a row that meet; compression leaves a few."""
+
+
+def rotations() -> np.ndarray:
+    """Return the rotations from a view's axes (x right, y down, z forward) to those of its panorama. [VIEWS, 3, 3]"""
+
+    def turn(pitch: float, yaw: float) -> np.ndarray:
+        return cv2.Rodrigues(np.array([pitch, yaw, 0.0]))[0]
+
+    angles = np.radians([(90 * i, _PITCH) for i in range(4)] + [(90 * i + 45, -_PITCH) for i in range(4)])
+    return np.stack([turn(0, yaw) @ turn(pitch, 0) for yaw, pitch in angles])
+
+
+def is_panorama(image: Image.Image, size: tuple[int, int]) -> bool:
+    """Return whether a photo shows everything around: its XMP says so, or its ends meet and its poles are even.
+
+    The ends of a 360° camera's two circles, which no program has stitched yet, are black.
+
+    Args:
+        image: The photo, which may be loaded at a smaller size.
+        size: Its width and height in px.
+    """
+    if size[0] != 2 * size[1]:
+        return False  # Others are parts of a panorama, or a phone's pictures stitched in a row.
+    if b"equirectangular" in image.info.get("xmp", b""):
+        return True
+    small = np.asarray(image.convert("L").resize((256, 128), Image.Resampling.BOX), float)
+    seam, steps = np.abs(small[:, 0] - small[:, -1]).mean(), np.abs(np.diff(small, axis=1)).mean(0)
+    meets = seam < min(_LEVELS, 2 * np.quantile(steps, 0.9) + 1) and small[:, 0].std() > 0.1 * small.std()
+    return bool(meets and small[[0, -1]].std(1).max() < 0.5 * small.std())
+
+
+def cut(panorama: Image.Image) -> list[Image.Image]:
+    """Cut a panorama into its `VIEWS`, squares of half its height."""
+    pixels, border = np.asarray(panorama), cv2.BORDER_WRAP
+    maps = [map_of_view(i, panorama.height) for i in range(VIEWS)]
+    return [Image.fromarray(cv2.remap(pixels, *places, cv2.INTER_CUBIC, borderMode=border)) for places in maps]
+
+
+@lru_cache(VIEWS)
+def map_of_view(view: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return where in a panorama of a height in px the pixels of a view lie, x and y in OpenCV's px. [H/2, H/2] each"""
+    side = height // 2
+    across = (np.arange(side) + 0.5) / side * 2 - 1  # The tangents of angles up to 45° from the view's axis
+    x, y = np.meshgrid(across, across)
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ rotations()[view].T
+    longitude = np.arctan2(rays[..., 0], rays[..., 2])
+    latitude = np.arctan2(-rays[..., 1], np.hypot(rays[..., 0], rays[..., 2]))
+    column = (0.5 + longitude / (2 * np.pi)) * 2 * height - 0.5
+    return column.astype(np.float32), ((0.5 - latitude / np.pi) * height - 0.5).astype(np.float32)
