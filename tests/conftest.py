@@ -25,6 +25,10 @@ if "PYTEST_XDIST_WORKER" in os.environ and "OMP_NUM_THREADS" not in os.environ:
     os.environ["OMP_NUM_THREADS"] = "1"
     torch.set_num_threads(1)
 
+THREADS = torch.get_num_threads()
+# gsply's numba sets OpenMP's number of threads, torch's too, for all that follows in the process.
+os.environ["NUMBA_NUM_THREADS"] = str(THREADS)
+
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel is defined: they then run on the CPU, slowly
     with contextlib.suppress(ImportError, AttributeError, TypeError):
@@ -76,6 +80,11 @@ THIRD_PARTY_WARNINGS = (
 def pytest_configure(config: pytest.Config) -> None:
     for warning in THIRD_PARTY_WARNINGS:
         config.addinivalue_line("filterwarnings", warning)
+
+
+@pytest.hookimpl(trylast=True)  # after all fixtures
+def pytest_runtest_teardown() -> None:
+    assert torch.get_num_threads() == THREADS, "every later test of this process would compute with other threads"
 
 
 @pytest.fixture(scope="session")
