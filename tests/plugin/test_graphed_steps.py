@@ -24,7 +24,7 @@ from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
 
-ITERATIONS = 30
+ITERATIONS = 20
 on_cpu = pytest.mark.skipif(torch.cuda.is_available(), reason="on the CPU Triton is interpreted")
 
 
@@ -71,7 +71,7 @@ def without_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def short(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig:
     """A run with an AbsGS step, a reset, a structure step, and steps after all of them."""
-    schedule = {"absgs_every": 8, "structure_every": 20, "reset_every": 12, "refine_stop_iter": 20, "eta_every": 5}
+    schedule = {"absgs_every": 6, "structure_every": 11, "reset_every": 8, "refine_stop_iter": 11, "eta_every": 5}
     config = configure(tmp_path, colmap, ITERATIONS, **schedule)
     config.machine.device_type = "cpu"
     config.pipeline.views_per_iteration = 1
