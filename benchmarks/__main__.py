@@ -41,8 +41,7 @@ COMMANDS = {
     "views": ("view_table:Command", "the PSNR of each held-out view, and where it collapses"),
     "documents": ("documents:Command", "the tables and figures of the documents, from the rows of docs/results"),
     "approximations": ("approximations:Command", "speed against error of the frequency analysis"),
-    "step": ("step:Compare", "the parts of a training step, with and without our Triton kernels (CUDA)"),
-    "memory": ("step:Memory", "the memory plan beside the real peaks of training steps (CUDA)"),
+    "step": ("step:Command", "the parts of a training step, with and without our Triton kernels (CUDA)"),
     "validation": ("validation:Command", "copies of scenes whose validation views are held out"),
     "exposures": ("exposures:Command", "a copy of a scene whose photos have known exposures"),
 }

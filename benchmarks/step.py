@@ -1,4 +1,4 @@
-"""A training step on made-up Gaussians: its parts with and without our kernels, and its peaks beside the memory plan.
+"""A training step on made-up Gaussians: its parts with and without our kernels.
 
 The Gaussians are a spherical shell, which cameras around it look at. Calls follow each other, so that the host's work
 counts only where it takes longer than the GPU's.
@@ -11,7 +11,6 @@ import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
 from typing import Any
 
 import torch
@@ -20,7 +19,6 @@ from torch import Tensor
 from benchmarks.evaluate import now
 from benchmarks.table import grid
 from sadgs_ns import kernels
-from sadgs_ns.method import memory
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, keep_gradient
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.statistics import empty_statistics, observe
@@ -32,8 +30,6 @@ REPEATS = 20
 """Calls in a row that are timed together."""
 ETA_EVERY = 10
 """Steps between two that observe η, about as many as in a run of 3,000 iterations."""
-ASPECT = 1.5
-"""Width of the images, relative to their height."""
 ROOM = 1.25
 """Places in the tile lists, relative to the pairs of the first step: as in training, later ones do not wait."""
 
@@ -47,12 +43,6 @@ def milliseconds(function: Callable[[], object], rounds: int = 5, repeats: int =
             function()
         times.append((now() - start) / repeats * 1e3)
     return statistics.median(times[1:])
-
-
-def size_of(megapixels: float) -> tuple[int, int]:
-    """Width and height in px of an image."""
-    height = round((megapixels * 1e6 / ASPECT) ** 0.5)
-    return round(ASPECT * height), height
 
 
 class Step:
@@ -172,7 +162,7 @@ def gpu() -> None:
 
 
 @dataclass
-class Compare:
+class Command:
     """Time the parts of a training step with and without our kernels (CUDA)."""
 
     gaussians: tuple[int, ...] = (500_000, 4_000_000)
@@ -203,55 +193,3 @@ class Compare:
             lines = [(name, *(f"{column[name]:.2f}" for column in columns)) for name in columns[0]]
             print(grid(("part", "gsplat and torch", "with our kernels"), lines), end="\n\n", flush=True)
         return 0
-
-
-@dataclass
-class Memory:
-    """Compare the memory plan with the real peaks of training steps (CUDA), in GB."""
-
-    gaussians: tuple[int, ...] = (300_000, 1_000_000)
-    """numbers of Gaussians"""
-    megapixels: tuple[float, ...] = (0.4, 2.0, 5.0)
-    """sizes of a view"""
-    views: tuple[int, ...] = (1, 4)
-    """of a step"""
-
-    def __call__(self) -> int:
-        gpu()
-        phases = (*memory.step_bytes(0, memory.StepSize(), torch.device("cuda")), "step")
-        lines = []
-        for gaussians, megapixels, views in product(self.gaussians, self.megapixels, self.views):
-            step = Step(gaussians, *size_of(megapixels), views)
-            peaks, planned = peaks_of(step), plan(step)
-            planned["step"], peaks["step"] = max(planned.values()), max(peaks.values())
-            cells = [f"{planned[name] / 1e9:.2f} / {peaks[name] / 1e9:.2f}" for name in phases]
-            ratio = f"{planned['step'] / peaks['step']:.2f}"
-            lines.append((f"{gaussians:,}", f"{megapixels:g}", str(views), *cells, ratio))
-            del step
-            torch.cuda.empty_cache()
-        print(grid(("Gaussians", "megapixels", "views", *phases, "plan / peak"), lines, names=0))
-        return 0
-
-
-def plan(step: Step) -> dict[str, float]:
-    """Bytes of all that a step has at its peak in each phase, as the memory plan counts them."""
-    n, size = len(step.params["means"]), memory.StepSize.of([step.info])
-    kept = memory.kept_bytes(step.params, step.state) * n + step.images.numel() + step.codes.numel()  # type: ignore[arg-type]
-    return {name: kept + value for name, value in memory.step_bytes(n, size, step.images.device).items()}
-
-
-def peaks_of(step: Step) -> dict[str, float]:
-    """Bytes of all that torch had allocated at the peak of each phase of a step that observes η."""
-    peaks: dict[str, float] = {}
-
-    def note(phase: str) -> None:
-        peaks[phase] = torch.cuda.max_memory_allocated()
-        torch.cuda.reset_peak_memory_stats()
-
-    for _ in range(2):  # kernels are compiled, and Adam's moments are made
-        step()
-    step.count = 0
-    torch.cuda.synchronize()
-    torch.cuda.reset_peak_memory_stats()
-    step(note)
-    return peaks

@@ -1,8 +1,8 @@
 """How much memory a training step takes on CUDA, and how many Gaussians may be added so that the next one fits.
 
 The bytes are counted from the code that allocates them: `render.fused` and gsplat's `fully_fused_projection`,
-`kernels.tiles`, `kernels.losses` and `kernels.compositing`. `python -m benchmarks memory` compares the count with real
-peaks.
+`kernels.tiles`, `kernels.losses` and `kernels.compositing`. `tests/benchmarks/test_step.py` compares the count with
+real peaks.
 
 A step is largest in one of three phases, in which different tensors are alive: while the tile lists are sorted, in the
 loss, and in the backward pass of rasterization. What a Gaussian keeps between steps comes on top of each.
