@@ -10,8 +10,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from PIL import Image
-
 from benchmarks.protocol import Job
 
 if TYPE_CHECKING:
@@ -69,8 +67,9 @@ def image_names(parser: ColmapDataParserConfig, data: Path) -> list[str]:
     Raises:
         FileNotFoundError: The model, the folder of (downscaled) images or an image is missing; names the path.
     """
-    from nerfstudio.data.dataparsers.colmap_dataparser import MAX_AUTO_RESOLUTION
     from nerfstudio.data.utils import colmap_parsing_utils as colmap
+
+    from sadgs_ns.data.checks.images import MAX_AUTO_RESOLUTION, image_size, smaller_folder
 
     model, images = data / parser.colmap_path, data / parser.images_path
     if (model / "cameras.txt").exists():  # nerfstudio's order of preference
@@ -79,16 +78,12 @@ def image_names(parser: ColmapDataParserConfig, data: Path) -> list[str]:
         views = colmap.read_images_binary(model / "images.bin")
     else:
         raise FileNotFoundError(f"{model} holds no COLMAP model")
-    names = [views[index].name for index in sorted(views)]
-    factor = parser.downscale_factor
+    names, factor = [views[index].name for index in sorted(views)], parser.downscale_factor
     if factor is None:
-        if not (images / names[0]).exists():
-            raise FileNotFoundError(f"{images / names[0]} does not exist")
-        with Image.open(images / names[0]) as image:
-            longest, factor = max(image.size), 1
+        longest, factor = max(image_size(images / names[0])), 1
         while longest / factor > MAX_AUTO_RESOLUTION:
             factor *= 2
-    folder = images if factor == 1 else images.with_name(f"{images.name}_{factor}")
+    folder = smaller_folder(images, factor)
     if not folder.exists():
         raise FileNotFoundError(f"{folder} does not exist")
     absent = [name for name in names if not (folder / name).exists()]
