@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import shutil
@@ -12,8 +11,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import tyro
 from numpy.typing import NDArray
 from PIL import Image
+from tyro.conf import Positional
 
 from examples.drawn_scene.drawing import Array, Rectangle, Sphere, Surface, View, render, visible
 
@@ -107,28 +108,16 @@ def arc_views(count: int, width: int, height: int) -> tuple[View, ...]:
 def describe_scene(
     width: int = 160, height: int = 120, views: int = 40, points: int = 800, seed: int = 0
 ) -> SceneDescription:
-    """Lay out the scene without drawing it.
+    """Lay out the scene without drawing it; arguments are those of `write_scene`.
 
-    Args:
-        width: Image width in px, at least 16.
-        height: Image height in px, at least 16.
-        views: Training and held-out views together, at least 9.
-        points: Number of initial points, at least 10.
-        seed: Of the points' positions and noise. Surfaces and cameras do not depend on it.
-
-    Returns:
-        SceneDescription. Each point is seen by at least 2 views and lies 0.004 world units (one standard deviation per
-        axis) off its surface, as after a structure-from-motion run.
+    Each point is seen by at least 2 views and lies 0.004 world units (one standard deviation per axis) off its surface,
+    as after a structure-from-motion run.
 
     Raises:
         ValueError: If a number is too small.
     """
-    for name, value, least in (
-        ("width", width, 16),
-        ("height", height, 16),
-        ("views", views, 9),
-        ("points", points, 10),
-    ):
+    numbers = {"width": (width, 16), "height": (height, 16), "views": (views, 9), "points": (points, 10)}
+    for name, (value, least) in numbers.items():
         if value < least:
             raise ValueError(f"the demo scene's {name} is {value}; give at least {least}")
     rng = np.random.default_rng(seed)
@@ -186,7 +175,7 @@ def _refuse_foreign(folder: Path) -> None:
 
 
 def write_scene(
-    folder: Path, width: int = 160, height: int = 120, views: int = 40, points: int = 800, seed: int = 0
+    folder: Positional[Path], width: int = 160, height: int = 120, views: int = 40, points: int = 800, seed: int = 0
 ) -> SceneDescription:
     """Draw the scene and write it as a COLMAP dataset: `images/*.png`, `sparse/0/*.bin` and `scene.json`.
 
@@ -194,10 +183,11 @@ def write_scene(
 
     Args:
         folder: Created, with its parents; an earlier demo scene there is replaced.
-        width, height, views, points, seed: As for `describe_scene`.
-
-    Returns:
-        What was drawn.
+        width: Of the images, in px, at least 16.
+        height: Of the images, in px, at least 16.
+        views: Training and held-out views together, at least 9.
+        points: Number of initial points, at least 10.
+        seed: Of the points' positions and noise; surfaces and cameras do not depend on it.
 
     Raises:
         ValueError: If a number is too small.
@@ -224,21 +214,12 @@ def write_scene(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit status."""
-    parser = argparse.ArgumentParser(
-        prog="python -m examples.drawn_scene.scene", description=(__doc__ or "").split("\n")[0]
-    )
-    parser.add_argument("folder", type=Path, help="where to write the scene")
-    parser.add_argument("--width", type=int, default=160, help="image width in px (default %(default)s)")
-    parser.add_argument("--height", type=int, default=120, help="image height in px (default %(default)s)")
-    parser.add_argument("--views", type=int, default=40, help="training and held-out views (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the initial points (default %(default)s)")
-    given = parser.parse_args(arguments)
     try:
-        scene = write_scene(given.folder, given.width, given.height, given.views, seed=given.seed)
+        scene = tyro.cli(write_scene, prog="python -m examples.drawn_scene.scene", args=arguments)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    print(f"{given.folder}: {len(scene.views)} views, {len(scene.points)} points; wavelengths in world units:")
+    print(f"{len(scene.views)} views, {len(scene.points)} points; wavelengths in world units:")
     for name, wavelength in scene.wavelengths.items():
         print(f"  {name:16s} {wavelength:g}")
     return 0
