@@ -25,7 +25,8 @@ from sadgs_ns.cli.program import locked
 from sadgs_ns.cli.status_line import StatusLine
 from sadgs_ns.data.ply import read_points
 
-TRAINING = ["--", "--max-num-iterations", "15"]
+TRAINING = ["--", "--max-num-iterations", "15", "--pipeline.model.strategy.max-gaussians", "1500"]
+"""More Gaussians take a second a step."""
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +152,6 @@ def test_photos_that_are_added_are_registered_and_the_splat_is_trained_anew_wher
     for name in set(names) - set(later):
         shutil.copy2(photos / name, source)
     command = [str(source), "--output", str(folder), "--formats", "ply", "--max-size", "120", *TRAINING]
-    command += ["--pipeline.model.strategy.max-gaussians", "3000"]  # More take a second a step.
     assert main(command) == 0
     first, splat = folder / "training" / "sadgs" / "run", folder / "splat.ply"
     moved, written = (first / "dataparser_transforms.json").read_bytes(), splat.read_bytes()
