@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from processes import HANGS
 from websockets.sync.client import ClientConnection, connect
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -30,7 +31,7 @@ class Page:
         number = next(self._ids)
         self._socket.send(json.dumps({"id": number, "method": method, "params": params}))
         while True:
-            message = json.loads(self._socket.recv(timeout=120))
+            message = json.loads(self._socket.recv(timeout=HANGS))
             if message.get("id") == number:
                 assert "error" not in message, message
                 return message["result"]
@@ -39,7 +40,7 @@ class Page:
         """The value of a JavaScript expression."""
         return self.command("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
 
-    def wait_for(self, script: str, seconds: float = 120) -> Any:
+    def wait_for(self, script: str, seconds: float = HANGS) -> Any:
         """The value of an expression as soon as it is true."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -90,7 +91,7 @@ def open_page(url: str, profile: Path, width: int = 1280, height: int = 800) -> 
         stderr=subprocess.DEVNULL,
     )
     try:
-        port_file, end = profile / "DevToolsActivePort", time.monotonic() + 60
+        port_file, end = profile / "DevToolsActivePort", time.monotonic() + HANGS
         while not port_file.exists() or not port_file.read_text():
             assert process.poll() is None and time.monotonic() < end, "Chromium did not start"
             time.sleep(0.2)
@@ -103,4 +104,4 @@ def open_page(url: str, profile: Path, width: int = 1280, height: int = 800) -> 
             yield Page(socket)
     finally:
         process.terminate()
-        process.wait(30)
+        process.wait(HANGS)

@@ -25,12 +25,14 @@ IMPORTED = ["sadgs_ns.plugin.presets", "sadgs_ns.plugin.model"]
 NS_TRAIN = "import sys; from nerfstudio.scripts.train import entrypoint; sys.argv[:] = {}; entrypoint()"
 """The program `ns-train`, to be completed with its name and arguments."""
 
+HANGS = 600.0
+"""Seconds after which a test takes for hanging what it waits for; on a busy machine a start takes minutes."""
 _NO_GPU = {"CUDA_VISIBLE_DEVICES": ""}
 _SERVER = multiprocessing.get_context("forkserver")
 _SERVER.set_forkserver_preload(IMPORTED)
 
 
-def python(code: str, environment: Mapping[str, str] = os.environ, timeout: float = 100) -> Any:
+def python(code: str, environment: Mapping[str, str] = os.environ, timeout: float = HANGS) -> Any:
     """Run a program as `python -W ignore -c` does.
 
     Args:

@@ -246,7 +246,7 @@ def test_commands_that_no_other_test_runs_work_in_the_order_of_the_documents(tmp
     # Where nothing listens, LPIPS, whose weights are a download, is left out at once.
     nowhere = dict.fromkeys(("http_proxy", "https_proxy"), "http://127.0.0.1:9")
     environment = {**os.environ, **nowhere, "TORCH_HOME": str(tmp_path)}
-    run = processes.python(RUN_ALL.format(str(tmp_path), commands), environment, timeout=300)
+    run = processes.python(RUN_ALL.format(str(tmp_path), commands), environment)
     assert run.returncode == 0, run.stdout + run.stderr
     assert (tmp_path / "outputs/scene/sadgs/run/inspect").is_dir() and (tmp_path / "splat.ply").is_file()
 

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from processes import HANGS
 from torch import Tensor
 
 from benchmarks import __main__ as bench
@@ -393,7 +394,7 @@ def test_two_processes_train_one_splat_whose_row_the_first_writes(
         "share_always": True,
     }
     with bench.launcher(root)(Job(SCENE, Row("ours", "sadgs", overrides), 0), "0+1", tmp_path) as process:
-        assert process.wait(200) == 0, (tmp_path / "log").read_text()
+        assert process.wait(HANGS) == 0, (tmp_path / "log").read_text()
     record = json.loads((tmp_path / "result.json").read_text())
     assert record["status"] == "ok" and record["devices"] == 2 and record["iterations"] == ITERATIONS
     assert record["psnr"] > 10 and record["gaussians"] > 100 and record["loop_seconds"] > 0

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from processes import HANGS
 
 from sadgs_ns.cli.worker import Worker, WorkerError
 from sadgs_ns.errors import InputError
@@ -157,7 +158,7 @@ def test_a_function_does_not_outlive_the_command_that_is_killed(program, tmp_pat
         time.sleep(0.05)
     command.kill()
     command.wait()
-    end = time.monotonic() + 20
+    end = time.monotonic() + HANGS
     while Path(f"/proc/{found[1]}/stat").exists() and " Z " not in Path(f"/proc/{found[1]}/stat").read_text():
         assert time.monotonic() < end
         time.sleep(0.05)

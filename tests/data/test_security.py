@@ -30,6 +30,7 @@ from nerfstudio.data.utils import colmap_parsing_utils as colmap
 from nerfstudio.scripts.viewer.run_viewer import ViewerConfigWithoutNumRays
 from nerfstudio.utils.eval_utils import eval_load_checkpoint, eval_setup
 from PIL import Image
+from processes import HANGS
 from tyro import cli
 
 from benchmarks import protocol, run
@@ -211,7 +212,7 @@ def test_saved_configs_make_the_datamanager_with_the_checks():
 
 
 def answers(host: str, port: int) -> bool:
-    with closing(HTTPConnection(host, port, timeout=30)) as connection:
+    with closing(HTTPConnection(host, port, timeout=HANGS)) as connection:
         try:
             connection.request("GET", "/")
         except ConnectionRefusedError:
@@ -236,7 +237,7 @@ def shut_down(trainer: SadgsTrainer) -> None:
         server.close()
         await server.wait_closed()
 
-    asyncio.run_coroutine_threadsafe(close(), server.get_loop()).result(timeout=60)
+    asyncio.run_coroutine_threadsafe(close(), server.get_loop()).result(timeout=HANGS)
     trainer.shutdown()
 
 

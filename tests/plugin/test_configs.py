@@ -21,6 +21,7 @@ import yaml
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
+from processes import HANGS
 
 import sadgs_ns.plugin.model
 from sadgs_ns.errors import InputError
@@ -68,7 +69,7 @@ def is_string(statement: ast.stmt) -> bool:
 
 
 def python(code: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", code], cwd=cwd, capture_output=True, text=True, timeout=60)
+    return subprocess.run([sys.executable, "-c", code], cwd=cwd, capture_output=True, text=True, timeout=HANGS)
 
 
 def preset(name: str) -> Any:

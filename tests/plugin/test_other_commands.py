@@ -20,6 +20,7 @@ from kill_and_resume import configure
 from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.render import DatasetRender, RenderInterpolated, SpiralRender
 from nerfstudio.utils import install_checks, writer
+from processes import HANGS
 from runs import train
 
 from sadgs_ns import errors
@@ -154,7 +155,11 @@ def test_a_deleted_working_directory_is_named_before_torch_ends_the_process(tmp_
     code = f"import os; os.chdir({str(gone)!r}); os.rmdir({str(gone)!r}); import sadgs_ns.cli.doctor"
     path = {"PYTHONPATH": os.pathsep.join(sys.path)}
     result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, env={**os.environ, **path}
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=HANGS,
+        env={**os.environ, **path},
     )
     said = "error: The working directory was deleted: change to a folder that exists with `cd`.\n"
     assert (result.returncode, result.stderr) == (1, said)

@@ -213,11 +213,11 @@ def test_ctrl_c_on_ns_train_prints_the_command_that_resumes_it(
     program = processes.NS_TRAIN.format(command)  # It does not matter where pip has put the script ns-train.
     process = processes.start(processes.into_files, files, program, dict(os.environ))
     try:
-        deadline = time.monotonic() + 100
+        deadline = time.monotonic() + processes.HANGS
         while not list(folder.glob("*.ckpt")) and process.is_alive() and time.monotonic() < deadline:
             time.sleep(0.01)
         os.kill(process.pid, signal.SIGINT)
-        process.join(60)
+        process.join(processes.HANGS)
         printed, errors = (file.read_text() for file in files)
         assert process.exitcode == 130, printed + errors
     finally:
@@ -353,7 +353,7 @@ def test_a_terminal_that_is_gone_costs_nothing_that_was_trained(scene: Path, tmp
             printed += os.read(ours, 4096)
         os.close(theirs)
         os.close(ours)
-        process.join(60)
+        process.join(processes.HANGS)
         assert process.exitcode == 128 + signal.SIGHUP, printed.decode()
     finally:
         process.kill()
@@ -377,13 +377,13 @@ def test_a_terminal_that_goes_while_the_hung_up_run_saves_hides_nothing(scene: P
         while b"10 (0.20%)" not in printed:
             printed += os.read(ours, 4096)
         os.kill(process.pid, signal.SIGHUP)
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + processes.HANGS
         while not saving.exists() and time.monotonic() < deadline:
             time.sleep(0.01)
         os.close(theirs)
         os.close(ours)
         gone.touch()
-        process.join(60)
+        process.join(processes.HANGS)
         assert process.exitcode == 128 + signal.SIGHUP, printed.decode()
     finally:
         process.kill()
@@ -408,7 +408,7 @@ def test_a_run_whose_output_nobody_reads_any_more_trains_on(errors: str, scene: 
     process = processes.start(processes.into_files, files, script, dict(os.environ))
     try:
         read = read_until("10 (25.00%)", output)
-        process.join(300)
+        process.join(processes.HANGS)
         assert process.exitcode == 0, read
     finally:
         process.kill()
@@ -434,7 +434,7 @@ def test_ctrl_c_that_ends_tee_as_well_costs_nothing_that_was_trained(scene: Path
     try:
         read = read_until("10 (0.20%)", output)
         os.kill(process.pid, signal.SIGINT)
-        process.join(60)
+        process.join(processes.HANGS)
         assert process.exitcode == 128 + signal.SIGINT, read
     finally:
         process.kill()

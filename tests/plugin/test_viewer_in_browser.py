@@ -17,6 +17,7 @@ from browser import Page, open_page
 from kill_and_resume import configure, set_up
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.viewer import Viewer
+from processes import HANGS
 
 from examples.drawn_scene.scene import write_scene
 from sadgs_ns.plugin.panel import OUTPUT
@@ -26,7 +27,7 @@ ELEMENT = "document.getElementById(" + LABEL + ".htmlFor)"
 OPTION = "[...document.querySelectorAll('[role=option]')].filter(o => o.textContent == '{}' && o.offsetParent)[0]"
 
 
-def eventually(condition: Callable[[], bool], seconds: float = 60) -> None:
+def eventually(condition: Callable[[], bool], seconds: float = HANGS) -> None:
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end
@@ -35,7 +36,7 @@ def eventually(condition: Callable[[], bool], seconds: float = 60) -> None:
 
 def select(page: Page, label: str, option: str) -> None:
     """Choose an option; once more where the panel moved under the mouse, because a text above it changed."""
-    for _ in range(5):
+    for _ in range(20):
         page.click(ELEMENT.format(label))
         with suppress(TimeoutError):
             page.wait_for(f"!!{OPTION.format(option)}", 10)
@@ -97,4 +98,4 @@ def test_the_panel_shows_and_sets_what_is_chosen_in_a_browser(tmp_path: Path):
         for thread in threading.enumerate():  # one that still renders when Python ends would abort it
             if isinstance(thread, RenderStateMachine):
                 thread.running = False
-                thread.join(30)
+                thread.join(HANGS)
