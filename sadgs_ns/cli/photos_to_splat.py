@@ -240,7 +240,7 @@ class PhotosToSplat:
             nonlocal added, duration, done_before
             if event == "added":
                 added = f"{fields['photos']}: "
-            elif event == "panoramas":
+            elif event in ("panoramas", "aside"):
                 line.print(fields["told"])
             elif event == "expected":
                 duration = f" ({fields['duration']} in all)"

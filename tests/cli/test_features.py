@@ -71,9 +71,9 @@ def test_photos_that_have_features_are_not_searched_again(features, tmp_path: Pa
         Image.fromarray(cv2.resize(pixels, (160, 120))).save(tmp_path / name)
     searched, told, sift = [], [], features.sift
 
-    def noting(photo: Path):
+    def noting(photo: Path, mask: Path):
         searched.append(photo.name)
-        return sift(photo)
+        return sift(photo, mask)
 
     monkeypatch.setattr(features, "sift", noting)
     database = tmp_path / "database.db"

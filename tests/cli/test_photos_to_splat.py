@@ -236,11 +236,13 @@ def test_few_registered_photos_end_it_until_it_shall_go_on_anyway(
         (source / path.name).write_bytes(path.read_bytes())
         Image.new("RGB", (160, 120), (9 * i, 90, 90)).save(source / f"fog-{i}.png")
     Image.new("RGB", (160, 120)).save(source / "fog.png")
+    (source / "a.HEIC").write_bytes(b"a")
     command = [str(source), "--output", str(tmp_path / "out"), "--formats", "ply"]
     assert main(command) == 1
     printed = capsys.readouterr()
     assert re.search(r"^sadgs: only \d of 11 photos registered, so .* go on with these with --anyway\.$", printed.err)
     assert "--matching" not in printed.err, "all pairs were compared"
+    assert "Left out as images that are not read (make them .jpg or .png files): 1, such as a.HEIC." in printed.out
     assert lines_of(printed.out) == {"cameras": f"{printed.err.split()[2]} of 11 photos registered"}
     assert main([*command, "--anyway", "--", "--no-such-option"]) == 2
     printed = capsys.readouterr()

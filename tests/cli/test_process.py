@@ -20,6 +20,7 @@ import signal
 import struct
 import subprocess
 import sys
+import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ import pycolmap
 import pytest
 import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from PIL import Image
+from PIL import Image, ImageFilter
 from PIL.TiffImagePlugin import IFDRational
 from rich.progress import Progress
 from room import HEIGHT, VIEWS, WIDTH, camera_centres, draw_photos
@@ -40,7 +41,8 @@ from sadgs_ns.cli.process import command as program
 from sadgs_ns.cli.process import stages as colmap_stages
 from sadgs_ns.cli.process.colmap import run_colmap
 from sadgs_ns.cli.process.command import Process, main, photos_added, process
-from sadgs_ns.cli.process.photos import Photo, find_photos, photos_by_camera, read_photos
+from sadgs_ns.cli.process.folder import look_into
+from sadgs_ns.cli.process.photos import Photo, find_photos, photos_by_camera, read_photos, write_masks
 from sadgs_ns.cli.process.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching, expected_work
 from sadgs_ns.cli.process.stages import check_written, fetch_vocabulary, match, sequential_pairs
 from sadgs_ns.cli.process.video import sharpest_frames, video_frames
@@ -238,7 +240,10 @@ def test_photos_of_one_size_and_lens_share_a_camera(tmp_path: Path):
     [
         (lambda folder: None, "photos does not exist; give a folder of photos or of videos, or a video."),
         (lambda folder: folder.mkdir(), "photos holds 0 photos; a reconstruction needs at least 3"),
-        (lambda folder: heic(folder), "4 of its files are not read, such as IMG_0.HEIC: convert them to JPEG or PNG"),
+        (
+            lambda folder: heic(folder),
+            "as images that are not read (make them .jpg or .png files): 4, such as IMG_0.HEIC.",
+        ),
         (lambda folder: folder.write_text("x"), "photos cannot be read as a video (Invalid data found when processing"),
         (lambda folder: broken(folder), "1 of the 3 photos in "),
         (lambda folder: broken(folder), "whole image: 2.png (no image that Pillow knows); copy it again or remove it."),
@@ -270,19 +275,18 @@ def test_photos_that_are_not_read_are_told_beside_those_that_are(
     heic(folder)
     black(folder, "a.png", "b.png", "c.png", "d.gif", "e.jpg")
     (folder / "e.jpg").rename(folder / "e.jpg_large")
-    shutil.copy(folder / "a.png", folder / "f.NEF")
+    Image.new("RGB", (8, 8)).save(folder / "f.NEF", "TIFF")
     (folder / "g.jxl").write_bytes(b"\xff\x0a")
     (folder / "notes.txt").write_text("no image")
     registered(9)
     assert main([str(folder), str(tmp_path / "out")]) == 0
     assert "9 of 12 photos registered" in (printed := capsys.readouterr().out)
-    assert "8 of its files are not read, such as IMG_0.HEIC: convert them to JPEG or PNG, with .jpg or .png" in printed
+    assert "as images that are not read (make them .jpg or .png files): 8, such as IMG_0.HEIC.\n" in printed
 
 
 def broken(folder: Path) -> None:
     folder.mkdir()
-    for i in range(2):
-        Image.new("RGB", (8, 8)).save(folder / f"{i}.png")
+    black(folder, "0.png", "1.png")
     (folder / "2.png").write_bytes(b"no image")
 
 
@@ -393,6 +397,11 @@ def lying(photo: Image.Image, orientation: int, path: Path) -> None:
 
 
 @pytest.mark.hard_case(
+    "masks of photos: `masks/NAME.png`, COLMAP's `masks/NAME.jpg.png`, `NAME_mask.png`, of half the size, of 0 and 1, "
+    "or of a photo that lies on its side",
+    "no features where they are black; the scene has them, and white ones for the other photos",
+)
+@pytest.mark.hard_case(
     "EXIF orientations of 6, 8, 3, and mirrored (2, 7), in JPEG and PNG, beside upright photos",
     "the scene's images are upright and without the tag, all of one camera",
 )
@@ -402,6 +411,12 @@ def test_photos_that_lie_on_their_side_by_exif_become_upright(tmp_path: Path):
     for i, photo in drawn.items():
         path = tmp_path / "photos" / f"{i:02d}.{'jpg' if i % 2 else 'png'}"
         lying(photo, [*TURNS][i], path) if i < len(TURNS) else photo.save(path, quality=97)
+    black(tmp_path / "photos", "masks/none.png")
+    mask = Image.new("L", (WIDTH // 2, HEIGHT // 2), 255)
+    mask.paste(0, (0, 0, WIDTH // 8, HEIGHT))  # a quarter, on the left
+    mask.save(tmp_path / "photos" / "masks" / "00.png")
+    mask.transpose(TURNS[6]).save(tmp_path / "photos" / "masks" / "02.png.png")  # as that photo is stored
+    mask.point([value // 255 for value in range(256)]).save(tmp_path / "photos" / "05_mask.png")
     summary = process(Process(tmp_path / "photos", tmp_path / "out"))
     assert summary.registered == VIEWS and errors_of_centres(tmp_path / "out").max() < 0.05
     described = json.loads((tmp_path / "out" / "transforms.json").read_text())
@@ -413,17 +428,29 @@ def test_photos_that_lie_on_their_side_by_exif_become_upright(tmp_path: Path):
                 np.ravel(np.asarray(shown.convert("L").resize((32, 24)))) for shown in (image, drawn[int(name[-6:-4])])
             )
         assert np.corrcoef(actual, expected)[0, 1] > 0.9
-    assert not any("EXIF" in finding.sentence for finding in check_nerfstudio(tmp_path / "out", ParserOptions()))
+        with Image.open(tmp_path / "out" / "masks" / f"{Path(name).name}.png") as mask:
+            columns, masked = np.asarray(mask), name[-6:-4] in ("00", "02", "05")
+        assert (columns[:, :35] == 255 * (not masked)).all() and (columns[:, 45:-5] == 255).all()
+    assert [frame["mask_path"] for frame in described["frames"] if frame["file_path"] == "images/02.png"]
+    with pycolmap.Database.open(tmp_path / "out" / "work" / "database.db") as opened:
+        keypoints = [opened.read_keypoints(image.image_id) for image in opened.read_all_images()]
+    assert sorted(found[:, 0].min() > WIDTH / 4 - 1 for found in keypoints) == [False] * 7 + [True] * 3
+    found = check_nerfstudio(tmp_path / "out", ParserOptions())
+    assert {finding.severity for finding in found} == {"note"} and "with 10 masks" in found[-2].sentence, found
 
 
 @pytest.mark.hard_case(
     "photos with an EXIF orientation, some of them added to a scene of an earlier version, which ignored it",
     "the added ones are turned; those that were there stay as its cameras know them",
 )
+@pytest.mark.hard_case(
+    "photos with masks, added to a scene", "where it has masks, all of them get one; where it has none, a line says so"
+)
+@pytest.mark.parametrize("has_masks", [False, True])
 def test_photos_are_turned_unless_their_scene_knows_them_otherwise(
-    tmp_path: Path, registered: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
+    has_masks: bool, tmp_path: Path, registered: Callable[[int], None], monkeypatch: pytest.MonkeyPatch, capsys
 ):
-    source, out, photo = tmp_path / "photos", tmp_path / "out", next(draw_photos())
+    source, out, (photo, other) = tmp_path / "photos", tmp_path / "out", itertools.islice(draw_photos(), 2)
     source.mkdir()
     for name, orientation in (("a.jpg", 6), ("b.jpg", 8), ("c.jpg", 3)):
         lying(photo, orientation, source / name)
@@ -433,19 +460,93 @@ def test_photos_are_turned_unless_their_scene_knows_them_otherwise(
     settings = json.loads((out / "work" / "settings.json").read_text())
     assert settings.pop("as_stored") == []
     (out / "work" / "settings.json").write_text(json.dumps(settings))
-    lying(photo, 6, source / "d.jpg")
+    lying(other, 6, source / "d.jpg")
+    (source / "masks").mkdir()
+    Image.new("L", photo.size).save(source / "masks" / "d.png")
+    if has_masks:
+        (out / "masks").mkdir()
     made: dict[str, tuple[int, int]] = {}
+    masks: dict[str, Any] = {}
 
     def look(function: str, photos: Path, groups: list[list[str]], *others: object, **named: object) -> None:
         assert groups == [["a.jpg", "b.jpg"], ["c.jpg", "d.jpg"]]
         for name in itertools.chain(*groups):
             with Image.open(photos / name) as image:
                 made[name] = image.size
+        masks.update((path.name, Image.open(path).getextrema()) for path in (out / "work").glob("masks/*"))
         raise KeyboardInterrupt
 
     monkeypatch.setattr(program, "run_colmap", look)
     assert main([str(source), str(out)]) == 130
     assert made == {"a.jpg": (HEIGHT, WIDTH), "b.jpg": (HEIGHT, WIDTH)} | dict.fromkeys(("c.jpg", "d.jpg"), photo.size)
+    white = dict.fromkeys(("a.jpg.png", "b.jpg.png", "c.jpg.png"), (255, 255))
+    assert masks == (white | {"d.jpg.png": (0, 0)} if has_masks else {})
+    assert f"Masks of 1 photos are {'used' if has_masks else 'not used'}" in capsys.readouterr().out
+
+
+@pytest.mark.hard_case(
+    "in the photos' folder: thumbnails and trash of a NAS (`@eaDir`, `#recycle`), `__MACOSX`, `images_2`, `images_4`, "
+    "copies such as `a (1).jpg`, the same photo as WebP, an iPhone's edited `IMG_E1.jpg`, a mask of no photo, an "
+    "earlier scene",
+    "left out, with a line; photos of a rig's cameras, which have equal names, are not",
+)
+def test_what_is_no_photo_becomes_none(tmp_path: Path):
+    """Photos that the scene was begun with stay photos."""
+    views = [photo.filter(ImageFilter.GaussianBlur(3)) for photo in itertools.islice(draw_photos(), 7)]
+    files = {
+        "images/a.jpg": views[0], "images/b.jpg": views[1], "images/IMG_1.jpg": views[2], "rig/a.jpg": views[3],
+        "rig/b.jpg": views[4].resize((80, 60)), "masks/carnival.jpg": views[5], "masks/b.jpg": views[6],
+    }  # fmt: skip
+    left = {
+        "images_2/a.jpg": views[0].resize((80, 60)), "images_4/b.png": views[1].resize((40, 30)),
+        "images/b.webp": views[1], "images/IMG_E1.jpg": views[2].point(lambda value: 0.7 * value + 50),
+        "@eaDir/a.jpg/SYNOFILE_THUMB_M.jpg": views[0].resize((80, 60)), "#recycle/old.jpg": views[0].rotate(9),
+        "__MACOSX/x.jpg": views[0].rotate(20), "masks/none.png": Image.new("L", (WIDTH, HEIGHT)),
+        "images/a_mask.png": Image.new("L", (WIDTH, HEIGHT), 255),
+    }  # fmt: skip
+    for name, image in (files | left).items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        image.save(tmp_path / name, quality=90)
+    shutil.copy(tmp_path / "images" / "a.jpg", tmp_path / "images" / "a (1).jpg")
+    black(tmp_path / "earlier", "images/c.png")
+    (tmp_path / "earlier" / "work").mkdir()
+    (tmp_path / "earlier" / "work" / "settings.json").write_text("{}")
+    found = look_into(tmp_path, tmp_path / "out")
+    assert found.photos == sorted(files) and found.masks == {"images/a.jpg": "images/a_mask.png"}
+    assert found.told == [
+        "Left out as thumbnails or trash: 3, such as #recycle/old.jpg.",
+        "Left out as copies of others: 5, such as images/a (1).jpg.",
+        "Left out as masks of no photo: 1, such as masks/none.png.",
+    ]
+    (tmp_path / "out" / "work").mkdir(parents=True)
+    (tmp_path / "out" / "work" / "settings.json").write_text(json.dumps({"photos": [*left, "images/b.jpg"]}))
+    assert look_into(tmp_path, tmp_path / "out").photos == sorted(
+        {*left, *files} - {"images/a.jpg", "images/IMG_1.jpg"}
+    )
+
+
+@pytest.mark.hard_case("a mask of a panorama", "is cut into masks of its views")
+def test_a_mask_of_a_panorama_is_cut_as_it_is(tmp_path: Path):
+    for name, height in (("pano.png", 0), ("mask.png", 64)):
+        image = Image.new("L", (256, 128), 255)
+        image.paste(0, (0, 128 - height, 256, 128))  # what is below the horizon
+        image.save(tmp_path / name)
+    panorama = Photo("pano.png", (256, 128), (), False, False, is_panorama=True)
+    write_masks(tmp_path, {"pano.png": "mask.png"}, [panorama], panorama.views, tmp_path / "masks")
+    white = [np.asarray(Image.open(tmp_path / "masks" / f"{view.name}.png")).mean() / 255 for view in panorama.views]
+    assert min(white[:4]) > 0.6 and max(white[4:]) < 0.4 and len(white) == 8
+
+
+@pytest.mark.hard_case("a mask of another shape than its photo", "refused: make it of the whole photo")
+def test_a_mask_of_another_shape_is_refused(tmp_path: Path, taken: list[list[str]], capsys):
+    photos = black(tmp_path / "photos", "a.png", "b.png", "c.png", "masks/b.png")
+    with Image.open(photos / "masks" / "b.png") as mask:
+        mask.resize((8, 6)).save(photos / "masks" / "b.png")
+    assert main([str(photos), str(tmp_path / "out")]) == 2
+    told = "masks/b.png has another shape than b.png, whose mask it is by its name: make it of the whole photo, or take"
+    assert told in capsys.readouterr().err
+    (photos / "masks" / "b.png").unlink()
+    assert main([str(photos), str(tmp_path / "out")]) == 130 and taken == [["a.png", "b.png", "c.png"]]
 
 
 def test_names_with_spaces_are_matched_by_colmap_s_own_function(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -743,7 +844,7 @@ def test_a_gpu_matches_the_pairs_that_colmap_verifies(tmp_path: Path, monkeypatc
 
 
 @pytest.mark.hard_case(
-    "photos without texture, or one photo five times",
+    "photos without texture",
     "one sentence: no two photos could be related, and how many photos have few features",
 )
 def test_photos_without_texture_are_told_in_a_sentence(tmp_path: Path, capsys):
@@ -883,10 +984,10 @@ def film(path: Path, frames: int) -> Path:
 
 
 def black(folder: Path, *names: str) -> Path:
-    """A folder with these photos in it."""
+    """A folder with these photos in it, which are nearly black, each of a colour of its own."""
     for name in names:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        Image.new("RGB", (8, 8)).save(folder / name)
+        Image.new("RGB", (8, 8), f"#{zlib.crc32(name.encode()) & 0x0F0F0F:06x}").save(folder / name)
     return folder
 
 

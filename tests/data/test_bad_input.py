@@ -306,7 +306,7 @@ COLMAP = {
     ),
     "image-orientation": (
         store_turned((36, 48), 6),
-        r"\S+/000\.png \(and 9 more\) has EXIF orientation 6, and as training reads it 36 × 48 px, but "
+        r"\S+/000\.png \(and 9 more\) has EXIF orientation 6 and is read as 36 × 48 px, but "
         r"its camera in \S+/images\.bin 48 × 36: turn their pixels as those .*\.",
     ),
     "image-mode": (picture(FIRST, mode="P"), r"\S+/000\.png has pixels of Pillow's mode P: convert it .*\."),

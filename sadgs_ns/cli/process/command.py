@@ -26,6 +26,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from sadgs_ns import events
 from sadgs_ns.cli.process.colmap import Report, run_colmap
+from sadgs_ns.cli.process.folder import look_into
 from sadgs_ns.cli.process.panoramas import VIEWS
 from sadgs_ns.cli.process.photos import (
     Photo,
@@ -35,10 +36,10 @@ from sadgs_ns.cli.process.photos import (
     find_source,
     photo_stamps,
     photos_by_camera,
-    photos_not_read,
     read_photos,
     restore_alpha,
     write_alpha,
+    write_masks,
 )
 from sadgs_ns.cli.process.plan import Matching, Summary, choose_matching, expected_work
 from sadgs_ns.cli.process.video import find_videos, video_frames, write_frames
@@ -183,8 +184,8 @@ def process(given: Process) -> Summary:
             with Progress(*columns, disable=not sys.stdout.isatty()) as progress:
                 summary = _make(scene, _reporter(progress))
     print(summary)
-    if given.source.is_dir() and (not_read := photos_not_read(given.source)):
-        print(not_read)
+    for told in look_into(given.source, given.out).told if given.source.is_dir() else ():
+        _say("aside", told, told=told)
     if not scene.is_video and (videos := find_videos(given.source)):
         print(f"Its videos ({len(videos)}, such as {videos[0]}) are not used: give them in a folder of their own.")
     return summary
@@ -224,9 +225,7 @@ def _make(scene: _Scene, report: Report) -> Summary:
             for path in (scene.model, work / "photos", work / "alpha"):
                 shutil.rmtree(path, ignore_errors=True)
         rigs = [[view.name for view in photo.views] for photo in photos if photo.is_panorama]
-        folder, photos = convert_photos(folder, photos, work / "photos")
-        if transparent := write_alpha(folder, photos, work / "alpha"):
-            _say("transparent", f"{transparent} photos are partly transparent; their images in the scene are, too.")
+        folder, photos = _convert(scene, folder, photos)
         photos = [photo for photo in photos if photo.camera]  # without the views
         groups = [[photo.name] for photo in photos] if given.camera_per_photo else photos_by_camera(photos)
         arguments = (folder, groups, matching, given.max_size, scene.model, scene.base, rigs)
@@ -255,6 +254,23 @@ def _tell_work(scene: _Scene, photos: Sequence[Photo], matching: Matching, notic
     known = sum(len(photo.views) for photo in photos if photo.name in before)
     expected, duration = expected_work(views, matching, known)
     _say("expected", f"{notice} {expected}".lstrip(), duration=duration)
+
+
+def _convert(scene: _Scene, folder: Path, stored: Sequence[Photo]) -> tuple[Path, list[Photo]]:
+    """Convert photos as `convert_photos`, and write their masks, if they or the scene have any, and opacities."""
+    source, out, work = scene.given.source, scene.given.out, scene.work
+    converted, photos = convert_photos(folder, stored, work / "photos")
+    masks = {} if scene.is_video else look_into(source, out).masks
+    has_masks = (out / "masks").exists() if scene.added else bool(masks)
+    shutil.rmtree(work / "masks", ignore_errors=True)
+    if has_masks:
+        write_masks(source, masks, stored, photos, work / "masks")
+    if masks:
+        why = "used" if has_masks else "not used, because the scene has none: give another folder for it"
+        _say("aside", told := f"Masks of {len(masks)} photos are {why}.", told=told)
+    if transparent := write_alpha(converted, photos, work / "alpha"):
+        _say("transparent", f"{transparent} photos are partly transparent; their images in the scene are, too.")
+    return converted, photos
 
 
 def photos_added(source: Path, out: Path) -> list[str]:
@@ -298,6 +314,9 @@ def _publish(undistorted: Path, out: Path, grown: bool = False) -> None:
     """
     images, described = undistorted / "images", json.loads((undistorted / "transforms.json").read_text())
     written = [frame["file_path"] for frame in described["frames"]]
+    masks = [path.relative_to(undistorted).as_posix() for path in (undistorted / "masks").rglob("*.png")]
+    for frame in described["frames"] if masks or (grown and (out / "masks").exists()) else ():
+        frame["mask_path"] = f"masks/{frame['file_path'].removeprefix('images/')}.png"
     if grown:
         before = json.loads((out / "transforms.json").read_text())
         poses = {frame["file_path"]: frame["transform_matrix"] for frame in before["frames"]}
@@ -306,8 +325,10 @@ def _publish(undistorted: Path, out: Path, grown: bool = False) -> None:
         kept = {name: before[name] for name in _KEPT_KEYS if name in before}
         for name in kept.keys() & described.keys() - {*FRAME_KEYS}:  # The new views of panoramas are divided, too.
             kept[name] = kept[name] + [view for view in described[name] if view not in poses]
-        (undistorted / "transforms.json").write_text(json.dumps(described | kept))
+        described |= kept
         written = [name for name in written if (undistorted / name).exists() or name not in poses]
+    (undistorted / "transforms.json").write_text(json.dumps(described, indent=4))
+    written += masks
     try:
         read_photos(undistorted, written, lambda *step: None)
     except InputError as error:  # COLMAP does not say when a disk is full
@@ -315,7 +336,8 @@ def _publish(undistorted: Path, out: Path, grown: bool = False) -> None:
     restore_alpha(images, undistorted / "alpha")
     if not grown:
         (out / "transforms.json").unlink(missing_ok=True)  # Its presence says that all the others are there.
-        shutil.rmtree(out / "images", ignore_errors=True)
+        for name in ("images", "masks"):
+            shutil.rmtree(out / name, ignore_errors=True)
     for name in written:
         (out / name).parent.mkdir(parents=True, exist_ok=True)
         (undistorted / name).replace(out / name)

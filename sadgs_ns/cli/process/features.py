@@ -30,7 +30,7 @@ def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, rigs:
     """Find SIFT features in the photos of a folder that have none yet; one that cannot be decoded gets none.
 
     In `groups` the names of one camera's photos are together, in `rigs` those of one panorama's views. COLMAP's
-    database is made if it does not exist.
+    database is made if it does not exist. Beside it the folder `masks` may hold masks, as `write_masks` writes them.
     """
     total = sum(map(len, [*groups, *rigs]))
     progress("features", 0, total)
@@ -52,7 +52,8 @@ def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, rigs:
         sizes = [(cameras[image.camera_id].width, cameras[image.camera_id].height) for image in images]
         cv2.setNumThreads(1)  # Each thread of ours has a photo.
         with ThreadPoolExecutor(_num_threads(sizes)) as pool:
-            found = pool.map(sift, [photos / image.name for image in images])
+            masks = [database.with_name("masks") / f"{image.name}.png" for image in images]
+            found = pool.map(sift, [photos / image.name for image in images], masks)
             for image, (keypoints, descriptors) in zip(images, found, strict=True):
                 features = pycolmap.FeatureDescriptors(type=pycolmap.FeatureExtractorType.SIFT, data=descriptors)
                 with pycolmap.DatabaseTransaction(opened):
@@ -83,11 +84,12 @@ def _add_panorama(opened: pycolmap.Database, photos: Path, views: Sequence[str])
     opened.write_frame(frame)
 
 
-def sift(photo: Path) -> tuple[np.ndarray, np.ndarray]:
+def sift(photo: Path, mask: Path | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Find the SIFT features of a photo.
 
     Args:
         photo: An image file, whose EXIF orientation is ignored, as COLMAP does.
+        mask: An image file, perhaps, of the photo's shape; no feature lies where it is black.
 
     Returns:
         Keypoints as float32 [N, 4], N at most about `MOST_FEATURES`: x and y in px of the file's pixels, the first of
@@ -104,7 +106,10 @@ def sift(photo: Path) -> tuple[np.ndarray, np.ndarray]:
             size = max(1, round(shrink * width)), max(1, round(shrink * height))
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         finder = cv2.SIFT.create(MOST_FEATURES, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
-        points, values = finder.detectAndCompute(image, None)  # type: ignore[arg-type] # There is no mask.
+        searched = cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE) if mask and mask.exists() else None
+        if searched is not None:
+            searched = cv2.resize(searched, image.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        points, values = finder.detectAndCompute(image, searched)  # type: ignore[arg-type] # None is no mask.
     if image is None or values is None:
         return np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8)
     stretch = np.array([width / image.shape[1], height / image.shape[0]])

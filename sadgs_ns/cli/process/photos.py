@@ -12,25 +12,17 @@ import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
+from sadgs_ns.cli.process.folder import COLMAP_FORMATS, look_into
 from sadgs_ns.cli.process.panoramas import VIEWS, cut, is_panorama
 from sadgs_ns.cli.process.video import find_videos
-from sadgs_ns.data import IMAGE_SUFFIXES, SIDEWAYS, TURNED
+from sadgs_ns.data import SIDEWAYS
 from sadgs_ns.errors import InputError, reason
 
-_RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"}
-"""Suffixes of cameras' raw files, of some of which Pillow reads a small preview as TIFF."""
-_UNREAD_SUFFIXES = {".heic", ".heif", ".hif", ".jxl"}
-"""Suffixes of formats that Pillow does not read; phones and apps give them to JPEG, too."""
-_COLMAP_FORMATS = {"JPEG", "MPO", "PNG", "TIFF", "BMP"}
-"""Pillow's names of the formats that COLMAP and OpenCV read."""
-_FORMATS = _COLMAP_FORMATS | {"WEBP", "AVIF"}
-_UNREAD_FORMATS = {"GIF", "JPEG2000", "PSD", "PPM"}
-"""Pillow's names of further formats, whose files are told of."""
 _KEPT_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
 """Suffixes by which COLMAP knows in which format to write; it reads by what a file holds."""
 _POSITION = (ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLongitude, ExifTags.GPS.GPSAltitude)
@@ -67,43 +59,6 @@ class Photo:
         return [Photo(name, size, (), False, self.has_alpha) for name in names] if self.is_panorama else [self]
 
 
-def photos_not_read(folder: Path) -> str:
-    """Return a sentence on the images in formats that are not read; it is empty if there are none."""
-    unread = sorted(path for path in folder.rglob("*") if _kind(path) == "unread")
-    if not unread:
-        return ""
-    return (
-        f"{len(unread)} of its files are not read, such as {unread[0].relative_to(folder)}: convert them to JPEG or "
-        "PNG, with .jpg or .png at the end of their names."
-    )
-
-
-def _kind(path: Path) -> Literal["photo", "unread", "other"]:
-    """Return whether a file is a photo, by its suffix and by what it holds, or an image that is not read.
-
-    A photo may yet be damaged.
-    """
-    suffix = path.suffix.lower()
-    if path.name.startswith(".") or (path.exists() and not path.is_file()):
-        return "other"
-    if suffix in _RAW_SUFFIXES:
-        return "unread"
-    try:
-        with path.open("rb") as file:
-            start = file.read(12)
-    except OSError:  # It is named when it is read.
-        start = b""
-    if suffix in IMAGE_SUFFIXES and start[4:8] not in (b"ftyp", b"JXL ") and start[:2] != b"\xff\x0a":
-        return "photo"
-    may_be_photo = suffix in IMAGE_SUFFIXES or suffix in _UNREAD_SUFFIXES
-    try:
-        with Image.open(path) as image:  # HEIC, AVIF or JPEG XL, or a file with any other suffix
-            kind = image.format
-    except Exception:  # Decoders raise anything.
-        return "unread" if may_be_photo else "other"
-    return "photo" if may_be_photo and kind in _FORMATS else "unread" if kind in _FORMATS | _UNREAD_FORMATS else "other"
-
-
 def find_source(source: Path, out: Path) -> tuple[list[str], bool]:
     """Return the photos of a folder, or its videos where it has fewer than three photos, and whether these are videos.
 
@@ -120,23 +75,18 @@ def find_source(source: Path, out: Path) -> tuple[list[str], bool]:
 
 
 def find_photos(source: Path, out: Path) -> list[str]:
-    """Return the sorted names of a folder's photos, relative to it.
-
-    The photos of a scene that is made in the same folder are left out, and so are hidden files, as macOS writes them.
+    """Return the sorted names of a folder's photos for a scene, relative to it, as `look_into` finds them.
 
     Raises:
         InputError: If there are fewer than three photos, or one has a name that is no Unicode.
     """
     if not source.is_dir():
         raise InputError(f"{source} does not exist; give a folder of photos or of videos, or a video.")
-    folder, scene = Path(os.path.realpath(source)), Path(os.path.realpath(out))
-    found = [
-        path.relative_to(folder) for path in folder.rglob("*") if scene not in path.parents and _kind(path) == "photo"
-    ]
-    names = sorted(path.as_posix() for path in found if not any(part.startswith(".") for part in path.parts))
+    found = look_into(source, out)
+    names = found.photos
     if len(names) < 3:
         told = f"{source} holds {len(names)} photos; a reconstruction needs at least 3, better 30 or more."
-        raise InputError(f"{told} {photos_not_read(folder)}".rstrip())
+        raise InputError(" ".join([told, *found.told]))
     for name in names:
         if not name.isprintable():
             raise InputError(f"{source} holds a photo with unprintable characters in its name, {name!a}: rename it.")
@@ -229,8 +179,8 @@ def _read_photo(folder: Path, name: str, as_stored: bool) -> Photo:
             (size, *(exif.get(tag) for tag in (ExifTags.Base.Make, ExifTags.Base.Model)), max((0.0, *focal))),
             all(_numbers(position.get(tag)) for tag in _POSITION),
             image.has_transparency_data,
-            image.format in _COLMAP_FORMATS,
-            orientation in TURNED,
+            image.format in COLMAP_FORMATS,
+            orientation in range(2, 9),
         )
         # An eighth of a JPEG's size tells whether it is whole.
         image.draft("RGB", (image.width // 8, image.height // 8))
@@ -282,10 +232,9 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
                 image.info.pop("exif", None)  # Pillow would write it anew, which fails where it is damaged.
                 pixels = ImageOps.exif_transpose(image) if photo.lies and not is_tiff else image
                 exif.pop(ExifTags.Base.Orientation, None)
-                try:
+                kept = b""
+                with contextlib.suppress(Exception):  # Pillow raises anything where EXIF is damaged.
                     kept = exif.tobytes()
-                except Exception:  # Pillow raises anything where EXIF is damaged.
-                    kept = b""
                 if pixels.mode != "I;16":
                     pixels = pixels.convert("RGBA" if photo.has_alpha else "RGB")
                 for part, target in zip(cut(pixels) if photo.is_panorama else [pixels], targets, strict=True):
@@ -319,6 +268,32 @@ def write_alpha(folder: Path, photos: Sequence[Photo], alphas: Path) -> int:
                     alpha.save(target)
         partial.rename(alphas)
     return sum(1 for _ in alphas.rglob("*.png"))
+
+
+def write_masks(
+    folder: Path, masks: Mapping[str, str], photos: Sequence[Photo], converted: Sequence[Photo], target: Path
+) -> None:
+    """Write a mask for each of a folder's photos, as it was `converted`; that of `NAME` is `NAME.png` in `target`.
+
+    A photo without one gets a white mask. Raise an InputError if a mask has another shape than its photo.
+    """
+    names = iter(f"{photo.name}.png" for photo in converted)
+    for photo in photos:
+        mask = Image.new("L", photo.size, 255)
+        if photo.name in masks:
+            with Image.open(folder / masks[photo.name]) as image, Image.open(folder / photo.name) as stored:
+                grey = np.asarray(image.convert("L"))
+                mask = Image.fromarray(np.uint8(255 * (grey > (127 if grey.max() > 15 else 0))))
+                if photo.lies and (mask.width > mask.height) != (photo.size[0] > photo.size[1]):
+                    mask.getexif()[ExifTags.Base.Orientation] = stored.getexif()[ExifTags.Base.Orientation]
+                    mask = ImageOps.exif_transpose(mask)
+        if not 0.97 < mask.width * photo.size[1] / (mask.height * photo.size[0]) < 1.03:
+            told = f"{folder / masks[photo.name]} has another shape than {photo.name}, whose mask it is by its name"
+            raise InputError(f"{told}: make it of the whole photo, or take it out of the folder.")
+        mask = mask.resize(photo.size, Image.Resampling.NEAREST)
+        for part, name in zip(cut(mask) if photo.is_panorama else [mask], names, strict=False):
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
+            part.save(target / name)
 
 
 def restore_alpha(images: Path, alphas: Path) -> None:

@@ -66,8 +66,8 @@ def make_model(
         groups: The photos' names, those of one camera together.
         matching: Any but "auto".
         max_size: Longest side of the undistorted photos in px; 0 keeps them as they are.
-        model: The model's folder. Beside it `alpha` holds the photos' opacities, as `write_alpha` writes them, and what
-            an interrupted run left there is used again.
+        model: The model's folder. Beside it `alpha` and `masks` hold what `write_alpha` and `write_masks` write, and
+            what an interrupted run left there is used again.
         base: The earlier model's folder, whose cameras stay as they are; None begins anew.
         rigs: The names of the views of each panorama.
 
@@ -286,11 +286,11 @@ def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
 
 
 def undistort(photos: Path, model: Path, made: pycolmap.Reconstruction, max_size: int, known: Collection[str]) -> None:
-    """Write `images`, `alpha` and the model that fits them, `sparse/0`, to the folder `undistorted`, which is emptied.
+    """Write `images`, `alpha`, `masks`, and their model, `sparse/0`, to the folder `undistorted`, which is emptied.
 
     Args:
         photos: The folder of the photos.
-        model: The folder of their model, with their opacities in `alpha` beside it.
+        model: The folder of their model, with their opacities in `alpha` and their masks in `masks` beside it.
         made: That model.
         max_size: Longest side of the undistorted photos in px; 0 keeps them as they are.
         known: Names of photos that were undistorted before, by the same cameras.
@@ -298,7 +298,7 @@ def undistort(photos: Path, model: Path, made: pycolmap.Reconstruction, max_size
     Raises:
         OSError: If the model could not be written.
     """
-    folder, alphas = model.with_name("undistorted"), model.with_name("alpha")
+    folder = model.with_name("undistorted")
     registered = [image for image in made.images.values() if image.has_pose and image.name not in known]
     progress("undistorted photos", 0, len(registered))
     shutil.rmtree(folder, ignore_errors=True)
@@ -313,14 +313,17 @@ def undistort(photos: Path, model: Path, made: pycolmap.Reconstruction, max_size
             written = sum(path.is_file() for path in (folder / "images").rglob("*"))
             progress("undistorted photos", written, len(registered))
         undistortion.result()
-    for image in registered:
-        alpha = alphas / f"{image.name}.png"
-        if alpha.exists():
-            target = folder / "alpha" / f"{image.name}.png"
+    for kind, image in itertools.product(("alpha", "masks"), registered):
+        stored = model.with_name(kind) / f"{image.name}.png"
+        if stored.exists():
+            target = folder / kind / f"{image.name}.png"
             target.parent.mkdir(parents=True, exist_ok=True)
-            opacity = pycolmap.Bitmap.read(alpha, as_rgb=False)
-            assert opacity is not None  # `write_alpha` wrote it
-            pycolmap.undistort_image(options, opacity, image.camera)[0].write(target)
+            grey = pycolmap.Bitmap.read(stored, as_rgb=False)
+            assert grey is not None  # `write_alpha` or `write_masks` wrote it
+            grey = pycolmap.undistort_image(options, grey, image.camera)[0]
+            if kind == "masks":
+                grey = pycolmap.Bitmap.from_array(np.uint8(255 * (grey.to_array() > 127)))
+            grey.write(target)
     sparse = folder / "sparse"
     (sparse / "0").mkdir()
     for file in sparse.glob("*.bin"):

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from PIL import ExifTags, Image, UnidentifiedImageError
 
-from sadgs_ns.data import IMAGE_SUFFIXES, SIDEWAYS, TURNED
+from sadgs_ns.data import IMAGE_SUFFIXES, SIDEWAYS
 from sadgs_ns.data.checks.findings import Finding, and_more
 from sadgs_ns.errors import reason
 
@@ -52,15 +52,9 @@ class _Image:
     format: str = ""
     """Pillow's name for the format of the file."""
     orientation: int = 1
-    """EXIF's number, from 1 to 8, which nerfstudio and COLMAP ignore, but for TIFF, which Pillow turns."""
+    """EXIF's number, from 1 to 8, by which TIFF alone is turned, by Pillow."""
     problem: str = ""
     """The rest of a sentence that starts with the file; empty for a good image."""
-
-    @property
-    def may_lie(self) -> bool:
-        """Whether EXIF turns the image, and its size does not tell whether its camera is of the turned one."""
-        is_told = self.orientation in SIDEWAYS and self.size[0] != self.size[1]
-        return self.orientation in TURNED and self.format != "TIFF" and not is_told
 
 
 def image_size(path: Path) -> Size:
@@ -144,7 +138,13 @@ def check_images(frames: Sequence[Frame], source: Path, look_for_unused: bool = 
             f"{source} has {len(frames)} masks that are all black, such as {frames[0].mask}, which leaves no pixel to "
             "train on: make white what is to be trained on.",
         )
-    if not problems and (lying := [frame.image for frame, image in zip(frames, images, strict=True) if image.may_lie]):
+    # Where the size does not tell whether the poses are of turned images.
+    lying = [
+        frame.image
+        for frame, image in zip(frames, images, strict=True)
+        if image.format != "TIFF" and image.orientation in (range(2, 9) if len({*image.size}) == 1 else range(2, 5))
+    ]
+    if lying and not problems:
         yield Finding(
             "warning",
             f"{and_more(lying[0], len(lying))} has an EXIF orientation that would turn it, which training ignores, as "
@@ -167,8 +167,8 @@ def _problem(frame: Frame, image: _Image, mask: _Image | None, source: Path) -> 
     if frame.size not in (None, image.size):
         sizes = "{} × {} px, but its camera in {} {} × {}".format(*image.size, source, *frame.size)
         if image.orientation in SIDEWAYS and frame.size == image.size[::-1]:
-            tag = f"has EXIF orientation {image.orientation}, and as training reads it"
-            return "orientation", frame.image, f"{tag} {sizes}: {_TURN}"
+            sizes = f"EXIF orientation {image.orientation} and is read as {sizes}: {_TURN}"
+            return "orientation", frame.image, f"has {sizes}"
         return "size", frame.image, f"has {sizes}: use the images that the poses were computed from"
     if frame.mask is None or mask is None:
         return None
