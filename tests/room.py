@@ -26,14 +26,20 @@ def camera_centres() -> np.ndarray:
     return np.stack([4.5 * np.cos(angles), 4.5 * np.sin(angles), 2 + 0.6 * np.sin(5 * angles)], 1)
 
 
-def draw_photos() -> Iterator[Image.Image]:
+def walk_centres() -> np.ndarray:
+    """Where photos are taken on a walk into the corner of the room, swaying a little. [VIEWS, 3]"""
+    ahead, sway = np.linspace(3.0, 2.2, VIEWS)[:, None], 0.02 * np.sin(2 * np.arange(VIEWS))[:, None]
+    return 0.8 + ahead * np.array([0.69, 0.66, 0.3]) + sway * np.array([-0.7, 0.7, 0.2])
+
+
+def draw_photos(centres: np.ndarray | None = None) -> Iterator[Image.Image]:
     """Photos of a corner of a room whose walls carry noise, which has many features and takes milliseconds to draw."""
     random, side = np.random.default_rng(0), 256
     noise = [cv2.GaussianBlur(random.integers(0, 256, (side, side, 3), np.uint8), (0, 0), 2) for _ in WALLS]
     textures = [np.clip((texture - 127.0) * 5 + 127, 0, 255).astype(np.uint8) for texture in noise]
     corners = np.array([(0, 0), (side, 0), (side, side), (0, side)], np.float32)
     intrinsics = np.array([[WIDTH, 0, WIDTH / 2], [0, WIDTH, HEIGHT / 2], [0, 0, 1]])
-    for centre in camera_centres():
+    for centre in camera_centres() if centres is None else centres:
         forward = 0.8 - centre
         forward /= np.linalg.norm(forward)
         right = np.cross(forward, [0, 0, 1])

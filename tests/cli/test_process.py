@@ -14,6 +14,7 @@ import functools
 import itertools
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -35,7 +36,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from PIL import Image, ImageFilter
 from PIL.TiffImagePlugin import IFDRational
 from rich.progress import Progress
-from room import HEIGHT, VIEWS, WIDTH, camera_centres, draw_photos
+from room import HEIGHT, VIEWS, WIDTH, camera_centres, draw_photos, walk_centres
 
 from sadgs_ns.cli.process import command as program
 from sadgs_ns.cli.process import stages as colmap_stages
@@ -146,21 +147,69 @@ def test_photos_are_registered_where_they_were_taken(run: Run):
     assert summary.photos == VIEWS + 1 and summary.registered == VIEWS
     assert summary.points > 200 and summary.reprojection_error < 0.5
     assert list(summary.left_out) == ["fog.png"] and "features" in summary.left_out["fog.png"]
-    errors = errors_of_centres(run.out)
+    errors = errors_of_centres(run.out, camera_centres())
     assert np.median(errors) < 0.03 and errors.max() < 0.05
 
 
-def errors_of_centres(out: Path) -> np.ndarray:
-    """Distances of the room's cameras from where they are, as shares of the largest from their centre. [VIEWS]"""
+def errors_of_centres(out: Path, expected: np.ndarray) -> np.ndarray:
+    """Distances of cameras from where they are [VIEWS, 3], as shares of the largest from their centre. [VIEWS]"""
     model = pycolmap.Reconstruction(out / "sparse" / "0")
     by_name = {image.name: image.projection_center() for image in model.images.values()}
-    found, expected = np.stack([by_name[name] for name in sorted(by_name)]), camera_centres()
+    found = np.stack([by_name[name] for name in sorted(by_name)])
     # Umeyama's similarity between the two sets of centres.
     found, expected = found - found.mean(0), expected - expected.mean(0)
     u, s, vt = np.linalg.svd(expected.T @ found)
     sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
     aligned = (found @ (u @ sign @ vt).T) * (s * np.diag(sign)).sum() / (found**2).sum()
     return np.linalg.norm(aligned - expected, axis=1) / np.linalg.norm(expected, axis=1).max()
+
+
+@pytest.mark.hard_case(
+    "photos of a walk straight ahead, of which hardly any register with COLMAP's own limits",
+    "a second attempt with relaxed limits registers all, and the summary says so",
+)
+def test_photos_of_a_walk_straight_ahead_register_at_a_second_attempt(tmp_path: Path, capsys):
+    (tmp_path / "photos").mkdir()
+    for i, photo in enumerate(draw_photos(walk_centres())):
+        photo.save(tmp_path / "photos" / f"{i:02d}.png")
+    assert main([str(tmp_path / "photos"), str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"10 of 10 photos .* A first attempt registered [0-4], one with relaxed limits 10\.\n", printed)
+    assert "cameras (relaxed) 10/10\n" in printed
+    assert errors_of_centres(tmp_path / "out", walk_centres()).max() < 0.02
+
+
+@pytest.mark.hard_case(
+    "all photos register, with focal lengths in x and y that differ as no lens's do, so that cameras are wrong",
+    "a second attempt; the model with focal lengths that fit is kept",
+)
+@pytest.mark.hard_case("fewer than 90 % of the photos register at both attempts", "the model with more is kept")
+@pytest.mark.parametrize(("registered", "stretch"), [(VIEWS, 1.2), (VIEWS - 2, 1.0)])
+def test_a_doubtful_model_is_tried_again_and_the_better_one_kept(
+    run: Run, photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, registered: int, stretch: float
+):
+    shutil.copy(run.out / "work" / "database.db", tmp_path)
+    mapping, angles = pycolmap.incremental_mapping, []
+
+    def spoil_the_first(*arguments: Any, **callbacks: Any) -> Any:
+        angles.append(arguments[3].mapper.init_min_tri_angle)
+        models = mapping(*arguments, **callbacks)
+        if len(angles) == 1:
+            model = max(models.values(), key=lambda model: model.num_reg_images())
+            for frame in list(model.frames)[registered:]:
+                model.deregister_frame(frame)
+            for camera in model.cameras.values():
+                camera.focal_length_x *= stretch
+        return models
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", spoil_the_first)
+    names = sorted(photo.name for photo in photos.iterdir())
+    colmap_stages.place_cameras(photos, names, tmp_path / "database.db", tmp_path / "model", None)
+    (camera,) = (made := pycolmap.Reconstruction(tmp_path / "model")).cameras.values()
+    assert angles == [16, 4] and made.num_reg_images() == VIEWS
+    assert camera.focal_length_x == pytest.approx(camera.focal_length_y, rel=0.05)
+    told = (tmp_path / "model" / "attempts.txt").read_text()
+    assert told == f"A first attempt registered {registered}, one with relaxed limits {VIEWS}."
 
 
 # nerfstudio opens the first photo to learn its size and does not close it.
@@ -418,7 +467,7 @@ def test_photos_that_lie_on_their_side_by_exif_become_upright(tmp_path: Path):
     mask.transpose(TURNS[6]).save(tmp_path / "photos" / "masks" / "02.png.png")  # as that photo is stored
     mask.point([value // 255 for value in range(256)]).save(tmp_path / "photos" / "05_mask.png")
     summary = process(Process(tmp_path / "photos", tmp_path / "out"))
-    assert summary.registered == VIEWS and errors_of_centres(tmp_path / "out").max() < 0.05
+    assert summary.registered == VIEWS and errors_of_centres(tmp_path / "out", camera_centres()).max() < 0.05
     described = json.loads((tmp_path / "out" / "transforms.json").read_text())
     assert described["w"] > described["h"]
     for name in (frame["file_path"] for frame in described["frames"]):
@@ -1116,7 +1165,7 @@ def test_added_photos_leave_the_cameras_that_are_there(grown: tuple[Path, Path, 
         now = (out / "images" / image.name).stat()
         assert (now.st_ino, now.st_mtime_ns) == (images[image.name].st_ino, images[image.name].st_mtime_ns)
     assert (new.cameras[1].params == old.cameras[1].params).all() and len(new.cameras) == 1
-    assert new.num_points3D() > old.num_points3D() and errors_of_centres(out).max() < 0.05
+    assert new.num_points3D() > old.num_points3D() and errors_of_centres(out, camera_centres()).max() < 0.05
     assert {path.name for path in (out / "work").iterdir()} == {"settings.json", "database.db", "model-10"}
     assert photos_added(source, out) == []
 

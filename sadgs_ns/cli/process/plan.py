@@ -39,11 +39,13 @@ class Summary:
     """Photos that were not registered, and why."""
     matching: Matching
     """Which pairs were matched."""
+    attempts: str = ""
+    """A sentence on a second attempt to place the cameras, where one was made."""
 
     def __str__(self) -> str:
         lines = [
             f"{self.registered} of {self.photos} photos registered, {self.points:,} points, "
-            f"mean reprojection error {self.reprojection_error:.2f} px."
+            f"mean reprojection error {self.reprojection_error:.2f} px. {self.attempts}".rstrip()
         ]
         return "\n".join(lines + [f"  {name}: {why}" for name, why in sorted(self.left_out.items())])
 

@@ -49,6 +49,14 @@ _ADJUSTED_PHOTOS = 2
 """Photos that are adjusted after each that is placed; COLMAP's own are 6. With these numbers placing cameras takes
 .32 to .41 of the time that it takes with COLMAP's on three captures, .74 to .81 where photos are added to a model, and
 puts them within .3 % of where it puts them."""
+_RELAXED = {"init_max_forward_motion": 1.0, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
+"""Limits of a second attempt: photos along the view and under smaller angles begin a model, and half of the matches
+place a photo (COLMAP's own: .95, 16° and 30). They are not the first because placing takes up to 1.3 times as long."""
+_ENOUGH, _MOST_STRETCH = 0.9, 0.05
+"""Share of the photos that suffices at the first attempt, and the most that the two focal lengths of a photo differ:
+no lens's do more, but those of models do that went wrong in the beginning."""
+_NOTE = "attempts.txt"
+"""File in a model's folder that says what a second attempt brought."""
 FEW_FEATURES = 500
 """Keypoints under which a photo counts as blurred or empty."""
 
@@ -91,7 +99,7 @@ def make_model(
         colmap_to_json(undistorted / "sparse" / "0", undistorted)
     if rigs:
         hold_out_panoramas(undistorted / "transforms.json", rigs)
-    return summarize(names, made, database, matching)
+    return summarize(names, made, database, matching, (model / _NOTE).read_text())
 
 
 def wake_gpu() -> torch.device | None:
@@ -217,29 +225,45 @@ def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Pat
         InputError: If no two photos could be related, or no photo could be added.
     """
     before = None if base is None else pycolmap.Reconstruction(base)
-    registered = 0 if before is None else before.num_reg_frames()
     with pycolmap.Database.open(database) as opened:
-        count, rigs = opened.num_frames(), [rig for rig in opened.read_all_rigs() if rig.num_sensors() > 1]
+        total, rigs = opened.num_frames(), [rig for rig in opened.read_all_rigs() if rig.num_sensors() > 1]
     fixed = {sensor.id for rig in rigs for sensor in rig.sensor_ids()}  # Panoramas are cut for these cameras.
     others: dict[str, Any] = {"min_model_size": 3}
     if before is not None:
         others = {"multiple_models": False, "fix_existing_frames": True, "image_names": list(names)}
         fixed |= set(before.cameras)
     others |= {"constant_cameras": fixed, "ba_refine_sensor_from_rig": False}
-    options = pycolmap.IncrementalPipelineOptions(random_seed=_SEED, **_ADJUSTMENT, **others)
-    options.mapper.ba_local_num_images = _ADJUSTED_PHOTOS
 
-    def advance(more: int) -> None:
-        nonlocal registered
-        registered = min(registered + more, count)  # COLMAP counts on where it begins another model.
-        progress("cameras", registered, count)
+    def attempt(stage: str, limits: dict[str, float]) -> pycolmap.Reconstruction | None:
+        options = pycolmap.IncrementalPipelineOptions(random_seed=_SEED, **_ADJUSTMENT, **others)
+        options.mapper.mergedict({"ba_local_num_images": _ADJUSTED_PHOTOS, **limits})
+        registered = 0 if before is None else before.num_reg_frames()
 
-    advance(0)
-    models = pycolmap.incremental_mapping(
-        database, photos, empty_folder(model.with_name("models")), options, input_path=base or "",
-        initial_image_pair_callback=lambda: advance(2), next_image_callback=lambda: advance(1),
-    )  # fmt: skip
-    best = max(models.values(), key=lambda candidate: candidate.num_reg_images(), default=None)
+        def advance(more: int) -> None:
+            nonlocal registered
+            registered = min(registered + more, total)  # COLMAP counts on where it begins another model.
+            progress(stage, registered, total)
+
+        advance(0)
+        models = pycolmap.incremental_mapping(
+            database, photos, empty_folder(model.with_name("models")), options, input_path=base or "",
+            initial_image_pair_callback=lambda: advance(2), next_image_callback=lambda: advance(1),
+        )  # fmt: skip
+        return max(models.values(), key=lambda candidate: candidate.num_reg_images(), default=None)
+
+    def quality(candidate: pycolmap.Reconstruction | None) -> tuple[bool, int]:
+        """Whether an attempt suffices, and how many photos it registered."""
+        if candidate is None:
+            return False, 0
+        cameras, count = [image.camera for image in candidate.images.values()], candidate.num_reg_images()
+        stretch = np.median([camera.focal_length_x / camera.focal_length_y for camera in cameras]) - 1
+        return bool(count >= _ENOUGH * len(names) and abs(stretch) < _MOST_STRETCH), count
+
+    best, note = attempt("cameras", {}), ""
+    if not quality(best)[0]:
+        second = attempt("cameras (relaxed)", _RELAXED)
+        note = f"A first attempt registered {quality(best)[1]}, one with relaxed limits {quality(second)[1]}."
+        best = max(best, second, key=quality)
     if before is None and best is None:
         with pycolmap.Database.open(database) as opened:
             images = opened.read_all_images()
@@ -259,8 +283,9 @@ def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Pat
     partial = empty_folder(model.with_name("model.partial"))
     best.write(partial)
     check_written(partial, best)
+    (partial / _NOTE).write_text(note)
     partial.rename(model)
-    progress("cameras", count, count)
+    progress("cameras", total, total)
 
 
 def registered_photos(model: pycolmap.Reconstruction) -> set[str]:
@@ -332,7 +357,9 @@ def undistort(photos: Path, model: Path, made: pycolmap.Reconstruction, max_size
     progress("undistorted photos", len(registered), len(registered))
 
 
-def summarize(names: Sequence[str], model: pycolmap.Reconstruction, database: Path, matching: Matching) -> Summary:
+def summarize(
+    names: Sequence[str], model: pycolmap.Reconstruction, database: Path, matching: Matching, attempts: str
+) -> Summary:
     """Count what was registered, and find out why the rest was not."""
     registered, left_out = registered_photos(model), {}
     with pycolmap.Database.open(database) as opened:
@@ -353,4 +380,4 @@ def summarize(names: Sequence[str], model: pycolmap.Reconstruction, database: Pa
             else:
                 left_out[name] = "matches other photos, but its pose stayed ambiguous"
     error = model.compute_mean_reprojection_error()
-    return Summary(len(names), len(registered), model.num_points3D(), error, left_out, matching)
+    return Summary(len(names), len(registered), model.num_points3D(), error, left_out, matching, attempts)
