@@ -19,10 +19,11 @@ import shlex
 import shutil
 import sys
 import time
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -35,6 +36,9 @@ from sadgs_ns.cli.process.video import count_frames
 from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_json
 from sadgs_ns.cli.status_line import StatusLine, clock
 from sadgs_ns.cli.worker import OnEvent, Worker, WorkerError
+from sadgs_ns.data.checks import check_data
+from sadgs_ns.data.checks.findings import refuse
+from sadgs_ns.data.checks.layouts import find_cameras
 from sadgs_ns.data.coordinates import FRAME_KEYS, TRANSFORMS_NAME
 from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.formats import FORMATS, MESH
@@ -66,6 +70,8 @@ class Sadgs:
     """Folder for all that is made; by default the source's name and -splat, in the working directory."""
     effort: Annotated[float, tyro.conf.arg(metavar="X")] = 1.0
     """How much training: 0.5 is a draft, 2 resolves more."""
+    cameras: Literal["given", "new"] = "given"
+    """Use the cameras that the folder brings, a COLMAP model or transforms.json, if any, or find new ones."""
     max_size: Annotated[int, tyro.conf.arg(metavar="PX")] = 1600
     """Longest side of the photos, at least 64, 0 to keep it."""
     formats: Annotated[
@@ -89,6 +95,7 @@ class PhotosToSplat:
         self.source, self.folder = given.source, given.output or Path(name)
         self.given, self.options, self.console = given, options, console
         self._formats = sorted(_formats(given.formats, console), key=lambda name: name == "html")
+        self._given = _given_cameras(given)
         self._scene, self._runs = self.folder / "scene", self.folder / "training" / "sadgs"
         self._settings: dict[str, Any] = {}
         if not 0 < given.effort < math.inf:
@@ -102,7 +109,8 @@ class PhotosToSplat:
         for path in (self.source, self.folder):
             if not str(path).isprintable():
                 raise InputError(f"{str(path)!a} has unprintable characters in its name: rename it.")
-        count_frames(self.source) if self.source.is_file() else find_source(self.source, self._scene)
+        if not self._given:
+            count_frames(self.source) if self.source.is_file() else find_source(self.source, self._scene)
 
     def _read_settings(self) -> None:
         """Read the settings that the folder was begun with, and take what is not decided yet as it is asked for now.
@@ -111,12 +119,14 @@ class PhotosToSplat:
             InputError: If they are others than those asked for, or the folder is something else.
         """
         folder, given = self.folder, self.given
-        asked = {"source": os.path.realpath(self.source), "--max-size": given.max_size}
+        asked = {"source": os.path.realpath(self.source), "--cameras": "new", "--max-size": given.max_size}
+        if self._given:
+            asked["--cameras"] = f"{self._given} (checksum {zlib.crc32(self._given.read_bytes()):08x})"
         asked |= {"--effort": given.effort, "options of ns-train": list(self.options)}
         self._settings = begun = read_settings(folder / "settings.json", folder)
         if not begun and (folder.is_file() or (folder.is_dir() and any(folder.iterdir()))):
             raise InputError(f"{folder} exists and is not a folder that sadgs began; give another --output.")
-        decided = ["source"] if begun else []
+        decided = ["source", "--cameras"] if begun else []
         decided += ["--max-size"] if (self._scene / "transforms.json").exists() else []
         decided += ["--effort", "options of ns-train"] if self._checkpoint() else []
         differing = [name for name in decided if begun.get(name) != asked[name]]
@@ -150,7 +160,7 @@ class PhotosToSplat:
             self._read_settings()  # Another run may have gone on meanwhile.
             self._note()
             # Importing nerfstudio takes some 12 s, in which cameras can be found.
-            needs_training = not self._trained() or photos_added(self.source, self._scene)
+            needs_training = not self._trained() or (not self._given and photos_added(self.source, self._scene))
             self._trainer = self._worker("training", _TRAINING) if needs_training else None
             stages: tuple[tuple[str, Callable[[StatusLine], str]], ...] = (
                 ("cameras", self._find_cameras),
@@ -176,6 +186,8 @@ class PhotosToSplat:
 
     def _choose_run(self) -> None:
         """Begin another run where photos were added since the present one began."""
+        if self._given:  # They are those that the folder was begun with.
+            return
         views, before = self._views(), self._settings.get("views")
         if views == before:
             return
@@ -231,6 +243,11 @@ class PhotosToSplat:
             raise RunError(f"{told}, and the same command goes on.") from None
 
     def _find_cameras(self, line: StatusLine) -> str:
+        if self._given:
+            return f"those of {self._given}; --cameras new finds others"
+        with contextlib.suppress(InputError):  # It is another folder's.
+            if self.source.name.startswith("images") and (other := find_cameras(self.source.parent)):
+                line.print(f"{other} is not used: `sadgs {shlex.quote(str(self.source.parent))}` takes these cameras.")
         few = self._settings.get("few")
         if few and (self.given.anyway or self._checkpoint()) and not photos_added(self.source, self._scene):
             return f"{few}; done before"
@@ -294,7 +311,7 @@ class PhotosToSplat:
 
         begun = bool(self._checkpoint())
         line.update("going on" if begun else "starting")
-        command = ["ns-train", "sadgs", "--data", str(self._scene.absolute())]
+        command = ["ns-train", "sadgs", "--data", os.path.abspath(self.source if self._given else self._scene)]
         command += ["--output-dir", str(self.folder.absolute()), "--experiment-name", "training"]
         command += ["--timestamp", self._run.name, "--vis", "tensorboard"]
         command += ["--steps-per-eval-image", "0", "--pipeline.effort", f"{self.given.effort:g}"]
@@ -316,6 +333,26 @@ class PhotosToSplat:
         command = ["sadgs-export", str(self._run), "--output", str(output)]
         self._call(worker, line, lambda event, **fields: None, command, Export(self._run, output))
         return f"{output}, {output.stat().st_size / 1e6:,.1f} MB"
+
+
+def _given_cameras(given: Sadgs) -> Path | None:
+    """Return the file with the cameras that the source brings, None where it brings none or new ones are asked for.
+
+    Raises:
+        InputError: If they, or the images, cannot be trained on.
+    """
+    try:
+        if given.cameras == "new" or (file := find_cameras(given.source)) is None:
+            return None
+        refuse(check_data(given.source), given.source)
+    except InputError as error:
+        raise InputError(f"{str(error).rstrip('.')}; or find new cameras with --cameras new.") from None
+    if given.max_size != Sadgs.max_size:
+        raise InputError(
+            f"--max-size is for new cameras, and those of {file} are used: leave it out, and end the command with `-- "
+            "--pipeline.datamanager.camera-res-scale-factor 0.5` to train on smaller images."
+        )
+    return file
 
 
 def _shown(value: Any) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import re
@@ -18,9 +19,11 @@ from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fractio
 from PIL import Image
 from rich.console import Console
 from room import draw_photos
+from runs import nerfstudio_data
 
 from sadgs_ns.cli import photos_to_splat
 from sadgs_ns.cli.photos_to_splat import PhotosToSplat, Sadgs, main
+from sadgs_ns.cli.process.plan import Summary
 from sadgs_ns.cli.program import locked
 from sadgs_ns.cli.status_line import StatusLine
 from sadgs_ns.data.ply import read_points
@@ -294,6 +297,87 @@ def test_wrong_input_is_told_in_a_sentence_before_any_work(
     assert main([source, "-o", "others/letter.txt/below"]) == 1
     assert "could not be written (Not a directory" in capsys.readouterr().err
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.fixture
+def commands(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """The commands of the stages of `sadgs`, which are not run, but for a checkpoint and a splat of 0 bytes."""
+    called: list[list[str]] = []
+
+    def call(work: PhotosToSplat, worker: object, line: object, hear: object, command: list[str], *others: Any) -> Any:
+        called.append(command)
+        if command[0] == "sadgs-process":
+            Path(command[2]).mkdir()
+            (Path(command[2]) / "transforms.json").write_text('{"frames": []}')
+            return dataclasses.asdict(Summary(10, 10, 100, 0.5, {}, "exhaustive"))
+        if command[0] == "ns-train":
+            (work._run / "nerfstudio_models").mkdir(parents=True)
+            (work._run / "nerfstudio_models" / "step-000000007.ckpt").touch()
+        else:
+            Path(command[-1]).touch()
+
+    monkeypatch.setattr(PhotosToSplat, "_call", call)
+    monkeypatch.setattr(PhotosToSplat, "_worker", lambda *others: None)
+    return called
+
+
+@pytest.mark.hard_case(
+    "`sadgs FOLDER` where the folder brings a COLMAP model, or one among its images, or `transforms.json`, or is one",
+    "its cameras are used and named; `--cameras new` finds others; nothing is written there",
+)
+@pytest.mark.parametrize("layout", ["sparse/0", "beside", "transforms.json", "file"])
+def test_cameras_that_a_folder_brings_are_used(
+    layout: str,
+    scene: Path,
+    tmp_path: Path,
+    commands: list[list[str]],
+    capsys: pytest.CaptureFixture[str],
+):
+    source = Path(shutil.copytree(scene, tmp_path / "capture"))
+    used = {"sparse/0": "sparse/0/images.bin", "beside": "images.bin"}.get(layout, "transforms.json")
+    if layout != "sparse/0":
+        (source / "sparse").rename(tmp_path / "sparse")
+    if layout == "beside":
+        shutil.copytree(tmp_path / "sparse/0", source, dirs_exist_ok=True)
+    elif layout != "sparse/0":
+        shutil.rmtree(source / "images")
+        nerfstudio_data(source)
+    given = source / "transforms.json" if layout == "file" else source
+    before = {path: path.stat().st_mtime_ns for path in source.rglob("*")}
+    command = [str(given), "-o", str(tmp_path / "out"), "--formats", "ply"]
+    assert main(command) == 0
+    cameras = f"those of {source / used}; --cameras new finds others"
+    assert lines_of(capsys.readouterr().out)["cameras"] == cameras
+    assert [words[0] for words in commands] == ["ns-train", "sadgs-export"]
+    assert commands[0][commands[0].index("--data") + 1] == str(given)
+    assert main(command) == 0
+    lines = lines_of(capsys.readouterr().out)
+    assert lines["cameras"] == cameras and lines["export"].endswith("done before") and len(commands) == 2
+    assert before == {path: path.stat().st_mtime_ns for path in source.rglob("*")}
+    assert main([*command, "--max-size", "800"]) == 2
+    assert f"--max-size is for new cameras, and those of {source / used} are used" in capsys.readouterr().err
+    (source / used).write_bytes((source / used).read_bytes() + b" ")
+    assert main(command) == 2
+    assert f"(--cameras was {source / used} (checksum " in capsys.readouterr().err
+    (source / used).write_bytes(b"")
+    assert main([*command[:2], str(tmp_path / "other"), *command[3:]]) == 2
+    assert capsys.readouterr().err.endswith("; or find new cameras with --cameras new.\n")
+    assert not (tmp_path / "other").exists()
+    if layout != "file":
+        assert main([*command[:2], str(tmp_path / "other"), *command[3:], "--cameras", "new"]) == 0
+        assert commands[-3][:2] == ["sadgs-process", str(source)]
+
+
+@pytest.mark.hard_case(
+    "`sadgs CAPTURE/images` where the capture has cameras",
+    "finds new ones, and a line tells of those and how to use them",
+)
+def test_cameras_of_the_folder_above_are_told(
+    scene: Path, tmp_path: Path, commands: list[list[str]], capsys: pytest.CaptureFixture[str]
+):
+    assert main([str(scene / "images"), "-o", str(tmp_path / "out"), "--formats", "ply"]) == 0
+    assert commands[0][0] == "sadgs-process"
+    assert f"{scene}/sparse/0/images.bin is not used: `sadgs {scene}` takes these cameras.\n" in capsys.readouterr().out
 
 
 @pytest.mark.hard_case("two `sadgs` in one folder", "the second waits up to 10 s, then is refused")

@@ -63,6 +63,18 @@ def find_reconstructions(data: Path) -> dict[Path, int]:
     return {folder: counts[folder] for folder in order}
 
 
+def find_cameras(data: Path) -> Path | None:
+    """Return the file with the poses that a capture's folder or `transforms.json` brings, or None.
+
+    Raises as `find_reconstruction`.
+    """
+    files = [data / name for name in ("transforms.json", "transforms_train.json")]
+    files = [data] if data.suffix == ".json" else files
+    if (model := find_reconstruction(data)) is not None:
+        files.append(data / model / f"images.{colmap.model_kind(data / model)}")
+    return next((file for file in files if file.is_file()), None)
+
+
 def images_folder(data: Path, model: Path) -> Path | None:
     """Return the folder that has images of a reconstruction, both relative to the data; None if none has any.
 
