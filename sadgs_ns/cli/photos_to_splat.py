@@ -186,8 +186,6 @@ class PhotosToSplat:
 
     def _choose_run(self) -> None:
         """Begin another run where photos were added since the present one began."""
-        if self._given:  # They are those that the folder was begun with.
-            return
         views, before = self._views(), self._settings.get("views")
         if views == before:
             return
@@ -292,7 +290,8 @@ class PhotosToSplat:
         return self._settings.get("trained") if self._checkpoint() else None
 
     def _train(self, line: StatusLine) -> str:
-        self._choose_run()
+        if not self._given:  # These are those that the folder was begun with.
+            self._choose_run()
         if trained := self._trained():
             return f"{trained}; done before"
         total, count = "", ""
@@ -336,11 +335,7 @@ class PhotosToSplat:
 
 
 def _given_cameras(given: Sadgs) -> Path | None:
-    """Return the file with the cameras that the source brings, None where it brings none or new ones are asked for.
-
-    Raises:
-        InputError: If they, or the images, cannot be trained on.
-    """
+    """Return the file of the source's cameras, or None; raise an InputError if they cannot be trained on."""
     try:
         if given.cameras == "new" or (file := find_cameras(given.source)) is None:
             return None
@@ -348,10 +343,8 @@ def _given_cameras(given: Sadgs) -> Path | None:
     except InputError as error:
         raise InputError(f"{str(error).rstrip('.')}; or find new cameras with --cameras new.") from None
     if given.max_size != Sadgs.max_size:
-        raise InputError(
-            f"--max-size is for new cameras, and those of {file} are used: leave it out, and end the command with `-- "
-            "--pipeline.datamanager.camera-res-scale-factor 0.5` to train on smaller images."
-        )
+        smaller = "or for images of half the size `-- --pipeline.datamanager.camera-res-scale-factor 0.5` at the end"
+        raise InputError(f"--max-size is for new cameras, and those of {file} are used: leave it out, {smaller}.")
     return file
 
 

@@ -59,10 +59,7 @@ def choose_parser(config: FullImageDatamanagerConfig) -> None:
     elif layout == "colmap" and folder is not None:
         options = automatic_options(data, folder)
         config.dataparser = ColmapDataParserConfig(
-            data=data,
-            colmap_path=folder,
-            images_path=options.images_path,
-            downscale_factor=options.downscale_factor,
+            data=data, colmap_path=folder, images_path=options.images_path, downscale_factor=options.downscale_factor
         )
     else:
         config.dataparser = NerfstudioDataParserConfig(data=data, load_3D_points=True)

@@ -355,7 +355,10 @@ def test_cameras_that_a_folder_brings_are_used(
     assert lines["cameras"] == cameras and lines["export"].endswith("done before") and len(commands) == 2
     assert before == {path: path.stat().st_mtime_ns for path in source.rglob("*")}
     assert main([*command, "--max-size", "800"]) == 2
-    assert f"--max-size is for new cameras, and those of {source / used} are used" in capsys.readouterr().err
+    assert (
+        f"--max-size is for new cameras, and those of {source / used} are used: leave it out, or for"
+        in capsys.readouterr().err
+    )
     (source / used).write_bytes((source / used).read_bytes() + b" ")
     assert main(command) == 2
     assert f"(--cameras was {source / used} (checksum " in capsys.readouterr().err

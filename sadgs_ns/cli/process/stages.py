@@ -55,8 +55,6 @@ place a photo (COLMAP's own: .95, 16° and 30). They are not the first because p
 _ENOUGH, _MOST_STRETCH = 0.9, 0.05
 """Share of the photos that suffices at the first attempt, and the most that the two focal lengths of a photo differ:
 no lens's do more, but those of models do that went wrong in the beginning."""
-_NOTE = "attempts.txt"
-"""File in a model's folder that says what a second attempt brought."""
 FEW_FEATURES = 500
 """Keypoints under which a photo counts as blurred or empty."""
 
@@ -99,7 +97,7 @@ def make_model(
         colmap_to_json(undistorted / "sparse" / "0", undistorted)
     if rigs:
         hold_out_panoramas(undistorted / "transforms.json", rigs)
-    return summarize(names, made, database, matching, (model / _NOTE).read_text())
+    return summarize(names, made, database, matching, (model / "attempts.txt").read_text())
 
 
 def wake_gpu() -> torch.device | None:
@@ -283,7 +281,7 @@ def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Pat
     partial = empty_folder(model.with_name("model.partial"))
     best.write(partial)
     check_written(partial, best)
-    (partial / _NOTE).write_text(note)
+    (partial / "attempts.txt").write_text(note)
     partial.rename(model)
     progress("cameras", total, total)
 

@@ -27,13 +27,7 @@ from sadgs_ns.data.checks.images import (
     scaled_size,
     smaller_folder,
 )
-from sadgs_ns.data.checks.layouts import (
-    ParserOptions,
-    find_reconstruction,
-    find_reconstructions,
-    images_folder,
-    no_layout,
-)
+from sadgs_ns.data.checks.layouts import ParserOptions, find_reconstructions, images_folder, no_layout
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
 from sadgs_ns.data.text import refuse_byte_order_mark
 from sadgs_ns.errors import InputError, reason
@@ -48,7 +42,7 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
     images, model_folder = data / options.images_path, data / options.colmap_path
     kind = colmap.model_kind(model_folder)
     if kind is None:
-        if (found := find_reconstruction(data)) is not None:
+        if found := next(iter(find_reconstructions(data)), None):
             told = f"{model_folder} holds no COLMAP reconstruction, but {data / found} does"
             raise InputError(f"{told}: add `{_words(data, automatic_options(data, found))}` after `colmap`.")
         raise InputError(no_layout(data))
@@ -90,11 +84,10 @@ def _check_folders(data: Path, options: ParserOptions, names: Sequence[str], pos
     """Refuse a folder of images that are not those of the model, and warn of a larger model beside it."""
     images = data / options.images_path
     if not any(os.path.isfile(images / name) for name in names):
-        if (found := images_folder(data, options.colmap_path)) is not None:
+        if found := images_folder(data, options.colmap_path):
+            told = f"{poses}: image {names[0]} is not in {images}, but in {data / found}"
             remedy = _words(data, dataclasses.replace(options, images_path=found))
-            raise InputError(
-                f"{poses}: image {names[0]} is not in {images}, but in {data / found}: add `{remedy}` after `colmap`."
-            )
+            raise InputError(f"{told}: add `{remedy}` after `colmap`.")
         if not images.is_dir():
             raise InputError(
                 f"{poses} has poses of {len(names)} images, but there is no folder {images}: put them there, or end "

@@ -64,12 +64,8 @@ def find_reconstructions(data: Path) -> dict[Path, int]:
 
 
 def find_cameras(data: Path) -> Path | None:
-    """Return the file with the poses that a capture's folder or `transforms.json` brings, or None.
-
-    Raises as `find_reconstruction`.
-    """
-    files = [data / name for name in ("transforms.json", "transforms_train.json")]
-    files = [data] if data.suffix == ".json" else files
+    """Return the file with the poses that a folder or JSON file brings, or None; raises as `find_reconstruction`."""
+    files = [data if data.suffix == ".json" else data / "transforms.json", data / "transforms_train.json"]
     if (model := find_reconstruction(data)) is not None:
         files.append(data / model / f"images.{colmap.model_kind(data / model)}")
     return next((file for file in files if file.is_file()), None)
