@@ -22,7 +22,7 @@ import struct
 import subprocess
 import sys
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -1113,20 +1113,32 @@ def test_photos_added_or_removed_while_it_is_not_finished_make_another_scene(
     assert f"(source was {photos.resolve()}, is {other.resolve()})" in capsys.readouterr().err
 
 
-@pytest.fixture
-def grown(photos: Path, tmp_path: Path) -> tuple[Path, Path, dict[str, Any]]:
-    """A folder of photos to which three were added, its scene of the others, and that scene's transforms.json."""
-    source, out = tmp_path / "photos", tmp_path / "out"
-    source.mkdir()
-    later = [f"{i:02d}.png" for i in (0, 4, 9)]
+LATER = [f"{i:02d}.png" for i in (0, 4, 9)]
+
+
+@pytest.fixture(scope="module")
+def seven(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder for `grown`, and in `before` what it begins with: photos and their scene, without three of them."""
+    folder = tmp_path_factory.mktemp("grown")
+    source, out = folder / "now" / "photos", folder / "now" / "out"
+    source.mkdir(parents=True)
     for path in photos.glob("[0-9]*.png"):
-        if path.name not in later:
+        if path.name not in LATER:
             shutil.copy2(path, source)
     process(Process(source, out, max_size=120))
-    described = json.loads((out / "transforms.json").read_text())
-    for name in later:
-        shutil.copy2(photos / name, source)
-    return source, out, described
+    (folder / "now").rename(folder / "before")
+    return folder
+
+
+@pytest.fixture
+def grown(photos: Path, seven: Path) -> Iterator[tuple[Path, Path, dict[str, Any]]]:
+    """A folder of photos to which three were added, its scene of the others, and that scene's transforms.json."""
+    now = seven / "now"
+    shutil.copytree(seven / "before", now, symlinks=True)
+    for name in LATER:
+        shutil.copy2(photos / name, now / "photos")
+    yield now / "photos", now / "out", json.loads((now / "out" / "transforms.json").read_text())
+    shutil.rmtree(now)
 
 
 @pytest.mark.hard_case(

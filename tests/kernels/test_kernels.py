@@ -600,16 +600,16 @@ def test_more_tiles_than_16_bits_number_are_listed_as_view_by_view():
 
 def test_a_gaussian_that_is_listed_in_parts_is_listed_as_by_one_lane(monkeypatch):
     """Also where a Gaussian has more parts than rows, whose last rows are few, and where programs share many parts."""
-    gaussians = {name: value.to(DEVICE) for name, value in projected_gaussians(2, 60, 640, 480).items()}
+    gaussians = {name: value.to(DEVICE) for name, value in projected_gaussians(2, 60, 320, 240).items()}
     gaussians["radii"][:, 1], gaussians["conics"][:, 1] = 2000, torch.tensor([1e-6, 0.0, 1e-6])  # It covers all tiles.
     found = []
     for few, part, programs in ((10**9, 256, 8), (64, 256, 8), (0, 256, 8), (0, 16, 1)):
         monkeypatch.setattr(tiles, "_FEW_PAIRS", few)
         monkeypatch.setattr(tiles, "_PART_PAIRS", part)
         monkeypatch.setattr(tiles, "_PROGRAMS", programs)
-        found.append(tiles.intersect_tiles(**gaussians, width=640, height=480, tile_size=8).lists())
+        found.append(tiles.intersect_tiles(**gaussians, width=320, height=240, tile_size=8).lists())
     assert all(torch.equal(one, other) for lists in found[1:] for one, other in zip(found[0], lists, strict=True))
-    assert all((found[0][1] == g).sum() == 80 * 60 for g in (1, 61)) and len(found[0][1]) > 2 * 80 * 60 + 500
+    assert all((found[0][1] == g).sum() == 40 * 30 for g in (1, 61)) and len(found[0][1]) > 2 * 40 * 30 + 500
 
 
 def listed_by_tile(lists: tuple[Tensor, Tensor], rows: int) -> list[list[int]]:
