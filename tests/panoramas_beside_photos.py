@@ -17,7 +17,7 @@ from room import draw_panorama, draw_photo, panorama_centres
 from sadgs_ns.cli.process.command import main as process
 from sadgs_ns.cli.process.panoramas import VIEWS, rotations
 
-COUNT, HEIGHT, TURN, SIZE = 12, 320, 0.3, 96
+COUNT, HEIGHT, TURN, SIZE = 12, 320, 0.3, 80
 
 
 def draw(folder: Path) -> None:

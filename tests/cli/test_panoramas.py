@@ -128,6 +128,9 @@ def test_what_is_a_panorama(panoramas: list[Image.Image], tmp_path: Path):
     xmp = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf GPano:ProjectionType="equirectangular"/></x:xmpmeta>'
     photo.save(tmp_path / "told.jpg", xmp=xmp)
     wide.save(tmp_path / "wide.jpg", xmp=xmp)
+    for i, panorama in enumerate(panoramas):
+        panorama.resize((1024, 512)).save(tmp_path / f"{i}.jpg", quality=80)
+        assert read_photos(tmp_path, [f"{i}.jpg"], lambda *step: None)[0].is_panorama
     told, part = read_photos(tmp_path, ["told.jpg", "wide.jpg"], lambda *step: None)
     assert told.is_panorama and not part.is_panorama
 

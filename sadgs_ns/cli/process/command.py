@@ -245,9 +245,10 @@ def _tell_work(scene: _Scene, photos: Sequence[Photo], matching: Matching, notic
         told = f"{scene.added} photo{'s' * (scene.added > 1)} added to {len(before)}"
         _say("added", f"{told}.", photos=told)
     if panoramas := sum(photo.is_panorama for photo in photos):
+        held_out = "all those of a panorama" if len(photos) > 4 else "single ones"
         told = (
             f"{panoramas} of the {len(photos)} photos are panoramas: each is cut into {VIEWS} views of 90°, which "
-            "leave out 30° about the zenith and the nadir, and all views of a panorama are held out, or none."
+            f"leave out 30° about the zenith and the nadir; {held_out} are held out."
         )
         _say("panoramas", told, told=told)
     views = [view for photo in photos for view in photo.views]

@@ -14,8 +14,6 @@ directions has a quarter of the panorama's width, so nearly as many pixels as th
 _PITCH = 22.5
 """Degrees above and below the horizon. The views show all directions up to a latitude of 60°, and none over 68°: a
 tripod or a hand is not seen."""
-_LEVELS = 12.0
-"""Most levels of grey, of 255, between the two ends of a row that meet; compression leaves a few."""
 
 
 def rotations() -> np.ndarray:
@@ -34,7 +32,7 @@ def is_panorama(image: Image.Image, size: tuple[int, int]) -> bool:
     The ends of a 360° camera's two circles, which no program has stitched yet, are black.
 
     Args:
-        image: The photo, which may be loaded at a smaller size.
+        image: The photo, which may be loaded at a smaller size, of 512 px or more across.
         size: Its width and height in px.
     """
     if size[0] != 2 * size[1]:
@@ -42,9 +40,9 @@ def is_panorama(image: Image.Image, size: tuple[int, int]) -> bool:
     if b"equirectangular" in image.info.get("xmp", b""):
         return True
     small = np.asarray(image.convert("L").resize((256, 128), Image.Resampling.BOX), float)
-    seam, steps = np.abs(small[:, 0] - small[:, -1]).mean(), np.abs(np.diff(small, axis=1)).mean(0)
-    meets = seam < min(_LEVELS, 2 * np.quantile(steps, 0.9) + 1) and small[:, 0].std() > 0.1 * small.std()
-    return bool(meets and small[[0, -1]].std(1).max() < 0.5 * small.std())
+    seam, steps = np.abs(small[:, 0] - small[:, -1]).mean(), np.abs(np.diff(small, axis=1))
+    poles = steps[[0, -1]].mean(1).max()  # Each is one point.
+    return bool(max(seam / 3, 4 * poles) < steps.mean() and small[:, 0].std() > 0.1 * small.std())
 
 
 def cut(panorama: Image.Image) -> list[Image.Image]:

@@ -182,8 +182,9 @@ def _read_photo(folder: Path, name: str, as_stored: bool) -> Photo:
             image.format in COLMAP_FORMATS,
             orientation in range(2, 9),
         )
-        # An eighth of a JPEG's size tells whether it is whole.
-        image.draft("RGB", (image.width // 8, image.height // 8))
+        # An eighth of a JPEG's size tells whether it is whole, but not whether it is a panorama.
+        least = 512 if width == 2 * height else 0
+        image.draft("RGB", (max(least, width // 8), max(least // 2, height // 8)))
         image.load()
         return dataclasses.replace(photo, is_panorama=is_panorama(image, size))
 
