@@ -39,6 +39,7 @@ from rich.progress import Progress
 from room import HEIGHT, VIEWS, WIDTH, camera_centres, draw_photos, walk_centres
 
 from sadgs_ns.cli.process import command as program
+from sadgs_ns.cli.process import features
 from sadgs_ns.cli.process import stages as colmap_stages
 from sadgs_ns.cli.process.colmap import run_colmap
 from sadgs_ns.cli.process.command import Process, main, photos_added, process
@@ -640,7 +641,7 @@ def test_a_vocabulary_tree_that_is_there_is_found(tmp_path: Path, monkeypatch: p
 
 
 def numbered(count: int, has_position: bool = False, name: str = "IMG_{}.jpg") -> list[Photo]:
-    return [Photo(name.format(i), (8, 8), (), has_position, False) for i in range(count)]
+    return [Photo(name.format(i), (8, 8), (), (48.0, 11.0, float(i)) * has_position, False) for i in range(count)]
 
 
 @pytest.mark.hard_case(
@@ -720,7 +721,26 @@ def test_photos_with_gps_positions_are_known(tmp_path: Path):
         exif[0x8825] = {1: "N", 2: (48.0, 5.0, float(i)), 3: "E", 4: (11.0, 0.0, 0.0)} | ({6: 500.0} if i < 2 else {})
         Image.new("RGB", (8, 8)).save(tmp_path / f"{i}.jpg", exif=exif)
     read = read_photos(tmp_path, [f"{i}.jpg" for i in range(3)], lambda *step: None)
-    assert [photo.has_position for photo in read] == [True, True, False]
+    assert [bool(photo.position) for photo in read] == [True, True, False]
+
+
+@pytest.mark.hard_case(
+    "GPS positions of 0°, 0°, beyond 90°, without degrees, of 0/0, or one position for all photos, as phones repeat "
+    "indoors",
+    "count as none, and do not decide which photos are matched",
+)
+def test_positions_that_tell_nothing_are_not_matched_by(tmp_path: Path):
+    unknown, nothing = IFDRational(0, 0), (0.0, 0.0, 0.0)
+    latitudes = [nothing, (95.0, 0.0, 0.0), (), (48.0, unknown, 0.0), (48.0, 5.0, 0.0)]
+    for i, latitude in enumerate(latitudes):
+        exif = Image.Exif()
+        exif[0x8825] = {1: "N", 2: latitude, 3: "E", 4: (11.0, 0.0, 0.0) if i else nothing, 6: 500.0}
+        Image.new("RGB", (8, 8)).save(tmp_path / f"{i}.jpg", exif=exif)
+    read = read_photos(tmp_path, [f"{i}.jpg" for i in range(len(latitudes))], lambda *step: None)
+    assert [photo.position for photo in read] == [(), (), (), (), (48.0, 5.0, 0.0, 11.0, 0.0, 0.0, 500.0)]
+    same = [dataclasses.replace(photo, position=(48.0, 11.0, 0.0)) for photo in numbered(EXHAUSTIVE_LIMIT + 1)]
+    assert choose_matching("auto", same, False, lambda: None)[0] == "vocabulary"
+    assert choose_matching("spatial", same, False, lambda: None)[0] == "spatial"
 
 
 @pytest.mark.hard_case(
@@ -737,7 +757,43 @@ def test_a_focal_length_that_is_no_number_is_none(focal: Any, tmp_path: Path):
         Image.new("RGB", (8, 8)).save(tmp_path / f"{i}.jpg", exif=exif)
     names = [f"{i}.jpg" for i in range(3)]
     read = read_photos(tmp_path, names, lambda *step: None)
-    assert photos_by_camera(read) == [names] and not any(photo.has_position for photo in read)
+    assert photos_by_camera(read) == [names] and not any(photo.position for photo in read)
+
+
+@pytest.mark.hard_case(
+    "EXIF whose focal-plane resolution is 0/0 or huge, or whose focal length for 35 mm film is 0, 1 or 65,535",
+    "COLMAP's NaN, or a focal length of .03 or 2,000 photos' widths, counts as unknown; a plausible one stays",
+)
+@pytest.mark.parametrize(
+    ("tags", "expected"),
+    [
+        ({0xA20E: IFDRational(0, 0), 0xA20F: IFDRational(0, 0), 0xA210: 2}, 1.2),
+        ({0xA20E: IFDRational(2**32 - 1, 1), 0xA20F: IFDRational(2**32 - 1, 1), 0xA210: 2}, 1.2),
+        ({0xA405: 0}, 1.2),
+        ({0xA405: 1}, 1.2),
+        ({0xA405: 65535}, 1.2),
+        ({0xA405: 36}, 36 / 43.2666 * 1.25),
+    ],
+)
+def test_a_focal_length_that_no_lens_has_is_unknown(tags: dict[int, Any], expected: float, tmp_path: Path):
+    exif = Image.Exif()
+    exif[0x8769] = {0x920A: IFDRational(24, 1)} | tags
+    Image.new("RGB", (64, 48)).save(tmp_path / "0.jpg", exif=exif)
+    features.extract(tmp_path, [["0.jpg"]], tmp_path / "database.db")
+    with pycolmap.Database.open(tmp_path / "database.db") as opened:
+        (camera,) = opened.read_all_cameras()
+    assert camera.mean_focal_length() / 64 == pytest.approx(expected, rel=1e-3)
+    assert camera.has_prior_focal_length == (expected != 1.2)
+
+
+@pytest.mark.hard_case("a phone's photos with and without digital zoom, of one lens", "have a camera each")
+def test_digital_zoom_is_another_camera(tmp_path: Path):
+    for i in range(4):
+        exif = Image.Exif()
+        exif[0x8769] = {0x920A: IFDRational(42, 10), 0xA405: 26 + 26 * (i // 2)}
+        Image.new("RGB", (8, 8)).save(tmp_path / f"{i}.jpg", exif=exif)
+    read = read_photos(tmp_path, [f"{i}.jpg" for i in range(4)], lambda *step: None)
+    assert photos_by_camera(read) == [["0.jpg", "1.jpg"], ["2.jpg", "3.jpg"]]
 
 
 @pytest.mark.hard_case("COLMAP aborts", "one sentence with the stage and COLMAP's own words")

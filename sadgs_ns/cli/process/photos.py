@@ -25,6 +25,8 @@ from sadgs_ns.errors import InputError, reason
 
 _KEPT_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
 """Suffixes by which COLMAP knows in which format to write; it reads by what a file holds."""
+_FOCAL_LENGTHS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
+"""The second alone tells of a phone's digital zoom."""
 _POSITION = (ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLongitude, ExifTags.GPS.GPSAltitude)
 _NAMED = 20
 """How many unreadable photos a message names."""
@@ -40,8 +42,8 @@ class Photo:
     """Width and height in px, upright."""
     camera: tuple
     """Equal for photos that one camera at one focal length took, as far as size and EXIF tell."""
-    has_position: bool
-    """Whether EXIF holds GPS coordinates with an altitude; COLMAP uses none without it."""
+    position: tuple[float, ...]
+    """Latitude, longitude and altitude as EXIF holds them; empty where one lacks, because COLMAP then uses none."""
     has_alpha: bool
     """Whether some pixels may be transparent."""
     is_read: bool = True
@@ -56,7 +58,7 @@ class Photo:
         """The views that a panorama is cut into, which have no camera of their own; another photo is its own view."""
         suffix, size = "png" if self.has_alpha else "jpg", (self.size[1] // 2, self.size[1] // 2)
         names = [f"{self.name}/{i}.{suffix}" for i in range(VIEWS)]
-        return [Photo(name, size, (), False, self.has_alpha) for name in names] if self.is_panorama else [self]
+        return [Photo(name, size, (), (), self.has_alpha) for name in names] if self.is_panorama else [self]
 
 
 def find_source(source: Path, out: Path) -> tuple[list[str], bool]:
@@ -171,13 +173,16 @@ def _read_photo(folder: Path, name: str, as_stored: bool) -> Photo:
         orientation = 1 if as_stored else exif.get(ExifTags.Base.Orientation)
         width, height = image.size  # Pillow turns TIFF by itself.
         size = (height, width) if orientation in SIDEWAYS and image.format != "TIFF" else image.size
-        focal = _numbers(exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLength))  # mm; 0 is unknown, too
-        position = exif.get_ifd(ExifTags.IFD.GPSInfo)
+        lens, gps = (exif.get_ifd(part) for part in (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo))
+        focals = [max((0.0, *_numbers(lens.get(tag)))) for tag in _FOCAL_LENGTHS]  # mm; 0 is unknown, too
+        latitude, longitude, altitude = (_numbers(gps.get(tag)) for tag in _POSITION)
+        is_known = latitude and longitude and altitude and any(latitude + longitude)  # 0, 0 is what has no position.
+        is_known = is_known and latitude[0] <= 90 and longitude[0] <= 180
         photo = Photo(
             name,
             size,
-            (size, *(exif.get(tag) for tag in (ExifTags.Base.Make, ExifTags.Base.Model)), max((0.0, *focal))),
-            all(_numbers(position.get(tag)) for tag in _POSITION),
+            (size, *(exif.get(tag) for tag in (ExifTags.Base.Make, ExifTags.Base.Model)), *focals),
+            latitude + longitude + altitude if is_known else (),
             image.has_transparency_data,
             image.format in COLMAP_FORMATS,
             orientation in range(2, 9),

@@ -69,13 +69,15 @@ def choose_matching(
     Raises:
         InputError: If what was asked for cannot work on these photos or this machine.
     """
-    nowhere = [photo.name for photo in photos if not photo.has_position]
+    nowhere = [photo.name for photo in photos if not photo.position]
     if asked == "spatial" and nowhere:
         raise InputError(
             f"--matching spatial needs a GPS position with altitude in the EXIF data of every photo, and "
             f"{len(nowhere)} of the {len(photos)} have none, such as {nowhere[0]}; use sequential, exhaustive or auto."
         )
-    if asked == "auto" and (is_video or len(photos) <= EXHAUSTIVE_LIMIT or not nowhere):
+    # Indoors a phone repeats its last position, whose nearest photos are any.
+    are_apart = 2 * len({photo.position for photo in photos}) > len(photos) and not nowhere
+    if asked == "auto" and (is_video or len(photos) <= EXHAUSTIVE_LIMIT or are_apart):
         asked = "sequential" if is_video else "exhaustive" if len(photos) <= EXHAUSTIVE_LIMIT else "spatial"
     if asked not in ("auto", "vocabulary"):
         return asked, ""
