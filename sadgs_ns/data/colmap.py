@@ -180,15 +180,17 @@ def _read_text_poses(path: Path) -> Iterator[Pose]:
                 f"{path}: image {' '.join(fields[9:])!r} has a space in its name, where nerfstudio takes the name to "
                 "end: write the model in binary (`colmap model_converter --output_type BIN`), or rename the image."
             )
-        if len(next(following, "").split()) % 3:  # Each keypoint has x, y and the number of its point.
+        try:
+            keypoints = next(following, "").split()
+            pose = fields[9], int(fields[8]), np.array(fields[1:8], dtype=np.float64)
+        except ValueError as error:
+            raise _not_colmap(path, error) from error
+        if len(keypoints) % 3:  # Each has x, y and the number of its point.
             raise InputError(
                 f"{path}: the line after image {fields[9]!r} does not hold its keypoints: each image needs such a "
                 "line, which may be empty."
             )
-        try:
-            yield fields[9], int(fields[8]), np.array(fields[1:8], dtype=np.float64)
-        except ValueError as error:
-            raise _not_colmap(path, error) from error
+        yield pose
 
 
 def _read_text_points(path: Path) -> Points:

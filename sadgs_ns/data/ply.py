@@ -12,8 +12,12 @@ from numpy.typing import NDArray
 
 from sadgs_ns.errors import InputError, reason
 
-COLORS = (("red", "green", "blue"), ("r", "g", "b"))
-"""Names that programs give to colours, in small letters; some put `diffuse_` before them."""
+COLORS = tuple(
+    tuple(prefix + name for name in names)
+    for prefix in ("", "diffuse_", "scalar_", "vertex_", "color_")
+    for names in (("red", "green", "blue"), ("r", "g", "b"))
+)
+"""Names that programs give to colours, in small letters."""
 GREY = 127
 """Colour that is given to points without one, in 0 … 255."""
 
@@ -35,8 +39,12 @@ def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         raise InputError(f"{path} cannot be read ({reason(error)}): restore it.") from error
     except Exception as error:  # What a damaged header leads plyfile's parser to is open.
         raise InputError(f"{path} is not a PLY file of points ({reason(error)}): restore it.") from error
-    named = {name.lower().removeprefix("diffuse_"): name for name in vertices.dtype.names or ()}
+    named = {name.lower(): name for name in vertices.dtype.names or () if vertices.dtype[name].kind in "fiu"}
     channels = next((names for names in COLORS if named.keys() >= set(names)), None)
+    if channels is None and (packed := named.keys() & {"rgb", "rgba"}):  # PCL packs bytes into one number.
+        bits = np.ascontiguousarray(vertices[named[packed.pop()]])
+        bits = bits.astype(np.float32).view(np.uint32) if bits.dtype.kind == "f" else bits
+        return positions, np.stack([bits >> shift & 255 for shift in (16, 8, 0)], axis=-1).astype(np.uint8)
     if channels is None:
         return positions, np.full(positions.shape, GREY, np.uint8)
     colors = np.stack([vertices[named[channel]] for channel in channels], axis=-1).astype(np.float64)

@@ -1252,6 +1252,42 @@ def test_an_images_txt_without_lines_of_keypoints_is_refused(tmp_path: Path):
     assert [name for name, _, _ in colmap.read_poses(path)] == ["000.png", "001.png", "002.png", "003.png"]
 
 
+@pytest.mark.hard_case(
+    "a COLMAP model in text with Windows' line ends, tabs, comments between images, empty lines at the end, no end of "
+    "the last line, or without tracks",
+    "read",
+)
+@pytest.mark.parametrize("edit", ["crlf", "tabs", "comments", "blank lines", "no end", "no tracks"])
+def test_texts_of_other_programs_are_read(edit: str, tmp_path: Path):
+    camera, points = "1 SIMPLE_PINHOLE 64 48 50 32 24\n", "1 0 0 1 9 8 7 .5 1 0\n2 0 1 1 9 8 7 .5 1 1\n"
+    images = "# IMAGE_ID, …\n" + "".join(f"{i} 1 0 0 0 0 0 {i} 1 00{i}.png\n1.5 2.5 -1\n" for i in range(3))
+    texts = {"cameras.txt": camera, "images.txt": images, "points3D.txt": points}
+    edits: dict[str, Callable[[str], str]] = {
+        "crlf": lambda text: text.replace("\n", "\r\n"),
+        "tabs": lambda text: text.replace(" ", "\t"),
+        "comments": lambda text: "# by me\n" + text.replace("-1\n", "-1\n# next\n") + "# end\n",
+        "blank lines": lambda text: "\n" + text + "\n \n\n",
+        "no end": str.rstrip,
+        "no tracks": lambda text: re.sub(r"(?m) 1 \d$", "", text),
+    }
+    for name, text in texts.items():
+        (tmp_path / name).write_bytes(edits[edit](text).encode())
+    assert [name for name, _, _ in colmap.read_poses(tmp_path / "images.txt")] == ["000.png", "001.png", "002.png"]
+    assert colmap.read_cameras(tmp_path / "cameras.txt")[1].params == (50, 32, 24)
+    assert colmap.read_points(tmp_path / "points3D.txt")[0].tolist() == [[0, 0, 1], [0, 1, 1]]
+
+
+@pytest.mark.hard_case("an images.txt that is not in UTF-8, even on a line of keypoints", "refused, not a traceback")
+def test_an_images_txt_in_another_encoding_is_refused(tmp_path: Path):
+    path = tmp_path / "images.txt"
+    for keypoints in (b"", b"1 2 \xe9", b"1.5 2.5 -1 " * 2000):
+        path.write_bytes(b"1 1 0 0 0 0 0 0 1 000.png\n" + keypoints + b"\n2 1 0 0 0 0 0 0 1 caf\xe9.png\n\n")
+        with pytest.raises(
+            InputError, match=r"images\.txt is not COLMAP's text \('utf-8' codec can't decode .*\): copy"
+        ):
+            colmap.read_poses(path)
+
+
 # --- what the checks assume of others ---
 
 
