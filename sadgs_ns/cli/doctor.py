@@ -60,7 +60,7 @@ def check_machine() -> Iterator[Finding]:
     yield from _check_lpips()
     for program, package, use in (
         ("ffmpeg", "ffmpeg", "`ns-render` needs it for videos, and nerfstudio to scale images down"),
-        ("libusb-1.0", "libusb-1.0-0", "`ns-export` and meshes of `sadgs-export` import open3d, which needs it"),
+        ("libusb-1.0", "libusb-1.0-0", "`ns-export`, `ns-process-data` and meshes import open3d, which needs it"),
     ):
         found = shutil.which(program) or ctypes.util.find_library(program.removeprefix("lib"))
         if found:

@@ -42,6 +42,7 @@ from sadgs_ns.data.checks.layouts import find_cameras
 from sadgs_ns.data.coordinates import FRAME_KEYS, TRANSFORMS_NAME
 from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.formats import FORMATS, MESH
+from sadgs_ns.formats.mesh import load_open3d
 from sadgs_ns.plugin.interrupts import Interrupts
 from sadgs_ns.plugin.lost_output import print_elsewhere_once_unread
 
@@ -329,8 +330,10 @@ class PhotosToSplat:
             return f"{output}; done before"
         line.update(str(output))
         worker = self._worker("export", "sadgs_ns.cli.export:export")
-        command = ["sadgs-export", str(self._run), "--output", str(output)]
-        self._call(worker, line, lambda event, **fields: None, command, Export(self._run, output))
+        # The folder may have been renamed since the run's config.yml noted where the scene is.
+        given = Export(self._run, output, data=self._scene)
+        command = ["sadgs-export", str(self._run), "--output", str(output), "--data", str(self._scene)]
+        self._call(worker, line, lambda event, **fields: None, command, given)
         return f"{output}, {output.stat().st_size / 1e6:,.1f} MB"
 
 
@@ -364,6 +367,8 @@ def _formats(asked: str | None, console: Console) -> list[str]:
         raise InputError(f"--formats knows {', '.join(_FORMATS)}, and not {unknown[0]!r}.")
     if "html" in chosen and not has_node:
         raise InputError("a page is made with the help of Node.js: install version 22 or newer, or leave html out.")
+    if MESH[1:] in chosen:
+        load_open3d()  # A machine that lacks it is told before cameras are found.
     return chosen
 
 

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.blender_dataparser import Blender
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
+from nerfstudio.data.dataparsers.scannet_dataparser import ScanNet
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -21,30 +23,44 @@ from sadgs_ns.data.checks.transforms import read_json
 from sadgs_ns.data.coordinates import FRAME_KEYS, Similarity, fixed_frame
 
 
-class TransformsParser(Nerfstudio):
-    """nerfstudio's parser of transforms.json, which alone reads points with open3d and asks whether to make a PLY.
+class _PointsOfPly:
+    """Reads a PLY's points for nerfstudio's parsers, which need open3d for it."""
+
+    config: Any
+
+    def _load_3D_points(self, path: Path, transform: Any = None, scale: Any = None, *_: Any) -> dict[str, Tensor]:
+        positions, colors = ply.read_points(path)
+        if transform is None:  # Blender's parser gives neither.
+            transform, scale = torch.eye(4)[:3], self.config.scale_factor
+        return points_in_the_run(positions, colors, transform, scale) if len(positions) else {}
+
+
+class _Blender(_PointsOfPly, Blender): ...
+
+
+class _ScanNet(_PointsOfPly, ScanNet):
+    def _load_3D_points(self, path: Path, *settings: Any) -> dict[str, Tensor]:
+        return super()._load_3D_points(path, *settings) if path.is_file() else {}  # By default there is none.
+
+
+class TransformsParser(_PointsOfPly, Nerfstudio):
+    """nerfstudio's parser of transforms.json, which asks whether to make a PLY.
 
     Where the file fixes the frame (`coordinates.FRAME_KEYS`), this parser moves cameras and points there.
     """
 
     def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
-        model = self.config.data / COLMAP_FOLDERS[0]
+        path = self.config.data if self.config.data.suffix == ".json" else self.config.data / "transforms.json"
+        model = path.parent / COLMAP_FOLDERS[0]
         if model.exists():
             self.prompted_user, self.create_pc = True, False  # The answer no; the points are read below.
         outputs = super()._generate_dataparser_outputs(split)
-        path = self.config.data if self.config.data.suffix == ".json" else self.config.data / "transforms.json"
         _move_to_fixed_frame(outputs, read_json(path), path)
         source = colmap.points_file(model)
         if self.config.load_3D_points and "points3D_xyz" not in outputs.metadata and source is not None:
             points = colmap.read_points(source)
             outputs.metadata |= points_in_the_run(*points, outputs.dataparser_transform, outputs.dataparser_scale)
         return outputs
-
-    def _load_3D_points(
-        self, ply_file_path: Path, transform_matrix: Tensor, scale_factor: float
-    ) -> dict[str, Tensor] | None:
-        positions, colors = ply.read_points(ply_file_path)
-        return points_in_the_run(positions, colors, transform_matrix, scale_factor) if len(positions) else None
 
 
 class ColmapParser(ColmapDataParser):
@@ -59,7 +75,7 @@ class ColmapParser(ColmapDataParser):
         return described
 
 
-OWN: dict[type, type] = {Nerfstudio: TransformsParser, ColmapDataParser: ColmapParser}
+OWN: dict[type, type] = {own.__bases__[-1]: own for own in (_Blender, ColmapParser, _ScanNet, TransformsParser)}
 """This package's parser in the place of each of nerfstudio's."""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import torch
 import yaml
 from torch import Tensor
 
+from sadgs_ns.data import colmap
 from sadgs_ns.data.coordinates import TRANSFORMS_NAME, Similarity, from_data
 from sadgs_ns.errors import InputError, reason
 
@@ -49,52 +51,56 @@ def _plain(loader: _PlainLoader, kind: str, node: yaml.Node) -> Any:
 _PlainLoader.add_multi_constructor("tag:yaml.org,2002:python/", _plain)
 
 
-def _noted(run: Path) -> tuple[Path, dict[str, Any]]:
-    """Return the capture's folder and the parser's settings of a run's `config.yml`, or raise InputError."""
+def find_capture(run: Path) -> tuple[Path, dict[str, Any]]:
+    """Return the capture's folder and its parser's settings in a run's `config.yml`, or raise InputError."""
     path = run / "config.yml"
     try:
         manager = yaml.load(path.read_bytes(), Loader=_PlainLoader)["pipeline"]["datamanager"]
         parser = manager["dataparser"]
-        data = Path(manager.get("data") or parser["data"])
+        return Path(manager.get("data") or parser["data"]), parser
     except (OSError, yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
         what = type(error).__name__ if isinstance(error, KeyError) else reason(error)
         raise InputError(f"{path} does not tell where the capture is ({what}): give its folder with --data.") from error
-    return data, parser
 
 
-def find_capture(run: Path) -> Path:
-    """Return the capture's folder that a run's `config.yml` names; raise InputError if it names none that exists."""
-    data, _ = _noted(run)
-    if not data.exists():
-        raise InputError(f"{data}, on which {run} was trained, is not there: give the capture's folder with --data.")
-    return data
-
-
-def _parser(run: Path, data: Path) -> Any:
-    """Return the configuration of the parser with which a run read its capture, or of the one that fits the folder."""
+def _parser(settings: Mapping[str, Any], data: Path) -> Any:
+    """Return a parser with settings as `find_capture` returns them, or where they name none, the one that fits."""
     # nerfstudio takes ten seconds to import, which `--help` and wrong arguments need not wait for.
     from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
+    from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser
 
     from sadgs_ns.data.automatic import PARSERS, AutomaticDataParserConfig, choose_parser
+    from sadgs_ns.data.checks.colmap import automatic_factor
 
-    try:
-        _, noted = _noted(run)
-    except InputError:
-        noted = {}
     known = {f"{type(parser).__module__}.{type(parser).__qualname__}": parser for parser in PARSERS.values()}
-    parser = copy.deepcopy(known.get(noted.get(_CLASS, ""), AutomaticDataParserConfig()))
+    parser: Any = copy.deepcopy(known.get(settings.get(_CLASS, ""), AutomaticDataParserConfig()))
     for field in fields(parser):
-        if field.name in noted and not field.name.startswith("_"):
-            setattr(parser, field.name, noted[field.name])
+        if field.name in settings and not field.name.startswith("_"):
+            setattr(parser, field.name, settings[field.name])
     parser.data = data
-    config = FullImageDatamanagerConfig(data=data, dataparser=parser)  # type: ignore[arg-type]
+    config = FullImageDatamanagerConfig(data=data, dataparser=parser)
     choose_parser(config)
     parser = config.dataparser
     # Points are not needed. nerfstudio reads some with open3d, which a machine may lack, or asks whether to make a PLY.
     for name, value in (("load_3D_points", False), ("ply_path", None)):
         if hasattr(parser, name):
             setattr(parser, name, value)
-    return parser
+    made = parser.setup()
+    if isinstance(made, ColmapDataParser):  # It asks whether to make smaller images, which are not needed either.
+        first = data / parser.images_path / colmap.image_names(data / parser.colmap_path)[0]
+        made._downscale_factor = parser.downscale_factor or automatic_factor(first)
+    return made
+
+
+def _parse(settings: Mapping[str, Any], data: Path, split: str, as_fits: bool) -> Any:
+    """Parse a split with settings for `_parser`, or where that fails as fits the folder, if it has another layout."""
+    try:
+        return _parser(settings, data).get_dataparser_outputs(split=split)
+    except Exception:
+        fitting = _parser({}, data) if as_fits and settings else None
+        if fitting is None or settings.get(_CLASS, "").endswith(f".{type(fitting.config).__qualname__}"):
+            raise  # The folder may hold another COLMAP model than the run's, whose frame is another.
+        return fitting.get_dataparser_outputs(split=split)
 
 
 def read_cameras(run: Path, data: Path | None = None, split: str = "train") -> RunCameras:
@@ -103,13 +109,21 @@ def read_cameras(run: Path, data: Path | None = None, split: str = "train") -> R
     `data` is that folder; None is where the run's `config.yml` says it was. `split` is "train", or "test" for the views
     that are held out. InputError is raised if the capture cannot be read, or the run does not tell how it was moved.
     """
-    data = find_capture(run) if data is None else data
     try:
-        outputs = _parser(run, data).setup().get_dataparser_outputs(split=split)
+        found, settings = find_capture(run)
+    except InputError:
+        if data is None:
+            raise
+        found, settings = data, {}
+    if data is None and not found.exists():
+        raise InputError(f"{found}, on which {run} was trained, is not there: give the capture's folder with --data.")
+    found = data or found
+    try:
+        outputs = _parse(settings, found, split, as_fits=data is not None)
     except InputError:
         raise
     except Exception as error:  # The parsers' errors are of every kind.
-        raise InputError(f"{data} cannot be read as a capture ({reason(error)}): give another with --data.") from error
+        raise InputError(f"{found} cannot be read as a capture ({reason(error)}): give another with --data.") from error
     cameras, poses = outputs.cameras, outputs.cameras.camera_to_worlds.double().numpy()
     if (run / TRANSFORMS_NAME).is_file():  # The run's own options may have moved the capture otherwise.
         transform = outputs.dataparser_scale * outputs.dataparser_transform.double().numpy()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import sys
@@ -341,6 +342,54 @@ def test_the_cameras_are_read_as_the_run_read_them(tmp_path: Path):
 
 
 @pytest.mark.hard_case(
+    "a run on another folder of images, on smaller ones that are gone, or with other options of its parser; a capture "
+    "that has moved since",
+    "the run's cameras, without a question",
+)
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"images_path": Path("photos"), "eval_mode": "fraction", "train_split_fraction": 0.5},
+        {"downscale_factor": 2, "orientation_method": "none", "center_method": "none"},
+        {"downscale_factor": 2, "downscale_rounding_mode": "ceil", "scale_factor": 3.0, "auto_scale_poses": False},
+    ],
+)
+def test_the_cameras_of_a_moved_capture_are_the_run_s(options: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    write_scene(tmp_path / "scene", WIDTH + 1, HEIGHT, VIEWS, points=300)
+    parser = dataclasses.replace(parser_of(tmp_path / "scene"), **options)
+    (tmp_path / "scene/images").rename(tmp_path / "scene" / parser.images_path)
+    (tmp_path / "scene" / f"{parser.images_path}_2").mkdir()
+    expected = parser.setup().get_dataparser_outputs("train")
+    write_config(tmp_path / "run", parser)
+    (tmp_path / "scene" / f"{parser.images_path}_2").rmdir()
+    (tmp_path / "scene").rename(tmp_path / "moved")
+    monkeypatch.setattr("rich.prompt.Confirm.ask", None)
+    found = read_cameras(tmp_path / "run", tmp_path / "moved")
+    np.testing.assert_array_equal(found.camera_to_worlds, expected.cameras.camera_to_worlds)
+    np.testing.assert_array_equal(found.Ks, expected.cameras.get_intrinsics_matrices())
+    assert [path.name for path in found.photos] == [path.name for path in expected.image_filenames]
+
+
+@pytest.mark.hard_case(
+    "a run on a transforms.json of another name, its folder with --data, or a copy of the capture in another layout",
+    "the run's cameras where its parser can read the folder, else those of the parser that can",
+)
+def test_data_may_be_a_copy_of_another_layout(tmp_path: Path):
+    parser = nerfstudio_data(tmp_path / "data")
+    parser.data = (tmp_path / "data/transforms.json").rename(tmp_path / "data/other.json")
+    parser.eval_mode, parser.eval_interval = "interval", 3
+    write_config(tmp_path / "run", parser)
+    expected = parser.setup().get_dataparser_outputs("train").cameras.camera_to_worlds
+    np.testing.assert_array_equal(read_cameras(tmp_path / "run").camera_to_worlds, expected)
+    with pytest.raises(InputError, match=r"data cannot be read as a capture \(.*: give another with --data\.$"):
+        read_cameras(tmp_path / "run", tmp_path / "data")
+    parser.data.rename(tmp_path / "data/transforms.json")
+    np.testing.assert_array_equal(read_cameras(tmp_path / "run", tmp_path / "data").camera_to_worlds, expected)
+    write_scene(tmp_path / "copy", WIDTH, HEIGHT, VIEWS, points=300)
+    assert len(read_cameras(tmp_path / "run", tmp_path / "copy").photos) == VIEWS - len(range(0, VIEWS, 8))
+
+
+@pytest.mark.hard_case(
     "a page or cleaning of a capture with transforms.json, without libusb-1.0 or without a PLY of its points",
     "the cameras are read without the points: open3d is not imported, nothing is asked and nothing is written",
 )
@@ -383,10 +432,10 @@ pipeline: !!python/object:c.Pipeline
 """
     parts = ", ".join(f"'{part}'" for part in tmp_path.parts)
     (tmp_path / "config.yml").write_text(config.format(parts))
-    assert find_capture(tmp_path) == tmp_path
+    assert find_capture(tmp_path)[0] == tmp_path
     (tmp_path / "config.yml").write_text(config.format("gone"))
     with pytest.raises(InputError, match=r"^gone, on which .* was trained, is not there: give the .* with --data\.$"):
-        find_capture(tmp_path)
+        read_cameras(tmp_path)
     for broken in ("a: [", "a: 1", "!!python/object/apply:os.abort []"):
         (tmp_path / "config.yml").write_text(broken)
         with pytest.raises(

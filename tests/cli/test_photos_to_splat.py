@@ -42,6 +42,15 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
+def without_libusb(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have open3d fail in all processes as it does where a system library is missing."""
+    folder = tmp_path_factory.mktemp("modules")
+    (folder / "open3d.py").write_text("raise OSError('libusb-1.0.so.0: cannot open shared object file')")
+    monkeypatch.delitem(sys.modules, "open3d", raising=False)
+    monkeypatch.syspath_prepend(folder)
+
+
+@pytest.fixture
 def stop(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     """Have the command get a SIGINT once a stage's line says what a pattern finds."""
     update = StatusLine.update
@@ -61,6 +70,14 @@ def stop(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     return stop_at
 
 
+def make_a_page_without_network(npx: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Put a program in the place of Node.js's that makes a page without a viewer."""
+    page = '<script type="application/json" id="sse-bootstrap">{"settings": {}}</script>'
+    npx.write_text(f"#!/bin/sh\nfor file; do :; done\necho '{page}' > \"$file\"\n")
+    npx.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{npx.parent}:{os.environ['PATH']}")
+
+
 def lines_of(printed: str) -> dict[str, str]:
     """The last of each stage's lines, without its time, which must be there."""
     found = re.findall(r"^(cameras|training|export|in all) +(?:\d+:)?\d+:\d\d(?:  (.*))?$", printed, re.MULTILINE)
@@ -78,12 +95,18 @@ def times_of_results(folder: Path) -> dict[Path, int]:
     "the stage saves; the same command goes on, and does nothing twice",
 )
 @pytest.mark.hard_case("the reader of the output of `sadgs` ends", "all stages run; it prints where errors go")
+@pytest.mark.hard_case(
+    "`sadgs photos --formats ply,html` without libusb-1.0, its folder renamed before the page is made",
+    "the page is made of the cameras where they are now",
+)
+@pytest.mark.usefixtures("without_libusb")
 def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothing(
     photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], stop
 ):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    command = [str(photos), "--formats", "ply", "--max-size", "120", *TRAINING]
+    make_a_page_without_network(tmp_path / "npx", monkeypatch)
+    command = [str(photos), "--formats", "ply,html", "--max-size", "120", *TRAINING]
     folder = tmp_path / "my room-splat"
 
     stop("^matches")
@@ -114,10 +137,12 @@ def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothin
     assert f"Resuming after step {int(checkpoint.stem[5:])} of {checkpoint}" in resumed
 
     stop("nothing")
+    folder = folder.rename(tmp_path / "renamed")
+    command = ["--output", "renamed", *command]
     assert main(command) == 0
     lines = lines_of(capsys.readouterr().out)
-    assert lines["training"].endswith(" Gaussians; done before") and lines["export"].endswith(" MB")
-    assert lines["in all"] == "The splat is my room-splat/splat.ply."
+    assert lines["training"].endswith(" Gaussians; done before") and lines["export"].startswith("renamed/splat.html")
+    assert lines["in all"] == f"Open {(folder / 'splat.html').as_uri()}"
     assert len(read_points(folder / "splat.ply")[0]) > 0
 
     before = times_of_results(folder)
@@ -136,7 +161,7 @@ def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothin
         (["--effort", "2"], "--effort was 1.0, is 2.0"),
         (["--max-size", "160"], "--max-size was 120, is 160"),
     ):
-        assert main([*command[:5], *changed, *TRAINING]) == 2
+        assert main([*command[:7], *changed, *TRAINING]) == 2
         assert f"({told}); give another --output or delete it." in capsys.readouterr().err
 
 
@@ -257,9 +282,11 @@ def test_few_registered_photos_end_it_until_it_shall_go_on_anyway(
 
 
 @pytest.mark.hard_case(
-    "`sadgs` with photos removed, other settings or options, another folder, no Node.js for a page",
+    "`sadgs` with photos removed, other settings or options, another folder, no Node.js for a page or no "
+    "libusb-1.0 for a mesh",
     "one sentence before any work",
 )
+@pytest.mark.usefixtures("without_libusb")
 def test_wrong_input_is_told_in_a_sentence_before_any_work(
     photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -286,6 +313,10 @@ def test_wrong_input_is_told_in_a_sentence_before_any_work(
         (
             [source, "--formats", "ply,splat"],
             "--formats knows ply, compressed.ply, spz, sog, glb, html, mesh.ply, and not 'splat'",
+        ),
+        (
+            [source, "--formats", "ply,mesh.ply"],
+            "A mesh is made by open3d, which cannot be imported (libusb-1.0.so.0: c",
         ),
         ([source, "--effort", "0"], "--effort must be more than 0"),
         ([source, "--max-size", "20"], "--max-size must be at least 64 px, or 0 to keep the photos' size"),

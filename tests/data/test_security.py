@@ -2,7 +2,7 @@
 
 nerfstudio's `config.yml` executes code (it is read with `yaml.Loader`). Our presets (plain Python of the package),
 protocols (`yaml.safe_load`), checkpoints (`torch.load(weights_only=True)`), `transforms.json` and COLMAP models do not.
-Pillow and plyfile parse images and PLY files (open3d if `blender-data` or ScanNet name one).
+Pillow and plyfile parse images and PLY files.
 """
 
 from __future__ import annotations

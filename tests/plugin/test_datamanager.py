@@ -17,6 +17,7 @@ import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
+from nerfstudio.data.dataparsers.scannet_dataparser import ScanNetDataParserConfig
 from nerfstudio.data.utils import colmap_parsing_utils
 from nerfstudio.process_data.colmap_utils import create_ply_from_colmap
 from plyfile import PlyData, PlyElement
@@ -255,6 +256,31 @@ def test_points_of_a_ply_file_are_read_once_and_without_open3d(
     assert outputs.metadata["points3D_rgb"].tolist() == COLORS.tolist()
 
 
+@pytest.mark.hard_case(
+    "points of a PLY for `blender-data --ply-path` or `scannet-data`, without libusb-1.0", "read without open3d"
+)
+def test_other_parsers_read_a_ply_without_open3d(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    ply_scene(tmp_path / "ply", colors=COLORS.astype(np.uint8))
+    parser = blender_data(tmp_path / "blender", "white")
+    parser.ply_path, parser.scale_factor = tmp_path / "ply/points.ply", 3.0
+    metadata = load(parser).train_dataset.metadata
+    np.testing.assert_allclose(metadata["points3D_xyz"], 3 * POSITIONS)
+    assert metadata["points3D_rgb"].tolist() == COLORS.tolist()
+    folder = tmp_path / "scannet"
+    for i, image in enumerate(sorted((tmp_path / "ply/images").iterdir())):
+        for kind in ("color", "depth", "pose"):
+            (folder / kind).mkdir(parents=True, exist_ok=True)
+            shutil.copy(image, folder / f"{kind}/{i}.png")
+        (folder / f"pose/{i}.png").unlink()
+        np.savetxt(folder / f"pose/{i}.txt", np.eye(4) + i * np.eye(4, k=3))
+    (folder / "intrinsic").mkdir()
+    np.savetxt(folder / "intrinsic/intrinsic_color.txt", np.diag([30.0, 30.0, 1.0, 1.0]))
+    for path, count in ((tmp_path / "ply/points.ply", 3), (tmp_path / "none.ply", 0)):
+        scannet = ScanNetDataParserConfig(data=folder, ply_file_path=path)
+        assert len(load(scannet).train_dataset.metadata.get("points3D_xyz", ())) == count
+
+
 def test_points_of_a_ply_file_are_nerfstudio_s(tmp_path: Path, open3d: None):
     parser = ply_scene(tmp_path, colors=COLORS.astype(np.uint8))
     expected = parser.setup().get_dataparser_outputs("train").metadata
@@ -284,11 +310,58 @@ def test_colours_of_a_ply_file(colors: np.ndarray | None, expected: list, tmp_pa
     assert metadata["points3D_rgb"].dtype == torch.uint8 and metadata["points3D_rgb"].tolist() == expected
 
 
-@pytest.mark.hard_case("a PLY of points whose colours are named r, g, b, or Red, or diffuse_red", "read")
-@pytest.mark.parametrize("names", ["rgb", ("Red", "Green", "Blue"), ("diffuse_red", "diffuse_green", "diffuse_blue")])
+@pytest.mark.hard_case(
+    "a PLY of points whose colours are named r, g, b, or Red, or diffuse_red, or scalar_R, as CloudCompare writes",
+    "read",
+)
+@pytest.mark.parametrize(
+    "names",
+    [
+        "rgb",
+        ("Red", "Green", "Blue"),
+        ("diffuse_red", "diffuse_green", "diffuse_blue"),
+        *(
+            [prefix + name for name in names]
+            for prefix, names in (("scalar_", "RGB"), ("vertex_", ("red", "green", "blue")), ("color_", "rgb"))
+        ),
+    ],
+)
 def test_colours_are_known_by_the_names_in_use(names: Sequence[str], tmp_path: Path):
-    ply_scene(tmp_path, colors=COLORS.astype(np.uint8), names=names)
+    ply_scene(tmp_path, colors=COLORS.astype(np.float32), names=names)
     assert ply.read_points(tmp_path / "points.ply")[1].tolist() == COLORS.tolist()
+
+
+@pytest.mark.hard_case(
+    "a PLY of points with doubles, alpha, lists, other elements before and after, in big endian or text", "read"
+)
+@pytest.mark.parametrize("order", ["<", ">", "text"])
+@pytest.mark.parametrize("kind", ["<u2", "<i2", "<i4", "<f8"])
+def test_points_are_found_among_what_else_a_ply_holds(kind: str, order: Any, tmp_path: Path):
+    fields = [(axis, "<f8") for axis in "xyz"] + [(name, kind) for name in ("red", "green", "blue")]
+    # plyfile writes big-endian elements with lists wrongly.
+    fields += [("alpha", "u1")] if order == ">" else [("track", "O")]
+    other = (lambda i: i) if order == ">" else (lambda i: np.arange(i + 1))
+    rows = [(*place, *color, other(i)) for i, (place, color) in enumerate(zip(POSITIONS, COLORS, strict=True))]
+    vertices = np.array(rows, fields)
+    faces = np.array([([0, 1, 2],)], [("vertex_indices", "<i4", (3,))])
+    before, after = (PlyElement.describe(faces, name) for name in ("face", "edge"))
+    points = PlyElement.describe(vertices, "vertex", len_types={"track": "u1"}, val_types={"track": "i4"})
+    whole = PlyData([before, points, after], text=order == "text", byte_order="<" if order == "text" else order)
+    whole.write(str(tmp_path / "a.ply"))
+    positions, colors = ply.read_points(tmp_path / "a.ply")
+    assert positions.tolist() == POSITIONS.tolist() and colors.tolist() == COLORS.tolist()
+
+
+@pytest.mark.hard_case("a PLY of PCL, which packs a colour into one number, rgb or rgba", "read")
+@pytest.mark.parametrize("name", ["rgb", "rgba"])
+def test_packed_colours_are_read(name: str, tmp_path: Path):
+    bits = ((COLORS[:, 0] << 16) | (COLORS[:, 1] << 8) | COLORS[:, 2]).astype(np.uint32)
+    values = bits.view(np.float32) if name == "rgb" else bits | np.uint32(255 << 24)
+    vertices = np.array(
+        list(zip(*POSITIONS.T, values, strict=True)), [(axis, "<f4") for axis in "xyz"] + [(name, values.dtype)]
+    )
+    PlyData([PlyElement.describe(vertices, "vertex")]).write(str(tmp_path / "a.ply"))
+    assert ply.read_points(tmp_path / "a.ply")[1].tolist() == COLORS.tolist()
 
 
 @pytest.mark.hard_case("a PLY of points without colours", "trains from grey points; the check notes it")

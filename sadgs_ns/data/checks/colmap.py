@@ -105,12 +105,12 @@ def _words(data: Path, options: ParserOptions) -> str:
     words, names = ["--colmap-path", str(options.colmap_path)], colmap.image_names(data / options.colmap_path)
     if options.images_path != ParserOptions.images_path:
         words += ["--images-path", str(options.images_path)]
-    if options.downscale_factor not in (None, _automatic_factor(data / options.images_path / [*names, ""][0])):
+    if options.downscale_factor not in (None, automatic_factor(data / options.images_path / [*names, ""][0])):
         words += ["--downscale-factor", str(options.downscale_factor)]
     return shlex.join(words)
 
 
-def _automatic_factor(image: Path) -> int:
+def automatic_factor(image: Path) -> int:
     """Return the factor by which nerfstudio's parser scales images down where it is named without one."""
     factor, size = 1, image_size(image)
     while max(size) / factor > MAX_AUTO_RESOLUTION:
@@ -147,7 +147,7 @@ def _check_factor(images_folder: Path, names: Sequence[str], options: ParserOpti
 
     If they are not, this raises InputError where nobody can answer nerfstudio's question whether to make them.
     """
-    factor = options.downscale_factor or _automatic_factor(images_folder / names[0])
+    factor = options.downscale_factor or automatic_factor(images_folder / names[0])
     smaller = smaller_folder(images_folder, factor)
     if factor == 1 or all((smaller / name).parent.exists() for name in names):
         return factor
