@@ -154,11 +154,7 @@ def export(given: Export) -> int:
 
 
 def _check(given: Export) -> None:
-    """Check whether the options suit the format.
-
-    Raises:
-        InputError: If not.
-    """
+    """Check whether the options suit the format; raises InputError if not."""
     suffix, voxel_size = format_of(given.output), given.voxel_size
     if suffix == ".html" and given.frame != "nerfstudio":
         raise InputError("--frame colmap is for files that other programs read: leave it out for a page.")

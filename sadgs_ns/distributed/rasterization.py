@@ -44,7 +44,8 @@ def rasterize(
 ) -> tuple[list[RenderedBand], Tensor, dict[str, Any]]:
     """Render the Gaussians of all processes into V pinhole cameras, of which each process composites its share.
 
-    Every process must call this, and `backward` of something to which the anchor was added, in the same order.
+    Every process must call this, and `backward` of something to which the anchor was added, in the same order. Raises
+    InputError as `render.rasterization.rasterize`.
 
     Args:
         world: The processes, whose `sizes` are right.
@@ -57,9 +58,6 @@ def rasterize(
         The bands of this process; the anchor, a zero that must be added to the loss; and gsplat's `info` of this
         process's Gaussians in all views, whose `means2d` has `absgrad` and `grad2d` after `backward` where `absgrad`
         was asked for. In `info`, `num_pairs` and `num_pixels` are those of what this process composited.
-
-    Raises:
-        InputError: As `render.rasterization.rasterize`.
     """
     projected = project(
         means, quats, scales, opacities, colors, viewmats, Ks, width, height,

@@ -32,14 +32,11 @@ def _refuse_beyond(limit: int, size: int, what: str, remedy: str) -> None:
 
 
 def check_gaussians(num_views: int, num_gaussians: int) -> None:
-    """Refuse more Gaussians than one step can render.
+    """Refuse more Gaussians than one step can render; raises InputError if C or C · N is too large.
 
     Args:
         num_views: C
         num_gaussians: N
-
-    Raises:
-        InputError: If C or C · N is too large.
     """
     _refuse_beyond(MAX_BLOCKS, num_views, "The views of one step", "take fewer views at once")
     what = f"The Gaussians of all views of one step, {num_views:,} × {num_gaussians:,},"
@@ -47,15 +44,12 @@ def check_gaussians(num_views: int, num_gaussians: int) -> None:
 
 
 def check_pixels(num_views: int, height: int, width: int) -> None:
-    """Refuse more pixels than one step can render and compare.
+    """Refuse more pixels than one step can render and compare; raises InputError if C, H or C · H · W is too large.
 
     Args:
         num_views: C
         height: H in px.
         width: W in px.
-
-    Raises:
-        InputError: If C, H or C · H · W is too large.
     """
     _refuse_beyond(MAX_BLOCKS, num_views, "The views of one step", "take fewer views at once")
     _refuse_beyond(MAX_HEIGHT, height, "The rows of an image", "make the images smaller")
@@ -81,13 +75,10 @@ def check_batch(batch: int, channels: int, height: int, width: int) -> None:
 
 
 def check_pairs(num_pairs: int) -> None:
-    """Refuse tile lists that are too long.
+    """Refuse tile lists that are too long; raises InputError if they are too many.
 
     Args:
         num_pairs: Of a Gaussian and a tile that it reaches, in all views.
-
-    Raises:
-        InputError: If they are too many.
     """
     remedy = "take fewer views at once, smaller images, or fewer and smaller Gaussians"
     _refuse_beyond(MAX_PAIRS, num_pairs, "The pairs of a Gaussian and a tile of all views of one step", remedy)

@@ -319,7 +319,8 @@ class PendingTiles:
         Lists of a given length have one more row of tiles in each view, which lies below the image. The last tile of
         that row in the last view is given the places that are left, so that nobody draws them. If there are more pairs
         than places, it is given all of them, and the radii that the lists were made of are set to 0: then nothing is
-        drawn, no gradient flows and no statistic counts the views. All of this is decided on the device.
+        drawn, no gradient flows and no statistic counts the views. All of this is decided on the device. Raises
+        InputError if there are more pairs than 32 bits number.
 
         Args:
             capacity: Length of the lists, in [1, 2³¹), for which the host does not wait. With None it waits for the
@@ -328,9 +329,6 @@ class PendingTiles:
         Returns:
             Where each tile's list starts, int32 [C, tile rows (+ 1), tile columns]; and the indices in C · N that the
             lists hold, from front to back, int32 [number of pairs, or `capacity`].
-
-        Raises:
-            InputError: If there are more pairs than 32 bits number.
         """
         views, rows, columns = self.tile_counts
         if capacity is None:

@@ -46,7 +46,8 @@ def correct_colors(
     """Apply an affine map to the colours of the Gaussians that a rendering shows: M c + α b.
 
     The offset b counts as much as the Gaussians cover, as if each Gaussian's own colour had been changed. What nothing
-    covers stays black, and teaches the matrices nothing.
+    covers stays black, and teaches the matrices nothing. Raises InputError if the views have more pixels than the
+    Triton kernels can address (kernels/limits.py).
 
     Args:
         render: Renderings before a black background, not clamped. [C, H, W, 3]
@@ -55,9 +56,6 @@ def correct_colors(
 
     Returns:
         [C, H, W, 3]
-
-    Raises:
-        InputError: If the views have more pixels than the Triton kernels can address (kernels/limits.py).
     """
     if use_triton(render):
         from sadgs_ns.kernels.color_matrices import correct_colors as fused_correct_colors

@@ -50,15 +50,13 @@ def neighbour_scales(points: Tensor) -> Tensor:
     """The initial scale of each point, which is the mean distance to its 3 nearest neighbours (3DGS, splatfacto).
 
     Duplicates have distance 0; the scale is then a millionth of the cloud's extent, so that its logarithm is finite.
+    Raises ValueError if there is no point.
 
     Args:
         points: World units. [P, 3]
 
     Returns:
         World units, > 0. [P]
-
-    Raises:
-        ValueError: If there is no point.
     """
     if len(points) == 0:
         raise ValueError("There are no points to start from: give SfM points, or set pipeline.model.random-init True.")
@@ -93,7 +91,7 @@ def _far_outliers(positions: Tensor, share: float) -> Tensor:
 def starting_points(
     points: Tensor, colors: Tensor, *, faces: bool, opacity: float = POINT_OPACITY
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The points that training starts from, with the scale and opacity of each.
+    """The points that training starts from, with the scale and opacity of each; raises ValueError if there is no point.
 
     Args:
         points: World units. [P, 3]
@@ -103,9 +101,6 @@ def starting_points(
 
     Returns:
         Points in world units, [N, 3]; colours in [0, 1], [N, 3]; scales in world units, > 0, [N]; opacities, [N].
-
-    Raises:
-        ValueError: If there is no point.
     """
     scales, opacities = neighbour_scales(points), torch.full((len(points),), opacity)
     if not faces:

@@ -83,7 +83,7 @@ def photometric_part(
 ) -> tuple[Tensor, Tensor]:
     """What some rows of a view add to its `photometric_loss`: over rows that cover the view, these parts sum to it.
 
-    SSIM's windows belong to the rows in which they are centred.
+    SSIM's windows belong to the rows in which they are centred. Raises ValueError as `photometric_loss`.
 
     Args:
         predicted: Rendered rows, from `top` on. Unless the image's border is there, 5 more than `rows` on either side.
@@ -95,9 +95,6 @@ def photometric_part(
 
     Returns:
         The part of the loss, and that of the mean square error, without gradient; both are scalars.
-
-    Raises:
-        ValueError: As `photometric_loss`.
     """
     first, last = rows
     if last - first == height:

@@ -109,14 +109,11 @@ def windows(iterations: int, **given: int | None) -> Windows:
     runs of fewer than `RESETS_FROM` iterations. η is observed ten times in a part.
 
     Densification ends after at most 19/30 of the run (released code). Where that is before `refine_start_iter`, there
-    is none, and nothing that prepares it.
+    is none, and nothing that prepares it. Raises TypeError if another name is given.
 
     Args:
         iterations: Length of the run.
         **given: Fields of `Windows`; None derives one.
-
-    Raises:
-        TypeError: If another name is given.
     """
     part = max(round(iterations / _PARTS), 1)
     derived = {name: max(round(parts * part), 1) for name, parts in _WINDOWS.items()}

@@ -102,7 +102,8 @@ def depth_maps(
 ) -> list[DepthMap]:
     """Compute a depth map with confidence for each view of a capture.
 
-    Nothing is random. After the images are read, the host waits for the device only to choose neighbours.
+    Nothing is random. After the images are read, the host waits for the device only to choose neighbours. Raises
+    ValueError if an image or a mask has another shape or type, or their numbers differ.
 
     Args:
         images: Of all views, or a function that returns a view's. They may lie anywhere and differ in size. uint8, or
@@ -119,9 +120,6 @@ def depth_maps(
     Returns:
         A map for each view, whose longest side is at most WORKING_SIDE px. It is empty, with confidence 0, where a view
         has no usable neighbour.
-
-    Raises:
-        ValueError: If an image or a mask has another shape or type, or their numbers differ.
     """
     count, device = len(viewmats), torch.device(device)
     given = [len(Ks)] + ([] if callable(images) else [len(images)]) + ([] if masks is None else [len(masks)])

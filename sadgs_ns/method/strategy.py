@@ -142,13 +142,11 @@ class StructureAwareStrategy(Strategy):
         """State to pass to the other methods; its tensors are made at the first step.
 
         Each structure step appends its numbers of Gaussians to the list `structure_steps`. With a `CameraPaths` under
-        `camera_paths`, each densification step prunes the haze near these, until densification ends.
+        `camera_paths`, each densification step prunes the haze near these, until densification ends. Raises ValueError
+        as `check`.
 
         Args:
             scene_scale: Extent of the cameras in world units, as 3DGS defines it.
-
-        Raises:
-            ValueError: As `check`.
         """
         self.check()
         return {"scene_scale": scene_scale}

@@ -152,7 +152,7 @@ def multiscale_structure_tensor(
 
 
 def _normalised(images: Tensor, masks: Tensor | None, known_finite: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Check the images, and scale and centre their valid pixels.
+    """Check the images, and scale and centre their valid pixels; raises ValueError as `multiscale_structure_tensor`.
 
     Args:
         images: [B, H, W, C]
@@ -163,9 +163,6 @@ def _normalised(images: Tensor, masks: Tensor | None, known_finite: bool) -> tup
         The images in [−1, 1] around a mean of 0, 0 where masked [B, C, H, W]; 1 at valid pixels and 0 at masked ones
         [B, 1, H, W]; the largest absolute value, by which they were divided [B, 1, 1, 1]; and their contrast after
         that, the root of the mean squared distance from the mean colour [B, 1, 1, 1].
-
-    Raises:
-        ValueError: As `multiscale_structure_tensor`.
     """
     if images.dim() != 4 or not images.is_floating_point():
         raise ValueError(f"images must be floating point [B, H, W, C], got {images.dtype} {tuple(images.shape)}")

@@ -83,11 +83,9 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
     """A loader that checks the images' names and places, decodes them in more threads, or only when they are needed,
     and reads SfM points once, faster and without open3d.
 
-    The checks are here rather than in the pipeline, because `ns-render dataset` makes a datamanager of its own.
-
-    Raises:
-        InputError: If an image is too small; as `colmap.read_poses`, `ply.read_points`, `splits.check_names` and
-            `splits.check_paths`.
+    The checks are here rather than in the pipeline, because `ns-render dataset` makes a datamanager of its own. Raises
+    InputError if an image is too small; as `colmap.read_poses`, `ply.read_points`, `splits.check_names` and
+    `splits.check_paths`.
     """
 
     def __init__(self, config: FullImageDatamanagerConfig, *args: Any, **kwargs: Any) -> None:

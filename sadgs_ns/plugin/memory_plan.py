@@ -193,7 +193,7 @@ def fit_to_memory(
     """Lower `max_gaussians` to what the budget, or the device's free memory, holds; call before the first step.
 
     A cap under the present number of Gaussians adds none and takes none away. Without a budget, a `max_gaussians` that
-    is not the default stays as it is.
+    is not the default stays as it is. Raises ValueError if the budget leaves no room for Gaussians.
 
     Args:
         strategy: Its `max_gaussians` is lowered.
@@ -205,9 +205,6 @@ def fit_to_memory(
     Returns:
         A line for the user, and a warning if the first step will probably not fit; both None without CUDA, where
         nothing is changed.
-
-    Raises:
-        ValueError: If the budget leaves no room for Gaussians.
     """
     device, n = params["means"].device, len(params["means"])
     free, total = memory.available_bytes(device)

@@ -409,14 +409,12 @@ class SadgsPipeline(VanillaPipeline):
         """Check whether a checkpoint is of the data that training is about to go on with.
 
         Images may have been added or taken away since, if the others' poses stayed where they were. A warning is
-        printed where the cameras are the same and no image has its old name.
+        printed where the cameras are the same and no image has its old name. Raises InputError if more than half of the
+        cameras of either are where the other has none.
 
         Args:
             before: Names of the images that the checkpoint's run was trained on.
             positions_before: Centres of their cameras in world units. [C, 3]
-
-        Raises:
-            InputError: If more than half of the cameras of either are where the other has none.
         """
         dataset = self.datamanager.train_dataset
         now, positions = [path.name for path in dataset.image_filenames], _positions(dataset.cameras)

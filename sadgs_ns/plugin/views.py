@@ -64,7 +64,7 @@ class TrainingViews:
 
         Where a round ends inside the step, the next one begins with those of its views that the step does not have yet;
         the views that were passed over come first in the next step. No view is drawn twice, then, unless a round holds
-        fewer views than the step takes.
+        fewer views than the step takes. Raises InputError as `ImagesAhead.take`.
 
         Args:
             number: Views to draw, at least 1 and at most as many as there are.
@@ -73,9 +73,6 @@ class TrainingViews:
         Returns:
             Index and data of each view; the image is on the training device, and where images travel so is the mask.
             Where they travel, and there are several processes, views that only others composite come without data.
-
-        Raises:
-            InputError: As `ImagesAhead.take`.
         """
         datamanager, device, ahead = self.datamanager, self.model.device, self.ahead
         indices: list[int] = []

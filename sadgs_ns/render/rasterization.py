@@ -125,10 +125,8 @@ def project(
 ) -> Projected:
     """Do the first half of `rasterize`, whose arguments these are: project Gaussians and compute their colours.
 
-    Without our Triton kernels, that is the splatter's, on CUDA, too.
-
-    Raises:
-        InputError: If there are more Gaussians than the Triton kernels can address (kernels/limits.py).
+    Without our Triton kernels, that is the splatter's, on CUDA, too. Raises InputError if there are more Gaussians than
+    the Triton kernels can address (kernels/limits.py).
     """
     antialiased = rasterize_mode == "antialiased"
     if use_triton(means.device):

@@ -99,7 +99,8 @@ def rasterization(
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians into C pinhole cameras, as gsplat's `rasterization(..., packed=False)` does.
 
-    Differentiable with respect to all float arguments except `Ks`.
+    Differentiable with respect to all float arguments except `Ks`. Raises ValueError if `packed` is True, a mode is
+    unknown, or a shape does not match.
 
     Args:
         means: Centres in world space. [N, 3]
@@ -133,9 +134,6 @@ def rasterization(
         `render_colors` [C, height, width, X] with X = D, 1 or D + 1 by `render_mode`; `render_alphas`
         [C, height, width, 1] in [0, 1]; and gsplat's `info`. As in gsplat, rows of `info["means2d"]`,
         `info["conics"]` and `info["opacities"]` have no meaning where the radii are zero.
-
-    Raises:
-        ValueError: If `packed` is True, a mode is unknown, or a shape does not match.
     """
     C, N = viewmats.shape[0], means.shape[0]
     if packed:
