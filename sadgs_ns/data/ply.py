@@ -12,11 +12,8 @@ from numpy.typing import NDArray
 
 from sadgs_ns.errors import InputError, reason
 
-COLORS = tuple(
-    tuple(prefix + name for name in names)
-    for prefix in ("", "diffuse_", "scalar_", "vertex_", "color_")
-    for names in (("red", "green", "blue"), ("r", "g", "b"))
-)
+_PREFIXES = ("", "diffuse_", "scalar_", "vertex_", "color_")
+COLORS = [[prefix + name for name in names] for prefix in _PREFIXES for names in (("red", "green", "blue"), "rgb")]
 """Names that programs give to colours, in small letters."""
 GREY = 127
 """Colour that is given to points without one, in 0 … 255."""

@@ -22,8 +22,6 @@ MOST_FEATURES = 8192
 """Features of a photo, of which the most contrasted are taken; COLMAP's own limit."""
 _CONTRAST = 0.02
 """Least contrast of a feature, COLMAP's: a photo in [0, 1] needs a third of it in a scale of three per octave."""
-_LEAST_FOCAL_LENGTH, _GUESSED_FOCAL_LENGTH, _LARGEST_FOCAL_LENGTH = 0.1, 1.2, 10.0
-"""Focal lengths in lengths of the photo's longer side, COLMAP's."""
 _BYTES_PER_PIXEL = 240
 """Memory that OpenCV takes for features, as measured; it doubles the photo's size first."""
 
@@ -47,8 +45,8 @@ def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, rigs:
     with pycolmap.Database.open(database) as opened:
         for camera in opened.read_all_cameras():  # EXIF may hold nonsense, which COLMAP takes for what is known.
             side = max(camera.width, camera.height)
-            if not _LEAST_FOCAL_LENGTH < camera.mean_focal_length() / side < _LARGEST_FOCAL_LENGTH:
-                camera.focal_length_x = camera.focal_length_y = _GUESSED_FOCAL_LENGTH * side
+            if not 0.1 < camera.mean_focal_length() / side < 10:  # These limits and the guess are COLMAP's own.
+                camera.focal_length_x = camera.focal_length_y = 1.2 * side
                 camera.has_prior_focal_length = False
                 opened.update_camera(camera)
         for views in (views for views in rigs if views[0] not in known):
