@@ -44,7 +44,7 @@ from sadgs_ns.cli.process import stages as colmap_stages
 from sadgs_ns.cli.process.colmap import run_colmap
 from sadgs_ns.cli.process.command import Process, main, photos_added, process
 from sadgs_ns.cli.process.folder import look_into
-from sadgs_ns.cli.process.photos import Photo, find_photos, photos_by_camera, read_photos, write_masks
+from sadgs_ns.cli.process.photos import Photo, find_source, photos_by_camera, read_photos, write_masks
 from sadgs_ns.cli.process.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching, expected_work
 from sadgs_ns.cli.process.stages import check_written, fetch_vocabulary, match, sequential_pairs
 from sadgs_ns.cli.process.video import sharpest_frames, video_frames
@@ -376,10 +376,10 @@ def test_all_photos_that_are_not_whole_are_named(tmp_path: Path, capsys):
 def test_hidden_files_and_folders_named_as_photos_are_no_photos(tmp_path: Path):
     black(tmp_path, "a.png", "b.png", "c.png", "._a.png", ".thumbnails/a.png", "folder.png/d.png")
     (tmp_path / "around").symlink_to(tmp_path)
-    assert find_photos(tmp_path, tmp_path / "out") == ["a.png", "b.png", "c.png", "folder.png/d.png"]
+    assert find_source(tmp_path, tmp_path / "out") == (["a.png", "b.png", "c.png", "folder.png/d.png"], False)
     black(tmp_path, "line\nbreak.png")
     with pytest.raises(InputError, match=r"unprintable characters in its name, 'line.nbreak.png': rename it"):
-        find_photos(tmp_path, tmp_path / "out")
+        find_source(tmp_path, tmp_path / "out")
 
 
 @pytest.mark.hard_case("the output folder is a loop of links", "one sentence")
@@ -561,18 +561,16 @@ def test_what_is_no_photo_becomes_none(tmp_path: Path):
     black(tmp_path / "earlier", "images/c.png")
     (tmp_path / "earlier" / "work").mkdir()
     (tmp_path / "earlier" / "work" / "settings.json").write_text("{}")
-    found = look_into(tmp_path, tmp_path / "out")
-    assert found.photos == sorted(files) and found.masks == {"images/a.jpg": "images/a_mask.png"}
-    assert found.told == [
+    found, masks, told = look_into(tmp_path, tmp_path / "out")
+    assert found == sorted(files) and masks == {"images/a.jpg": "images/a_mask.png"}
+    assert told == [
         "Left out as thumbnails or trash: 3, such as #recycle/old.jpg.",
         "Left out as copies of others: 5, such as images/a (1).jpg.",
         "Left out as masks of no photo: 1, such as masks/none.png.",
     ]
     (tmp_path / "out" / "work").mkdir(parents=True)
     (tmp_path / "out" / "work" / "settings.json").write_text(json.dumps({"photos": [*left, "images/b.jpg"]}))
-    assert look_into(tmp_path, tmp_path / "out").photos == sorted(
-        {*left, *files} - {"images/a.jpg", "images/IMG_1.jpg"}
-    )
+    assert look_into(tmp_path, tmp_path / "out")[0] == sorted({*left, *files} - {"images/a.jpg", "images/IMG_1.jpg"})
 
 
 @pytest.mark.hard_case("a mask of a panorama", "is cut into masks of its views")

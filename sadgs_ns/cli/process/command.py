@@ -54,7 +54,7 @@ _SECONDS_PER_LINE = 1.0
 """Least time between two lines of a stage's progress in a file."""
 _KEPT_KEYS = (*FRAME_KEYS, "train_filenames", "val_filenames", "test_filenames")
 """Keys that a scene's `transforms.json` keeps when photos are added."""
-_UNFINISHED = ("frames.partial", "photos.partial", "alpha.partial", "model.partial", "models", "undistorted")
+_UNFINISHED = ("frames.partial", "photos.partial", "model.partial", "models", "undistorted")
 """Folders in `work` that are made anew by each run that needs them."""
 
 
@@ -184,7 +184,7 @@ def process(given: Process) -> Summary:
             with Progress(*columns, disable=not sys.stdout.isatty()) as progress:
                 summary = _make(scene, _reporter(progress))
     print(summary)
-    for told in look_into(given.source, given.out).told if given.source.is_dir() else ():
+    for told in look_into(given.source, given.out)[2] if given.source.is_dir() else ():
         _say("aside", told, told=told)
     if not scene.is_video and (videos := find_videos(given.source)):
         print(f"Its videos ({len(videos)}, such as {videos[0]}) are not used: give them in a folder of their own.")
@@ -222,7 +222,7 @@ def _make(scene: _Scene, report: Report) -> Summary:
             alone.enter_context(scene.alone())  # Only now, when the photos are known to be readable.
         _tell_work(scene, photos, matching, notice)
         if scene.added:  # An interrupted run may have made these without some of them.
-            for path in (scene.model, work / "photos", work / "alpha"):
+            for path in (scene.model, work / "photos"):
                 shutil.rmtree(path, ignore_errors=True)
         rigs = [[view.name for view in photo.views] for photo in photos if photo.is_panorama]
         folder, photos = _convert(scene, folder, photos)
@@ -261,7 +261,7 @@ def _convert(scene: _Scene, folder: Path, stored: Sequence[Photo]) -> tuple[Path
     """Convert photos as `convert_photos`, and write their masks, if they or the scene have any, and opacities."""
     source, out, work = scene.given.source, scene.given.out, scene.work
     converted, photos = convert_photos(folder, stored, work / "photos")
-    masks = {} if scene.is_video else look_into(source, out).masks
+    masks = {} if scene.is_video else look_into(source, out)[1]
     has_masks = (out / "masks").exists() if scene.added else bool(masks)
     shutil.rmtree(work / "masks", ignore_errors=True)
     if has_masks:

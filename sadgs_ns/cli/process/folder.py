@@ -8,8 +8,7 @@ import math
 import os
 import re
 from collections import defaultdict
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,23 +29,16 @@ _SERVICE = re.compile(r"(.*/)?(@eadir|@__thumb|[@#$]recycle(\.bin)?|__macosx|los
 _MASK = re.compile(r"(.*/)?masks?(_\d+)?/.*|.*[ ._-]mask\.\w+", re.IGNORECASE)
 _VARIANT = re.compile(r"(?<=^img_)e(?=\d)|[ ._-]*(mask|edited|copy|thumb|small|\(\d+\))$")
 """What programs add to a photo's name for its mask or a copy; an iPhone's IMG_E1234 is the edited IMG_1234."""
-_SAME = 0.99
-"""Correlation above which two images of 16 × 16 px show the same; smaller copies of photos reach .999."""
 
 
-@dataclass(frozen=True)
-class Found:
-    """Photos of a folder and their masks, by names relative to it, and sentences on other images."""
-
-    photos: list[str]
-    masks: dict[str, str]
-    told: list[str]
-
-
-def look_into(source: Path, out: Path) -> Found:
-    """Find the photos of a folder, and their masks, for a scene; photos that it was begun with stay photos.
+def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[str]]:
+    """Find the photos of a folder for a scene; photos that it was begun with stay photos.
 
     Hidden files, as macOS writes them, and those of scenes that are made in the same folder are left out.
+
+    Returns:
+        The sorted photos, the masks of those that have one, both by names relative to the folder, and sentences on what
+        other images there are.
     """
     folder, scene = Path(os.path.realpath(source)), Path(os.path.realpath(out))
     scenes = {scene, *(path.parents[1] for path in folder.glob("*/**/work/settings.json"))}
@@ -73,19 +65,16 @@ def look_into(source: Path, out: Path) -> Found:
             masks.setdefault(owner, name)
     left = ((what, names) for what, names in found.items() if names and what not in ("photos", "masks"))
     told = [f"Left out as {what}: {len(names)}, such as {names[0]}." for what, names in left]
-    return Found(photos, masks, told)
+    return photos, masks, told
 
 
 def _kind(path: Path) -> str:
     """Return "photos" by a file's suffix and content, even if damaged, `_NOT_READ` for other images, or nothing."""
-    suffix, kind = path.suffix.lower(), ""
+    suffix, kind, start = path.suffix.lower(), "", b""
     if path.exists() and not path.is_file():
         return ""
-    try:
-        with path.open("rb") as file:
-            start = file.read(12)
-    except OSError:  # It is named when it is read.
-        start = b""
+    with contextlib.suppress(OSError), path.open("rb") as file:  # What cannot be read is named later.
+        start = file.read(12)
     if suffix in IMAGE_SUFFIXES and start[4:8] not in (b"ftyp", b"JXL ") and start[:2] != b"\xff\x0a":
         return "photos"
     with (
@@ -116,39 +105,37 @@ def _is_mask(path: Path) -> bool:
 
 def _copies(folder: Path, photos: Sequence[str], known: Collection[str]) -> list[str]:
     """Return the photos with the bytes of another, and those with the name of another that show the same."""
-    sizes, stems, copies = defaultdict(list), defaultdict(list), []
-
-    def compare(names: Sequence[str], is_same: Callable[[Path, Path], bool]) -> None:
-        kept = []
-        for name in sorted(names, key=lambda name: name not in known):
-            is_copy = name not in known and any(is_same(folder / other, folder / name) for other in kept)
-            (copies if is_copy else kept).append(name)
-
+    groups, copies = defaultdict(list), []
     for name in sorted(photos, key=len):
-        if (folder / name).is_file():
-            sizes[(folder / name).stat().st_size].append(name)
-            stems[_stem(name)].append(name)
-    for size, names in sizes.items():
-        compare(names if size else (), lambda photo, other: filecmp.cmp(photo, other, shallow=False))
-    for names in stems.values():
-        if len(left := [name for name in names if name not in copies]) > 1:
-            left.sort(key=lambda name: -math.prod(image_size(folder / name)))
-            compare(left, _shows_the_same)
+        if (folder / name).is_file() and (size := (folder / name).stat().st_size):
+            groups[size].append(name)
+            groups[_stem(name)].append(name)
+    for names in (names for names in groups.values() if len(names) > 1):
+        pixels = {name: math.prod(image_size(folder / name)) for name in names}
+        names.sort(key=lambda name: (name not in known, -pixels[name]))
+        for i, name in enumerate(names):
+            others = (folder / other for other in names[:i] if other not in copies)
+            if name not in {*known, *copies} and any(_is_copy(folder / name, other) for other in others):
+                copies.append(name)
     return copies
 
 
-def _shows_the_same(photo: Path, other: Path) -> bool:
-    """Return whether another image shows the same, in its folder, another format or another size; tones may differ."""
+def _is_copy(photo: Path, other: Path) -> bool:
+    """Return whether photos are equal, or have one name and show the same in another size, format or tone."""
+    if filecmp.cmp(photo, other, shallow=False):
+        return True
     try:
         with Image.open(photo) as one, Image.open(other) as two:
-            if one.size == two.size and photo.parent != other.parent and photo.suffix == other.suffix:
-                return False  # Cameras of a rig give their photos the same names.
+            is_rig = one.size == two.size and photo.parent != other.parent and photo.suffix == other.suffix
+            if is_rig or _stem(photo.name) != _stem(other.name):
+                return False
             one.draft("L", (64, 64))
             two.draft("L", (64, 64))
             a, b = (ImageOps.exif_transpose(image).convert("L") for image in (one, two))
     except Exception:  # A damaged photo is named when it is read.
         return False
+    if not 0.97 < a.width * b.height / (a.height * b.width) < 1.03:
+        return False
     small = [np.ravel(np.asarray(image.resize((16, 16), Image.Resampling.HAMMING))) for image in (a, b)]
     with np.errstate(invalid="ignore", divide="ignore"):  # of one colour
-        is_same = np.corrcoef(small)[0, 1] > _SAME
-    return bool(is_same and 0.97 < a.width * b.height / (a.height * b.width) < 1.03)
+        return bool(np.corrcoef(small)[0, 1] > 0.99)  # Smaller copies of photos reach .999.

@@ -20,7 +20,6 @@ from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 from sadgs_ns.cli.process.folder import COLMAP_FORMATS, look_into
 from sadgs_ns.cli.process.panoramas import VIEWS, cut, is_panorama
 from sadgs_ns.cli.process.video import find_videos
-from sadgs_ns.data import SIDEWAYS
 from sadgs_ns.errors import InputError, reason
 
 _KEPT_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
@@ -62,37 +61,27 @@ class Photo:
 
 
 def find_source(source: Path, out: Path) -> tuple[list[str], bool]:
-    """Return the photos of a folder, or its videos where it has fewer than three photos, and whether these are videos.
+    """Return the photos of a folder, as `look_into` finds them, or its videos where it has fewer than three photos.
 
-    A single video has no names. Raise as `find_photos`, which looks for the photos.
+    Also return whether these are videos. A single video has no names.
+
+    Raises:
+        InputError: If there are neither three photos nor a video, or a photo has a name that is no Unicode.
     """
     if source.is_file():
         return [], True
-    try:
-        return find_photos(source, out), False
-    except InputError:
-        if videos := find_videos(source):
-            return videos, True
-        raise
-
-
-def find_photos(source: Path, out: Path) -> list[str]:
-    """Return the sorted names of a folder's photos for a scene, relative to it, as `look_into` finds them.
-
-    Raises:
-        InputError: If there are fewer than three photos, or one has a name that is no Unicode.
-    """
     if not source.is_dir():
         raise InputError(f"{source} does not exist; give a folder of photos or of videos, or a video.")
-    found = look_into(source, out)
-    names = found.photos
-    if len(names) < 3:
-        told = f"{source} holds {len(names)} photos; a reconstruction needs at least 3, better 30 or more."
-        raise InputError(" ".join([told, *found.told]))
-    for name in names:
+    photos, _, others = look_into(source, out)
+    if len(photos) < 3:
+        if videos := find_videos(source):
+            return videos, True
+        told = f"{source} holds {len(photos)} photos; a reconstruction needs at least 3, better 30 or more."
+        raise InputError(" ".join([told, *others]))
+    for name in photos:
         if not name.isprintable():
             raise InputError(f"{source} holds a photo with unprintable characters in its name, {name!a}: rename it.")
-    return names
+    return photos, False
 
 
 def photo_stamps(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
@@ -172,7 +161,7 @@ def _read_photo(folder: Path, name: str, as_stored: bool) -> Photo:
         exif = image.getexif()
         orientation = 1 if as_stored else exif.get(ExifTags.Base.Orientation)
         width, height = image.size  # Pillow turns TIFF by itself.
-        size = (height, width) if orientation in SIDEWAYS and image.format != "TIFF" else image.size
+        size = (height, width) if orientation in range(5, 9) and image.format != "TIFF" else image.size
         lens, gps = (exif.get_ifd(part) for part in (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo))
         focals = [max((0.0, *_numbers(lens.get(tag)))) for tag in _FOCAL_LENGTHS]  # mm; 0 is unknown, too
         latitude, longitude, altitude = (_numbers(gps.get(tag)) for tag in _POSITION)
@@ -233,10 +222,9 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
         target.parent.mkdir(parents=True, exist_ok=True)
         if photo.lies or not photo.is_read or photo.is_panorama:
             with Image.open(source) as image:
-                is_tiff = image.format == "TIFF"  # Its tags tell of its pixels, and Pillow turns it by itself.
-                exif = Image.Exif() if is_tiff else image.getexif()
+                exif = Image.Exif() if image.format == "TIFF" else image.getexif()  # A TIFF's tells of its pixels, too.
                 image.info.pop("exif", None)  # Pillow would write it anew, which fails where it is damaged.
-                pixels = ImageOps.exif_transpose(image) if photo.lies and not is_tiff else image
+                pixels = ImageOps.exif_transpose(image) if photo.lies else image
                 exif.pop(ExifTags.Base.Orientation, None)
                 kept = b""
                 with contextlib.suppress(Exception):  # Pillow raises anything where EXIF is damaged.
@@ -260,19 +248,17 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
 def write_alpha(folder: Path, photos: Sequence[Photo], alphas: Path) -> int:
     """Write the opacity of a folder's photos that are partly transparent, which COLMAP leaves out, as grey images.
 
-    That of `NAME` is `NAME.png` in the folder `alphas`, which is made where there is none. Return how many these are.
+    That of `NAME` is `NAME.png` in the folder `alphas`, which is emptied. Return how many these are.
     """
-    if not alphas.exists():
-        partial = empty_folder(alphas.with_name(f"{alphas.name}.partial"))
-        for photo in photos:
-            if photo.has_alpha:
-                with Image.open(folder / photo.name) as image:
-                    alpha = image.convert("RGBA").getchannel("A")
-                if alpha.getextrema() != (255, 255):
-                    target = partial / f"{photo.name}.png"
-                    target.parent.mkdir(parents=True, exist_ok=True)
-                    alpha.save(target)
-        partial.rename(alphas)
+    empty_folder(alphas)
+    for photo in photos:
+        if photo.has_alpha:
+            with Image.open(folder / photo.name) as image:
+                alpha = image.convert("RGBA").getchannel("A")
+            if alpha.getextrema() != (255, 255):
+                target = alphas / f"{photo.name}.png"
+                target.parent.mkdir(parents=True, exist_ok=True)
+                alpha.save(target)
     return sum(1 for _ in alphas.rglob("*.png"))
 
 

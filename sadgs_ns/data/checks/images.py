@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from PIL import ExifTags, Image, UnidentifiedImageError
 
-from sadgs_ns.data import IMAGE_SUFFIXES, SIDEWAYS
+from sadgs_ns.data import IMAGE_SUFFIXES
 from sadgs_ns.data.checks.findings import Finding, and_more
 from sadgs_ns.errors import reason
 
@@ -52,7 +52,7 @@ class _Image:
     format: str = ""
     """Pillow's name for the format of the file."""
     orientation: int = 1
-    """EXIF's number, from 1 to 8, by which TIFF alone is turned, by Pillow."""
+    """EXIF's number: 1 is upright, 2 to 4 keep the size, 5 to 8 exchange its sides. TIFF alone is turned, by Pillow."""
     problem: str = ""
     """The rest of a sentence that starts with the file; empty for a good image."""
 
@@ -166,7 +166,7 @@ def _problem(frame: Frame, image: _Image, mask: _Image | None, source: Path) -> 
         return "small", frame.image, "has {} × {} px: leave it out of the reconstruction".format(*image.size)
     if frame.size not in (None, image.size):
         sizes = "{} × {} px, but its camera in {} {} × {}".format(*image.size, source, *frame.size)
-        if image.orientation in SIDEWAYS and frame.size == image.size[::-1]:
+        if image.orientation in range(5, 9) and frame.size == image.size[::-1]:
             sizes = f"EXIF orientation {image.orientation} and is read as {sizes}: {_TURN}"
             return "orientation", frame.image, f"has {sizes}"
         return "size", frame.image, f"has {sizes}: use the images that the poses were computed from"
