@@ -138,16 +138,8 @@ def adam_step_with_factors(
 ) -> None:
     """Do what `adam_step` does, to the bit, in a launch whose arguments are the same in every update of a parameter.
 
-    Args:
-        parameters: As of `adam_step`, which also describes the arguments that are not described here.
-        gradients: As of `adam_step`.
-        exp_avgs: As of `adam_step`.
-        exp_avg_sqs: As of `adam_step`.
-        noted: As of `adam_step`. float32 [1]
-        factors: What `rates_and_scales` returns for this update, on the device, contiguous float32. [2, P]
-        betas: As of `adam_step`.
-        eps: As of `adam_step`.
-        max_gradient: As of `adam_step`.
+    `factors` are what `rates_and_scales` returns for this update, on the device, contiguous float32 [2, P], in the
+    place of `steps` and `lrs`.
     """
     rates, scales = (row.unbind() for row in factors)
     _launch(parameters, gradients, exp_avgs, exp_avg_sqs, noted, (rates, scales), betas, eps, max_gradient)

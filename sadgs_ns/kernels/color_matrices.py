@@ -97,16 +97,11 @@ class _CorrectColors(torch.autograd.Function):
         return v_render, v_alpha, sums.sum(dim=1)
 
 
-def correct_colors(render: Tensor, alpha: Tensor, matrices: Tensor) -> Tensor:
-    """Do what `method.color_matrices.correct_colors` does.
-
-    Args:
-        render: Renderings, float32. [C, H, W, 3]
-        alpha: Accumulated opacity, float32. [C, H, W, 1]
-        matrices: (M | b) of each view, float32. [C, 3, 4]
-
-    Raises:
-        InputError: If the views have more pixels than the kernels can address (limits.py).
-    """
+def correct_colors(
+    render: Tensor,  # [C, H, W, 3] float32
+    alpha: Tensor,  # [C, H, W, 1] float32
+    matrices: Tensor,  # [C, 3, 4] float32
+) -> Tensor:
+    """Do what `method.color_matrices.correct_colors` does, and raise the same."""
     check_pixels(*render.shape[:3])
     return _CorrectColors.apply(render.contiguous(), alpha.contiguous(), matrices.contiguous())  # type: ignore[return-value]

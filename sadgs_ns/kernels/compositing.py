@@ -177,40 +177,27 @@ def _composite_backward(
 
 
 def composite_backward(
-    means2d: Tensor,
-    conics: Tensor,
-    colors: Tensor,
-    opacities: Tensor,
-    isect_offsets: Tensor,
-    flatten_ids: Tensor,
-    alphas: Tensor,
-    last_ids: Tensor,
-    v_renders: Tensor,
-    v_alphas: Tensor | None,
+    means2d: Tensor,  # [C, N, 2] px
+    conics: Tensor,  # [C, N, 3] in 1/px²
+    colors: Tensor,  # [C, N, 3]
+    opacities: Tensor,  # [C, N] in [0, 1]
+    isect_offsets: Tensor,  # int32 [C, tile rows, tile columns]
+    flatten_ids: Tensor,  # int32 [number of pairs]
+    alphas: Tensor,  # [C, height, width, 1]
+    last_ids: Tensor,  # int32 [C, height, width]
+    v_renders: Tensor,  # [C, height, width, 3]
+    v_alphas: Tensor | None,  # [C, height, width, 1]
     absgrad: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]:
-    """Differentiate gsplat's compositing of three channels in tiles of TILE_SIZE; all tensors are contiguous float32.
+    """Differentiate `composite_forward`, whose arguments and results these are; all tensors are contiguous.
 
-    A pixel whose gradient is not finite, or at least 1e18, makes the gradients of the Gaussians that it sees NaN, and
-    of no others.
-
-    Args:
-        means2d: px. [C, N, 2]
-        conics: In 1/px². [C, N, 3]
-        colors: [C, N, 3]
-        opacities: In [0, 1]. [C, N]
-        isect_offsets: Where each tile's list starts, int32 [C, tile rows, tile columns]. A list of a tile below the
-            image is passed over.
-        flatten_ids: Indices in C·N, int32 [number of pairs].
-        alphas: As rendered. [C, height, width, 1]
-        last_ids: Place in the lists of the last Gaussian that a pixel drew, int32 [C, height, width].
-        v_renders: Gradient of the rendered colours. [C, height, width, 3]
-        v_alphas: Gradient of `alphas`, None where nothing depends on them. [C, height, width, 1]
-        absgrad: Whether to sum the absolute gradients of the centres, too.
+    `v_renders` and `v_alphas` are the gradients of its colours and alphas, the latter None where nothing depends on
+    them. A pixel whose gradient is not finite, or at least 1e18, makes the gradients of the Gaussians that it sees NaN,
+    and of no others.
 
     Returns:
-        Gradients of means2d, conics, colors and opacities, in their shapes, and the absolute gradient [C, N, 2]: parts
-        of the rows of one tensor.
+        Gradients of means2d, conics, colors and opacities, in their shapes, and with `absgrad` the sum of the absolute
+        gradients of the centres [C, N, 2]: parts of the rows of one tensor.
     """
     gradients = means2d.new_zeros((*opacities.shape, _STRIDE))
     if len(flatten_ids):
@@ -268,31 +255,20 @@ class _RasterizeToPixels(torch.autograd.Function):
 
 
 def rasterize_to_pixels(
-    means2d: Tensor,
-    conics: Tensor,
-    colors: Tensor,
-    opacities: Tensor,
+    means2d: Tensor,  # [C, N, 2] px
+    conics: Tensor,  # [C, N, 3] in 1/px²
+    colors: Tensor,  # [C, N, 3]
+    opacities: Tensor,  # [C, N] in [0, 1]
     width: int,
     height: int,
-    isect_offsets: Tensor,
-    flatten_ids: Tensor,
+    isect_offsets: Tensor,  # int32 [C, tile rows, tile columns]
+    flatten_ids: Tensor,  # int32 [number of pairs]
     absgrad: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Do what gsplat's `rasterize_to_pixels` does with three channels in tiles of TILE_SIZE.
+    """Do what `composite_forward` does, whose arguments these are, and differentiate it.
 
-    With `absgrad`, `means2d` gets an attribute `grad2d`, which `backward` sets to its gradient, and which is None until
-    then: `retain_grad` would copy the gradient.
-
-    Args:
-        means2d: px; with `absgrad`, `backward` sets its attribute of that name, too. [C, N, 2]
-        conics: In 1/px². [C, N, 3]
-        colors: [C, N, 3]
-        opacities: In [0, 1]. [C, N]
-        width: Of the images in px.
-        height: Of the images in px.
-        isect_offsets: Where each tile's list starts, int32 [C, tile rows, tile columns].
-        flatten_ids: Indices in C·N, int32 [number of pairs].
-        absgrad: Whether to sum the absolute gradients of the centres, too.
+    With `absgrad`, `backward` sets two attributes of `means2d`: `absgrad`, the sum of its absolute gradients, and
+    `grad2d`, its gradient, which is None until then: `retain_grad` would copy the gradient.
 
     Returns:
         Colours [C, height, width, 3] and alphas [C, height, width, 1].

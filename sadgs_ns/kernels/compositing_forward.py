@@ -101,29 +101,20 @@ def _composite_forward(
 
 
 def composite_forward(
-    means2d: Tensor,
-    conics: Tensor,
-    colors: Tensor,
-    opacities: Tensor,
+    means2d: Tensor,  # [C, N, 2] px
+    conics: Tensor,  # [C, N, 3] in 1/px²
+    colors: Tensor,  # [C, N, 3]
+    opacities: Tensor,  # [C, N] in [0, 1]
     width: int,
     height: int,
-    isect_offsets: Tensor,
-    flatten_ids: Tensor,
+    isect_offsets: Tensor,  # int32 [C, tile rows, tile columns]
+    flatten_ids: Tensor,  # int32 [number of pairs]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Do what `gsplat_internals.composite` does, for three channels in tiles of TILE_SIZE.
 
-    A colour that is not finite makes the pixels that see it NaN, and no others.
-
-    Args:
-        means2d: px; this and all other tensors must be contiguous. [C, N, 2]
-        conics: In 1/px². [C, N, 3]
-        colors: [C, N, 3]
-        opacities: In [0, 1]. [C, N]
-        width: px.
-        height: px.
-        isect_offsets: Where each tile's list starts, int32 [C, tile rows, tile columns]. A list of a tile below the
-            image is passed over.
-        flatten_ids: Indices in C·N, int32 [number of pairs].
+    All tensors must be contiguous. `isect_offsets` tells where each tile's list starts; lists of tiles below the image
+    are passed over. `flatten_ids` are the lists: indices in C·N, from front to back. A colour that is not finite makes
+    the pixels that see it NaN, and no others.
 
     Returns:
         Colours [C, height, width, 3]; alphas [C, height, width, 1]; and the place in the lists of the last Gaussian

@@ -271,20 +271,17 @@ class _Colors(torch.autograd.Function):
 
 
 def colors_from_harmonics(
-    degree: int, means: Tensor, first: Tensor, rest: Tensor, viewmats: Tensor, radii: Tensor
+    degree: int,
+    means: Tensor,  # [N, 3] float32
+    first: Tensor,  # [N, 3]
+    rest: Tensor,  # [N, K − 1, 3]
+    viewmats: Tensor,  # [C, 4, 4], without gradient
+    radii: Tensor,  # int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5
 ) -> Tensor:
-    """Colours that 3DGS gives Gaussians seen from cameras: max(Σ_k Y_k(direction) · coefficient_k + 0.5, 0).
+    """Colours that 3DGS gives Gaussians seen from cameras: max(Σ_k Y_k(direction) · coefficient_k + 0.5, 0). [C, N, 3]
 
-    Args:
-        degree: Highest degree to use, 0 … 3.
-        means: Centres in world space, float32. [N, 3]
-        first: Coefficients of degree 0. [N, 3]
-        rest: Coefficients of the higher degrees, at least of those that `degree` needs. [N, K − 1, 3]
-        viewmats: World-to-camera transforms, rigid, which get no gradient. [C, 4, 4]
-        radii: px, int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5; where one is not positive, the colour means nothing.
-
-    Returns:
-        Not negative. [C, N, 3]
+    `first` are the coefficients of degree 0, `rest` those of the higher degrees, at least up to `degree`, which is at
+    most 3. Where a radius is not positive, the colour means nothing.
     """
     tensors = (value.contiguous() for value in (means, first, rest, viewmats, radii))
     return _Colors.apply(*tensors, (degree + 1) ** 2 - 1)  # type: ignore[return-value]

@@ -242,29 +242,18 @@ class _PhotometricLoss(torch.autograd.Function):
 
 
 def photometric_loss(
-    predicted: Tensor,
-    target: Tensor,
+    predicted: Tensor,  # [C, H, W, 3] float32
+    target: Tensor,  # [C, H, W, 3] float32 in [0, 1] or uint8
     window: tuple[float, ...],
     *,
     ssim_lambda: float,
     l2_lambda: float,
-    parts: Tensor | None = None,
+    parts: Tensor | None = None,  # [P] contiguous float32
 ) -> tuple[Tensor, Tensor]:
     """Do what `method.losses.photometric_loss` does, for views at least as large as SSIM's window.
 
-    Args:
-        predicted: Rendered views, float32. [C, H, W, 3]
-        target: Training views, float32 in [0, 1] or uint8. [C, H, W, 3]
-        window: Weights of SSIM's window along one axis, symmetric.
-        ssim_lambda: λ in [0, 1].
-        l2_lambda: λ_2 ≥ 0.
-        parts: Numbers whose sum is added to the loss, contiguous float32. [P]
-
-    Returns:
-        The loss, and PSNR in dB without gradient; both scalars.
-
-    Raises:
-        InputError: If the views have more pixels than the kernels can address (limits.py).
+    `window` has the weights of that window along one axis, and is symmetric. Raises InputError if the views have more
+    pixels than the kernels can address (limits.py).
     """
     check_pixels(*predicted.shape[:3])
     return _PhotometricLoss.apply(  # type: ignore[return-value]

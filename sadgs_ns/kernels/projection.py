@@ -284,30 +284,18 @@ class _Project(torch.autograd.Function):
 
 
 def project(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
+    means: Tensor,  # [N, 3] float32
+    quats: Tensor,  # [N, 4]
+    scales: Tensor,  # [N, 3]
+    opacities: Tensor,  # [N], without gradient, as the cameras
+    viewmats: Tensor,  # [C, 4, 4]
+    Ks: Tensor,  # [C, 3, 3]
     width: int,
     height: int,
     calc_compensations: bool,
     near_plane: float = NEAR_PLANE,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None, Tensor]:
     """Do what `gsplat_internals.project` does, but differentiate it with one kernel.
-
-    Args:
-        means: Centres in world space, float32. [N, 3]
-        quats: Rotations as wxyz quaternions; need not have unit length. [N, 4]
-        scales: Standard deviations in world units, > 0. [N, 3]
-        opacities: In [0, 1], which get no gradient. [N]
-        viewmats: World-to-camera transforms, which get no gradient. [C, 4, 4]
-        Ks: Intrinsics in px, which get no gradient. [C, 3, 3]
-        width: px.
-        height: px.
-        calc_compensations: Whether to compute how much the blur must lower the opacities.
-        near_plane: Depth in world units from which Gaussians are drawn.
 
     Returns:
         What `gsplat_internals.project` returns, whose radii may be set to 0 in place until the backward pass; and

@@ -168,32 +168,23 @@ def _observe(
 
 
 def observe_views(
-    statistics: tuple[Tensor, Tensor, Tensor, Tensor],
-    params: tuple[Tensor, Tensor, Tensor],
-    radii: Tensor,
-    means2d: Tensor,
-    conics: Tensor,
-    jitter: Tensor,
-    structure_tensors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
+    statistics: tuple[Tensor, Tensor, Tensor, Tensor],  # n_high, n_low, eta_max [N, 3], n_total [N]; float32
+    params: tuple[Tensor, Tensor, Tensor],  # means [N, 3], quats [N, 4] and log scales [N, 3]; float32
+    radii: Tensor,  # int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5, px; not positive where nothing was drawn
+    means2d: Tensor,  # [C, N, 2] px
+    conics: Tensor,  # [C, N, 3] in 1/px²
+    jitter: Tensor,  # [C, N, 2] in [0, 1)
+    structure_tensors: Tensor,  # [C, H, W, 3] in 1/px², or its codes
+    viewmats: Tensor,  # [C, 4, 4]
+    Ks: Tensor,  # [C, 3, 3] px
     *,
     thresholds: tuple[float, float],
     constants: tuple[float, float, float],
     code_range: tuple[float, float, int],
 ) -> None:
-    """Do what the loop in `method.statistics.observe` does, for all views at once.
+    """Do what the loop in `method.statistics.observe` does, for all views at once; `statistics` change in place.
 
     Args:
-        statistics: n_high, n_low, eta_max [N, 3] and n_total [N], float32, updated in place.
-        params: means [N, 3], quats [N, 4] and log scales [N, 3], float32.
-        radii: px, int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5; not positive where a Gaussian was not drawn.
-        means2d: px. [C, N, 2]
-        conics: 1/px². [C, N, 3]
-        jitter: In [0, 1). [C, N, 2]
-        structure_tensors: S̄ in 1/px², or its codes of `codes.encode`. [C, H, W, 3]
-        viewmats: World to camera. [C, 4, 4]
-        Ks: Intrinsics in px. [C, 3, 3]
         thresholds: η above the first is high, and below the second it is low.
         constants: gsplat's blur in px², its margin of the frustum, and ε of the wavelength in 1/px.
         code_range: HIGHEST_FREQUENCY, OCTAVES and MASKED of `method.codes`.

@@ -364,11 +364,11 @@ class PendingTiles:
 
 @torch.no_grad()
 def intersect_tiles(
-    means2d: Tensor,
-    radii: Tensor,
-    depths: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
+    means2d: Tensor,  # [C, N, 2] px
+    radii: Tensor,  # int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5, px; not positive where a Gaussian was culled
+    depths: Tensor,  # [C, N] along the viewing axis
+    conics: Tensor,  # [C, N, 3] in 1/px²
+    opacities: Tensor,  # [C, N] in [0, 1]
     width: int,
     height: int,
     tile_size: int,
@@ -377,15 +377,8 @@ def intersect_tiles(
     """Begin to list the Gaussians of each tile; in place of gsplat's `isect_tiles` and `isect_offset_encode`.
 
     Args:
-        means2d: px. [C, N, 2]
-        radii: px, int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5; not positive where a Gaussian was culled. They should
-            be contiguous: they are set to 0 where a Gaussian is culled here, and by `lists` where its capacity is too
-            small, which would happen to a copy of others.
-        depths: Along the viewing axis. [C, N]
-        conics: (a, b, c) of the inverse of the blurred Σ2D, in 1/px². [C, N, 3]
-        opacities: In [0, 1]. [C, N]
-        width: Of the image in px.
-        height: Of the image in px.
+        radii: They should be contiguous: they are set to 0 where a Gaussian is culled here, and by `lists` where its
+            capacity is too small, which would happen to a copy of others.
         tile_size: Side of a tile in px, a power of two.
         max_off_axis: Gaussians whose centre is further from the image's centre, in halves of its width and height along
             x and y, are culled, as `render.off_axis.cull_off_axis` does; 0 culls none.

@@ -43,16 +43,11 @@ def correct_colors(
     alpha: Tensor,  # [C, H, W, 1]
     matrices: Tensor,  # [C, 3, 4]
 ) -> Tensor:
-    """Apply an affine map to the colours of the Gaussians that a rendering shows: M c + α b.
+    """Apply an affine map (M | b) to the colours of the Gaussians that a rendering shows: M c + α b.
 
     The offset b counts as much as the Gaussians cover, as if each Gaussian's own colour had been changed. What nothing
-    covers stays black, and teaches the matrices nothing. Raises InputError if the views have more pixels than the
-    Triton kernels can address (kernels/limits.py).
-
-    Args:
-        render: Renderings before a black background, not clamped. [C, H, W, 3]
-        alpha: Accumulated opacity in [0, 1]. [C, H, W, 1]
-        matrices: (M | b) of each view. [C, 3, 4]
+    covers stays black, and teaches the matrices nothing. `render` is before a black background and not clamped, `alpha`
+    in [0, 1]. Raises InputError if the views have more pixels than the Triton kernels can address (kernels/limits.py).
 
     Returns:
         [C, H, W, 3]

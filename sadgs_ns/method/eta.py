@@ -48,20 +48,17 @@ def wavelength(structure_tensor: Tensor) -> Tensor:
 
 
 def projected_axes(
-    means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int
+    means: Tensor,  # [M, 3] world units, in front of the camera
+    quats: Tensor,  # [M, 4] wxyz, of any length
+    scales: Tensor,  # [M, 3] standard deviations in world units, > 0
+    viewmats: Tensor,  # [M, 4, 4] world to camera, one for each observation
+    Ks: Tensor,  # [M, 3, 3] px
+    width: int,
+    height: int,
 ) -> Tensor:
     """Screen-space vectors of the three principal axes, v_k = J W R S_k (paper, eq. 1).
 
     J is the Jacobian that gsplat's forward pass uses for a pinhole camera, with its clamp near the frustum's border.
-
-    Args:
-        means: World positions, in front of the camera. [M, 3]
-        quats: Rotations as wxyz quaternions, which need not have unit length. [M, 4]
-        scales: Standard deviations along the axes, world units, > 0. [M, 3]
-        viewmats: World to camera, one for each observation. [M, 4, 4]
-        Ks: Intrinsics in px, one for each observation. [M, 3, 3]
-        width: Image width in px.
-        height: Image height in px.
 
     Returns:
         v_k in px, axis k before component. [M, 3, 2]
@@ -78,18 +75,17 @@ def projected_axes(
     return (jacobian @ rotation @ axes).transpose(1, 2)
 
 
-def sample_footprint(means2d: Tensor, conics: Tensor, jitter: Tensor) -> Tensor:
+def sample_footprint(
+    means2d: Tensor,  # [M, 2] px
+    conics: Tensor,  # [M, 3] (a, b, c) of the inverse of Σ2D + SCREEN_BLUR·I, in 1/px²
+    jitter: Tensor,  # [M, 2] in [0, 1)
+) -> Tensor:
     """Draw one point in each Gaussian's footprint, uniformly if the jitter is uniform.
 
     The footprint is the 2σ ellipse of Σ2D: a uniform point in it has mean μ_2D and covariance Σ2D. gsplat's conic
     contains its screen-space blur, which is taken out again; what rounding makes negative is set to 0. Rounded to
     float32, a conic tells its determinant from 0 only above ε a c: footprints longer than that (thousands of px) are
     cut to it.
-
-    Args:
-        means2d: px. [M, 2]
-        conics: (a, b, c) of the inverse of Σ2D + SCREEN_BLUR·I, in 1/px². [M, 3]
-        jitter: In [0, 1). [M, 2]
 
     Returns:
         Points in px, pixel centres at half-integers; NaN where the conic is NaN or infinite. [M, 2]

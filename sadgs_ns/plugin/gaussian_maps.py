@@ -22,24 +22,19 @@ MIN_COVER = 0.05
 @torch.no_grad()
 def blend(
     params: Mapping[str, Tensor],
-    values: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
+    values: Tensor,  # [N, D]
+    viewmat: Tensor,  # [4, 4]
+    K: Tensor,  # [3, 3]
     width: int,
     height: int,
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
     max_off_axis: float = 0.0,
     near_plane: float = NEAR_PLANE,
 ) -> tuple[Tensor, Tensor]:
-    """Blend D values of each Gaussian [N, D] as their colours are blended, front to back.
+    """Blend D values of each Gaussian as their colours are blended, front to back.
 
-    Args:
-        params: `means` [N, 3], `quats` [N, 4], log `scales` [N, 3], logit `opacities` [N] or [N, 1].
-        values: D values for each Gaussian. [N, D]
-        viewmat: World-to-camera matrix. [4, 4]
-        K: Intrinsics in px. [3, 3]
-        width, height: Of the image, px.
-        rasterize_mode, max_off_axis, near_plane: As for `rasterize`.
+    `params` are `means` [N, 3], `quats` [N, 4], log `scales` [N, 3] and logit `opacities` [N] or [N, 1]; the rest is as
+    for `rasterize`.
 
     Returns:
         The blended values [H, W, D], and how much of each pixel is covered, in [0, 1] [H, W, 1].

@@ -17,13 +17,13 @@ from sadgs_ns.render.projected import Projected
 
 
 def rasterize(
-    means: Tensor,  # [N, 3]
-    quats: Tensor,  # [N, 4]
-    scales: Tensor,  # [N, 3]
-    opacities: Tensor,  # [N]
+    means: Tensor,  # [N, 3] centres in world space
+    quats: Tensor,  # [N, 4] wxyz, of any length
+    scales: Tensor,  # [N, 3] standard deviations along the axes, in world units, > 0
+    opacities: Tensor,  # [N] in [0, 1]
     colors: Tensor | tuple[Tensor, Tensor],  # [(C,) N, D], [(C,) N, K, 3] or [N, 3] and [N, K - 1, 3]
-    viewmats: Tensor,  # [C, 4, 4]
-    Ks: Tensor,  # [C, 3, 3]
+    viewmats: Tensor,  # [C, 4, 4] world to camera, rigid, OpenCV axes (x right, y down, z forward)
+    Ks: Tensor,  # [C, 3, 3] px
     width: int,
     height: int,
     *,
@@ -40,16 +40,8 @@ def rasterize(
     With our Triton kernels a tile lists only the Gaussians that reach it; what is drawn is the same as gsplat's.
 
     Args:
-        means: Centres in world space. [N, 3]
-        quats: Rotations as wxyz quaternions; need not have unit length. [N, 4]
-        scales: Standard deviations along the Gaussians' axes, in world units, > 0. [N, 3]
-        opacities: In [0, 1]. [N]
         colors: Features [(C,) N, D] or, with `sh_degree`, spherical harmonics coefficients: [(C,) N, K, 3], or the pair
             of those of degree 0 [N, 3] and of the others [N, K − 1, 3].
-        viewmats: Rigid world-to-camera transforms, OpenCV axes (x right, y down, z forward). [C, 4, 4]
-        Ks: Intrinsics in pixels. [C, 3, 3]
-        width: Image width in pixels.
-        height: Image height in pixels.
         sh_degree: Degree to evaluate, (sh_degree + 1)^2 <= K; None takes `colors` as they are.
         render_mode: "RGB" renders colours, "RGB+ED" appends the expected depth.
         absgrad: Whether `backward` sets `info["means2d"].absgrad`. [C, N, 2]

@@ -99,41 +99,30 @@ def rasterization(
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians into C pinhole cameras, as gsplat's `rasterization(..., packed=False)` does.
 
-    Differentiable with respect to all float arguments except `Ks`. Raises ValueError if `packed` is True, a mode is
-    unknown, or a shape does not match.
+    Differentiable with respect to all float arguments except `Ks`. Where nothing is said here, an argument is gsplat's,
+    and is explained for `render.rasterization.rasterize`, too.
 
     Args:
-        means: Centres in world space. [N, 3]
-        quats: Rotations as wxyz quaternions; need not have unit length. [N, 4]
-        scales: Standard deviations along the Gaussians' axes, in world units, > 0. [N, 3]
-        opacities: In [0, 1]. [N]
-        colors: Features [(C,) N, D] or, with `sh_degree`, spherical harmonics coefficients [(C,) N, K, 3].
-        viewmats: World-to-camera transforms, OpenCV axes (x right, y down, z forward). [C, 4, 4]
-        Ks: Intrinsics in pixels. [C, 3, 3]
-        width: Image width in pixels.
-        height: Image height in pixels.
-        near_plane: Gaussians whose centre is nearer are culled, in world units.
         far_plane: Gaussians whose centre is farther are culled, in world units.
         radius_clip: Gaussians with a screen radius of at most this many pixels are culled.
         eps2d: Added to the diagonal of the projected covariances, in pixels squared.
-        sh_degree: Degree to evaluate, (sh_degree + 1)^2 <= K; None takes `colors` as they are.
         packed: Only False is supported.
         tile_size: Pixels per side of a tile.
         backgrounds: Colours behind the Gaussians. [C, D]
         render_mode: "RGB" renders colours, "D" accumulated depth, "ED" expected depth; the sums append depth.
-        absgrad: Whether `backward` sets `info["means2d"].absgrad`, the sum over pixels of the absolute gradients of
-            `means2d`. [C, N, 2]
         rasterize_mode: "antialiased" multiplies opacities by the area ratio of the Gaussians before and after `eps2d`.
         per_axis_radii: Whether `info["radii"]` and the culling follow gsplat >= 1.5 (int32 [C, N, 2], the extent in x
             and y at which alpha falls below 1/255) or gsplat 1.4 (int32 [C, N], three standard deviations of the long
             axis); None follows the installed gsplat.
-        max_off_axis: Gaussians further off the axis are culled, in half images along x or y, which gsplat cannot
-            (off_axis.py); 0 culls none.
+        max_off_axis: Gaussians further off the axis are culled, which gsplat cannot (off_axis.py); 0 culls none.
 
     Returns:
         `render_colors` [C, height, width, X] with X = D, 1 or D + 1 by `render_mode`; `render_alphas`
         [C, height, width, 1] in [0, 1]; and gsplat's `info`. As in gsplat, rows of `info["means2d"]`,
         `info["conics"]` and `info["opacities"]` have no meaning where the radii are zero.
+
+    Raises:
+        ValueError: If `packed` is True, a mode is unknown, or a shape does not match.
     """
     C, N = viewmats.shape[0], means.shape[0]
     if packed:
