@@ -22,7 +22,7 @@ COLMAP_FORMATS = {"JPEG", "MPO", "PNG", "BMP", "TIFF"}
 """Pillow's names of the formats that COLMAP and OpenCV read."""
 _FORMATS = COLMAP_FORMATS | {"WEBP", "AVIF"}
 _NOT_READ = "images that are not read (make them .jpg or .png files)"
-_UNREAD = {".heic", ".heif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"}
+_RAW_OR_HEIC = {".heic", ".heif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
 """Suffixes of formats that are not read, by which programs also call JPEG; Pillow takes previews of some for TIFF."""
 _SERVICE = re.compile(r"(.*/)?(@eadir|@__thumb|[@#$]recycle(\.bin)?|__macosx|lost\+found)/.*", re.IGNORECASE)
 """Files in folders that network drives and operating systems keep of thumbnails and of what was deleted."""
@@ -58,11 +58,10 @@ def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[
         stems[_stem(name)].append(name)
     for name in maps:
         parts = {*name.split("/")}
-        owner = max(stems[_stem(name)], key=lambda photo: len(parts & {*photo.split("/")}), default=None)
-        if owner is None:
-            found["masks of no photo"].append(name)
+        if stems[_stem(name)]:
+            masks.setdefault(max(stems[_stem(name)], key=lambda photo: len(parts & {*photo.split("/")})), name)
         else:
-            masks.setdefault(owner, name)
+            found["masks of no photo"].append(name)
     left = ((what, names) for what, names in found.items() if names and what not in ("photos", "masks"))
     told = [f"Left out as {what}: {len(names)}, such as {names[0]}." for what, names in left]
     return photos, masks, told
@@ -77,12 +76,9 @@ def _kind(path: Path) -> str:
         start = file.read(12)
     if suffix in IMAGE_SUFFIXES and start[4:8] not in (b"ftyp", b"JXL ") and start[:2] != b"\xff\x0a":
         return "photos"
-    with (
-        contextlib.suppress(Exception),
-        Image.open(path) as image,
-    ):  # HEIC, AVIF, JPEG XL, or a file with another suffix
+    with contextlib.suppress(Exception), Image.open(path) as image:  # HEIC, AVIF, JPEG XL, or another suffix
         kind = image.format
-    if suffix not in IMAGE_SUFFIXES | _UNREAD:
+    if suffix not in IMAGE_SUFFIXES | _RAW_OR_HEIC:
         return _NOT_READ if kind in _FORMATS | {"GIF", "JPEG2000", "PSD", "PPM"} else ""
     return "photos" if kind in _FORMATS - {"TIFF"} else _NOT_READ
 
