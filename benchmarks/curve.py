@@ -82,14 +82,10 @@ def undisturbed(pipeline: Any) -> Iterator[None]:
 
 
 class Curve:
-    """Measures the held-out views every so many iterations of a run.
+    """Measures the held-out views every so many iterations of a run, while its timer is stopped.
 
     It does so right after the optimizers' step and before what the iteration densifies: a split or an opacity reset
     lowers quality for some steps, and methods that densify at other iterations would show it differently.
-
-    Args:
-        every: Iterations between two points.
-        timer: The run's, which is stopped meanwhile.
     """
 
     def __init__(self, every: int, timer: LoopTimer) -> None:

@@ -100,13 +100,9 @@ class Source:
 
 
 def made(source: Source, what: str, name: str, description: Any) -> Any:
-    """What a description in tables.yaml makes: the text of a table, or the arguments of a figure of `plots`.
+    """The text of a described `table`, or the arguments of a described `figure`'s function in `plots`.
 
-    Args:
-        what: `table` or `figure`.
-
-    Raises:
-        ValueError: The description is wrong, or a row lacks what it names; one sentence.
+    Raises ValueError, one sentence, if the description is wrong or a row lacks what it names.
     """
     try:
         options = dict(description)
@@ -119,11 +115,7 @@ def made(source: Source, what: str, name: str, description: Any) -> Any:
 
 
 def described(folder: Path) -> tuple[Source, dict[str, Any], dict[str, Any]]:
-    """The rows in a folder, and the descriptions of the tables and of the figures by their names.
-
-    Raises:
-        ValueError: The descriptions cannot be read.
-    """
+    """The rows in a folder, and the descriptions of tables and figures by their names; raises ValueError."""
     try:
         content = yaml.safe_load((folder / TABLES).read_text("utf-8"))
         return Source(folder, content["megapixels"]), dict(content["tables"]), dict(content.get("figures", {}))
@@ -135,18 +127,15 @@ def described(folder: Path) -> tuple[Source, dict[str, Any], dict[str, Any]]:
 
 
 def write(checkout: Path, check: bool = False) -> list[str]:
-    """Write the tables and figures of a checkout's documents, none where one of them is described wrongly.
-
-    Args:
-        checkout: Folder of README.md and docs.
-        check: Write nothing.
+    """Write the tables and figures of a checkout's documents, or only `check` them.
 
     Returns:
-        `DOCUMENT: table NAME` of each table that is not what its rows give, or was not, and files of such figures.
+        `DOCUMENT: table NAME` of each table that was not what its rows give, and files of such figures.
 
     Raises:
-        ValueError: A table without description, rows or end, a description without a table, or rows that no table has.
-        WriteError: If a document cannot be written.
+        ValueError: A table without description, rows or end, a description without a table, or rows that no table has;
+            nothing is written then.
+        WriteError: A document cannot be written.
     """
     from benchmarks import plots
 

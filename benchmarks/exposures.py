@@ -62,11 +62,7 @@ def with_gains(image: NDArray[np.uint8], gains: Array) -> NDArray[np.uint8]:
 
 
 def write_scene(scene: Path, out: Path, spread: float, white_balance: float, mean: float, seed: int = 0) -> None:
-    """Write the copy; an earlier one is replaced.
-
-    Raises:
-        FileNotFoundError: The model or an image is missing; names the path.
-    """
+    """Write the copy; an earlier one is replaced. Raises as `image_names`."""
     names = image_names(ColmapDataParserConfig(colmap_path=SPARSE, downscale_factor=1), scene)
     held_out = [i % INTERVAL in (TEST, VALIDATION) for i in range(len(names))]
     drawn = zip(*draw_gains(held_out.count(False), spread, white_balance, mean, seed), strict=True)

@@ -49,11 +49,7 @@ Baseline = dict[str, dict[str, Metric]]
 
 
 def read(path: Path) -> Baseline:
-    """Read a baseline.
-
-    Raises:
-        ValueError: The file is not a baseline; one sentence.
-    """
+    """Read a baseline; raises ValueError if the file is none."""
     try:
         content = json.loads(path.read_text())
         return {row: {name: Metric(**entry) for name, entry in metrics.items()} for row, metrics in content.items()}
@@ -65,12 +61,7 @@ def read(path: Path) -> Baseline:
 
 
 def regressions(baseline: Baseline, jobs: Iterable[Job], results: Iterable[Result]) -> list[str]:
-    """What is worse than the baseline allows, a line each; also rows and metrics that were not measured.
-
-    Args:
-        jobs: The runs that should have been made.
-        results: What they gave, and perhaps other results.
-    """
+    """What is worse than the baseline allows, a line each; also rows and metrics that jobs should have measured."""
     ok = {result["key"]: result for result in results if result["status"] == "ok"}
     runs: dict[str, list[Result | None]] = {}
     for job in jobs:

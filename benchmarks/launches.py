@@ -23,17 +23,9 @@ _LAUNCHES += ("cudaMemcpyAsync", "cudaMemsetAsync")
 
 
 def measure(trainer: Any, steps: int = STEPS) -> dict[str, Any] | None:
-    """Train some steps beyond the end of a run under torch's profiler.
+    """Train some steps as `phases.measure` does, under torch's profiler, and `summarize` them; None without CUDA.
 
-    They are steps of the densification window, as `phases.measure` takes apart. The profiler makes the host slower, so
-    the device is busier than `busy` says when nobody looks.
-
-    Args:
-        trainer: A nerfstudio Trainer after `train`; its model goes on training.
-        steps: How many, rounded up to a multiple of `eta_every`.
-
-    Returns:
-        Means of a step, as `summarize`; None without CUDA.
+    The profiler makes the host slower, so without it the device is busier than `busy` says.
     """
     if torch.device(trainer.device).type != "cuda":
         return None

@@ -173,12 +173,10 @@ def within_densification(strategy: Any) -> Iterator[None]:
 def measure(trainer: Any, steps: int = STEPS) -> dict[str, float]:
     """Train some steps beyond the end of a run and take their time apart.
 
-    It is a step with the trained model's Gaussians as within the densification window, longer than the run's mean step:
-    the strategy observes η and gathers gradients as in a step that AbsGS reads, but densifies nothing.
-
-    `rasterize_forward` ends with the image, `rasterize_backward` begins with its gradient, and `loss` is what lies
-    between, forth and back. `eta` is the observation's share of each step, `optimizer` includes zeroing gradients and
-    the rates' schedules, and `rest` is choosing views, metrics, gradient statistics and nerfstudio's overhead.
+    In these steps the strategy observes η and gathers gradients as in one that AbsGS reads, but densifies nothing, so
+    they take longer than the run's mean step. `rasterize_forward` ends with the image, `rasterize_backward` begins with
+    its gradient, and `loss` lies between. `eta` is the observation's share of each step, `optimizer` includes zeroing
+    gradients and the rates' schedules, and `rest` is choosing views, metrics and nerfstudio's overhead.
 
     Args:
         trainer: A nerfstudio Trainer after `train`; its model goes on training.

@@ -75,13 +75,9 @@ def pareto_front(points: Iterable[tuple[float, float]], higher_is_better: bool) 
 
 @_styled
 def quality(results: Iterable[tuple[tuple[str, str], list[Result]]], cost: str) -> Figure:
-    """PSNR, SSIM and LPIPS against a field of COSTS, a row of panels a scene.
+    """PSNR, SSIM and LPIPS of scenes and labels against a field of COSTS, a row of panels a scene.
 
     Against seconds, runs that were measured on their way have lines; against Gaussians there is the Pareto front.
-
-    Args:
-        results: Scene and label, and the results of their seeds.
-        cost: The field.
     """
     groups, timed = dict(results), cost == "loop_seconds"
     scenes = list(dict.fromkeys(scene for scene, _ in groups))

@@ -116,11 +116,7 @@ def load(path: Path) -> Protocol:
 
 
 def parse(content: object) -> Protocol:
-    """Turn the content of a protocol file into a Protocol.
-
-    Raises:
-        ValueError: As `load`, without the file's name.
-    """
+    """Turn the content of a protocol file into a Protocol; raises as `load`, without the file's name."""
     top = _mapping(content, "the protocol", {"scenes", "rows"}, {"seeds", "source", "curve_every"})
     scenes = {name: _scene(name, value) for name, value in _mapping(top["scenes"], "scenes").items()}
     if not scenes:
@@ -141,13 +137,8 @@ def parse(content: object) -> Protocol:
 def set_dotted(config: Any, path: str, value: Any) -> None:
     """Set one setting in a tree of dataclasses and dicts, in place.
 
-    Args:
-        config: Root of the tree.
-        path: Dataclass fields and dict keys, joined by dots.
-        value: What YAML holds; it becomes a Path, tuple or float where the present value is one.
-
-    Raises:
-        ValueError: The path leads nowhere, or the value has another type than the present one.
+    The path is of fields and keys, joined by dots. The value, from YAML, becomes a Path, tuple or float where the
+    present one is. Raises ValueError if the path leads nowhere, or the value has another type than the present one.
     """
     *parents, last = path.split(".")
     node = config

@@ -212,11 +212,7 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
 
 
 def alone(job: Job, root: Path, work: Path, checkpoint: Path) -> Any:
-    """Return a trainer in which this process has all of what several have trained and have left by now.
-
-    Args:
-        checkpoint: Folder of the checkpoint that they wrote.
-    """
+    """Return a trainer in which this process has all that several trained and wrote to a folder of checkpoints."""
     for name in list(os.environ):
         if name in ("RANK", "WORLD_SIZE") or name.startswith(("LOCAL_", "GROUP_")):
             del os.environ[name]

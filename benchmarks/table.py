@@ -34,13 +34,7 @@ def count(value: float) -> str:
 
 
 def grid(header: Sequence[str], lines: Iterable[Sequence[str]], names: int = 1) -> str:
-    """Cells as a Markdown table.
-
-    Args:
-        header: The columns' names.
-        lines: Of as many cells as the header.
-        names: So many columns, the first ones, are to the left; the others, which hold numbers, are to the right.
-    """
+    """Cells as a Markdown table; the first `names` columns are aligned to the left, the others to the right."""
     rule = ["---"] * names + ["---:"] * (len(header) - names)
     cells = ([cell.replace("|", "\\|") for cell in line] for line in (header, rule, *lines))
     return "\n".join("| " + " | ".join(line) + " |" for line in cells)
@@ -158,15 +152,10 @@ _PRINTED = ("scene", "method", "loop", "relative", "psnr", "ssim", "lpips", "gau
 
 
 def of_runs(runs: Iterable[Run], columns: Sequence[str | Sequence[str]], strict: bool = True) -> str:
-    """Runs as a Markdown table.
+    """Runs as a Markdown table, a line each.
 
-    Args:
-        runs: A line each.
-        columns: Names of COLUMNS, or a header and a field of seconds or milliseconds each.
-        strict: Whether it is an error if a run lacks a column's number.
-
-    Raises:
-        ValueError: There is no such column, or, with `strict`, a number is missing.
+    The columns are names of COLUMNS, or a header and a field of seconds or milliseconds each. Raises ValueError if
+    there is no such column or, with `strict`, a number is missing.
     """
 
     def cell(column: Callable[[Run], str], run: Run) -> str:
@@ -185,14 +174,10 @@ def of_runs(runs: Iterable[Run], columns: Sequence[str | Sequence[str]], strict:
 
 
 def markdown(rows: Iterable[Result], reference: str | None = None) -> str:
-    """Results as a Markdown table: a line per scene and label, the mean over seeds ± half their range.
+    """Results as a Markdown table, and under it what is wrong with it: failed runs, shared GPUs, several commits.
 
-    Args:
-        rows: Results; of several with one scene, label and seed the last counts. Failed ones are listed below.
-        reference: Label whose loop seconds on the same scene are 1 in the column Ratio.
-
-    Returns:
-        The table, and under it what is wrong with it, if anything.
+    A line is the mean over seeds ± half their range of one scene and label; of several results with one seed the last
+    counts. The label `reference` has the loop seconds that are 1 in the column Ratio.
     """
     last = latest(rows)
     grouped = groups(last)
@@ -215,12 +200,8 @@ def markdown(rows: Iterable[Result], reference: str | None = None) -> str:
 def of_sweep(found: Groups, labels: Mapping[str, str], scenes: Mapping[str, Sequence[str]]) -> str:
     """A setting a line and scenes as columns: PSNR / SSIM / LPIPS / Gaussians, as differences from the first setting.
 
-    The second line is half the range of the first one's runs, and ¹ a difference of which one side is a single run.
-
-    Args:
-        found: All results, of which several may have one seed.
-        labels: Label in the rows: name in the table.
-        scenes: Name of a column: scenes whose mean it is.
+    The second line is half the range of the first one's runs, and ¹ marks differences from or to a single run. `labels`
+    are the names of the rows' labels, and `scenes` the scenes whose mean a column is.
     """
     for label in labels:
         if label not in {other for _, other in found}:

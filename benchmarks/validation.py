@@ -41,10 +41,7 @@ def write_colmap(scene: Path, out: Path, fold: int = VALIDATION) -> tuple[int, i
         fold: Number of the first view that is held out, in [0, 7]. Test views are in the training views of no fold.
 
     Returns:
-        Numbers of training and of held-out views.
-
-    Raises:
-        FileNotFoundError: The model or an image is missing; names the path.
+        Numbers of training and of held-out views. Raises as `image_names`.
     """
     names = image_names(ColmapDataParserConfig(colmap_path=SPARSE, downscale_factor=1), scene)
     shutil.rmtree(out, ignore_errors=True)
@@ -59,11 +56,7 @@ def write_colmap(scene: Path, out: Path, fold: int = VALIDATION) -> tuple[int, i
 
 
 def turn_cameras(out: Path) -> None:
-    """Turn the training cameras of a copy about their centres, by NOISY_DEGREES, the same at each call.
-
-    Args:
-        out: Folder that `write_colmap` wrote.
-    """
+    """Turn the training cameras of a copy of `write_colmap` about their centres, the same at each call."""
     import pycolmap  # Pillow cannot write PNGs if it is loaded after this.
 
     model = pycolmap.Reconstruction(out / SPARSE)
@@ -81,14 +74,9 @@ def turn_cameras(out: Path) -> None:
 
 
 def write_transforms(scene: Path, out: Path, fold: int = VALIDATION) -> tuple[int, int]:
-    """Write one scene of a `transforms.json` that lists its splits, with every 8th training view held out.
+    """Write one scene of a `transforms.json` that lists its splits, otherwise as `write_colmap`.
 
-    Args:
-        scene, out: As for `write_colmap`.
-        fold: Number of the first training view that is held out, in [1, 7]; 0 holds out the listed test views.
-
-    Returns:
-        Numbers of training and of held-out views.
+    The training view `fold`, in [1, 7], and every 8th after it are held out; 0 holds out the listed test views.
     """
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)

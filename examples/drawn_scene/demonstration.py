@@ -59,12 +59,7 @@ class Run:
 
 
 def fit_densification(strategy: StructureAwareStrategy, max_gaussians: int) -> None:
-    """Fit densification to the demo, whose images are small and whose run is short.
-
-    Args:
-        strategy: Changed in place.
-        max_gaussians: The demo's cap, which bounds the time of a step on a CPU.
-    """
+    """Fit densification to the demo, whose images are small and whose run is short; the cap bounds a step's time."""
     strategy.clone_grad2d *= ABSGS_THRESHOLD_FACTOR
     strategy.split_absgrad2d *= ABSGS_THRESHOLD_FACTOR
     strategy.max_gaussians = max_gaussians
@@ -73,11 +68,7 @@ def fit_densification(strategy: StructureAwareStrategy, max_gaussians: int) -> N
 def run_config(output: Path, label: str, iterations: int, max_gaussians: int) -> SadgsTrainerConfig:
     """Return the preset `sadgs` with the demo's data and length, without a viewer or evaluation on the way.
 
-    Args:
-        output: The demo's folder.
-        label: One of `ROWS`, which also names the run's folder.
-        iterations: Length of the run.
-        max_gaussians: Cap on the number of Gaussians.
+    The label, one of `ROWS`, also names the run's folder in that of the demo.
     """
     config: SadgsTrainerConfig = copy.deepcopy(presets.sadgs.config)  # type: ignore[assignment]
     config.output_dir, config.experiment_name, config.timestamp = output / "runs", label.replace(" ", "-"), "latest"
@@ -99,12 +90,7 @@ def run_config(output: Path, label: str, iterations: int, max_gaussians: int) ->
 
 
 def train(config: SadgsTrainerConfig, on_step: Callable[[int], None]) -> Run:
-    """Train through nerfstudio's trainer and render the held-out views.
-
-    Args:
-        config: The run.
-        on_step: Called with the step, from 0, after each iteration.
-    """
+    """Train through nerfstudio's trainer, call `on_step` after each step, from 0, and render the held-out views."""
     torch.manual_seed(config.machine.seed)
     np.random.seed(config.machine.seed)
     trainer: SadgsTrainer = config.setup(local_rank=0, world_size=1)
@@ -147,11 +133,7 @@ def demonstrate(output: Path, iterations: int, max_gaussians: int, width: int, h
         output: Folder for everything that is left.
         iterations: Of each run, at least 30.
         max_gaussians: Cap on the number of Gaussians.
-        width, height, views: As for `write_scene`.
-
-    Raises:
-        ValueError: If a number is too small.
-        FileExistsError: If `output`/scene holds something else.
+        width, height, views: As for `write_scene`, which also tells what is raised.
     """
     if iterations < 30:
         raise ValueError(f"--max-num-iterations is {iterations}; give at least 30, or nothing is split")
