@@ -10,7 +10,7 @@ import contextlib
 import itertools
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -112,28 +112,26 @@ def booked(trainer: Any, watch: Stopwatch) -> Iterator[None]:
     """For the duration, a nerfstudio Trainer's steps are booked by phase."""
     model, optimizers = trainer.pipeline.model, trainer.optimizers
 
-    def rendering(function: Callable[..., Any]) -> Callable[..., Any]:
-        def render(*args: Any, **kwargs: Any) -> Any:
-            outputs = watch.during("rasterize_forward", function)(*args, **kwargs)
-            watch.when_gradient_arrives(outputs["rgb"], "rasterize_backward")
-            return outputs
+    def booking(forward: str, backward: str, tensors: Callable[[Any], Iterable[Any]]) -> Callable[..., Any]:
+        """Book a function under a phase, and the backward pass from its tensors' gradients on under another."""
 
-        return render
+        def wrap(function: Callable[..., Any]) -> Callable[..., Any]:
+            def call(*args: Any, **kwargs: Any) -> Any:
+                result = watch.during(forward, function)(*args, **kwargs)
+                for tensor in tensors(result):
+                    watch.when_gradient_arrives(tensor, backward)
+                return result
 
-    def losing(function: Callable[..., Any]) -> Callable[..., Any]:
-        def lose(*args: Any, **kwargs: Any) -> Any:
-            losses = watch.during("loss", function)(*args, **kwargs)
-            for loss in losses.values():  # with several renderings a step, this one's backward pass begins here
-                watch.when_gradient_arrives(loss, "loss")
-            return losses
+            return call
 
-        return lose
+        return wrap
 
     # sadgs trains on several views at once, which nerfstudio's method cannot express.
     render = "get_training_outputs" if hasattr(model, "get_training_outputs") else "get_outputs"
     places: list[tuple[Any, str, Any]] = [
-        (model, render, rendering),
-        (model, "get_loss_dict", losing),
+        (model, render, booking("rasterize_forward", "rasterize_backward", lambda outputs: [outputs["rgb"]])),
+        # With several renderings a step, the backward pass of one begins where its loss has a gradient.
+        (model, "get_loss_dict", booking("loss", "loss", dict.values)),
         (torch.Tensor, "backward", partial(watch.during, "loss")),
         (sadgs_ns.method.strategy, "observe", partial(watch.during, "eta")),
     ]
