@@ -17,11 +17,7 @@ if TYPE_CHECKING:
 
 
 def check(jobs: Sequence[Job], root: Path, source: str | None = None) -> None:
-    """Check that the jobs' scenes are there, and build every config once.
-
-    Args:
-        root: Folder that holds all scenes.
-        source: What the data are called and where they come from, for the error.
+    """Check that the jobs' scenes are there below `root`, and build every config once.
 
     Raises:
         ValueError: A scene is missing, or as `build_config`; one sentence.
@@ -59,10 +55,6 @@ def check(jobs: Sequence[Job], root: Path, source: str | None = None) -> None:
 
 def image_names(parser: ColmapDataParserConfig, data: Path) -> list[str]:
     """Names of a COLMAP scene's images in the order in which nerfstudio holds out every n-th.
-
-    Args:
-        parser: How nerfstudio will read the scene.
-        data: The scene's folder.
 
     Raises:
         FileNotFoundError: The model, the folder of (downscaled) images or an image is missing; names the path.

@@ -115,12 +115,10 @@ def quality(results: Iterable[tuple[tuple[str, str], list[Result]]], cost: str) 
 
 @_styled
 def peers(points: Sequence[tuple[str, bool, float, float, float]], cost: str) -> Figure:
-    """PSNR and LPIPS against a cost on a logarithmic axis, each point with its name; those of other machines hollow.
+    """PSNR and LPIPS against a field of COSTS, each point with its name.
 
-    Args:
-        points: Name, the first word of which is that of the method; whether it ran on the machine that most points
-            share; cost, PSNR and LPIPS.
-        cost: Field of COSTS that the points' cost is.
+    Points are a name that begins with the method's, whether it ran on the machine that most share (the others are
+    hollow), cost, PSNR and LPIPS.
     """
     figure = Figure(figsize=(_WIDTH, 3.0))
     methods = [name.split()[0].rstrip(",") for name, *_ in points]

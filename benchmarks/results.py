@@ -16,9 +16,7 @@ def read(path: Path, missing_ok: bool = False) -> list[Result]:
     """Results in the order they ended; the last one of each key.
 
     A line that is no result, such as one that a killed benchmark left half-written, is reported on stderr and ignored.
-
-    Raises:
-        ValueError: There is no such file, unless `missing_ok`, or it is not text.
+    Raises ValueError if there is no such file, unless `missing_ok`, or if it is not text.
     """
     if not path.is_file():
         if missing_ok:

@@ -30,11 +30,7 @@ if TYPE_CHECKING:
 
 
 def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> TrainerConfig:
-    """The nerfstudio config of a run.
-
-    Args:
-        root: Folder that holds all scenes.
-        work: Folder for what nerfstudio writes.
+    """The nerfstudio config of a run on a scene below `root`, which writes to `work`.
 
     Raises:
         ValueError: Unknown method, dataparser or setting, or no data; one sentence that names it.

@@ -34,14 +34,14 @@ ROOM = 1.25
 """Places in the tile lists, relative to the pairs of the first step: as in training, later ones do not wait."""
 
 
-def milliseconds(function: Callable[[], object], rounds: int = 5, repeats: int = REPEATS) -> float:
+def milliseconds(function: Callable[[], object], rounds: int = 5) -> float:
     """Time of a call among calls that follow each other, as in training: the median of some rounds, after one."""
     times = []
     for _ in range(1 + rounds):
         start = now()
-        for _ in range(repeats):
+        for _ in range(REPEATS):
             function()
-        times.append((now() - start) / repeats * 1e3)
+        times.append((now() - start) / REPEATS * 1e3)
     return statistics.median(times[1:])
 
 
@@ -150,17 +150,6 @@ class Step:
         self.optimize()
 
 
-def gpu() -> None:
-    """Print what the GPU is.
-
-    Raises:
-        ValueError: There is none.
-    """
-    if not torch.cuda.is_available():
-        raise ValueError("this needs a CUDA device, and torch finds none.")
-    print(f"torch {torch.__version__}, {torch.cuda.get_device_name()}\n", flush=True)
-
-
 @dataclass
 class Command:
     """Time the parts of a training step with and without our kernels (CUDA)."""
@@ -173,7 +162,9 @@ class Command:
     """px"""
 
     def __call__(self) -> int:
-        gpu()
+        if not torch.cuda.is_available():
+            raise ValueError("this needs a CUDA device, and torch finds none.")
+        print(f"torch {torch.__version__}, {torch.cuda.get_device_name()}\n", flush=True)
         for gaussians in self.gaussians:
             columns = []
             for triton in (False, True):

@@ -49,13 +49,9 @@ class SceneDescription:
 
 
 def _box(name: str, centre: tuple[float, float], size: tuple[float, float, float], turn: float, *texture) -> list:
-    """Five faces of a box that stands on the floor.
+    """Five faces of a box that stands on the floor at x and y, turned about the vertical, in rad.
 
-    Args:
-        centre: x and y, world units.
-        size: Along the box's own x, y and z, world units.
-        turn: About the vertical, in rad.
-        texture: The last fields of `Rectangle`, from `dark`.
+    The size is along the box's own axes, and `texture` the last fields of `Rectangle`, from `dark`.
     """
     x = np.array([np.cos(turn), np.sin(turn), 0.0]) * size[0]
     y = np.array([-np.sin(turn), np.cos(turn), 0.0]) * size[1]
