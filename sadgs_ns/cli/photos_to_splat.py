@@ -98,6 +98,7 @@ class PhotosToSplat:
         self._formats = sorted(_formats(given.formats, console), key=lambda name: name == "html")
         self._given = _given_cameras(given)
         self._scene, self._runs = self.folder / "scene", self.folder / "training" / "sadgs"
+        self._data = self.source if self._given else self._scene
         self._settings: dict[str, Any] = {}
         if not 0 < given.effort < math.inf:
             raise InputError("--effort must be more than 0.")
@@ -271,6 +272,7 @@ class PhotosToSplat:
         given = Process(source, self._scene, max_size=self.given.max_size)
         summary = Summary(**self._call(worker, line, hear, command, given))
         found = f"{added}{summary.registered} of {summary.photos} photos registered"
+        found += " after a second attempt" if summary.attempts else ""
         self._settings.pop("few", None)
         if summary.is_poor:
             self._note(few=found)
@@ -311,7 +313,7 @@ class PhotosToSplat:
 
         begun = bool(self._checkpoint())
         line.update("going on" if begun else "starting")
-        command = ["ns-train", "sadgs", "--data", os.path.abspath(self.source if self._given else self._scene)]
+        command = ["ns-train", "sadgs", "--data", os.path.abspath(self._data)]
         command += ["--output-dir", str(self.folder.absolute()), "--experiment-name", "training"]
         command += ["--timestamp", self._run.name, "--vis", "tensorboard"]
         command += ["--steps-per-eval-image", "0", "--pipeline.effort", f"{self.given.effort:g}"]
@@ -331,8 +333,8 @@ class PhotosToSplat:
         line.update(str(output))
         worker = self._worker("export", "sadgs_ns.cli.export:export")
         # The folder may have been renamed since the run's config.yml noted where the scene is.
-        given = Export(self._run, output, data=self._scene)
-        command = ["sadgs-export", str(self._run), "--output", str(output), "--data", str(self._scene)]
+        given = Export(self._run, output, data=self._data)
+        command = ["sadgs-export", str(self._run), "--output", str(output), "--data", str(self._data)]
         self._call(worker, line, lambda event, **fields: None, command, given)
         return f"{output}, {output.stat().st_size / 1e6:,.1f} MB"
 

@@ -50,11 +50,10 @@ _ADJUSTED_PHOTOS = 2
 .32 to .41 of the time that it takes with COLMAP's on three captures, .74 to .81 where photos are added to a model, and
 puts them within .3 % of where it puts them."""
 _RELAXED = {"init_max_forward_motion": 1.0, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
-"""Limits of a second attempt: photos along the view and under smaller angles begin a model, and half of the matches
-place a photo (COLMAP's own: .95, 16° and 30). They are not the first because placing takes up to 1.3 times as long."""
+"""Limits of a second attempt (COLMAP's own: .95, 16° and 30), which takes .9 to 1.5 times as long as a first."""
 _ENOUGH, _MOST_STRETCH = 0.9, 0.05
-"""Share of the photos that suffices at the first attempt, and the most that the two focal lengths of a photo differ:
-no lens's do more, but those of models do that went wrong in the beginning."""
+"""Share of the photos that suffices at the first attempt, and the most by which its two focal lengths may differ:
+those of lenses do less, those of models that went wrong in the beginning more."""
 FEW_FEATURES = 500
 """Keypoints under which a photo counts as blurred or empty."""
 

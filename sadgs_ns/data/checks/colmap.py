@@ -61,11 +61,8 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
         random = f"{this_model} --load-3D-points False` to start from random points"
         yield from _check_points(model_folder, views if sound else [], random)
     if options.masks_path is None and images_in(data / "masks"):
-        yield Finding(
-            "warning",
-            f"{data / 'masks'} holds masks that are not used: {this_model} --masks-path masks` to leave out what is "
-            "black in them.",
-        )
+        told = f"{data / 'masks'} holds masks that are not used"
+        yield Finding("warning", f"{told}: {this_model} --masks-path masks` to leave out what is black in them.")
     if not open_images:
         return
     factor = yield from _check_factor(images, names, options)

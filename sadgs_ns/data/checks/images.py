@@ -75,10 +75,9 @@ def smaller_folder(folder: Path, factor: int) -> Path:
 
 
 def mask_name(folder: Path, image: str) -> Path:
-    """Return an image's mask in a folder of masks, relative to it.
+    """Return an image's mask, relative to a folder of masks: the first that exists of the names in use, else the first.
 
-    It is called as the image, with .png instead of its suffix (nerfstudio), or after it (COLMAP), or with _mask.png
-    (Metashape) or .mask.png; the first that exists, else the first.
+    They are those of nerfstudio, COLMAP, Metashape and RealityCapture.
     """
     stem = PurePosixPath(image).with_suffix("")
     names = [Path(f"{start}.png") for start in (stem, image, f"{stem}_mask", f"{stem}.mask", f"{image}.mask")]

@@ -72,10 +72,7 @@ def find_cameras(data: Path) -> Path | None:
 
 
 def images_folder(data: Path, model: Path) -> Path | None:
-    """Return the folder that has images of a reconstruction, both relative to the data; None if none has any.
-
-    Images beside the model or in a folder of any name are found, also where their names begin with that folder's.
-    """
+    """Return the folder that has images of a reconstruction, both relative to the data; None if none has any."""
     names = colmap.image_names(data / model)
     others = [path.name for path in data.iterdir() if not re.search(r"mask|depth|normal|_\d+$", path.name)]
     beside = [folder / "images" for folder in (model, *model.parents)]
