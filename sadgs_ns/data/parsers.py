@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import torch
+from nerfstudio.data.dataparsers import blender_dataparser, nerfstudio_dataparser
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.blender_dataparser import Blender
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser
@@ -19,7 +21,7 @@ from torch import Tensor
 from sadgs_ns.data import colmap, ply
 from sadgs_ns.data.checks.images import mask_name
 from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS
-from sadgs_ns.data.checks.transforms import read_json
+from sadgs_ns.data.checks.transforms import read_blender, read_json, read_transforms
 from sadgs_ns.data.coordinates import FRAME_KEYS, Similarity, fixed_frame
 
 
@@ -35,7 +37,10 @@ class _PointsOfPly:
         return points_in_the_run(positions, colors, transform, scale) if len(positions) else {}
 
 
-class _Blender(_PointsOfPly, Blender): ...
+class _Blender(_PointsOfPly, Blender):
+    def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
+        with mock.patch.object(blender_dataparser, "load_from_json", read_blender):
+            return super()._generate_dataparser_outputs(split)
 
 
 class _ScanNet(_PointsOfPly, ScanNet):
@@ -54,7 +59,8 @@ class TransformsParser(_PointsOfPly, Nerfstudio):
         model = path.parent / COLMAP_FOLDERS[0]
         if model.exists():
             self.prompted_user, self.create_pc = True, False  # The answer no; the points are read below.
-        outputs = super()._generate_dataparser_outputs(split)
+        with mock.patch.object(nerfstudio_dataparser, "load_from_json", read_transforms):
+            outputs = super()._generate_dataparser_outputs(split)
         _move_to_fixed_frame(outputs, read_json(path), path)
         source = colmap.points_file(model)
         if self.config.load_3D_points and "points3D_xyz" not in outputs.metadata and source is not None:

@@ -71,6 +71,7 @@ def _parser(settings: Mapping[str, Any], data: Path) -> Any:
 
     from sadgs_ns.data.automatic import PARSERS, AutomaticDataParserConfig, choose_parser
     from sadgs_ns.data.checks.colmap import automatic_factor
+    from sadgs_ns.data.parsers import OWN
 
     known = {f"{type(parser).__module__}.{type(parser).__qualname__}": parser for parser in PARSERS.values()}
     parser: Any = copy.deepcopy(known.get(settings.get(_CLASS, ""), AutomaticDataParserConfig()))
@@ -81,6 +82,7 @@ def _parser(settings: Mapping[str, Any], data: Path) -> Any:
     config = FullImageDatamanagerConfig(data=data, dataparser=parser)
     choose_parser(config)
     parser = config.dataparser
+    parser._target = OWN.get(parser._target, parser._target)
     # Points are not needed. nerfstudio reads some with open3d, which a machine may lack, or asks whether to make a PLY.
     for name, value in (("load_3D_points", False), ("ply_path", None)):
         if hasattr(parser, name):
@@ -120,8 +122,6 @@ def read_cameras(run: Path, data: Path | None = None, split: str = "train") -> R
     found = data or found
     try:
         outputs = _parse(settings, found, split, as_fits=data is not None)
-    except InputError:
-        raise
     except Exception as error:  # The parsers' errors are of every kind.
         raise InputError(f"{found} cannot be read as a capture ({reason(error)}): give another with --data.") from error
     cameras, poses = outputs.cameras, outputs.cameras.camera_to_worlds.double().numpy()

@@ -604,7 +604,7 @@ NERFSTUDIO = {
     ),
     "json-few-coefficients": (
         meta(lambda m: m.update(distortion_params=[0.1])),
-        r"\S+ has distortion_params that are no list of 6 numbers \(k1, k2, k3, k4, p1, p2\): correct or remove them\.",
+        r"\S+: frame \S+ has distortion_params that are no list of 6 numbers \(k1, k2, k3, k4, p1, p2\): correct or .*",
     ),
     "json-last-row": (
         meta(set_pose(5, 3, 3, 2)),
@@ -623,7 +623,7 @@ NERFSTUDIO = {
         r"\S+: frame images/000\.png has k4 = 0\.1, which nerfstudio cannot undo: undistort the images yourself\.",
     ),
     "json-huge": (
-        meta(lambda m: m.update(fl_x=10**400)),
+        meta(lambda m: m["frames"][0].update(fl_x=10**400)),
         r"\S+: frame images/000\.png has fl_x = .*, which is no finite number: correct it\.",
     ),
     "json-shifted": (
@@ -666,7 +666,10 @@ NERFSTUDIO = {
     ),
 }
 BLENDER = {
-    "blender-no-val": (remove("transforms_val.json"), r"\S+/transforms_val\.json does not exist: restore it.*"),
+    "blender-no-val": (
+        lambda data: [remove(f"transforms_{split}.json")(data) for split in ("val", "test")],
+        r"\S+/transforms_val\.json does not exist: restore it.*",
+    ),
     "blender-nan": (meta(set_pose(0, 1, 3, np.inf), "transforms_train.json"), r"\S+: frame \S+ has NaN or inf.*"),
     "blender-mirrored": (
         change_poses(1, name="transforms_test.json", times=MIRROR),

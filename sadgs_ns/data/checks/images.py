@@ -157,6 +157,10 @@ def check_images(frames: Sequence[Frame], source: Path, look_for_unused: bool = 
 
 def _problem(frame: Frame, image: _Image, mask: _Image | None, source: Path) -> tuple[str, Path, str] | None:
     """Return what is wrong with a frame's files, if anything is: its kind, the file and the rest of the sentence."""
+    if image.problem.startswith("does not exist"):
+        places = (frame.image.parent, source.parent / "images", source.parent)
+        if near := [path for place in places for path in images_in(place) if path.stem == frame.image.stem]:
+            return "near", frame.image, f"does not exist, but {near[0]} does: correct the name, or save that as this"
     if image.problem:
         return image.problem.split(" (")[0], frame.image, image.problem
     if image.mode not in ("RGB", "RGBA", "L"):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sadgs_ns.data import colmap
+from sadgs_ns.data import IMAGE_SUFFIXES, colmap
 from sadgs_ns.data.checks.findings import Finding, collect_findings
 from sadgs_ns.data.checks.geometry import (
     UNDISTORTED_FISHEYE,
@@ -33,6 +33,8 @@ from sadgs_ns.errors import InputError, reason
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Names of nerfstudio's coefficients, in the order of its distortion_params."""
+_LENS, _PINHOLE = (*_DISTORTION, "distortion_params"), ("fl_x", "fl_y", "cx", "cy", "w", "h")
+_PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 
 @collect_findings
@@ -47,29 +49,26 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
     path = data if data.suffix == ".json" else data / "transforms.json"
     if not path.is_file():
         raise InputError(_no_transforms(data, path))
-    folder, meta = path.parent, read_json(path)
-    described = frames_of(meta, path)
-    model = meta.get("camera_model", "OPENCV")
-    perspective = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FISHEYE624")
-    if model not in perspective:
-        raise InputError(f"{path} has the camera model {model!r}: give one of {', '.join(perspective)}.")
+    folder, meta = path.parent, read_transforms(path)
+    described, model = meta["frames"], meta.get("camera_model", "OPENCV")
+    if model not in (known := (*_PERSPECTIVE, "OPENCV_FISHEYE", "FISHEYE624")):
+        raise InputError(f"{path} has the camera model {model!r}: give one of {', '.join(known)}.")
     _check_transform(meta, path)
     factor = options.downscale_factor
     if factor is None:
         factor = _smaller_copies(folder, Path(described[0]["file_path"])) if open_images else 1
     if factor > 1 and not (folder / f"images_{factor}").is_dir():
         raise InputError(": ".join(no_copies(folder / f"images_{factor}", factor)) + ".")
-    shared = _distortion_of(meta, path)
     frames, views = [], []
     for frame in described:
-        image, values, where = Path(frame["file_path"]), {**frame, **meta}, f"{path}: frame {frame['file_path']}"
-        check_positive(values, where, ("fl_x", "fl_y", "cx", "cy", "w", "h"))
-        views.append(view_of(frame, where, _camera(values, shared or _distortion_of(frame, where), model, where)))
+        image, where = Path(frame["file_path"]), f"{path}: frame {frame['file_path']}"
+        check_positive(frame, where, _PINHOLE)
+        views.append(view_of(frame, where, _camera(frame, model, where)))
         mask = frame.get("mask_path")
         frames.append(
             Frame(
                 folder / (f"images_{factor}/{image.name}" if factor > 1 else image),
-                scaled_size((int(values["w"]), int(values["h"])), factor, "floor"),
+                scaled_size((int(frame["w"]), int(frame["h"])), factor, "floor"),
                 None if mask is None else folder / (f"masks_{factor}/{Path(mask).name}" if factor > 1 else mask),
             )
         )
@@ -114,16 +113,17 @@ def check_blender(data: Path, options: ParserOptions, open_images: bool = True) 
         if split == "test" and not path.is_file():
             yield Finding("warning", f"{path} does not exist: `ns-eval` will have nothing to measure.")
             continue
-        meta = read_json(path)
-        described = frames_of(meta, path)
-        check_positive(meta, str(path), ["camera_angle_x"])
-        if not meta["camera_angle_x"] < math.pi:
-            angle = f"camera_angle_x = {meta['camera_angle_x']:g}"
-            raise InputError(f"{path} has {angle}, which is no angle of view in radians: correct it.")
+        meta = read_blender(path)
+        described = meta["frames"]
         images = [data / (frame["file_path"].replace("./", "") + ".png") for frame in described]
         size = image_size(images[0])  # The cameras have no size of their own.
         width, height = size if open_images and any(size) else (1, 1)  # The other checks need none.
-        focal = 0.5 * width / math.tan(0.5 * meta["camera_angle_x"])
+        focal = _focal_length(meta, width, "camera_angle_x", str(path))
+        taken = {"fl_x": focal, "fl_y": focal, "cx": width / 2, "cy": height / 2, **dict.fromkeys(_DISTORTION, 0)}
+        for values in (meta, *described) if open_images and any(size) else ():
+            for name, value in taken.items():
+                if abs(finite(values.get(name, value), name, str(path)) - value) > 1e-3 * value:
+                    raise InputError(f"{path} has a {name} that Blender scenes have not: rename it to transforms.json.")
         camera = Camera(width, height, focal, focal, width / 2, height / 2)
         views = [view_of(frame, f"{path}: frame {frame['file_path']}", camera) for frame in described]
         if split == "train":
@@ -135,6 +135,61 @@ def check_blender(data: Path, options: ParserOptions, open_images: bool = True) 
             yield from check_rotations(views)
         if open_images:
             yield from check_images([Frame(image, size if any(size) else None) for image in images], path)
+
+
+def read_transforms(path: Path) -> dict[str, Any]:
+    """Return a `transforms.json` for nerfstudio's parser, with the frames' own values before those of the file.
+
+    InputError is raised as by `read_json` and `frames_of`, for a wrong angle of view, and for mixed models of cameras.
+    """
+    meta, models = read_json(path), set()
+    frames = [frame | _completed(frame, meta, path) for frame in frames_of(meta, path)]
+    for values in ({**meta, **frame} for frame in frames):
+        fisheye, model = bool(values.get("is_fisheye")), str(values.get("camera_model", "OPENCV"))
+        models.add("OPENCV" + fisheye * "_FISHEYE" if model in _PERSPECTIVE else model)
+    if len(models) > 1:
+        raise InputError(
+            f"{path} mixes the camera models {' and '.join(sorted(models))}: keep the frames of one of them."
+        )
+    meta = {name: meta[name] for name in meta if name not in (*_PINHOLE, *_LENS)}
+    return {**meta, "camera_model": models.pop(), "frames": frames}
+
+
+def _completed(frame: dict[str, Any], meta: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Return a frame's image, found with / for \\ or without suffix, and intrinsics from what tells of them."""
+    where, values, name = f"{path}: frame {frame['file_path']}", {**meta, **frame}, frame["file_path"]
+    names = (start + suffix for start in (name, name.replace("\\", "/")) for suffix in ("", *sorted(IMAGE_SUFFIXES)))
+    name = next((found for found in names if (path.parent / found).is_file()), name)
+    if not values.keys() >= {"w", "h"} and any(size := image_size(path.parent / name)):
+        values = {"w": size[0], "h": size[1], **values}
+    for side, focal, center, angle in (("w", "fl_x", "cx", "camera_angle_x"), ("h", "fl_y", "cy", "camera_angle_y")):
+        if side in values:
+            values.setdefault(center, finite(values[side], side, where) / 2)
+            if focal not in values and angle in values:
+                values[focal] = _focal_length(values, values[side], angle, where)
+    if "fl_x" in values:
+        values.setdefault("fl_y", values["fl_x"])
+    lens = frame if any(name in frame for name in _LENS) else meta
+    taken = {n: values[n] for n in _PINHOLE if n in values} | {n: lens[n] for n in _LENS if n in lens}
+    return {**taken, "file_path": name}
+
+
+def _focal_length(values: dict[str, Any], side: float, angle: str, where: str) -> float:
+    """Return the focal length in px of a named angle of view over a side in px; raise InputError if it is no angle."""
+    check_positive(values, where, [angle])
+    if not values[angle] < math.pi:
+        raise InputError(f"{where} has {angle} = {values[angle]:g}, which is no angle of view in radians: correct it.")
+    return 0.5 * side / math.tan(0.5 * values[angle])
+
+
+def read_blender(path: Path) -> dict[str, Any]:
+    """Return a Blender scene's file, or the tests' for a missing one of validation, without the .png that is added."""
+    tests = path.with_name("transforms_test.json")
+    meta = read_json(tests if path.name == "transforms_val.json" and tests.exists() and not path.exists() else path)
+    for frame in frames_of(meta, path):
+        if not (path.parent / f"{frame['file_path']}.png").exists():
+            frame["file_path"] = frame["file_path"].removesuffix(".png")
+    return meta
 
 
 def _check_transform(meta: dict[str, Any], path: Path) -> None:
@@ -214,11 +269,8 @@ def view_of(frame: dict[str, Any], where: str, camera: Camera) -> View:
     return View(where, where, (pose[:3, :3] * [1, -1, -1]).T, pose[:3, 3], camera)  # The axes become OpenCV's.
 
 
-def _distortion_of(values: dict[str, Any], where: Path | str) -> dict[str, Any]:
-    """Return the coefficients that a frame, or all of them, have by name; nerfstudio takes all from one of the two.
-
-    Raises InputError if they are listed, but not as nerfstudio reads them.
-    """
+def _distortion_of(values: dict[str, Any], where: str) -> dict[str, Any]:
+    """Return a frame's coefficients by name; raise InputError for a list that is not as nerfstudio reads it."""
     if "distortion_params" not in values:
         return {name: values[name] for name in _DISTORTION if name in values}
     listed = values["distortion_params"]
@@ -230,9 +282,9 @@ def _distortion_of(values: dict[str, Any], where: Path | str) -> dict[str, Any]:
     return dict(zip(_DISTORTION, listed, strict=False))
 
 
-def _camera(values: dict[str, Any], distortion: dict[str, Any], model: str, where: str) -> Camera:
+def _camera(values: dict[str, Any], model: str, where: str) -> Camera:
     """Return the camera of good values; raise InputError for a distortion that nerfstudio does not support."""
-    size = (int(values["w"]), int(values["h"]))
+    size, distortion = (int(values["w"]), int(values["h"])), _distortion_of(values, where)
     pinhole = (*size, values["fl_x"], values["fl_y"], values["cx"], values["cy"])
     k1, k2, k3, k4, p1, p2 = (finite(distortion.get(name, 0.0), name, where) for name in _DISTORTION)
     if model == "FISHEYE624":

@@ -1,0 +1,179 @@
+"""`transforms.json` and Blender scenes as other programs write them, read with the cameras that they mean."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.cameras.cameras import CameraType
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from PIL import Image
+from runs import blender_data, nerfstudio_data
+from scenes import HEIGHT, WIDTH
+
+from sadgs_ns.data.checks import check_data
+from sadgs_ns.data.parsers import TransformsParser
+from sadgs_ns.data.run_cameras import read_cameras
+
+# nerfstudio opens an image, to look for smaller copies of it, and leaves it open.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:Exception ignored in. <_io.FileIO:pytest.PytestUnraisableExceptionWarning"
+)
+
+PINHOLE = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+FOCAL = 0.8 * WIDTH
+ANGLES = {"camera_angle_x": 2 * math.atan(0.5 / 0.8), "camera_angle_y": 2 * math.atan(0.5 * HEIGHT / FOCAL)}
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset as ns-process-data writes it, with all values in the frames, and one as Blender does."""
+    folder = tmp_path_factory.mktemp("captures")
+    nerfstudio_data(folder / "transforms")
+    blender_data(folder / "blender", "white")
+    return folder
+
+
+@pytest.fixture
+def write(captures: Path, tmp_path: Path) -> Callable[..., Path]:
+    """Copies a dataset, with a function called with the content of each JSON file and with each of its frames."""
+
+    def change(
+        of_file: Callable[[dict[str, Any]], Any] = dict,
+        of_frame: Callable[[dict[str, Any]], Any] = dict,
+        kind: str = "",
+    ) -> Path:
+        data = Path(shutil.copytree(captures / (kind or "transforms"), tmp_path / "data"))
+        for path in data.glob("transforms*.json"):
+            meta = json.loads(path.read_text())
+            of_file(meta)
+            for frame in meta["frames"]:
+                of_frame(frame)
+            path.write_text(json.dumps(meta))
+        return data
+
+    return change
+
+
+def errors(data: Path) -> list[str]:
+    return [finding.sentence for finding in check_data(data) if finding.severity == "error"]
+
+
+def parsed(data: Path) -> Any:
+    return (
+        TransformsParser(NerfstudioDataParserConfig(data=data, downscale_factor=1))
+        .get_dataparser_outputs("train")
+        .cameras
+    )
+
+
+def expect_the_same_cameras(data: Path, original: Path) -> None:
+    """What is read is what the original means, and nothing in the folder has changed."""
+    files = {path: path.read_bytes() for path in data.rglob("*") if path.is_file()}
+    assert errors(data) == []
+    found, expected = (read_cameras(data / "no run", folder) for folder in (data, original))
+    torch.testing.assert_close(found.camera_to_worlds, expected.camera_to_worlds)
+    torch.testing.assert_close(found.Ks, expected.Ks, rtol=1e-5, atol=1e-4)
+    assert found.sizes == expected.sizes
+    assert [path.name for path in found.photos] == [path.name for path in expected.photos]
+    assert files == {path: path.read_bytes() for path in data.rglob("*") if path.is_file()}
+
+
+def without(*names: str) -> Callable[[dict[str, Any]], Any]:
+    return lambda frame: [frame.pop(name) for name in names]
+
+
+def with_other_names(change: Callable[[str], str]) -> Callable[[dict[str, Any]], None]:
+    return lambda frame: frame.update(file_path=change(frame["file_path"]))
+
+
+@pytest.mark.hard_case(
+    "a `transforms.json` with the file's intrinsics beside other ones of its frames; with an angle of view alone; with "
+    "names of images that lack their suffix or have backslashes",
+    "read as the programs that write it mean it; the frames' values were left out, and the others refused",
+)
+@pytest.mark.parametrize(
+    "change",
+    {
+        "values of frames beside other ones of the file": (lambda m: m.update(fl_x=9.0, fl_y=5.0, cx=1.0, w=7, h=7),),
+        "an angle alone": (lambda m: m.update(camera_angle_x=ANGLES["camera_angle_x"]), without(*PINHOLE)),
+        "two angles and sizes": (lambda m: m.update(ANGLES, w=WIDTH, h=HEIGHT), without(*PINHOLE)),
+        "an angle in each frame": (dict, lambda f: [without(*PINHOLE)(f), f.update(ANGLES)]),
+        "one focal length": (dict, without("fl_y", "cx", "cy", "w", "h")),
+        "names without suffix": (dict, with_other_names(lambda name: name.removesuffix(".png"))),
+        "backslashes": (dict, with_other_names(lambda name: name.replace("/", "\\"))),
+    }.values(),
+)
+def test_a_transforms_json_is_read_as_its_program_means_it(
+    change: tuple[Any, ...], write: Callable[..., Path], captures: Path
+):
+    expect_the_same_cameras(write(*change), captures / "transforms")
+
+
+@pytest.mark.hard_case("lenses and camera models in frames; `is_fisheye`", "read; mixed ones are refused")
+def test_lenses_and_models_of_frames_count(write: Callable[..., Path]):
+    data = write(lambda m: m.update(k1=0.5, p1=0.1), lambda f: f.update(k1=0.01, k2=0.02))
+    torch.testing.assert_close(parsed(data).distortion_params, torch.tensor([0.01, 0.02, 0, 0, 0, 0]).expand(9, 6))
+    shutil.rmtree(data)
+    data = write(lambda m: m.update(is_fisheye=True, k1=0.01))
+    assert errors(data) == [] and set(parsed(data).camera_type.flatten().tolist()) == {CameraType.FISHEYE.value}
+    shutil.rmtree(data)
+    data = write(lambda m: m.pop("camera_model"), lambda f: f.update(camera_model="OPENCV_FISHEYE", k1=0.01))
+    assert errors(data) == [] and set(parsed(data).camera_type.flatten().tolist()) == {CameraType.FISHEYE.value}
+    shutil.rmtree(data)
+    (said,) = errors(write(lambda m: m["frames"][3].update(camera_model="OPENCV_FISHEYE")))
+    assert said.endswith("mixes the camera models OPENCV and OPENCV_FISHEYE: keep the frames of one of them.")
+
+
+@pytest.mark.hard_case(
+    "a Blender scene whose names end in .png, or without a file of validation", "read; the names became `.png.png`"
+)
+def test_a_blender_scene_is_read_with_and_without_suffixes(write: Callable[..., Path], captures: Path):
+    data = write(of_frame=with_other_names(lambda name: f"{name}.png"), kind="blender")
+    (data / "transforms_val.json").unlink()
+    expect_the_same_cameras(data, captures / "blender")
+
+
+@pytest.mark.hard_case(
+    "a Blender scene with a principal point, a lens or JPEGs, which its parser does not read",
+    "refused: rename the file to `transforms.json`, of which all is read",
+)
+def test_what_is_not_read_of_a_blender_scene_is_read_of_a_transforms_json(write: Callable[..., Path]):
+    data = write(lambda m: m.update(cx=20.0, k1=0.001), kind="blender")
+    (said,) = errors(data)
+    assert said.endswith("transforms_train.json has a cx that Blender scenes have not: rename it to transforms.json.")
+    (data / "transforms_train.json").rename(data / "transforms.json")
+    assert errors(data) == []
+    cameras = parsed(data)
+    torch.testing.assert_close(cameras.fx, torch.full_like(cameras.fx, FOCAL))
+    assert set(cameras.cx.flatten().tolist()) == {20.0} and (cameras.distortion_params[:, 0] > 0).all()
+
+
+@pytest.mark.hard_case(
+    "an image that is there with another suffix, or in another folder than a `transforms.json` or a Blender scene says",
+    "refused: the sentence names the file that is there",
+)
+@pytest.mark.parametrize("name", ["images/000.jpg", "/home/someone/scene/000.jpg", "000.png"])
+def test_an_image_elsewhere_is_named(name: str, write: Callable[..., Path]):
+    data = write(lambda m: m["frames"][0].update(file_path=name))
+    (said,) = errors(data)
+    assert said == (
+        f"{data / name} does not exist, but {data / 'images/000.png'} does: correct the name, or save that as this."
+    )
+
+
+def test_an_image_saved_as_the_name_says_is_read(write: Callable[..., Path]):
+    data = write(kind="blender")
+    image = data / "images/005.png"
+    Image.open(image).convert("RGB").save(image.with_suffix(".jpg"))
+    image.unlink()
+    (said,) = errors(data)
+    assert said.startswith(f"{image} does not exist, but {image.with_suffix('.jpg')} does: ")
+    Image.open(image.with_suffix(".jpg")).save(image)
+    assert errors(data) == []
