@@ -1067,6 +1067,17 @@ def test_films_beside_photos_are_told_of(tmp_path: Path, registered: Callable[[i
     assert "Its videos (1, such as a.MOV) are not used: give them in a folder of" in capsys.readouterr().out
 
 
+@pytest.mark.hard_case(
+    "photos beside another program's poses", "computed anew, after a line with the command for those"
+)
+def test_poses_of_other_programs_are_told_of(tmp_path: Path, registered: Callable[[int], None], capsys):
+    photos = black(tmp_path / "photos", "a.png", "b.png", "c.png")
+    (photos / "poses.csv").write_text("#name,x,y,alt\n")
+    registered(9)
+    assert main([str(photos), str(tmp_path / "out")]) == 0
+    assert capsys.readouterr().out.startswith(f"Poses are computed anew. {photos}/poses.csv has poses: `ns-")
+
+
 @pytest.mark.hard_case("a cut video, one of two frames, a photo as the video", "refused in a sentence")
 def test_a_film_that_is_none_is_told_in_a_sentence(tmp_path: Path, capsys):
     (tmp_path / "film.mp4").write_bytes(b"no film")

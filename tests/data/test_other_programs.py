@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import re
+import shlex
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -11,13 +13,16 @@ from typing import Any
 
 import pytest
 import torch
+import tyro
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.scripts import process_data
 from PIL import Image
 from runs import blender_data, nerfstudio_data
 from scenes import HEIGHT, WIDTH
 
 from sadgs_ns.data.checks import check_data
+from sadgs_ns.data.checks.layouts import poses_elsewhere
 from sadgs_ns.data.parsers import TransformsParser
 from sadgs_ns.data.run_cameras import read_cameras
 
@@ -177,3 +182,40 @@ def test_an_image_saved_as_the_name_says_is_read(write: Callable[..., Path]):
     assert said.startswith(f"{image} does not exist, but {image.with_suffix('.jpg')} does: ")
     Image.open(image.with_suffix(".jpg")).save(image)
     assert errors(data) == []
+
+
+@pytest.mark.hard_case(
+    "exports of Metashape (cameras, project), RealityCapture (CSV, XMP), ODM, Polycam and Record3D",
+    "the `ns-process-data` command that keeps their poses is named, also where new ones are computed",
+)
+@pytest.mark.parametrize(
+    ("file", "content", "photos", "kind", "options"),
+    [
+        ("cameras.xml", "<document><chunk>", "photos", process_data.ProcessMetashape, {"xml": "cameras.xml"}),
+        ("house.psx", "", "", process_data.ProcessMetashape, {"xml": "EXPORTED.xml"}),
+        ("poses.csv", "#name,x,y,alt\n", "", process_data.ProcessRealityCapture, {"csv": "poses.csv"}),
+        ("1.xmp", "<xcr:Rotation>", "", process_data.ProcessRealityCapture, {"csv": "EXPORTED.csv"}),
+        ("odm_report/shots.geojson", "{}", "images", process_data.ProcessODM, {}),
+        ("keyframes/cameras/1.json", "{}", "keyframes/images", process_data.ProcessPolycam, {}),
+        ("metadata.json", '{"poses": []}', "rgb", process_data.ProcessRecord3D, {}),
+    ],
+)
+def test_the_command_that_keeps_an_export_s_poses_is_named(
+    file: str, content: str, photos: str, kind: type, options: dict[str, str], tmp_path: Path
+):
+    data = tmp_path / "my export"
+    for path in (data / file, data / photos / "1.jpg"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    (data / file).write_text(content)
+    Image.new("RGB", (8, 8)).save(data / photos / "1.jpg")
+    (said,) = errors(data)
+    named = re.search("`ns-process-data ([^`]*)`", said)
+    assert said.startswith(f"{data / file} has poses: `ns-process-data ") and named
+    words = shlex.split(named[1].replace("FOLDER", str(tmp_path / "out")))
+    commands: Any = process_data.Commands
+    command = tyro.cli(commands, args=words)
+    assert type(command) is kind and command.output_dir == tmp_path / "out"
+    assert command.data == (data / photos if options else data)
+    for name, value in options.items():
+        assert getattr(command, name).name == value
+    assert poses_elsewhere(data) == said and poses_elsewhere(tmp_path / "out") is None

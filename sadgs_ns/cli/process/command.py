@@ -44,6 +44,7 @@ from sadgs_ns.cli.process.photos import (
 from sadgs_ns.cli.process.plan import Matching, Summary, choose_matching, expected_work
 from sadgs_ns.cli.process.video import find_videos, video_frames, write_frames
 from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_json
+from sadgs_ns.data.checks.layouts import poses_elsewhere
 from sadgs_ns.data.coordinates import FRAME_KEYS
 from sadgs_ns.errors import InputError, WriteError
 from sadgs_ns.plugin.interrupts import Interrupts
@@ -180,6 +181,8 @@ def process(given: Process) -> Summary:
             _say("unchanged", f"{given.out} is finished; delete it to make it again.")
             summary = Summary(**scene.finished)
         else:
+            if given.source.is_dir() and (told := poses_elsewhere(given.source)):
+                print(f"Poses are computed anew. {told}", flush=True)
             columns = (TextColumn("{task.description:>24}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
             with Progress(*columns, disable=not sys.stdout.isatty()) as progress:
                 summary = _make(scene, _reporter(progress))

@@ -16,6 +16,16 @@ from sadgs_ns.errors import InputError
 
 COLMAP_FOLDERS = ("colmap/sparse/0", "sparse/0", "sparse", "colmap")
 """Folders in which a reconstruction is looked for; nerfstudio's default is the first."""
+_EXPORTS = {
+    "*.xml": (b"<chunk", "metashape --data {photos} --xml {file}"),
+    "*.psx": (b"", "metashape --data {photos} --xml EXPORTED.xml"),
+    "*.csv": (b"#name,", "realitycapture --data {photos} --csv {file}"),
+    "*.xmp": (b"xcr:Rotation", "realitycapture --data {photos} --csv EXPORTED.csv"),
+    "odm_report/shots.geojson": (b"", "odm --data {data}"),
+    "keyframes/cameras/*.json": (b"", "polycam --data {data}"),
+    "metadata.json": (b'"poses"', "record3d --data {data}"),
+}
+"""Files with other programs' poses, what is in them, and the command of `ns-process-data` that reads them."""
 GIVE_POSES = "compute poses with `sadgs-process PHOTOS FOLDER` or `ns-process-data`"
 """Remedy where poses are missing, as the end of a sentence."""
 
@@ -89,6 +99,17 @@ def layout_of(data: Path) -> Literal["nerfstudio", "blender", "colmap"] | None:
     return None if find_reconstruction(data) is None else "colmap"
 
 
+def poses_elsewhere(data: Path) -> str | None:
+    """Return the sentence for a folder in which another program left poses that `ns-process-data` reads, or None."""
+    for pattern, (mark, options) in _EXPORTS.items():
+        if files := [file for file in sorted(data.glob(pattern)) if mark in file.read_bytes()]:
+            photos = next((folder for folder in (data, *sorted(data.glob("*/"))) if images_in(folder)), data)
+            named = {"file": files[0], "photos": photos, "data": data}
+            command = options.format(**{name: shlex.quote(str(path)) for name, path in named.items()})
+            return f"{files[0]} has poses: `ns-process-data {command} --output-dir FOLDER` (with ffmpeg) keeps them."
+    return None
+
+
 def no_layout(data: Path) -> str:
     """Return the sentence for a folder without poses."""
     models = [data / folder for folder in COLMAP_FOLDERS]
@@ -108,10 +129,12 @@ def no_layout(data: Path) -> str:
     if kind := colmap.model_kind(data):
         first = colmap.image_names(data)[:1]
         return f"{data}/images.{kind} has poses, but its images, such as {first}, are not in {data}: put them there."
-    for photos in (data, data / "images"):
-        if images := images_in(photos):
-            command = f"`sadgs-process {shlex.quote(str(photos))} FOLDER`"
-            return f"{data} holds {len(images)} images but no camera poses: compute them with {command}."
+    if told := poses_elsewhere(data):
+        return told
+    photos = data if images_in(data) else data / "images"
+    if images := images_in(photos):
+        command = f"`sadgs-process {shlex.quote(str(photos))} FOLDER`"
+        return f"{data} holds {len(images)} images but no camera poses: compute them with {command}."
     for other in sorted(data.iterdir())[:100]:
         if other.is_dir() and layout_of(other) is not None:
             return f"{data} is no capture, but {other} in it is one: give --data that folder."
