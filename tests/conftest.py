@@ -15,9 +15,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 import torch
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
-settings.register_profile("long", max_examples=5000)  # pytest --hypothesis-profile=long
+# How long an example takes says nothing on a busy machine.
+patient = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("patient", patient)
+settings.register_profile("long", patient, max_examples=5000)  # pytest --hypothesis-profile=long
+settings.load_profile("patient")
 
 if "PYTEST_XDIST_WORKER" in os.environ and "OMP_NUM_THREADS" not in os.environ:
     # Where each worker's torch has a thread for every core, they wait for each other's: training takes four times as
