@@ -27,18 +27,13 @@ def rotations() -> np.ndarray:
 
 
 def is_panorama(image: Image.Image, size: tuple[int, int]) -> bool:
-    """Return whether a photo shows everything around: its XMP says so, or its ends meet and its poles are even.
+    """Return whether a photo of this size in px, maybe loaded at a smaller one of 512 px across, shows all around.
 
-    The ends of a 360° camera's two circles, which no program has stitched yet, are black.
-
-    Args:
-        image: The photo, which may be loaded at a smaller size, of 512 px or more across.
-        size: Its width and height in px.
+    XMP says so, or its ends meet and its poles are even. The ends of a 360° camera's two circles, which no program has
+    stitched yet, are black.
     """
-    if size[0] != 2 * size[1]:
-        return False  # Others are parts of a panorama, or a phone's pictures stitched in a row.
-    if b"equirectangular" in image.info.get("xmp", b""):
-        return True
+    if size[0] != 2 * size[1] or b"equirectangular" in image.info.get("xmp", b""):
+        return size[0] == 2 * size[1]  # Others are parts of a panorama.
     small = np.asarray(image.convert("L").resize((256, 128), Image.Resampling.BOX), float)
     seam, steps = np.abs(small[:, 0] - small[:, -1]).mean(), np.abs(np.diff(small, axis=1))
     poles = steps[[0, -1]].mean(1).max()  # Each is one point.
@@ -57,9 +52,7 @@ def map_of_view(view: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     """Return where in a panorama of a height in px the pixels of a view lie, x and y in OpenCV's px. [H/2, H/2] each"""
     side = height // 2
     across = (np.arange(side) + 0.5) / side * 2 - 1  # The tangents of angles up to 45° from the view's axis
-    x, y = np.meshgrid(across, across)
-    rays = np.stack([x, y, np.ones_like(x)], -1) @ rotations()[view].T
-    longitude = np.arctan2(rays[..., 0], rays[..., 2])
-    latitude = np.arctan2(-rays[..., 1], np.hypot(rays[..., 0], rays[..., 2]))
-    column = (0.5 + longitude / (2 * np.pi)) * 2 * height - 0.5
-    return column.astype(np.float32), ((0.5 - latitude / np.pi) * height - 0.5).astype(np.float32)
+    rays = np.stack([*np.meshgrid(across, across), np.ones((side, side))], -1) @ rotations()[view].T
+    x, y, z = np.moveaxis(rays.astype(np.float32), -1, 0)
+    columns = (1 + np.arctan2(x, z) / np.pi) * height
+    return columns - 0.5, (0.5 + np.arctan2(y, np.hypot(x, z)) / np.pi) * height - 0.5

@@ -26,11 +26,7 @@ def find_videos(folder: Path) -> list[str]:
 
 
 def count_frames(video: Path) -> int:
-    """Return the number of a video's frames, which are counted where its header does not tell, as in recordings.
-
-    Raises:
-        InputError: If it cannot be opened as a video.
-    """
+    """Count a video's frames where its header does not tell, as in recordings; raise an InputError if it is none."""
     try:
         with av.open(os.fspath(video)) as container:
             stream = container.streams.best("video")
@@ -38,10 +34,8 @@ def count_frames(video: Path) -> int:
             return stream.frames or sum(packet.size > 0 for packet in container.demux(stream))
     except Exception as error:  # FFmpeg has many.
         why = getattr(error, "strerror", None) or "it shows nothing"
-        raise InputError(
-            f"{video} cannot be read as a video ({why}); give a folder of photos or of videos, or convert a video to "
-            "MP4 with H.264."
-        ) from error
+        remedy = "give a folder of photos or of videos, or convert a video to MP4 with H.264."
+        raise InputError(f"{video} cannot be read as a video ({why}); {remedy}") from error
 
 
 def read_frames(video: Path) -> Iterator[np.ndarray]:
@@ -66,23 +60,15 @@ def sharpest_frames(video: Path, count: int, total: int) -> Iterator[tuple[int, 
     """
     stretches = itertools.groupby(enumerate(read_frames(video)), lambda numbered: numbered[0] * count // total)
     for number, group in itertools.takewhile(lambda stretch: stretch[0] < count, stretches):
-        yield number, max((frame for _, frame in group), key=_sharpness)
-
-
-def _sharpness(frame: np.ndarray) -> float:
-    return float(cv2.Laplacian(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), cv2.CV_64F).var())
+        grey = ((frame, cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)) for _, frame in group)
+        yield number, max(grey, key=lambda both: cv2.Laplacian(both[1], cv2.CV_64F).var())[0]
 
 
 def video_frames(source: Path, names: Sequence[str], count: int) -> Iterator[tuple[str, np.ndarray]]:
-    """Return names and pictures of the `sharpest_frames` of videos, each of which gives a share by its length.
+    """Return names and pictures of `count` frames, the `sharpest_frames` of a video or of those `names` in a folder.
 
-    Args:
-        source: A video, or a folder of some.
-        names: Of the videos in the folder, by which those of their frames begin; none for a single video.
-        count: Frames of all together, at least three.
-
-    Raises:
-        InputError: If a file is no video, or they give fewer than three frames.
+    A video of a folder gives a share by its length, and the names of its frames begin with its own. Raise an InputError
+    if a file is no video, or they give fewer than three frames.
     """
     totals = {name: count_frames(source / name) for name in names or [""]}
     everything = max(sum(totals.values()), 1)
