@@ -271,8 +271,8 @@ class PhotosToSplat:
         command = ["sadgs-process", str(source), str(self._scene), "--max-size", str(self.given.max_size)]
         given = Process(source, self._scene, max_size=self.given.max_size)
         summary = Summary(**self._call(worker, line, hear, command, given))
-        found = f"{added}{summary.registered} of {summary.photos} photos registered"
-        found += " after a second attempt" if summary.attempts else ""
+        again = " after a second attempt" if summary.attempts else ""
+        found = f"{added}{summary.registered} of {summary.photos} photos registered{again}"
         self._settings.pop("few", None)
         if summary.is_poor:
             self._note(few=found)

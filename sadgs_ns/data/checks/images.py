@@ -75,10 +75,7 @@ def smaller_folder(folder: Path, factor: int) -> Path:
 
 
 def mask_name(folder: Path, image: str) -> Path:
-    """Return an image's mask, relative to a folder of masks: the first that exists of the names in use, else the first.
-
-    They are those of nerfstudio, COLMAP, Metashape and RealityCapture.
-    """
+    """Return the file of an image's mask, relative to a folder of masks, by the first name in use that exists there."""
     stem = PurePosixPath(image).with_suffix("")
     names = [Path(f"{start}.png") for start in (stem, image, f"{stem}_mask", f"{stem}.mask", f"{image}.mask")]
     return next((name for name in names if (folder / name).is_file()), names[0])

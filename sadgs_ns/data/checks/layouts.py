@@ -69,8 +69,7 @@ def find_reconstructions(data: Path) -> dict[Path, int]:
     for folder in counts:
         with contextlib.suppress(InputError):
             counts[folder] = len(colmap.image_names(data / folder))
-    order = sorted(counts, key=lambda folder: 0 if folder.as_posix() in COLMAP_FOLDERS else 1 / (counts[folder] + 1))
-    return {folder: counts[folder] for folder in order}
+    return dict(sorted(counts.items(), key=lambda item: 0 if str(item[0]) in COLMAP_FOLDERS else 1 / (1 + item[1])))
 
 
 def find_cameras(data: Path) -> Path | None:
