@@ -45,17 +45,13 @@ class Source:
     """Names of the files that were read."""
 
     def read(self, *names: str) -> list[dict[str, Any]]:
-        """The rows of files in the folder, of JSON lines or a table of numbers in CSV."""
+        """The rows of files in the folder."""
         self.cited |= {*names}
         rows: list[dict[str, Any]] = []
         for path in (self.folder / name for name in names):
             if not path.is_file():
                 raise ValueError(f"{path} is not there; rows lie in docs/results.")
-            lines = path.read_text("utf-8").splitlines()
-            if path.suffix == ".csv":
-                rows += [dict(zip(lines[0].split(","), map(float, line.split(",")), strict=True)) for line in lines[1:]]
-            else:
-                rows += map(json.loads, lines)
+            rows += map(json.loads, path.read_text("utf-8").splitlines())
         return rows
 
     def lines(

@@ -109,7 +109,7 @@ def test_a_difference_that_rests_on_a_single_run_is_marked(tmp_path: Path):
     assert "| × 2 | 0.00 / .0000 / .0000 / ×1.00 ¹ |" in (folder / "README.md").read_text("utf8")
 
 
-def test_approximations_are_printed_as_their_command_does_and_growth_by_its_two_sizes(tmp_path: Path):
+def test_approximations_are_printed_as_their_command_does_and_growth_with_its_ratio(tmp_path: Path):
     common = {"table": "footprint", "input": "demo", "median": 0.1, "p95": 0.2, "max": 0.3, "flips": 0.0, "ms": 1234.5}
     rows = [{**common, "variant": "1 sample"}, {**common, "variant": "4 samples", "ms": None}]
     tables = {
@@ -117,16 +117,18 @@ def test_approximations_are_printed_as_their_command_does_and_growth_by_its_two_
         "one": {
             "kind": "approximations", "rows": "a.jsonl", "of": "footprint", "input": "demo", "variants": ["1 sample"]
         },
-        "growth": {"kind": "growth", "rows": "growth.csv"},
+        "growth": {"kind": "growth", "rows": "growth.jsonl"},
     }  # fmt: skip
-    folder = checkout(tmp_path, tables, {"a.jsonl": rows})
-    csv = "gaussians,megapixels,ours_ms,gsplat_ms\n1000000,2.0,3.0,9.0\n100000,2.0,2.0,5.0\n1000000,0.3,2.5,7.5\n"
-    (folder / documents.RESULTS / "growth.csv").write_text(csv, "utf8")
+    names = ("gaussians", "megapixels", "ours_ms", "gsplat_ms")
+    growth: list[Any] = [
+        dict(zip(names, row, strict=True)) for row in ((100_000, 2.0, 2.0, 5.0), (1_000_000, 0.3, 2.5, 7.5))
+    ]
+    folder = checkout(tmp_path, tables, {"a.jsonl": rows, "growth.jsonl": growth})
     assert bench.main(["documents", str(folder)]) == 0
     text = (folder / "README.md").read_text("utf8")
     assert text.count("| 1 sample | 10 % | 20 % | 30 % | 0 % | 1,234 |") == 2
     assert text.count("| 4 samples | 10 % | 20 % | 30 % | 0 % | – |") == 1
-    assert "| 100,000 | 2 | 2.00 | 5.00 | 2.5 |\n| 1,000,000 | 2 | 3.00 | 9.00 | 3.0 |\n| 1,000,000 | 0.3 |" in text
+    assert "| 100,000 | 2 | 2.00 | 5.00 | 2.5 |\n| 1,000,000 | 0.3 | 2.50 | 7.50 | 3.0 |" in text
 
 
 FIGURE = {
