@@ -152,7 +152,7 @@ def test_a_blender_scene_is_read_with_and_without_suffixes(write: Callable[..., 
 def test_what_is_not_read_of_a_blender_scene_is_read_of_a_transforms_json(write: Callable[..., Path]):
     data = write(lambda m: m.update(cx=20.0, k1=0.001), kind="blender")
     (said,) = errors(data)
-    assert said.endswith("transforms_train.json has a cx that Blender scenes have not: rename it to transforms.json.")
+    assert said.endswith("transforms_train.json: of Blender scenes cx is not read; rename it to transforms.json.")
     (data / "transforms_train.json").rename(data / "transforms.json")
     assert errors(data) == []
     cameras = parsed(data)

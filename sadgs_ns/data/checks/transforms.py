@@ -123,7 +123,7 @@ def check_blender(data: Path, options: ParserOptions, open_images: bool = True) 
         for values in (meta, *described) if open_images and any(size) else ():
             for name, value in taken.items():
                 if abs(finite(values.get(name, value), name, str(path)) - value) > 1e-3 * value:
-                    raise InputError(f"{path} has a {name} that Blender scenes have not: rename it to transforms.json.")
+                    raise InputError(f"{path}: of Blender scenes {name} is not read; rename it to transforms.json.")
         camera = Camera(width, height, focal, focal, width / 2, height / 2)
         views = [view_of(frame, f"{path}: frame {frame['file_path']}", camera) for frame in described]
         if split == "train":
