@@ -181,8 +181,8 @@ def process(given: Process) -> Summary:
             _say("unchanged", f"{given.out} is finished; delete it to make it again.")
             summary = Summary(**scene.finished)
         else:
-            if given.source.is_dir() and (told := poses_elsewhere(given.source)):
-                print(f"Poses are computed anew. {told}", flush=True)
+            if given.source.is_dir() and (poses := poses_elsewhere(given.source)):
+                _say("aside", told := f"Poses are computed anew. {poses}", told=told)
             columns = (TextColumn("{task.description:>24}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
             with Progress(*columns, disable=not sys.stdout.isatty()) as progress:
                 summary = _make(scene, _reporter(progress))
