@@ -114,9 +114,7 @@ def run_all(
 ) -> None:
     """Run jobs in their order, some at a time on each GPU; whatever ends this early also ends the runs.
 
-    Args:
-        finished: Called with each result as its run ends.
-        log: Takes the output of runs that fail.
+    `finished` is called with each result as its run ends, and `log` takes the output of runs that fail.
     """
     pending, free = deque(jobs), deque(gpu for _ in range(jobs_per_gpu) for gpu in gpus)
     running: list[tuple[subprocess.Popen[bytes], Job, str | None, Path]] = []
@@ -242,11 +240,7 @@ class Benchmark:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a protocol, or one of COMMANDS.
-
-    Returns:
-        Exit code: what the command returns, 2 if the input is wrong.
-    """
+    """Run a protocol or one of COMMANDS, and return its exit code, 2 if the input is wrong."""
     words = list(sys.argv[1:] if argv is None else argv)
     name, target, kind = "python -m benchmarks", words[0] if words else "", Benchmark
     others = "\n".join(f"  {other}: {what}" for other, (_, what) in COMMANDS.items())

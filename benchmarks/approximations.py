@@ -113,13 +113,9 @@ def random_footprints(count: int, images: Tensor) -> Footprints:
 
 
 def average(tensors: Tensor, footprints: Footprints, positions: Iterator[Tensor]) -> tuple[Tensor, Tensor]:
-    """S̄ [B, H, W, 3] averaged over points of each footprint, of those that lie in the image.
+    """S̄ [B, H, W, 3] averaged over those points of each footprint, in px [M, 2] each, that lie in the image.
 
-    Args:
-        positions: A point of each footprint in px, as often as there are points. [M, 2]
-
-    Returns:
-        The averages, 0 outside [M, 3], and whether any point lies in the image. bool [M]
+    Returns the averages, 0 outside [M, 3], and whether any point lies in the image, bool [M].
     """
     total, count = tensors.new_zeros((len(footprints.means2d), 3)), tensors.new_zeros(len(footprints.means2d))
     for points in positions:

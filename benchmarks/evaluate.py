@@ -98,8 +98,7 @@ def quality(
 def view_psnr_in_viewers(model: Any, views: Iterable[View], view_psnr: list[float]) -> list[float]:
     """Return the PSNR of each view in dB as other programs' viewers show the exported file: from NEAR_PLANE on.
 
-    Args:
-        view_psnr: What `quality` measured; returned unless the model has a `near_plane` that lies beyond theirs.
+    `view_psnr`, which `quality` measured, is returned unless the model has a `near_plane` that lies beyond theirs.
     """
     near_plane = getattr(model, "near_plane", 0.0)
     if near_plane <= NEAR_PLANE:

@@ -4,8 +4,8 @@ A baseline is a JSON file of rows, named `scene/label`, and their metrics: numbe
 
     {"fox/sadgs-indoor": {"psnr": {"value": 31.2, "direction": "higher", "tolerance": 0.4}}}
 
-`higher` and `lower` say which way is better; `near` allows no more than the tolerance either way. Tolerances are in the
-metric's unit. Where a change is meant, put the values that the gate prints into the file.
+`higher` and `lower` say which way is better; `near` allows no more than the tolerance either way. Where a change is
+meant, put the values that the gate prints into the file.
 """
 
 from __future__ import annotations

@@ -88,11 +88,7 @@ class Run:
     """Of an image."""
 
     def mean(self, field: str) -> float:
-        """Mean over the seeds.
-
-        Raises:
-            ValueError: No result has that number.
-        """
+        """Mean over the seeds; raises ValueError if no result has that number."""
         if (value := mean(self.group, field)) is None:
             raise ValueError(f"{self.group[0]['key']} has no {field}; leave that column out.")
         return value
@@ -218,11 +214,7 @@ def of_sweep(found: Groups, labels: Mapping[str, str], scenes: Mapping[str, Sequ
 
 
 def group_of(found: Groups, scene: str, label: str) -> Sequence[Result]:
-    """The results of a scene and a label.
-
-    Raises:
-        ValueError: There are none.
-    """
+    """The results of a scene and a label; raises ValueError if there are none."""
     if (scene, label) not in found:
         raise ValueError(f"there is no row {label!r} of {scene}.")
     return found[scene, label]

@@ -25,11 +25,7 @@ Runs = Mapping[str, Sequence[Result]]
 
 
 def load(paths: Iterable[Path]) -> dict[str, dict[str, list[Result]]]:
-    """Read the latest runs by scene and label; those without `view_psnr` are left out with one line on stderr.
-
-    Raises:
-        ValueError: A file is missing; names it.
-    """
+    """Read the latest runs by scene and label; those without `view_psnr` are left out with one line on stderr."""
     rows = [row for path in paths for row in results.read(path)]
     found: dict[str, dict[str, list[Result]]] = {}
     for row in (latest := table.latest(rows)):
@@ -43,8 +39,7 @@ def load(paths: Iterable[Path]) -> dict[str, dict[str, list[Result]]]:
 def view_names(scene: str, runs: Iterable[Result]) -> list[str]:
     """Return the names of a scene's held-out views, or their numbers if no run tells names.
 
-    Raises:
-        ValueError: Two runs have different numbers of views, or different names.
+    Raises ValueError if two runs have different numbers of views, or different names.
     """
     told = [(len(row["view_psnr"]), row.get("view_names")) for row in runs]
     names = next((names for _, names in told if names), [str(view) for view in range(told[0][0])])
@@ -72,8 +67,7 @@ def collapsed(group: Sequence[Result], reference: Sequence[float]) -> list[tuple
 def markdown(scene: str, runs: Runs, names: Sequence[str], reference: Sequence[float]) -> str:
     """Return a scene's table of views, with means over seeds ± standard deviations in dB, and a line for each label.
 
-    Args:
-        reference: Of each view, in dB; empty where nothing is known to compare with.
+    The reference of each view is in dB; there is none where nothing is known to compare with.
     """
     views = zip(*(map(_mean_and_deviation, _by_view(group)) for group in runs.values()), strict=True)
     lines = ((name, *cells) for name, cells in zip(names, views, strict=True))

@@ -152,11 +152,7 @@ class View:
         return -self.rotation.T @ self.translation
 
     def rays(self, supersampling: int = 1) -> Array:
-        """Ray directions in the world, scaled so that the ray parameter is the depth.
-
-        Returns:
-            One per sample, row by row, with `supersampling` (s) samples per pixel and axis. [H·s·W·s, 3]
-        """
+        """Ray directions of s² samples a pixel, row by row, whose ray parameter is the depth. [H·s·W·s, 3]"""
         x = (np.arange(self.width * supersampling) + 0.5) / supersampling - 0.5 * self.width
         y = (np.arange(self.height * supersampling) + 0.5) / supersampling - 0.5 * self.height
         x, y = np.meshgrid(x / self.focal, y / self.focal)
@@ -171,10 +167,9 @@ class View:
 
 
 def trace(surfaces: Sequence[Surface], origin: Array, directions: Array) -> tuple[NDArray[np.intp], Array]:
-    """First surface that each ray meets. origin [3], directions [R, 3]
+    """Index of the first surface that each ray meets, −1 for none [R], and the ray parameter, inf for none [R].
 
-    Returns:
-        Index of the surface, −1 where there is none [R], and the ray parameter, inf where there is none [R].
+    The rays have one origin [3] and directions [R, 3].
     """
     nearest = np.full(len(directions), np.inf)
     index = np.full(len(directions), -1)
@@ -202,10 +197,8 @@ def expected_wavelength_map(surfaces: Sequence[Surface], view: View) -> NDArray[
 
     A texture's phase is φ(X) = f·X with X = o + t(p) d(p) on the surface, and t = nᵀ(q − o) / nᵀd. Its gradient over
     the pixel, t (fᵀd' − fᵀd · nᵀd' / nᵀd), is the frequency in cycles per px: world wavelength times focal length over
-    depth, foreshortened along the grating. Of a checker's two waves the shorter counts.
-
-    Returns:
-        Wavelength in px, NaN where there is no texture. [H, W]
+    depth, foreshortened along the grating. Of a checker's two waves the shorter counts. It is in px, NaN where there is
+    no texture. [H, W]
     """
     directions = view.rays()
     index, depth = trace(surfaces, view.position, directions)
