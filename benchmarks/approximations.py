@@ -190,11 +190,7 @@ class Command:
 
 
 def read_photo(path: Path) -> Tensor:
-    """A photo as RGB in [0, 1], reduced so that no side exceeds 1,600 px. [1, H, W, 3]
-
-    Raises:
-        ValueError: If it cannot be read.
-    """
+    """A photo as RGB in [0, 1], no side over 1,600 px [1, H, W, 3]; raises ValueError if it cannot be read."""
     try:
         with Image.open(path) as image:
             image.thumbnail((1600, 1600), Image.Resampling.BOX)

@@ -17,11 +17,7 @@ if TYPE_CHECKING:
 
 
 def check(jobs: Sequence[Job], root: Path, source: str | None = None) -> None:
-    """Check that the jobs' scenes are there below `root`, and build every config once.
-
-    Raises:
-        ValueError: A scene is missing, or as `build_config`; one sentence.
-    """
+    """Check that the jobs' scenes are there below `root`, and build every config once; raises as `build_config`."""
     from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 
     from benchmarks.run import build_config
@@ -56,8 +52,7 @@ def check(jobs: Sequence[Job], root: Path, source: str | None = None) -> None:
 def image_names(parser: ColmapDataParserConfig, data: Path) -> list[str]:
     """Names of a COLMAP scene's images in the order in which nerfstudio holds out every n-th.
 
-    Raises:
-        FileNotFoundError: The model, the folder of (downscaled) images or an image is missing; names the path.
+    Raises FileNotFoundError with the path if the model, the folder of (downscaled) images or an image is missing.
     """
     from nerfstudio.data.utils import colmap_parsing_utils as colmap
 

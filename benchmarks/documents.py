@@ -125,8 +125,7 @@ def described(folder: Path) -> tuple[Source, dict[str, Any], dict[str, Any]]:
 def write(checkout: Path, check: bool = False) -> list[str]:
     """Write the tables and figures of a checkout's documents, or only `check` them.
 
-    Returns:
-        `DOCUMENT: table NAME` of each table that was not what its rows give, and files of such figures.
+    Returns `DOCUMENT: table NAME` of each table that was not what its rows give, and files of such figures.
 
     Raises:
         ValueError: A table without description, rows or end, a description without a table, or rows that no table has;

@@ -47,11 +47,7 @@ def load_lpips() -> LearnedPerceptualImagePatchSimilarity | None:
 
 @torch.no_grad()
 def render(model: Any, view: View) -> tuple[Tensor, Tensor]:
-    """Render a view with a splatting model in eval mode.
-
-    Returns:
-        The rendering and the photograph over the rendering's background, in [0, 1]. [1, 3, H, W] both
-    """
+    """Render a view in eval mode; also return the photograph over its background, in [0, 1]. [1, 3, H, W] both"""
     camera, batch = view
     outputs = model.get_outputs_for_camera(camera)
     truth = model.composite_with_background(model.get_gt_img(batch["image"]), outputs["background"])
@@ -69,6 +65,7 @@ def quality(
     `view_psnr` lists the PSNR of each view in their order: a mean over few views can be the work of one. The network is
     on the model's device during the call only, so that it takes no memory from training.
     """
+    from nerfstudio.model_components.lib_bilagrid import color_correct
     from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
     prefixes = ("", "cc_") if getattr(model.config, "color_corrected_metrics", False) else ("",)
@@ -85,7 +82,10 @@ def quality(
         for view in views:
             rendered, truth = render(model, view)
             for prefix in prefixes:
-                image = fitted(rendered, truth) if prefix else rendered
+                image = rendered
+                if prefix:
+                    image, photo = (tensor[0].movedim(0, -1) for tensor in (rendered, truth))
+                    image = color_correct(image, photo).movedim(-1, 0)[None]
                 for name, measure in measures.items():
                     if measure is not None:
                         values[f"{prefix}{name}"].append(float(measure(image, truth)))
@@ -108,10 +108,3 @@ def view_psnr_in_viewers(model: Any, views: Iterable[View], view_psnr: list[floa
         return quality(model, views)["view_psnr"]
     finally:
         model.near_plane = near_plane
-
-
-def fitted(image: Tensor, truth: Tensor) -> Tensor:
-    """The rendering with its colours fitted to the photograph. [1, 3, H, W] both, in [0, 1]"""
-    from nerfstudio.model_components.lib_bilagrid import color_correct
-
-    return color_correct(image[0].movedim(0, -1), truth[0].movedim(0, -1)).movedim(-1, 0)[None]

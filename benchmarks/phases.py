@@ -176,12 +176,8 @@ def measure(trainer: Any, steps: int = STEPS) -> dict[str, float]:
     its gradient, and `loss` lies between. `eta` is the observation's share of each step, `optimizer` includes zeroing
     gradients and the rates' schedules, and `rest` is choosing views, metrics and nerfstudio's overhead.
 
-    Args:
-        trainer: A nerfstudio Trainer after `train`; its model goes on training.
-        steps: How many, rounded up to a multiple of `eta_every`.
-
-    Returns:
-        Milliseconds of each phase in a step, the mean over the steps; their sum is the step's wall time.
+    `trainer` is nerfstudio's after `train`, and `steps` are rounded up to a multiple of `eta_every`. Returns the mean
+    milliseconds of each phase in a step; their sum is the step's wall time.
     """
     model, measured = trainer.pipeline.model, steps_after_run(trainer, steps)
     watch = Stopwatch(torch.device(model.device))

@@ -60,11 +60,7 @@ def styles(labels: Iterable[str]) -> dict[str, dict[str, Any]]:
 
 
 def pareto_front(points: Iterable[tuple[float, float]], higher_is_better: bool) -> Points:
-    """The points (cost, quality) that no other point beats: none costs as little or less with better quality.
-
-    Returns:
-        By rising cost; of equal points one.
-    """
+    """The points (cost, quality), by rising cost, that no other beats: none costs as little with better quality."""
     sign = 1 if higher_is_better else -1
     front: Points = []
     for cost, quality in sorted(points, key=lambda point: (point[0], -sign * point[1])):

@@ -100,11 +100,7 @@ class Protocol:
 
 
 def load(path: Path) -> Protocol:
-    """Read a protocol.
-
-    Raises:
-        ValueError: The file is not a protocol; one sentence that names the place and the remedy.
-    """
+    """Read a protocol; raises ValueError, which names the place and the remedy, if the file is none."""
     try:
         return parse(yaml.safe_load(path.read_text()))
     except OSError as error:

@@ -32,8 +32,7 @@ if TYPE_CHECKING:
 def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> TrainerConfig:
     """The nerfstudio config of a run on a scene below `root`, which writes to `work`.
 
-    Raises:
-        ValueError: Unknown method, dataparser or setting, or no data; one sentence that names it.
+    Raises ValueError, which names it, if there is no such method, dataparser, setting or data.
     """
     import torch
     from nerfstudio.configs.dataparser_configs import all_dataparsers

@@ -33,15 +33,10 @@ NOISY_DEGREES = 0.1
 
 
 def write_colmap(scene: Path, out: Path, fold: int = VALIDATION) -> tuple[int, int]:
-    """Write one COLMAP scene with the lists that nerfstudio's parser reads.
+    """Write one COLMAP scene, of `images` and `sparse/0`, with the lists that nerfstudio's parser reads.
 
-    Args:
-        scene: Folder with `images` and `sparse/0`.
-        out: Folder to write; one that is there is replaced.
-        fold: Number of the first view that is held out, in [0, 7]. Test views are in the training views of no fold.
-
-    Returns:
-        Numbers of training and of held-out views. Raises as `image_names`.
+    A folder `out` that is there is replaced. Every 8th view from `fold`, in [0, 7], is held out, and no test view is in
+    the training views. Returns the numbers of training and of held-out views; raises as `image_names`.
     """
     names = image_names(ColmapDataParserConfig(colmap_path=SPARSE, downscale_factor=1), scene)
     shutil.rmtree(out, ignore_errors=True)

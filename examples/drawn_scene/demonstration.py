@@ -127,13 +127,9 @@ def draw_wavelength_and_eta(path: Path, scene: SceneDescription, runs: dict[str,
 
 
 def demonstrate(output: Path, iterations: int, max_gaussians: int, width: int, height: int, views: int) -> None:
-    """Draw the scene, train each of `ROWS` on it, and write pictures and a PLY file.
+    """Draw the scene, train each of `ROWS` on it, and write pictures and a PLY file to a folder.
 
-    Args:
-        output: Folder for everything that is left.
-        iterations: Of each run, at least 30.
-        max_gaussians: Cap on the number of Gaussians.
-        width, height, views: As for `write_scene`, which also tells what is raised.
+    Each run has at least 30 iterations; the other numbers, and what is raised, are those of `write_scene`.
     """
     if iterations < 30:
         raise ValueError(f"--max-num-iterations is {iterations}; give at least 30, or nothing is split")

@@ -107,10 +107,7 @@ def describe_scene(
     """Lay out the scene without drawing it; arguments are those of `write_scene`.
 
     Each point is seen by at least 2 views and lies 0.004 world units (one standard deviation per axis) off its surface,
-    as after a structure-from-motion run.
-
-    Raises:
-        ValueError: If a number is too small.
+    as after a structure-from-motion run. Raises ValueError if a number is too small.
     """
     numbers = {"width": (width, 16), "height": (height, 16), "views": (views, 9), "points": (points, 10)}
     for name, (value, least) in numbers.items():
