@@ -92,11 +92,7 @@ def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> T
 
 
 def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
-    """Train once and measure.
-
-    Args:
-        root: Folder that holds all scenes.
-        work: Folder for what nerfstudio writes; the caller deletes it.
+    """Train once on a scene below `root` and measure; nerfstudio writes to `work`, which the caller deletes.
 
     Returns:
         JSON-ready. Seconds: `import_seconds`, `setup_seconds` (parsing the data and all else that nerfstudio builds),
@@ -110,9 +106,7 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
         but `phases`, `launches` and `curve`: its checkpoint is evaluated on one device, S̄ is computed in the loop, and
         `peak_gb` is the first device's. The others return nothing.
 
-    Raises:
-        ValueError: As `build_config`.
-        RuntimeError: The training loop stopped early, or whatever the method raises.
+    Raises as `build_config`, RuntimeError if the training loop stopped early, or whatever the method raises.
     """
     seconds: dict[str, float] = {}
     start = time.perf_counter()
