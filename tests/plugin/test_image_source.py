@@ -97,9 +97,10 @@ def assert_same_images(images: Any, expected: Any) -> None:
 def assert_same_cameras(cameras: Any, expected: Any) -> None:
     for field in dataclasses.fields(cameras):
         value, other = getattr(cameras, field.name), getattr(expected, field.name)
-        if field.name == "metadata":
-            value, other = value or {}, other or {}  # Ours have one always, for `ns-export cameras`.
-        assert torch.equal(value, other) if isinstance(value, torch.Tensor) else value == other
+        if isinstance(value, torch.Tensor):
+            assert torch.equal(value, other)
+        else:  # Ours always have metadata, for `ns-export cameras`.
+            assert (value or {}) == (other or {})
 
 
 @pytest.mark.parametrize("options", [{}, {"camera_res_scale_factor": 0.5}], ids=str)
