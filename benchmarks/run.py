@@ -12,6 +12,7 @@ import copy
 import datetime
 import importlib.metadata
 import json
+import math
 import os
 import subprocess
 import sys
@@ -99,9 +100,9 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
         `initialization_seconds` (the model from the points), `load_seconds`, `warmup_seconds` and, where the method has
         them, `structure_tensor_seconds`, one after the other before the loop; `loop_seconds`, of the training loop
         alone. Over the held-out views what `evaluate.quality` measures, and of each `ply_view_psnr` (with the near
-        plane of other programs' viewers) and its name. `phases` and `launches` as these modules measure them. `curve`,
-        if the job asks for it, has the points of `curve.Curve`, the last one being the finished run; no time contains
-        its evaluations.
+        plane of other programs' viewers) and what `coverage_of_views` tells. `phases` and `launches` as these modules
+        measure them. `curve`, if the job asks for it, has the points of `curve.Curve`, the last one being the finished
+        run; no time contains its evaluations.
         Where torchrun started several processes, which train one splat on `devices` of them, the first measures all
         but `phases`, `launches` and `curve`: its checkpoint is evaluated on one device, S̄ is computed in the loop, and
         `peak_gb` is the first device's. The others return nothing.
@@ -184,7 +185,7 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
         "loop_seconds": timer.seconds,
         **seconds,
         **held_out,
-        "view_names": [Path(path).stem for path in datamanager.eval_dataset.image_filenames],
+        **coverage_of_views(datamanager, model),
         "gaussians": int(model.num_points),
         "peak_gb": timer.peak_gb,
         "train_views": len(datamanager.train_dataset),
@@ -198,6 +199,32 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
         record["phases"] = phases.measure(trainer)  # from here on the model is trained further
         record["launches"] = launches.measure(trainer)
     return record
+
+
+def coverage_of_views(datamanager: Any, model: Any) -> dict[str, list[Any]]:
+    """Tell how far the held-out views are from the training views, in the order in which they are evaluated.
+
+    Without SfM points, the centres of the model's Gaussians are the points. The images must be loaded, because that
+    takes the distortion from the cameras.
+
+    Returns:
+        The images' names without suffix, and what `coverage` measures: degrees and shares, None in place of NaN.
+    """
+    from benchmarks.coverage import Views, nearest_angles, uncovered_shares
+
+    training, held_out = datamanager.train_dataset, datamanager.eval_dataset
+    points = training.metadata.get("points3D_xyz")
+    points = (model.means.detach() if points is None or not len(points) else points).to(model.device)
+    there, known = (Views.of(dataset.cameras.to(model.device)) for dataset in (held_out, training))
+
+    def rounded(values: Any, digits: int) -> list[float | None]:
+        return [None if math.isnan(value) else round(value, digits) for value in values.tolist()]
+
+    return {
+        "view_names": [Path(path).stem for path in held_out.image_filenames],
+        "view_angles": rounded(nearest_angles(there, known, points), 1),
+        "view_uncovered": rounded(uncovered_shares(there, known, points), 3),
+    }
 
 
 def alone(job: Job, root: Path, work: Path, checkpoint: Path) -> Any:

@@ -69,9 +69,12 @@ def markdown(scene: str, runs: Runs, names: Sequence[str], reference: Sequence[f
 
     The reference of each view is in dB; there is none where nothing is known to compare with.
     """
-    views = zip(*(map(_mean_and_deviation, _by_view(group)) for group in runs.values()), strict=True)
-    lines = ((name, *cells) for name, cells in zip(names, views, strict=True))
-    text = [f"## {scene}", "", table.grid(("View", *runs), lines), ""]
+    every = [row for group in runs.values() for row in group]
+    lines = []
+    for i, name in enumerate(names):
+        told = (_known(every, "view_angles", i, ".1f"), _known(every, "view_uncovered", i, ".3f"))
+        lines.append((name, *told, *(_mean_and_deviation(_by_view(group)[i]) for group in runs.values())))
+    text = [f"## {scene}", "", table.grid(("View", "Angle °", "Uncovered", *runs), lines), ""]
     for label, group in runs.items():
         median = statistics.median(statistics.fmean(view) for view in _by_view(group))
         lowest, worst = min((psnr, i) for row in group for i, psnr in enumerate(row["view_psnr"]))
@@ -83,6 +86,11 @@ def markdown(scene: str, runs: Runs, names: Sequence[str], reference: Sequence[f
 
 def _by_view(group: Sequence[Result]) -> list[tuple[float, ...]]:
     return list(zip(*(row["view_psnr"] for row in group), strict=True))
+
+
+def _known(rows: Iterable[Result], field: str, view: int, form: str) -> str:
+    values = [row[field][view] for row in rows if row.get(field) and row[field][view] is not None]
+    return format(statistics.median(values), form) if values else "–"
 
 
 def _mean_and_deviation(values: Sequence[float]) -> str:

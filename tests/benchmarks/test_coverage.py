@@ -1,0 +1,72 @@
+"""Angles between held-out and training views, and what no training view covers, of geometry with known answers."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from scenes import camera
+from torch import Tensor
+
+from benchmarks.coverage import MAX_POINTS, Views, nearest_angles, thinned, uncovered_shares
+
+DEPTH, IMAGE = 4.0, 64 / 60 * 4
+"""Distance of the points that all cameras look at, and width of the images there."""
+
+
+def looking(*poses: tuple[float, float]) -> Views:
+    """Cameras that are turned around the point (0, 0, DEPTH) by an angle about y in degrees, then moved aside."""
+    viewmats, K = camera()
+    viewmats = viewmats.repeat(len(poses), 1, 1)
+    for viewmat, (degrees, aside) in zip(viewmats, poses, strict=True):
+        angle, centre = torch.tensor(degrees).deg2rad(), torch.tensor([0.0, 0.0, DEPTH])
+        viewmat[0, 0] = viewmat[2, 2] = angle.cos()
+        viewmat[0, 2], viewmat[2, 0] = angle.sin(), -angle.sin()
+        viewmat[:3, 3] = centre - viewmat[:3, :3] @ centre - torch.tensor([aside, 0.0, 0.0])
+    return Views(viewmats, K.expand(len(poses), 3, 3), torch.tensor([[64, 48]]).expand(len(poses), 2))
+
+
+HERE = looking((0.0, 0.0))
+
+
+def square(depth: float = DEPTH, reach: float = 0.05) -> Tensor:
+    """25 points before the camera at the origin. [25, 3]"""
+    steps = torch.linspace(-reach, reach, 5)
+    return torch.nn.functional.pad(torch.cartesian_prod(steps, steps), (0, 1), value=depth)
+
+
+def test_the_angle_is_that_to_the_nearest_training_view_that_shares_points():
+    # The training view of 2 degrees looks elsewhere.
+    training = looking((20.0, 0.0), (-7.0, 0.0), (90.0, 0.0), (2.0, 50.0))
+    angles = nearest_angles(looking((0.0, 0.0), (30.0, 0.0)), training, square())
+    torch.testing.assert_close(angles, torch.tensor([7.0, 10.0]), atol=0.05, rtol=0)
+    assert nearest_angles(HERE, HERE, square()).item() == 0
+    assert nearest_angles(HERE, looking((180.0, 0.0)), square()).item() == pytest.approx(180, abs=2)
+
+
+def test_views_that_share_too_few_points_have_no_angle():
+    few, behind = square()[:9], square(-DEPTH)
+    for points in (few, behind, torch.cat([few, behind]), square(reach=100), torch.empty(0, 3)):
+        assert nearest_angles(HERE, looking((5.0, 0.0)), points).isnan().all()
+
+
+def test_what_no_training_view_covers_is_told_as_a_share():
+    for aside, share in (([0.0], 0), ([0.5], 0.5), ([1.1], 1), ([0.5, -0.75], 0.25)):
+        training = looking(*((0.0, x * IMAGE) for x in aside))
+        assert uncovered_shares(HERE, training, square()).item() == pytest.approx(share)
+    assert uncovered_shares(HERE, HERE, square(-DEPTH)).isnan().all(), "the view sees no point"
+
+
+def test_each_pixel_takes_the_depth_of_the_nearest_point():
+    # Near on the left, far on the right; the training view stands beyond the near one, where the image of the far one
+    # is 3/4 as wide and high.
+    points = torch.tensor([[-0.25, 0.0, 1.0], [2.0, 0.0, 8.0]])
+    viewmats, Ks, sizes = looking((0.0, 0.0))
+    viewmats[0, 2, 3] = -2.0
+    assert uncovered_shares(HERE, Views(viewmats, Ks, sizes), points).item() == pytest.approx(1 - 0.5 * 0.75**2)
+
+
+def test_finite_points_are_thinned_evenly():
+    points = torch.arange(3.0 * (4 * MAX_POINTS + 1)).view(-1, 3)
+    points[1] = torch.inf
+    finite = points[points.isfinite().all(dim=-1)]
+    assert torch.equal(thinned(points[:9]), finite[:8]) and torch.equal(thinned(points), finite[::4])
