@@ -131,7 +131,7 @@ class Step:
             optimizer.step()
 
     def __call__(self, after: Callable[[str], None] = lambda phase: None) -> None:
-        """A whole step, of which every `ETA_EVERY`th observes η; `after` hears the phases of `memory.step_bytes`."""
+        """A whole step; every `ETA_EVERY`th observes η, and `after` hears the phases of `memory.step_bytes`."""
         self.forget_gradients()
         drawn = self.draw()
         if self.count % ETA_EVERY == 0:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class ViewerMarkdown(ViewerElement[str]):
-    """A text in the viewer, of which it calls `text` when it is installed and at every `refresh`."""
+    """A text in the viewer, which `text` returns when it is installed and at every `refresh`."""
 
     def __init__(self, name: str, text: Callable[[], str]) -> None:
         super().__init__(name)

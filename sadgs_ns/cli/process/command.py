@@ -90,7 +90,9 @@ class _Scene:
         out, source = given.out, given.source
         if out.is_file() or (not self.noted.exists() and any(not path.is_dir() for path in out.rglob("*"))):
             raise InputError(f"{out} exists and is not a scene that sadgs-process began; give another folder.")
-        photos, self.is_video = find_source(source, out)
+        found = look_into(source, out) if source.is_dir() else ([], {}, [])
+        photos, self.is_video = find_source(source, out, found)
+        _, self.masks, self.left_out = found
         self.settings: dict[str, Any] = {
             "source": os.path.realpath(source),
             "camera_per_photo": given.camera_per_photo,
@@ -187,7 +189,7 @@ def process(given: Process) -> Summary:
             with Progress(*columns, disable=not sys.stdout.isatty()) as progress:
                 summary = _make(scene, _reporter(progress))
     print(summary)
-    for told in look_into(given.source, given.out)[2] if given.source.is_dir() else ():
+    for told in scene.left_out:
         _say("aside", told, told=told)
     if not scene.is_video and (videos := find_videos(given.source)):
         print(f"Its videos ({len(videos)}, such as {videos[0]}) are not used: give them in a folder of their own.")
@@ -262,10 +264,10 @@ def _tell_work(scene: _Scene, photos: Sequence[Photo], matching: Matching, notic
 
 def _convert(scene: _Scene, folder: Path, stored: Sequence[Photo]) -> tuple[Path, list[Photo]]:
     """Convert photos as `convert_photos`, and write their masks, if they or the scene have any, and opacities."""
-    source, out, work = scene.given.source, scene.given.out, scene.work
+    source, work = scene.given.source, scene.work
     converted, photos = convert_photos(folder, stored, work / "photos")
-    masks = {} if scene.is_video else look_into(source, out)[1]
-    has_masks = (out / "masks").exists() if scene.added else bool(masks)
+    masks = {} if scene.is_video else scene.masks
+    has_masks = (scene.given.out / "masks").exists() if scene.added else bool(masks)
     shutil.rmtree(work / "masks", ignore_errors=True)
     if has_masks:
         write_masks(source, masks, stored, photos, work / "masks")

@@ -29,9 +29,11 @@ _SERVICE = re.compile(r"(.*/)?(@eadir|@__thumb|[@#$]recycle(\.bin)?|__macosx|los
 _MASK = re.compile(r"(.*/)?masks?(_\d+)?/.*|.*[ ._-]mask\.\w+", re.IGNORECASE)
 _VARIANT = re.compile(r"(?<=^img_)e(?=\d)|[ ._-]*(mask|edited|copy|thumb|small|\(\d+\))$")
 """What programs add to a photo's name for its mask or a copy; an iPhone's IMG_E1234 is the edited IMG_1234."""
+Found = tuple[list[str], dict[str, str], list[str]]
+"""What `look_into` returns."""
 
 
-def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[str]]:
+def look_into(source: Path, out: Path) -> Found:
     """Find the photos of a folder for a scene; photos that it was begun with stay photos.
 
     Hidden files, as macOS writes them, and those of scenes that are made in the same folder are left out.
@@ -41,7 +43,7 @@ def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[
         other images there are.
     """
     folder, scene = Path(os.path.realpath(source)), Path(os.path.realpath(out))
-    scenes = {scene, *(path.parents[1] for path in folder.glob("*/**/work/settings.json"))}
+    scenes = {scene, *(path.parents[1] for path in folder.glob(os.path.join("*", "**", "work", "settings.json")))}
     known = {*read_settings(out / "work" / "settings.json", out).get("photos", [])}
     found, stems, masks = defaultdict(list), defaultdict(list), {}
     for path in sorted(folder.rglob("*")):

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
-from sadgs_ns.cli.process.folder import COLMAP_FORMATS, look_into
+from sadgs_ns.cli.process.folder import COLMAP_FORMATS, Found, look_into
 from sadgs_ns.cli.process.panoramas import VIEWS, cut, is_panorama
 from sadgs_ns.cli.process.video import find_videos
 from sadgs_ns.errors import InputError, reason
@@ -60,10 +60,10 @@ class Photo:
         return [Photo(name, size, (), (), self.has_alpha) for name in names] if self.is_panorama else [self]
 
 
-def find_source(source: Path, out: Path) -> tuple[list[str], bool]:
+def find_source(source: Path, out: Path, found: Found | None = None) -> tuple[list[str], bool]:
     """Return the photos of a folder, as `look_into` finds them, or its videos where it has fewer than three photos.
 
-    Also return whether these are videos. A single video has no names.
+    Also return whether these are videos. A single video has no names. `found` is what `look_into` returned before.
 
     Raises:
         InputError: If there are neither three photos nor a video, or a photo has a name that is no Unicode.
@@ -72,7 +72,7 @@ def find_source(source: Path, out: Path) -> tuple[list[str], bool]:
         return [], True
     if not source.is_dir():
         raise InputError(f"{source} does not exist; give a folder of photos or of videos, or a video.")
-    photos, _, others = look_into(source, out)
+    photos, _, others = found or look_into(source, out)
     if len(photos) < 3:
         if videos := find_videos(source):
             return videos, True

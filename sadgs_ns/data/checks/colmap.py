@@ -27,7 +27,13 @@ from sadgs_ns.data.checks.images import (
     scaled_size,
     smaller_folder,
 )
-from sadgs_ns.data.checks.layouts import ParserOptions, find_reconstructions, images_folder, no_layout
+from sadgs_ns.data.checks.layouts import (
+    ParserOptions,
+    find_reconstruction,
+    find_reconstructions,
+    images_folder,
+    no_layout,
+)
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
 from sadgs_ns.data.text import refuse_byte_order_mark
 from sadgs_ns.errors import InputError, reason
@@ -42,7 +48,7 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
     images, model_folder = data / options.images_path, data / options.colmap_path
     kind = colmap.model_kind(model_folder)
     if kind is None:
-        if found := next(iter(find_reconstructions(data)), None):
+        if found := find_reconstruction(data):
             told = f"{model_folder} holds no COLMAP reconstruction, but {data / found} does"
             raise InputError(f"{told}: add `{_words(data, automatic_options(data, found))}` after `colmap`.")
         raise InputError(no_layout(data))
