@@ -26,7 +26,7 @@ from tyro.conf import Positional
 
 from benchmarks import table
 from benchmarks.table import Run
-from sadgs_ns.atomic import atomic_path
+from sadgs_ns.files import atomic_path
 
 RESULTS, FIGURES, TABLES = Path("docs", "results"), Path("docs", "figures"), "tables.yaml"
 """Folders of the rows and of the figures in a checkout, and the name of the description among the rows."""

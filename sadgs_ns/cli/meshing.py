@@ -12,10 +12,10 @@ from rich.console import Console
 from rich.progress import track
 from torch import Tensor
 
-from sadgs_ns.atomic import atomic_path
 from sadgs_ns.data.coordinates import Similarity
 from sadgs_ns.data.run_cameras import RunCameras
 from sadgs_ns.errors import InputError
+from sadgs_ns.files import atomic_path
 from sadgs_ns.formats import mesh
 from sadgs_ns.formats.gaussians import DEGREE_0
 from sadgs_ns.formats.mesh import DepthView, Fusion

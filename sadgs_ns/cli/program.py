@@ -16,8 +16,8 @@ from typing import Any, TypeVar
 
 import tyro
 
-from sadgs_ns.atomic import atomic_path
 from sadgs_ns.errors import InputError, RunError, free_space, reason
+from sadgs_ns.files import atomic_path
 from sadgs_ns.plugin.interrupts import Interrupted
 
 Options = TypeVar("Options")

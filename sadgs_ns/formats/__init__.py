@@ -9,8 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Literal
 
-from sadgs_ns.atomic import atomic_path
 from sadgs_ns.errors import InputError
+from sadgs_ns.files import atomic_path
 from sadgs_ns.formats import compressed_ply, glb, html, ply, sog, spz
 from sadgs_ns.formats.gaussians import Gaussians
 

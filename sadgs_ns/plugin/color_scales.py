@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from sadgs_ns.atomic import atomic_path
+from sadgs_ns.files import atomic_path
 
 Picture = NDArray[np.uint8]
 """RGB. [H, W, 3]"""

@@ -17,9 +17,9 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from tyro.conf import Suppress
 
-from sadgs_ns.atomic import atomic_path
 from sadgs_ns.data.checks.parsers import keep_findings, refuse_bad_data
 from sadgs_ns.errors import InputError, reason
+from sadgs_ns.files import atomic_path
 from sadgs_ns.kernels import SWITCH, switched_off
 from sadgs_ns.plugin import checkpoints, processes
 from sadgs_ns.plugin.optimizers import RunLengthDecaySchedulerConfig

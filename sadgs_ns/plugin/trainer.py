@@ -19,9 +19,9 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from sadgs_ns import events
-from sadgs_ns.atomic import atomic_path
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
+from sadgs_ns.files import atomic_path
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.method.schedule import between_one_and_four, schedule
 from sadgs_ns.plugin import checkpoints, processes

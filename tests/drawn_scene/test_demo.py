@@ -27,8 +27,8 @@ from examples.drawn_scene.scene import (
     room_surfaces,
     write_scene,
 )
-from sadgs_ns.atomic import atomic_path
 from sadgs_ns.cli.export import write_gaussians
+from sadgs_ns.files import atomic_path
 
 WIDTH, HEIGHT, VIEWS = 48, 36, 9
 

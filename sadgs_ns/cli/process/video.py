@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from av.error import InvalidDataError
 
-from sadgs_ns.atomic import atomic_path
 from sadgs_ns.errors import InputError
+from sadgs_ns.files import atomic_path
 
 VIDEO_SUFFIXES = (".3gp", ".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".mts", ".ogv", ".webm", ".wmv")
 
