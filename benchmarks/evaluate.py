@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from sadgs_ns.gsplat_internals import NEAR_PLANE
+from sadgs_ns.gsplat_compat import NEAR_PLANE
 
 if TYPE_CHECKING:  # torchmetrics takes a second to import, which is no part of the training that is timed
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity

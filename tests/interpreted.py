@@ -9,9 +9,9 @@ import torch
 from gsplat.cuda._torch_impl import _fully_fused_projection
 from torch import Tensor
 
-from sadgs_ns import gsplat_internals
+from sadgs_ns import gsplat_compat
 from sadgs_ns.kernels import TILE_SIZE
-from sadgs_ns.render import rasterization, splatter
+from sadgs_ns.render import backend_torch, rasterization
 
 compositing = pytest.importorskip("sadgs_ns.kernels.compositing", reason="Triton is not installed")
 harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")
@@ -31,8 +31,8 @@ def project(
     calc_compensations: bool,
     near_plane: float = 0.01,
 ) -> tuple[Tensor, ...]:
-    """`gsplat_internals.project` in torch."""
-    covariances = gsplat_internals.torch_quat_scale_to_covar_preci(quats, scales, True, False)[0]
+    """`gsplat_compat.project` in torch."""
+    covariances = gsplat_compat.torch_quat_scale_to_covar_preci(quats, scales, True, False)[0]
     return _fully_fused_projection(
         means,
         covariances,  # type: ignore[arg-type]
@@ -63,8 +63,8 @@ def composite(
     starts, ends = (places[:, :rows].flatten().long() for places in (starts, ends))
     row, column = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
     origins = (torch.stack([column, row], dim=-1) * size).reshape(-1, 2).repeat(views, 1)
-    tiles = splatter._Tiles(size, origins, starts, ends - starts, ids.long())
-    canvas: Any = splatter._Composite.apply(means2d, conics, colors, opacities, tiles, absgrad)
+    tiles = backend_torch._Tiles(size, origins, starts, ends - starts, ids.long())
+    canvas: Any = backend_torch._Composite.apply(means2d, conics, colors, opacities, tiles, absgrad)
     image = canvas.reshape(views, rows, columns, size, size, 4).transpose(2, 3).reshape(views, rows * size, -1, 4)
     return image[:, :height, :width, :3], image[:, :height, :width, 3:]
 
@@ -72,7 +72,7 @@ def composite(
 def use_our_rasterizer(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have runs draw with it."""
     monkeypatch.setattr(rasterization, "use_triton", lambda place: True)
-    monkeypatch.setattr(gsplat_internals, "project", project)
+    monkeypatch.setattr(gsplat_compat, "project", project)
     monkeypatch.setattr(compositing, "rasterize_to_pixels", composite)
     lanes = [(tiles, "_LANES"), (harmonics, "_LANES"), (harmonics, "_BACKWARD_LANES"), (projection, "_LANES")]
     for module, name in lanes:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.render.splatter import rasterization
+from sadgs_ns.render.backend_torch import rasterization
 
 WIDTH, HEIGHT, VIEWS, POINTS = 48, 36, 10, 300
 """Of the drawn scene that the fixture `scene` is."""

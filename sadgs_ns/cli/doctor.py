@@ -109,9 +109,9 @@ def _check_cuda() -> Iterator[Finding]:
             "compiler and Python's headers.",
         )
     try:
-        from sadgs_ns import gsplat_internals
+        from sadgs_ns import gsplat_compat
 
-        problem = None if gsplat_internals.cuda_extension() is not None else "neither prebuilt nor compiled"
+        problem = None if gsplat_compat.cuda_extension() is not None else "neither prebuilt nor compiled"
     except Exception as error:  # Its compilation fails in many ways.
         problem = reason(error)
     if problem is None:

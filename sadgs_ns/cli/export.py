@@ -219,7 +219,7 @@ def read_checkpoint(run: Path) -> tuple[Path, dict[str, Tensor], float]:
     # These import torch, which takes seconds, and `--help` and a wrong path need not wait for it.
     from torch import Tensor
 
-    from sadgs_ns.gsplat_internals import NEAR_PLANE
+    from sadgs_ns.gsplat_compat import NEAR_PLANE
     from sadgs_ns.plugin import checkpoints
 
     checkpoint = _checkpoint_of(run)

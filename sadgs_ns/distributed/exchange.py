@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from sadgs_ns.distributed.bands import Band
 from sadgs_ns.distributed.world import World
-from sadgs_ns.gsplat_internals import drawn
+from sadgs_ns.gsplat_compat import drawn
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.render.projected import Projected
 

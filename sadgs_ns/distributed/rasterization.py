@@ -9,7 +9,7 @@ from torch import Tensor
 from sadgs_ns.distributed.bands import Band, share_out
 from sadgs_ns.distributed.exchange import Exchange
 from sadgs_ns.distributed.world import World
-from sadgs_ns.gsplat_internals import NEAR_PLANE
+from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.render.rasterization import composite, project
 
 

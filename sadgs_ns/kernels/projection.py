@@ -19,8 +19,8 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sadgs_ns import gsplat_internals
-from sadgs_ns.gsplat_internals import NEAR_PLANE, SCREEN_BLUR
+from sadgs_ns import gsplat_compat
+from sadgs_ns.gsplat_compat import NEAR_PLANE, SCREEN_BLUR
 from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.visibility import drawn
 
@@ -244,7 +244,7 @@ class _Project(torch.autograd.Function):
         calc_compensations: bool,
         near_plane: float,
     ) -> tuple[Tensor | None, ...]:
-        radii, means2d, depths, conics, compensations = gsplat_internals.project(
+        radii, means2d, depths, conics, compensations = gsplat_compat.project(
             means, quats, scales, opacities, viewmats, Ks, width, height, calc_compensations, near_plane
         )
         radii = radii.contiguous()
@@ -295,10 +295,10 @@ def project(
     calc_compensations: bool,
     near_plane: float = NEAR_PLANE,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None, Tensor]:
-    """Do what `gsplat_internals.project` does, but differentiate it with one kernel.
+    """Do what `gsplat_compat.project` does, but differentiate it with one kernel.
 
     Returns:
-        What `gsplat_internals.project` returns, whose radii may be set to 0 in place until the backward pass; and
+        What `gsplat_compat.project` returns, whose radii may be set to 0 in place until the backward pass; and
         `means`. If what else depends on the centres takes this tensor, the backward kernel adds its gradient to theirs.
     """
     tensors = (value.contiguous() for value in (means, quats, scales, opacities, viewmats, Ks))

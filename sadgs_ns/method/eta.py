@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 
-from sadgs_ns.gsplat_internals import SCREEN_BLUR
+from sadgs_ns.gsplat_compat import SCREEN_BLUR
 from sadgs_ns.method.codes import decode
 
 WAVELENGTH_EPSILON = 1e-5

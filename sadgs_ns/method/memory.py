@@ -1,6 +1,6 @@
 """How much memory a training step takes on CUDA, and how many Gaussians may be added so that the next one fits.
 
-The bytes are counted from the code that allocates them: `render.fused` and gsplat's `fully_fused_projection`,
+The bytes are counted from the code that allocates them: `render.backend_triton` and gsplat's `fully_fused_projection`,
 `kernels.tiles`, `kernels.losses` and `kernels.compositing`. `tests/benchmarks/test_step.py` compares the count with
 real peaks.
 

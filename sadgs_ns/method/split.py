@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 
-from sadgs_ns.gsplat_internals import update_param_with_optimizer
+from sadgs_ns.gsplat_compat import update_param_with_optimizer
 
 Params = MutableMapping[str, torch.nn.Parameter] | torch.nn.ParameterDict
 """gsplat's parameters by name, each with leading dimension N."""

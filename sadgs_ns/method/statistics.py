@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sadgs_ns.gsplat_internals import SCREEN_BLUR
+from sadgs_ns.gsplat_compat import SCREEN_BLUR
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.method.codes import HIGHEST_FREQUENCY, MASKED, OCTAVES
 from sadgs_ns.method.eta import (

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sadgs_ns.distributed import ranking
 from sadgs_ns.distributed.world import World
-from sadgs_ns.gsplat_internals import update_param_with_optimizer
+from sadgs_ns.gsplat_compat import update_param_with_optimizer
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow, keep_gradient
 from sadgs_ns.method.memory import StepSize, affordable_growth, free_bytes
 from sadgs_ns.method.schedule import Windows, windows

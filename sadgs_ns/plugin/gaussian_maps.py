@@ -11,7 +11,7 @@ from gsplat.utils import normalized_quat_to_rotmat
 from matplotlib.colors import hsv_to_rgb
 from torch import Tensor
 
-from sadgs_ns.gsplat_internals import NEAR_PLANE
+from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.method.split import num_children
 from sadgs_ns.render.rasterization import rasterize
 

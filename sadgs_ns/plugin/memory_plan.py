@@ -11,7 +11,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from torch import Tensor
 
 from sadgs_ns.distributed.bands import views_of_rank
-from sadgs_ns.gsplat_internals import NEAR_PLANE, SCREEN_BLUR
+from sadgs_ns.gsplat_compat import NEAR_PLANE, SCREEN_BLUR
 from sadgs_ns.kernels import TILE_SIZE
 from sadgs_ns.method import memory
 from sadgs_ns.method.absgs import empty_gradients

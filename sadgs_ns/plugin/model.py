@@ -25,7 +25,7 @@ from torch import Tensor
 from sadgs_ns.data.cameras import refuse_unsupported_cameras
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
-from sadgs_ns.gsplat_internals import NEAR_PLANE
+from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.method.averaging import RunningMean
 from sadgs_ns.method.camera_paths import MOST_VIEWS, CameraPaths
 from sadgs_ns.method.clearance import clear_of_cameras, limit_scales

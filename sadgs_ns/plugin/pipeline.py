@@ -22,7 +22,7 @@ from sadgs_ns.data.cameras import refuse_unsupported_cameras
 from sadgs_ns.data.checks.parsers import findings_of
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
-from sadgs_ns.gsplat_internals import FAR_PLANE
+from sadgs_ns.gsplat_compat import FAR_PLANE
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.method.codes import HIGHEST_FREQUENCY
 from sadgs_ns.method.initialization import camera_extent

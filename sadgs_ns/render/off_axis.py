@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sadgs_ns.gsplat_internals import has_radius_per_axis, with_changed_radii
+from sadgs_ns.gsplat_compat import has_radius_per_axis, with_changed_radii
 
 
 @torch.no_grad()

@@ -8,10 +8,10 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from sadgs_ns import gsplat_internals
-from sadgs_ns.gsplat_internals import NEAR_PLANE
+from sadgs_ns import gsplat_compat
+from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.kernels import use_triton
-from sadgs_ns.render import splatter
+from sadgs_ns.render import backend_torch
 from sadgs_ns.render.off_axis import culling
 from sadgs_ns.render.projected import Projected
 
@@ -65,12 +65,12 @@ def rasterize(
             (kernels/limits.py).
     """
     options: dict[str, Any] = {"max_off_axis": max_off_axis}
-    rasterization: Any = splatter.rasterization
+    rasterization: Any = backend_torch.rasterization
     triton = use_triton(means.device)
     # gsplat compiles its CUDA kernels when they are first used. These imports stand here so that nothing touches them
     # without a GPU.
     if triton:
-        from sadgs_ns.render.fused import rasterization
+        from sadgs_ns.render.backend_triton import rasterization
 
         options["tile_capacity"] = tile_capacity
     elif means.is_cuda:
@@ -122,7 +122,7 @@ def project(
     """
     antialiased = rasterize_mode == "antialiased"
     if use_triton(means.device):
-        from sadgs_ns.render.fused import project
+        from sadgs_ns.render.backend_triton import project
 
         return project(
             means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree,
@@ -130,7 +130,7 @@ def project(
         )  # fmt: skip
     if isinstance(colors, tuple):
         colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
-    return splatter.project(
+    return backend_torch.project(
         means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree,
         antialiased=antialiased, max_off_axis=max_off_axis, near_plane=near_plane,
     )  # fmt: skip
@@ -151,10 +151,10 @@ def composite(
         InputError: As `rasterize`.
     """
     if use_triton(projected.means2d.device):
-        from sadgs_ns.render.fused import composite
+        from sadgs_ns.render.backend_triton import composite
 
         return composite(projected, width, height, absgrad=absgrad)
-    return splatter.composite(projected, width, height, absgrad=absgrad)
+    return backend_torch.composite(projected, width, height, absgrad=absgrad)
 
 
 def visible(info: Mapping[str, Any]) -> Tensor:
@@ -166,7 +166,7 @@ def visible(info: Mapping[str, Any]) -> Tensor:
     Returns:
         bool [C, N]
     """
-    return gsplat_internals.drawn(info["radii"], info["means2d"])
+    return gsplat_compat.drawn(info["radii"], info["means2d"])
 
 
 def viewmats_from_camera_to_world(

@@ -28,7 +28,7 @@ from benchmarks.phases import PHASES, Stopwatch
 from benchmarks.protocol import Job, Row, Scene
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.render import splatter
+from sadgs_ns.render import backend_torch
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 WIDTH, HEIGHT, VIEWS = 48, 36, 10
@@ -113,7 +113,7 @@ def replace_gsplat(patch: pytest.MonkeyPatch) -> None:
         return
 
     def rasterization(packed: bool, sparse_grad: bool, **options: Any) -> Any:
-        return splatter.rasterization(**options)
+        return backend_torch.rasterization(**options)
 
     patch.setattr(splatfacto, "rasterization", rasterization)
     patch.setattr(torch.Tensor, "cuda", lambda tensor: tensor)

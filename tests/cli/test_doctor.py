@@ -18,7 +18,7 @@ import pytest
 import torch
 
 from examples.drawn_scene.scene import write_scene
-from sadgs_ns import gsplat_internals, kernels
+from sadgs_ns import gsplat_compat, kernels
 from sadgs_ns.cli import doctor
 from sadgs_ns.data.checks.findings import Finding
 
@@ -50,7 +50,7 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (6_000_000_000, 8_000_000_000))
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "A GPU")
     monkeypatch.setattr(kernels, "available", available)
-    monkeypatch.setattr(gsplat_internals, "cuda_extension", lambda: state.extension)
+    monkeypatch.setattr(gsplat_compat, "cuda_extension", lambda: state.extension)
     return state
 
 

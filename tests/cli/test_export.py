@@ -29,9 +29,9 @@ from sadgs_ns.data.coordinates import Similarity, from_data, spherical_harmonics
 from sadgs_ns.data.run_cameras import find_capture, read_cameras
 from sadgs_ns.errors import InputError
 from sadgs_ns.formats import FORMATS, html
-from sadgs_ns.gsplat_internals import torch_quat_scale_to_covar_preci, torch_spherical_harmonics
+from sadgs_ns.gsplat_compat import torch_quat_scale_to_covar_preci, torch_spherical_harmonics
 from sadgs_ns.plugin.trainer import SadgsTrainer
-from sadgs_ns.render import splatter
+from sadgs_ns.render import backend_torch
 
 WIDTH, HEIGHT, VIEWS = 48, 36, 10
 PARAMS = {
@@ -192,7 +192,7 @@ def test_the_export_in_colmap_s_frame_looks_through_colmap_s_cameras_as_the_mode
         pose = pose() if callable(pose) else pose
         viewmat = np.eye(4)
         viewmat[:3] = pose.matrix()
-        render, _, _ = splatter.rasterization(
+        render, _, _ = backend_torch.rasterization(
             torch.from_numpy(means),
             torch.from_numpy(quats),
             torch.from_numpy(scales),

@@ -10,14 +10,14 @@ import torch
 from gsplat.cuda._torch_impl import _fully_fused_projection
 from torch import Tensor
 
-from sadgs_ns import gsplat_internals
+from sadgs_ns import gsplat_compat
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, keep_gradient
-from sadgs_ns.render import splatter
+from sadgs_ns.render import backend_torch
 from sadgs_ns.render.rasterization import visible
 
 compositing = pytest.importorskip("sadgs_ns.kernels.compositing", reason="Triton is not installed")
 forward = pytest.importorskip("sadgs_ns.kernels.compositing_forward", reason="Triton is not installed")
-rasterization = pytest.importorskip("sadgs_ns.render.fused", reason="Triton is not installed")
+rasterization = pytest.importorskip("sadgs_ns.render.backend_triton", reason="Triton is not installed")
 tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not installed")
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -334,7 +334,7 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
     width, height = 22, 18
 
     def project(means, quats, scales, opacities, viewmats, Ks, width, height, calc_compensations, near_plane):
-        covariances = gsplat_internals.torch_quat_scale_to_covar_preci(quats, scales, True, False)[0]
+        covariances = gsplat_compat.torch_quat_scale_to_covar_preci(quats, scales, True, False)[0]
         assert covariances is not None
         return _fully_fused_projection(
             means,
@@ -347,7 +347,7 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
             calc_compensations=calc_compensations,
         )
 
-    monkeypatch.setattr(gsplat_internals, "project", project)
+    monkeypatch.setattr(gsplat_compat, "project", project)
     generator = torch.Generator().manual_seed(0)
     viewmats = torch.eye(4).repeat(2, 1, 1)
     viewmats[1, :3, :3] = torch.linalg.qr(torch.eye(3) + 0.05 * torch.randn(3, 3, generator=generator))[0]
@@ -356,7 +356,7 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
     Ks = scenes.camera(width, height, 30.0)[1].repeat(2, 1, 1)
     rest, v_renders = (0.1 * torch.randn(shape, generator=generator) for shape in ((60, 15, 3), (2, height, width, 3)))
     results, drawn = [], []
-    for function, dtype in ((rasterization.rasterization, torch.float32), (splatter.rasterization, torch.float64)):
+    for function, dtype in ((rasterization.rasterization, torch.float32), (backend_torch.rasterization, torch.float64)):
         values = {name: p.detach() for name, p in scenes.random_params(60).items()} | {"rest": rest}
         values = {name: value.to(dtype, copy=True).requires_grad_() for name, value in values.items()}
         colors: Any = values["features_dc"], values["rest"]
@@ -394,7 +394,7 @@ def test_what_is_drawn_is_as_close_to_float64_as_what_gsplat_draws(kind):
     scene = make_scene(kind, num_views=3, n=300, width=93, height=70)
     _, true_alphas, _ = reference(scene)
     means2d, conics, colors, opacities = (scene[name].contiguous() for name in NAMES[:4])
-    expected = gsplat_internals.rasterize_to_pixels(
+    expected = gsplat_compat.rasterize_to_pixels(
         means2d, conics, colors, opacities, 93, 70, 8, scene["starts"], scene["ids"], False
     )  # fmt: skip
     truths = (scene["renders"], true_alphas)
@@ -421,7 +421,7 @@ def test_gradients_are_as_close_to_float64_as_gsplats(kind):
         if ours:
             outputs = compositing.rasterize_to_pixels(means2d, conics, colors, opacities, 93, 70, *lists, True)
         else:
-            outputs = gsplat_internals.rasterize_to_pixels(
+            outputs = gsplat_compat.rasterize_to_pixels(
                 means2d, conics, colors, opacities, 93, 70, 8, *lists, True
             )  # fmt: skip
         torch.autograd.backward(outputs, [scene["v_renders"], scene["v_alphas"]])

@@ -18,7 +18,7 @@ from random_scene import random_scene
 from torch import Tensor
 
 from sadgs_ns import kernels
-from sadgs_ns.gsplat_internals import torch_spherical_harmonics
+from sadgs_ns.gsplat_compat import torch_spherical_harmonics
 from sadgs_ns.method import losses
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients
 from sadgs_ns.method.codes import encode
@@ -730,7 +730,7 @@ def test_the_lists_order_and_starts_are_torchs(dtype, num_pairs, num_tiles):
 def test_rasterization_equals_gsplats_own(render_mode, max_off_axis):
     from gsplat import rasterization as gsplats
 
-    from sadgs_ns.render import fused as ours
+    from sadgs_ns.render import backend_triton as ours
     from sadgs_ns.render.off_axis import culling
 
     scene = {name: value.float().cuda() for name, value in random_scene(3000, 128, seed=0).items()}

@@ -10,7 +10,7 @@ from sadgs_ns.kernels import limits
 
 harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")
 losses = pytest.importorskip("sadgs_ns.kernels.losses", reason="Triton is not installed")
-rasterization = pytest.importorskip("sadgs_ns.render.fused", reason="Triton is not installed")
+rasterization = pytest.importorskip("sadgs_ns.render.backend_triton", reason="Triton is not installed")
 tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not installed")
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")

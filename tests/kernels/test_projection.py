@@ -11,7 +11,7 @@ import torch
 from gsplat.cuda._torch_impl import _fully_fused_projection
 from torch import Tensor
 
-from sadgs_ns import gsplat_internals
+from sadgs_ns import gsplat_compat
 
 projection = pytest.importorskip("sadgs_ns.kernels.projection", reason="Triton is not installed")
 
@@ -50,14 +50,14 @@ def project_in_torch(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor,
     width: int, height: int, calc_compensations: bool, near_plane: float = 0.01, per_axis_radii: bool = False,
 ) -> tuple[Any, ...]:  # fmt: skip
-    """Do what `gsplat_internals.project` does, with radii in either layout."""
-    covariances, _ = gsplat_internals.torch_quat_scale_to_covar_preci(quats, scales, True, False)
+    """Do what `gsplat_compat.project` does, with radii in either layout."""
+    covariances, _ = gsplat_compat.torch_quat_scale_to_covar_preci(quats, scales, True, False)
     assert covariances is not None
     radii, *others = _fully_fused_projection(
         means, covariances, viewmats, Ks, width, height, near_plane=near_plane, calc_compensations=calc_compensations
     )
     assert others[0] is not None
-    seen = gsplat_internals.drawn(radii, others[0])
+    seen = gsplat_compat.drawn(radii, others[0])
     radii = seen.int() * 3
     return (torch.stack([radii, 2 * radii], dim=-1) if per_axis_radii else radii), *others
 
@@ -94,7 +94,7 @@ def upstream_of(seen: Tensor, names: tuple[str, ...]) -> dict[str, Tensor]:
     ids=lambda value: "-".join(value) if isinstance(value, tuple) else str(value),
 )
 def test_gradients_equal_float64_autograd(monkeypatch, num_views, names, per_axis_radii):
-    if DEVICE.type == "cuda" and per_axis_radii is not gsplat_internals.RADII_PER_AXIS:
+    if DEVICE.type == "cuda" and per_axis_radii is not gsplat_compat.RADII_PER_AXIS:
         pytest.skip("gsplat's kernel makes radii in one of the layouts")
     values, antialiased = scene(num_views), "compensations" in names
     inputs: dict[str, Any] = {name: value.clone().requires_grad_() for name, value in values.items()}
@@ -109,13 +109,13 @@ def test_gradients_equal_float64_autograd(monkeypatch, num_views, names, per_axi
 
     if DEVICE.type == "cpu":  # gsplat's kernels need CUDA
         monkeypatch.setattr(
-            gsplat_internals, "project", lambda *arguments: project_in_torch(*arguments, per_axis_radii=per_axis_radii)
+            gsplat_compat, "project", lambda *arguments: project_in_torch(*arguments, per_axis_radii=per_axis_radii)
         )
     inputs = {name: value.float().to(DEVICE) for name, value in values.items()}
     for name in ("means", "quats", "scales"):
         inputs[name].requires_grad_()
     radii, *others = projection.project(**inputs, width=WIDTH, height=HEIGHT, calc_compensations=antialiased)
-    assert not radii.requires_grad and torch.equal(gsplat_internals.drawn(radii, others[0]).cpu(), seen)
+    assert not radii.requires_grad and torch.equal(gsplat_compat.drawn(radii, others[0]).cpu(), seen)
     found = gradients_of(dict(zip(OUTPUTS, others, strict=True)), inputs, upstream)
     for name, value in expected.items():
         error = float((found[name] - value).norm() / value.norm())
@@ -128,7 +128,7 @@ def test_gradients_equal_float64_autograd(monkeypatch, num_views, names, per_axi
 def test_what_no_view_draws_has_gradients_of_zero_whatever_its_numbers_are(monkeypatch):
     """Also where it is culled, or where tile lists overflow, after the projection."""
     values = {name: value.float().to(DEVICE) for name, value in scene(2).items()}
-    monkeypatch.setattr(gsplat_internals, "project", project_in_torch)
+    monkeypatch.setattr(gsplat_compat, "project", project_in_torch)
     results = []
     for broken in (False, True):
         inputs = {name: value.clone() for name, value in values.items()}
@@ -138,7 +138,7 @@ def test_what_no_view_draws_has_gradients_of_zero_whatever_its_numbers_are(monke
             inputs[name].requires_grad_()
         radii, *others = projection.project(**inputs, width=WIDTH, height=HEIGHT, calc_compensations=False)
         radii.data[:, :50] = 0  # as kernels do, of whose changes autograd does not know
-        upstream = upstream_of(gsplat_internals.drawn(radii, others[0]).cpu(), ("means2d", "conics"))
+        upstream = upstream_of(gsplat_compat.drawn(radii, others[0]).cpu(), ("means2d", "conics"))
         with np.errstate(all="ignore"):  # Triton's interpreter computes with numpy
             results.append(gradients_of(dict(zip(OUTPUTS, others, strict=True)), inputs, upstream))
     for name, value in results[1].items():
@@ -154,7 +154,7 @@ def test_gradients_are_as_close_to_float64_as_gsplats():
     upstream = upstream_of(radii > 0, OUTPUTS[:4])
     expected = gradients_of(dict(zip(OUTPUTS, others, strict=False)), inputs, upstream)
     errors = []
-    for function in (projection.project, gsplat_internals.project):
+    for function in (projection.project, gsplat_compat.project):
         inputs = {name: value.float().to(DEVICE) for name, value in values.items()}
         for name in ("means", "quats", "scales"):
             inputs[name].requires_grad_()

@@ -7,7 +7,7 @@ import torch
 
 from sadgs_ns.method import clearance
 from sadgs_ns.method.clearance import clear_of_cameras, limit_scales
-from sadgs_ns.render.splatter import rasterization
+from sadgs_ns.render.backend_torch import rasterization
 
 
 def test_points_are_clear_of_cameras_from_their_radius_on():

@@ -9,7 +9,7 @@ import torch
 from scenes import camera, random_params
 from torch import Tensor
 
-from sadgs_ns.gsplat_internals import SCREEN_BLUR, torch_persp_proj, torch_quat_scale_to_covar_preci, torch_world_to_cam
+from sadgs_ns.gsplat_compat import SCREEN_BLUR, torch_persp_proj, torch_quat_scale_to_covar_preci, torch_world_to_cam
 from sadgs_ns.method.codes import encode
 from sadgs_ns.method.eta import (
     eta,

@@ -28,7 +28,7 @@ from PIL import Image
 from torch import Tensor
 
 from sadgs_ns.data.cameras import refuse_failed_undistortion, refuse_unsupported_cameras
-from sadgs_ns.gsplat_internals import SCREEN_BLUR
+from sadgs_ns.gsplat_compat import SCREEN_BLUR
 from sadgs_ns.kernels import triton_switched
 from sadgs_ns.method import losses
 from sadgs_ns.method.eta import eta, projected_axes, sample_footprint

@@ -31,9 +31,9 @@ from runs import checkpoint, configure, train
 from torch import Tensor
 
 from sadgs_ns import kernels
-from sadgs_ns.gsplat_internals import torch_spherical_harmonics
+from sadgs_ns.gsplat_compat import torch_spherical_harmonics
 from sadgs_ns.method import losses
-from sadgs_ns.render import splatter
+from sadgs_ns.render import backend_torch
 
 harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")
 photometric = pytest.importorskip("sadgs_ns.kernels.losses", reason="Triton is not installed")
@@ -201,7 +201,7 @@ def render_hard(gaussians: dict[str, Any], **options: Any) -> Tensor:
     dtype, device = gaussians["means"].dtype, gaussians["means"].device
     viewmats = torch.eye(4, dtype=dtype, device=device)[None]
     Ks = torch.tensor([[[9.0, 0, 3.1], [0, 9.0, 2.6], [0, 0, 1]]], dtype=dtype, device=device)
-    colors, alphas, _ = splatter.rasterization(
+    colors, alphas, _ = backend_torch.rasterization(
         **gaussians, viewmats=viewmats, Ks=Ks, width=6, height=5, tile_size=4, **options
     )
     return torch.cat([colors, alphas], dim=-1)
@@ -241,7 +241,7 @@ def test_loss_and_splatter_together_by_finite_differences():
 
     def loss(*values: Tensor) -> Tensor:
         arguments: dict[str, Any] = dict(zip(names, values, strict=True))
-        rgb, _, _ = splatter.rasterization(**arguments, viewmats=viewmats, Ks=Ks, width=11, height=12)
+        rgb, _, _ = backend_torch.rasterization(**arguments, viewmats=viewmats, Ks=Ks, width=11, height=12)
         return losses.photometric_loss(rgb, target)[0]
 
     inputs = [gaussians[name].clone().requires_grad_() for name in names]

@@ -12,7 +12,7 @@ import torch
 from random_scene import random_scene
 from torch import Tensor
 
-from sadgs_ns.render import splatter
+from sadgs_ns.render import backend_torch
 from sadgs_ns.render.off_axis import cull_off_axis, culling, near_axis
 from sadgs_ns.render.rasterization import rasterize, visible
 
@@ -54,7 +54,7 @@ def test_what_is_left_is_drawn_as_if_the_culled_were_not_there():
     for view in range(2):
         rest = {name: value[drawn[view]] for name, value in arguments.items() if name not in ("viewmats", "Ks")}
         cameras = {name: arguments[name][view : view + 1] for name in ("viewmats", "Ks")}
-        expected, _, _ = splatter.rasterization(**rest, **cameras, width=40, height=40, sh_degree=3)
+        expected, _, _ = backend_torch.rasterization(**rest, **cameras, width=40, height=40, sh_degree=3)
         assert torch.equal(colors[view], expected[0])
 
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 from random_scene import random_scene, render_with_gradients
 
-from sadgs_ns.render import splatter
+from sadgs_ns.render import backend_torch
 from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world, visible
 
 
@@ -23,7 +23,9 @@ def test_the_cpu_gets_the_splatter(monkeypatch: pytest.MonkeyPatch) -> None:
     scene["means"][:5, 2] = -4.0  # behind the camera
     options: dict[str, Any] = {"sh_degree": 3, "rasterize_mode": "antialiased", "render_mode": "RGB+ED"}
     colors, alphas, info = rasterize(**scene, width=32, height=32, **options)
-    expected_colors, expected_alphas, expected_info = splatter.rasterization(**scene, width=32, height=32, **options)
+    expected_colors, expected_alphas, expected_info = backend_torch.rasterization(
+        **scene, width=32, height=32, **options
+    )
     assert torch.equal(colors, expected_colors) and torch.equal(alphas, expected_alphas)
     assert torch.equal(visible(info), visible(expected_info))
     assert 0 < visible(info).sum() < 50

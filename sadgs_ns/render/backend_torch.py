@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sadgs_ns.gsplat_internals import (
+from sadgs_ns.gsplat_compat import (
     FAR_PLANE,
     NEAR_PLANE,
     RADII_PER_AXIS,

@@ -12,7 +12,7 @@ from random_scene import random_scene
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from sadgs_ns.render import splatter
+from sadgs_ns.render import backend_torch
 
 NEAR = 0.01
 
@@ -56,7 +56,7 @@ def small_scene(gaussians: int = 24, seed: int = 0) -> dict[str, Any]:
 
 
 def render(scene: dict[str, Any], **changes: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    return splatter.rasterization(**{**scene, **changes})
+    return backend_torch.rasterization(**{**scene, **changes})
 
 
 def reference_gaussian(scene: dict[str, Any], index: int, per_axis: bool, antialiased: bool) -> dict[str, Any] | None:
@@ -137,13 +137,13 @@ def reference_render(
 
 @pytest.fixture(params=[128, 3], ids=["one segment", "many segments"])
 def segment(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(splatter, "_SEGMENT", request.param)
+    monkeypatch.setattr(backend_torch, "_SEGMENT", request.param)
 
 
 @pytest.mark.usefixtures("segment")
 @pytest.mark.parametrize("per_axis", [False, True])
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
-def test_agrees_with_the_reference(mode: splatter.RasterizeMode, per_axis: bool) -> None:
+def test_agrees_with_the_reference(mode: backend_torch.RasterizeMode, per_axis: bool) -> None:
     scene = small_scene()
     colors, alphas, info = render(scene, render_mode="RGB+D", rasterize_mode=mode, per_axis_radii=per_axis)
     expected_colors, expected_alphas = reference_render(scene, per_axis=per_axis, antialiased=mode == "antialiased")
@@ -199,7 +199,7 @@ def test_render_modes() -> None:
 
 @pytest.mark.usefixtures("segment")
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
-def test_gradients_agree_with_finite_differences(mode: splatter.RasterizeMode) -> None:
+def test_gradients_agree_with_finite_differences(mode: backend_torch.RasterizeMode) -> None:
     scene = small_scene(gaussians=6, seed=3)
     # Keep away from the cut-offs, at which the image jumps.
     scene["means"] *= 0.3
@@ -322,7 +322,7 @@ def test_culled_gaussians_get_zero_gradients() -> None:
     scales = torch.full((4, 3), 0.1).requires_grad_()
     quats, opacities, colors = torch.eye(4), torch.full((4,), 0.8), torch.ones(4, 16, 3)
     viewmats, Ks = torch.eye(4)[None], torch.tensor([[[20.0, 0, 10], [0, 20.0, 10], [0, 0, 1]]])
-    image, alphas, info = splatter.rasterization(
+    image, alphas, info = backend_torch.rasterization(
         means, quats, scales, opacities, colors, viewmats, Ks, 20, 20, far_plane=100.0, sh_degree=3, absgrad=True
     )
     (image.sum() + alphas.sum()).backward()
@@ -401,8 +401,8 @@ class LargestTensor(TorchDispatchMode):
 
 
 def test_no_tensor_grows_with_the_number_of_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(splatter, "_CHUNK_PAIRS", 1 << 14)
-    monkeypatch.setattr(splatter, "_SEGMENT", 32)
+    monkeypatch.setattr(backend_torch, "_CHUNK_PAIRS", 1 << 14)
+    monkeypatch.setattr(backend_torch, "_SEGMENT", 32)
     scene: dict[str, Any] = {name: value.float() for name, value in random_scene(1500, 64, seed=0).items()}
     del scene["weights"]
     scene["colors"] = scene["colors"][:, 0].contiguous()
@@ -412,9 +412,9 @@ def test_no_tensor_grows_with_the_number_of_pairs(monkeypatch: pytest.MonkeyPatc
     with LargestTensor() as largest:
         colors, _, info = render(scene, width=64, height=64, absgrad=True, per_axis_radii=False)
         colors.square().mean().backward()
-    assert len(info["flatten_ids"]) * 16**2 > 100 * splatter._CHUNK_PAIRS
+    assert len(info["flatten_ids"]) * 16**2 > 100 * backend_torch._CHUNK_PAIRS
     # A chunk has up to `_CHUNK_PAIRS` pairs, and one element more per pixel where transmittances are kept.
-    assert largest.elements <= splatter._CHUNK_PAIRS * (1 + 1 / 32)
+    assert largest.elements <= backend_torch._CHUNK_PAIRS * (1 + 1 / 32)
 
 
 class Operations(TorchDispatchMode):

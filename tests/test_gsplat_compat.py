@@ -1,4 +1,4 @@
-"""Signatures, names and shapes in the installed gsplat on which gsplat_internals.py relies; no test needs a GPU."""
+"""Signatures, names and shapes in the installed gsplat on which gsplat_compat.py relies; no test needs a GPU."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import pytest
 import torch
 from gsplat.cuda import _torch_impl
 
-from sadgs_ns import gsplat_internals
+from sadgs_ns import gsplat_compat
 
 EXPECTED = {
     # function: its first parameters, which are given by their places; then those with defaults that are relied on
@@ -30,12 +30,12 @@ EXPECTED = {
         "means2d conics colors opacities image_width image_height tile_size isect_offsets flatten_ids",
         {"backgrounds": None, "masks": None, "packed": False, "absgrad": False},
     ),
-    gsplat_internals.torch_quat_scale_to_covar_preci: (
+    gsplat_compat.torch_quat_scale_to_covar_preci: (
         "quats scales compute_covar compute_preci", {"compute_covar": True, "compute_preci": True, "triu": False}
     ),
-    gsplat_internals.torch_world_to_cam: ("means covars viewmats", {}),
-    gsplat_internals.torch_persp_proj: ("means covars Ks width height", {}),
-    gsplat_internals.update_param_with_optimizer: ("param_fn optimizer_fn params optimizers", {"names": None}),
+    gsplat_compat.torch_world_to_cam: ("means covars viewmats", {}),
+    gsplat_compat.torch_persp_proj: ("means covars Ks width height", {}),
+    gsplat_compat.update_param_with_optimizer: ("param_fn optimizer_fn params optimizers", {"names": None}),
 }  # fmt: skip
 N = 5
 
@@ -87,7 +87,7 @@ def test_signatures(function: Callable[..., Any]):
 
 
 def test_harmonics_in_torch_take_three_arguments_by_their_places():
-    parameters = inspect.signature(gsplat_internals.torch_spherical_harmonics).parameters.values()
+    parameters = inspect.signature(gsplat_compat.torch_spherical_harmonics).parameters.values()
     assert len(parameters) == 3
     assert all(parameter.kind is inspect.Parameter.POSITIONAL_OR_KEYWORD for parameter in parameters)
 
@@ -105,7 +105,7 @@ def test_the_projection_gets_what_gsplats_rasterization_gives_it(monkeypatch: py
             lambda: gsplat.rasterization(
                 *geometry, torch.ones(N, 3), viewmats, Ks, 40, 30, near_plane=0.7, packed=False, rasterize_mode=mode
             ),
-            lambda: gsplat_internals.project(*geometry, viewmats, Ks, 40, 30, mode == "antialiased", 0.7),
+            lambda: gsplat_compat.project(*geometry, viewmats, Ks, 40, 30, mode == "antialiased", 0.7),
         )
     )
     assert found.keys() == expected.keys()
@@ -117,7 +117,7 @@ def test_two_kernels_get_their_arguments_in_their_places(monkeypatch: pytest.Mon
     for name, count in (("spherical_harmonics", 4), ("rasterize_to_pixels", 10)):
         signature = inspect.signature(getattr(gsplat, name))
         monkeypatch.setattr(gsplat, name, lambda *args, s=signature, **options: s.bind(*args, **options).arguments)
-        found = getattr(gsplat_internals, name)(*values[:count])
+        found = getattr(gsplat_compat, name)(*values[:count])
         last = "masks" if count == 4 else "absgrad"
         assert list(found.values()) == values[:count] and list(found)[-1] == last
 
@@ -125,27 +125,25 @@ def test_two_kernels_get_their_arguments_in_their_places(monkeypatch: pytest.Mon
 def test_radii_of_the_installed_gsplat_have_the_layout_that_is_stated():
     viewmats, Ks = cameras()
     scene = gaussians()
-    covars, precis = gsplat_internals.torch_quat_scale_to_covar_preci(
-        scene["quats"], scene["scales"], compute_preci=False
-    )
+    covars, precis = gsplat_compat.torch_quat_scale_to_covar_preci(scene["quats"], scene["scales"], compute_preci=False)
     assert covars is not None and covars.shape == (N, 3, 3) and precis is None
     radii, means2d, *_ = _torch_impl._fully_fused_projection(scene["means"], covars, viewmats, Ks, 40, 30)
     assert radii.dtype == torch.int32
-    assert radii.shape == ((2, N, 2) if gsplat_internals.RADII_PER_AXIS else (2, N))
-    assert gsplat_internals.has_radius_per_axis(radii, means2d) is gsplat_internals.RADII_PER_AXIS
-    assert gsplat_internals.drawn(radii, means2d).tolist() == [[True] * N] * 2
+    assert radii.shape == ((2, N, 2) if gsplat_compat.RADII_PER_AXIS else (2, N))
+    assert gsplat_compat.has_radius_per_axis(radii, means2d) is gsplat_compat.RADII_PER_AXIS
+    assert gsplat_compat.drawn(radii, means2d).tolist() == [[True] * N] * 2
 
 
 def test_the_functions_in_torch_return_the_shapes_that_are_stated():
     viewmats, Ks = cameras()
     scene = {name: value.double() for name, value in gaussians().items()}
-    covars, _ = gsplat_internals.torch_quat_scale_to_covar_preci(scene["quats"], scene["scales"], compute_preci=False)
+    covars, _ = gsplat_compat.torch_quat_scale_to_covar_preci(scene["quats"], scene["scales"], compute_preci=False)
     assert covars is not None
-    means_c, covars_c = gsplat_internals.torch_world_to_cam(scene["means"], covars, viewmats.double())
-    means2d, covars2d = gsplat_internals.torch_persp_proj(means_c, covars_c, Ks.double(), 40, 30)
+    means_c, covars_c = gsplat_compat.torch_world_to_cam(scene["means"], covars, viewmats.double())
+    means2d, covars2d = gsplat_compat.torch_persp_proj(means_c, covars_c, Ks.double(), 40, 30)
     shapes = [tuple(value.shape) for value in (means_c, covars_c, means2d, covars2d)]
     assert shapes == [(2, N, 3), (2, N, 3, 3), (2, N, 2), (2, N, 2, 2)]
-    colors = gsplat_internals.torch_spherical_harmonics(1, means_c, torch.ones(2, N, 4, 3, dtype=torch.float64))
+    colors = gsplat_compat.torch_spherical_harmonics(1, means_c, torch.ones(2, N, 4, 3, dtype=torch.float64))
     assert colors.shape == (2, N, 3) and colors.dtype == torch.float64
 
 
@@ -167,7 +165,7 @@ def test_width_and_height_are_the_seventh_and_eighth_that_the_projection_gets(mo
         raise _Called
 
     monkeypatch.setattr(gsplat.rendering, "fully_fused_projection", project)
-    rasterization = gsplat_internals.with_changed_radii(gsplat.rendering.rasterization, change)
+    rasterization = gsplat_compat.with_changed_radii(gsplat.rendering.rasterization, change)
     with pytest.raises(_Called):
         rasterization(*gaussians().values(), torch.ones(N, 3), *cameras(), 40, 30, packed=False)
     assert sizes == [(40, 30)]
@@ -183,7 +181,7 @@ def test_an_optimizer_whose_moments_were_being_changed_has_no_state():
     optimizers["means"].step()
     assert optimizers["means"].state
     with pytest.raises(MemoryError):
-        gsplat_internals.update_param_with_optimizer(lambda name, p: p, fail, params, optimizers)
+        gsplat_compat.update_param_with_optimizer(lambda name, p: p, fail, params, optimizers)
     assert not optimizers["means"].state
 
 

@@ -3,7 +3,7 @@
 Every docstring says which gsplat versions it holds for: 1.4.0, 1.5.0 and 1.5.3 were read, and 1.5.1 and 1.5.2 lie
 between two that agree. gsplat 1.6, which is not released, needs torch 2.7, makes exact tile lists of its own and
 reorganizes how `rasterization` calls its parts; its sources were not read. Where they differ,
-tests/test_gsplat_internals.py fails and names the function of this file.
+tests/test_gsplat_compat.py fails and names the function of this file.
 
 Importing this module loads none of gsplat's CUDA kernels: gsplat loads or compiles them when the first of them runs.
 """

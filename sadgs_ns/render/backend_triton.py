@@ -7,8 +7,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from sadgs_ns import gsplat_internals
-from sadgs_ns.gsplat_internals import NEAR_PLANE
+from sadgs_ns import gsplat_compat
+from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.kernels import TILE_SIZE, compositing
 from sadgs_ns.kernels import projection as kernels_projection
 from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
@@ -137,7 +137,7 @@ def _geometry(
         # Colours take these centres, so that their gradient is added in the projection's backward kernel.
         radii, means2d, depths, conics, compensations, means = kernels_projection.project(*geometry)
     else:
-        radii, means2d, depths, conics, compensations = gsplat_internals.project(*geometry)
+        radii, means2d, depths, conics, compensations = gsplat_compat.project(*geometry)
     radii = radii.contiguous()  # Culling, and tile lists that are too short, set these very radii to 0.
     if compensations is not None:
         opacities = opacities * compensations
@@ -169,8 +169,8 @@ def _colors(
     coefficients = colors.expand(num_views, -1, -1, -1)
     # gsplat inverts the matrices, which makes the host wait for the device.
     positions = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:]).mT  # [C, 1, 3]
-    drawn = gsplat_internals.drawn(radii, means2d)  # [C, N]
-    colors = gsplat_internals.spherical_harmonics(sh_degree, means - positions, coefficients, drawn)
+    drawn = gsplat_compat.drawn(radii, means2d)  # [C, N]
+    colors = gsplat_compat.spherical_harmonics(sh_degree, means - positions, coefficients, drawn)
     return torch.clamp_min(colors + 0.5, 0.0)
 
 
@@ -194,7 +194,7 @@ def _composite(
     if ours:
         renders, alphas = compositing.rasterize_to_pixels(*splats, isect_offsets, flatten_ids, absgrad)
     else:
-        renders, alphas = gsplat_internals.rasterize_to_pixels(*splats, TILE_SIZE, isect_offsets, flatten_ids, absgrad)
+        renders, alphas = gsplat_compat.rasterize_to_pixels(*splats, TILE_SIZE, isect_offsets, flatten_ids, absgrad)
     if render_mode == "RGB+ED":
         renders = torch.cat([renders[..., :-1], renders[..., -1:] / alphas.clamp_min(1e-10)], dim=-1)
     info = {
