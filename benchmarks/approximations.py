@@ -23,8 +23,8 @@ from torch import Tensor
 
 from benchmarks import results, table
 from sadgs_ns.gsplat_compat import SCREEN_BLUR
-from sadgs_ns.method.codes import decode, encode
 from sadgs_ns.method.eta import eta, sample_footprint, sample_map, wavelength
+from sadgs_ns.method.quantization import decode, encode
 from sadgs_ns.method.statistics import HIGH_ETA
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 

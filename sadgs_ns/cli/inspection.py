@@ -17,7 +17,7 @@ from torch import Tensor
 
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow, keep_gradient
-from sadgs_ns.method.codes import decode
+from sadgs_ns.method.quantization import decode
 from sadgs_ns.method.split import grid_split, num_children
 from sadgs_ns.method.strategy import SMALL_SCALE
 from sadgs_ns.plugin import checkpoints, color_scales, gaussian_maps, texture

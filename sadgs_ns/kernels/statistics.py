@@ -49,7 +49,7 @@ def _eta(u, v, xx, xy, yy, EPSILON: tl.constexpr):
 
 @triton.jit
 def _frequency(code, HIGHEST: tl.constexpr, OCTAVES: tl.constexpr):
-    """Frequency of a code in 1/px, as in `method.codes.decode`."""
+    """Frequency of a code in 1/px, as in `method.quantization.decode`."""
     return tl.where(code > 0, HIGHEST * tl.exp2(OCTAVES * ((code - 1) / 254 - 1)), 0.0)
 
 
@@ -187,7 +187,7 @@ def observe_views(
     Args:
         thresholds: η above the first is high, and below the second it is low.
         constants: gsplat's blur in px², its margin of the frustum, and ε of the wavelength in 1/px.
-        code_range: HIGHEST_FREQUENCY, OCTAVES and MASKED of `method.codes`.
+        code_range: HIGHEST_FREQUENCY, OCTAVES and MASKED of `method.quantization`.
     """
     inputs = (*params, radii, means2d, conics, jitter, structure_tensors, viewmats, Ks)
     num_views, n = radii.shape[:2]

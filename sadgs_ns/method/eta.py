@@ -12,7 +12,7 @@ from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 
 from sadgs_ns.gsplat_compat import SCREEN_BLUR
-from sadgs_ns.method.codes import decode
+from sadgs_ns.method.quantization import decode
 
 WAVELENGTH_EPSILON = 1e-5
 """ε of Λ_min = 1 / (√λ_1 + ε) in 1/px: a textureless region has a wavelength of 10⁵ px, not infinity."""
@@ -112,7 +112,7 @@ def sample_map(structure_tensors: Tensor, camera_ids: Tensor, points: Tensor) ->
     """Read S̄ at the pixel under each point.
 
     Args:
-        structure_tensors: S̄ of each camera's image, any floating dtype, or its codes of `codes.encode`. [C, H, W, 3]
+        structure_tensors: S̄ of each camera's image, of any floating dtype or quantized. [C, H, W, 3]
         camera_ids: Index of the image of each point. int64 [M]
         points: In px, pixel centres at half-integers. [M, 2]
 

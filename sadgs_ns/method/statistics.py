@@ -14,7 +14,6 @@ from torch import Tensor
 
 from sadgs_ns.gsplat_compat import SCREEN_BLUR
 from sadgs_ns.kernels import use_triton
-from sadgs_ns.method.codes import HIGHEST_FREQUENCY, MASKED, OCTAVES
 from sadgs_ns.method.eta import (
     FRUSTUM_MARGIN,
     WAVELENGTH_EPSILON,
@@ -23,6 +22,7 @@ from sadgs_ns.method.eta import (
     sample_footprint,
     sample_map,
 )
+from sadgs_ns.method.quantization import HIGHEST_FREQUENCY, MASKED, OCTAVES
 from sadgs_ns.method.split import Params
 from sadgs_ns.render.rasterization import visible
 
@@ -60,8 +60,8 @@ def observe(
     Args:
         statistics: As made by `empty_statistics`.
         params: `means` [N, 3], `quats` [N, 4] and log `scales` [N, 3].
-        info: gsplat's meta, unpacked, of C views of one size, plus `structure_tensors` (S̄, or its codes of
-            `codes.encode`) [C, H, W, 3], `viewmats` [C, 4, 4] and `Ks` [C, 3, 3].
+        info: gsplat's meta, unpacked, of C views of one size, plus `structure_tensors` [C, H, W, 3] (S̄,
+            which may be quantized), `viewmats` [C, 4, 4] and `Ks` [C, 3, 3].
         generator: Source of the jitter.
         jitter: In [0, 1), where it is not to be drawn here. [C, N, 2]
     """

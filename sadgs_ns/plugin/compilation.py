@@ -15,9 +15,9 @@ from torch import Tensor
 from sadgs_ns.errors import reason
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients
-from sadgs_ns.method.codes import encode
 from sadgs_ns.method.color_matrices import correct_colors, identities
 from sadgs_ns.method.losses import photometric_loss
+from sadgs_ns.method.quantization import encode
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
 from sadgs_ns.plugin.optimizers import FusedAdam, RepeatedUpdate, step_together

@@ -26,7 +26,7 @@ from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 PLANNED_SHARE = 0.8
 """Share of the available memory that is planned with; the rest is for fragments and other programs."""
 CODE_BYTES = 3
-"""Bytes that the codes of S̄ take for each pixel of the training images (`method.codes`)."""
+"""Bytes that the codes of S̄ take for each pixel of the training images (`method.quantization`)."""
 STRUCTURE_PIXEL_BYTES = 300
 """Bytes that a pixel takes at most while S̄ is computed."""
 SAMPLED_CAMERAS = 8

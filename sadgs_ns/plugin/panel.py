@@ -27,7 +27,7 @@ from rich.markup import escape
 from torch import Tensor
 
 from sadgs_ns.errors import reason
-from sadgs_ns.method.codes import decode
+from sadgs_ns.method.quantization import decode
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin import color_scales, gaussian_maps, texture
 from sadgs_ns.plugin.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture

@@ -24,8 +24,8 @@ from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
 from sadgs_ns.gsplat_compat import FAR_PLANE
 from sadgs_ns.kernels import use_triton
-from sadgs_ns.method.codes import HIGHEST_FREQUENCY
 from sadgs_ns.method.initialization import camera_extent
+from sadgs_ns.method.quantization import HIGHEST_FREQUENCY
 from sadgs_ns.method.schedule import growth_threshold, schedule
 from sadgs_ns.method.structure_tensor import ENERGY_BLUR, FREQUENCY_CONSTANT
 from sadgs_ns.plugin import nonfinite

@@ -8,10 +8,10 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from sadgs_ns.method.codes import decode
 from sadgs_ns.method.dense_start import NUMBER, dense_points
 from sadgs_ns.method.eta import wavelength
 from sadgs_ns.method.initialization import plausible_points
+from sadgs_ns.method.quantization import decode
 from sadgs_ns.method.stereo import depth_maps
 from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sadgs_ns.distributed.bands import first_ranks, share_out
 from sadgs_ns.distributed.world import World
-from sadgs_ns.method.codes import encode
+from sadgs_ns.method.quantization import encode
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.plugin.views import TrainingViews
@@ -36,7 +36,7 @@ class StructureMaps:
 
     @cached_property
     def codes(self) -> Sequence[Tensor]:
-        """Codes (`codes.encode`) of S̄ of every training image, on the device. uint8 [H, W, 3] each
+        """Codes (`quantization.encode`) of S̄ of every training image, on the device. uint8 [H, W, 3] each
 
         Where the images are on the host, those of a view are computed whenever they are asked for.
         """

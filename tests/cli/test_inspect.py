@@ -26,7 +26,7 @@ from runs import in_the_viewer
 from examples.drawn_scene.scene import write_scene
 from sadgs_ns.cli import inspect, inspection
 from sadgs_ns.errors import InputError
-from sadgs_ns.method.codes import MASKED
+from sadgs_ns.method.quantization import MASKED
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin import color_scales, gaussian_maps, texture
 from sadgs_ns.plugin.model import _say_once

@@ -21,7 +21,7 @@ from sadgs_ns import kernels
 from sadgs_ns.gsplat_compat import torch_spherical_harmonics
 from sadgs_ns.method import losses
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients
-from sadgs_ns.method.codes import encode
+from sadgs_ns.method.quantization import encode
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.plugin.optimizers import FusedAdam
@@ -30,7 +30,7 @@ from sadgs_ns.render.off_axis import cull_off_axis
 
 triton = pytest.importorskip("triton", reason="Triton is not installed")
 activations = pytest.importorskip("sadgs_ns.kernels.activations", reason="Triton is not installed")
-codes = pytest.importorskip("sadgs_ns.kernels.codes", reason="Triton is not installed")
+codes = pytest.importorskip("sadgs_ns.kernels.quantization", reason="Triton is not installed")
 adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
 structure = pytest.importorskip("sadgs_ns.kernels.structure_tensor", reason="Triton is not installed")
 harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")

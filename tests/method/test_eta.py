@@ -10,7 +10,6 @@ from scenes import camera, random_params
 from torch import Tensor
 
 from sadgs_ns.gsplat_compat import SCREEN_BLUR, torch_persp_proj, torch_quat_scale_to_covar_preci, torch_world_to_cam
-from sadgs_ns.method.codes import encode
 from sadgs_ns.method.eta import (
     eta,
     principal_eigenvalue,
@@ -19,6 +18,7 @@ from sadgs_ns.method.eta import (
     sample_map,
     wavelength,
 )
+from sadgs_ns.method.quantization import encode
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 
 WIDTH, HEIGHT = 64, 48

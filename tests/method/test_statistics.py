@@ -8,7 +8,7 @@ import pytest
 import torch
 from scenes import camera, random_params, splat
 
-from sadgs_ns.method.codes import encode
+from sadgs_ns.method.quantization import encode
 from sadgs_ns.method.statistics import consistent, empty_statistics, observe
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 

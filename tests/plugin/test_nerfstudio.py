@@ -35,8 +35,8 @@ from scenes import HEIGHT, POINTS, VIEWS, WIDTH
 
 from examples.drawn_scene.scene import SPARSE_FOLDER
 from sadgs_ns.errors import InputError
-from sadgs_ns.method.codes import decode
 from sadgs_ns.method.near_plane import NEAR_SHARE
+from sadgs_ns.method.quantization import decode
 from sadgs_ns.method.schedule import Schedule
 from sadgs_ns.plugin.model import SadgsModel, _load_lpips
 from sadgs_ns.plugin.presets import RATES

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from sadgs_ns.method.codes import HIGHEST_FREQUENCY, MASKED, OCTAVES, decode, encode
 from sadgs_ns.method.eta import principal_eigenvalue, sample_map
+from sadgs_ns.method.quantization import HIGHEST_FREQUENCY, MASKED, OCTAVES, decode, encode
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 
 

@@ -29,7 +29,7 @@ def encode(tensor: Tensor) -> Tensor:
         uint8 [..., 3]
     """
     if use_triton(tensor):
-        from sadgs_ns.kernels import codes as kernel
+        from sadgs_ns.kernels import quantization as kernel
 
         return kernel.encode(tensor, HIGHEST_FREQUENCY, OCTAVES, MASKED)
     xx, xy, yy = tensor.unbind(-1)

@@ -1,4 +1,4 @@
-"""`method.codes.encode` in one kernel."""
+"""`method.quantization.encode` in one kernel."""
 
 # pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
 # (Triton's launch syntax, kernel[grid](...), is not in its types.)
@@ -48,13 +48,13 @@ def _encode(
 
 
 def encode(tensor: Tensor, highest_frequency: float, octaves: float, masked: int) -> Tensor:
-    """Do what `method.codes.encode` does; where rounding decides, a code may be its neighbour.
+    """Do what `method.quantization.encode` does; where rounding decides, a code may be its neighbour.
 
     Args:
         tensor: S̄ as (xx, xy, yy) in 1/px², finite or NaN, float32. [..., 3]
-        highest_frequency: HIGHEST_FREQUENCY of `method.codes`, in 1/px.
-        octaves: OCTAVES of `method.codes`.
-        masked: MASKED of `method.codes`.
+        highest_frequency: HIGHEST_FREQUENCY of `method.quantization`, in 1/px.
+        octaves: OCTAVES of `method.quantization`.
+        masked: MASKED of `method.quantization`.
 
     Returns:
         uint8 [..., 3]
