@@ -24,7 +24,7 @@ from torch import Tensor
 from benchmarks import results, table
 from sadgs_ns.gsplat_compat import SCREEN_BLUR
 from sadgs_ns.method.eta import eta, sample_footprint, sample_map, wavelength
-from sadgs_ns.method.quantization import decode, encode
+from sadgs_ns.method.quantization import dequantize, quantize
 from sadgs_ns.method.statistics import HIGH_ETA
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 
@@ -68,10 +68,10 @@ def structure_tensor_rows(images: Tensor, repeats: int) -> Iterator[Row]:
     reference, ms = measure(lambda: multiscale_structure_tensor(images.double()))
     single = reference.float()
     variants: dict[str, tuple[Callable[[], Tensor], Callable[[Tensor], Tensor], int]] = {
-        "as shipped: float32, stored in 8 bits": (lambda: encode(multiscale_structure_tensor(images)), decode, 3),
+        "as shipped: float32, stored in 8 bits": (lambda: quantize(multiscale_structure_tensor(images)), dequantize, 3),
         "precision alone: float32": (lambda: multiscale_structure_tensor(images), lambda code: code, 12),
         "storage alone: float16": (single.half, lambda code: code, 6),
-        "storage alone: 8 bits": (lambda: encode(single), decode, 3),
+        "storage alone: 8 bits": (lambda: quantize(single), dequantize, 3),
     }
     made = {"reference: float64": (reference, ms, lambda code: code, 24)}
     made |= {name: (*measure(store), read, size) for name, (store, read, size) in variants.items()}

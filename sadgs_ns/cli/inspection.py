@@ -17,7 +17,7 @@ from torch import Tensor
 
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow, keep_gradient
-from sadgs_ns.method.quantization import decode
+from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.method.split import grid_split, num_children
 from sadgs_ns.method.strategy import SMALL_SCALE
 from sadgs_ns.plugin import checkpoints, color_scales, gaussian_maps, texture
@@ -126,7 +126,7 @@ def get_view(pipeline: SadgsPipeline, index: int, split: Split = "train") -> Vie
     return View(
         name=dataset.image_filenames[index].name,
         photo=pipeline.structure_maps.photo(data),
-        structure_tensor=decode(pipeline.structure_maps.codes_of([data])[0]),
+        structure_tensor=dequantize(pipeline.structure_maps.codes_of([data])[0]),
         viewmat=(pipeline.views.viewmat(index) if training else viewmat).to(pipeline.device),
         K=camera.get_intrinsics_matrices()[0].to(pipeline.device),
     )

@@ -1,4 +1,4 @@
-"""`method.quantization.encode` in one kernel."""
+"""`method.quantization.quantize` in one kernel."""
 
 # pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
 # (Triton's launch syntax, kernel[grid](...), is not in its types.)
@@ -19,16 +19,16 @@ _TINY = 1.1754943508222875e-38
 
 
 @triton.jit
-def _to_code(value, HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, TINY: tl.constexpr):
-    """Code of a squared frequency plus a half, so that cutting the fraction off rounds it: codes are not negative."""
+def _to_byte(value, HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, TINY: tl.constexpr):
+    """Return the byte of a squared frequency plus a half, so that cutting off the fraction rounds it."""
     octaves = 0.5 * tl.log2(tl.maximum(value, TINY) / (HIGHEST * HIGHEST))
     return tl.minimum(tl.maximum(255 + 254 * octaves / OCTAVES, 0.0), 255.0) + 0.5
 
 
 @triton.jit(do_not_specialize=["n"])
-def _encode(
-    tensor, codes, n,
-    HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, MASKED: tl.constexpr, TINY: tl.constexpr, PIXELS: tl.constexpr,
+def _quantize(
+    tensor, quantized, n,
+    HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, INVALID: tl.constexpr, TINY: tl.constexpr, PIXELS: tl.constexpr,
 ):  # fmt: skip
     pixel = tl.program_id(0).to(tl.int64) * PIXELS + tl.arange(0, PIXELS)
     exists = pixel < n
@@ -41,26 +41,24 @@ def _encode(
     product = tl.sqrt(tl.maximum(xx, 0.0)) * tl.sqrt(tl.maximum(yy, 0.0))
     correlation = tl.where(product > 0, xy / tl.maximum(product, TINY), 0.0)
     correlation = 127.5 + 127 * tl.minimum(tl.maximum(correlation, -1.0), 1.0)
-    correlation = tl.where(known, correlation, MASKED)
-    tl.store(codes + 3 * pixel, _to_code(xx, HIGHEST, OCTAVES, TINY).to(tl.uint8), exists)
-    tl.store(codes + 3 * pixel + 1, correlation.to(tl.uint8), exists)
-    tl.store(codes + 3 * pixel + 2, _to_code(yy, HIGHEST, OCTAVES, TINY).to(tl.uint8), exists)
+    correlation = tl.where(known, correlation, INVALID)
+    tl.store(quantized + 3 * pixel, _to_byte(xx, HIGHEST, OCTAVES, TINY).to(tl.uint8), exists)
+    tl.store(quantized + 3 * pixel + 1, correlation.to(tl.uint8), exists)
+    tl.store(quantized + 3 * pixel + 2, _to_byte(yy, HIGHEST, OCTAVES, TINY).to(tl.uint8), exists)
 
 
-def encode(tensor: Tensor, highest_frequency: float, octaves: float, masked: int) -> Tensor:
-    """Do what `method.quantization.encode` does; where rounding decides, a code may be its neighbour.
+def quantize(tensor: Tensor, highest_frequency: float, octaves: float, invalid: int) -> Tensor:
+    """Do what `method.quantization.quantize` does; where rounding decides, a byte may be its neighbour.
 
     Args:
         tensor: S̄ as (xx, xy, yy) in 1/px², finite or NaN, float32. [..., 3]
-        highest_frequency: HIGHEST_FREQUENCY of `method.quantization`, in 1/px.
-        octaves: OCTAVES of `method.quantization`.
-        masked: MASKED of `method.quantization`.
+        highest_frequency, octaves, invalid: The constants of `method.quantization`.
 
     Returns:
         uint8 [..., 3]
     """
     tensor = tensor.contiguous()
-    codes = torch.empty_like(tensor, dtype=torch.uint8)
+    quantized = torch.empty_like(tensor, dtype=torch.uint8)
     n = tensor.numel() // 3
-    _encode[cdiv(n, _PIXELS),](tensor, codes, n, highest_frequency, octaves, masked, _TINY, _PIXELS)
-    return codes
+    _quantize[cdiv(n, _PIXELS),](tensor, quantized, n, highest_frequency, octaves, invalid, _TINY, _PIXELS)
+    return quantized

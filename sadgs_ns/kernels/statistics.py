@@ -48,9 +48,9 @@ def _eta(u, v, xx, xy, yy, EPSILON: tl.constexpr):
 
 
 @triton.jit
-def _frequency(code, HIGHEST: tl.constexpr, OCTAVES: tl.constexpr):
-    """Frequency of a code in 1/px, as in `method.quantization.decode`."""
-    return tl.where(code > 0, HIGHEST * tl.exp2(OCTAVES * ((code - 1) / 254 - 1)), 0.0)
+def _frequency(byte, HIGHEST: tl.constexpr, OCTAVES: tl.constexpr):
+    """Frequency in 1/px that a byte stands for, as in `method.quantization.dequantize`."""
+    return tl.where(byte > 0, HIGHEST * tl.exp2(OCTAVES * ((byte - 1) / 254 - 1)), 0.0)
 
 
 @triton.jit
@@ -61,7 +61,7 @@ def _add_axis(n_high, n_low, eta_max, at, high, low, most, changed):
     tl.store(eta_max + at, tl.maximum(tl.load(eta_max + at, changed, 0.0), most), changed)
 
 
-# One view's intrinsics and codes may be part of a tensor of several views, and begin at no multiple of 16 bytes: Triton
+# One view's intrinsics and S̄ may be part of a tensor of several views, and begin at no multiple of 16 bytes: Triton
 # would compile another kernel for that.
 @triton.jit(
     do_not_specialize=["n", "num_views", "width", "height"],
@@ -71,7 +71,7 @@ def _observe(
     means, quats, scales, radii, means2d, conics, jitter, structure_tensors, viewmats, Ks,
     n_high, n_low, eta_max, n_total, n, num_views, width, height,
     HIGH: tl.constexpr, LOW: tl.constexpr, BLUR: tl.constexpr, MARGIN: tl.constexpr, EPSILON: tl.constexpr,
-    HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, MASKED: tl.constexpr, PER_GAUSSIAN: tl.constexpr,
+    HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, INVALID: tl.constexpr, PER_GAUSSIAN: tl.constexpr,
     LANES: tl.constexpr,
 ):  # fmt: skip
     """Observe LANES Gaussians in all views."""
@@ -120,7 +120,7 @@ def _observe(
         s_xy = tl.load(pixel + 1, observed, 0).to(tl.float32)
         s_yy = tl.load(pixel + 2, observed, 0).to(tl.float32)
         if structure_tensors.dtype.element_ty == tl.uint8:
-            observed = observed & (s_xy != MASKED)
+            observed = observed & (s_xy != INVALID)
             frequency_x, frequency_y = _frequency(s_xx, HIGHEST, OCTAVES), _frequency(s_yy, HIGHEST, OCTAVES)
             s_xy = frequency_x * frequency_y * (s_xy - 127) / 127
             s_xx, s_yy = frequency_x * frequency_x, frequency_y * frequency_y
@@ -174,25 +174,25 @@ def observe_views(
     means2d: Tensor,  # [C, N, 2] px
     conics: Tensor,  # [C, N, 3] in 1/px²
     jitter: Tensor,  # [C, N, 2] in [0, 1)
-    structure_tensors: Tensor,  # [C, H, W, 3] in 1/px², or its codes
+    structure_tensors: Tensor,  # [C, H, W, 3] in 1/px², or quantized
     viewmats: Tensor,  # [C, 4, 4]
     Ks: Tensor,  # [C, 3, 3] px
     *,
     thresholds: tuple[float, float],
     constants: tuple[float, float, float],
-    code_range: tuple[float, float, int],
+    quantization: tuple[float, float, int],
 ) -> None:
     """Do what the loop in `method.statistics.observe` does, for all views at once; `statistics` change in place.
 
     Args:
         thresholds: η above the first is high, and below the second it is low.
         constants: gsplat's blur in px², its margin of the frustum, and ε of the wavelength in 1/px.
-        code_range: HIGHEST_FREQUENCY, OCTAVES and MASKED of `method.quantization`.
+        quantization: HIGHEST_FREQUENCY, OCTAVES and INVALID of `method.quantization`.
     """
     inputs = (*params, radii, means2d, conics, jitter, structure_tensors, viewmats, Ks)
     num_views, n = radii.shape[:2]
     height, width = structure_tensors.shape[1:3]
     _observe[cdiv(n, _LANES),](
         *(value.contiguous() for value in inputs), *statistics, n, num_views, width, height,
-        *thresholds, *constants, *code_range, radii.dim() - 1, _LANES,
+        *thresholds, *constants, *quantization, radii.dim() - 1, _LANES,
     )  # fmt: skip

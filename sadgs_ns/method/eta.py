@@ -12,7 +12,7 @@ from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 
 from sadgs_ns.gsplat_compat import SCREEN_BLUR
-from sadgs_ns.method.quantization import decode
+from sadgs_ns.method.quantization import dequantize
 
 WAVELENGTH_EPSILON = 1e-5
 """ε of Λ_min = 1 / (√λ_1 + ε) in 1/px: a textureless region has a wavelength of 10⁵ px, not infinity."""
@@ -126,8 +126,8 @@ def sample_map(structure_tensors: Tensor, camera_ids: Tensor, points: Tensor) ->
     column = torch.where(inside, x, 0).long()
     row = torch.where(inside, y, 0).long()
     values = structure_tensors[camera_ids, row, column]
-    is_code = values.dtype == torch.uint8
-    values = decode(values) if is_code else values.to(torch.promote_types(values.dtype, torch.float32))
+    is_quantized = values.dtype == torch.uint8
+    values = dequantize(values) if is_quantized else values.to(torch.promote_types(values.dtype, torch.float32))
     known = inside & ~values.isnan().any(dim=1)
     return torch.where(known[:, None], values, 0.0), known
 

@@ -7,20 +7,20 @@ from torch import Tensor
 
 from sadgs_ns.kernels import use_triton
 
-MASKED = 255
-"""Second byte of a masked pixel, whose S̄ is NaN; the codes of correlations end at 254."""
+INVALID = 255
+"""Second byte of a pixel whose S̄ is NaN, such as a masked one; those of correlations end at 254."""
 HIGHEST_FREQUENCY = 4.0
 """1/px. S̄'s trace is at most c²/px² by construction, so this is the largest c that can be stored."""
 OCTAVES = 12.0
-"""Frequencies down to 2⁻¹² of the highest one, which are wavelengths of 0.25 to 1,024 px, have codes of their own."""
+"""Frequencies from 2⁻¹² of the highest one on, wavelengths of 0.25 to 1,024 px, are told apart; lower ones become 0."""
 
 
-def encode(tensor: Tensor) -> Tensor:
-    """Encode √xx and √yy on a logarithmic scale, and the correlation xy / √(xx yy) on a linear one.
+def quantize(tensor: Tensor) -> Tensor:
+    """Round √xx and √yy on a logarithmic scale, and the correlation xy / √(xx yy) on a linear one, to a byte each.
 
     A logarithm keeps the relative error of every wavelength the same (at most 1.7 %), and a correlation within ±1 keeps
     S̄ positive semidefinite. A pixel of which any number is NaN, as `multiscale_structure_tensor` gives masked ones,
-    becomes (0, MASKED, 0).
+    becomes (0, INVALID, 0).
 
     Args:
         tensor: S̄ as (xx, xy, yy) in 1/px², finite or NaN. [..., 3]
@@ -31,33 +31,30 @@ def encode(tensor: Tensor) -> Tensor:
     if use_triton(tensor):
         from sadgs_ns.kernels import quantization as kernel
 
-        return kernel.encode(tensor, HIGHEST_FREQUENCY, OCTAVES, MASKED)
+        return kernel.quantize(tensor, HIGHEST_FREQUENCY, OCTAVES, INVALID)
     xx, xy, yy = tensor.unbind(-1)
     frequencies = torch.stack([xx, yy], -1).clamp_min(0).sqrt()  # [..., 2] in 1/px
     logarithms = 1 + (frequencies / HIGHEST_FREQUENCY).log2() / OCTAVES  # (−∞, 1]
-    codes = (1 + 254 * logarithms).round().clamp(0, 255)
+    rounded = (1 + 254 * logarithms).round().clamp(0, 255)
     product = frequencies[..., 0] * frequencies[..., 1]
     correlation = torch.where(product > 0, xy / product.clamp_min(torch.finfo(product.dtype).tiny), 0.0)
-    masked = tensor.isnan().any(-1)
-    codes = torch.where(masked[..., None], 0.0, codes)
-    correlation = torch.where(masked, MASKED, (127 + 127 * correlation.clamp(-1, 1)).round())
-    return torch.stack([codes[..., 0], correlation, codes[..., 1]], -1).byte()
+    invalid = tensor.isnan().any(-1)
+    rounded = torch.where(invalid[..., None], 0.0, rounded)
+    correlation = torch.where(invalid, INVALID, (127 + 127 * correlation.clamp(-1, 1)).round())
+    return torch.stack([rounded[..., 0], correlation, rounded[..., 1]], -1).byte()
 
 
-def decode(codes: Tensor) -> Tensor:
-    """Read S̄ back from its codes.
-
-    Args:
-        codes: As made by `encode`, uint8. [..., 3]
+def dequantize(quantized: Tensor) -> Tensor:
+    """Read S̄ back from what `quantize` made of it, uint8 [..., 3].
 
     Returns:
         S̄ as (xx, xy, yy) in 1/px², float32; NaN at masked pixels. [..., 3]
     """
-    x, correlation, y = codes.float().unbind(-1)
+    x, correlation, y = quantized.float().unbind(-1)
 
-    def frequency(code: Tensor) -> Tensor:
-        return torch.where(code > 0, HIGHEST_FREQUENCY * torch.exp2(OCTAVES * ((code - 1) / 254 - 1)), 0.0)
+    def frequency(byte: Tensor) -> Tensor:
+        return torch.where(byte > 0, HIGHEST_FREQUENCY * torch.exp2(OCTAVES * ((byte - 1) / 254 - 1)), 0.0)
 
     x, y = frequency(x), frequency(y)
     decoded = torch.stack([x * x, x * y * (correlation - 127) / 127, y * y], -1)
-    return torch.where(codes[..., 1:2] == MASKED, torch.nan, decoded)
+    return torch.where(quantized[..., 1:2] == INVALID, torch.nan, decoded)

@@ -22,7 +22,7 @@ from sadgs_ns.method.eta import (
     sample_footprint,
     sample_map,
 )
-from sadgs_ns.method.quantization import HIGHEST_FREQUENCY, MASKED, OCTAVES
+from sadgs_ns.method.quantization import HIGHEST_FREQUENCY, INVALID, OCTAVES
 from sadgs_ns.method.split import Params
 from sadgs_ns.render.rasterization import visible
 
@@ -83,7 +83,7 @@ def observe(
             info["Ks"],
             thresholds=(HIGH_ETA, LOW_ETA),
             constants=(SCREEN_BLUR, FRUSTUM_MARGIN, WAVELENGTH_EPSILON),
-            code_range=(HIGHEST_FREQUENCY, OCTAVES, MASKED),
+            quantization=(HIGHEST_FREQUENCY, OCTAVES, INVALID),
         )
         return
     seen = visible(info)  # [C, N]

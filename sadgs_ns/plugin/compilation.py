@@ -17,7 +17,7 @@ from sadgs_ns.kernels import use_triton
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients
 from sadgs_ns.method.color_matrices import correct_colors, identities
 from sadgs_ns.method.losses import photometric_loss
-from sadgs_ns.method.quantization import encode
+from sadgs_ns.method.quantization import quantize
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
 from sadgs_ns.plugin.optimizers import FusedAdam, RepeatedUpdate, step_together
@@ -99,7 +99,7 @@ class _Stages:
         return self.means.new_zeros((_GAUSSIANS, *self.model.gauss_params[name].shape[1:]))
 
     def structure(self) -> None:
-        encode(self.pipeline.structure_maps.of_images(self.image))
+        quantize(self.pipeline.structure_maps.of_images(self.image))
 
     def loss(self, dtype: torch.dtype) -> None:  # Images are bytes; a mask or transparency makes them floats.
         predicted = self.image.repeat(self.views, 1, 1, 1).requires_grad_()

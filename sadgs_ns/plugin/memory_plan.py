@@ -25,8 +25,8 @@ from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 PLANNED_SHARE = 0.8
 """Share of the available memory that is planned with; the rest is for fragments and other programs."""
-CODE_BYTES = 3
-"""Bytes that the codes of S̄ take for each pixel of the training images (`method.quantization`)."""
+QUANTIZED_BYTES = 3
+"""Bytes that S̄ takes for each pixel of the training images (`method.quantization`)."""
 STRUCTURE_PIXEL_BYTES = 300
 """Bytes that a pixel takes at most while S̄ is computed."""
 SAMPLED_CAMERAS = 8
@@ -49,7 +49,7 @@ class TrainingSize:
     """What a run keeps and renders besides its Gaussians."""
 
     image_bytes: float
-    """Bytes of images and codes of S̄ on the training device."""
+    """Bytes of images and their S̄ on the training device."""
     step: StepSize
     """The largest step of the run, with the pairs of the initial Gaussians."""
     structure_bytes: float = 0.0
@@ -74,12 +74,12 @@ def training_size(
     structure = 0.0
     if datamanager.config.cache_images == "gpu":
         kept = image_bytes(datamanager)
-    else:  # The images of the next step are there, too; a process has those that it composites, and codes of all.
+    else:  # The images of the next step are there, too; a process has those that it composites, and S̄ of all.
         sizes = torch.cat([cameras.height, cameras.width], dim=-1).unique(dim=0).tolist()
         here = views  # Views of several sizes are shared out size by size, and a process may have a part of each.
         if len(sizes) == 1:
             here = max(len(views_of_rank([*map(tuple, sizes)] * views, processes, r)) for r in range(processes))
-        kept = float((3 * here + CODE_BYTES * views) * largest)
+        kept = float((3 * here + QUANTIZED_BYTES * views) * largest)
         structure = float(STRUCTURE_PIXEL_BYTES * max(largest, min(PIXELS_PER_BATCH, here * largest)))
     # A process composites its share of the pixels, and as many pairs as its share of the Gaussians has in all views.
     pixels, pairs = -(-views * largest // processes), views * estimate_pairs(params, cameras, near_plane)
@@ -87,12 +87,12 @@ def training_size(
 
 
 def image_bytes(datamanager: FullImageDatamanager) -> float:
-    """Bytes of all images, held-out ones too, and of the codes of S̄ of the training images."""
+    """Bytes of all images, held-out ones too, and of S̄ of the training images."""
     train, held_out = (
         float((cameras.height * cameras.width).sum())
         for cameras in (datamanager.train_dataset.cameras, datamanager.eval_dataset.cameras)
     )  # px
-    return 3 * (train + held_out) + CODE_BYTES * train
+    return 3 * (train + held_out) + QUANTIZED_BYTES * train
 
 
 def place_images(datamanager: FullImageDatamanager, device: torch.device) -> str | None:

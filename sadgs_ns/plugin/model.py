@@ -562,7 +562,7 @@ class SadgsModel(SplatfactoModel):
         Args:
             viewmats, Ks, width, height: As for `rasterize`.
             cam_indices: The views' indices among the training cameras, C of them.
-            structure_tensors: S̄ of the views, or codes of it, [C, H, W, 3]; None where η is not observed.
+            structure_tensors: S̄ of the views, which may be quantized, [C, H, W, 3]; None where η is not observed.
 
         Returns:
             `rgb` [C, H, W, 3], not clamped, and `background` [3]; while densification runs, and where the loss has that

@@ -27,7 +27,7 @@ from rich.markup import escape
 from torch import Tensor
 
 from sadgs_ns.errors import reason
-from sadgs_ns.method.quantization import decode
+from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin import color_scales, gaussian_maps, texture
 from sadgs_ns.plugin.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
@@ -277,7 +277,7 @@ class StructurePanel(torch.nn.Module):
             extent = float(self._model.strategy_state["scene_scale"])
             index = nearest_view(cameras, camera.camera_to_worlds[0].to(cameras), extent)
             photo = to_picture(maps.photo(datamanager.cached_train[index]))
-            tensor = decode(maps.codes[index])
+            tensor = dequantize(maps.codes[index])
             name = f"the nearest training view, `{datamanager.train_dataset.image_filenames[index].name}`"
         scale = min(height / photo.shape[0], width / photo.shape[1])
         size = max(round(scale * photo.shape[0]), 1), max(round(scale * photo.shape[1]), 1)

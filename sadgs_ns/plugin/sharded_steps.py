@@ -32,7 +32,7 @@ def losses_of_views(
         viewmats, Ks, width, height: As for `rasterize`, of V views.
         views: Index and data of each view; the images of those of which this process composites rows are on the
             training device.
-        structure_tensors: S̄ of the views, or codes of it, [V, H, W, 3]; None where η is not observed.
+        structure_tensors: S̄ of the views, which may be quantized, [V, H, W, 3]; None where η is not observed.
 
     Returns:
         This process's part of the loss, `main_loss`, whose sum over the processes is the loss of one; and the metrics

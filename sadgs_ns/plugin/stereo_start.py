@@ -11,7 +11,7 @@ from torch import Tensor
 from sadgs_ns.method.dense_start import NUMBER, dense_points
 from sadgs_ns.method.eta import wavelength
 from sadgs_ns.method.initialization import plausible_points
-from sadgs_ns.method.quantization import decode
+from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.method.stereo import depth_maps
 from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
@@ -75,7 +75,7 @@ def _add_points(pipeline: SadgsPipeline, number: int) -> None:
         return maps.photo(data[view])[..., :3]
 
     def wavelengths(view: int) -> Tensor:
-        return wavelength(decode(maps.codes[view].to(model.device)))
+        return wavelength(dequantize(maps.codes[view].to(model.device)))
 
     points = dense_points(depths, viewmats, image, wavelengths, number)
     added = model.add_points(*points)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sadgs_ns.distributed.bands import first_ranks, share_out
 from sadgs_ns.distributed.world import World
-from sadgs_ns.method.quantization import encode
+from sadgs_ns.method.quantization import quantize
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.plugin.views import TrainingViews
@@ -36,7 +36,7 @@ class StructureMaps:
 
     @cached_property
     def codes(self) -> Sequence[Tensor]:
-        """Codes (`quantization.encode`) of S̄ of every training image, on the device. uint8 [H, W, 3] each
+        """Codes (`quantization.quantize`) of S̄ of every training image, on the device. uint8 [H, W, 3] each
 
         Where the images are on the host, those of a view are computed whenever they are asked for.
         """
@@ -102,7 +102,7 @@ class StructureMaps:
         if any("mask" in d for d in data):
             everything = torch.ones(images.shape[1:3], dtype=torch.bool, device=images.device)
             masks = torch.stack([d["mask"][..., 0].to(images.device) if "mask" in d else everything for d in data])
-        return encode(self.of_images(images, masks, known_finite=True))
+        return quantize(self.of_images(images, masks, known_finite=True))
 
     def of_images(
         self,

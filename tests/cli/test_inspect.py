@@ -26,7 +26,7 @@ from runs import in_the_viewer
 from examples.drawn_scene.scene import write_scene
 from sadgs_ns.cli import inspect, inspection
 from sadgs_ns.errors import InputError
-from sadgs_ns.method.quantization import MASKED
+from sadgs_ns.method.quantization import INVALID
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin import color_scales, gaussian_maps, texture
 from sadgs_ns.plugin.model import _say_once
@@ -390,7 +390,7 @@ def test_a_finished_run_is_observed_when_eta_is_asked_for(panel: StructurePanel)
 def test_where_every_pixel_is_masked_the_panel_says_that_none_was_observed(panel: StructurePanel):
     pipeline = pipeline_of(panel)
     for codes in pipeline.structure_maps.codes:
-        codes[..., 1] = MASKED
+        codes[..., 1] = INVALID
     panel.choice.value = "η"
     panel.choose()
     statistics = panel.statistics()

@@ -21,7 +21,7 @@ from sadgs_ns import kernels
 from sadgs_ns.gsplat_compat import torch_spherical_harmonics
 from sadgs_ns.method import losses
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients
-from sadgs_ns.method.quantization import encode
+from sadgs_ns.method.quantization import quantize
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.plugin.optimizers import FusedAdam
@@ -30,7 +30,7 @@ from sadgs_ns.render.off_axis import cull_off_axis
 
 triton = pytest.importorskip("triton", reason="Triton is not installed")
 activations = pytest.importorskip("sadgs_ns.kernels.activations", reason="Triton is not installed")
-codes = pytest.importorskip("sadgs_ns.kernels.quantization", reason="Triton is not installed")
+quantization = pytest.importorskip("sadgs_ns.kernels.quantization", reason="Triton is not installed")
 adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
 structure = pytest.importorskip("sadgs_ns.kernels.structure_tensor", reason="Triton is not installed")
 harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")
@@ -249,15 +249,15 @@ def test_structure_tensors_are_the_same_with_the_kernels(monkeypatch, masked, en
     torch.testing.assert_close(actual.double(), expected, atol=atol, rtol=1e-4, equal_nan=True)
 
 
-def test_codes_are_the_references_or_their_neighbours(monkeypatch):
+def test_quantized_tensors_are_the_references_or_their_neighbours(monkeypatch):
     tensor = torch.rand((3, 100, 3), generator=torch.Generator().manual_seed(0)) ** 8 * torch.tensor([16.0, 1.0, 16.0])
     tensor[0, :4] = torch.tensor([[0.0, 0, 0], [64, 0, 1e-12], [0, 0.1, 1], [8, -9, 8]])
     tensor[1, :4] = torch.tensor([[math.nan] * 3, [math.nan, 0, 1], [1, math.nan, 1], [1, 0, math.nan]])  # masked
     with kernels.triton_switched(False):
-        expected = encode(tensor).int()
-    calls = recorded(monkeypatch, codes, "encode")
+        expected = quantize(tensor).int()
+    calls = recorded(monkeypatch, quantization, "quantize")
     with kernels.triton_switched(True):
-        actual = encode(tensor.to(DEVICE)).cpu().int()
+        actual = quantize(tensor.to(DEVICE)).cpu().int()
     assert len(calls) == 1
     assert (actual - expected).abs().max() <= 1 and (actual != expected).float().mean() < 0.01
     assert torch.equal(actual[:2, :4], expected[:2, :4])
@@ -295,7 +295,7 @@ def test_colours_and_gradients_equal_gsplats_float64_harmonics(monkeypatch, degr
 
 
 @pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
-@pytest.mark.parametrize("kept", [Tensor.half, encode], ids=["float16", "8 bits"])
+@pytest.mark.parametrize("kept", [Tensor.half, quantize], ids=["float16", "8 bits"])
 def test_observation_equals_the_reference(monkeypatch, kept, per_axis_radii):
     n, width, height = 150, 40, 30
     params = {name: p.detach() for name, p in scenes.random_params(n).items()}

@@ -20,7 +20,7 @@ CONSTANTS = {
     "GAUSSIAN": (0.25, 0.5, 0.25), "STRIP": 256, "RUN": 8, "ROWS": 16, "COLUMNS": 128, "TILE": 8, "LANES": 32,
     "VIEWS": 2, "BLOCK": 1024, "HIGH": 1.0, "LOW": 0.1, "BLUR": 0.3, "MARGIN": 0.3, "EPSILON": 1e-5,
     "VERTICAL": False, "MAX": 1e18, "PIXELS": 1024, "TINY": 1e-38, "HIGHEST": 4.0,
-    "OCTAVES": 12.0, "MASKED": 255, "WIDTHS": (3, 45, 1), "PER_GAUSSIAN": 2, "GAUSSIANS": 16, "STRIDE": 12,
+    "OCTAVES": 12.0, "INVALID": 255, "WIDTHS": (3, 45, 1), "PER_GAUSSIAN": 2, "GAUSSIANS": 16, "STRIDE": 12,
     "ALPHAS": True, "ABSGRAD": True, "PRECISION": "tf32x3", "PENALTY": True, "CULL": True,
     "DEPTHS": True, "COMPENSATIONS": True, "PASSED": True, "ON_DEVICE": False, "FEW": 64,
     "PART": 256,
@@ -76,7 +76,7 @@ def test_every_kernel_compiles_for_an_a100_and_an_h200(tmp_path):
     assert run.returncode == 0, run.stderr[-3000:]
     expected = {"_blur_along_rows", "_similarity", "_spread_along_rows", "_gradient", "_count", "_list", "_observe"}
     expected |= {"_forward", "_backward", "_update", "_correlate", "_differentiate", "_aggregate", "_write_one"}
-    expected |= {"_composite_backward", "_composite_forward", "_encode", "_accumulate_gradients", "_finish", "_order"}
+    expected |= {"_composite_backward", "_composite_forward", "_quantize", "_accumulate_gradients", "_finish", "_order"}
     expected |= {
         "_list_parts",
         "_pack",

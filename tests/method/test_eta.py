@@ -18,7 +18,7 @@ from sadgs_ns.method.eta import (
     sample_map,
     wavelength,
 )
-from sadgs_ns.method.quantization import encode
+from sadgs_ns.method.quantization import quantize
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 
 WIDTH, HEIGHT = 64, 48
@@ -139,7 +139,7 @@ def test_points_outside_the_image_are_no_observation():
 
 
 @pytest.mark.hard_case("a sample on a masked pixel of S̄", "no observation")
-@pytest.mark.parametrize("kept", [Tensor.half, encode], ids=["float16", "8 bits"])
+@pytest.mark.parametrize("kept", [Tensor.half, quantize], ids=["float16", "8 bits"])
 def test_points_on_masked_pixels_are_no_observation(kept):
     """Left half masked: points there are as unknown as those outside the image, and a smooth pixel is known to be."""
     masks = torch.ones((1, HEIGHT, WIDTH), dtype=torch.bool)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scenes import camera, random_params, splat
 
-from sadgs_ns.method.quantization import encode
+from sadgs_ns.method.quantization import quantize
 from sadgs_ns.method.statistics import consistent, empty_statistics, observe
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 
@@ -85,8 +85,10 @@ def test_textureless_pixels_are_low_not_high():
     assert statistics["n_low"][0].tolist() == [1.0] * 3 and not statistics["n_high"].any()
 
 
-@pytest.mark.hard_case("a sample on a masked pixel of S̄'s codes", "no observation, in the torch code as in the kernel")
-@pytest.mark.parametrize("kept", [torch.Tensor.half, encode], ids=["float16", "8 bits"])
+@pytest.mark.hard_case(
+    "a sample on a masked pixel of quantized S̄", "no observation, in the torch code as in the kernel"
+)
+@pytest.mark.parametrize("kept", [torch.Tensor.half, quantize], ids=["float16", "8 bits"])
 def test_masked_pixels_are_no_observation(kept):
     """One half of a smooth image is masked: only the Gaussian over the other half gets its low response."""
     params = three_gaussians()

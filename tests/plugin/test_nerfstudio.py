@@ -36,7 +36,7 @@ from scenes import HEIGHT, POINTS, VIEWS, WIDTH
 from examples.drawn_scene.scene import SPARSE_FOLDER
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.near_plane import NEAR_SHARE
-from sadgs_ns.method.quantization import decode
+from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.method.schedule import Schedule
 from sadgs_ns.plugin.model import SadgsModel, _load_lpips
 from sadgs_ns.plugin.presets import RATES
@@ -558,8 +558,8 @@ def test_masked_pixels_have_no_structure_tensor_and_no_part_in_the_loss(tmp_path
     trainer = train(config)
     pipeline = trainer.pipeline
     for tensor in pipeline.structure_maps.codes:
-        assert decode(tensor[:, : WIDTH // 2]).isnan().all()
-        assert decode(tensor[:, WIDTH // 2 :]).amax() > 0
+        assert dequantize(tensor[:, : WIDTH // 2]).isnan().all()
+        assert dequantize(tensor[:, WIDTH // 2 :]).amax() > 0
     data = pipeline.datamanager.cached_train[0]
     background = torch.zeros(3, device=pipeline.device)
 
