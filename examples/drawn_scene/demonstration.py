@@ -26,7 +26,7 @@ from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin import color_scales, gaussian_maps, presets, texture
 from sadgs_ns.plugin.color_scales import ETA, PERIOD, Panel, to_picture
 from sadgs_ns.plugin.pipeline import SadgsPipeline
-from sadgs_ns.plugin.structure_maps import observe_training_views
+from sadgs_ns.plugin.structure_cache import observe_training_views
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 ABSGS_THRESHOLD_FACTOR = 16.0

@@ -25,7 +25,7 @@ from sadgs_ns.data.checks import splits
 from sadgs_ns.data.parsers import OWN, points_in_the_run
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.memory import available_host_bytes
-from sadgs_ns.plugin.image_source import ImagesOnDemand, thread_count
+from sadgs_ns.plugin.images import ImagesOnDemand, thread_count
 from sadgs_ns.plugin.options import check_ranges, hide
 from sadgs_ns.plugin.processes import processes_on_this_machine
 

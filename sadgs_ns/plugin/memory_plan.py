@@ -20,7 +20,7 @@ from sadgs_ns.method.split import Params
 from sadgs_ns.method.statistics import empty_statistics
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin.processes import least, number_of_processes, processes_on_this_machine
-from sadgs_ns.plugin.structure_maps import PIXELS_PER_BATCH
+from sadgs_ns.plugin.structure_cache import PIXELS_PER_BATCH
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 PLANNED_SHARE = 0.8

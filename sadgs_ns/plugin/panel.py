@@ -32,7 +32,7 @@ from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin import color_scales, gaussian_maps, texture
 from sadgs_ns.plugin.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
 from sadgs_ns.plugin.model import SadgsModel, in_viewer
-from sadgs_ns.plugin.structure_maps import StructureMaps, observe_training_views
+from sadgs_ns.plugin.structure_cache import StructureMaps, observe_training_views
 from sadgs_ns.plugin.viewer import ViewerMarkdown, show_output
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 

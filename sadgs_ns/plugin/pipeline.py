@@ -38,7 +38,7 @@ from sadgs_ns.plugin.optimizers import FusedAdam
 from sadgs_ns.plugin.options import check_ranges
 from sadgs_ns.plugin.panel import StructurePanel
 from sadgs_ns.plugin.sharded_steps import losses_of_views
-from sadgs_ns.plugin.structure_maps import StructureMaps
+from sadgs_ns.plugin.structure_cache import StructureMaps
 from sadgs_ns.plugin.viewer import shows_output
 from sadgs_ns.plugin.views import TrainingViews
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world

@@ -14,7 +14,7 @@ from torch import Tensor
 from sadgs_ns.data.cameras import refuse_failed_undistortion
 from sadgs_ns.distributed.bands import views_of_rank
 from sadgs_ns.distributed.world import World
-from sadgs_ns.plugin.image_source import ImagesAhead, thread_count
+from sadgs_ns.plugin.images import ImagesAhead, thread_count
 from sadgs_ns.plugin.model import SadgsModel
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 

@@ -32,7 +32,7 @@ from sadgs_ns.plugin import color_scales, gaussian_maps, texture
 from sadgs_ns.plugin.model import _say_once
 from sadgs_ns.plugin.panel import CHOICES, OFF, OUTPUT, StructurePanel, change, describe, nearest_view
 from sadgs_ns.plugin.pipeline import SadgsPipeline
-from sadgs_ns.plugin.structure_maps import observe_training_views
+from sadgs_ns.plugin.structure_cache import observe_training_views
 from sadgs_ns.render import rasterization
 
 WIDTH, HEIGHT, TRAIN_VIEWS, EVAL_VIEWS = 48, 36, 8, 2

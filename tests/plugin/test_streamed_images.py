@@ -21,9 +21,9 @@ from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.method import memory
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
-from sadgs_ns.plugin.image_source import ImagesAhead, ImagesOnDemand, thread_count
+from sadgs_ns.plugin.images import ImagesAhead, ImagesOnDemand, thread_count
 from sadgs_ns.plugin.memory_plan import image_bytes, place_images
-from sadgs_ns.plugin.structure_maps import StructureMaps
+from sadgs_ns.plugin.structure_cache import StructureMaps
 from sadgs_ns.plugin.trainer import SadgsTrainerConfig
 from sadgs_ns.plugin.views import TrainingViews
 

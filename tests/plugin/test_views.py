@@ -13,7 +13,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 
 from sadgs_ns.distributed.world import World
 from sadgs_ns.method.schedule import Schedule
-from sadgs_ns.plugin.image_source import ImagesAhead
+from sadgs_ns.plugin.images import ImagesAhead
 from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.plugin.views import TrainingViews
 

@@ -24,8 +24,8 @@ from scenes import HEIGHT, VIEWS, WIDTH
 from sadgs_ns.cli.inspection import get_view
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig
-from sadgs_ns.plugin.image_source import ImagesAhead
-from sadgs_ns.plugin.structure_maps import StructureMaps, observe_training_views
+from sadgs_ns.plugin.images import ImagesAhead
+from sadgs_ns.plugin.structure_cache import StructureMaps, observe_training_views
 from sadgs_ns.plugin.trainer import SadgsTrainer
 
 COMPRESSED: Any = "compressed"
