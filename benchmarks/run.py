@@ -41,7 +41,7 @@ def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> T
     from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
     from nerfstudio.engine.trainer import TrainerConfig
 
-    from sadgs_ns.data.automatic import PARSERS
+    from sadgs_ns.data.parsers import PARSERS
     from sadgs_ns.plugin.trainer import SadgsTrainerConfig
 
     config = copy.deepcopy(all_methods.get(row.method))

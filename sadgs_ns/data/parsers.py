@@ -1,28 +1,120 @@
-"""nerfstudio's parsers, as this package's commands read captures with them."""
+"""nerfstudio's parsers: which one fits a capture, the check of its data, and the changes that this package makes."""
 
 from __future__ import annotations
 
+import copy
 import os
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from unittest import mock
 
 import numpy as np
 import torch
+import tyro
+from nerfstudio.configs.dataparser_configs import all_dataparsers
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers import blender_dataparser, nerfstudio_dataparser
-from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
-from nerfstudio.data.dataparsers.blender_dataparser import Blender
-from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
+from nerfstudio.data.dataparsers.blender_dataparser import Blender, BlenderDataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from nerfstudio.data.dataparsers.scannet_dataparser import ScanNet
 from numpy.typing import NDArray
 from torch import Tensor
 
 from sadgs_ns.data import colmap, ply
+from sadgs_ns.data.checks.colmap import automatic_options, check_colmap
+from sadgs_ns.data.checks.findings import Finding, refuse, unreadable
 from sadgs_ns.data.checks.images import mask_name
-from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS
-from sadgs_ns.data.checks.transforms import read_blender, read_json, read_transforms
+from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS, ParserOptions, find_reconstruction, layout_of
+from sadgs_ns.data.checks.transforms import check_blender, check_nerfstudio, read_blender, read_json, read_transforms
 from sadgs_ns.data.coordinates import FRAME_KEYS, Similarity, fixed_frame
+from sadgs_ns.errors import InputError
+
+
+@dataclass
+class AutomaticDataParserConfig(DataParserConfig):
+    """The parser that fits what the folder holds: transforms.json, a COLMAP reconstruction or a Blender scene."""
+
+
+PARSERS: dict[str, DataParserConfig] = {
+    "automatic": AutomaticDataParserConfig(),
+    **all_dataparsers,
+    "nerfstudio-data": NerfstudioDataParserConfig(load_3D_points=True),
+}
+"""Parsers by their names on the command line: ours, then nerfstudio's."""
+
+if TYPE_CHECKING:
+    AnyParserConfig = DataParserConfig
+else:
+    AnyParserConfig = tyro.conf.OmitSubcommandPrefixes[
+        tyro.extras.subcommand_type_from_defaults(PARSERS, prefix_names=False)
+    ]
+    """The union that tyro turns into subcommands, as nerfstudio does with its own parsers."""
+
+CHECKS = {
+    ColmapDataParserConfig: check_colmap,
+    NerfstudioDataParserConfig: check_nerfstudio,
+    BlenderDataParserConfig: check_blender,
+}
+"""The check of each parser's data; other parsers' data are not checked."""
+
+
+def choose_parser(config: FullImageDatamanagerConfig) -> None:
+    """Replace the automatic parser by the one that fits the data, so that a run's `config.yml` names that one.
+
+    Raises:
+        InputError: If the folder cannot be read; as `automatic_options`.
+    """
+    if not isinstance(config.dataparser, AutomaticDataParserConfig):
+        return
+    data = Path(config.data or config.dataparser.data)
+    try:
+        layout, folder = layout_of(data), find_reconstruction(data)
+    except OSError as error:
+        raise InputError(unreadable(error)) from error
+    if layout == "blender":
+        config.dataparser = BlenderDataParserConfig(data=data)
+    elif layout == "colmap" and folder is not None:
+        options = automatic_options(data, folder)
+        config.dataparser = ColmapDataParserConfig(
+            data=data, colmap_path=folder, images_path=options.images_path, downscale_factor=options.downscale_factor
+        )
+    else:
+        config.dataparser = NerfstudioDataParserConfig(data=data, load_3D_points=True)
+
+
+def check_capture(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[Finding]:
+    """Choose the parser if none was named, and check the data before nerfstudio parses them.
+
+    Returns:
+        The findings that do not stop training.
+
+    Raises:
+        InputError: With the first finding that does; as `choose_parser`.
+    """
+    vars(config).pop("findings", None)
+    choose_parser(config)
+    parser = config.dataparser
+    data = Path(config.data or parser.data)
+    names = [field.name for field in fields(ParserOptions) if hasattr(parser, field.name)]
+    options = ParserOptions(**{name: getattr(parser, name) for name in names})
+    checks = [check for kind, check in CHECKS.items() if isinstance(parser, kind)]
+    findings = checks[0](data, options, open_images) if checks else []
+    refuse(findings, data)
+    return findings
+
+
+def keep_findings(config: FullImageDatamanagerConfig, findings: list[Finding]) -> None:
+    """Keep what `check_capture` found with these settings, so that `findings_of` need not check again, once."""
+    vars(config)["findings"] = copy.deepcopy(config), findings
+
+
+def findings_of(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[Finding]:
+    """Return the findings that were kept in these settings, or else those of `check_capture`."""
+    checked, findings = vars(config).pop("findings", (None, []))
+    return findings if checked == config else check_capture(config, open_images)
 
 
 class _PointsOfPly:

@@ -17,7 +17,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from tyro.conf import Suppress
 
-from sadgs_ns.data.checks.parsers import keep_findings, refuse_bad_data
+from sadgs_ns.data.parsers import check_capture, keep_findings
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.files import atomic_path
 from sadgs_ns.kernels import SWITCH, switched_off
@@ -279,7 +279,7 @@ class CheckedTrainerConfig(TrainerConfig):
             return  # torchrun's other processes leave the files to the first.
         if self.is_viewer_enabled() or self.is_viewer_legacy_enabled():
             self._check_address()
-        findings = refuse_bad_data(self.pipeline.datamanager)
+        findings = check_capture(self.pipeline.datamanager)
         CONSOLE.log(f"Saving config to: {self.write()}")
         keep_findings(self.pipeline.datamanager, findings)  # After writing, so that `config.yml` holds none.
 

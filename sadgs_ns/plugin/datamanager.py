@@ -20,9 +20,8 @@ from torch import Tensor
 from tyro.conf import Suppress
 
 from sadgs_ns.data import colmap
-from sadgs_ns.data.automatic import AnyParserConfig, AutomaticDataParserConfig, choose_parser
 from sadgs_ns.data.checks import splits
-from sadgs_ns.data.parsers import OWN, points_in_the_run
+from sadgs_ns.data.parsers import OWN, AnyParserConfig, AutomaticDataParserConfig, choose_parser, points_in_the_run
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.memory import available_host_bytes
 from sadgs_ns.plugin.images import ImagesOnDemand, thread_count

@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from sadgs_ns.data.cameras import refuse_unsupported_cameras
-from sadgs_ns.data.checks.parsers import findings_of
+from sadgs_ns.data.parsers import findings_of
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
 from sadgs_ns.gsplat_compat import FAR_PLANE

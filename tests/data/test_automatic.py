@@ -27,9 +27,8 @@ from runs import blender_data, configure, nerfstudio_data, train
 from scenes import HEIGHT, VIEWS, WIDTH
 
 from examples.drawn_scene.scene import SPARSE_FOLDER
-from sadgs_ns.data.automatic import AutomaticDataParserConfig, choose_parser
 from sadgs_ns.data.checks import check_data
-from sadgs_ns.data.checks.parsers import refuse_bad_data
+from sadgs_ns.data.parsers import AutomaticDataParserConfig, check_capture, choose_parser
 from sadgs_ns.errors import InputError
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
 
@@ -112,7 +111,7 @@ def test_the_parser_is_chosen_by_what_the_folder_holds(layout: str, scene: Path,
     lay_out(scene, data)
     config = SadgsDatamanagerConfig(data=data)
     assert [finding for finding in check_data(data) if finding.severity != "note"] == []
-    assert [finding for finding in refuse_bad_data(config) if finding.severity != "note"] == []
+    assert [finding for finding in check_capture(config) if finding.severity != "note"] == []
     assert config.dataparser == expected(data)
     if isinstance(config.dataparser, ColmapDataParserConfig):
         parsed = config.dataparser.setup().get_dataparser_outputs()
@@ -128,10 +127,10 @@ def test_the_options_that_a_named_parser_lacks_are_told(layout: str, scene: Path
     data, (lay_out, expected) = tmp_path / "capture", LAYOUTS[layout]
     lay_out(scene, data)
     with pytest.raises(InputError, match=r": add `.*` after `colmap`\.$") as refused:
-        refuse_bad_data(SadgsDatamanagerConfig(dataparser=ColmapDataParserConfig(data=data)))
+        check_capture(SadgsDatamanagerConfig(dataparser=ColmapDataParserConfig(data=data)))
     config = parsed("colmap", *shlex.split(str(refused.value).split("`")[1]))
     config.data = data
-    assert [finding for finding in refuse_bad_data(config) if finding.severity != "note"] == []
+    assert [finding for finding in check_capture(config) if finding.severity != "note"] == []
     expected_parser = expected(data)
     assert isinstance(config.dataparser, ColmapDataParserConfig) and isinstance(expected_parser, ColmapDataParserConfig)
     assert config.dataparser.colmap_path == expected_parser.colmap_path
@@ -153,7 +152,7 @@ def test_a_larger_model_is_told(scene: Path, tmp_path: Path):
     ) in sentences
     config = parsed("colmap", "--colmap-path", "sparse/1")
     config.data = tmp_path
-    assert [finding for finding in refuse_bad_data(config) if finding.severity != "note"] == []
+    assert [finding for finding in check_capture(config) if finding.severity != "note"] == []
 
 
 @pytest.mark.hard_case(
@@ -172,7 +171,7 @@ def test_masks_are_read_by_the_names_in_use(called: str, scene: Path, tmp_path: 
     assert words[-2:] == ["--masks-path", "masks"]
     config = parsed(*words, "--downscale-factor", "1")  # nerfstudio leaves open what it measures without it.
     config.data = data
-    notes = [finding.sentence for finding in refuse_bad_data(config)]
+    notes = [finding.sentence for finding in check_capture(config)]
     assert any(f"with {VIEWS} masks" in note for note in notes)
     loaded = config.setup(device="cpu").cached_train
     assert [int((~view["mask"]).sum()) for view in loaded] == [2, 3, 4, 5, 6, 7, 8, 10]
@@ -196,7 +195,7 @@ def test_a_folder_above_or_below_a_capture_is_told_where_that_is(scene: Path, tm
         (finding,) = check_data(folder)
         assert finding.sentence == sentence
         with pytest.raises(InputError) as refused:
-            refuse_bad_data(SadgsDatamanagerConfig(data=folder))
+            check_capture(SadgsDatamanagerConfig(data=folder))
         assert str(refused.value) == sentence
     (finding,) = check_data(data / "other")
     assert "other holds neither transforms.json nor a COLMAP reconstruction" in finding.sentence
@@ -208,7 +207,7 @@ def test_a_folder_that_cannot_be_read_is_named(tmp_path: Path):
     sentence = f"{data} cannot be read (File name too long): correct its name or rights."
     assert [finding.sentence for finding in check_data(data)] == [sentence]
     with pytest.raises(InputError) as refused:
-        refuse_bad_data(SadgsDatamanagerConfig(data=data))
+        check_capture(SadgsDatamanagerConfig(data=data))
     assert str(refused.value) == sentence
 
 
@@ -234,7 +233,7 @@ def test_the_command_line_tells_a_parser_that_was_named_from_none(scene: Path, c
         with pytest.raises(
             InputError, match=r"leave `nerfstudio-data` out|add `--colmap-path sparse/0` after `colmap`"
         ):
-            refuse_bad_data(config)
+            check_capture(config)
 
 
 @pytest.mark.hard_case("a run whose parser was chosen by its folder", "`config.yml` names nerfstudio's own parser")
@@ -274,7 +273,7 @@ def test_large_images_are_taken_as_they_are_and_smaller_copies_where_they_exist(
             with Image.open(path) as image:
                 image.resize((image.width // copies, image.height // copies)).save(smaller / path.name)
         config = SadgsDatamanagerConfig(data=large)
-        refuse_bad_data(config)
+        check_capture(config)
         assert isinstance(config.dataparser, ColmapDataParserConfig) and config.dataparser.downscale_factor == factor
         (note,) = [finding.sentence for finding in check_data(large) if " images of " in finding.sentence]
         assert note.endswith("PNG RGB, without masks.") == (factor == 4)
@@ -290,9 +289,9 @@ def test_a_question_that_a_named_parser_would_ask_nobody_is_an_error(large: Path
     config = SadgsDatamanagerConfig(dataparser=ColmapDataParserConfig(data=large, colmap_path=SPARSE_FOLDER))
     monkeypatch.setattr(sys.stdin, "isatty", lambda: False)
     with pytest.raises(InputError, match=r"more than 20 px and there is no \S+/images_4: add `--downscale-factor 1` "):
-        refuse_bad_data(config)
+        check_capture(config)
     monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
-    (warning,) = [finding for finding in refuse_bad_data(config) if finding.severity == "warning"]
+    (warning,) = [finding for finding in check_capture(config) if finding.severity == "warning"]
     assert "nerfstudio will ask whether to make it with ffmpeg; say yes, or add `--down" in warning.sentence
 
 
@@ -308,7 +307,7 @@ def test_a_factor_without_copies_and_one_that_makes_nothing_smaller_are_named(sc
     for parser in named:
         parser.downscale_factor = 8
         with pytest.raises(InputError) as refused:
-            refuse_bad_data(SadgsDatamanagerConfig(dataparser=parser))
+            check_capture(SadgsDatamanagerConfig(dataparser=parser))
         folder = parser.data / "images_8"
         assert str(refused.value) == (
             f"{folder} does not exist, which should hold the images scaled down by `--downscale-factor 8`: leave that "
@@ -316,7 +315,7 @@ def test_a_factor_without_copies_and_one_that_makes_nothing_smaller_are_named(sc
         )
         parser.downscale_factor = 0
         with pytest.raises(InputError, match=r"^downscale-factor must be at least 1, got 0\.$"):
-            refuse_bad_data(SadgsDatamanagerConfig(dataparser=parser))
+            check_capture(SadgsDatamanagerConfig(dataparser=parser))
 
 
 @pytest.mark.hard_case(
@@ -327,13 +326,13 @@ def test_images_that_are_to_be_divided_by_their_names_need_such_names(tmp_path: 
     parser = nerfstudio_data(tmp_path)
     parser.eval_mode = "filename"
     with pytest.raises(InputError, match=r"^images/000\.png has neither train nor eval in its name, by which `--eval-"):
-        refuse_bad_data(SadgsDatamanagerConfig(dataparser=parser))
+        check_capture(SadgsDatamanagerConfig(dataparser=parser))
     path, names = tmp_path / "transforms.json", {"000": "eval0", "001": "eval1"}
     for image in (tmp_path / "images").iterdir():
         name = names.get(image.stem, f"train{image.stem}")
         image.rename(image.with_stem(name))
         path.write_text(path.read_text().replace(f"images/{image.stem}.", f"images/{name}."))
-    findings = refuse_bad_data(SadgsDatamanagerConfig(dataparser=parser))
+    findings = check_capture(SadgsDatamanagerConfig(dataparser=parser))
     assert [finding for finding in findings if finding.severity != "note"] == []
 
 

@@ -42,8 +42,8 @@ from torch import Tensor
 
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
 from sadgs_ns.cli import doctor
-from sadgs_ns.data import colmap
-from sadgs_ns.data.checks import check_data, parsers
+from sadgs_ns.data import colmap, parsers
+from sadgs_ns.data.checks import check_data
 from sadgs_ns.data.checks.findings import Finding, refuse
 from sadgs_ns.data.checks.layouts import ParserOptions
 from sadgs_ns.data.checks.transforms import check_blender, check_nerfstudio

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
-from sadgs_ns.data.checks.parsers import refuse_bad_data
+from sadgs_ns.data.parsers import check_capture
 from sadgs_ns.errors import InputError
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
 
@@ -87,7 +87,7 @@ def parse(data: Path) -> str | None:
     config = SadgsDatamanagerConfig(dataparser=parser)
     with bounded():
         try:
-            refuse_bad_data(config)
+            check_capture(config)
             config.setup(device="cpu")
         except InputError as error:
             assert len(str(error).splitlines()) == 1, error

@@ -26,7 +26,7 @@ from runs import blender_data, nerfstudio_data
 from examples.drawn_scene.scene import SPARSE_FOLDER
 from sadgs_ns.data import ply
 from sadgs_ns.data.checks.geometry import check_ply
-from sadgs_ns.data.checks.parsers import refuse_bad_data
+from sadgs_ns.data.parsers import check_capture
 from sadgs_ns.errors import InputError
 from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig
 
@@ -111,7 +111,7 @@ def test_colmap_s_text_with_windows_s_line_ends_is_read_as_without_them(
     for path in (parser.data / SPARSE_FOLDER).iterdir():
         lines = path.read_bytes().splitlines()
         path.write_bytes(b"".join(line + b"\r\n" for line in lines if comments or not line.startswith(b"#")))
-    assert refuse_bad_data(SadgsDatamanagerConfig(dataparser=parser))
+    assert check_capture(SadgsDatamanagerConfig(dataparser=parser))
     assert_equal_outputs(load(parser).train_dataparser_outputs, expected)
 
 
@@ -129,7 +129,7 @@ def test_a_byte_order_mark_is_refused_by_the_file_s_name(kind: str, colmap: Colm
         parser, file = nerfstudio_data(tmp_path), tmp_path / kind
     file.write_bytes(MARK + file.read_bytes())
     with pytest.raises(InputError) as refused:
-        refuse_bad_data(SadgsDatamanagerConfig(dataparser=parser))
+        check_capture(SadgsDatamanagerConfig(dataparser=parser))
     told = f"{file} starts with a byte order mark, which nerfstudio cannot read: save it as UTF-8 without one."
     assert str(refused.value) == told
 

@@ -1,6 +1,6 @@
 """Checks of a data folder before nerfstudio parses it, which say in one sentence each what would go wrong.
 
-A few hundred images take under a second. Nothing here needs torch, and only `parsers` needs nerfstudio.
+A few hundred images take under a second. Nothing here needs torch or nerfstudio.
 """
 
 from __future__ import annotations
