@@ -19,7 +19,7 @@ import tyro
 
 from sadgs_ns.cli.program import parse
 from sadgs_ns.data.checks import check_data
-from sadgs_ns.data.checks.findings import Finding
+from sadgs_ns.data.checks.findings import Finding, fault, note, warning
 from sadgs_ns.errors import free_space, reason
 
 PACKAGES = ("sadgs_ns", "torch", "torchvision", "gsplat", "nerfstudio", "triton", "pycolmap", "open3d")
@@ -46,16 +46,15 @@ def check_machine() -> Iterator[Finding]:
 
         _load_torchvision()
     except Exception as error:  # A broken installation raises anything.
-        yield Finding("error", f"torch cannot be used ({reason(error)}): install the versions of constraints.txt.")
+        yield fault(f"torch cannot be used ({reason(error)}): install the versions of constraints.txt.")
         return
     if torch.cuda.is_available():
         yield from _check_cuda()
     else:
         built = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "built without CUDA"
-        yield Finding(
-            "warning",
+        yield warning(
             f"torch is {built} and sees no GPU: training runs on {os.cpu_count()} CPU cores, which is for small scenes "
-            "and tests; for more, install a GPU's driver and a torch for its CUDA.",
+            "and tests; for more, install a GPU's driver and a torch for its CUDA."
         )
     yield from _check_lpips()
     for program, package, use in (
@@ -64,9 +63,9 @@ def check_machine() -> Iterator[Finding]:
     ):
         found = shutil.which(program) or ctypes.util.find_library(program.removeprefix("lib"))
         if found:
-            yield Finding("note", f"{program}: {found}.")
+            yield note(f"{program}: {found}.")
         else:
-            yield Finding("warning", f"{program} is missing: {use}; install the system's package {package}.")
+            yield warning(f"{program} is missing: {use}; install the system's package {package}.")
 
 
 def _load_torchvision() -> None:
@@ -92,21 +91,20 @@ def _check_cuda() -> Iterator[Finding]:
     device = torch.device("cuda")
     name, (free, total) = torch.cuda.get_device_name(device), torch.cuda.mem_get_info(device)
     memory = f"{free / 1e9:.1f} of {total / 1e9:.1f} GB free"
-    yield Finding("note", f"GPU: {name}, {memory}, CUDA {torch.version.cuda}.")
+    yield note(f"GPU: {name}, {memory}, CUDA {torch.version.cuda}.")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         compiles = kernels.available(device)
     if compiles and kernels.switched_off():
-        yield Finding("warning", f"Training will take twice as long: {kernels.SWITCH} is 0, unset it.")
+        yield warning(f"Training will take twice as long: {kernels.SWITCH} is 0, unset it.")
     elif compiles:
-        yield Finding("note", "Triton compiles its kernels here.")
+        yield note("Triton compiles its kernels here.")
     else:
         why = "; ".join(str(warning.message) for warning in caught) or "Triton is not installed or failed before"
         needed = ".".join(map(str, kernels.OLDEST_TRITON))
-        yield Finding(
-            "warning",
+        yield warning(
             f"Training will take twice as long ({why}): install a torch whose Triton is {needed} or newer, a C "
-            "compiler and Python's headers.",
+            "compiler and Python's headers."
         )
     try:
         from sadgs_ns import gsplat_compat
@@ -115,10 +113,10 @@ def _check_cuda() -> Iterator[Finding]:
     except Exception as error:  # Its compilation fails in many ways.
         problem = reason(error)
     if problem is None:
-        yield Finding("note", "gsplat has its CUDA kernels.")
+        yield note("gsplat has its CUDA kernels.")
     else:
         remedy = "install its wheel for this torch, or the CUDA toolkit"
-        yield Finding("error", f"gsplat has no CUDA kernels ({problem}): {remedy}.")
+        yield fault(f"gsplat has no CUDA kernels ({problem}): {remedy}.")
 
 
 def _check_lpips() -> Iterator[Finding]:
@@ -126,10 +124,10 @@ def _check_lpips() -> Iterator[Finding]:
 
     path = Path(torch.hub.get_dir(), "checkpoints", _LPIPS_FILE)
     if path.is_file():
-        yield Finding("note", f"LPIPS with AlexNet has its weights: {path}.")
+        yield note(f"LPIPS with AlexNet has its weights: {path}.")
     else:
         sentence = f"LPIPS with AlexNet has no weights: the first `ns-eval` downloads them to {path}, or leaves it out."
-        yield Finding("warning", sentence)
+        yield warning(sentence)
 
 
 def check_all(data: Path | None) -> Iterator[Finding]:
@@ -139,7 +137,7 @@ def check_all(data: Path | None) -> Iterator[Finding]:
         findings = check_data(data)
         yield from findings
         if all(finding.severity == "note" for finding in findings):
-            yield Finding("note", f"{data}: nothing to complain about.")
+            yield note(f"{data}: nothing to complain about.")
 
 
 @dataclass

@@ -13,14 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sadgs_ns.data import colmap
-from sadgs_ns.data.checks.findings import Finding, collect_findings
+from sadgs_ns.data.checks.findings import Finding, collect_findings, fault, warning
 from sadgs_ns.data.checks.geometry import Camera, View, check_points, check_positive, check_views
 from sadgs_ns.data.checks.images import (
     MAX_AUTO_RESOLUTION,
     Frame,
+    automatic_factor,
     check_images,
-    existing_factor,
-    image_size,
     images_in,
     mask_name,
     no_copies,
@@ -68,7 +67,7 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
         yield from _check_points(model_folder, views if sound else [], random)
     if options.masks_path is None and images_in(data / "masks"):
         told = f"{data / 'masks'} holds masks that are not used"
-        yield Finding("warning", f"{told}: {this_model} --masks-path masks` to leave out what is black in them.")
+        yield warning(f"{told}: {this_model} --masks-path masks` to leave out what is black in them.")
     if not open_images:
         return
     factor = yield from _check_factor(images, names, options)
@@ -100,7 +99,7 @@ def _check_folders(data: Path, options: ParserOptions, names: Sequence[str], pos
         if count > len(names):
             told = f"{poses} has {len(names)} images, {data / other} has {count}"
             remedy = f"end the command with `colmap {_words(data, dataclasses.replace(options, colmap_path=other))}`"
-            yield Finding("warning", f"{told}: {remedy} to train on those.")
+            yield warning(f"{told}: {remedy} to train on those.")
 
 
 def _words(data: Path, options: ParserOptions) -> str:
@@ -111,14 +110,6 @@ def _words(data: Path, options: ParserOptions) -> str:
     if options.downscale_factor not in (None, automatic_factor(data / options.images_path / [*names, ""][0])):
         words += ["--downscale-factor", str(options.downscale_factor)]
     return shlex.join(words)
-
-
-def automatic_factor(image: Path) -> int:
-    """Return the factor by which nerfstudio's parser scales images down where it is named without one."""
-    factor, size = 1, image_size(image)
-    while max(size) / factor > MAX_AUTO_RESOLUTION:
-        factor *= 2
-    return factor
 
 
 def _read_model(poses_path: Path, cameras_path: Path) -> tuple[list[colmap.Pose], dict[int, colmap.Camera]]:
@@ -161,7 +152,7 @@ def _check_factor(images_folder: Path, names: Sequence[str], options: ParserOpti
         remedy = "add `--downscale-factor 1` after `colmap` to take them as they are"
     if sys.stdin is None or not sys.stdin.isatty():
         raise InputError(f"{problem}: {remedy}.")
-    yield Finding("warning", f"{problem}: nerfstudio will ask whether to make it with ffmpeg; say yes, or {remedy}.")
+    yield warning(f"{problem}: nerfstudio will ask whether to make it with ffmpeg; say yes, or {remedy}.")
     return 1
 
 
@@ -171,10 +162,11 @@ def automatic_options(data: Path, model: Path) -> ParserOptions:
     nerfstudio's parser of COLMAP's files asks a question at the terminal where copies that it wants do not exist. So
     that it never has to, the images are taken at full resolution then, as they are beside a `transforms.json`.
     """
-    names, folder, factor = colmap.image_names(data / model), images_folder(data, model) or Path("images"), 1
-    images = data / folder
+    names, factor = colmap.image_names(data / model), 1
+    folder = images_folder(data, model, names) or Path("images")
     if names and folder != Path():  # The smaller copies of images right in the capture would lie outside of it.
-        factor = existing_factor(image_size(images / names[0]), lambda by: smaller_folder(images, by) / names[0])
+        copies = data / folder
+        factor = automatic_factor(copies / names[0], lambda by: smaller_folder(copies, by) / names[0])
     return ParserOptions(images_path=folder, colmap_path=model, downscale_factor=factor, eval_mode="interval")
 
 
@@ -254,14 +246,12 @@ def _check_points(model_folder: Path, views: Sequence[View], random: str) -> Ite
     """Check the SfM points and, if there are views, how the points lie to them; `random` tells how to do without."""
     path = colmap.points_file(model_folder)
     if path is None:
-        yield Finding(
-            "error", f"{model_folder} has no points3D.bin or .txt: copy the whole reconstruction, or {random}."
-        )
+        yield fault(f"{model_folder} has no points3D.bin or .txt: copy the whole reconstruction, or {random}.")
         return
     positions, _ = colmap.read_points(path)
     if not np.isfinite(positions).all():
-        yield Finding("error", f"{path} has NaN or infinity in a point: run COLMAP's mapper again, or {random}.")
+        yield fault(f"{path} has NaN or infinity in a point: run COLMAP's mapper again, or {random}.")
     if len(positions) == 0:
-        yield Finding("error", f"{path} holds no SfM point: run COLMAP's mapper again, or {random}.")
+        yield fault(f"{path} holds no SfM point: run COLMAP's mapper again, or {random}.")
     elif np.isfinite(positions).all():
         yield from check_points(positions, views, path)

@@ -23,6 +23,8 @@ class Finding:
     """A sentence that names the file and the remedy."""
 
 
+fault, warning, note = (functools.partial(Finding, severity) for severity in ("error", "warning", "note"))
+"""Make a finding of each severity of its sentence."""
 _Arguments = ParamSpec("_Arguments")
 
 
@@ -35,9 +37,9 @@ def collect_findings(check: Callable[_Arguments, Iterator[Finding]]) -> Callable
             with np.errstate(over="ignore", invalid="ignore"):  # Some numbers are nearly infinite.
                 return list(check(*args, **kwargs))
         except InputError as error:
-            return [Finding("error", str(error))]
+            return [fault(str(error))]
         except OSError as error:
-            return [Finding("error", unreadable(error))]
+            return [fault(unreadable(error))]
 
     return findings
 

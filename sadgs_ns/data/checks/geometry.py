@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sadgs_ns.data import ply
-from sadgs_ns.data.checks.findings import Finding, and_more
+from sadgs_ns.data.checks.findings import Finding, and_more, fault, note, warning
 from sadgs_ns.errors import InputError
 from sadgs_ns.outliers import CAMERA_SHARE, POINT_SHARE, REACH, far_outliers
 
@@ -108,13 +108,12 @@ def check_views(views: Sequence[View], training: int, source: Path) -> Generator
 
 def _check_number(views: int, training: int, source: Path) -> Iterator[Finding]:
     if views < 2:
-        yield Finding("error", f"{source} has 1 view, which shows no depth: take at least 2 images, better 20 or more.")
+        yield fault(f"{source} has 1 view, which shows no depth: take at least 2 images, better 20 or more.")
     elif training == 0:
-        yield Finding("error", f"{source} leaves no view for training: hold out fewer images.")
+        yield fault(f"{source} leaves no view for training: hold out fewer images.")
     elif training < 3:
-        yield Finding(
-            "warning",
-            f"{source} leaves {training} training view{'s' * (training > 1)}: so few fix no shape; take 20 or more.",
+        yield warning(
+            f"{source} leaves {training} training view{'s' * (training > 1)}: so few fix no shape; take 20 or more."
         )
 
 
@@ -129,24 +128,21 @@ def check_rotations(views: Sequence[View]) -> Iterator[Finding]:
     ):
         if wrong.any():
             where = and_more(views[int(wrong.argmax())].where, int(wrong.sum()))
-            yield Finding("error", f"{where} has {what}: {remedy}, or compute the poses again.")
+            yield fault(f"{where} has {what}: {remedy}, or compute the poses again.")
 
 
 def _check_centres(views: Sequence[View], source: Path) -> Iterator[Finding]:
     centres = np.stack([view.centre for view in views])  # [V, 3]
     largest = np.abs(centres - centres.mean(axis=0)).max()
     if len(centres) > 1 and largest <= 1e-9 * max(np.abs(centres).max(), 1.0):
-        yield Finding(
-            "error", f"{source} has all {len(centres)} cameras in one place, which shows no depth: move between images."
-        )
+        yield fault(f"{source} has all {len(centres)} cameras in one place, which shows no depth: move between images.")
         return
     distances, spread = _distances(centres), _spread(centres)
     offset = float(np.linalg.norm(np.median(centres, axis=0)))
     if spread > 0 and offset * _FLOAT32_STEP * _FEWEST_STEPS > spread:
-        yield Finding(
-            "error",
+        yield fault(
             f"{source} has its cameras {offset:.3g} units from the origin and only {spread:.3g} apart, which float32 "
-            "cannot tell apart: subtract their centre from all poses and points.",
+            "cannot tell apart: subtract their centre from all poses and points."
         )
     far = far_outliers(centres, CAMERA_SHARE)
     if far.any():
@@ -175,20 +171,20 @@ def _check_camera(camera: Camera, where: str) -> Iterator[Finding]:
         yield Finding("warning" if likely else "error", f"{where} has {focal}: correct it, in pixels.")
     if not 0.5 <= camera.fx / camera.fy <= 2:
         focals = f"the focal lengths {camera.fx:g} and {camera.fy:g} px, which differ as no lens's do"
-        yield Finding("warning", f"{where} has {focals}: correct them, in pixels.")
+        yield warning(f"{where} has {focals}: correct them, in pixels.")
     if any(abs(value) > 0.5 for value in camera.tangential):
         coefficients = ", ".join(f"{value:g}" for value in camera.tangential)
-        yield Finding("error", f"{where} has p1, p2 = {coefficients}, which no lens has: calibrate the camera again.")
+        yield fault(f"{where} has p1, p2 = {coefficients}, which no lens has: calibrate the camera again.")
     if not any(camera.radial):
         if camera.fisheye and camera.radial:
-            yield Finding("error", f"{where} {UNDISTORTED_FISHEYE}")
+            yield fault(f"{where} {UNDISTORTED_FISHEYE}")
         return
     coefficients = ", ".join(f"{value:g}" for value in camera.radial)
     told = f"{where} has the radial distortion {coefficients}, which cannot be undone"
     if not _can_be_undone(camera, min(half_width, half_height)):
-        yield Finding("error", f"{told}: calibrate the camera again, or undistort the images yourself.")
+        yield fault(f"{told}: calibrate the camera again, or undistort the images yourself.")
     elif not camera.fisheye and not _can_be_undone(camera, math.hypot(half_width, half_height)):
-        yield Finding("warning", f"{told} in the image's corners: they will be wrong; calibrate the camera again.")
+        yield warning(f"{told} in the image's corners: they will be wrong; calibrate the camera again.")
 
 
 def _can_be_undone(camera: Camera, radius: float) -> bool:
@@ -219,9 +215,9 @@ def check_ply(path: Path, views: Sequence[View], remedy: str) -> Iterator[Findin
         elif problem is None:
             yield from check_points(positions, views, path)
             if (colors == ply.GREY).all():
-                yield Finding("note", f"{path} has points without colours, which start grey.")
+                yield note(f"{path} has points without colours, which start grey.")
     if problem is not None:
-        yield Finding("error", f"{path} should hold the SfM points but {problem}: {remedy}.")
+        yield fault(f"{path} should hold the SfM points but {problem}: {remedy}.")
 
 
 def check_points(positions: NDArray[np.floating], views: Sequence[View], path: Path) -> Iterator[Finding]:
@@ -232,16 +228,15 @@ def check_points(positions: NDArray[np.floating], views: Sequence[View], path: P
         views: All of them, or none if they are not to be relied on.
         path: The points' file.
     """
-    yield Finding("note", f"{path} has {len(positions):,} points.")
+    yield note(f"{path} has {len(positions):,} points.")
     if not views or len(positions) == 0:
         return
     positions = positions.astype(np.float64)
     far = far_outliers(positions, POINT_SHARE)
     if far.any():
-        yield Finding(
-            "note",
+        yield note(
             f"{path} has {far.sum()} of {len(far)} points more than {REACH:g} times as far out as {POINT_SHARE:.0%} of "
-            "them: training leaves them out.",
+            "them: training leaves them out."
         )
     positions = positions[~far]
     centres = np.stack([view.centre for view in views])  # [V, 3]

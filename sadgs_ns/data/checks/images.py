@@ -16,7 +16,7 @@ import numpy as np
 from PIL import ExifTags, Image, UnidentifiedImageError
 
 from sadgs_ns.data import IMAGE_SUFFIXES
-from sadgs_ns.data.checks.findings import Finding, and_more
+from sadgs_ns.data.checks.findings import Finding, and_more, fault, note, warning
 from sadgs_ns.errors import reason
 
 MAX_AUTO_RESOLUTION = 1600
@@ -90,18 +90,14 @@ def no_copies(folder: Path, factor: int) -> tuple[str, str]:
     )
 
 
-def existing_factor(size: Size, copy_of: Callable[[int], Path]) -> int:
-    """Return the factor by which images are scaled down where the user names none, as nerfstudio chooses it, too.
+def automatic_factor(image: Path, copy_of: Callable[[int], Path] | None = None) -> int:
+    """Return the factor by which nerfstudio scales images down if the user names none.
 
-    It is the smallest power of 2 that makes the image's sides 1600 px or less, or a smaller one if copies by that
-    factor do not exist; 1 if there are no copies.
-
-    Args:
-        size: That of an image at full resolution.
-        copy_of: Where that image's copy would lie that is smaller by a factor.
+    It is the smallest power of 2 that makes the image's sides 1600 px or less. With `copy_of`, which tells where the
+    copy that is smaller by a factor would lie, it is only as large as such copies exist, as for a `transforms.json`.
     """
-    factor = 1
-    while max(size) / factor > MAX_AUTO_RESOLUTION and copy_of(2 * factor).exists():
+    factor, size = 1, image_size(image)
+    while max(size) / factor > MAX_AUTO_RESOLUTION and (copy_of is None or copy_of(2 * factor).exists()):
         factor *= 2
     return factor
 
@@ -121,18 +117,16 @@ def check_images(frames: Sequence[Frame], source: Path, look_for_unused: bool = 
             problems[found[0]].append(found[1:])
     for same in problems.values():
         path, text = same[0]
-        yield Finding("error", f"{and_more(path, len(same))} {text}.")
+        yield fault(f"{and_more(path, len(same))} {text}.")
     if not problems and all(_is_flat(frame.image) for frame in frames):
-        yield Finding(
-            "error",
+        yield fault(
             f"{source} has {len(frames)} images that show a single colour and nothing else, such as {frames[0].image}: "
-            "export them again.",
+            "export them again."
         )
     if not problems and all(frame.mask is not None and _is_flat(frame.mask, black=True) for frame in frames):
-        yield Finding(
-            "error",
+        yield fault(
             f"{source} has {len(frames)} masks that are all black, such as {frames[0].mask}, which leaves no pixel to "
-            "train on: make white what is to be trained on.",
+            "train on: make white what is to be trained on."
         )
     # Where the size does not tell whether the poses are of turned images.
     lying = [
@@ -141,15 +135,15 @@ def check_images(frames: Sequence[Frame], source: Path, look_for_unused: bool = 
         if image.format != "TIFF" and image.orientation in (range(2, 9) if len({*image.size}) == 1 else range(2, 5))
     ]
     if lying and not problems:
-        yield Finding(
-            "warning",
+        yield warning(
             f"{and_more(lying[0], len(lying))} has an EXIF orientation that would turn it, which training ignores, as "
-            f"COLMAP does: if the poses are those of the turned images, {_TURN}.",
+            f"COLMAP does: if the poses are those of the turned images, {_TURN}."
         )
-    if look_for_unused and (unused := unused_images(frames, source)) is not None:
-        yield Finding("warning", unused)
+    if look_for_unused and (unused := _unused_images(frames)):
+        where = and_more(unused[0], len(unused))
+        yield warning(f"{where} has no pose in {source} and is not used: reconstruct again if it matters.")
     if not problems:
-        yield Finding("note", _describe(source, images, masks))
+        yield note(_describe(source, images, masks))
 
 
 def _problem(frame: Frame, image: _Image, mask: _Image | None, source: Path) -> tuple[str, Path, str] | None:
@@ -199,17 +193,12 @@ def _describe(source: Path, images: Sequence[_Image], masks: Sequence[_Image | N
     return text
 
 
-def unused_images(frames: Sequence[Frame], source: Path) -> str | None:
-    """Return a sentence on images beside the frames' that have no pose in the source; None if there are none."""
+def _unused_images(frames: Sequence[Frame]) -> list[Path]:
+    """Return the images beside the frames' that no frame uses."""
     # Unlike Path.resolve, realpath does not raise where links form a loop.
     used = {os.path.realpath(path) for frame in frames for path in (frame.image, frame.mask) if path is not None}
     folders = sorted({frame.image.parent for frame in frames})
-    unused = [path for folder in folders for path in images_in(folder) if os.path.realpath(path) not in used]
-    if not unused:
-        return None
-    return (
-        f"{and_more(unused[0], len(unused))} has no pose in {source} and is not used: reconstruct again if it matters."
-    )
+    return [path for folder in folders for path in images_in(folder) if os.path.realpath(path) not in used]
 
 
 def images_in(folder: Path) -> list[Path]:

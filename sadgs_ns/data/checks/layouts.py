@@ -6,6 +6,7 @@ import contextlib
 import os
 import re
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -58,31 +59,39 @@ def find_reconstruction(data: Path) -> Path | None:
 def find_reconstructions(data: Path) -> dict[Path, int]:
     """Return the folders of COLMAP's reconstructions, relative to the data, and how many images each has.
 
-    The usual places come first, then others, beginning with the most images; one right in the data's folder counts
-    where there is no other and its images are at hand. The number is 0 where a reconstruction cannot be read.
+    The first is the one to read. The usual places precede others, of which the one with the most images comes first.
+    A reconstruction right in the data's folder counts if there is no other and its images are at hand. The number is 0
+    if a reconstruction cannot be read.
     """
-    numbered = [path for place in ("colmap/sparse", "sparse") for path in sorted((data / place).glob("[0-9]*"))]
-    folders = (*map(Path, COLMAP_FOLDERS), Path("images"), *(path.relative_to(data) for path in numbered))
-    counts = {folder: 0 for folder in folders if colmap.model_kind(data / folder)}
-    if not counts and (kind := colmap.model_kind(data)) and (data / f"images.{kind}").is_file():
-        return {Path(): 0} if images_folder(data, Path()) else {}
-    for folder in counts:
+    folders = _model_folders(data)
+    counts = dict.fromkeys(folders, 0)
+    for folder in folders:
         with contextlib.suppress(InputError):
             counts[folder] = len(colmap.image_names(data / folder))
     return dict(sorted(counts.items(), key=lambda item: 0 if str(item[0]) in COLMAP_FOLDERS else 1 / (1 + item[1])))
 
 
+def _model_folders(data: Path) -> list[Path]:
+    numbered = [path for place in ("colmap/sparse", "sparse") for path in sorted((data / place).glob("[0-9]*"))]
+    folders = (*map(Path, COLMAP_FOLDERS), Path("images"), *(path.relative_to(data) for path in numbered))
+    if found := [folder for folder in folders if colmap.model_kind(data / folder)]:
+        return found
+    kind = colmap.model_kind(data)
+    has_images = kind and (data / f"images.{kind}").is_file() and images_folder(data, Path()) is not None
+    return [Path()] if has_images else []
+
+
 def find_cameras(data: Path) -> Path | None:
-    """Return the file with the poses that a folder or JSON file brings, or None; raises as `find_reconstruction`."""
+    """Return the file with the poses that a folder or JSON file brings, or None; raises as `colmap.read_poses`."""
     files = [data if data.suffix == ".json" else data / "transforms.json", data / "transforms_train.json"]
-    if (model := find_reconstruction(data)) is not None:
-        files.append(data / model / f"images.{colmap.model_kind(data / model)}")
+    if not any(file.is_file() for file in files) and (model := find_reconstruction(data)) is not None:
+        files = [data / model / f"images.{colmap.model_kind(data / model)}"]
     return next((file for file in files if file.is_file()), None)
 
 
-def images_folder(data: Path, model: Path) -> Path | None:
+def images_folder(data: Path, model: Path, names: Sequence[str] = ()) -> Path | None:
     """Return the folder that has images of a reconstruction, both relative to the data; None if none has any."""
-    names = colmap.image_names(data / model)
+    names = names or colmap.image_names(data / model)
     others = [path.name for path in data.iterdir() if not re.search(r"mask|depth|normal|_\d+$", path.name)]
     beside = [folder / "images" for folder in (model, *model.parents)]
     folders = map(Path, ("images", "", model, *beside, *sorted(others)))
@@ -95,7 +104,7 @@ def layout_of(data: Path) -> Literal["nerfstudio", "blender", "colmap"] | None:
         return "nerfstudio"
     if (data / "transforms_train.json").is_file():
         return "blender"
-    return None if find_reconstruction(data) is None else "colmap"
+    return "colmap" if _model_folders(data) else None
 
 
 def poses_elsewhere(data: Path) -> str | None:

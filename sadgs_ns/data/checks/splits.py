@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sadgs_ns.data.checks.findings import Finding
+from sadgs_ns.data.checks.findings import Finding, warning
 from sadgs_ns.data.checks.layouts import ParserOptions
 from sadgs_ns.errors import InputError
 
@@ -57,12 +57,11 @@ def check_splits(
         located[split] = set(map(locate, listed))
     if not located.get("test"):
         state = "is empty" if "test" in located else "is missing"
-        yield Finding("warning", f"{called('test')} {state}: `ns-eval` will have nothing to measure; name some images.")
+        yield warning(f"{called('test')} {state}: `ns-eval` will have nothing to measure; name some images.")
     elif both := located["train"] & located["test"]:
-        yield Finding(
-            "warning",
+        yield warning(
             f"{called('test')} names {len(both)} of the {len(located['train'])} training images: what `ns-eval` "
-            "measures of them shows nothing about new views.",
+            "measures of them shows nothing about new views."
         )
     return len(located["train"])
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sadgs_ns.data import IMAGE_SUFFIXES, colmap
-from sadgs_ns.data.checks.findings import Finding, collect_findings
+from sadgs_ns.data.checks.findings import Finding, collect_findings, note, warning
 from sadgs_ns.data.checks.geometry import (
     UNDISTORTED_FISHEYE,
     Camera,
@@ -24,7 +24,7 @@ from sadgs_ns.data.checks.geometry import (
     check_views,
     finite,
 )
-from sadgs_ns.data.checks.images import Frame, check_images, existing_factor, image_size, no_copies, scaled_size
+from sadgs_ns.data.checks.images import Frame, automatic_factor, check_images, image_size, no_copies, scaled_size
 from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS, GIVE_POSES, ParserOptions, find_reconstruction, no_layout
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
 from sadgs_ns.data.coordinates import fixed_frame
@@ -54,9 +54,9 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
     if model not in (known := (*_PERSPECTIVE, "OPENCV_FISHEYE", "FISHEYE624")):
         raise InputError(f"{path} has the camera model {model!r}: give one of {', '.join(known)}.")
     _check_transform(meta, path)
-    factor = options.downscale_factor
+    first, factor = folder / described[0]["file_path"], options.downscale_factor
     if factor is None:
-        factor = _smaller_copies(folder, Path(described[0]["file_path"])) if open_images else 1
+        factor = automatic_factor(first, lambda by: folder / f"images_{by}" / first.name) if open_images else 1
     if factor > 1 and not (folder / f"images_{factor}").is_dir():
         raise InputError(": ".join(no_copies(folder / f"images_{factor}", factor)) + ".")
     frames, views = [], []
@@ -86,7 +86,7 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
     training = yield from check_splits(names, lists, lambda split: f"{path}: {split}_filenames", locate, options)
     sound = yield from check_views(views, training, path)
     if 3 <= training == len(frames) < 10:  # With more frames all are trained on only where that was asked for.
-        yield Finding("note", f"{path} has {training} views, none of them held out: `ns-eval` cannot measure any.")
+        yield note(f"{path} has {training} views, none of them held out: `ns-eval` cannot measure any.")
     if open_images:
         yield from check_images(frames, path, look_for_unused=factor == 1)
     if options.load_3D_points:
@@ -111,7 +111,7 @@ def check_blender(data: Path, options: ParserOptions, open_images: bool = True) 
     for split in ("train", "val", "test"):
         path = data / f"transforms_{split}.json"
         if split == "test" and not path.is_file():
-            yield Finding("warning", f"{path} does not exist: `ns-eval` will have nothing to measure.")
+            yield warning(f"{path} does not exist: `ns-eval` will have nothing to measure.")
             continue
         meta = read_blender(path)
         described = meta["frames"]
@@ -308,9 +308,4 @@ def _check_ply(meta: dict[str, Any], path: Path, views: Sequence[View]) -> Itera
         positions = positions[np.isfinite(positions).all(axis=1)]
         yield from check_points(positions @ transform[:, :3].T + transform[:, 3], views, source)
     else:
-        yield Finding("note", f"{path} has no ply_file_path: training will start from random points.")
-
-
-def _smaller_copies(folder: Path, image: Path) -> int:
-    """Return the factor that nerfstudio's own parser chooses: it takes smaller copies only where they exist."""
-    return existing_factor(image_size(folder / image), lambda factor: folder / f"images_{factor}" / image.name)
+        yield note(f"{path} has no ply_file_path: training will start from random points.")
