@@ -1,10 +1,20 @@
-"""Text in UTF-8, before which editors of Windows write a mark that nerfstudio's readers take for content."""
+"""Text in UTF-8. Editors of Windows write a mark before it that nerfstudio's readers take for content."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from sadgs_ns.errors import InputError
+
+
+def read_text(path: Path) -> str:
+    """Return a file's text; raise InputError if it is not UTF-8, or starts with a byte order mark."""
+    try:
+        text = path.read_text("utf8")
+    except UnicodeDecodeError:
+        raise InputError(f"{path} is not text in UTF-8: save it in that encoding.") from None
+    refuse_byte_order_mark(text, path)
+    return text
 
 
 def refuse_byte_order_mark(text: str, path: Path) -> None:

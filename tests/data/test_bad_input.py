@@ -341,7 +341,7 @@ COLMAP = {
     ),
     "list-latin": (
         overwrite("train_list.txt", b"\xe9.png\n"),
-        r"\S+/train_list\.txt cannot be read as text in UTF-8 \(.*\): correct or remove it\.",
+        r"\S+/train_list\.txt is not text in UTF-8: save it in that encoding\.",
     ),
     # poses
     "model-loop": (

@@ -20,6 +20,7 @@ from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 from sadgs_ns.cli.process.folder import COLMAP_FORMATS, Found, look_into
 from sadgs_ns.cli.process.panoramas import VIEWS, cut, is_panorama
 from sadgs_ns.cli.process.video import find_videos
+from sadgs_ns.data.checks.images import NOT_UPRIGHT, SIDEWAYS
 from sadgs_ns.errors import InputError, reason
 
 _KEPT_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
@@ -160,8 +161,8 @@ def _read_photo(folder: Path, name: str, as_stored: bool) -> Photo:
     with Image.open(folder / name) as image:
         exif = image.getexif()
         orientation = 1 if as_stored else exif.get(ExifTags.Base.Orientation)
-        width, height = image.size  # Pillow turns TIFF by itself.
-        size = (height, width) if orientation in range(5, 9) and image.format != "TIFF" else image.size
+        width, height = image.size
+        size = (height, width) if orientation in SIDEWAYS and image.format != "TIFF" else image.size
         lens, gps = (exif.get_ifd(part) for part in (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo))
         focals = [max((0.0, *_numbers(lens.get(tag)))) for tag in _FOCAL_LENGTHS]  # mm; 0 is unknown, too
         latitude, longitude, altitude = (_numbers(gps.get(tag)) for tag in _POSITION)
@@ -174,7 +175,7 @@ def _read_photo(folder: Path, name: str, as_stored: bool) -> Photo:
             latitude + longitude + altitude if is_known else (),
             image.has_transparency_data,
             image.format in COLMAP_FORMATS,
-            orientation in range(2, 9),
+            orientation in NOT_UPRIGHT,
         )
         # An eighth of a JPEG's size tells whether it is whole, but not whether it is a panorama.
         least = 512 if width == 2 * height else 0

@@ -6,7 +6,7 @@ import dataclasses
 import os
 import shlex
 import sys
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -34,8 +34,8 @@ from sadgs_ns.data.checks.layouts import (
     no_layout,
 )
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
-from sadgs_ns.data.text import refuse_byte_order_mark
-from sadgs_ns.errors import InputError, reason
+from sadgs_ns.data.text import read_text
+from sadgs_ns.errors import InputError
 
 UNSUPPORTED_CAMERAS = {"FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}
 """COLMAP's camera models that nerfstudio cannot read."""
@@ -43,24 +43,20 @@ UNSUPPORTED_CAMERAS = {"FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}
 
 @collect_findings
 def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -> Iterator[Finding]:
-    """Check a COLMAP reconstruction, binary or text, in a folder that the options' paths are relative to."""
+    """Check a COLMAP reconstruction in a folder, to which the options' paths are relative, and its images if asked."""
     images, model_folder = data / options.images_path, data / options.colmap_path
-    kind = colmap.model_kind(model_folder)
-    if kind is None:
+    if (kind := colmap.model_kind(model_folder)) is None:
         if found := find_reconstruction(data):
             told = f"{model_folder} holds no COLMAP reconstruction, but {data / found} does"
             raise InputError(f"{told}: add `{_words(data, automatic_options(data, found))}` after `colmap`.")
         raise InputError(no_layout(data))
     cameras_path, poses_path = model_folder / f"cameras.{kind}", model_folder / f"images.{kind}"
-    poses, cameras = _read_model(poses_path, cameras_path)
-    names = [name for name, _, _ in poses]
+    names, views = _read_views(poses_path, cameras_path)
     this_model = f"end the command with `colmap {_words(data, options)}"
     yield from _check_folders(data, options, names, poses_path)
-    lists = {split: _read_list(path) for split in SPLITS if (path := data / f"{split}_list.txt").is_file()}
-    training = yield from check_splits(
-        names, lists, lambda split: f"{data / split}_list.txt", lambda name: images / name, options
-    )
-    views = _views(poses, cameras, poses_path, cameras_path)
+    files = {split: data / f"{split}_list.txt" for split in SPLITS}
+    lists = {split: read_text(file).splitlines() for split, file in files.items() if file.is_file()}
+    training = yield from check_splits(names, lists, lambda split: f"{files[split]}", images.joinpath, options)
     sound = yield from check_views(views, training, poses_path)
     if options.load_3D_points:
         random = f"{this_model} --load-3D-points False` to start from random points"
@@ -71,13 +67,10 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
     if not open_images:
         return
     factor = yield from _check_factor(images, names, options)
-    frames = []
-    for name, camera_id, _ in poses:
-        camera, mask = cameras[camera_id], None
+    masks, frames = None if options.masks_path is None else data / options.masks_path, []
+    for name, camera in zip(names, (view.camera for view in views), strict=True):
         size = scaled_size((camera.width, camera.height), factor, options.downscale_rounding_mode)
-        if options.masks_path is not None:
-            masks = data / options.masks_path
-            mask = smaller_folder(masks, factor) / mask_name(masks, name)
+        mask = None if masks is None else smaller_folder(masks, factor) / mask_name(masks, name)
         frames.append(Frame(smaller_folder(images, factor) / name, size, mask))
     yield from check_images(frames, poses_path, look_for_unused=factor == 1)
 
@@ -112,9 +105,9 @@ def _words(data: Path, options: ParserOptions) -> str:
     return shlex.join(words)
 
 
-def _read_model(poses_path: Path, cameras_path: Path) -> tuple[list[colmap.Pose], dict[int, colmap.Camera]]:
-    """Return the poses, and the cameras that they use; raise InputError if one makes no sense or there is none."""
-    cameras, poses = colmap.read_cameras(cameras_path), colmap.read_poses(poses_path)
+def _read_views(poses_path: Path, cameras_path: Path) -> tuple[list[str], list[View]]:
+    """Return the images' names and views; raise InputError if there is none, or one makes no sense to nerfstudio."""
+    stored, poses = colmap.read_cameras(cameras_path), colmap.read_poses(poses_path)
     if not poses:
         raise InputError(f"{poses_path} holds no pose, so there is no image to train on: run COLMAP's mapper again.")
     for name, camera_id, pose in poses:
@@ -123,23 +116,27 @@ def _read_model(poses_path: Path, cameras_path: Path) -> tuple[list[colmap.Pose]
             raise InputError(f"{where} has NaN or infinity in its pose: run COLMAP's mapper again.")
         if not 0.99 < np.linalg.norm(pose[:4]) < 1.01:
             raise InputError(f"{where} has a rotation that is no unit quaternion: run COLMAP's mapper again.")
-        if camera_id not in cameras:
+        if camera_id not in stored:
             raise InputError(f"{where} has camera {camera_id}, which {cameras_path} lacks: take both of one model.")
-    for camera_id, camera in cameras.items():  # nerfstudio reads unused ones, too.
-        _check_camera(camera, f"{cameras_path}: camera {camera_id}")
-    used = {camera_id: cameras[camera_id] for _, camera_id, _ in poses}
-    if len({"FISHEYE" in camera.model for camera in used.values()}) > 1:
+    called = {camera_id: f"{cameras_path}: camera {camera_id}" for camera_id in stored}
+    cameras = {camera_id: _camera(stored[camera_id], where) for camera_id, where in called.items()}
+    if len({cameras[camera_id].fisheye for _, camera_id, _ in poses}) > 1:
         raise InputError(
             f"{cameras_path} mixes fisheye and other cameras, which nerfstudio cannot read: undistort the images with "
             "`colmap image_undistorter`."
         )
-    return poses, used
+    rotations = _rotations(np.array([pose[:4] for _, _, pose in poses]))
+    views = [
+        View(f"{poses_path}: image {name}", called[number], rotation, -rotation.T @ pose[4:], cameras[number])
+        for (name, number, pose), rotation in zip(poses, rotations, strict=True)
+    ]
+    return [name for name, _, _ in poses], views
 
 
 def _check_factor(images_folder: Path, names: Sequence[str], options: ParserOptions) -> Generator[Finding, None, int]:
-    """Return the factor by which the images that will be read are scaled down, after a check that they are there.
+    """Return the factor by which the images are scaled down that will be read.
 
-    If they are not, this raises InputError where nobody can answer nerfstudio's question whether to make them.
+    If they do not exist, raise InputError unless somebody can answer nerfstudio's question whether to make them.
     """
     factor = options.downscale_factor or automatic_factor(images_folder / names[0])
     smaller = smaller_folder(images_folder, factor)
@@ -159,8 +156,8 @@ def _check_factor(images_folder: Path, names: Sequence[str], options: ParserOpti
 def automatic_options(data: Path, model: Path) -> ParserOptions:
     """Return how a reconstruction is read where no parser is named; raises as `colmap.read_poses`.
 
-    nerfstudio's parser of COLMAP's files asks a question at the terminal where copies that it wants do not exist. So
-    that it never has to, the images are taken at full resolution then, as they are beside a `transforms.json`.
+    Without the smaller copies that it wants, nerfstudio's parser of COLMAP's files asks a question at the terminal. So
+    that it never has to, the images are then taken at full resolution, as they are beside a `transforms.json`.
     """
     names, factor = colmap.image_names(data / model), 1
     folder = images_folder(data, model, names) or Path("images")
@@ -170,50 +167,25 @@ def automatic_options(data: Path, model: Path) -> ParserOptions:
     return ParserOptions(images_path=folder, colmap_path=model, downscale_factor=factor, eval_mode="interval")
 
 
-def _read_list(path: Path) -> list[str]:
-    """Return the names in a list of images; raise InputError if the file is not UTF-8 without a byte order mark."""
-    try:
-        text = path.read_text("utf8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read as text in UTF-8 ({reason(error)}): correct or remove it.") from error
-    refuse_byte_order_mark(text, path)
-    return text.splitlines()
-
-
-def _check_camera(camera: colmap.Camera, where: str) -> None:
-    """Raise InputError if nerfstudio cannot read a camera or one of its values makes no sense."""
-    if camera.model not in colmap.CAMERA_PARAMETERS or camera.model in UNSUPPORTED_CAMERAS:
+def _camera(camera: colmap.Camera, where: str) -> Camera:
+    """Return a camera for the checks; raise InputError if nerfstudio cannot read it, or one of its values is wrong."""
+    model, params, number = camera.model, camera.params, colmap.CAMERA_PARAMETERS.get(camera.model)
+    if number is None or model in UNSUPPORTED_CAMERAS:
         raise InputError(
-            f"{where} has the model {camera.model}, which nerfstudio cannot read: undistort the images with "
+            f"{where} has the model {model}, which nerfstudio cannot read: undistort the images with "
             "`colmap image_undistorter`."
         )
-    focals = _number_of_focals(camera.model)
+    focals = 1 if model.startswith("SIMPLE") or "RADIAL" in model else 2
     values = {"width": camera.width, "height": camera.height}
-    values |= {f"focal length {axis}": value for axis, value in zip("xy", camera.params[:focals], strict=False)}
+    values |= {f"focal length {axis}": value for axis, value in zip("xy", params[:focals], strict=False)}
     check_positive(values, where, list(values))
-    if not np.isfinite(camera.params).all() or len(camera.params) != colmap.CAMERA_PARAMETERS[camera.model]:
+    if not np.isfinite(params).all() or len(params) != number:
         raise InputError(
-            f"{where} has the parameters {camera.params} instead of {colmap.CAMERA_PARAMETERS[camera.model]} finite "
-            "numbers: run COLMAP's mapper again."
+            f"{where} has the parameters {params} instead of {number} finite numbers: run COLMAP's mapper again."
         )
-
-
-def _views(
-    poses: Sequence[colmap.Pose], cameras: Mapping[int, colmap.Camera], poses_path: Path, cameras_path: Path
-) -> list[View]:
-    """Return the poses and their cameras, as the checks of geometry take them."""
-    described = {camera_id: _describe(camera) for camera_id, camera in cameras.items()}
-    rotations = _rotations(np.array([pose[:4] for _, _, pose in poses]))
-    return [
-        View(
-            f"{poses_path}: image {name}",
-            f"{cameras_path}: camera {camera_id}",
-            rotation,
-            -rotation.T @ pose[4:],
-            described[camera_id],
-        )
-        for (name, camera_id, pose), rotation in zip(poses, rotations, strict=True)
-    ]
+    fx, fy, (cx, cy, *rest) = params[0], params[focals - 1], params[focals:]
+    radial, tangential = (rest[:2], rest[2:]) if model == "OPENCV" else (rest, ())
+    return Camera(camera.width, camera.height, fx, fy, cx, cy, tuple(radial), tuple(tangential), "FISHEYE" in model)
 
 
 def _rotations(quats: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -225,21 +197,6 @@ def _rotations(quats: NDArray[np.float64]) -> NDArray[np.float64]:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return np.array(rows).transpose(2, 0, 1)
-
-
-def _describe(camera: colmap.Camera) -> Camera:
-    """Return what COLMAP's parameters of a model that nerfstudio reads stand for."""
-    focals = _number_of_focals(camera.model)
-    fx, fy, (cx, cy, *rest) = camera.params[0], camera.params[focals - 1], camera.params[focals:]
-    tangential = rest[2:] if camera.model == "OPENCV" else ()
-    radial = rest[:2] if camera.model == "OPENCV" else rest
-    fisheye = "FISHEYE" in camera.model
-    return Camera(camera.width, camera.height, fx, fy, cx, cy, tuple(radial), tuple(tangential), fisheye)
-
-
-def _number_of_focals(model: str) -> int:
-    """Return how many focal lengths a camera model has, 1 or 2."""
-    return 1 if model.startswith("SIMPLE") or "RADIAL" in model else 2
 
 
 def _check_points(model_folder: Path, views: Sequence[View], random: str) -> Iterator[Finding]:

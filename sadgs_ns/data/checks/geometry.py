@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from sadgs_ns.outliers import CAMERA_SHARE, POINT_SHARE, REACH, far_outliers
 _FLOAT32_STEP = 2.0**-23
 """Distance of a float32 to the next one, relative to its size; nerfstudio centres poses in float32."""
 _FEWEST_STEPS = 1_000
-"""Least number of steps of float32 within the cameras' spread; with fewer, their positions are too coarse."""
+"""Steps of float32 that the cameras' spread must have at least, so that their positions are not too coarse."""
 _WIDEST, _NARROW, _NARROWEST = 170.0, 0.5, 0.01
 """Angles of view in degrees: lenses without fisheye stay below the first; under the last no pixel shows any depth."""
 _FARTHEST_CENTER = 10
@@ -38,23 +39,19 @@ class Camera:
     """Intrinsics of a camera, as all layouts give them."""
 
     width: int
-    """Width of the image in px."""
     height: int
-    """Height of the image in px."""
+    """Size of the image in px."""
     fx: float
-    """Horizontal focal length in px."""
     fy: float
-    """Vertical focal length in px."""
+    """Focal lengths in px."""
     cx: float
-    """Distance of the principal point from the left edge in px."""
     cy: float
-    """Distance of the principal point from the upper edge in px."""
+    """Distance of the principal point from the left and the upper edge in px."""
     radial: tuple[float, ...] = ()
     """Coefficients k1, k2, … of OpenCV's polynomial of the radius, or of the angle for a fisheye."""
     tangential: tuple[float, ...] = ()
     """Coefficients p1, p2 as OpenCV defines them."""
     fisheye: bool = False
-    """Whether the lens is a fisheye."""
 
 
 class View(NamedTuple):
@@ -69,14 +66,10 @@ class View(NamedTuple):
     centre: NDArray[np.float64]
     """Position of the camera in world units. [3]"""
     camera: Camera
-    """Intrinsics of the camera."""
 
 
 def check_positive(values: Mapping[str, Any], where: str, names: Sequence[str]) -> None:
-    """Raise InputError unless the named values are finite numbers, whole for sizes, and positive but for the centre.
-
-    `where` is the start of a sentence about them.
-    """
+    """Raise InputError unless the named values are finite numbers, sizes whole and all but the centre positive."""
     for name in names:
         if name not in values:
             raise InputError(f"{where} has no {name}: give it one, for all frames or this one.")
@@ -98,36 +91,33 @@ def finite(value: Any, name: str, where: str) -> float:
 
 
 def check_views(views: Sequence[View], training: int, source: Path) -> Generator[Finding, None, bool]:
-    """Check number, cameras, rotations and positions of a file's views; return whether points can be compared."""
-    findings = [*_check_number(len(views), training, source), *check_rotations(views), *_check_centres(views, source)]
+    """Check number, cameras, rotations and positions of a file's views; return whether none of them is an error."""
+    findings: list[Finding] = []
+    if len(views) < 2:
+        findings.append(fault(f"{source} has 1 view, which shows no depth: take at least 2 images, better 20 or more."))
+    elif training == 0:
+        findings.append(fault(f"{source} leaves no view for training: hold out fewer images."))
+    elif training < 3:
+        few = f"{training} training view{'s' * (training > 1)}"
+        findings.append(warning(f"{source} leaves {few}: so few fix no shape; take 20 or more."))
+    findings += [*check_rotations(views), *_check_centres(views, source)]
     first = {view.camera: view.where_camera for view in reversed(views)}  # Of views with one camera the first is named.
     findings += [finding for camera, where in first.items() for finding in _check_camera(camera, where)]
     yield from findings
     return all(finding.severity != "error" for finding in findings)
 
 
-def _check_number(views: int, training: int, source: Path) -> Iterator[Finding]:
-    if views < 2:
-        yield fault(f"{source} has 1 view, which shows no depth: take at least 2 images, better 20 or more.")
-    elif training == 0:
-        yield fault(f"{source} leaves no view for training: hold out fewer images.")
-    elif training < 3:
-        yield warning(
-            f"{source} leaves {training} training view{'s' * (training > 1)}: so few fix no shape; take 20 or more."
-        )
-
-
 def check_rotations(views: Sequence[View]) -> Iterator[Finding]:
-    """Check that the rotations of the views are rotations."""
+    """Check that the views' rotations are neither skewed nor mirrored."""
     rotations = np.stack([view.rotation for view in views])  # [V, 3, 3]
     skewed = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > 0.01
     mirrored = ~skewed & (np.linalg.det(rotations) < 0)
-    for wrong, what, remedy in (
+    for is_wrong, what, remedy in (
         (skewed, "a pose whose rotation is stretched, skewed or 0", "remove what scales its three columns"),
         (mirrored, "a mirrored pose (determinant −1)", "negate one column of its rotation"),
     ):
-        if wrong.any():
-            where = and_more(views[int(wrong.argmax())].where, int(wrong.sum()))
+        if wrong := list(itertools.compress(views, is_wrong)):
+            where = and_more(wrong[0].where, len(wrong))
             yield fault(f"{where} has {what}: {remedy}, or compute the poses again.")
 
 
@@ -137,7 +127,7 @@ def _check_centres(views: Sequence[View], source: Path) -> Iterator[Finding]:
     if len(centres) > 1 and largest <= 1e-9 * max(np.abs(centres).max(), 1.0):
         yield fault(f"{source} has all {len(centres)} cameras in one place, which shows no depth: move between images.")
         return
-    distances, spread = _distances(centres), _spread(centres)
+    distances, spread = _spread(centres)
     offset = float(np.linalg.norm(np.median(centres, axis=0)))
     if spread > 0 and offset * _FLOAT32_STEP * _FEWEST_STEPS > spread:
         yield fault(
@@ -148,11 +138,9 @@ def _check_centres(views: Sequence[View], source: Path) -> Iterator[Finding]:
     if far.any():
         where = and_more(views[int(far.argmax())].where, int(far.sum()))
         times = f"{distances.max() / spread:.3g} times as far from the other cameras as those are from each other"
-        too_far = bool(distances.max() * _FLOAT32_STEP * _FEWEST_STEPS > spread)
-        yield Finding(
-            "error" if too_far else "warning",
-            f"{where} has its camera {times}: remove the image from the poses, or compute them again.",
-        )
+        is_too_far = distances.max() * _FLOAT32_STEP * _FEWEST_STEPS > spread
+        told = f"{where} has its camera {times}: remove the image from the poses, or compute them again."
+        yield (fault if is_too_far else warning)(told)
 
 
 def _check_camera(camera: Camera, where: str) -> Iterator[Finding]:
@@ -160,15 +148,13 @@ def _check_camera(camera: Camera, where: str) -> Iterator[Finding]:
     off = max(abs(camera.cx / width - 0.5), abs(camera.cy / height - 0.5))  # In image sizes from the middle.
     if off > 0.5:
         center = f"its principal point at ({camera.cx:g}, {camera.cy:g}) px, outside its image of {width} × {height} px"
-        yield Finding(
-            "error" if off > _FARTHEST_CENTER else "warning", f"{where} has {center}: correct cx and cy, in pixels."
-        )
+        yield (fault if off > _FARTHEST_CENTER else warning)(f"{where} has {center}: correct cx and cy, in pixels.")
     half_width, half_height = width / 2 / camera.fx, height / 2 / camera.fy
     angle = 2 * math.degrees(math.atan(max(half_width, half_height)))
     if not camera.fisheye and not _NARROW <= angle <= _WIDEST:
         focal = f"the focal length {camera.fx:g} px, with which {width} × {height} px span an angle of {angle:.2g}°"
-        likely = _NARROWEST <= angle <= _WIDEST
-        yield Finding("warning" if likely else "error", f"{where} has {focal}: correct it, in pixels.")
+        is_likely = _NARROWEST <= angle <= _WIDEST
+        yield (warning if is_likely else fault)(f"{where} has {focal}: correct it, in pixels.")
     if not 0.5 <= camera.fx / camera.fy <= 2:
         focals = f"the focal lengths {camera.fx:g} and {camera.fy:g} px, which differ as no lens's do"
         yield warning(f"{where} has {focals}: correct them, in pixels.")
@@ -188,7 +174,7 @@ def _check_camera(camera: Camera, where: str) -> Iterator[Finding]:
 
 
 def _can_be_undone(camera: Camera, radius: float) -> bool:
-    """Return whether pixels up to a distorted radius, in focal lengths from the middle, each show one place alone."""
+    """Return whether each pixel up to a distorted radius, in focal lengths from the middle, shows one place alone."""
     # Without distortion these are radii, or angles of a fisheye.
     undistorted = np.linspace(0, np.pi if camera.fisheye else 4 * radius, 2049)
     with np.errstate(all="ignore"):  # Large coefficients overflow.
@@ -240,28 +226,25 @@ def check_points(positions: NDArray[np.floating], views: Sequence[View], path: P
         )
     positions = positions[~far]
     centres = np.stack([view.centre for view in views])  # [V, 3]
-    middle, spread = np.median(centres, axis=0), _spread(centres)
+    middle, (_, spread) = np.median(centres, axis=0), _spread(centres)
     distance = float(np.median(np.linalg.norm(positions - middle, axis=1)))
     remedy = "take points and poses of one reconstruction, in the same units and axes"
     if spread > 0 and distance > 1e3 * spread:
-        yield Finding(
-            "error" if distance > 1e5 * spread else "warning",
+        yield (fault if distance > 1e5 * spread else warning)(
             f"{path} has its points {distance / spread:.3g} times as far away as the cameras are apart, so that all "
-            f"images see them from one direction: {remedy}.",
+            f"images see them from one direction: {remedy}."
         )
         return
     seeing = _share_of_views_with_points(positions, views)
     if seeing < 0.5:
         whom = f"only {seeing:.0%} of the cameras" if seeing else "no camera"
-        yield Finding(
-            "warning" if seeing else "error", f"{path} has points that {whom} can see in front of it: {remedy}."
-        )
+        yield (warning if seeing else fault)(f"{path} has points that {whom} can see in front of it: {remedy}.")
 
 
 def _share_of_views_with_points(positions: NDArray[np.float64], views: Sequence[View]) -> float:
-    """Return which part of the views, in [0, 1], has any of the points [P, 3] on its image or not far beside it.
+    """Return the share of the views, in [0, 1], that have any of the points [P, 3] on their image or not far beside it.
 
-    Of many views and of many points a part is looked at, evenly through them.
+    Of many views and points an even part is looked at.
     """
     positions = positions[:: len(positions) // 10_000 + 1]  # [P, 3]
     views = views[:: len(views) // 50 + 1]
@@ -277,11 +260,7 @@ def _share_of_views_with_points(positions: NDArray[np.float64], views: Sequence[
     return seeing / len(views)
 
 
-def _distances(centres: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the distances of centres [V, 3] from their median. [V]"""
-    return np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
-
-
-def _spread(centres: NDArray[np.float64]) -> float:
-    """Return how far from their median most of the centres [V, 3] lie; one of them, at least, does not count."""
-    return float(np.quantile(_distances(centres), CAMERA_SHARE, method="lower"))
+def _spread(centres: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Return the distances [V] of centres [V, 3] from their median, and the one within which most lie, but not all."""
+    distances = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
+    return distances, float(np.quantile(distances, CAMERA_SHARE, method="lower"))

@@ -23,6 +23,8 @@ MAX_AUTO_RESOLUTION = 1600
 """Longest side in px up to which nerfstudio looks for no smaller copies of images."""
 MASK_MODES = ("L", "1", "I;16", "I")
 """Pillow's modes that masks may have; nerfstudio trains on every pixel that is not 0."""
+NOT_UPRIGHT, SIDEWAYS = range(2, 9), range(5, 9)
+"""EXIF's orientations, and those of them that exchange the sides. Pillow turns TIFF by itself, and nothing else."""
 _TURN = "turn their pixels as those poses want it, and take the tag away, as ImageMagick's `mogrify -auto-orient` does"
 Rounding = Literal["floor", "round", "ceil"]
 Size = tuple[int, int]
@@ -34,11 +36,9 @@ class Frame:
     """An image with what its camera says."""
 
     image: Path
-    """File of the image."""
     size: Size | None
-    """Size that the camera has, or None where nothing but the image tells."""
+    """The camera's size; None if it has none of its own."""
     mask: Path | None = None
-    """File of the mask, if there is one."""
 
 
 @dataclass(frozen=True)
@@ -46,13 +46,12 @@ class _Image:
     """What is known of an image file."""
 
     size: Size = (0, 0)
-    """Width and height in px, zeros where they are unknown."""
+    """Zeros if it is unknown."""
     mode: str = ""
-    """Pillow's name for the kind of pixels."""
     format: str = ""
-    """Pillow's name for the format of the file."""
+    """Pillow's names for the kind of pixels and the format of the file."""
     orientation: int = 1
-    """EXIF's number: 1 is upright, 2 to 4 keep the size, 5 to 8 exchange its sides. TIFF alone is turned, by Pillow."""
+    """As EXIF tells it."""
     problem: str = ""
     """The rest of a sentence that starts with the file; empty for a good image."""
 
@@ -103,18 +102,17 @@ def automatic_factor(image: Path, copy_of: Callable[[int], Path] | None = None) 
 
 
 def check_images(frames: Sequence[Frame], source: Path, look_for_unused: bool = False) -> Iterator[Finding]:
-    """Check the frames' images and masks, whose sizes are from a source, and say in a note what they are.
+    """Check the images and masks of frames from a source, and say in a note how many and of what kind they are.
 
-    Images are decoded until one shows something, and masks until one leaves a pixel to train on. A warning tells, where
-    asked, of images beside the frames' that no frame uses.
+    Images are decoded until one shows something, and masks until one leaves a pixel to train on. If asked, a warning
+    tells of images beside the frames' that no frame uses.
     """
     with ThreadPoolExecutor() as pool:
         images = list(pool.map(_inspect, (frame.image for frame in frames)))
         masks = list(pool.map(lambda frame: frame.mask and _inspect(frame.mask), frames))
     problems: dict[str, list[tuple[Path, str]]] = defaultdict(list)
-    for found in map(_problem, frames, images, masks, [source] * len(frames)):
-        if found is not None:
-            problems[found[0]].append(found[1:])
+    for found in filter(None, map(_problem, frames, images, masks, [source] * len(frames))):
+        problems[found[0]].append(found[1:])
     for same in problems.values():
         path, text = same[0]
         yield fault(f"{and_more(path, len(same))} {text}.")
@@ -128,12 +126,10 @@ def check_images(frames: Sequence[Frame], source: Path, look_for_unused: bool = 
             f"{source} has {len(frames)} masks that are all black, such as {frames[0].mask}, which leaves no pixel to "
             "train on: make white what is to be trained on."
         )
-    # Where the size does not tell whether the poses are of turned images.
-    lying = [
-        frame.image
-        for frame, image in zip(frames, images, strict=True)
-        if image.format != "TIFF" and image.orientation in (range(2, 9) if len({*image.size}) == 1 else range(2, 5))
-    ]
+    # Of square or mirrored images the size does not tell whether the poses are of the turned ones.
+    unclear = [image.orientation in (NOT_UPRIGHT if len({*image.size}) == 1 else range(2, 5)) for image in images]
+    pairs = zip(frames, images, unclear, strict=True)
+    lying = [frame.image for frame, image, is_unclear in pairs if is_unclear and image.format != "TIFF"]
     if lying and not problems:
         yield warning(
             f"{and_more(lying[0], len(lying))} has an EXIF orientation that would turn it, which training ignores, as "
@@ -160,7 +156,7 @@ def _problem(frame: Frame, image: _Image, mask: _Image | None, source: Path) -> 
         return "small", frame.image, "has {} × {} px: leave it out of the reconstruction".format(*image.size)
     if frame.size not in (None, image.size):
         sizes = "{} × {} px, but its camera in {} {} × {}".format(*image.size, source, *frame.size)
-        if image.orientation in range(5, 9) and frame.size == image.size[::-1]:
+        if image.orientation in SIDEWAYS and frame.size == image.size[::-1]:
             sizes = f"EXIF orientation {image.orientation} and is read as {sizes}: {_TURN}"
             return "orientation", frame.image, f"has {sizes}"
         return "size", frame.image, f"has {sizes}: use the images that the poses were computed from"
@@ -183,13 +179,12 @@ def _describe(source: Path, images: Sequence[_Image], masks: Sequence[_Image | N
     of_size = f"{width} × {height} px" + (" and other sizes" if len(sizes) > 1 else "")
     of_kind = ", ".join(f"{kind} ({count})" if len(kinds) > 1 else kind for kind, count in kinds.most_common())
     masked = sum(mask is not None for mask in masks)
-    with_masks = f", with {masked} masks" if masked else ", without masks"
-    text = f"{source} has {len(images)} images of {of_size}, {of_kind}{with_masks}."
-    if max(max(size) for size in sizes) > MAX_AUTO_RESOLUTION:
-        text += (
-            f" Images of more than {MAX_AUTO_RESOLUTION} px take long: "
-            "`--pipeline.datamanager.camera-res-scale-factor 0.5` trains at half their resolution."
-        )
+    text = (
+        f"{source} has {len(images)} images of {of_size}, {of_kind}, {f'with {masked}' if masked else 'without'} masks."
+    )
+    if max(map(max, sizes)) > MAX_AUTO_RESOLUTION:
+        half = "`--pipeline.datamanager.camera-res-scale-factor 0.5` trains at half their resolution"
+        text += f" Images of more than {MAX_AUTO_RESOLUTION} px take long: {half}."
     return text
 
 
@@ -202,14 +197,13 @@ def _unused_images(frames: Sequence[Frame]) -> list[Path]:
 
 
 def images_in(folder: Path) -> list[Path]:
-    """Return the images right in a folder, sorted; none where there is no folder."""
-    if not folder.is_dir():
-        return []
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+    """Return the images right in a folder, sorted; none if there is no folder."""
+    paths = folder.iterdir() if folder.is_dir() else ()
+    return sorted(path for path in paths if path.suffix.lower() in IMAGE_SUFFIXES)
 
 
 def _inspect(path: Path) -> _Image:
-    """Read an image's header, and decode it only where the file's end does not tell that it is whole."""
+    """Read an image's header, and decode it only if the file's end does not tell that it is whole."""
     again = "copy it again, or leave it out of the reconstruction"
     try:
         if path.stat().st_size == 0:
@@ -232,7 +226,7 @@ def _inspect(path: Path) -> _Image:
 
 
 def _ends_well(path: Path, image: Image.Image) -> bool:
-    """Return whether an image that opened is surely whole, without decoding it; if not, decoding it tells."""
+    """Return whether an open image is whole for sure; otherwise only decoding it tells."""
     if image.format == "JPEG":
         with path.open("rb") as file:
             file.seek(-2, 2)
@@ -247,13 +241,10 @@ def _ends_well(path: Path, image: Image.Image) -> bool:
 
 
 def _is_flat(path: Path, black: bool = False) -> bool:
-    """Return whether all pixels of an image that can be seen have one colour, or whether all of a mask are black.
-
-    The file is decoded for that, an image as JPEG at an eighth of its size.
-    """
+    """Return whether all visible pixels have one colour, or are black; a JPEG is decoded at an eighth of its size."""
     try:
         with Image.open(path) as image:
-            if not black:
+            if not black:  # as in masks
                 image.draft(None, (image.width // 8, image.height // 8))
             seen = image.convert("RGBa") if image.mode == "RGBA" else image  # What is transparent becomes black.
             extrema: Any = seen.getextrema()

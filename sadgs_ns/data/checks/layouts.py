@@ -90,7 +90,7 @@ def find_cameras(data: Path) -> Path | None:
 
 
 def images_folder(data: Path, model: Path, names: Sequence[str] = ()) -> Path | None:
-    """Return the folder that has images of a reconstruction, both relative to the data; None if none has any."""
+    """Return the folder that has images of a reconstruction, both relative to the data, or None."""
     names = names or colmap.image_names(data / model)
     others = [path.name for path in data.iterdir() if not re.search(r"mask|depth|normal|_\d+$", path.name)]
     beside = [folder / "images" for folder in (model, *model.parents)]
@@ -99,7 +99,7 @@ def images_folder(data: Path, model: Path, names: Sequence[str] = ()) -> Path | 
 
 
 def layout_of(data: Path) -> Literal["nerfstudio", "blender", "colmap"] | None:
-    """Return how a capture's folder, or file, is laid out; None if nothing that is known lies there."""
+    """Return the layout of a capture's folder or file; None if it is unknown."""
     if data.is_file() or (data / "transforms.json").is_file():
         return "nerfstudio"
     if (data / "transforms_train.json").is_file():
@@ -108,7 +108,7 @@ def layout_of(data: Path) -> Literal["nerfstudio", "blender", "colmap"] | None:
 
 
 def poses_elsewhere(data: Path) -> str | None:
-    """Return the sentence for a folder in which another program left poses that `ns-process-data` reads, or None."""
+    """Return the sentence for a folder with another program's poses, which `ns-process-data` reads, or None."""
     for pattern, (mark, options) in _EXPORTS.items():
         if files := [file for file in sorted(data.glob(pattern)) if mark in file.read_bytes()]:
             photos = next((folder for folder in (data, *sorted(data.glob("*/"))) if images_in(folder)), data)

@@ -27,18 +27,18 @@ def check_splits(
     locate: Callable[[str], Path],
     options: ParserOptions,
 ) -> Generator[Finding, None, int]:
-    """Check the lists of a capture that has any; nerfstudio then divides the images by nothing else.
+    """Check how the images with poses are divided, and return how many are trained on.
 
     Args:
         names: The names of all images that have poses.
-        lists: What is given as the list of each split, for the splits that have one.
+        lists: The list of each split that has one; if any has, nerfstudio divides the images by nothing else.
         called: The start of a sentence about a split's list.
         locate: The file that a name stands for.
-        options: How the images are divided where there are no lists.
+        options: How the images are divided without lists.
 
-    Returns:
-        How many images are trained on. InputError is raised if "train" or "val" has no list beside others, a list names
-        an unknown image, or a name that shall divide the images does not say where it belongs.
+    Raises:
+        InputError: If "train" or "val" lacks a list beside others, a list names an unknown image, or a name that shall
+            divide the images does not say where it belongs.
     """
     if not lists:
         return _count_training_images(names, options)
@@ -83,7 +83,7 @@ def _count_training_images(names: Sequence[str], options: ParserOptions) -> int:
 
 
 def check_names(names: Iterable[str], source: Path) -> None:
-    """Raise InputError for the first name of an image in a source that leaves its folder, or that a shell would act on.
+    """Raise InputError for the first image of a source whose name leaves its folder, or that a shell would act on.
 
     nerfstudio gives its downscaled copies these names, and has a shell make them.
     """

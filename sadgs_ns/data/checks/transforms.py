@@ -28,7 +28,7 @@ from sadgs_ns.data.checks.images import Frame, automatic_factor, check_images, i
 from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS, GIVE_POSES, ParserOptions, find_reconstruction, no_layout
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
 from sadgs_ns.data.coordinates import fixed_frame
-from sadgs_ns.data.text import refuse_byte_order_mark
+from sadgs_ns.data.text import read_text
 from sadgs_ns.errors import InputError, reason
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -39,13 +39,7 @@ _PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"
 
 @collect_findings
 def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = True) -> Iterator[Finding]:
-    """Check a `transforms.json`, as `ns-process-data` writes it.
-
-    Args:
-        data: The folder, or the file itself.
-        options: How the data will be read.
-        open_images: Whether to look into the images, too.
-    """
+    """Check a `transforms.json`, or the one in a folder, and its images if asked."""
     path = data if data.suffix == ".json" else data / "transforms.json"
     if not path.is_file():
         raise InputError(_no_transforms(data, path))
@@ -59,30 +53,23 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
         factor = automatic_factor(first, lambda by: folder / f"images_{by}" / first.name) if open_images else 1
     if factor > 1 and not (folder / f"images_{factor}").is_dir():
         raise InputError(": ".join(no_copies(folder / f"images_{factor}", factor)) + ".")
+
+    def locate(name: str, kind: str = "images") -> Path:
+        return folder / (f"{kind}_{factor}/{Path(name).name}" if factor > 1 else name)  # Copies lie in one folder.
+
     frames, views = [], []
     for frame in described:
-        image, where = Path(frame["file_path"]), f"{path}: frame {frame['file_path']}"
+        where, mask = f"{path}: frame {frame['file_path']}", frame.get("mask_path")
         check_positive(frame, where, _PINHOLE)
         views.append(view_of(frame, where, _camera(frame, model, where)))
-        mask = frame.get("mask_path")
-        frames.append(
-            Frame(
-                folder / (f"images_{factor}/{image.name}" if factor > 1 else image),
-                scaled_size((int(frame["w"]), int(frame["h"])), factor, "floor"),
-                None if mask is None else folder / (f"masks_{factor}/{Path(mask).name}" if factor > 1 else mask),
-            )
-        )
+        size = scaled_size((int(frame["w"]), int(frame["h"])), factor, "floor")
+        frames.append(Frame(locate(frame["file_path"]), size, None if mask is None else locate(mask, "masks")))
     for name, what in (("mask_path", "masks"), ("depth_file_path", "depths")):
         if 0 < (having := sum(name in frame for frame in described)) < len(frames):
-            raise InputError(
-                f"{path} names {what} for {having} of {len(frames)} frames: give all of them one, or none."
-            )
+            told = f"{path} names {what} for {having} of {len(frames)} frames"
+            raise InputError(f"{told}: give all of them one, or none.")
     names = [frame["file_path"] for frame in described]
     lists = {split: meta[f"{split}_filenames"] for split in SPLITS if f"{split}_filenames" in meta}
-
-    def locate(name: str) -> Path:
-        return folder / (Path(name).name if factor > 1 else name)  # Smaller copies lie in one folder.
-
     training = yield from check_splits(names, lists, lambda split: f"{path}: {split}_filenames", locate, options)
     sound = yield from check_views(views, training, path)
     if 3 <= training == len(frames) < 10:  # With more frames all are trained on only where that was asked for.
@@ -94,27 +81,24 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
 
 
 def _no_transforms(data: Path, path: Path) -> str:
-    """Return the sentence for data whose `transforms.json` is not there."""
+    """Return the sentence for data without a `transforms.json`."""
     if (found := find_reconstruction(data)) is not None:
-        return (
-            f"{path} does not exist, but {data / found} holds a COLMAP reconstruction: leave `nerfstudio-data` out of "
-            "the command."
-        )
+        told = f"{path} does not exist, but {data / found} holds a COLMAP reconstruction"
+        return f"{told}: leave `nerfstudio-data` out of the command."
     return no_layout(data) if data.suffix != ".json" else f"{path} does not exist: {GIVE_POSES}."
 
 
 @collect_findings
 def check_blender(data: Path, options: ParserOptions, open_images: bool = True) -> Iterator[Finding]:
-    """Check a synthetic scene's folder in the layout of NeRF's: `transforms_train.json` and its siblings."""
+    """Check a synthetic scene in NeRF's layout, `transforms_train.json` and its siblings, and its images if asked."""
     if not (data / "transforms_train.json").is_file():
         raise InputError(no_layout(data))
-    for split in ("train", "val", "test"):
+    for split in SPLITS:
         path = data / f"transforms_{split}.json"
         if split == "test" and not path.is_file():
             yield warning(f"{path} does not exist: `ns-eval` will have nothing to measure.")
             continue
-        meta = read_blender(path)
-        described = meta["frames"]
+        described = (meta := read_blender(path))["frames"]
         images = [data / (frame["file_path"].replace("./", "") + ".png") for frame in described]
         size = image_size(images[0])  # The cameras have no size of their own.
         width, height = size if open_images and any(size) else (1, 1)  # The other checks need none.
@@ -138,9 +122,10 @@ def check_blender(data: Path, options: ParserOptions, open_images: bool = True) 
 
 
 def read_transforms(path: Path) -> dict[str, Any]:
-    """Return a `transforms.json` for nerfstudio's parser, with the frames' own values before those of the file.
+    """Return a `transforms.json` for nerfstudio's parser, in which each frame has all values that it shares.
 
-    InputError is raised as by `read_json` and `frames_of`, for a wrong angle of view, and for mixed models of cameras.
+    A frame's own values precede those of the file. Raise InputError as `read_json` and `frames_of`, for a wrong angle
+    of view, and for mixed models of cameras.
     """
     meta, models = read_json(path), set()
     frames = [frame | _completed(frame, meta, path) for frame in frames_of(meta, path)]
@@ -148,15 +133,14 @@ def read_transforms(path: Path) -> dict[str, Any]:
         fisheye, model = bool(values.get("is_fisheye")), str(values.get("camera_model", "OPENCV"))
         models.add("OPENCV" + fisheye * "_FISHEYE" if model in _PERSPECTIVE else model)
     if len(models) > 1:
-        raise InputError(
-            f"{path} mixes the camera models {' and '.join(sorted(models))}: keep the frames of one of them."
-        )
+        mixed = " and ".join(sorted(models))
+        raise InputError(f"{path} mixes the camera models {mixed}: keep the frames of one of them.")
     meta = {name: meta[name] for name in meta if name not in (*_PINHOLE, *_LENS)}
     return {**meta, "camera_model": models.pop(), "frames": frames}
 
 
 def _completed(frame: dict[str, Any], meta: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Return a frame's image, found with / for \\ or without suffix, and intrinsics from what tells of them."""
+    """Return a frame's image, also if its name has \\ for / or no suffix, and intrinsics from what tells of them."""
     where, values, name = f"{path}: frame {frame['file_path']}", {**meta, **frame}, frame["file_path"]
     names = (start + suffix for start in (name, name.replace("\\", "/")) for suffix in ("", *sorted(IMAGE_SUFFIXES)))
     name = next((found for found in names if (path.parent / found).is_file()), name)
@@ -183,7 +167,7 @@ def _focal_length(values: dict[str, Any], side: float, angle: str, where: str) -
 
 
 def read_blender(path: Path) -> dict[str, Any]:
-    """Return a Blender scene's file, or the tests' for a missing one of validation, without the .png that is added."""
+    """Return a Blender scene's file, or that of the tests if validation has none, without the .png that is added."""
     tests = path.with_name("transforms_test.json")
     meta = read_json(tests if path.name == "transforms_val.json" and tests.exists() and not path.exists() else path)
     for frame in frames_of(meta, path):
@@ -193,7 +177,7 @@ def read_blender(path: Path) -> dict[str, Any]:
 
 
 def _check_transform(meta: dict[str, Any], path: Path) -> None:
-    """Raise InputError if what nerfstudio does to all poses makes no sense."""
+    """Raise InputError if what the file says of all poses together makes no sense."""
     try:
         applied = applied_transform(meta)
     except (TypeError, ValueError, OverflowError):
@@ -211,26 +195,19 @@ def _check_transform(meta: dict[str, Any], path: Path) -> None:
 
 
 def applied_transform(meta: dict[str, Any]) -> NDArray[np.float64]:
-    """Return the map [3, 4] from the world of COLMAP's points to that of the poses.
-
-    Where the file says nothing, it is what ns-process-data did before it wrote so.
-    """
+    """Return the map [3, 4] from COLMAP's world to that of the poses, by default that of older ns-process-data."""
     default = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
     return np.array(meta.get("applied_transform", default), dtype=np.float64)
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return the object that a file holds; raise InputError if it is none in JSON and plain UTF-8."""
+    """Return the object that a file holds; raise InputError if it holds none in JSON and plain UTF-8."""
     try:
-        text = path.read_text("utf8")
-        refuse_byte_order_mark(text, path)
-        meta = json.loads(text)
+        meta = json.loads(read_text(path))
     except InputError:
         raise
     except FileNotFoundError:
         raise InputError(f"{path} does not exist: restore it, or {GIVE_POSES}.") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path} is not text in UTF-8: save it in that encoding.") from None
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path} is not readable JSON ({reason(error)}): restore it, or {GIVE_POSES}.") from error
     if not isinstance(meta, dict):
@@ -239,7 +216,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def frames_of(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
-    """Return the frames; raise InputError if there are none, or one has no file path and pose that can be used."""
+    """Return the frames; raise InputError if there are none, or one has no usable file path and pose."""
     frames = meta.get("frames")
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{path} lists no frames, so there is no image to train on: {GIVE_POSES}.")
@@ -264,31 +241,21 @@ def frames_of(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
 
 
 def view_of(frame: dict[str, Any], where: str, camera: Camera) -> View:
-    """Return a frame that `frames_of` found good, with its camera, as the checks of geometry take it."""
+    """Return the view of a frame that `frames_of` found good."""
     pose = np.array(frame["transform_matrix"], dtype=np.float64)
     return View(where, where, (pose[:3, :3] * [1, -1, -1]).T, pose[:3, 3], camera)  # The axes become OpenCV's.
 
 
-def _distortion_of(values: dict[str, Any], where: str) -> dict[str, Any]:
-    """Return a frame's coefficients by name; raise InputError for a list that is not as nerfstudio reads it."""
-    if "distortion_params" not in values:
-        return {name: values[name] for name in _DISTORTION if name in values}
-    listed = values["distortion_params"]
-    if not isinstance(listed, list) or len(listed) not in (6, 12):  # FISHEYE624 has 12.
-        names = ", ".join(_DISTORTION)
-        raise InputError(
-            f"{where} has distortion_params that are no list of 6 numbers ({names}): correct or remove them."
-        )
-    return dict(zip(_DISTORTION, listed, strict=False))
-
-
 def _camera(values: dict[str, Any], model: str, where: str) -> Camera:
     """Return the camera of good values; raise InputError for a distortion that nerfstudio does not support."""
-    size, distortion = (int(values["w"]), int(values["h"])), _distortion_of(values, where)
-    pinhole = (*size, values["fl_x"], values["fl_y"], values["cx"], values["cy"])
-    k1, k2, k3, k4, p1, p2 = (finite(distortion.get(name, 0.0), name, where) for name in _DISTORTION)
+    pinhole = (int(values["w"]), int(values["h"]), *(values[name] for name in _PINHOLE[:4]))
+    listed = values.get("distortion_params", [values.get(name, 0.0) for name in _DISTORTION])
+    if not isinstance(listed, list) or len(listed) not in (6, 12):  # FISHEYE624 has 12.
+        named = f"distortion_params that are no list of 6 numbers ({', '.join(_DISTORTION)})"
+        raise InputError(f"{where} has {named}: correct or remove them.")
+    k1, k2, k3, k4, p1, p2 = (finite(value, name, where) for value, name in zip(listed, _DISTORTION, strict=False))
     if model == "FISHEYE624":
-        if not any(distortion.values()):
+        if not any((k1, k2, k3, k4, p1, p2)):
             raise InputError(f"{where} {UNDISTORTED_FISHEYE}")
         return Camera(*pinhole, fisheye=True)  # Its coefficients mean something else.
     if model == "OPENCV_FISHEYE":
@@ -299,7 +266,7 @@ def _camera(values: dict[str, Any], model: str, where: str) -> Camera:
 
 
 def _check_ply(meta: dict[str, Any], path: Path, views: Sequence[View]) -> Iterator[Finding]:
-    """Check the SfM points and, if there are views, how the points lie to them."""
+    """Check the SfM points that belong to a file of poses."""
     if "ply_file_path" in meta:
         remedy = f"restore it, or remove ply_file_path from {path} to start from random points"
         yield from check_ply(path.parent / str(meta["ply_file_path"]), views, remedy)
