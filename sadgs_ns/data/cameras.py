@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
+from sadgs_ns.data.checks.geometry import NO_COEFFICIENTS
 from sadgs_ns.errors import InputError
 
 _UNDISTORTED = (CameraType.FISHEYE, CameraType.FISHEYE624)
@@ -15,35 +16,31 @@ _UNDISTORTED = (CameraType.FISHEYE, CameraType.FISHEYE624)
 
 
 def refuse_unsupported_cameras(cameras: Cameras) -> None:
-    """Raise InputError for the first of C cameras that is no pinhole and becomes none, with its type and the remedy.
+    """Raise InputError for the first of C cameras that neither is a pinhole nor becomes one.
 
     nerfstudio gives full images of any camera type to a splatting model, and undistorts those of perspective and
-    fisheye cameras that have a distortion coefficient other than 0. The others would be rendered, wrongly, as pinholes.
+    fisheye cameras with a distortion coefficient other than 0. Others would be rendered wrongly, as pinholes.
     """
     types = cameras.camera_type.flatten().cpu()  # [C]
     distorted = torch.zeros_like(types, dtype=torch.bool)
     if cameras.distortion_params is not None and len(types) > 0:
         distorted = (cameras.distortion_params.reshape(len(types), -1) != 0).any(dim=1).cpu()
-    for index, (number, undistorts) in enumerate(zip(types.tolist(), distorted.tolist(), strict=True)):
-        camera_type = CameraType(number)
-        if camera_type is CameraType.PERSPECTIVE or (camera_type in _UNDISTORTED and undistorts):
-            continue
-        if camera_type in _UNDISTORTED:
+    for index, (number, is_distorted) in enumerate(zip(types.tolist(), distorted.tolist(), strict=True)):
+        where, camera_type = f"Camera {index} is {CameraType(number).name}", CameraType(number)
+        if camera_type in _UNDISTORTED and not is_distorted:
+            raise InputError(f"{where} {NO_COEFFICIENTS}")
+        if camera_type not in (CameraType.PERSPECTIVE, *_UNDISTORTED):
             raise InputError(
-                f"Camera {index} is {camera_type.name} with all distortion coefficients 0, and nerfstudio undistorts "
-                "no such image: undistort the images yourself, or give one coefficient a tiny value (k1 = 1e-9)."
+                f"{where}, which sadgs cannot render: it renders PERSPECTIVE cameras only. Make perspective images of "
+                "it (ns-process-data does so with --camera-type equirectangular)."
             )
-        raise InputError(
-            f"Camera {index} is {camera_type.name}, which sadgs cannot render: it renders PERSPECTIVE cameras only. "
-            "Make perspective images of it (ns-process-data does so with --camera-type equirectangular)."
-        )
 
 
 def refuse_failed_undistortion(cameras: Cameras, names: Sequence[Path]) -> None:
-    """Raise InputError for the first of C fisheye images that became black when nerfstudio undistorted them.
+    """Raise InputError for the first of C fisheye images that became black when nerfstudio undistorted it.
 
-    Near a field of view of 180° OpenCV's new intrinsics have a focal length of almost 0, or their centre far outside
-    the image. `cameras` are those after undistortion, and `names` their files.
+    `cameras` are those after undistortion, and `names` their files. Near a field of view of 180° OpenCV gives them a
+    focal length of almost 0, or a centre far outside the image.
     """
     sizes = torch.cat([cameras.width, cameras.height], dim=-1)  # [C, 2] px
     focals, centers = torch.cat([cameras.fx, cameras.fy], dim=-1), torch.cat([cameras.cx, cameras.cy], dim=-1)

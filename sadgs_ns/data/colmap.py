@@ -1,8 +1,7 @@
 """Readers of COLMAP's reconstructions, text and binary, as far as checks and training need them.
 
-The libraries' readers trust the files: a corrupt length makes nerfstudio's and pycolmap's ask for terabytes. To find
-the lengths means to walk through the file as the functions here do, which take a tenth of the time of nerfstudio's
-functions, and less than it takes to import pycolmap.
+The readers of nerfstudio and pycolmap trust the files, and ask for terabytes if a length is corrupt. Those here do not,
+take a tenth of the time of nerfstudio's, and less than it takes to import pycolmap.
 """
 
 from __future__ import annotations
@@ -35,7 +34,6 @@ CAMERA_PARAMETERS = {
 }
 """Number of parameters of each of COLMAP's camera models, in the order of the models' numbers."""
 
-
 Points = tuple[NDArray[np.float64], NDArray[np.uint8]]
 """Positions [P, 3] and colours in 0 … 255 [P, 3]."""
 Pose = tuple[str, int, NDArray[np.float64]]
@@ -47,17 +45,15 @@ class Camera:
     """Intrinsics of a camera, as COLMAP stores them."""
 
     model: str
-    """Name of the camera model."""
     width: int
-    """Width of the images in px."""
     height: int
-    """Height of the images in px."""
+    """Size of the images in px."""
     params: tuple[float, ...]
     """Parameters in the order of the model; the first are focal lengths in px."""
 
 
 class _Binary:
-    """A COLMAP binary file that is read item by item; where it ends too early, reading raises an InputError."""
+    """A COLMAP binary file, read item by item; reading raises an InputError if it ends too early."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.offset = path, 0
@@ -70,7 +66,7 @@ class _Binary:
             raise InputError(f"{path} cannot be read ({reason(error)}): copy the whole reconstruction.") from error
 
     def corrupt(self, detail: str) -> InputError:
-        """Return the error to raise where the content makes no sense."""
+        """Return the error for content that makes no sense."""
         return InputError(f"{self.path} is cut off or corrupt ({detail}): copy it again, or run COLMAP's mapper again.")
 
     def take(self, layout: struct.Struct) -> tuple[Any, ...]:
@@ -79,7 +75,7 @@ class _Binary:
         return layout.unpack_from(self.content, self.offset - layout.size)
 
     def skip(self, size: int) -> None:
-        """Pass over bytes, which have to be there."""
+        """Pass over bytes."""
         if self.offset + size > len(self.content):
             raise self.corrupt(f"it ends after {len(self.content)} bytes, in the middle of an item")
         self.offset += size
@@ -114,7 +110,6 @@ def _read_binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
 
 
 def _read_binary_poses(path: Path) -> Iterator[Pose]:
-    """Yield name, camera and pose (wxyz quaternion, translation) [7] of each image."""
     file = _Binary(path)
     for _ in range(file.take(_COUNT)[0]):
         _, *pose, camera_id = file.take(_POSE)
@@ -125,8 +120,7 @@ def _read_binary_poses(path: Path) -> Iterator[Pose]:
 
 def _read_binary_points(path: Path) -> Points:
     file = _Binary(path)
-    records = []
-    (count,), content, start = file.take(_COUNT), file.content, file.offset
+    (count,), content, start, records = file.take(_COUNT), file.content, file.offset, []
     for _ in range(count):  # There may be millions, so nothing is called in here.
         record = content[start : start + _POINT.itemsize]
         records.append(record)
@@ -165,15 +159,12 @@ def _not_colmap(path: Path, error: ValueError) -> InputError:
 def _read_text_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
     for fields, _ in _read_text(path, 5):
         try:
-            params = tuple(float(value) for value in fields[4:])
-            camera = Camera(fields[1], int(fields[2]), int(fields[3]), params)
-            yield int(fields[0]), camera
+            yield int(fields[0]), Camera(fields[1], int(fields[2]), int(fields[3]), tuple(map(float, fields[4:])))
         except ValueError as error:
             raise _not_colmap(path, error) from error
 
 
 def _read_text_poses(path: Path) -> Iterator[Pose]:
-    """Yield name, camera and pose (wxyz quaternion, translation) [7] of each image."""
     for fields, following in _read_text(path, 10):
         if len(fields) > 10:
             raise InputError(
@@ -196,17 +187,16 @@ def _read_text_poses(path: Path) -> Iterator[Pose]:
 def _read_text_points(path: Path) -> Points:
     lines = [fields[1:7] for fields, _ in _read_text(path, 8)]
     try:
-        values = np.array(lines, np.float64).reshape(-1, 6)
-        colors = values[:, 3:]
+        positions, colors = np.hsplit(np.array(lines, np.float64).reshape(-1, 6), 2)
         if not ((colors >= 0) & (colors <= 255)).all():
             raise ValueError("a colour is not in 0 … 255")
     except ValueError as error:
         raise _not_colmap(path, error) from error
-    return values[:, :3], colors.astype(np.uint8)
+    return positions, colors.astype(np.uint8)
 
 
 def model_kind(model: Path) -> str | None:
-    """Return how a folder's reconstruction is written, "txt", which nerfstudio prefers, or "bin"; None if none is."""
+    """Return the kind of a folder's reconstruction, "txt", which nerfstudio prefers, or "bin"; None if it has none."""
     return next((kind for kind in ("txt", "bin") if (model / f"cameras.{kind}").is_file()), None)
 
 
@@ -221,10 +211,7 @@ def read_cameras(path: Path) -> dict[int, Camera]:
 
 
 def read_poses(path: Path) -> list[Pose]:
-    """Return name, camera id and pose [7] of the images of an `images.bin` or `images.txt`; raises as `read_cameras`.
-
-    A pose is a wxyz quaternion and a translation, from world to camera.
-    """
+    """Return the poses of an `images.bin` or `images.txt`; raises as `read_cameras`."""
     return list((_read_binary_poses if path.suffix == ".bin" else _read_text_poses)(path))
 
 
@@ -234,5 +221,5 @@ def points_file(model: Path) -> Path | None:
 
 
 def read_points(path: Path) -> Points:
-    """Return positions [P, 3] and colours in 0 … 255 [P, 3] of a `points3D.bin` or `.txt`; raises as `read_cameras`."""
+    """Return the points of a `points3D.bin` or `points3D.txt`; raises as `read_cameras`."""
     return (_read_binary_points if path.suffix == ".bin" else _read_text_points)(path)

@@ -19,8 +19,7 @@ Array = NDArray[np.float64]
 TRANSFORMS_NAME = "dataparser_transforms.json"
 """Name of the file in which nerfstudio's trainer writes, beside `config.yml`, how it moved cameras and points."""
 FRAME_KEYS = ("dataparser_transform", "dataparser_scale")
-"""Keys of a `transforms.json` that fix how its data is moved, as that file has it, so that photos may be added and the
-frame of training stays."""
+"""Keys of a `transforms.json` that fix how its data is moved, so that adding photos leaves the frame of training."""
 _TOLERANCE = 1e-4
 """Largest deviation from a similarity of a transform that was written in float32, relative to its scale."""
 
@@ -66,9 +65,9 @@ class Similarity:
         return scales + math.log(self.scale)
 
     def rotations(self, quats: Array) -> Array:
-        """Return rotations of Gaussians, wxyz, in the new frame; a Gaussian is its own point reflection. [N, 4]
+        """Return rotations of Gaussians, wxyz, in the new frame, of unit length; a zero stays as it is. [N, 4]
 
-        The results have unit length; those without a direction stay as they are.
+        A reflection is no rotation, but a Gaussian is its own point reflection.
         """
         from scipy.spatial.transform import Rotation  # It takes half a second to import.
 
@@ -79,34 +78,30 @@ class Similarity:
         return turned
 
     def harmonics(self, degree: int) -> Array:
-        """Return the matrix D that takes coefficients c of colours of degree 0 … 3 to those in the new frame, c' = D c.
+        """Return the matrix D with which colours' coefficients c of degree 0 … 3 become D c in the new frame.
 
-        By definition D = ∫ Y(d)ᵀ Y(Qᵀ d) over the unit sphere, Q being the orthogonal part; the quadrature, 4
-        Gauss–Legendre nodes in z times 8 in azimuth, is exact for the polynomials of degree 2 · 3 in it.
-
-        Returns:
-            [(degree + 1)², (degree + 1)²]
+        D = ∫ Y(d)ᵀ Y(Qᵀ d) over the unit sphere, Q being the orthogonal part. The quadrature, 4 Gauss–Legendre nodes in
+        z times 8 in azimuth, is exact for these polynomials of degree 6. [(degree + 1)², (degree + 1)²]
         """
         z, weights = np.polynomial.legendre.leggauss(4)
         azimuth = np.arange(8) * (2 * np.pi / 8)
         radius = np.sqrt(1 - z**2)[:, None]
-        directions = np.stack(
-            np.broadcast_arrays(radius * np.cos(azimuth), radius * np.sin(azimuth), z[:, None]), -1
-        ).reshape(-1, 3)
+        axes = np.broadcast_arrays(radius * np.cos(azimuth), radius * np.sin(azimuth), z[:, None])
+        directions = np.stack(axes, -1).reshape(-1, 3)
         weights = np.repeat(weights * (2 * np.pi / 8), 8)
         before = spherical_harmonics(directions @ self.orthogonal, degree)
         return (spherical_harmonics(directions, degree) * weights[:, None]).T @ before
 
 
 def spherical_harmonics(directions: Array, degree: int) -> Array:
-    """Return the real spherical harmonics, in the order and with the signs of 3D Gaussian splatting.
+    """Return the real, orthonormal spherical harmonics, in the order and with the signs of 3D Gaussian splatting.
 
     Args:
         directions: Unit vectors. [..., 3]
-        degree: Degree of the harmonics, 0 … 3; another raises ValueError.
+        degree: Highest degree, 0 … 3; another raises ValueError.
 
     Returns:
-        Values of functions that are orthonormal on the unit sphere. [..., (degree + 1)²]
+        [..., (degree + 1)²]
     """
     if not 0 <= degree <= 3:
         raise ValueError(f"spherical harmonics of degree {degree}: only 0 to 3 are known")
@@ -137,7 +132,7 @@ def spherical_harmonics(directions: Array, degree: int) -> Array:
 
 
 def from_data(path: Path) -> Similarity:
-    """Return how nerfstudio moved the data's world into its own, or raise InputError if a run's file does not tell."""
+    """Return how nerfstudio moved the data's world into its own; raise InputError if a run's file does not tell."""
     try:
         content = json.loads(path.read_bytes())
         return _moved_by(content["transform"], content["scale"])
@@ -149,10 +144,10 @@ def from_data(path: Path) -> Similarity:
 
 
 def fixed_frame(meta: Mapping[str, Any], path: Path) -> Similarity | None:
-    """Return how the data of a `transforms.json` is to be moved, or None where nerfstudio's parser decides it.
+    """Return how the content of a `transforms.json`, `meta`, wants to be moved, or None if nerfstudio decides.
 
     Raises:
-        InputError: If the file's content, `meta`, holds anything but a similarity there.
+        InputError: If it wants to be moved by anything but a similarity.
     """
     if not any(name in meta for name in FRAME_KEYS):
         return None

@@ -141,10 +141,7 @@ class _ScanNet(_PointsOfPly, ScanNet):
 
 
 class TransformsParser(_PointsOfPly, Nerfstudio):
-    """nerfstudio's parser of transforms.json, which asks whether to make a PLY.
-
-    Where the file fixes the frame (`coordinates.FRAME_KEYS`), this parser moves cameras and points there.
-    """
+    """nerfstudio's parser of transforms.json, which moves cameras and points to the frame that a file may fix."""
 
     def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
         path = self.config.data if self.config.data.suffix == ".json" else self.config.data / "transforms.json"
@@ -178,7 +175,7 @@ OWN: dict[type, type] = {own.__bases__[-1]: own for own in (_Blender, ColmapPars
 
 
 def _move_to_fixed_frame(outputs: DataparserOutputs, meta: dict[str, Any], path: Path) -> None:
-    """Move a parser's cameras and points to the frame that `transforms.json` fixes; raises as `fixed_frame`."""
+    """Move a parser's cameras and points to the frame that the content of a `transforms.json` fixes, if it does."""
     if (fixed := fixed_frame(meta, path)) is None:
         return
     chosen = Similarity.of(outputs.dataparser_scale * outputs.dataparser_transform.double().numpy())
@@ -195,7 +192,7 @@ def _move_to_fixed_frame(outputs: DataparserOutputs, meta: dict[str, Any], path:
 def points_in_the_run(
     positions: NDArray[np.floating], colors: NDArray[np.uint8], transform: Tensor, scale: float
 ) -> dict[str, Tensor]:
-    """Return points [P, 3] and their colours in 0 … 255 [P, 3] as nerfstudio's metadata hold them.
+    """Return points [P, 3] and their colours in 0 … 255 [P, 3] as nerfstudio's metadata hold them in the run's frame.
 
     The transform [3, 4] maps the data's frame to the run's; the scale is applied after it.
     """

@@ -16,15 +16,15 @@ _PREFIXES = ("", "diffuse_", "scalar_", "vertex_", "color_")
 COLORS = [[prefix + name for name in names] for prefix in _PREFIXES for names in (("red", "green", "blue"), "rgb")]
 """Names that programs give to colours, in small letters."""
 GREY = 127
-"""Colour that is given to points without one, in 0 … 255."""
+"""Colour of points without one, in 0 … 255."""
 
 
 def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return positions [P, 3] in the file's frame and colours in 0 … 255 [P, 3] of a PLY file, text or binary.
 
-    Colours in the file may be of any type and reach to 1 (where they are floating-point numbers), to 255 or to 65,535:
-    the largest one tells. Points without colours are grey. InputError is raised if the file cannot be read, is cut off
-    or holds no points.
+    Colours in the file may be of any type and reach to 1 (if they are floating-point numbers), 255 or 65,535: the
+    largest one tells. Points without colours are grey. Raise InputError if the file cannot be read, is cut off or holds
+    no points.
     """
     try:
         vertices = _read_vertices(path)
@@ -60,10 +60,9 @@ def _read_vertices(path: Path) -> NDArray[Any]:
 
     with path.open("rb") as file:
         header = b""
-        while len(header) < 1 << 16 and not header.rstrip().endswith(b"end_header"):
-            line = file.readline(1 << 12)
-            if not line:
-                break
+        while (
+            len(header) < 1 << 16 and not header.rstrip().endswith(b"end_header") and (line := file.readline(1 << 12))
+        ):
             header += line
         # plyfile reads what follows a header at once, so it is given one that promises nothing.
         empty = PlyData.read(io.BytesIO(re.sub(rb"(?m)^(element\s+\S+)\s+\d+", rb"\1 0", header)))

@@ -19,24 +19,23 @@ from sadgs_ns.errors import InputError, reason
 
 @dataclass(frozen=True)
 class RunCameras:
-    """C pinhole cameras in the frame of training; distortion is left out."""
+    """C pinhole cameras in the frame of training, and their image files; distortion is left out."""
 
     camera_to_worlds: Tensor
     """OpenGL axes (x right, y up, z backward). [C, 3, 4]"""
     Ks: Tensor
     """Intrinsics in px. [C, 3, 3]"""
     sizes: list[tuple[int, int]]
-    """Width and height in px. C of them"""
+    """Widths and heights in px."""
     photos: list[Path]
-    """The image files. C of them"""
 
 
 _CLASS = "<class>"
-"""Key under which an object's mapping has the name of its class."""
+"""Key of an object's class in its mapping."""
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """Reads Python objects as the mappings, lists, paths and texts that they are written as, and makes none."""
+    """Reads Python objects as mappings, lists, paths and texts, as they are written, and makes none of them."""
 
 
 def _plain(loader: _PlainLoader, kind: str, node: yaml.Node) -> Any:
@@ -64,7 +63,7 @@ def find_capture(run: Path) -> tuple[Path, dict[str, Any]]:
 
 
 def _parser(settings: Mapping[str, Any], data: Path) -> Any:
-    """Return a parser with settings as `find_capture` returns them, or where they name none, the one that fits."""
+    """Return a parser with settings as `find_capture` returns them, or the one that fits if they name none."""
     # nerfstudio takes ten seconds to import, which `--help` and wrong arguments need not wait for.
     from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
     from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser
@@ -94,7 +93,7 @@ def _parser(settings: Mapping[str, Any], data: Path) -> Any:
 
 
 def _parse(settings: Mapping[str, Any], data: Path, split: str, as_fits: bool) -> Any:
-    """Parse a split with settings for `_parser`, or where that fails as fits the folder, if it has another layout."""
+    """Parse a split with settings for `_parser`; if that fails, as fits the folder, if that has another layout."""
     try:
         return _parser(settings, data).get_dataparser_outputs(split=split)
     except Exception:
@@ -105,10 +104,14 @@ def _parse(settings: Mapping[str, Any], data: Path, split: str, as_fits: bool) -
 
 
 def read_cameras(run: Path, data: Path | None = None, split: str = "train") -> RunCameras:
-    """Read a run's cameras, in its frame, as the run read them; where it does not tell how, as fits the folder.
+    """Read a run's cameras, in its frame, as the run read them, or as fits the folder if the run does not tell how.
 
-    `data` is that folder; None is where the run's `config.yml` says it was. `split` is "train", or "test" for the views
-    that are held out. InputError is raised if the capture cannot be read, or the run does not tell how it was moved.
+    Args:
+        data: The capture's folder; None is where the run's `config.yml` says that it was.
+        split: "train", or "test" for the views that are held out.
+
+    Raises:
+        InputError: If the capture cannot be read, or the run does not tell how it was moved.
     """
     try:
         found, settings = find_capture(run)
@@ -128,10 +131,6 @@ def read_cameras(run: Path, data: Path | None = None, split: str = "train") -> R
         transform = outputs.dataparser_scale * outputs.dataparser_transform.double().numpy()
         for similarity in (Similarity.of(transform).inverse(), from_data(run / TRANSFORMS_NAME)):
             poses = similarity.poses(poses)
-    sizes = torch.cat([cameras.width, cameras.height], dim=1).tolist()
-    return RunCameras(
-        torch.from_numpy(poses).float(),
-        cameras.get_intrinsics_matrices(),
-        [(width, height) for width, height in sizes],
-        outputs.image_filenames,
-    )
+    sizes = [(int(width), int(height)) for width, height in zip(cameras.width, cameras.height, strict=True)]
+    Ks = cameras.get_intrinsics_matrices()
+    return RunCameras(torch.from_numpy(poses).float(), Ks, sizes, outputs.image_filenames)

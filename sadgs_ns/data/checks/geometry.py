@@ -25,11 +25,11 @@ _WIDEST, _NARROW, _NARROWEST = 170.0, 0.5, 0.01
 """Angles of view in degrees: lenses without fisheye stay below the first; under the last no pixel shows any depth."""
 _FARTHEST_CENTER = 10
 """Distance in image sizes at which a principal point is a mistake, and not due to a crop."""
-UNDISTORTED_FISHEYE = (
-    "is a fisheye with all distortion coefficients 0, and nerfstudio undistorts no such image: undistort the images "
-    "yourself, or give one coefficient a tiny value (k1 = 1e-9)."
+NO_COEFFICIENTS = (
+    "with all distortion coefficients 0, and nerfstudio undistorts no such image: undistort the images yourself, or "
+    "give one coefficient a tiny value (k1 = 1e-9)."
 )
-"""The rest of a sentence about such a camera."""
+"""The rest of a sentence about a fisheye camera."""
 _STRONGEST_DISTORTION = 2.0
 """Quotient of a pixel's distorted and undistorted radius from which on OpenCV's undistortion does not converge."""
 
@@ -163,7 +163,7 @@ def _check_camera(camera: Camera, where: str) -> Iterator[Finding]:
         yield fault(f"{where} has p1, p2 = {coefficients}, which no lens has: calibrate the camera again.")
     if not any(camera.radial):
         if camera.fisheye and camera.radial:
-            yield fault(f"{where} {UNDISTORTED_FISHEYE}")
+            yield fault(f"{where} is a fisheye {NO_COEFFICIENTS}")
         return
     coefficients = ", ".join(f"{value:g}" for value in camera.radial)
     told = f"{where} has the radial distortion {coefficients}, which cannot be undone"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sadgs_ns.data import IMAGE_SUFFIXES, colmap
 from sadgs_ns.data.checks.findings import Finding, collect_findings, note, warning
 from sadgs_ns.data.checks.geometry import (
-    UNDISTORTED_FISHEYE,
+    NO_COEFFICIENTS,
     Camera,
     View,
     check_ply,
@@ -256,7 +256,7 @@ def _camera(values: dict[str, Any], model: str, where: str) -> Camera:
     k1, k2, k3, k4, p1, p2 = (finite(value, name, where) for value, name in zip(listed, _DISTORTION, strict=False))
     if model == "FISHEYE624":
         if not any((k1, k2, k3, k4, p1, p2)):
-            raise InputError(f"{where} {UNDISTORTED_FISHEYE}")
+            raise InputError(f"{where} is a fisheye {NO_COEFFICIENTS}")
         return Camera(*pinhole, fisheye=True)  # Its coefficients mean something else.
     if model == "OPENCV_FISHEYE":
         return Camera(*pinhole, radial=(k1, k2, k3, k4), fisheye=True)
