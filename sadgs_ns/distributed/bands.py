@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 ROWS = 16
@@ -63,8 +64,9 @@ def first_ranks(bands: Sequence[Band]) -> dict[int, int]:
     return {band.view: band.rank for band in reversed(bands)}
 
 
-def views_of_rank(sizes: Sequence[tuple[int, int]], num_ranks: int, rank: int) -> list[int]:
-    """Return of which views of a step a process composites rows.
+@lru_cache(maxsize=1024)
+def views_of_rank(sizes: tuple[tuple[int, int], ...], num_ranks: int, rank: int) -> tuple[int, ...]:
+    """Return of which views of a step a process composites rows; many steps are looked ahead at, and most are alike.
 
     Args:
         sizes: Height and width of each view in px; views of one size are shared out together.
@@ -78,4 +80,4 @@ def views_of_rank(sizes: Sequence[tuple[int, int]], num_ranks: int, rank: int) -
     for view, size in enumerate(sizes):
         groups[size].append(view)
     bands = ((share_out(len(views), height, num_ranks), views) for (height, _), views in groups.items())
-    return [views[band.view] for shared, views in bands for band in shared if band.rank == rank]
+    return tuple(views[band.view] for shared, views in bands for band in shared if band.rank == rank)

@@ -78,7 +78,7 @@ def training_size(
         sizes = torch.cat([cameras.height, cameras.width], dim=-1).unique(dim=0).tolist()
         here = views  # Views of several sizes are shared out size by size, and a process may have a part of each.
         if len(sizes) == 1:
-            here = max(len(views_of_rank([*map(tuple, sizes)] * views, processes, r)) for r in range(processes))
+            here = max(len(views_of_rank((*map(tuple, sizes),) * views, processes, r)) for r in range(processes))
         kept = float((3 * here + QUANTIZED_BYTES * views) * largest)
         structure = float(STRUCTURE_PIXEL_BYTES * max(largest, min(PIXELS_PER_BATCH, here * largest)))
     # A process composites its share of the pixels, and as many pairs as its share of the Gaussians has in all views.

@@ -302,7 +302,7 @@ class SadgsPipeline(VanillaPipeline):
         """Put back the views that were not drawn, because their tile lists were longer than foreseen."""
         forecast = self.model.tile_forecast
         if forecast is not None and (lost := forecast.overflowed(wait=wait)):
-            self.views.put_back(lost)
+            self.views.sampler.requeue(lost)
 
     def _report_at_the_end(self) -> None:
         """Say what was not finite in the last iterations, and how often nothing was drawn."""
@@ -446,11 +446,10 @@ class SadgsPipeline(VanillaPipeline):
 
         This is random states, the order of the views, the settings, and the names and cameras of the images.
         """
-        self._repeat_overflowed(wait=True)  # The views that are put back are part of the order.
+        self._repeat_overflowed(wait=True)  # The sampler's state holds the views that are put back.
         state: dict[str, Any] = {
             "torch": torch.get_rng_state(),
-            "view_order": list(self.datamanager.train_unseen_cameras),
-            "view_shuffle": self.datamanager.random_generator.getstate(),
+            "views": self.views.sampler.state_dict(),
             "settings": self._settings(),
             "schedule": {**asdict(self.schedule), "effort": self.config.effort},
             "max_gaussians": self.model.strategy.max_gaussians,  # It may be lower than the setting.
@@ -478,9 +477,7 @@ class SadgsPipeline(VanillaPipeline):
             self._checkpoint_cap = state["max_gaussians"]
         self.checkpoint_views = state["images"], state["camera_positions"]
         torch.set_rng_state(state["torch"].cpu())
-        if max(state["view_order"], default=0) < len(self.datamanager.train_dataset):
-            self.datamanager.train_unseen_cameras = list(state["view_order"])
-            self.datamanager.random_generator.setstate(state["view_shuffle"])
+        self.views.sampler.load_state_dict(state["views"])
         if "cuda" in state and self.device.type == "cuda":
             torch.cuda.set_rng_state(state["cuda"].cpu(), self.device)
 

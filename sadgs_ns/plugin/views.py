@@ -1,10 +1,11 @@
-"""The training views: which of them a step takes, and their images and cameras on the training device."""
+"""The training views: which of them each step takes, and their images and cameras on the training device."""
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterator, Sequence
+import random
+from collections.abc import Sequence
 from functools import cached_property
+from itertools import chain
 from typing import Any
 
 import torch
@@ -19,30 +20,85 @@ from sadgs_ns.plugin.model import SadgsModel
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 
-class TrainingViews:
-    """Draws training views and gives their cameras.
+class ViewSampler:
+    """Draws the training views of each step, in rounds that have every view once.
+
+    Where a round ends inside a step, the step goes on with those views of the next round that it does not have yet. The
+    views that were passed over come first in the next step. So no view is drawn twice in a step, unless the step takes
+    more views than there are.
 
     Args:
-        datamanager: Holds the images, the cameras, and the order in which views are drawn.
+        num_views: Number of training views, at least 1.
+        seed: Seed of the order, which depends on nothing else.
+    """
+
+    def __init__(self, num_views: int, seed: int) -> None:
+        self.num_views = num_views
+        self._generator = random.Random(seed)
+        self._order: list[int] = []
+        """Views to come; another round is appended when a step, drawn or foreseen, needs it."""
+
+    def draw(self, number: int) -> list[int]:
+        """Return the indices of the next step's views."""
+        return self._take_step(self._order, number)
+
+    def foresee(self, number: int, steps: int) -> list[list[int]]:
+        """Return what `draw` will return in the next steps if no view is put back meanwhile."""
+        order = [*self._order]
+        return [self._take_step(order, number) for _ in range(steps)]
+
+    def requeue(self, views: Sequence[int]) -> None:
+        """Draw views again, first of all, because what was drawn of them did not count."""
+        self._order[:0] = views
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the views to come and the state of the generator that shuffles the rounds after them."""
+        return {"num_views": self.num_views, "order": [*self._order], "generator": self._generator.getstate()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on with a saved order if it is of as many views; otherwise keep the new one."""
+        if state["num_views"] == self.num_views:
+            self._order = [*state["order"]]
+            self._generator.setstate(state["generator"])
+
+    def _take_step(self, order: list[int], number: int) -> list[int]:
+        """Move the views of a step out of an order, which is the sampler's own or a copy of it."""
+        step: list[int] = []
+        while len(step) < number:
+            drawn = step[len(step) // self.num_views * self.num_views :]  # Beyond all views, each comes again.
+            place = next((place for place, view in enumerate(order) if view not in drawn), None)
+            if place is not None:
+                step.append(order.pop(place))
+                continue
+            following = list(range(self.num_views))
+            self._generator.shuffle(following)
+            self._order += following
+            if order is not self._order:
+                order += following
+        return step
+
+
+class TrainingViews:
+    """Draws training views and gives their images and cameras.
+
+    Args:
+        datamanager: Holds the images, the cameras and the seed of the order of the views.
         model: Its camera optimizer corrects the cameras, and its device is the training device.
 
     Attributes:
+        sampler: Draws the views of each step, the same ones in all processes.
         world: The processes of the run, of which each composites its share of a step.
     """
 
     def __init__(self, datamanager: FullImageDatamanager, model: SadgsModel) -> None:
         self.datamanager = datamanager
         self.model = model
+        self.sampler = ViewSampler(len(datamanager.train_dataset), datamanager.config.train_cameras_sampling_seed)
         self.world = World()
-        self._next_round: tuple[Any, list[int]] = None, []  # It is drawn from this state of the random generator.
-        self._foreseen: deque[tuple[list[int], list[int]]] = deque()
-        """Views of the next steps, and which of them this process composites."""
-        self._steps: Iterator[list[int]] = iter(())
-        """Yields the steps after these."""
 
     def __len__(self) -> int:
         """Number of training views."""
-        return len(self.datamanager.train_dataset)
+        return self.sampler.num_views
 
     @cached_property
     def ahead(self) -> ImagesAhead | None:
@@ -60,110 +116,43 @@ class TrainingViews:
         return list(zip(cameras.height.flatten().tolist(), cameras.width.flatten().tolist(), strict=True))
 
     def draw(self, number: int, codes: tuple[bool, bool] = (False, False)) -> list[tuple[int, dict[str, Any]]]:
-        """Draw the views of one step in nerfstudio's order, which is a sequence of rounds through all views.
-
-        Where a round ends inside the step, the next one begins with those of its views that the step does not have yet;
-        the views that were passed over come first in the next step. No view is drawn twice, then, unless a round holds
-        fewer views than the step takes. Raises InputError as `ImagesAhead.take`.
+        """Draw the views of one step, and bring images of the steps after it nearer. Raises as `ImagesAhead.take`.
 
         Args:
-            number: Views to draw, at least 1 and at most as many as there are.
+            number: Views to draw, at least 1.
             codes: Whether this step, and whether the next one, needs the codes of S̄.
 
         Returns:
             Index and data of each view; the image is on the training device, and where images travel so is the mask.
             Where they travel, and there are several processes, views that only others composite come without data.
         """
-        datamanager, device, ahead = self.datamanager, self.model.device, self.ahead
-        indices: list[int] = []
-        for _ in range(number):
-            _take(datamanager.train_unseen_cameras, indices)
-            if not datamanager.train_unseen_cameras:
-                datamanager.train_unseen_cameras = datamanager.sample_train_cameras()
+        indices, ahead = self.sampler.draw(number), self.ahead
         if ahead is None:
-            data = {index: datamanager.cached_train[index] for index in indices}
-            drawn = {i: {**its, "image": its["image"].to(device, non_blocking=True)} for i, its in data.items()}
-        else:
-            composited = self._composited(indices)
-            # This does not change from step to step, so that no view is forgotten that was on its way.
-            share = -(-number // self.world.num_ranks)
-            upcoming, following = self._upcoming(indices, ahead.threads + 2 * share)
-            ahead.load([*composited, *upcoming])
-            drawn = {index: {} for index in indices} | {i: ahead.take(i, codes[0]) for i in composited}
-            ahead.load(upcoming)  # A view that was just taken may come again soon.
-            ahead.send(following, codes[1])
-        return [(index, drawn[index]) for index in indices]
+            cached, device = self.datamanager.cached_train, self.model.device
+            return [(i, {**cached[i], "image": cached[i]["image"].to(device, non_blocking=True)}) for i in indices]
+        # As many are brought nearer in each step, so that no view is forgotten that was on its way.
+        share = -(-number // self.world.num_ranks)
+        steps = self.sampler.foresee(number, 2 + -(-ahead.threads // share))
+        following, *later = [self._composited(step) for step in steps]
+        upcoming = list(dict.fromkeys(chain(following, *later)))[: max(ahead.threads + 2 * share, len(following))]
+        composited = self._composited(indices)
+        ahead.load([*composited, *upcoming])
+        data = {index: ahead.take(index, codes[0]) for index in composited}
+        ahead.load(upcoming)  # A view that was just taken may come again soon.
+        ahead.send(following, codes[1])
+        return [(index, data.get(index, {})) for index in indices]
 
     def _composited(self, indices: Sequence[int]) -> list[int]:
         """Return those of a step's views, each once, of which this process composites rows."""
         if not self.world.alone:
-            of_step = views_of_rank([self.sizes[i] for i in indices], self.world.num_ranks, self.world.rank)
-            indices = [indices[position] for position in of_step]
+            sizes = tuple(self.sizes[index] for index in indices)
+            indices = [indices[position] for position in views_of_rank(sizes, self.world.num_ranks, self.world.rank)]
         return list(dict.fromkeys(indices))
-
-    def _upcoming(self, drawn: list[int], most: int) -> tuple[list[int], list[int]]:
-        """Return the views that this process will composite next, as far as they are known.
-
-        Steps that were foreseen stay so, as long as those that are drawn are among them; looking for all of them anew
-        in each step would take longer the more processes there are.
-
-        Args:
-            drawn: Views of the step that has been drawn.
-            most: Number of views that are enough, unless the next step has more.
-
-        Returns:
-            The views of several steps, each once, and those among them of the next step.
-        """
-        foreseen = self._foreseen
-        anew = not foreseen or foreseen.popleft()[0] != drawn
-        if anew:
-            foreseen.clear()
-            self._steps = self._next_steps(len(drawn))
-        upcoming = dict.fromkeys(index for _, composited in foreseen for index in composited)
-        # What is foreseen is always ahead of what is drawn, so that a round that begins is the one that was foreseen.
-        while len(upcoming) < most or len(foreseen) < 2:
-            step = next(self._steps, None)
-            if step is not None:
-                foreseen.append((step, self._composited(step)))
-                upcoming |= dict.fromkeys(foreseen[-1][1])
-            elif anew:
-                break
-            else:  # Another round may be known by now.
-                foreseen.clear()
-                upcoming.clear()
-                self._steps, anew = self._next_steps(len(drawn)), True
-        following = foreseen[0][1] if foreseen else []
-        return list(upcoming)[: max(most, len(following))], following
-
-    def _next_steps(self, number: int) -> Iterator[list[int]]:
-        """Yield the views of the next steps, as far as they are known without changing what will be drawn."""
-        datamanager = self.datamanager
-        generator, order, more = datamanager.random_generator, [*datamanager.train_unseen_cameras], True
-        while True:
-            step: list[int] = []
-            while len(step) < number:
-                if not order and not more:
-                    # Which part of a step this process composites depends on the views of all of it.
-                    if step and self.world.alone:
-                        yield step
-                    return
-                if not order:
-                    state, more = generator.getstate(), False
-                    if self._next_round[0] != state:
-                        self._next_round = state, datamanager.sample_train_cameras()
-                        generator.setstate(state)
-                    order = [*self._next_round[1]]
-                _take(order, step)
-            yield step
 
     def close(self) -> None:
         """End the threads that decode images; they start again if another view is drawn."""
         if vars(self).get("ahead") is not None:
             vars(self)["ahead"].close()
-
-    def put_back(self, indices: Sequence[int]) -> None:
-        """Let drawn views be the first of the next step, since what was drawn of them did not count."""
-        self.datamanager.train_unseen_cameras = [*indices, *self.datamanager.train_unseen_cameras]
 
     @cached_property
     def cameras(self) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
@@ -199,9 +188,3 @@ class TrainingViews:
         # This takes one copy on the device instead of two; both results are contiguous, as gsplat wants them.
         flat_viewmats, flat_Ks = torch.cat([matrix.flatten() for matrix in viewmats + Ks]).split([16 * n, 9 * n])
         return flat_viewmats.view(n, 4, 4), flat_Ks.view(n, 3, 3).detach()
-
-
-def _take(order: list[int], step: list[int]) -> None:
-    """Move a view from the order of those to come to a step: the first that the step does not have, if there is one."""
-    position = next((position for position, index in enumerate(order) if index not in step), 0)
-    step.append(order.pop(position))

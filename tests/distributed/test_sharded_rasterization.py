@@ -120,6 +120,6 @@ def test_bands_cover_every_row_once_and_evenly(views: int, height: int, ranks: i
 
 
 def test_views_of_several_sizes_are_shared_out_size_by_size():
-    sizes = [(48, 64), (30, 40), (48, 64), (48, 64), (30, 40)]
-    assert [views_of_rank(sizes, 3, rank) for rank in range(3)] == [[0], [2, 1], [3, 4]]
-    assert [views_of_rank(sizes[:2], 2, rank) for rank in range(2)] == [[0], [0, 1]]  # 30 rows are not cut.
+    sizes = (48, 64), (30, 40), (48, 64), (48, 64), (30, 40)
+    assert [views_of_rank(sizes, 3, rank) for rank in range(3)] == [(0,), (2, 1), (3, 4)]
+    assert [views_of_rank(sizes[:2], 2, rank) for rank in range(2)] == [(0,), (0, 1)]  # 30 rows are not cut.

@@ -166,7 +166,7 @@ class OneStep:
 
     def train(self) -> float:
         """Train the step on the view, with all that nerfstudio does before and after, and return its loss."""
-        self.pipeline.datamanager.train_unseen_cameras = [self.view, 7]
+        self.pipeline.views.sampler.requeue([self.view])
         train_step = self.trainer.train_iteration
         losses = []
         self.trainer.train_iteration = lambda step: losses.append(train_step(step)[0])  # type: ignore[method-assign]

@@ -41,6 +41,7 @@ from sadgs_ns.method.schedule import Schedule
 from sadgs_ns.plugin.model import SadgsModel, _load_lpips
 from sadgs_ns.plugin.presets import RATES
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
+from sadgs_ns.plugin.views import ViewSampler
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world, visible
 
 
@@ -130,23 +131,22 @@ def test_each_iteration_takes_its_number_of_views_in_nerfstudio_s_order(
     config = configure(tmp_path, colmap, iterations=3)
     config.pipeline.views_per_iteration = views
     trainer = set_up(config)
-    order = list(trainer.pipeline.datamanager.train_unseen_cameras)
+    order = trainer.pipeline.datamanager.train_unseen_cameras  # of nerfstudio, which draws nothing from it
     assert len(order) == TRAIN_VIEWS
     trainer.train()
-    assert trainer.pipeline.datamanager.train_unseen_cameras == order[3 * views :]
+    assert trainer.pipeline.views.sampler.draw(TRAIN_VIEWS - 3 * views) == order[3 * views :]
 
 
-def test_an_iteration_takes_no_more_views_than_there_are(colmap: ColmapDataParserConfig, tmp_path: Path):
+def test_an_iteration_takes_no_more_views_than_there_are(
+    colmap: ColmapDataParserConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     config = configure(tmp_path, colmap, iterations=3)
     config.pipeline.views_per_iteration = TRAIN_VIEWS + 3
     seen: list[list[int]] = []
-
-    def note(trainer: SadgsTrainer) -> None:
-        seen.append(list(trainer.pipeline.datamanager.train_unseen_cameras))
-
-    trainer = train(config, note)
-    assert trainer.pipeline.views_per_iteration == TRAIN_VIEWS
-    assert len(seen) >= 3 and all(sorted(left) == list(range(TRAIN_VIEWS)) for left in seen), "a round each"
+    draw = ViewSampler.draw
+    monkeypatch.setattr(ViewSampler, "draw", lambda *args: seen.append(draw(*args)) or seen[-1])
+    assert train(config).pipeline.views_per_iteration == TRAIN_VIEWS
+    assert len(seen) == 3 and all(sorted(drawn) == list(range(TRAIN_VIEWS)) for drawn in seen), "a round each"
 
 
 def test_no_view_at_all_per_iteration_is_refused(colmap: ColmapDataParserConfig, tmp_path: Path):
@@ -431,7 +431,7 @@ def test_the_seed_decides_the_order_of_the_views(colmap: ColmapDataParserConfig,
     for seed in (42, 1, 1):
         config = configure(tmp_path, colmap)
         config.machine.seed = seed
-        orders.append(set_up(config).pipeline.datamanager.train_unseen_cameras)
+        orders.append(set_up(config).pipeline.views.sampler.draw(TRAIN_VIEWS))
     assert orders[0] != orders[1] == orders[2] and sorted(orders[0]) == sorted(orders[1])
 
 
@@ -533,7 +533,7 @@ def test_the_loss_of_views_is_the_mean_of_their_own(tmp_path: Path, camera_optim
 
     def loss(*indices: int) -> torch.Tensor:
         pipeline.schedule = Schedule(iterations=3, views_per_iteration=len(indices))
-        pipeline.datamanager.train_unseen_cameras[:0] = indices
+        pipeline.views.sampler.requeue(indices)
         _, losses, metrics = pipeline.get_train_loss_dict(0)
         assert metrics["gaussian_count"] == pytest.approx(pipeline.model.num_points)
         return losses["main_loss"].detach()

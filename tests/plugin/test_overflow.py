@@ -123,7 +123,7 @@ def test_a_checkpoint_after_an_overflow_has_the_views_that_must_be_drawn_again(
     trainer = set_up(short)
     trainer.pipeline.model.tile_forecast = forecast
     location = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
-    keep = lambda step: orders.append(trainer.pipeline.get_extra_state()["view_order"])  # noqa: E731
+    keep = lambda step: orders.append(trainer.pipeline.get_extra_state()["views"]["order"])  # noqa: E731
     trainer.callbacks.append(TrainingCallback(location, keep))
     trainer.train()
     assert orders[3][:2] == forecast.views[3] and forecast.views[4] == forecast.views[3]

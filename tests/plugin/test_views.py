@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,31 +11,21 @@ import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 
 from sadgs_ns.distributed.world import World
-from sadgs_ns.method.schedule import Schedule
 from sadgs_ns.plugin.images import ImagesAhead
-from sadgs_ns.plugin.pipeline import SadgsPipeline
-from sadgs_ns.plugin.views import TrainingViews
+from sadgs_ns.plugin.views import TrainingViews, ViewSampler
 
 STEPS = 1000
 
 
 class Datamanager:
-    """nerfstudio's order of `total` views, without its images."""
+    """A datamanager of `total` views, without their images."""
 
     def __init__(self, total: int, **options: Any) -> None:
         self.config = FullImageDatamanagerConfig(**options)
         heights = torch.tensor([48, 30, 48, 16]).repeat(total)[:total, None]
-        cameras = SimpleNamespace(
-            camera_to_worlds=torch.rand((total, 3, 4), generator=torch.manual_seed(0)), height=heights, width=heights
-        )
+        cameras = SimpleNamespace(height=heights, width=heights)
         self.cached_train = [{"image": torch.zeros(1, 1, 3)} for _ in range(total)]
-        files = [Path(f"{index}.png") for index in range(total)]
-        self.train_dataset: Any = type(
-            "Dataset", (), {"cameras": cameras, "image_filenames": files, "__len__": lambda _: total}
-        )()
-        self.train_unseen_cameras = self.sample_train_cameras()
-
-    sample_train_cameras = FullImageDatamanager.sample_train_cameras
+        self.train_dataset: Any = type("Dataset", (), {"cameras": cameras, "__len__": lambda _: total})()
 
 
 def views_of(datamanager: Any, world: Any = None) -> TrainingViews:
@@ -49,18 +38,37 @@ def steps_of(views: TrainingViews, number: int, steps: int = STEPS) -> list[list
     return [[index for index, _ in views.draw(number)] for _ in range(steps)]
 
 
+def drawn_by(sampler: ViewSampler, number: int, steps: int = STEPS) -> list[list[int]]:
+    return [sampler.draw(number) for _ in range(steps)]
+
+
 @pytest.mark.hard_case(
     "a round of views that ends inside a step of several", "no view twice in a step, all equally often"
 )
-@pytest.mark.parametrize(("total", "number"), [(10, 4), (5, 4), (4, 4), (7, 3), (10, 1)])
+@pytest.mark.parametrize(("total", "number"), [(10, 4), (5, 4), (4, 4), (7, 3), (10, 1), (1, 1)])
 def test_no_view_comes_twice_in_a_step_and_all_come_equally_often(total: int, number: int):
-    views = views_of(Datamanager(total))
     visits: Counter[int] = Counter()
-    for drawn in steps_of(views, number):
+    for drawn in drawn_by(ViewSampler(total, 0), number):
         assert len(set(drawn)) == number
         visits.update(drawn)
         counts = [visits[index] for index in range(total)]
         assert max(counts) - min(counts) <= 1
+
+
+@pytest.mark.parametrize(("total", "number"), [(3, 5), (1, 3), (2, 4)])
+def test_a_step_of_more_views_than_there_are_has_all_of_them_equally_often(total: int, number: int):
+    for drawn in drawn_by(ViewSampler(total, 0), number, steps=100):
+        counts = [drawn.count(index) for index in range(total)]
+        assert len(drawn) == number and max(counts) - min(counts) <= 1
+
+
+@pytest.mark.parametrize(("total", "number"), [(60, 4), (10, 3), (5, 4), (3, 3)])
+def test_foreseen_steps_are_drawn_and_foreseeing_changes_no_order(total: int, number: int):
+    expected = drawn_by(ViewSampler(total, 0), number, steps=60)
+    sampler = ViewSampler(total, 0)
+    for step in range(50):
+        assert sampler.foresee(number, step % 11) == expected[step : step + step % 11]
+        assert sampler.draw(number) == expected[step]
 
 
 @pytest.mark.parametrize(("total", "number"), [(60, 4), (10, 3), (5, 4)])
@@ -119,31 +127,34 @@ def test_each_process_prepares_what_it_composites_and_nothing_else(
 
 @pytest.mark.parametrize(("total", "number"), [(10, 5), (10, 1), (4, 4)])
 def test_the_order_is_nerfstudio_s_where_rounds_end_with_steps(total: int, number: int):
-    drawn = steps_of(views_of(Datamanager(total)), number, steps=20)
+    nerfstudio: Any = SimpleNamespace(
+        config=FullImageDatamanagerConfig(train_cameras_sampling_seed=7), train_dataset=range(total)
+    )
     order: list[int] = []
-    nerfstudio = Datamanager(total)
     while len(order) < 20 * number:
-        order += nerfstudio.train_unseen_cameras
-        nerfstudio.train_unseen_cameras = nerfstudio.sample_train_cameras()
-    assert [index for step in drawn for index in step] == order[: 20 * number]
+        order += FullImageDatamanager.sample_train_cameras(nerfstudio)
+    views = views_of(Datamanager(total, train_cameras_sampling_seed=7))
+    assert [index for step in steps_of(views, number, steps=20) for index in step] == order[: 20 * number]
 
 
 def test_a_view_that_is_passed_over_comes_first_in_the_next_step():
-    datamanager = Datamanager(4)
-    datamanager.train_unseen_cameras = [2, 3]
-    datamanager.sample_train_cameras = lambda: [3, 0, 2, 1]  # type: ignore[method-assign]
-    assert steps_of(views_of(datamanager), 3, steps=2) == [[2, 3, 0], [3, 2, 1]]
+    sampler = ViewSampler(4, 0)
+    sampler.load_state_dict(sampler.state_dict() | {"order": [2, 3, 3, 0, 2, 1]})
+    assert drawn_by(sampler, 3, steps=2) == [[2, 3, 0], [3, 2, 1]]
 
 
+@pytest.mark.parametrize("foreseen", [0, 5])
 @pytest.mark.parametrize(("total", "number"), [(10, 4), (5, 4), (10, 1)])
-def test_views_that_are_put_back_come_next_and_all_count_equally_often(total: int, number: int):
+def test_views_that_are_put_back_come_next_and_all_count_equally_often(total: int, number: int, foreseen: int):
     """Every seventh step fails, which is found out only when two more steps have been drawn."""
-    views = views_of(Datamanager(total))
+    sampler = ViewSampler(total, 0)
     visits: Counter[int] = Counter()
     lost: dict[int, list[int]] = {}
     for step in range(STEPS):
-        views.put_back(back := lost.pop(step - 3, []))
-        drawn = [index for index, _ in views.draw(number)]
+        sampler.requeue(back := lost.pop(step - 3, []))
+        following = sampler.foresee(number, foreseen)
+        drawn = sampler.draw(number)
+        assert following[:1] in ([], [drawn])
         assert len(set(drawn)) == number and set(drawn) >= set(back)
         if step % 7 == 0:
             lost[step] = drawn
@@ -155,25 +166,41 @@ def test_views_that_are_put_back_come_next_and_all_count_equally_often(total: in
 
 
 @pytest.mark.hard_case(
+    "a view that did not count, put back before a step whose other views include it", "comes once in each step"
+)
+def test_a_view_that_is_put_back_twice_comes_in_two_steps():
+    sampler = ViewSampler(4, 0)
+    sampler.load_state_dict(sampler.state_dict() | {"order": [0, 1]})
+    sampler.requeue([0])
+    assert sampler.draw(2) == [0, 1]
+    assert sampler.draw(2)[0] == 0
+
+
+@pytest.mark.hard_case(
     "a run of several views a step is resumed", "goes on with the views of a run that was never stopped"
 )
 @pytest.mark.parametrize(("total", "number"), [(10, 4), (5, 4), (7, 3)])
 def test_a_resumed_run_goes_on_with_the_views_of_the_run_that_was_never_stopped(total: int, number: int):
-    undisturbed = steps_of(views_of(Datamanager(total)), number, steps=60)
+    undisturbed = drawn_by(ViewSampler(total, 0), number, steps=60)
     drawn = []
-    datamanager = Datamanager(total)
-    for _ in range(6):
-        drawn += steps_of(views_of(datamanager), number, steps=10)
-        pipeline: Any = SimpleNamespace(
-            datamanager=datamanager,
-            model=SimpleNamespace(strategy=SimpleNamespace(max_gaussians=1000)),
-            device=torch.device("cpu"),
-            _settings=dict,
-            schedule=Schedule(iterations=10, views_per_iteration=number),
-            config=SimpleNamespace(effort=1.0),
-            _repeat_overflowed=lambda wait: None,
-        )
-        state = SadgsPipeline.get_extra_state(pipeline)
-        datamanager = pipeline.datamanager = Datamanager(total)
-        SadgsPipeline.set_extra_state(pipeline, state)
+    sampler = ViewSampler(total, 0)
+    for seed in range(6):
+        drawn += drawn_by(sampler, number, steps=10)
+        sampler.foresee(number, seed)
+        state = sampler.state_dict()
+        drawn_by(sampler, number, steps=10)  # The state is a copy.
+        sampler = ViewSampler(total, seed)
+        sampler.load_state_dict(state)
     assert drawn == undisturbed
+
+
+def test_a_run_on_another_number_of_views_starts_an_order_of_its_own():
+    state = ViewSampler(7, 0).state_dict()
+    for total in (6, 8):
+        sampler = ViewSampler(total, 1)
+        sampler.load_state_dict(state)
+        assert drawn_by(sampler, 3, steps=20) == drawn_by(ViewSampler(total, 1), 3, steps=20)
+
+
+def test_another_seed_is_another_order():
+    assert ViewSampler(20, 0).draw(20) != ViewSampler(20, 1).draw(20)
