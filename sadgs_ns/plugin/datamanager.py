@@ -24,7 +24,7 @@ from sadgs_ns.data.checks import splits
 from sadgs_ns.data.parsers import OWN, AnyParserConfig, AutomaticDataParserConfig, choose_parser, points_in_the_run
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.memory import available_host_bytes
-from sadgs_ns.plugin.images import ImagesOnDemand, thread_count
+from sadgs_ns.plugin.images import LazyImages, thread_count
 from sadgs_ns.plugin.options import check_ranges, hide
 from sadgs_ns.plugin.processes import processes_on_this_machine
 
@@ -135,7 +135,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
             training with `cache_images` "gpu", else on the host, and pinned there if training is on CUDA.
 
         Raises:
-            InputError: As `ImagesOnDemand.__getitem__`, unless images stay compressed.
+            InputError: As `LazyImages.__getitem__`, unless images stay compressed.
         """
         device, dataset = torch.device(self.device), self.train_dataset if split == "train" else self.eval_dataset
         on_demand = cache_images_device == "compressed"
@@ -144,7 +144,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         if keep:
             size = sum(path.stat().st_size for path in dataset.image_filenames)
             keep = size <= KEPT_FILES_SHARE * available_host_bytes()
-        images = ImagesOnDemand(dataset, keep)
+        images = LazyImages(dataset, keep)
         self.train_cameras = self.train_dataset.cameras
         if on_demand:
             return images

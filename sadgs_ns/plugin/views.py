@@ -15,8 +15,9 @@ from torch import Tensor
 from sadgs_ns.data.cameras import refuse_failed_undistortion
 from sadgs_ns.distributed.bands import views_of_rank
 from sadgs_ns.distributed.world import World
-from sadgs_ns.plugin.images import ImagesAhead, thread_count
+from sadgs_ns.plugin.images import thread_count
 from sadgs_ns.plugin.model import SadgsModel
+from sadgs_ns.plugin.prefetch import ImagePrefetcher
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 
@@ -101,12 +102,14 @@ class TrainingViews:
         return self.sampler.num_views
 
     @cached_property
-    def ahead(self) -> ImagesAhead | None:
+    def ahead(self) -> ImagePrefetcher | None:
         """What brings images from the host ahead of their step; None where all images are on the device."""
         config = self.datamanager.config
         if config.cache_images == "gpu":
             return None
-        return ImagesAhead(self.datamanager.cached_train, self.model.device, thread_count(config.max_thread_workers))
+        return ImagePrefetcher(
+            self.datamanager.cached_train, self.model.device, thread_count(config.max_thread_workers)
+        )
 
     @cached_property
     def sizes(self) -> list[tuple[int, int]]:
@@ -116,7 +119,7 @@ class TrainingViews:
         return list(zip(cameras.height.flatten().tolist(), cameras.width.flatten().tolist(), strict=True))
 
     def draw(self, number: int, codes: tuple[bool, bool] = (False, False)) -> list[tuple[int, dict[str, Any]]]:
-        """Draw the views of one step, and bring images of the steps after it nearer. Raises as `ImagesAhead.take`.
+        """Draw the views of one step, and bring images of the steps after it nearer. Raises as `ImagePrefetcher.take`.
 
         Args:
             number: Views to draw, at least 1.

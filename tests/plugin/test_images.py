@@ -24,7 +24,7 @@ from scenes import HEIGHT, VIEWS, WIDTH
 from sadgs_ns.cli.inspection import get_view
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig
-from sadgs_ns.plugin.images import ImagesAhead
+from sadgs_ns.plugin.prefetch import ImagePrefetcher
 from sadgs_ns.plugin.structure_cache import StructureMaps, observe_training_views
 from sadgs_ns.plugin.trainer import SadgsTrainer
 from sadgs_ns.plugin.views import ViewSampler
@@ -226,16 +226,16 @@ def image_threads() -> list[threading.Thread]:
 def test_threads_decode_ahead_and_end_with_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     seen: list[int] = []
     late: list[int] = []
-    copied = ImagesAhead._copied
+    copied = ImagePrefetcher._copied
 
-    def noted(ahead: ImagesAhead, index: int, with_codes: bool) -> Any:
+    def noted(ahead: ImagePrefetcher, index: int, with_codes: bool) -> Any:
         if index not in ahead._loading:
             late.append(index)
         seen.append(len(image_threads()))
         assert len(ahead._loading) + len(ahead._sent) <= ahead.threads + 3 * 3
         return copied(ahead, index, with_codes)
 
-    monkeypatch.setattr(ImagesAhead, "_copied", noted)
+    monkeypatch.setattr(ImagePrefetcher, "_copied", noted)
     run(nerfstudio_data(tmp_path / "data"), "compressed", tmp_path)
     assert late == [] and min(seen) >= 1
     assert image_threads() == []
@@ -382,7 +382,7 @@ def test_a_step_waits_for_the_copies_of_its_own_images_alone_and_the_host_for_no
     monkeypatch.setattr(torch.cuda, "set_device", devices.append)
     images: Any = [{"image": Pixels.of(f"image {index}", log, kind == "pinned")} for index in range(3)]
     device = torch.device("cuda", 0)
-    ahead = ImagesAhead(images if kind != "compressed" else tuple(images), device, threads=1)
+    ahead = ImagePrefetcher(images if kind != "compressed" else tuple(images), device, threads=1)
     ahead.load([0, 1])
     data = ahead.take(0, with_codes=False)
     assert data["image"].is_cuda

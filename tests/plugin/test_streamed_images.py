@@ -21,8 +21,9 @@ from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.method import memory
 from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
-from sadgs_ns.plugin.images import ImagesAhead, ImagesOnDemand, thread_count
+from sadgs_ns.plugin.images import LazyImages, thread_count
 from sadgs_ns.plugin.memory_plan import image_bytes, place_images
+from sadgs_ns.plugin.prefetch import ImagePrefetcher
 from sadgs_ns.plugin.structure_cache import StructureMaps
 from sadgs_ns.plugin.trainer import SadgsTrainerConfig
 from sadgs_ns.plugin.views import TrainingViews
@@ -48,7 +49,7 @@ def record_images(world: World, config: SadgsTrainerConfig) -> dict[str, Any]:
     computed: list[int] = []
     under_way: list[int] = []
     draw, decode, codes_of, close = (
-        TrainingViews.draw, ImagesOnDemand.__getitem__, StructureMaps.codes_of, ImagesAhead.close
+        TrainingViews.draw, LazyImages.__getitem__, StructureMaps.codes_of, ImagePrefetcher.close
     )  # fmt: skip
 
     def noted_draw(views: TrainingViews, *args: Any, **options: Any) -> Any:
@@ -57,14 +58,14 @@ def record_images(world: World, config: SadgsTrainerConfig) -> dict[str, Any]:
         own.append([index for index, data in drawn if "image" in data])
         return drawn
 
-    def noted_close(ahead: ImagesAhead) -> None:
+    def noted_close(ahead: ImagePrefetcher) -> None:
         under_way.extend([*ahead._loading, *ahead._sent])
         close(ahead)
 
     patch.setattr(TrainingViews, "draw", noted_draw)
-    patch.setattr(ImagesOnDemand, "__getitem__", lambda images, i: decoded.append(i) or decode(images, i))
+    patch.setattr(LazyImages, "__getitem__", lambda images, i: decoded.append(i) or decode(images, i))
     patch.setattr(StructureMaps, "codes_of", lambda maps, data: computed.append(len(data)) or codes_of(maps, data))
-    patch.setattr(ImagesAhead, "close", noted_close)
+    patch.setattr(ImagePrefetcher, "close", noted_close)
     trainer = set_up_together(world, config)
     result = record(trainer)
     parameters = {name: value.detach() for name, value in trainer.pipeline.model.gauss_params.items()}

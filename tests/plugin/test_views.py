@@ -11,7 +11,7 @@ import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 
 from sadgs_ns.distributed.world import World
-from sadgs_ns.plugin.images import ImagesAhead
+from sadgs_ns.plugin.prefetch import ImagePrefetcher
 from sadgs_ns.plugin.views import TrainingViews, ViewSampler
 
 STEPS = 1000
@@ -97,8 +97,8 @@ def test_each_process_prepares_what_it_composites_and_nothing_else(
     options = {"max_thread_workers": 2}
     expected = steps_of(views_of(Datamanager(total, **options)), number, steps=100)
     loaded: list[int] = []
-    load = ImagesAhead._load
-    monkeypatch.setattr(ImagesAhead, "_load", lambda ahead, index: loaded.append(index) or load(ahead, index))
+    load = ImagePrefetcher._load
+    monkeypatch.setattr(ImagePrefetcher, "_load", lambda ahead, index: loaded.append(index) or load(ahead, index))
     composited: list[set[int]] = [set() for _ in expected]
     for rank in range(ranks):
         datamanager = Datamanager(total, cache_images="cpu", **options)
