@@ -156,9 +156,9 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
             with torch.no_grad():
                 model.get_outputs(camera)
             pipeline.train()
-        if hasattr(pipeline, "structure_maps"):  # splatfacto's pipeline has none
+        if hasattr(pipeline, "structure_cache"):  # splatfacto's pipeline has none
             with timed("structure_tensor"):
-                _ = pipeline.structure_maps.codes
+                pipeline.structure_cache.fill()
 
     timer, curve = LoopTimer(), None
     if job.row.curve_every is not None and devices == 1:

@@ -125,8 +125,8 @@ def get_view(pipeline: SadgsPipeline, index: int, split: Split = "train") -> Vie
     viewmat = viewmats_from_camera_to_world(camera.camera_to_worlds)[0]
     return View(
         name=dataset.image_filenames[index].name,
-        photo=pipeline.structure_maps.photo(data),
-        structure_tensor=dequantize(pipeline.structure_maps.codes_of([data])[0]),
+        photo=pipeline.structure_cache.photo(data),
+        structure_tensor=dequantize(next(pipeline.structure_cache.quantized([data]))),
         viewmat=(pipeline.views.viewmat(index) if training else viewmat).to(pipeline.device),
         K=camera.get_intrinsics_matrices()[0].to(pipeline.device),
     )
@@ -253,7 +253,7 @@ def inspect_run(
     pipeline, iterations = load_run(config, load_step, data)
     model, shown = pipeline.model, get_view(pipeline, view, split)
     eta, gradient = (f"{what} all training views" for what in ("η in", "gradients of"))
-    statistics = observe_training_views(pipeline.structure_maps, partial(track, transient=True, description=eta))
+    statistics = observe_training_views(pipeline.structure_cache, partial(track, transient=True, description=eta))
     gradients = screen_gradients(pipeline, partial(track, transient=True, description=gradient))
     print(
         f"{config}: {model.num_points} Gaussians after {iterations} iterations. In {len(pipeline.views)} training "

@@ -99,7 +99,7 @@ class _Stages:
         return self.means.new_zeros((_GAUSSIANS, *self.model.gauss_params[name].shape[1:]))
 
     def structure(self) -> None:
-        quantize(self.pipeline.structure_maps.of_images(self.image))
+        quantize(self.pipeline.structure_cache.of_images(self.image))
 
     def loss(self, dtype: torch.dtype) -> None:  # Images are bytes; a mask or transparency makes them floats.
         predicted = self.image.repeat(self.views, 1, 1, 1).requires_grad_()

@@ -32,7 +32,7 @@ from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin import color_scales, gaussian_maps, texture
 from sadgs_ns.plugin.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
 from sadgs_ns.plugin.model import SadgsModel, in_viewer
-from sadgs_ns.plugin.structure_cache import StructureMaps, observe_training_views
+from sadgs_ns.plugin.structure_cache import StructureCache, observe_training_views
 from sadgs_ns.plugin.viewer import ViewerMarkdown, show_output
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
@@ -103,9 +103,9 @@ class StructurePanel(torch.nn.Module):
     It is a module because the viewer looks for elements in modules only; it has neither parameters nor state.
     """
 
-    def __init__(self, maps: StructureMaps) -> None:
+    def __init__(self, cache: StructureCache) -> None:
         super().__init__()
-        self._maps = maps
+        self._cache = cache
         self._observed: dict[str, Tensor] = {}
         self._refreshed = 0.0
         self._status = ""
@@ -143,7 +143,7 @@ class StructurePanel(torch.nn.Module):
     @property
     def _model(self) -> SadgsModel:
         """The model; the name is private, lest the viewer walk from here into it again."""
-        return self._maps.views.model
+        return self._cache.views.model
 
     def _describe(self) -> str:
         model = self._model
@@ -195,11 +195,11 @@ class StructurePanel(torch.nn.Module):
 
     def observe_now(self) -> None:
         """Observe all training views with the present Gaussians, and say above the table how far that is."""
-        number = len(self._maps.views)
+        number = len(self._cache.views)
         self._set_busy(True)
         try:
             self._read_photos()
-            self._observed = observe_training_views(self._maps, self._told_of)
+            self._observed = observe_training_views(self._cache, self._told_of)
         finally:
             self._set_busy(False)
         seen = int((self._observed["n_total"] > 0).sum())
@@ -219,9 +219,9 @@ class StructurePanel(torch.nn.Module):
 
     def _read_photos(self) -> None:
         """Compute the structure tensors of the training photos, which are then kept."""
-        if "codes" not in vars(self._maps):
+        if not self._cache.filled:
             self._say("Reading the training photos and their texture …")
-            _ = self._maps.codes
+            self._cache.fill()
 
     def _set_busy(self, busy: bool) -> None:
         """Let the button be pressed only while nothing is observed."""
@@ -266,18 +266,18 @@ class StructurePanel(torch.nn.Module):
     @torch.no_grad()
     def picture(self, choice: str, camera: Cameras, rgb: Tensor) -> Panel:
         """Draw one of `CHOICES`, but not "off", as a camera, shape [1], that sees `rgb` [H, W, 3] in [0, 1] sees it."""
-        maps, datamanager, (height, width) = self._maps, self._maps.views.datamanager, rgb.shape[:2]
-        constant = maps.frequency_constant
+        cache, datamanager, (height, width) = self._cache, self._cache.views.datamanager, rgb.shape[:2]
+        constant = cache.frequency_constant
         if choice in OF_STATISTICS:
             return self._of_gaussians(choice, camera, width, height)
         if choice in (PERIOD_HERE, ELLIPSES_HERE):
-            photo, tensor, name = to_picture(rgb), maps.of_images(rgb[None])[0], "this rendering"
+            photo, tensor, name = to_picture(rgb), cache.of_images(rgb[None])[0], "this rendering"
         else:
             cameras = datamanager.train_dataset.cameras.camera_to_worlds
             extent = float(self._model.strategy_state["scene_scale"])
             index = nearest_view(cameras, camera.camera_to_worlds[0].to(cameras), extent)
-            photo = to_picture(maps.photo(datamanager.cached_train[index]))
-            tensor = dequantize(maps.codes[index])
+            photo = to_picture(cache.photo(datamanager.cached_train[index]))
+            tensor = dequantize(cache[index])
             name = f"the nearest training view, `{datamanager.train_dataset.image_filenames[index].name}`"
         scale = min(height / photo.shape[0], width / photo.shape[1])
         size = max(round(scale * photo.shape[0]), 1), max(round(scale * photo.shape[1]), 1)

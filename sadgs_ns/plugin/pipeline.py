@@ -38,7 +38,7 @@ from sadgs_ns.plugin.optimizers import FusedAdam
 from sadgs_ns.plugin.options import check_ranges
 from sadgs_ns.plugin.panel import StructurePanel
 from sadgs_ns.plugin.sharded_steps import losses_of_views
-from sadgs_ns.plugin.structure_cache import StructureMaps
+from sadgs_ns.plugin.structure_cache import StructureCache
 from sadgs_ns.plugin.viewer import shows_output
 from sadgs_ns.plugin.views import TrainingViews
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
@@ -140,7 +140,7 @@ class SadgsPipeline(VanillaPipeline):
             torch.cat([cameras.width, cameras.height], dim=-1),
         )
         self.views = TrainingViews(self.datamanager, self.model)
-        self.structure_maps = StructureMaps(
+        self.structure_cache = StructureCache(
             self.views, config.frequency_constant, energy_blur=config.energy_blur, epsilon=config.epsilon
         )
         number, asked = max(len(self.datamanager.train_dataset), 1), config.views_per_iteration
@@ -157,7 +157,7 @@ class SadgsPipeline(VanillaPipeline):
         self.checkpoint_views: tuple[list[str], Tensor] | None = None
         """What `refuse_other_capture` takes of the checkpoint that was loaded, if there is one."""
         self.stuck = ""  # It says why, where nothing is learned any more.
-        self.structure = StructurePanel(self.structure_maps)
+        self.structure = StructurePanel(self.structure_cache)
         self.cleaning = CleaningPanel(self.views)
         self.model.viewer_outputs = self._viewer_outputs
 
@@ -322,8 +322,8 @@ class SadgsPipeline(VanillaPipeline):
         drawn, self.put_aside = self.put_aside, None
         if drawn is None:
             self._repeat_overflowed()
-            drawn, wants = defaultdict(list), self.model.wants_structure_tensors
-            for index, data in self.views.draw(self.views_per_iteration, (wants(step), wants(step + 1))):
+            drawn = defaultdict(list)
+            for index, data in self.views.draw(self.views_per_iteration):
                 shape = data["image"].shape if self.world.alone else self.views.sizes[index]
                 drawn[shape].append((index, data))
         return drawn
@@ -337,7 +337,7 @@ class SadgsPipeline(VanillaPipeline):
         # Several processes have the same groups, and autograd goes back through them in the reverse order in each.
         for (height, width, *_), views in groups.items():
             indices = [index for index, _ in views]
-            tensors = _stack(self.structure_maps.of_views(views, self.world)) if observes else None
+            tensors = _stack(self.structure_cache.get(views)) if observes else None
             viewmats, Ks = self.views.stacked_cameras(indices)
             if not self.world.alone:
                 parts = losses_of_views(self.model, self.world, viewmats, Ks, width, height, views, tensors)

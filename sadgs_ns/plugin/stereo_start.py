@@ -55,7 +55,7 @@ def start_from_stereo(pipeline: SadgsPipeline, resumed: bool) -> None:
 
 def _add_points(pipeline: SadgsPipeline, number: int) -> None:
     """Compute depth maps of the training views, and add points of them to the initial Gaussians."""
-    model, maps = pipeline.model, pipeline.structure_maps
+    model, cache = pipeline.model, pipeline.structure_cache
     data, started = pipeline.datamanager.cached_train, time.perf_counter()  # Undistorting images changes cameras.
     cameras = pipeline.datamanager.train_dataset.cameras
     viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
@@ -72,10 +72,10 @@ def _add_points(pipeline: SadgsPipeline, number: int) -> None:
     )
 
     def image(view: int) -> Tensor:
-        return maps.photo(data[view])[..., :3]
+        return cache.photo(data[view])[..., :3]
 
     def wavelengths(view: int) -> Tensor:
-        return wavelength(dequantize(maps.codes[view].to(model.device)))
+        return wavelength(dequantize(cache[view]))
 
     points = dense_points(depths, viewmats, image, wavelengths, number)
     added = model.add_points(*points)

@@ -102,14 +102,13 @@ class TrainingViews:
         return self.sampler.num_views
 
     @cached_property
-    def ahead(self) -> ImagePrefetcher | None:
+    def prefetcher(self) -> ImagePrefetcher | None:
         """What brings images from the host ahead of their step; None where all images are on the device."""
         config = self.datamanager.config
         if config.cache_images == "gpu":
             return None
-        return ImagePrefetcher(
-            self.datamanager.cached_train, self.model.device, thread_count(config.max_thread_workers)
-        )
+        threads = thread_count(config.max_thread_workers)
+        return ImagePrefetcher(self.datamanager.cached_train, self.model.device, threads)
 
     @cached_property
     def sizes(self) -> list[tuple[int, int]]:
@@ -118,31 +117,24 @@ class TrainingViews:
         cameras = self.datamanager.train_dataset.cameras
         return list(zip(cameras.height.flatten().tolist(), cameras.width.flatten().tolist(), strict=True))
 
-    def draw(self, number: int, codes: tuple[bool, bool] = (False, False)) -> list[tuple[int, dict[str, Any]]]:
+    def draw(self, number: int) -> list[tuple[int, dict[str, Any]]]:
         """Draw the views of one step, and bring images of the steps after it nearer. Raises as `ImagePrefetcher.take`.
-
-        Args:
-            number: Views to draw, at least 1.
-            codes: Whether this step, and whether the next one, needs the codes of S̄.
 
         Returns:
             Index and data of each view; the image is on the training device, and where images travel so is the mask.
             Where they travel, and there are several processes, views that only others composite come without data.
         """
-        indices, ahead = self.sampler.draw(number), self.ahead
-        if ahead is None:
+        indices, prefetcher = self.sampler.draw(number), self.prefetcher
+        if prefetcher is None:
             cached, device = self.datamanager.cached_train, self.model.device
             return [(i, {**cached[i], "image": cached[i]["image"].to(device, non_blocking=True)}) for i in indices]
+        data = prefetcher.take(self._composited(indices))
         # As many are brought nearer in each step, so that no view is forgotten that was on its way.
         share = -(-number // self.world.num_ranks)
-        steps = self.sampler.foresee(number, 2 + -(-ahead.threads // share))
+        steps = self.sampler.foresee(number, 2 + -(-prefetcher.threads // share))
         following, *later = [self._composited(step) for step in steps]
-        upcoming = list(dict.fromkeys(chain(following, *later)))[: max(ahead.threads + 2 * share, len(following))]
-        composited = self._composited(indices)
-        ahead.load([*composited, *upcoming])
-        data = {index: ahead.take(index, codes[0]) for index in composited}
-        ahead.load(upcoming)  # A view that was just taken may come again soon.
-        ahead.send(following, codes[1])
+        upcoming = list(dict.fromkeys(chain(following, *later)))
+        prefetcher.prefetch(upcoming[: max(prefetcher.threads + 2 * share, len(following))], following)
         return [(index, data.get(index, {})) for index in indices]
 
     def _composited(self, indices: Sequence[int]) -> list[int]:
@@ -154,8 +146,8 @@ class TrainingViews:
 
     def close(self) -> None:
         """End the threads that decode images; they start again if another view is drawn."""
-        if vars(self).get("ahead") is not None:
-            vars(self)["ahead"].close()
+        if vars(self).get("prefetcher") is not None:
+            vars(self)["prefetcher"].close()
 
     @cached_property
     def cameras(self) -> tuple[Sequence[Tensor], Sequence[Tensor]]:

@@ -204,13 +204,13 @@ def test_a_gpu_that_is_full_is_one_sentence(
 def test_observing_all_views_finds_what_training_finds(run: Path):
     """Training's own code, shown every view once and nothing learned in between."""
     pipeline, _ = inspection.load_run(run, load_step=8)
-    observed, model = observe_training_views(pipeline.structure_maps), pipeline.model
+    observed, model = observe_training_views(pipeline.structure_cache), pipeline.model
     model.train()
     model.optimizers = {}
     model.strategy_state = model.strategy.initialize_state()
     model.step = 0
     for index in range(TRAIN_VIEWS):
-        tensors, Ks = pipeline.structure_maps.codes[index][None], pipeline.views.cameras[1][index][None]
+        tensors, Ks = pipeline.structure_cache[index][None], pipeline.views.cameras[1][index][None]
         viewmats = pipeline.views.viewmat(index)[None]
         model.get_training_outputs(viewmats, Ks, WIDTH, HEIGHT, [index], tensors)
     trained = model.strategy_state
@@ -224,8 +224,8 @@ def test_observing_all_views_finds_what_training_finds(run: Path):
 
 def test_observing_leaves_the_run_as_it_was(early: SadgsPipeline):
     before, random = early.state_dict()["_model.gauss_params.means"].clone(), torch.get_rng_state()
-    first = observe_training_views(early.structure_maps)
-    torch.testing.assert_close(observe_training_views(early.structure_maps), first)
+    first = observe_training_views(early.structure_cache)
+    torch.testing.assert_close(observe_training_views(early.structure_cache), first)
     inspection.screen_gradients(early, iter)
     assert torch.equal(torch.get_rng_state(), random)
     assert torch.equal(early.model.means, before)
@@ -233,7 +233,7 @@ def test_observing_leaves_the_run_as_it_was(early: SadgsPipeline):
 
 
 def test_the_structure_step_makes_the_children_of_the_plan(early: SadgsPipeline):
-    model, statistics = early.model, observe_training_views(early.structure_maps)
+    model, statistics = early.model, observe_training_views(early.structure_cache)
     counts, fits = model.strategy.split_plan(
         model.gauss_params, statistics, model.strategy.max_gaussians - model.num_points
     )
@@ -327,7 +327,7 @@ def test_drawing_which_the_viewer_may_break_off_loads_no_photo(choice: str, pane
     assert torch.equal(outputs[OUTPUT], outputs["rgb"])
     assert "cached_train" not in vars(pipeline.datamanager)
     panel.choose()
-    assert "cached_train" in vars(pipeline.datamanager) and "codes" in vars(pipeline.structure_maps)
+    assert "cached_train" in vars(pipeline.datamanager) and pipeline.structure_cache.filled
     outputs = in_the_viewer(lambda: pipeline.model.get_outputs_for_camera(a_camera(pipeline)))
     assert not torch.equal(outputs[OUTPUT], outputs["rgb"])
 
@@ -389,8 +389,8 @@ def test_a_finished_run_is_observed_when_eta_is_asked_for(panel: StructurePanel)
 
 def test_where_every_pixel_is_masked_the_panel_says_that_none_was_observed(panel: StructurePanel):
     pipeline = pipeline_of(panel)
-    for codes in pipeline.structure_maps.codes:
-        codes[..., 1] = INVALID
+    for index in range(len(pipeline.views)):
+        pipeline.structure_cache[index][..., 1] = INVALID
     panel.choice.value = "η"
     panel.choose()
     statistics = panel.statistics()
@@ -401,7 +401,7 @@ def test_where_every_pixel_is_masked_the_panel_says_that_none_was_observed(panel
 
 def test_sliders_reach_the_strategy_and_the_plan(panel: StructurePanel):
     pipeline = pipeline_of(panel)
-    strategy, statistics = pipeline.model.strategy, observe_training_views(pipeline.structure_maps)
+    strategy, statistics = pipeline.model.strategy, observe_training_views(pipeline.structure_cache)
     split = []
     for tau in (1.0, 0.5, 0.0):
         panel.set_tau_split.value = tau

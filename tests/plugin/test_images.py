@@ -25,7 +25,7 @@ from sadgs_ns.cli.inspection import get_view
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig
 from sadgs_ns.plugin.prefetch import ImagePrefetcher
-from sadgs_ns.plugin.structure_cache import StructureMaps, observe_training_views
+from sadgs_ns.plugin.structure_cache import StructureCache, observe_training_views
 from sadgs_ns.plugin.trainer import SadgsTrainer
 from sadgs_ns.plugin.views import ViewSampler
 
@@ -194,11 +194,11 @@ def test_training_is_the_same_bit_for_bit_wherever_images_are_kept(data: str, tm
     for tier in TIERS:
         trainer, steps = run(DATA[data](tmp_path / f"data {tier}"), tier, tmp_path / tier)
         assert isinstance(trainer.pipeline.datamanager.cached_train, list) is (tier != "compressed")
-        assert (trainer.pipeline.views.ahead is None) is (tier == "gpu")
+        assert (trainer.pipeline.views.prefetcher is None) is (tier == "gpu")
         states.append(checkpoint(trainer, ITERATIONS - 1)["pipeline"])
         sums.append(steps)
         view = get_view(trainer.pipeline, 1)  # as sadgs-inspect and the viewer's panel ask for it
-        observed = observe_training_views(trainer.pipeline.structure_maps)
+        observed = observe_training_views(trainer.pipeline.structure_cache)
         seen.append([view.photo, view.structure_tensor.nan_to_num(-1), view.K, *observed.values()])
     for tensors in zip(*seen, strict=True):
         assert all(torch.equal(tensor, tensors[0]) for tensor in tensors)
@@ -226,18 +226,21 @@ def image_threads() -> list[threading.Thread]:
 def test_threads_decode_ahead_and_end_with_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     seen: list[int] = []
     late: list[int] = []
-    copied = ImagePrefetcher._copied
+    take, copy = ImagePrefetcher.take, ImagePrefetcher._copy
 
-    def noted(ahead: ImagePrefetcher, index: int, with_codes: bool) -> Any:
-        if index not in ahead._loading:
-            late.append(index)
+    def noted_take(prefetcher: ImagePrefetcher, indices: list[int]) -> Any:
+        late.extend(index for index in indices if index not in prefetcher._loading | prefetcher._sent)
+        return take(prefetcher, indices)
+
+    def noted_copy(prefetcher: ImagePrefetcher, index: int) -> Any:
         seen.append(len(image_threads()))
-        assert len(ahead._loading) + len(ahead._sent) <= ahead.threads + 3 * 3
-        return copied(ahead, index, with_codes)
+        assert len(prefetcher._loading) + len(prefetcher._sent) <= prefetcher.threads + 3 * 3
+        return copy(prefetcher, index)
 
-    monkeypatch.setattr(ImagePrefetcher, "_copied", noted)
+    monkeypatch.setattr(ImagePrefetcher, "take", noted_take)
+    monkeypatch.setattr(ImagePrefetcher, "_copy", noted_copy)
     run(nerfstudio_data(tmp_path / "data"), "compressed", tmp_path)
-    assert late == [] and min(seen) >= 1
+    assert len(late) == 3 and min(seen) >= 1, "The first step's images alone are late."
     assert image_threads() == []
 
 
@@ -284,12 +287,14 @@ def test_an_image_that_is_broken_at_the_start_ends_the_run_in_one_sentence(tmp_p
     assert image_threads() == []
 
 
-def test_codes_are_computed_once_beside_decoded_images_and_anew_beside_compressed_ones(
+def test_s_is_computed_once_beside_decoded_images_and_anew_beside_compressed_ones(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     number: list[int] = []
-    codes_of = StructureMaps.codes_of
-    monkeypatch.setattr(StructureMaps, "codes_of", lambda maps, data: number.append(len(data)) or codes_of(maps, data))
+    compute = StructureCache.quantized
+    monkeypatch.setattr(
+        StructureCache, "quantized", lambda cache, data: number.append(len(data)) or compute(cache, data)
+    )
     counts = {}
     for tier in TIERS:
         number.clear()
@@ -304,15 +309,15 @@ def test_images_in_bytes_are_not_searched_for_nan_because_the_host_would_wait(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     known: list[bool] = []
-    compute = StructureMaps.of_images
+    compute = StructureCache.of_images
 
-    def noted(maps: StructureMaps, images: Any, masks: Any = None, known_finite: bool = False) -> Any:
+    def noted(cache: StructureCache, images: Any, masks: Any = None, known_finite: bool = False) -> Any:
         known.append(known_finite)
         with monkeypatch.context() as patch:
             patch.setattr(torch.Tensor, "isfinite", None)  # Asking for it is an error.
-            return compute(maps, images, masks, known_finite)
+            return compute(cache, images, masks, known_finite)
 
-    monkeypatch.setattr(StructureMaps, "of_images", noted)
+    monkeypatch.setattr(StructureCache, "of_images", noted)
     run(nerfstudio_data(tmp_path / "data", masks=True), COMPRESSED, tmp_path)
     assert known and all(known)
 
@@ -380,20 +385,25 @@ def test_a_step_waits_for_the_copies_of_its_own_images_alone_and_the_host_for_no
     monkeypatch.setattr(torch.cuda, "stream", contextlib.nullcontext)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device: training)
     monkeypatch.setattr(torch.cuda, "set_device", devices.append)
+    pin, wanted = ImagePrefetcher._pinned, threading.Event()
+    monkeypatch.setattr(
+        ImagePrefetcher, "_pinned", lambda prefetcher, index: (index < 2 or wanted.wait()) and pin(prefetcher, index)
+    )
     images: Any = [{"image": Pixels.of(f"image {index}", log, kind == "pinned")} for index in range(3)]
     device = torch.device("cuda", 0)
-    ahead = ImagePrefetcher(images if kind != "compressed" else tuple(images), device, threads=1)
-    ahead.load([0, 1])
-    data = ahead.take(0, with_codes=False)
-    assert data["image"].is_cuda
+    prefetcher = ImagePrefetcher(images if kind != "compressed" else tuple(images), device, threads=1)
+    data = prefetcher.take([0])
+    assert data[0]["image"].is_cuda
     steps = ["image 0 is copied", "training waits for image 0 is copied", "training uses image 0"]
     assert log == steps
+    prefetcher.prefetch([1], following=[])
     if kind != "pinned":
-        ahead._loading[1].result()
-    ahead.send([1, 2], with_codes=False)  # No thread has loaded image 2.
+        prefetcher._loading[1].result()
+    prefetcher.prefetch([1, 2], following=[1, 2])  # No thread has loaded image 2.
     steps += ["image 1 is copied"] + ["image 2 is copied"] * (kind == "pinned")
     assert log == steps
-    ahead.take(1, with_codes=False)
+    prefetcher.take([1])
     assert log == [*steps, "training waits for image 1 is copied", "training uses image 1"]
     assert devices == ([device] if kind != "pinned" else [])  # A thread of its own would pin for the first GPU.
-    ahead.close()
+    wanted.set()
+    prefetcher.close()

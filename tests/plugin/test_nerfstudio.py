@@ -519,7 +519,8 @@ def test_views_of_two_sizes_train_together(tmp_path: Path):
     pipeline.get_train_loss_dict, pipeline.model.get_training_outputs = count_sizes, note_size  # type: ignore
     trainer.train()
     assert set(numbers_of_sizes) == {1, 2}
-    assert {tuple(tensor.shape[:2]) for tensor in pipeline.structure_maps.codes} == {(HEIGHT, WIDTH), (30, 40)}
+    sizes = {tuple(pipeline.structure_cache[index].shape[:2]) for index in range(len(pipeline.views))}
+    assert sizes == {(HEIGHT, WIDTH), (30, 40)}
     assert is_finite(pipeline.model)
 
 
@@ -557,7 +558,8 @@ def test_masked_pixels_have_no_structure_tensor_and_no_part_in_the_loss(tmp_path
     config.pipeline.views_per_iteration = 2
     trainer = train(config)
     pipeline = trainer.pipeline
-    for tensor in pipeline.structure_maps.codes:
+    for index in range(len(pipeline.views)):
+        tensor = pipeline.structure_cache[index]
         assert dequantize(tensor[:, : WIDTH // 2]).isnan().all()
         assert dequantize(tensor[:, WIDTH // 2 :]).amax() > 0
     data = pipeline.datamanager.cached_train[0]
@@ -585,7 +587,7 @@ def test_transparent_images_train_in_front_of_the_background(tmp_path: Path):
     target = model.composite_with_background(data["image"].to(model.device) / 255, white)
     assert (target[:, : WIDTH // 2] == 1).all() and target[:, WIDTH // 2 :].amin() < 1
     model.set_background(torch.zeros(3))  # as the viewer does whenever it draws
-    torch.testing.assert_close(trainer.pipeline.structure_maps.photo(data), target)
+    torch.testing.assert_close(trainer.pipeline.structure_cache.photo(data), target)
     trainer.train()
     assert is_finite(model)
 

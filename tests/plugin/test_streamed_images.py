@@ -24,7 +24,7 @@ from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
 from sadgs_ns.plugin.images import LazyImages, thread_count
 from sadgs_ns.plugin.memory_plan import image_bytes, place_images
 from sadgs_ns.plugin.prefetch import ImagePrefetcher
-from sadgs_ns.plugin.structure_cache import StructureMaps
+from sadgs_ns.plugin.structure_cache import StructureCache
 from sadgs_ns.plugin.trainer import SadgsTrainerConfig
 from sadgs_ns.plugin.views import TrainingViews
 
@@ -48,8 +48,8 @@ def record_images(world: World, config: SadgsTrainerConfig) -> dict[str, Any]:
     decoded: list[int] = []
     computed: list[int] = []
     under_way: list[int] = []
-    draw, decode, codes_of, close = (
-        TrainingViews.draw, LazyImages.__getitem__, StructureMaps.codes_of, ImagePrefetcher.close
+    draw, decode, quantized, close = (
+        TrainingViews.draw, LazyImages.__getitem__, StructureCache.quantized, ImagePrefetcher.close
     )  # fmt: skip
 
     def noted_draw(views: TrainingViews, *args: Any, **options: Any) -> Any:
@@ -64,7 +64,7 @@ def record_images(world: World, config: SadgsTrainerConfig) -> dict[str, Any]:
 
     patch.setattr(TrainingViews, "draw", noted_draw)
     patch.setattr(LazyImages, "__getitem__", lambda images, i: decoded.append(i) or decode(images, i))
-    patch.setattr(StructureMaps, "codes_of", lambda maps, data: computed.append(len(data)) or codes_of(maps, data))
+    patch.setattr(StructureCache, "quantized", lambda cache, data: computed.append(len(data)) or quantized(cache, data))
     patch.setattr(ImagePrefetcher, "close", noted_close)
     trainer = set_up_together(world, config)
     result = record(trainer)
@@ -96,7 +96,7 @@ def test_processes_that_decode_what_they_composite_train_as_if_each_had_all_imag
     assert (
         [sum(result["computed"] for result in of_tier[tier]) for tier in of_tier]
         == [
-            ranks * TRAINING,  # All have all images and compute all codes.
+            ranks * TRAINING,  # All have all images and compute S̄ of all.
             len({index for step in of_tier["cpu"][0]["steps"][:STRUCTURE_EVERY] for index in step}),
             visits,
         ]

@@ -80,12 +80,12 @@ def test_images_that_are_decoded_ahead_change_no_order_and_are_awaited_once(tota
     views = views_of(datamanager)
     awaited = 0
     for step in expected:
-        assert views.ahead is not None
-        known = views.ahead._loading.keys() | views.ahead._sent.keys()
+        assert views.prefetcher is not None
+        known = views.prefetcher._loading.keys() | views.prefetcher._sent.keys()
         drawn = [index for index, _ in views.draw(number)]
         assert drawn == step
         awaited += not known.issuperset(drawn)
-        assert len(views.ahead._loading) + len(views.ahead._sent) <= 2 + 2 * number
+        assert len(views.prefetcher._loading) + len(views.prefetcher._sent) <= 2 + 2 * number
     assert awaited == 1
     views.close()
 
@@ -97,8 +97,8 @@ def test_each_process_prepares_what_it_composites_and_nothing_else(
     options = {"max_thread_workers": 2}
     expected = steps_of(views_of(Datamanager(total, **options)), number, steps=100)
     loaded: list[int] = []
-    load = ImagePrefetcher._load
-    monkeypatch.setattr(ImagePrefetcher, "_load", lambda ahead, index: loaded.append(index) or load(ahead, index))
+    pin = ImagePrefetcher._pinned
+    monkeypatch.setattr(ImagePrefetcher, "_pinned", lambda images, index: loaded.append(index) or pin(images, index))
     composited: list[set[int]] = [set() for _ in expected]
     for rank in range(ranks):
         datamanager = Datamanager(total, cache_images="cpu", **options)
@@ -108,16 +108,16 @@ def test_each_process_prepares_what_it_composites_and_nothing_else(
         views = views_of(datamanager, world)
         loaded.clear()
         awaited, taken = 0, Counter[int]()
-        assert views.ahead is not None
+        assert views.prefetcher is not None
         for step, of_all in zip(expected, composited, strict=True):
-            known = views.ahead._loading.keys() | views.ahead._sent.keys()
+            known = views.prefetcher._loading.keys() | views.prefetcher._sent.keys()
             drawn = views.draw(number)
             assert [index for index, _ in drawn] == step
             own = {index for index, data in drawn if "image" in data}
             taken.update(own)
             of_all |= own
             awaited += not known.issuperset(own)
-        under_way = Counter(views.ahead._loading.keys() | views.ahead._sent.keys())
+        under_way = Counter(views.prefetcher._loading.keys() | views.prefetcher._sent.keys())
         assert under_way.total() <= 2 + 2 * number
         views.close()
         assert taken <= Counter(loaded) <= taken + under_way
