@@ -1,7 +1,8 @@
-"""`sadgs-doctor [DATA]`, which says what this machine offers to training, and what a data folder holds."""
+"""`sadgs-doctor [DATA]`: what this machine offers to training, and what a data folder holds."""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes.util
 import importlib.util
 import os
@@ -23,19 +24,16 @@ from sadgs_ns.data.checks.findings import Finding, fault, note, warning
 from sadgs_ns.errors import free_space, reason
 
 PACKAGES = ("sadgs_ns", "torch", "torchvision", "gsplat", "nerfstudio", "triton", "pycolmap", "open3d")
-"""Packages whose versions are printed."""
 _LPIPS_FILE = "alexnet-owt-7be5be79.pth"
 """The file in which torchvision keeps the weights of LPIPS's AlexNet."""
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that matter; "missing" for those that are not installed."""
-    found = {"python": platform.python_version()}
+    """Return the versions of Python and of `PACKAGES`; "missing" for those that are not installed."""
+    found = {"python": platform.python_version()} | dict.fromkeys(PACKAGES, "missing")
     for package in PACKAGES:
-        try:
+        with contextlib.suppress(PackageNotFoundError):
             found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "missing"
     return found
 
 
@@ -56,7 +54,11 @@ def check_machine() -> Iterator[Finding]:
             f"torch is {built} and sees no GPU: training runs on {os.cpu_count()} CPU cores, which is for small scenes "
             "and tests; for more, install a GPU's driver and a torch for its CUDA."
         )
-    yield from _check_lpips()
+    if (weights := Path(torch.hub.get_dir(), "checkpoints", _LPIPS_FILE)).is_file():
+        yield note(f"LPIPS with AlexNet has its weights: {weights}.")
+    else:
+        remedy = f"the first `ns-eval` downloads them to {weights}, or leaves it out"
+        yield warning(f"LPIPS with AlexNet has no weights: {remedy}.")
     for program, package, use in (
         ("ffmpeg", "ffmpeg", "`ns-render` needs it for videos, and nerfstudio to scale images down"),
         ("libusb-1.0", "libusb-1.0-0", "`ns-export`, `ns-process-data` and meshes import open3d, which needs it"),
@@ -69,9 +71,9 @@ def check_machine() -> Iterator[Finding]:
 
 
 def _load_torchvision() -> None:
-    """Load the part of torchvision that is compiled for one version of torch; raise an error if it does not fit.
+    """Load the compiled part of torchvision, which raises an error if it is for another torch.
 
-    Importing all of torchvision takes two seconds more, since it imports torch's compiler, torch._dynamo.
+    Importing all of torchvision takes two seconds more, because it imports torch's compiler.
     """
     import torch
 
@@ -90,8 +92,7 @@ def _check_cuda() -> Iterator[Finding]:
 
     device = torch.device("cuda")
     name, (free, total) = torch.cuda.get_device_name(device), torch.cuda.mem_get_info(device)
-    memory = f"{free / 1e9:.1f} of {total / 1e9:.1f} GB free"
-    yield note(f"GPU: {name}, {memory}, CUDA {torch.version.cuda}.")
+    yield note(f"GPU: {name}, {free / 1e9:.1f} of {total / 1e9:.1f} GB free, CUDA {torch.version.cuda}.")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         compiles = kernels.available(device)
@@ -112,30 +113,17 @@ def _check_cuda() -> Iterator[Finding]:
         problem = None if gsplat_compat.cuda_extension() is not None else "neither prebuilt nor compiled"
     except Exception as error:  # Its compilation fails in many ways.
         problem = reason(error)
-    if problem is None:
-        yield note("gsplat has its CUDA kernels.")
-    else:
-        remedy = "install its wheel for this torch, or the CUDA toolkit"
-        yield fault(f"gsplat has no CUDA kernels ({problem}): {remedy}.")
-
-
-def _check_lpips() -> Iterator[Finding]:
-    import torch
-
-    path = Path(torch.hub.get_dir(), "checkpoints", _LPIPS_FILE)
-    if path.is_file():
-        yield note(f"LPIPS with AlexNet has its weights: {path}.")
-    else:
-        sentence = f"LPIPS with AlexNet has no weights: the first `ns-eval` downloads them to {path}, or leaves it out."
-        yield warning(sentence)
+    remedy = "install its wheel for this torch, or the CUDA toolkit"
+    yield (
+        fault(f"gsplat has no CUDA kernels ({problem}): {remedy}.") if problem else note("gsplat has its CUDA kernels.")
+    )
 
 
 def check_all(data: Path | None) -> Iterator[Finding]:
     """Check the machine and, if one is given, a data folder."""
     yield from check_machine()
     if data is not None:
-        findings = check_data(data)
-        yield from findings
+        yield from (findings := check_data(data))
         if all(finding.severity == "note" for finding in findings):
             yield note(f"{data}: nothing to complain about.")
 

@@ -34,7 +34,6 @@ _MAX_OFF_AXIS = 4.0
 """As `sadgs` draws; what it leaves out has no true size on the screen."""
 _PREFIX = "_model.gauss_params."
 _REMEDY = "give another checkpoint step-*.ckpt of a run of sadgs or splatfacto"
-"""What to do about a checkpoint that cannot be used."""
 
 
 @dataclass
@@ -77,18 +76,10 @@ def write_gaussians(
     similarity: Similarity | None = None,
     start: html.Start | None = None,
 ) -> int:
-    """Write a model's Gaussians as `formats.write` does, and return how many.
+    """Write a model's parameters as `formats.write` does, and return the number of Gaussians.
 
-    Those with a value that is not finite are dropped, and one printed line says how many.
-
-    Args:
-        path, frame, start: As for `formats.write`.
-        params: The parameters as training holds them, shaped as `of_parameters` takes them.
-        similarity: From the parameters' frame to the file's; None leaves them as they are.
-
-    Raises:
-        ValueError: If a tensor has another shape than the number of means asks for, naming it.
-        InputError, WriteError: As `formats.write`.
+    Those with a value that is not finite are dropped, and a printed line says how many. The similarity maps the
+    parameters' frame to the file's. Raises as `of_parameters` and `formats.write`.
     """
     gaussians = of_parameters(_arrays(params))
     sound = (gaussians if similarity is None else gaussians.moved(similarity)).finite()
@@ -105,7 +96,7 @@ def _arrays(params: Mapping[str, Tensor]) -> dict[str, NDArray[np.floating]]:
 def export(given: Export) -> int:
     """Write the Gaussians of a run of sadgs or splatfacto, or a mesh; return the number of Gaussians or triangles.
 
-    One printed line says what each option took away. Nothing in the run's folder is executed, not even `config.yml`.
+    A printed line says what each option took away. Nothing in the run's folder is executed, not even `config.yml`.
 
     Raises:
         InputError: If the run, the capture, an option or the output cannot be used.
@@ -148,13 +139,13 @@ def export(given: Export) -> int:
 
         return write_mesh(given.output, params, cameras, similarity, given.voxel_size, **drawing)
     if is_page and cameras is not None:
-        pose, K = cameras.camera_to_worlds[0].double().numpy(), cameras.Ks[0]
-        start = html.start_at(pose, max(cameras.sizes[0]), float(K[0, 0]), params["means"].numpy())
+        pose, focal = cameras.camera_to_worlds[0].double().numpy(), float(cameras.Ks[0, 0, 0])
+        start = html.start_at(pose, max(cameras.sizes[0]), focal, params["means"].numpy())
     return write_gaussians(given.output, params, given.frame, similarity, start)
 
 
 def _check(given: Export) -> None:
-    """Check whether the options suit the format; raises InputError if not."""
+    """Raise InputError if an option does not suit the format."""
     suffix, voxel_size = format_of(given.output), given.voxel_size
     if suffix == ".html" and given.frame != "nerfstudio":
         raise InputError("--frame colmap is for files that other programs read: leave it out for a page.")
@@ -167,7 +158,7 @@ def _check(given: Export) -> None:
 def _cleaned(
     params: dict[str, Tensor], cleaning: Cleaning, cameras: RunCameras | None, drawing: Mapping[str, float]
 ) -> dict[str, Tensor]:
-    """Print how many Gaussians each option takes away, and return the parameters of those that stay."""
+    """Return the parameters of the Gaussians that stay, and print how many each option takes away."""
     import torch
     from rich.console import Console
     from rich.progress import track
@@ -188,14 +179,13 @@ def _cleaned(
     stays, sentences = find(shapes, cleaning, seen)
     print("\n".join(sentences))
     if not stays.any():
-        raise InputError(
-            f"These options take away all {len(stays):,} Gaussians: nothing is written, so take fewer away."
-        )
+        told = f"These options take away all {len(stays):,} Gaussians"
+        raise InputError(f"{told}: nothing is written, so take fewer away.")
     return {name: value[stays.cpu()] for name, value in params.items()}
 
 
 def _checkpoint_of(run: Path) -> Path:
-    """Return the checkpoint that a run's folder, its `config.yml` or the checkpoint itself names."""
+    """Return the latest checkpoint of a run, which its folder, its `config.yml` or a checkpoint itself names."""
     if run.suffix == ".ckpt" and run.is_file():
         return run
     folder = run.parent if run.is_file() else run
@@ -207,14 +197,10 @@ def _checkpoint_of(run: Path) -> Path:
 
 
 def read_checkpoint(run: Path) -> tuple[Path, dict[str, Tensor], float]:
-    """Read a run's Gaussians, mapped from the file, so that what is not read takes no memory.
+    """Read a run's checkpoint, its parameters as `of_parameters` takes them, and its near plane in world units.
 
-    Returns:
-        The checkpoint; its `means` [N, 3], log `scales` [N, 3], `quats` [N, 4], logit `opacities` [N, 1], and harmonics
-        `features_dc` [N, 3] and `features_rest` [N, K, 3], on the CPU; and the run's near plane in world units.
-
-    Raises:
-        InputError: If there is no checkpoint of this method or of splatfacto.
+    The tensors are mapped from the file, so that they take no memory before they are read. Raise InputError if there is
+    no checkpoint of this method or of splatfacto.
     """
     # These import torch, which takes seconds, and `--help` and a wrong path need not wait for it.
     from torch import Tensor
@@ -247,7 +233,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (InputError, RunError, WriteError) as error:
         print(f"sadgs-export: {error}", file=sys.stderr)
         return 2
-    size = given.output.stat().st_size
     what = "triangles fused from rendered depth" if format_of(given.output) == MESH else "Gaussians"
-    print(f"{given.output}: {count:,} {what}, {size / 1e6:,.1f} MB, in the frame of {given.frame}")
+    size = given.output.stat().st_size / 1e6
+    print(f"{given.output}: {count:,} {what}, {size:,.1f} MB, in the frame of {given.frame}")
     return 0

@@ -31,13 +31,10 @@ from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 Split = Literal["train", "eval"]
 SEED = 0
 """Seed of the random colours and of AbsGS's children."""
-MIN_SIDE = 900
-"""Shortest length in px of the longer side of a picture with ellipses."""
-MIN_RENDER_SIDE = 640
-"""Shortest length in px of the longer side of a rendering in random colours. In a smaller one Gaussians could not be
-told apart."""
+MIN_SIDE, MIN_RENDER_SIDE = 900, 640
+"""Least length in px of the longer side of a picture with ellipses, and of a rendering in random colours, in a smaller
+one of which Gaussians could not be told apart."""
 _REMEDY = "give another with --load-step, or another run of sadgs"
-"""What to do about a checkpoint that cannot be used."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +59,9 @@ class View:
 
 
 def load_run(path: Path, load_step: int | None = None, data: Path | None = None) -> tuple[SadgsPipeline, int]:
-    """Load a finished or running run from its `config.yml`, as nerfstudio's `eval_setup` does.
+    """Load a finished or running run from its `config.yml`, as nerfstudio's `eval_setup` does; options as `Inspect`'s.
 
     The file is read with PyYAML's full loader, which calls what it names. Checkpoints are looked for beside it.
-
-    Args:
-        path, load_step, data: As for `sadgs-inspect`.
 
     Returns:
         The pipeline in evaluation mode, and the iterations that it was trained.
@@ -110,11 +104,7 @@ def load_run(path: Path, load_step: int | None = None, data: Path | None = None)
 
 
 def get_view(pipeline: SadgsPipeline, index: int, split: Split = "train") -> View:
-    """Return a view by its number, counted from 0 in the order of the split.
-
-    Raises:
-        InputError: If there is no such view.
-    """
+    """Return a view by its number in the split, from 0; raise InputError if there is none."""
     training, datamanager = split == "train", pipeline.datamanager
     dataset = datamanager.train_dataset if training else datamanager.eval_dataset
     if not 0 <= index < len(dataset):
@@ -133,9 +123,9 @@ def get_view(pipeline: SadgsPipeline, index: int, split: Split = "train") -> Vie
 
 
 def screen_gradients(pipeline: SadgsPipeline, progress: Callable[[range], Iterable[int]] = iter) -> dict[str, Tensor]:
-    """Return what AbsGS decides on: the loss's screen gradients of all training views, added up as in training.
+    """Add up the loss's screen gradients of all training views, by which AbsGS decides, as `absgs.empty_gradients`.
 
-    They are laid out as by `absgs.empty_gradients`. `progress` wraps the numbers of the views.
+    `progress` wraps the numbers of the views.
     """
     model = pipeline.model
     gradients = empty_gradients(model.num_points, pipeline.device)
@@ -155,15 +145,13 @@ def screen_gradients(pipeline: SadgsPipeline, progress: Callable[[range], Iterab
 
 
 def _try(model: SadgsModel, state: dict[str, Any], densify: Callable[[Any, Any, Any], Any]) -> dict[str, Tensor]:
-    """Call a function of parameters, optimizers and state that densifies copies of the model's Gaussians.
+    """Densify copies of the model's Gaussians by a function of parameters, optimizers and state.
 
     Returns:
-        The M Gaussians after that: raw parameters [M, …] by name, and as `origins` the number of the Gaussian before
-        the step that each one was or came from, int64 [M].
+        The raw parameters of M Gaussians, and as `origins`, int64 [M], the Gaussian that each one was or came from.
     """
     params = {name: torch.nn.Parameter(value.detach().clone()) for name, value in model.gauss_params.items()}
-    # The numbers are a parameter, since children take theirs from their parents, while rows of the state begin anew.
-    # float64 counts exactly.
+    # Children inherit parameters, while rows of the state begin anew. float64 counts exactly.
     numbers = torch.arange(model.num_points, device=params["means"].device, dtype=torch.float64)
     params["origins"] = torch.nn.Parameter(numbers)
     densify(params, {name: torch.optim.SGD([parameter], lr=0.0) for name, parameter in params.items()}, state)
@@ -172,13 +160,13 @@ def _try(model: SadgsModel, state: dict[str, Any], densify: Callable[[Any, Any, 
 
 
 def structure_step(model: SadgsModel, statistics: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Try a structure-aware step without its pruning, and return as `_try`."""
+    """Return the Gaussians after a structure-aware step without its pruning, as `_try`."""
     counts = model.strategy.children_now(model.gauss_params, statistics)
     return _try(model, {}, partial(grid_split, counts=counts, child_scale=model.strategy.child_scale))
 
 
 def conventional_step(model: SadgsModel, gradients: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Try a conventional step (AbsGS: clone, or split in two) without its pruning, and return as `_try`."""
+    """Return the Gaussians after a step of AbsGS, clones and splits in two, without its pruning, as `_try`."""
     strategy, size = model.strategy, SMALL_SCALE * float(model.strategy_state["scene_scale"])
     densify = partial(
         grow, clone_threshold=strategy.clone_grad2d, split_threshold=strategy.split_absgrad2d, size_threshold=size,
@@ -244,11 +232,9 @@ def step_panels(
 def inspect_run(
     config: Path, view: int, split: Split, output: Path | None, load_step: int | None, data: Path | None
 ) -> list[Path]:
-    """Write all pictures of one view of a run, as `sadgs_ns.cli.inspect.Inspect` asks for them; return their files.
+    """Write the pictures that `sadgs_ns.cli.inspect.Inspect` asks for, and return their files.
 
-    Raises:
-        InputError: As `load_run` and `get_view`; nothing is written then.
-        WriteError: If a file cannot be written.
+    Raise InputError as `load_run` and `get_view` before anything is written, and WriteError if a file cannot be.
     """
     pipeline, iterations = load_run(config, load_step, data)
     model, shown = pipeline.model, get_view(pipeline, view, split)

@@ -24,7 +24,7 @@ from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_wor
 MIN_ALPHA = 0.5
 """Pixels with less accumulated opacity show no surface."""
 _SAMPLED = 16
-"""At most so many views decide how large voxels are, where nobody says."""
+"""Most views of which the size of voxels is derived."""
 
 
 def write_mesh(
@@ -35,12 +35,10 @@ def write_mesh(
     voxel_size: float | None = None,
     **drawing: float,
 ) -> int:
-    """Fuse what the training views see into a mesh, write it whole or not at all, and return the number of triangles.
+    """Fuse what the training views see into a mesh, write it as `atomic_path` does, and return its number of triangles.
 
     Args:
-        path: Created, with its parents, or replaced.
-        params: `means` [N, 3], log `scales` [N, 3], `quats` [N, 4], logit `opacities` [N, 1], `features_dc` [N, 3] and
-            `features_rest` [N, K, 3].
+        params: As `of_parameters` takes them.
         cameras: The training views, in the parameters' frame.
         similarity: From the parameters' frame to the file's; None leaves the mesh as it is.
         voxel_size: Edge of a voxel in the parameters' frame; None derives it from the median depth.
@@ -58,10 +56,10 @@ def write_mesh(
     params = {name: value[sound].to(device) for name, value in params.items()}
     if voxel_size is None:
         step = -(-number // _SAMPLED)
-        voxel_size = derive_voxel_size(list(look(params, cameras, range(0, number, step), **drawing)))
+        voxel_size = derive_voxel_size(list(render_depths(params, cameras, range(0, number, step), **drawing)))
     fusion = Fusion(voxel_size)
     console = Console(stderr=True)
-    views = look(params, cameras, range(number), **drawing)
+    views = render_depths(params, cameras, range(number), **drawing)
     for view in track(views, "Fusing depth", number, console=console, disable=not console.is_terminal):
         fusion.add(view)
     found = fusion.mesh()
@@ -76,10 +74,9 @@ def write_mesh(
 
 
 def derive_voxel_size(views: Sequence[DepthView]) -> float:
-    """Return an edge of two pixels at the median depth, or of as much more as a mesh of such views needs to fit.
+    """Return an edge of two pixels at the median depth, or larger so that a mesh of such views fits in memory.
 
-    Raises:
-        InputError: If they see no surface, or open3d cannot be imported.
+    Raise InputError if they see no surface, or open3d cannot be imported.
     """
     pixels = [np.median(view.depth[view.depth > 0]) / view.focal for view in views if (view.depth > 0).any()]
     if not pixels:
@@ -91,13 +88,10 @@ def derive_voxel_size(views: Sequence[DepthView]) -> float:
 
 
 @torch.no_grad()
-def look(
+def render_depths(
     params: Mapping[str, Tensor], cameras: RunCameras, indices: Sequence[int], **drawing: Any
 ) -> Iterator[DepthView]:
-    """Render colours and expected depth along the axis of some of the views; arguments are those of `write_mesh`.
-
-    The parameters must be finite, and lie on the device that renders.
-    """
+    """Render colours and expected depth in some of the views; the parameters are finite, on the device that renders."""
     device = params["means"].device
     viewmats, Ks = viewmats_from_camera_to_world(cameras.camera_to_worlds), cameras.Ks
     quats, scales, opacities = params["quats"], params["scales"].exp(), params["opacities"].flatten().sigmoid()

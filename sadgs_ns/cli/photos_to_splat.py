@@ -30,7 +30,7 @@ from rich.console import Console
 
 from sadgs_ns.cli.export import Export
 from sadgs_ns.cli.process.command import Process, check_size, photos_added
-from sadgs_ns.cli.process.photos import find_source
+from sadgs_ns.cli.process.folder import find_source
 from sadgs_ns.cli.process.plan import Summary
 from sadgs_ns.cli.process.video import count_frames
 from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_json

@@ -24,15 +24,9 @@ Options = TypeVar("Options")
 
 
 def parse(options: type[Options], name: str, argv: Sequence[str] | None) -> Options:
-    """Read a command line, or print the help, the version or what is wrong with it, and exit.
+    """Read what follows a command, by default that of the process, or print help, version or an error and exit.
 
-    Args:
-        options: A dataclass; its docstring and those of its fields are the help.
-        name: The command.
-        argv: What follows the command; None is that of the process.
-
-    Raises:
-        SystemExit: With code 0 after the help or the version, with code 2 if the command line is wrong.
+    `options` is a dataclass; its docstring and those of its fields are the help. The exit code is 2 after an error.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     if "--version" in words:
@@ -44,11 +38,10 @@ def parse(options: type[Options], name: str, argv: Sequence[str] | None) -> Opti
 
 
 def exit_code(name: str, folder: Path | None, run: Callable[[], int]) -> int:
-    """Run a command that goes on where it was stopped, and print the sentence with which it ended.
+    """Run a command that can be resumed, print the sentence of an error, and return the exit code.
 
-    Returns:
-        What `run` returns, 1 where a file in `folder` could not be written or the run failed, 2 if the input is wrong,
-        and 130, 143 or 129 after SIGINT, SIGTERM or SIGHUP.
+    It is what `run` returns, 1 if a file in `folder` could not be written or the run failed, 2 if the input is wrong,
+    and 130, 143 or 129 after SIGINT, SIGTERM or SIGHUP.
     """
     try:
         return run()
@@ -67,7 +60,7 @@ def exit_code(name: str, folder: Path | None, run: Callable[[], int]) -> int:
 
 
 def read_settings(file: Path, folder: Path) -> dict[str, Any]:
-    """Return the settings that a folder was begun with, none without a file of them; a damaged one is an InputError."""
+    """Return the settings of a folder, none if their file does not exist; raise InputError if it is damaged."""
     try:
         return dict(json.loads(file.read_text("utf8"))) if file.exists() else {}
     except ValueError as error:
@@ -75,17 +68,17 @@ def read_settings(file: Path, folder: Path) -> dict[str, Any]:
 
 
 def write_json(file: Path, value: Any) -> None:
-    """Write JSON; the file appears complete or not at all, or a WriteError is raised."""
+    """Write JSON as `atomic_path` does."""
     with atomic_path(file) as partial:
         partial.write_text(json.dumps(value), "utf8")
 
 
 @contextlib.contextmanager
 def locked(folder: Path, refusal: str, seconds: float = 0.0) -> Iterator[int]:
-    """Keep others away from a folder, as long as a process lives that has the file descriptor which this yields.
+    """Lock a folder until all processes have ended that have the file descriptor which this yields.
 
     Raises:
-        InputError: If it does not become free in these seconds; `refusal` is its message.
+        InputError: With the message `refusal` if the folder does not become free in these seconds.
     """
     lock, end = os.open(folder, os.O_RDONLY), time.monotonic() + seconds
     try:

@@ -1,4 +1,4 @@
-"""One line that says how far a stage is."""
+"""A line that says how far a stage is."""
 
 from __future__ import annotations
 
@@ -10,10 +10,7 @@ from rich.text import Text
 
 
 class StatusLine:
-    """The name of a stage, the time it takes, and how far it is.
-
-    A terminal shows the line as it changes; elsewhere, as in a file, it is printed once, when the context ends.
-    """
+    """The name of a stage, its time and its status. A terminal shows each change; a file gets the line at the end."""
 
     def __init__(self, name: str, console: Console) -> None:
         self._name, self._console, self._status, self._start = name, console, "", time.monotonic()
@@ -31,7 +28,7 @@ class StatusLine:
             self._console.print(self._text(), soft_wrap=True)
 
     def update(self, status: str) -> None:
-        """Say how far the stage is."""
+        """Show how far the stage is."""
         self._status = status
 
     def print(self, sentence: str) -> None:

@@ -1,7 +1,6 @@
-"""Run a function in another process, hear its events, and raise here what it raised there.
+"""Run a function in another process, receive its events, and raise here what it raised there.
 
-A library that crashes, is killed for want of memory or does not listen to signals, such as COLMAP, then ends its own
-process alone. What was imported there is gone with it, too.
+A library that crashes, is killed for want of memory or ignores signals, such as COLMAP, then ends only that process.
 """
 
 from __future__ import annotations
@@ -30,19 +29,18 @@ from sadgs_ns.plugin.interrupts import Interrupted
 OnEvent = Callable[..., None]
 """Called with an event's name and, by keyword, its fields."""
 _POLL_SECONDS = 0.1
-"""Time between two looks at the events."""
 _KEPT_BYTES = 65536
-"""How much of the end of what a process printed is looked at when it failed."""
+"""Size of the end of a failed process's output that is searched for the reason."""
 _PROMPT = "$ "
 """What stands before a command in a log."""
 _PREFIX = re.compile(r"^(error|sadgs-[\w-]+): ")
-"""What commands put before the sentence with which they end."""
+"""What commands put before the sentence of an error."""
 
 
 class WorkerError(RunError):
     """A function raised something else than an InputError, or its process ended; the sentence has no full stop.
 
-    A negative `exitcode` is the signal that ended the process, and `output` is the end of what it printed.
+    A negative `exitcode` is the signal that ended the process. `output` is the end of what it printed.
     """
 
     def __init__(self, sentence: str, exitcode: int, output: str) -> None:
@@ -53,14 +51,14 @@ class WorkerError(RunError):
 class Worker:
     """A process that imports a function at once, and calls it when `run` brings the arguments.
 
-    It has a session of its own, so that a terminal's Ctrl-C reaches it once, from here. It gets a SIGTERM when this
-    process is gone, and it is ended when the context is left.
+    It has a session of its own, so that a terminal's Ctrl-C reaches it once, from here. It gets a SIGTERM if this
+    process ends, and is killed when the context is left.
 
     Args:
         function: As `module:name`.
         log: All that the process prints is added to this file.
         keep_open: File descriptors that it inherits, such as a lock's.
-        saves: Whether it may save what it did when it is interrupted. Otherwise it is killed.
+        saves: Whether it may save its work when it is interrupted. Otherwise it is killed.
 
     Raises:
         OSError: If the log cannot be written.
@@ -91,15 +89,12 @@ class Worker:
         self._events.unlink(missing_ok=True)
 
     def run(self, *arguments: Any, on_event: OnEvent, command: Sequence[str] = ()) -> Any:
-        """Call the function, and wait for its end.
+        """Call the function, and return its result as JSON holds it: a dataclass as a dictionary.
 
         Args:
             arguments: The function's; they are pickled.
-            on_event: Called here with each event. One that is named "stopping" comes when the process is interrupted.
+            on_event: Called here with each event, and with "stopping" when the process is interrupted.
             command: The command line that does the same, for the log and the function's `sys.argv`.
-
-        Returns:
-            What the function returns, as JSON holds it: a dataclass as a dictionary.
 
         Raises:
             InputError: If the function raises it.
@@ -124,11 +119,9 @@ class Worker:
     def _listen(self, on_event: OnEvent) -> Any:
         sentence, is_input, rest = None, False, b""
         with self._events.open("rb") as file:
-            ended = False
-            while not ended:
+            while self._process.returncode is None:
                 with suppress(subprocess.TimeoutExpired):
                     self._process.wait(_POLL_SECONDS)
-                ended = self._process.returncode is not None
                 *lines, rest = (rest + file.read()).split(b"\n")
                 for line in lines:
                     fields = json.loads(line)
@@ -143,16 +136,14 @@ class Worker:
                         on_event(event, **fields)
         if sentence is not None and is_input:
             raise InputError(sentence)
-        exitcode, output = self._process.returncode, self._output()
+        with self.log.open("rb") as file:
+            file.seek(max(self._start, self.log.stat().st_size - _KEPT_BYTES))
+            output = file.read().decode(errors="replace")
+        exitcode = self._process.returncode
         if exitcode < 0:
             name = signal.Signals(-exitcode).name
             sentence = f"it was ended by {name}" + ", most likely for want of memory" * (name == "SIGKILL")
         raise WorkerError((sentence or _last_sentence(output.splitlines())).rstrip("."), exitcode, output)
-
-    def _output(self) -> str:
-        with self.log.open("rb") as file:
-            file.seek(max(self._start, self.log.stat().st_size - _KEPT_BYTES))
-            return file.read().decode(errors="replace")
 
     def _end(self, number: int) -> None:
         """Send a signal and wait until the process has ended; Ctrl-C meanwhile kills it."""
@@ -171,18 +162,17 @@ class Worker:
 
 
 def _last_sentence(lines: Sequence[str]) -> str:
-    """Return what a command said last; of a box, as around a wrong option, its first paragraph."""
+    """Return the last sentence that a command printed; of a box, as around a wrong option, the first paragraph."""
     if lines and lines[-1].startswith("╰"):
         boxed = [line.strip("│ ") for line in lines if line.startswith("│ ")]
         paragraph = itertools.takewhile(lambda text: not text.startswith("──"), boxed)
         return " ".join(text for text in paragraph if text)
     told = (line.strip() for line in reversed(lines) if re.search(r"\w", line) and not line.startswith(_PROMPT))
-    last = next(told, "it printed nothing")
-    return _PREFIX.sub("", last)
+    return _PREFIX.sub("", next(told, "it printed nothing"))
 
 
 def main() -> None:
-    """Import the function that the command line names, and call it when its arguments come; the worker runs this."""
+    """Import the function that the command line names, and call it when its arguments come; runs in the worker."""
     channel, nowhere = os.dup(0), os.open(os.devnull, os.O_RDONLY)
     os.dup2(nowhere, 0)
     try:
@@ -205,6 +195,6 @@ def main() -> None:
 
 
 def _end_with_parent(channel: int) -> None:
-    """Interrupt this process when its parent, which holds the other end of the channel, is gone."""
+    """Interrupt this process when its parent, which holds the other end of the channel, has ended."""
     os.read(channel, 1)
     os.kill(os.getpid(), signal.SIGTERM)

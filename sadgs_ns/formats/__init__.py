@@ -25,8 +25,8 @@ FORMATS: dict[str, Callable[[IO[bytes], Gaussians, Frame, html.Start | None], No
     ".glb": lambda file, gaussians, frame, _: glb.write(file, gaussians, _TO_Y_UP[frame]),
     ".html": lambda file, gaussians, _, start: html.write(file, gaussians, start),
 }
-"""The writer of each format of Gaussians, by the end of the file's name. Each is called with a file that is open for
-writing, the Gaussians, their frame, and the camera with which a page opens."""
+"""The writer of each format of Gaussians, by the end of the file's name: a function of an open file, the Gaussians,
+their frame, and the camera with which a page opens."""
 MESH = ".mesh.ply"
 """End of the name of a triangle mesh."""
 _TO_Y_UP = {"nerfstudio": (-(0.5**0.5), 0.0, 0.0, 0.5**0.5), "colmap": (1.0, 0.0, 0.0, 0.0)}
@@ -34,7 +34,7 @@ _TO_Y_UP = {"nerfstudio": (-(0.5**0.5), 0.0, 0.0, 0.5**0.5), "colmap": (1.0, 0.0
 
 
 def format_of(path: Path) -> str:
-    """Return the key of `FORMATS`, or `MESH`, that ends a file's name; raise InputError for others and folders."""
+    """Return the key of `FORMATS`, or `MESH`, in which a file's name ends; raise InputError for others and folders."""
     found = [suffix for suffix in (*FORMATS, MESH) if path.name.lower().endswith(suffix)]
     if not found:
         raise InputError(f"--output {path} must end in {', '.join(FORMATS)} or {MESH}.")
@@ -46,7 +46,7 @@ def format_of(path: Path) -> str:
 def write(path: Path, gaussians: Gaussians, frame: Frame = "nerfstudio", start: html.Start | None = None) -> None:
     """Write Gaussians in the format that the file's name asks for; the file appears complete or not at all.
 
-    Only a PLY may hold none, and an HTML page needs a start. InputError is raised if there is nothing to write, or the
+    Only a PLY may hold none, and an HTML page needs a start. Raise InputError if there is nothing to write, or the
     format cannot hold it, and WriteError if the file cannot be written.
     """
     suffix = format_of(path)

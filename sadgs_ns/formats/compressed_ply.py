@@ -1,8 +1,8 @@
-"""Compressed PLY, PlayCanvas's layout: chunks of 256 Gaussians, quantised between each chunk's extremes, 16 bytes each.
+"""Compressed PLY, PlayCanvas's layout: 16 bytes for each Gaussian, in chunks of 256.
 
-Positions and scales have 11, 10 and 11 bits, colours 8 bits between the chunk's extremes, opacities 8 bits, quaternions
-10 bits for each of the three smallest components, and the higher harmonics 8 bits in ±4, which is an error of up to
-1/64. Scales are cut at e^±20.
+Between a chunk's extremes positions and scales have 11, 10 and 11 bits, and colours 8. Opacities have 8 bits, each of
+the three smallest components of quaternions 10, and the higher harmonics 8 in ±4, with errors of up to 1/64. Scales are
+cut at e^±20.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ def write(file: IO[bytes], gaussians: Gaussians) -> None:
 
 
 def _in_chunk(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return values as shares, in [0, 1], of the way between the extremes of their chunk, and these extremes.
+    """Return values as shares, in [0, 1], between the extremes of their chunk, and these, lowest first.
 
-    [N, 3] → [N, 3], [chunks, 6]: the three lowest and the three highest values
+    [N, 3] → [N, 3], [chunks, 6]
     """
     starts = np.arange(0, len(values), _CHUNK)
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
@@ -66,13 +66,13 @@ def _in_chunk(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray
 
 
 def _steps(shares: NDArray[np.float32], bits: int) -> NDArray[np.uint32]:
-    """Return shares, in [0, 1], in steps of so many bits. [N] → [N]"""
+    """Quantise shares, in [0, 1]. [N] → [N]"""
     most = (1 << bits) - 1
     return np.floor(shares * most + np.float32(0.5)).clip(0, most).astype(np.uint32)
 
 
 def _pack(shares: NDArray[np.float32], bits: tuple[int, int, int]) -> NDArray[np.uint32]:
-    """Return three shares in one number, the first of them in its highest bits. [N, 3] → [N]"""
+    """Quantise three shares into one number, the first into its highest bits. [N, 3] → [N]"""
     packed = np.zeros(len(shares), np.uint32)
     for values, number in zip(shares.T, bits, strict=True):
         packed = packed << np.uint32(number) | _steps(values, number)

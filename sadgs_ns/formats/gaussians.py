@@ -1,4 +1,4 @@
-"""The Gaussians that files are written of: what training learned, in the file's frame, without what is not finite."""
+"""The Gaussians that files hold."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Gaussians:
         return len(self.means)
 
     def __getitem__(self, rows: slice | NDArray[np.generic]) -> Gaussians:
-        """Return some of the Gaussians, by a slice, a mask or indices."""
+        """Return some of the Gaussians."""
         return Gaussians(**{name: value[rows] for name, value in vars(self).items()})
 
     @property
@@ -48,7 +48,7 @@ class Gaussians:
         return round((1 + self.features_rest.shape[1]) ** 0.5) - 1
 
     def finite(self) -> Gaussians:
-        """Return those of which every number is finite."""
+        """Return those whose numbers all are finite."""
         sound = np.ones(len(self), bool)
         for value in vars(self).values():
             sound &= np.isfinite(value).reshape(len(self), -1).all(axis=1)
@@ -56,22 +56,20 @@ class Gaussians:
 
     def moved(self, similarity: Similarity) -> Gaussians:
         """Return the Gaussians in another frame, with their harmonics turned; some may become infinite there."""
-        parts, turn = {name: np.empty_like(value) for name, value in vars(self).items()}, None
-        if self.degree:
-            turn = similarity.harmonics(self.degree)[1:, 1:]
+        parts = {name: np.empty_like(getattr(self, name)) for name in ("means", "scales", "quats", "features_rest")}
+        turn = similarity.harmonics(self.degree)[1:, 1:]
         with np.errstate(all="ignore"):
             for start in range(0, len(self), _ROWS):
                 rows = slice(start, start + _ROWS)
                 parts["means"][rows] = similarity.positions(self.means[rows].astype(np.float64))
                 parts["scales"][rows] = similarity.log_scales(self.scales[rows].astype(np.float64))
                 parts["quats"][rows] = similarity.rotations(self.quats[rows].astype(np.float64))
-                if turn is not None:
-                    parts["features_rest"][rows] = turn @ self.features_rest[rows].astype(np.float64)
-        return replace(self, **{name: parts[name] for name in ("means", "scales", "quats", "features_rest")})
+                parts["features_rest"][rows] = turn @ self.features_rest[rows].astype(np.float64)
+        return replace(self, **parts)
 
 
 def of_parameters(params: Mapping[str, NDArray[np.floating]]) -> Gaussians:
-    """Return the Gaussians that a run's parameters are.
+    """Return the Gaussians of a run's parameters.
 
     Args:
         params: `means` [N, 3], `scales` (logarithms) [N, 3], `quats` (wxyz, of any length) [N, 4], `opacities` (logits)
@@ -80,15 +78,14 @@ def of_parameters(params: Mapping[str, NDArray[np.floating]]) -> Gaussians:
     Raises:
         ValueError: If an array has another shape than the number of means asks for, naming it.
     """
-    count = len(params["means"])
-    rest = params["features_rest"]
+    count, rest = len(params["means"]), params["features_rest"]
     bands = rest.shape[1] if rest.ndim == 3 else 0
     if bands not in (0, 3, 8, 15):
         raise ValueError(f"features_rest must hold the 0, 3, 8 or 15 harmonics of degree 1 to 3, got {bands}")
     opacities = params["opacities"]
     arrays = {**params, "opacities": opacities[:, 0] if opacities.shape[1:] == (1,) else opacities}
-    shapes = {"means": (3,), "features_dc": (3,), "features_rest": (bands, 3), "opacities": (), "scales": (3,)}
-    shapes |= {"quats": (4,)}
+    shapes = {name: (3,) for name in ("means", "features_dc", "scales")}
+    shapes |= {"features_rest": (bands, 3), "opacities": (), "quats": (4,)}
     for name, shape in shapes.items():
         if arrays[name].shape != (count, *shape):
             raise ValueError(f"{name} must have the shape {[count, *shape]}, got {list(arrays[name].shape)}")

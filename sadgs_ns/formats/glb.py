@@ -21,23 +21,17 @@ _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
 def write(file: IO[bytes], gaussians: Gaussians, rotation: tuple[float, float, float, float]) -> None:
-    """Write at least one Gaussian as the points of one mesh; raise InputError beyond the 4 GB that the format can hold.
+    """Write at least one Gaussian as the points of a mesh; raise InputError beyond the 4 GB that the format can hold.
 
-    Viewers that do not know the extension show points of the Gaussians' colours. The rotation, xyzw, of the node turns
-    the Gaussians' frame so that y is up, as in glTF.
+    Viewers that do not know the extension show coloured points. The node's rotation, xyzw, turns y up, as in glTF.
     """
     attributes = _attributes(gaussians)
     arrays = list(attributes.values())
     sizes = [array.nbytes for array in arrays]
-    accessors: list[dict[str, Any]] = [
-        {
-            "bufferView": index,
-            "componentType": _BYTE if array.dtype == np.uint8 else _FLOAT,
-            "count": len(gaussians),
-            "type": _TYPES[array.shape[1]],
-        }
-        for index, array in enumerate(arrays)
-    ]
+    accessors: list[dict[str, Any]] = []
+    for index, array in enumerate(arrays):
+        kind = {"componentType": _BYTE if array.dtype == np.uint8 else _FLOAT, "type": _TYPES[array.shape[1]]}
+        accessors.append({"bufferView": index, "count": len(gaussians), **kind})
     accessors[0] |= {"min": gaussians.means.min(axis=0).tolist(), "max": gaussians.means.max(axis=0).tolist()}
     accessors[list(attributes).index("COLOR_0")]["normalized"] = True
     properties = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "sortingMethod": "cameraDistance"}
@@ -64,9 +58,8 @@ def write(file: IO[bytes], gaussians: Gaussians, rotation: tuple[float, float, f
     head += b" " * (-len(head) % 4)
     total = 12 + 8 + len(head) + 8 + sum(sizes)
     if total > _MOST_BYTES:
-        raise InputError(
-            f"{len(gaussians):,} Gaussians take more than the 4 GB that glTF can hold: choose another format."
-        )
+        told = f"{len(gaussians):,} Gaussians take more than the 4 GB that glTF can hold"
+        raise InputError(f"{told}: choose another format.")
     file.write(struct.pack("<4sIIII", b"glTF", 2, total, len(head), 0x4E4F534A) + head)
     file.write(struct.pack("<II", sum(sizes), 0x004E4942))
     for array in arrays:
@@ -74,7 +67,7 @@ def write(file: IO[bytes], gaussians: Gaussians, rotation: tuple[float, float, f
 
 
 def _attributes(gaussians: Gaussians) -> dict[str, NDArray[Any]]:
-    """Return what each Gaussian has, by the extension's names; every array's size is a multiple of 4 bytes."""
+    """Return the arrays of a value for each Gaussian, whose sizes are multiples of 4 bytes, by glTF's names."""
     alphas = sigmoid(gaussians.opacities)[:, None]
     colors = np.c_[gaussians.features_dc * np.float32(DEGREE_0) + np.float32(0.5), alphas]
     attributes: dict[str, NDArray[Any]] = {

@@ -1,8 +1,8 @@
 """One HTML file that opens without a network: PlayCanvas's SuperSplat viewer, with the Gaussians as SOG inside.
 
-The viewer is the one that `@playcanvas/splat-transform` puts into the pages that it makes. It is a program for Node.js,
-so Node must be there when the file is written, and a network the first time. It makes the page of a single Gaussian;
-ours are put in its place, because they are compressed here in a fraction of its time.
+`@playcanvas/splat-transform`, a program for Node.js, makes the page of a single Gaussian, so that Node must be there
+when a file is written, and a network the first time. The page's content is replaced, because SOG is written here in a
+fraction of that program's time.
 """
 
 from __future__ import annotations
@@ -28,15 +28,14 @@ from sadgs_ns.formats import ply, sog
 from sadgs_ns.formats.gaussians import Gaussians
 
 VIEWER = "@playcanvas/splat-transform@3.7.0"
-"""The package on npm."""
 _SECONDS = 300
-"""Longest time that making the page may take, with its download."""
+"""Longest time for making the page, with the download."""
 _BOOTSTRAP = re.compile(rb'(<script type="application/json" id="sse-bootstrap">)(.*?)(</script>)', re.DOTALL)
-"""Where the page holds its settings and what it shows."""
+"""The page's settings and content."""
 _TO_VIEWER = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """From z up to the viewer's frame, in which y is up."""
 _TO_CONTENT = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
-"""From z up to the content's frame, which the viewer turns by half a turn around its z."""
+"""From z up to the content's frame, which the viewer turns half round its z."""
 
 
 @dataclass(frozen=True)
@@ -51,10 +50,9 @@ class Start:
 
 
 def write(file: IO[bytes], gaussians: Gaussians, start: Start | None) -> None:
-    """Write a page that shows at least one Gaussian, in a frame in which z is up; it opens at the start, not None.
+    """Write a page of at least one Gaussian, in a frame in which z is up; it opens at the start, not None.
 
-    Raises:
-        InputError: If Node.js or its package cannot be run, or there are more Gaussians than SOG can hold.
+    Raise InputError if Node.js or its package cannot be run, or there are more Gaussians than SOG can hold.
     """
     assert start is not None
     page, content = _page(), io.BytesIO()
@@ -74,11 +72,8 @@ def write(file: IO[bytes], gaussians: Gaussians, start: Start | None) -> None:
 
 
 def _settings(start: Start) -> dict[str, Any]:
-    """Return the viewer's settings that depend on the start, and that show colours as they were trained."""
-    pose: dict[str, Any] = {
-        "position": (_TO_VIEWER @ start.position).tolist(),
-        "target": (_TO_VIEWER @ start.target).tolist(),
-    }
+    """Return the viewer's settings for a start, and for colours as they were trained."""
+    pose: dict[str, Any] = {name: (_TO_VIEWER @ getattr(start, name)).tolist() for name in ("position", "target")}
     values = pose | {"fov": [start.degrees]}
     track = {"name": "start", "duration": 1, "frameRate": 1, "loopMode": "none", "interpolation": "step"}
     return {
@@ -114,16 +109,11 @@ def _page() -> bytes:
             raise InputError(f"`npx {VIEWER}` failed ({what}): {remedy}.") from error
 
 
-def start_at(
-    camera_to_world: NDArray[np.float64],  # [3, 4]
-    side: int,
-    focal: float,
-    means: NDArray[np.float32],  # [N, 3]
-) -> Start:
-    """Return the start at a camera, which looks at a point as deep as what it has in the middle of its view.
+def start_at(camera_to_world: NDArray[np.float64], side: int, focal: float, means: NDArray[np.float32]) -> Start:
+    """Return the start at a camera, with a target as deep as the middle of its view.
 
-    The pose has OpenGL axes and the frame of the Gaussians' positions. `side` is the longer side of the image, and
-    `focal` the focal length, in px.
+    The pose [3, 4] has OpenGL axes and the frame of the Gaussians' positions [N, 3]. `side` is the longer side of the
+    image, and `focal` the focal length, in px.
     """
     position, forward = camera_to_world[:, 3], -camera_to_world[:, 2]
     depths = (means - position) @ forward

@@ -1,7 +1,7 @@
-"""A triangle mesh that is fused from depth maps by Open3D, with truncated signed distances in sparse blocks of voxels.
+"""A triangle mesh that Open3D fuses from depth maps, with truncated signed distances in sparse blocks of voxels.
 
-The fusion is that of Curless and Levoy, "A Volumetric Method for Building Complex Models from Range Images" (1996):
-each voxel keeps the mean of its signed distances to the surfaces that views see, and the mesh is where that mean is 0.
+Curless and Levoy, "A Volumetric Method for Building Complex Models from Range Images" (1996): each voxel keeps the mean
+of its signed distances to the surfaces that views see, and the mesh is where that mean is 0.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ TriangleMesh = Any
 """`open3d.geometry.TriangleMesh`; open3d cannot be imported everywhere. It has `vertices` in world units [V, 3], their
 `vertex_colors` in [0, 1] [V, 3], and `triangles`, with corners counterclockwise for a camera that sees them [F, 3]."""
 MOST_VOXELS = 60_000_000
-"""A mesh takes at most so many voxels; at the peak, while their number doubles, each takes 71 bytes, 4.3 GB in all."""
+"""Most voxels of a mesh; at the peak, while their number doubles, each takes 71 bytes, 4.3 GB in all."""
 PIXELS_PER_VOXEL = 2.0
-"""Edge of a voxel where none is given, in pixels of the median depth."""
+"""Edge of a voxel if none is given, in pixels of the median depth."""
 _TRUNCATION = 4.0
-"""Distance behind a surface up to which voxels count as near it, in voxels; thinner walls have no two sides."""
+"""Voxels behind a surface that count as near it; thinner walls have no two sides."""
 _WIDEST_PIXEL = 4.0
-"""Pixels that are wider than this at their depth, in voxels, are left out: they are far behind what the views show."""
+"""Width in voxels, at their depth, above which pixels are left out, as they are far behind what the views show."""
 _RESOLUTION = 16
 """Voxels along the edge of a block."""
 _BLOCKS = 1000
-"""Blocks for which there is room at first, 82 MB; Open3D doubles that where it must."""
+"""Blocks with room at first, 82 MB; Open3D doubles that if it must."""
 _VIEWS = 3
 """A surface needs so many views, or all where there are fewer."""
 _SMALLEST_SHARE = 0.01
@@ -39,10 +39,10 @@ _SMALLEST_SHARE = 0.01
 
 @dataclass(frozen=True)
 class DepthView:
-    """What a pinhole camera sees."""
+    """The image of a pinhole camera."""
 
     depth: NDArray[np.float32]
-    """Along the viewing axis, in world units; 0 where nothing is. [H, W]"""
+    """Along the viewing axis, in world units; 0 without a surface. [H, W]"""
     color: NDArray[np.float32]
     """In [0, 1]. [H, W, 3]"""
     K: NDArray[np.float64]
@@ -66,9 +66,9 @@ class Fusion:
         self._grid = open3d.t.geometry.VoxelBlockGrid(names, types, shapes, voxel_size, _RESOLUTION, _BLOCKS)
 
     def _blocks(self, view: DepthView) -> tuple[Any, dict[str, Any]] | None:
-        """Return the blocks near the surfaces that a view sees, int32 [B, 3], and what Open3D asks of the view.
+        """Return the blocks near the surfaces in a view, int32 [B, 3], and the view as Open3D takes it.
 
-        Open3D looks at every fourth pixel of every fourth row; where these show nothing near, the result is None.
+        Open3D looks at every fourth pixel of every fourth row; the result is None if these show nothing near.
         """
         tensor = self._core.Tensor
         camera = {
@@ -87,7 +87,7 @@ class Fusion:
             return None
 
     def has_room_for(self, views: Sequence[DepthView]) -> bool:
-        """Tell whether what these views need is at most a quarter of `MOST_VOXELS`; the rest is for other views."""
+        """Return whether these views need at most a quarter of `MOST_VOXELS`; the rest is for other views."""
         found = [blocks[0].numpy() for view in views if (blocks := self._blocks(view)) is not None]
         return not found or 4 * len(np.unique(np.concatenate(found), axis=0)) * _RESOLUTION**3 <= MOST_VOXELS
 
@@ -108,10 +108,7 @@ class Fusion:
         self._grid.integrate(blocks, camera.pop("depth"), color, **camera)
 
     def mesh(self) -> TriangleMesh:
-        """Return the surface, which has no triangles where the views showed none.
-
-        It leaves out connected components with less than a hundredth of the largest one's triangles.
-        """
+        """Return the surface, `without_small_parts`; it has no triangles if the views showed none."""
         found = load_open3d().geometry.TriangleMesh()
         if self._grid.hashmap().size():
             # Open3D wants more views than the threshold says.
@@ -121,14 +118,14 @@ class Fusion:
 
 
 def without_small_parts(mesh: TriangleMesh) -> TriangleMesh:
-    """Return a mesh without components of less than a hundredth of the largest one's triangles; it is changed."""
+    """Remove connected components with less than a hundredth of the largest one's triangles, and return the mesh."""
     parts, sizes, _ = map(np.asarray, mesh.cluster_connected_triangles())
     mesh.remove_triangles_by_mask(sizes[parts] < _SMALLEST_SHARE * sizes.max(initial=0))
     return mesh.remove_unreferenced_vertices()
 
 
 def moved(mesh: TriangleMesh, similarity: Similarity) -> TriangleMesh:
-    """Return a mesh in another frame; it is changed. A reflection turns the order of the triangles' corners round."""
+    """Move a mesh to another frame, and return it. A reflection reverses the order of the triangles' corners."""
     transform = np.eye(4)
     transform[:3] = np.c_[similarity.scale * similarity.orthogonal, similarity.translation]
     if np.linalg.det(similarity.orthogonal) < 0:

@@ -1,4 +1,4 @@
-"""What several formats have in common: an order in space, quaternions by their three smallest components, codebooks."""
+"""Functions for several formats: an order in space, quaternions by their three smallest components, codebooks."""
 
 from __future__ import annotations
 
@@ -9,39 +9,33 @@ from numpy.typing import NDArray
 
 _BITS = 21
 """Bits of each coordinate in a Morton code of 63 bits."""
-_LEVELS = 256
-"""Of a codebook, as one byte tells apart."""
-_BINS = 256
-"""Bins of the histogram from which a codebook begins."""
-_SAMPLE = 1 << 18
-"""Number of values from which a codebook is made."""
-_ROUNDS = 20
-"""Rounds in which a codebook's levels move to the means of the values that are nearest to them."""
+_SPREADING = (
+    (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)  # fmt: skip
+"""Shifts and masks that put two zeros between the bits of a coordinate."""
+_LEVELS, _BINS, _SAMPLE, _ROUNDS = 256, 256, 1 << 18, 20
+"""Of a codebook: levels, as many as a byte tells apart; bins of the histogram from which it begins; values that it is
+made of; and rounds in which levels move to the means of their values."""
 
 
 def morton_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Return the order [N] of positions [N, 3] along a Z-shaped curve in space, which keeps neighbours together."""
+    """Return the order [N] of positions [N, 3] along a curve that keeps neighbours together."""
     low, high = means.min(axis=0), means.max(axis=0)
     cells = (means - low) / np.maximum(high - low, 1e-30).astype(np.float64)
     codes = np.zeros(len(means), np.uint64)
     for axis, bits in enumerate((cells * ((1 << _BITS) - 1)).astype(np.uint64).T):
         spread = bits
-        for shift, mask in (
-            (32, 0x1F00000000FFFF),
-            (16, 0x1F0000FF0000FF),
-            (8, 0x100F00F00F00F00F),
-            (4, 0x10C30C30C30C30C3),
-            (2, 0x1249249249249249),
-        ):
+        for shift, mask in _SPREADING:
             spread = (spread | (spread << np.uint64(shift))) & np.uint64(mask)
         codes |= spread << np.uint64(axis)
     return np.argsort(codes, kind="stable")
 
 
 def smallest_three(quats: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return which component of each unit quaternion is the largest, and the others, signed so that it is positive.
+    """Return the index of each unit quaternion's largest component, and the others, signed so that it is positive.
 
-    [N, 4] in any order of components → the index [N], and the others, in ±√½, in their order [N, 3]
+    [N, 4] → [N], [N, 3] in ±√½
     """
     largest = np.abs(quats).argmax(axis=1)
     rows = np.arange(len(quats))
@@ -51,10 +45,10 @@ def smallest_three(quats: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArr
 
 
 def codebook(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return levels, ascending, that quantise values of any shape, at least one, with little mean square error. [256]
+    """Return ascending levels that quantise one value or more with little mean square error. [...] → [256]
 
-    They begin with the cube root of the values' density, which is the best one where there are many levels, and a fifth
-    of them evenly, so that no rare value is far from a level. Lloyd's algorithm makes them better.
+    They begin as dense as the cube root of the values, which is best for many levels, and a fifth of them evenly, so
+    that no rare value is far from a level. Lloyd's algorithm improves them.
     """
     counts, edges = np.histogram(values, _BINS)
     density = np.cbrt(counts)
@@ -69,7 +63,7 @@ def codebook(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def nearest_level(values: NDArray[np.floating], levels: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Return the index of the level, of at most 256 ascending ones, that is nearest to each value. [...] → [...]"""
+    """Return the index of the nearest level, of at most 256 ascending ones. [...] → [...]"""
     return np.searchsorted((levels[1:] + levels[:-1]) / 2, values).astype(np.uint8)
 
 
@@ -79,5 +73,5 @@ def to_bytes(values: NDArray[np.number]) -> NDArray[np.uint8]:
 
 
 def sigmoid(logits: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return opacities in [0, 1] of logits of any size. [...] → [...]"""
+    """Return opacities in [0, 1], also of huge logits. [...] → [...]"""
     return np.float32(0.5) + np.float32(0.5) * np.tanh(np.float32(0.5) * logits)

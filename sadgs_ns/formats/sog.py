@@ -1,8 +1,8 @@
 """SOG, PlayCanvas's layout, version 2: a zip archive of lossless WebP images, one pixel a Gaussian, and `meta.json`.
 
-Positions have 16 bits, evenly in sign(x) ln(1 + |x|); quaternions 8 bits for each of the three smallest components;
-opacities 8 bits; scales and colours one of 256 levels each, chosen for the scene; the higher harmonics of a Gaussian
-are one of up to 65,536 sets that were found by k-means, their values one of 256 levels.
+Positions have 16 bits, evenly in sign(x) ln(1 + |x|), each of the three smallest components of quaternions 8 bits, and
+opacities 8 bits. Scales and colours have 256 levels, chosen for the scene. A Gaussian's higher harmonics are one of up
+to 65,536 sets, found by k-means, with values of 256 levels.
 """
 
 from __future__ import annotations
@@ -28,10 +28,8 @@ _PALETTE = 1 << 16
 """Most sets of higher harmonics."""
 _SETS_A_ROW = 64
 """Sets of harmonics in a row of their image."""
-_SAMPLE = 1 << 16
-"""Number of sets from which the coarse clusters are found."""
-_ROUNDS = 8
-"""Rounds of k-means."""
+_SAMPLE, _ROUNDS = 1 << 16, 8
+"""Sets of which the coarse clusters are made, and rounds of k-means."""
 
 
 def write(file: IO[bytes], gaussians: Gaussians) -> None:
@@ -95,10 +93,10 @@ def _image(pixels: NDArray[np.uint8], width: int) -> Image.Image:
 
 
 def palette(vectors: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Return vectors [P, D] that stand for all [N, D], at most `_PALETTE`, and which of them stands for each [N].
+    """Return at most `_PALETTE` vectors [P, D] that stand for all [N, D], and the index of the one for each [N].
 
-    k-means runs twice: it finds coarse clusters of a sample, and then, in each, as many fine ones as its members' share
-    asks for. Compared with one k-means of all this takes the square root of the distances.
+    k-means finds coarse clusters of a sample, and then fine ones in each, by its share of the vectors. That takes the
+    square root of the distances that one k-means of all would compute.
     """
     number = min(_PALETTE, len(vectors) // 2 + 1)
     generator = np.random.default_rng(0)
@@ -118,7 +116,7 @@ def palette(vectors: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[
 
 
 def _k_means(vectors: NDArray[np.float32], number: int, generator: np.random.Generator) -> NDArray[np.float32]:
-    """Return so many centres of vectors, which are at least as many. [N, D] → [number, D]"""
+    """Return centres of at least as many vectors. [N, D] → [number, D]"""
     from scipy.cluster.vq import kmeans2  # It takes a third of a second to import.
 
     start = vectors[generator.choice(len(vectors), number, replace=False)]
@@ -128,7 +126,7 @@ def _k_means(vectors: NDArray[np.float32], number: int, generator: np.random.Gen
 
 
 def _nearest(vectors: NDArray[np.float32], centers: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Return the index of the centre that is nearest to each vector. [N, D], [M, D] → [N]"""
+    """Return the index of each vector's nearest centre. [N, D], [M, D] → [N]"""
     from scipy.cluster.vq import vq
 
     return vq(vectors, centers, check_finite=False)[0]

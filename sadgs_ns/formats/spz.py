@@ -1,14 +1,14 @@
 """SPZ, Niantic's layout, version 3: fixed-point positions, bytes for the rest, and gzip over all; 16 to 65 bytes each.
 
-Positions have 24 bits, of which as many are behind the point as the furthest Gaussian leaves. Logarithms of scales are
-cut to −10 … 5.94 and have steps of 1/16, opacities have 8 bits, colours steps of 1/38 in the harmonic of degree 0, cut
-at ±3.33, and quaternions 9 bits and a sign for each of the three smallest components. The higher harmonics are cut at
-±1, with steps of 1/32. Niantic's own writer takes 1/16 in degree 1 and 1/8 above, to which most of what a short run has
-learned there is zero.
+Positions have 24 bits, as many of them behind the point as the furthest Gaussian leaves. Logarithms of scales are cut
+to −10 … 5.94 and have steps of 1/16, opacities have 8 bits, colours steps of 1/38 in the harmonic of degree 0, cut at
+±3.33, and quaternions 9 bits and a sign for each of the three smallest components. The higher harmonics are cut at ±1
+and have steps of 1/32; with those of Niantic's own writer, 1/16 in degree 1 and 1/8 above, most of what a short run
+learns there would be zero.
 
-Axes are those of the PLY, and a record of Adobe's at the end says so. Without it some readers take a file's axes for a
+Axes are those of the PLY, as a record of Adobe's at the end says. Without it some readers take a file's axes for a
 PLY's (splat-transform from version 3, SuperSplat) and others for OpenGL's, half a turn around x away (Niantic's library
-and splat-transform 2 before a PLY is written); with it all of these leave the SPZ where the PLY is.
+and splat-transform 2 before a PLY is written). With it all of these leave the SPZ where the PLY is.
 """
 
 from __future__ import annotations
@@ -55,16 +55,15 @@ def write(file: IO[bytes], gaussians: Gaussians) -> None:
         to_bytes(128 + _STEP * np.rint(128 / _STEP * gaussians.features_rest)),
     ]
     with gzip.GzipFile(fileobj=file, mode="wb", compresslevel=6, mtime=0) as compressed:
-        compressed.write(
-            struct.pack("<IIIBBBB", _MAGIC, _VERSION, len(gaussians), gaussians.degree, bits, _HAS_RECORDS, 0)
-        )
+        counts = len(gaussians), gaussians.degree, bits
+        compressed.write(struct.pack("<IIIBBBB", _MAGIC, _VERSION, *counts, _HAS_RECORDS, 0))
         for part in parts:
             compressed.write(part.tobytes())
         compressed.write(_AXES)
 
 
 def _fractional_bits(reach: float) -> int:
-    """Return how many of a position's 23 bits and a sign can be behind the point."""
+    """Return how many of a position's 23 bits can be behind the point."""
     bits = min(_MOST_BITS, 22 - math.floor(math.log2(max(reach, 1e-6))))
     if bits < _LEAST_BITS:
         raise InputError(

@@ -43,8 +43,8 @@ from sadgs_ns.cli.process import features
 from sadgs_ns.cli.process import stages as colmap_stages
 from sadgs_ns.cli.process.colmap import run_colmap
 from sadgs_ns.cli.process.command import Process, main, photos_added, process
-from sadgs_ns.cli.process.folder import look_into
-from sadgs_ns.cli.process.photos import Photo, find_source, photos_by_camera, read_photos, write_masks
+from sadgs_ns.cli.process.folder import find_source, look_into
+from sadgs_ns.cli.process.photos import Photo, photos_by_camera, read_photos, write_masks
 from sadgs_ns.cli.process.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching, expected_work
 from sadgs_ns.cli.process.stages import check_written, fetch_vocabulary, match, sequential_pairs
 from sadgs_ns.cli.process.video import sharpest_frames, video_frames
@@ -376,7 +376,8 @@ def test_all_photos_that_are_not_whole_are_named(tmp_path: Path, capsys):
 def test_hidden_files_and_folders_named_as_photos_are_no_photos(tmp_path: Path):
     black(tmp_path, "a.png", "b.png", "c.png", "._a.png", ".thumbnails/a.png", "folder.png/d.png")
     (tmp_path / "around").symlink_to(tmp_path)
-    assert find_source(tmp_path, tmp_path / "out") == (["a.png", "b.png", "c.png", "folder.png/d.png"], False)
+    names = ["a.png", "b.png", "c.png", "folder.png/d.png"]
+    assert find_source(tmp_path, tmp_path / "out") == (names, False, {}, [])
     black(tmp_path, "line\nbreak.png")
     with pytest.raises(InputError, match=r"unprintable characters in its name, 'line.nbreak.png': rename it"):
         find_source(tmp_path, tmp_path / "out")
@@ -1306,7 +1307,7 @@ def test_photos_cannot_be_added_to_a_scene_whose_features_are_not_there(
     source, out, _ = grown
     (out / "work" / "database.db").unlink()
     assert main([str(source), str(out), "--max-size", "120"]) == 2
-    assert "holds the features and the model no more that photos could be added to" in capsys.readouterr().err
+    assert "no longer holds the features and the model that photos could be added to" in capsys.readouterr().err
 
 
 def test_an_unreadable_photo_can_be_removed(tmp_path: Path, taken: list[list[str]]):

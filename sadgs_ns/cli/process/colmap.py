@@ -1,8 +1,8 @@
-"""COLMAP runs in a process of its own.
+"""Runs COLMAP in a process of its own.
 
-COLMAP aborts the whole process where it meets an error in one of its threads, such as a full disk or a failed
-download, and does not listen to signals while it works. pycolmap's library also replaces the zlib that Pillow brings:
-Pillow crashes when it writes a PNG and was loaded after pycolmap.
+COLMAP aborts the whole process at an error in one of its threads, such as a full disk or a failed download, and ignores
+signals while it works. pycolmap's library also replaces Pillow's zlib: Pillow, if it is loaded later, crashes when it
+writes a PNG.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from sadgs_ns.cli.worker import Worker, WorkerError
 from sadgs_ns.errors import RunError, free_space
 
 Report = Callable[[str, int, int], None]
-"""Called with a stage's name, how much of it is done, and how much there is to do."""
+"""Called with a stage's name, the work that is done, and all its work."""
 _FULL_DISK = re.compile("no space left|disk is full|disk I/O error|file too large|failed to write", re.IGNORECASE)
 _FULL_BELOW = 8 * 2**20
 """Free bytes under which a disk counts as full."""
@@ -27,9 +27,7 @@ _ERROR_LINE = re.compile(r"^[EF]\d{8} |^\s*what\(\): |Error: ")
 
 
 def run_colmap(function: str, *arguments: Any, folder: Path, report: Report) -> Any:
-    """Call a function of `stages.py` by its name in another process, and return what it returns, as `Worker.run` does.
-
-    The function writes to `folder`, which is there and which errors name. `report` is called in this process.
+    """Call a function of `stages.py`, which writes to `folder`, in another process, as `Worker.run` does.
 
     Raises:
         InputError: If the function raises it.
@@ -38,14 +36,14 @@ def run_colmap(function: str, *arguments: Any, folder: Path, report: Report) -> 
     """
     begun, log = "its start", folder / "colmap.txt"
 
-    def hear(event: str, stage: str, done: int, total: int) -> None:
+    def on_event(event: str, stage: str, done: int, total: int) -> None:
         nonlocal begun
         begun = stage
         report(stage, done, total)
 
     try:
         with Worker(f"sadgs_ns.cli.process.stages:{function}", log) as worker:
-            return worker.run(*arguments, on_event=hear)
+            return worker.run(*arguments, on_event=on_event)
     except WorkerError as error:
         raise _error_of(error, begun, folder) from None
     finally:

@@ -1,8 +1,8 @@
 """`sadgs-process PHOTOS_OR_VIDEO OUT`: from photos to a scene that `ns-train sadgs --data OUT` reads, with pycolmap.
 
-OUT holds `images/`, `transforms.json`, `sparse_pc.ply` and COLMAP's model in `sparse/0`. What an interrupted run needs
-to go on lies in `OUT/work`. Of a finished scene `settings.json` stays there, by which the command knows it again, and
-what photos that come later are added to: the features and matches in `database.db`, and the model before undistortion.
+OUT holds `images/`, `transforms.json`, `sparse_pc.ply` and COLMAP's model in `sparse/0`. `OUT/work` holds what an
+interrupted run needs to go on. Of a finished scene it keeps `settings.json`, by which the command knows it again, and
+for photos that are added later the features and matches in `database.db`, and the model before undistortion.
 """
 
 from __future__ import annotations
@@ -26,14 +26,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from sadgs_ns import events
 from sadgs_ns.cli.process.colmap import Report, run_colmap
-from sadgs_ns.cli.process.folder import look_into
+from sadgs_ns.cli.process.folder import find_source
 from sadgs_ns.cli.process.panoramas import VIEWS
 from sadgs_ns.cli.process.photos import (
     Photo,
     changed_photos,
     convert_photos,
     empty_folder,
-    find_source,
     photo_stamps,
     photos_by_camera,
     read_photos,
@@ -50,13 +49,13 @@ from sadgs_ns.errors import InputError, WriteError
 from sadgs_ns.plugin.interrupts import Interrupts
 
 MIN_SIZE = 64
-"""Smallest longest side of the result in px; no structure is left in smaller images."""
+"""Least longest side of the result in px; no structure is left in smaller images."""
 _SECONDS_PER_LINE = 1.0
 """Least time between two lines of a stage's progress in a file."""
 _KEPT_KEYS = (*FRAME_KEYS, "train_filenames", "val_filenames", "test_filenames")
 """Keys that a scene's `transforms.json` keeps when photos are added."""
 _UNFINISHED = ("frames.partial", "photos.partial", "model.partial", "models", "undistorted")
-"""Folders in `work` that are made anew by each run that needs them."""
+"""Folders in `work` that each run makes anew."""
 
 
 @dataclass
@@ -78,11 +77,7 @@ class Process:
 
 
 class _Scene:
-    """What was begun of a scene, and what is asked for now.
-
-    Raises:
-        InputError: If the photos, the folder or the settings cannot be used.
-    """
+    """A scene that was begun, and what is asked of it now; raises InputError if the two do not fit."""
 
     def __init__(self, given: Process) -> None:
         self.given, self.work = given, given.out / "work"
@@ -90,9 +85,7 @@ class _Scene:
         out, source = given.out, given.source
         if out.is_file() or (not self.noted.exists() and any(not path.is_dir() for path in out.rglob("*"))):
             raise InputError(f"{out} exists and is not a scene that sadgs-process began; give another folder.")
-        found = look_into(source, out) if source.is_dir() else ([], {}, [])
-        photos, self.is_video = find_source(source, out, found)
-        _, self.masks, self.left_out = found
+        photos, self.is_video, self.masks, self.left_out = find_source(source, out)
         self.settings: dict[str, Any] = {
             "source": os.path.realpath(source),
             "camera_per_photo": given.camera_per_photo,
@@ -103,7 +96,7 @@ class _Scene:
         self.finished = self.begun.get("finished") if (out / "transforms.json").exists() else None
         if self.begun:
             self._refuse_changes()
-        # Photos of a scene that an earlier version began, whose cameras are those of the pixels as they are stored.
+        # The cameras of photos that an earlier version began with are those of the pixels as they are stored.
         self.settings["as_stored"] = self.begun.get("as_stored", self.begun.get("photos", []))
         self.added, self.base, self.model = 0, None, self.work / "model"
         if self.finished:
@@ -111,10 +104,8 @@ class _Scene:
         if self.added:
             self.base, self.model = self.model, self.work / f"model-{len(photos)}"
             if not (self.base.exists() and (self.work / "database.db").exists()):
-                raise InputError(
-                    f"{self.work} holds the features and the model no more that photos could be added to: give another "
-                    "folder or delete it."
-                )
+                told = f"{self.work} no longer holds the features and the model that photos could be added to"
+                raise InputError(f"{told}: give another folder or delete it.")
 
     def _refuse_changes(self) -> None:
         asked: dict[str, Any] = self.settings | ({"max_size": self.given.max_size} if self.finished else {})
@@ -147,7 +138,7 @@ class _Scene:
 
     @contextlib.contextmanager
     def alone(self) -> Iterator[None]:
-        """Keep other runs away from the work folder, and leave nothing half-written there."""
+        """Lock the work folder, and leave nothing half-written there."""
         if not self.begun:
             self.note()
         with locked(self.work, f"another sadgs-process works on {self.given.out}; wait for it, or stop it."):
@@ -159,16 +150,15 @@ class _Scene:
                 (self.work / "pairs.txt").unlink(missing_ok=True)
 
     def remove_intermediate_files(self) -> None:
-        """Remove from the work folder of the finished scene what no photo that is added later needs."""
+        """Remove what adding photos to the finished scene does not need."""
         for path in {*self.work.iterdir()} - {self.model, self.work / "database.db", self.noted}:
             shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def process(given: Process) -> Summary:
-    """Make a scene of photos or a video, and say how far it is, in print and as events.
+    """Make a scene of photos or a video, and report its progress in print and as events.
 
-    An interrupted run in the folder goes on. To a finished scene photos are added that have come since, while its other
-    cameras stay as they are; without any it is left as it is.
+    A run that was interrupted goes on. New photos are added to a finished scene, whose other cameras stay as they are.
 
     Raises:
         InputError: If the photos, the folder or the settings cannot be used.
@@ -263,14 +253,13 @@ def _tell_work(scene: _Scene, photos: Sequence[Photo], matching: Matching, notic
 
 
 def _convert(scene: _Scene, folder: Path, stored: Sequence[Photo]) -> tuple[Path, list[Photo]]:
-    """Convert photos as `convert_photos`, and write their masks, if they or the scene have any, and opacities."""
-    source, work = scene.given.source, scene.work
+    """Convert photos as `convert_photos`, and write their opacities, and masks if they or the scene have any."""
+    work, masks = scene.work, scene.masks
     converted, photos = convert_photos(folder, stored, work / "photos")
-    masks = {} if scene.is_video else scene.masks
     has_masks = (scene.given.out / "masks").exists() if scene.added else bool(masks)
     shutil.rmtree(work / "masks", ignore_errors=True)
     if has_masks:
-        write_masks(source, masks, stored, photos, work / "masks")
+        write_masks(scene.given.source, masks, stored, photos, work / "masks")
     if masks:
         why = "used" if has_masks else "not used, because the scene has none: give another folder for it"
         _say("aside", told := f"Masks of {len(masks)} photos are {why}.", told=told)
@@ -280,27 +269,26 @@ def _convert(scene: _Scene, folder: Path, stored: Sequence[Photo]) -> tuple[Path
 
 
 def photos_added(source: Path, out: Path) -> list[str]:
-    """Return the photos that came to a folder since its finished scene was made; raise as `find_source`."""
+    """Return the photos that were added to a folder since its scene was finished; raises as `find_source`."""
     begun = read_settings(out / "work" / "settings.json", out)
     return sorted({*find_source(source, out)[0]} - {*begun.get("photos", [])}) if "finished" in begun else []
 
 
 def _say(event: str, sentence: str, **fields: str) -> None:
-    """Print a sentence, and tell a listener of the event that it is about."""
+    """Print a sentence, and report the event that it is about."""
     print(sentence, flush=True)
     events.report(event, **fields)
 
 
 def _reporter(progress: Progress) -> Report:
-    """Return a function that shows each stage as a bar of its own; where there is no terminal, as lines of a number."""
+    """Return a function that shows each stage as a bar, or without a terminal as lines of numbers."""
     tasks: dict[str, TaskID] = {}
     printed = 0.0
 
     def report(stage: str, done: int, total: int) -> None:
         nonlocal printed
         events.progress(stage, done, total)
-        begins = stage not in tasks
-        if begins:
+        if begins := stage not in tasks:
             tasks[stage] = progress.add_task(stage, total=total)
         progress.update(tasks[stage], completed=done)
         if progress.disable and (begins or done == total or time.monotonic() >= printed + _SECONDS_PER_LINE):
@@ -313,10 +301,8 @@ def _reporter(progress: Progress) -> Report:
 def _publish(undistorted: Path, out: Path, grown: bool = False) -> None:
     """Move undistorted photos, their model and what nerfstudio reads of it to the scene's folder.
 
-    A finished scene that has `grown` by these photos stays one until all are there.
-
-    Raises:
-        OSError: If a file cannot be written, or COLMAP could not write one.
+    A finished scene that has `grown` by these photos stays one until all are there. Raise an OSError if a file cannot
+    be written, or COLMAP could not write one.
     """
     images, described = undistorted / "images", json.loads((undistorted / "transforms.json").read_text())
     written = [frame["file_path"] for frame in described["frames"]]
@@ -353,13 +339,13 @@ def _publish(undistorted: Path, out: Path, grown: bool = False) -> None:
 
 
 def check_size(max_size: int) -> None:
-    """Raise an InputError if a longest side in px leaves no structure in the photos."""
+    """Raise InputError if photos of this longest side in px would show no structure."""
     if max_size != 0 and max_size < MIN_SIZE:
         raise InputError(f"--max-size must be at least {MIN_SIZE} px, or 0 to keep the photos' size.")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Make a scene and return the exit code: as `exit_code`, and 1 for a scene of fewer than half of the photos."""
+    """Make a scene and return the exit code, which is 1 also if fewer than half of the photos registered."""
     given = parse(Process, "sadgs-process", argv)
     return exit_code("sadgs-process", given.out, lambda: _run(given))
 

@@ -19,18 +19,18 @@ from sadgs_ns.events import progress
 from sadgs_ns.method.host_memory import available_host_bytes
 
 MOST_FEATURES = 8192
-"""Features of a photo, of which the most contrasted are taken; COLMAP's own limit."""
+"""Most features of a photo, those with the most contrast; COLMAP's own limit."""
 _CONTRAST = 0.02
 """Least contrast of a feature, COLMAP's: a photo in [0, 1] needs a third of it in a scale of three per octave."""
 _BYTES_PER_PIXEL = 240
-"""Memory that OpenCV takes for features, as measured; it doubles the photo's size first."""
+"""Memory of OpenCV for features, as measured; it doubles the photo's size first."""
 
 
 def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, rigs: Sequence[Sequence[str]] = ()) -> None:
-    """Find SIFT features in the photos of a folder that have none yet; one that cannot be decoded gets none.
+    """Find SIFT features in the photos of a folder that have none in COLMAP's database yet, which is made if need be.
 
-    In `groups` the names of one camera's photos are together, in `rigs` those of one panorama's views. COLMAP's
-    database is made if it does not exist. Beside it the folder `masks` may hold masks, as `write_masks` writes them.
+    In `groups` the names of one camera's photos are together, in `rigs` those of one panorama's views. The folder
+    `masks` beside the database may hold masks, as `write_masks` writes them.
     """
     total = sum(map(len, [*groups, *rigs]))
     progress("features", 0, total)
@@ -91,17 +91,13 @@ def _add_panorama(opened: pycolmap.Database, photos: Path, views: Sequence[str])
 
 
 def sift(photo: Path, mask: Path | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Find the SIFT features of a photo.
-
-    Args:
-        photo: An image file, whose EXIF orientation is ignored, as COLMAP does.
-        mask: An image file, perhaps, of the photo's shape; no feature lies where it is black.
+    """Find the SIFT features of a photo, whose EXIF orientation is ignored, except where a mask of its shape is black.
 
     Returns:
-        Keypoints as float32 [N, 4], N at most about `MOST_FEATURES`: x and y in px of the file's pixels, the first of
-        which has its centre at .5; the scale in px; the orientation in radians. And their descriptors as uint8
-        [N, 128]: 512 times the roots of the shares of SIFT's numbers in their sum (RootSIFT), as COLMAP compares them.
-        N is 0 where the photo cannot be decoded.
+        N keypoints, at most about `MOST_FEATURES`, none if the photo cannot be decoded: x and y in px of the file, in
+        which the first pixel's centre lies at .5; scale in px; orientation in radians. float32 [N, 4]
+        Their descriptors, as COLMAP compares them: 512 times the roots of the shares of SIFT's numbers in their sum
+        (RootSIFT). uint8 [N, 128]
     """
     image = cv2.imread(str(photo), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     points, values = (), None
@@ -126,7 +122,7 @@ def sift(photo: Path, mask: Path | None = None) -> tuple[np.ndarray, np.ndarray]
 
 
 def _num_threads(sizes: Sequence[tuple[int, int]]) -> int:
-    """Return how many photos of these sizes in px are searched at a time: one on each core, if memory allows."""
+    """Return how many photos of these sizes in px are searched at a time: one on each core if memory allows."""
     pixels = max(map(searched_pixels, sizes), default=1.0)
     at_a_time = 0.5 * available_host_bytes() / (_BYTES_PER_PIXEL * pixels)
     return max(1, int(min(os.cpu_count() or 1, at_a_time)))

@@ -1,4 +1,4 @@
-"""Finds the photos of a folder and their masks, and tells of what else is there."""
+"""Finds the photos or videos of a folder, and masks, and tells of other images."""
 
 from __future__ import annotations
 
@@ -14,33 +14,55 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageOps
 
+from sadgs_ns.cli.process.video import find_videos
 from sadgs_ns.cli.program import read_settings
 from sadgs_ns.data import IMAGE_SUFFIXES
 from sadgs_ns.data.checks.images import image_size
+from sadgs_ns.errors import InputError
 
 COLMAP_FORMATS = {"JPEG", "MPO", "PNG", "BMP", "TIFF"}
 """Pillow's names of the formats that COLMAP and OpenCV read."""
 _FORMATS = COLMAP_FORMATS | {"WEBP", "AVIF"}
 _NOT_READ = "images that are not read (make them .jpg or .png files)"
 _RAW_OR_HEIC = {".heic", ".heif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
-"""Suffixes of formats that are not read, by which programs also call JPEG; Pillow takes previews of some for TIFF."""
+"""Suffixes of formats that are not read. Programs also give them to JPEG; Pillow takes previews of some for TIFF."""
 _SERVICE = re.compile(r"(.*/)?(@eadir|@__thumb|[@#$]recycle(\.bin)?|__macosx|lost\+found)/.*", re.IGNORECASE)
-"""Files in folders that network drives and operating systems keep of thumbnails and of what was deleted."""
+"""Files in folders of network drives and operating systems for thumbnails and deleted files."""
 _MASK = re.compile(r"(.*/)?masks?(_\d+)?/.*|.*[ ._-]mask\.\w+", re.IGNORECASE)
 _VARIANT = re.compile(r"(?<=^img_)e(?=\d)|[ ._-]*(mask|edited|copy|thumb|small|\(\d+\))$")
-"""What programs add to a photo's name for its mask or a copy; an iPhone's IMG_E1234 is the edited IMG_1234."""
-Found = tuple[list[str], dict[str, str], list[str]]
-"""What `look_into` returns."""
+"""Additions to a photo's name for its mask or a copy; an iPhone's IMG_E1234 is the edited IMG_1234."""
 
 
-def look_into(source: Path, out: Path) -> Found:
-    """Find the photos of a folder for a scene; photos that it was begun with stay photos.
-
-    Hidden files, as macOS writes them, and those of scenes that are made in the same folder are left out.
+def find_source(source: Path, out: Path) -> tuple[list[str], bool, dict[str, str], list[str]]:
+    """Return the photos of a folder for a scene, or its videos if it has fewer than three photos.
 
     Returns:
-        The sorted photos, the masks of those that have one, both by names relative to the folder, and sentences on what
-        other images there are.
+        The names; whether they are videos, of which a single file has no names; then as `look_into`.
+
+    Raises:
+        InputError: If there are neither three photos nor a video, or a photo has a name that is no Unicode.
+    """
+    if source.is_file():
+        return [], True, {}, []
+    if not source.is_dir():
+        raise InputError(f"{source} does not exist; give a folder of photos or of videos, or a video.")
+    photos, masks, others = look_into(source, out)
+    if len(photos) < 3:
+        if videos := find_videos(source):
+            return videos, True, {}, others
+        told = f"{source} holds {len(photos)} photos; a reconstruction needs at least 3, better 30 or more."
+        raise InputError(" ".join([told, *others]))
+    for name in photos:
+        if not name.isprintable():
+            raise InputError(f"{source} holds a photo with unprintable characters in its name, {name!a}: rename it.")
+    return photos, False, masks, others
+
+
+def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[str]]:
+    """Return the photos of a folder for a scene, their masks by photo, and sentences on the other images that it has.
+
+    Names are relative to the folder. Photos that the scene was begun with stay photos. Hidden files, as macOS writes
+    them, and those of scenes in the same folder are left out.
     """
     folder, scene = Path(os.path.realpath(source)), Path(os.path.realpath(out))
     scenes = {scene, *(path.parents[1] for path in folder.glob(os.path.join("*", "**", "work", "settings.json")))}
@@ -70,7 +92,7 @@ def look_into(source: Path, out: Path) -> Found:
 
 
 def _kind(path: Path) -> str:
-    """Return "photos" by a file's suffix and content, even if damaged, `_NOT_READ` for other images, or nothing."""
+    """Return "photos" by a file's suffix and content, even if damaged, `_NOT_READ` for other images, or ""."""
     suffix, kind, start = path.suffix.lower(), "", b""
     if path.exists() and not path.is_file():
         return ""
@@ -86,13 +108,13 @@ def _kind(path: Path) -> str:
 
 
 def _stem(name: str) -> str:
-    """Return what a photo's name has in common with those of its mask and copies."""
+    """Return the part of a photo's name that its mask and copies share."""
     stem = Path(_VARIANT.sub("", Path(name).stem.lower()))
     return stem.stem if stem.suffix in IMAGE_SUFFIXES else stem.name
 
 
 def _is_mask(path: Path) -> bool:
-    """Return whether an image is black and white and hardly anything between."""
+    """Return whether nearly all of an image is black or white."""
     try:
         with Image.open(path) as image:
             pixels = np.asarray(image.convert("RGB").resize((64, 64), Image.Resampling.NEAREST))
@@ -102,7 +124,7 @@ def _is_mask(path: Path) -> bool:
 
 
 def _copies(folder: Path, photos: Sequence[str], known: Collection[str]) -> list[str]:
-    """Return the photos with the bytes of another, and those with the name of another that show the same."""
+    """Return the photos with the bytes of another, or with its name and about its content."""
     groups, copies = defaultdict(list), []
     for name in sorted(photos, key=len):
         if (folder / name).is_file() and (size := (folder / name).stat().st_size):
@@ -119,7 +141,7 @@ def _copies(folder: Path, photos: Sequence[str], known: Collection[str]) -> list
 
 
 def _is_copy(photo: Path, other: Path) -> bool:
-    """Return whether photos are equal, or have one name and show the same in another size, format or tone."""
+    """Return whether photos are equal, or have one name and differ in size, format or tone alone."""
     if filecmp.cmp(photo, other, shallow=False):
         return True
     try:

@@ -1,7 +1,7 @@
-"""Matches of SIFT features by a matrix product of their descriptors, on a GPU.
+"""Matches of SIFT features by a matrix product of all descriptors of two photos, on a GPU.
 
-COLMAP looks for neighbours in an index on the CPU, which takes most of the time of matching. Here all descriptors of
-two photos are compared; COLMAP's criteria decide, and its geometric verification follows.
+COLMAP's index on the CPU takes most of the time of matching. Its criteria decide here, too, and its geometric
+verification follows.
 """
 
 from __future__ import annotations
@@ -16,20 +16,15 @@ import torch
 from torch import Tensor
 
 MAX_DISTANCE, MAX_RATIO = 0.7, 0.8
-"""Largest angle between matching descriptors in radians, and its largest ratio to that of the next best; COLMAP's."""
+"""Largest angle between matching descriptors in radians, and its largest ratio to the next best's; COLMAP's."""
 _KEPT_PHOTOS = 2000
 """Photos whose descriptors stay on the device, at 1 MB each."""
 
 
 def match_descriptors(one: Tensor, other: Tensor) -> Tensor:
-    """Match the descriptors of two photos: each is the other's nearest, near enough, and nearer than the next.
+    """Match 512 times the descriptors of two photos, each the other's nearest, near enough, and nearer than the next.
 
-    Args:
-        one: 512 times unit vectors. uint8 [N, 128]
-        other: The same of the other photo, on the same device. uint8 [M, 128]
-
-    Returns:
-        Indices in `one` and in `other`. int64 [K, 2]
+    uint8 [N, 128], [M, 128] → indices in both, int64 [K, 2]
     """
     if not len(one) or not len(other):
         return torch.zeros((0, 2), dtype=torch.int64, device=one.device)
@@ -49,7 +44,7 @@ def _nearest(cosines: Tensor) -> Tensor:
 
 
 def write_matches(database: Path, pairs: Sequence[tuple[str, str]], device: torch.device) -> None:
-    """Match pairs of photos, by name, that have no matches in COLMAP's database yet, and write those, unverified."""
+    """Match pairs of photos that have no matches in COLMAP's database yet, and write those there, unverified."""
     with pycolmap.Database.open(database) as opened:
         ids = {image.name: image.image_id for image in opened.read_all_images()}
 

@@ -1,4 +1,4 @@
-"""Panoramas of 2:1, which show everything around a camera, and the pinhole views that they are cut into."""
+"""Panoramas of 2:1, which show all directions, and the pinhole views that they are cut into."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 from PIL import Image
 
 VIEWS = 8
-"""Views of a panorama: four above the horizon, and four below it that look between those. A view of 90° in both
-directions has a quarter of the panorama's width, so nearly as many pixels as the panorama has there."""
+"""Views of a panorama: four above the horizon, and four below it that look between those. A view of 90° × 90° has a
+quarter of the panorama's width, so nearly as many pixels as the panorama has there."""
 _PITCH = 22.5
-"""Degrees above and below the horizon. The views show all directions up to a latitude of 60°, and none over 68°: a
-tripod or a hand is not seen."""
+"""Degrees above and below the horizon. The views show all up to a latitude of 60°, and nothing over 68°, where a
+tripod or a hand is."""
 
 
 def rotations() -> np.ndarray:
@@ -27,10 +27,9 @@ def rotations() -> np.ndarray:
 
 
 def is_panorama(image: Image.Image, size: tuple[int, int]) -> bool:
-    """Return whether a photo of this size in px, maybe loaded at a smaller one of 512 px across, shows all around.
+    """Return whether a photo of this size in px, loaded with 512 px across or more, shows all directions.
 
-    XMP says so, or its ends meet and its poles are even. The ends of a 360° camera's two circles, which no program has
-    stitched yet, are black.
+    XMP says so, or its ends meet and its poles are even. The ends of two circles that are not stitched yet are black.
     """
     if size[0] != 2 * size[1] or b"equirectangular" in image.info.get("xmp", b""):
         return size[0] == 2 * size[1]  # Others are parts of a panorama.
@@ -49,7 +48,7 @@ def cut(panorama: Image.Image) -> list[Image.Image]:
 
 @lru_cache(VIEWS)
 def map_of_view(view: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return where in a panorama of a height in px the pixels of a view lie, x and y in OpenCV's px. [H/2, H/2] each"""
+    """Return x and y in a panorama of a height in px, in OpenCV's px, of the pixels of a view. [H/2, H/2] each"""
     side = height // 2
     across = (np.arange(side) + 0.5) / side * 2 - 1  # The tangents of angles up to 45° from the view's axis
     rays = np.stack([*np.meshgrid(across, across), np.ones((side, side))], -1) @ rotations()[view].T

@@ -1,4 +1,4 @@
-"""Finds the photos of a folder, checks that they are whole, and converts what COLMAP does not read."""
+"""Checks that photos are whole, and converts those that COLMAP does not read."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 import zlib
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -17,14 +18,13 @@ from typing import Any
 import numpy as np
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
-from sadgs_ns.cli.process.folder import COLMAP_FORMATS, Found, look_into
+from sadgs_ns.cli.process.folder import COLMAP_FORMATS
 from sadgs_ns.cli.process.panoramas import VIEWS, cut, is_panorama
-from sadgs_ns.cli.process.video import find_videos
 from sadgs_ns.data.checks.images import NOT_UPRIGHT, SIDEWAYS
 from sadgs_ns.errors import InputError, reason
 
 _KEPT_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
-"""Suffixes by which COLMAP knows in which format to write; it reads by what a file holds."""
+"""Suffixes that tell COLMAP in which format to write; it reads by what a file holds."""
 _FOCAL_LENGTHS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
 """The second alone tells of a phone's digital zoom."""
 _POSITION = (ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLongitude, ExifTags.GPS.GPSAltitude)
@@ -34,59 +34,34 @@ _NAMED = 20
 
 @dataclasses.dataclass(frozen=True)
 class Photo:
-    """What a photo's header tells."""
+    """The content of a photo's header."""
 
     name: str
     """Relative to the folder of the photos."""
     size: tuple[int, int]
     """Width and height in px, upright."""
     camera: tuple
-    """Equal for photos that one camera at one focal length took, as far as size and EXIF tell."""
+    """Equal for photos by one camera at one focal length, as far as size and EXIF tell."""
     position: tuple[float, ...]
-    """Latitude, longitude and altitude as EXIF holds them; empty where one lacks, because COLMAP then uses none."""
+    """Latitude, longitude and altitude as EXIF holds them; empty if one lacks, because COLMAP then uses none."""
     has_alpha: bool
     """Whether some pixels may be transparent."""
     is_read: bool = True
     """Whether COLMAP reads its format."""
     lies: bool = False
-    """Whether the pixels have to be turned or mirrored to be upright, as EXIF tells."""
+    """Whether EXIF says that the pixels have to be turned or mirrored to be upright."""
     is_panorama: bool = False
-    """Whether it shows everything around."""
 
     @property
     def views(self) -> list[Photo]:
-        """The views that a panorama is cut into, which have no camera of their own; another photo is its own view."""
+        """The views that a panorama is cut into, without a camera of their own; another photo is its own view."""
         suffix, size = "png" if self.has_alpha else "jpg", (self.size[1] // 2, self.size[1] // 2)
         names = [f"{self.name}/{i}.{suffix}" for i in range(VIEWS)]
         return [Photo(name, size, (), (), self.has_alpha) for name in names] if self.is_panorama else [self]
 
 
-def find_source(source: Path, out: Path, found: Found | None = None) -> tuple[list[str], bool]:
-    """Return the photos of a folder, as `look_into` finds them, or its videos where it has fewer than three photos.
-
-    Also return whether these are videos. A single video has no names. `found` is what `look_into` returned before.
-
-    Raises:
-        InputError: If there are neither three photos nor a video, or a photo has a name that is no Unicode.
-    """
-    if source.is_file():
-        return [], True
-    if not source.is_dir():
-        raise InputError(f"{source} does not exist; give a folder of photos or of videos, or a video.")
-    photos, _, others = found or look_into(source, out)
-    if len(photos) < 3:
-        if videos := find_videos(source):
-            return videos, True
-        told = f"{source} holds {len(photos)} photos; a reconstruction needs at least 3, better 30 or more."
-        raise InputError(" ".join([told, *others]))
-    for name in photos:
-        if not name.isprintable():
-            raise InputError(f"{source} holds a photo with unprintable characters in its name, {name!a}: rename it.")
-    return photos, False
-
-
 def photo_stamps(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
-    """Return size in bytes, time of the last change in ns and checksum of photos, by which they are known again."""
+    """Return size in bytes, time of the last change in ns and checksum of each photo."""
 
     def stamp(name: str) -> list[int]:
         status = (folder / name).stat()
@@ -97,10 +72,7 @@ def photo_stamps(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
 
 
 def changed_photos(folder: Path, stamps: Mapping[str, Sequence[int]]) -> list[str]:
-    """Return the names of the photos that are there and hold something else than when they were stamped.
-
-    Only those of another time are read: copying a photo changes its time and nothing else.
-    """
+    """Return the photos whose content is another than in their stamps; those of the same time are not read."""
     there = {name: (folder / name).stat() for name in stamps if (folder / name).exists()}
     touched = [name for name, now in there.items() if [now.st_size, now.st_mtime_ns] != list(stamps[name][:2])]
     now = photo_stamps(folder, touched)
@@ -112,10 +84,8 @@ def read_photos(
 ) -> list[Photo]:
     """Read and decode photos, because COLMAP takes the missing end of a file for black pixels.
 
-    EXIF's orientation counts, but for those of the photos that are taken `as_stored`.
-
-    Raises:
-        InputError: If some cannot be read or decoded; the message names them.
+    EXIF's orientation is ignored for photos that are taken `as_stored`. Raise InputError, which names them, if some
+    photos cannot be decoded.
     """
     photos: list[Photo] = []
     broken: list[str] = []
@@ -140,16 +110,16 @@ def read_photos(
             f"{len(broken)} of the {len(names)} photos in {folder} cannot be read as a whole image: "
             f"{', '.join(broken[:_NAMED] + more)}; copy {them} again or remove {them}."
         )
-    looks: dict[tuple[int, int], list[bool]] = {}
+    looks: dict[tuple[int, int], list[bool]] = defaultdict(list)
     for photo in photos:
-        looks.setdefault(photo.size, []).append(photo.is_panorama)
-    # Of one size all are panoramas or none is, for single ones may look otherwise.
+        looks[photo.size].append(photo.is_panorama)
+    # Of one size all are panoramas or none is, because single ones may look otherwise.
     return [dataclasses.replace(photo, is_panorama=bool(np.mean(looks[photo.size]) >= 0.5)) for photo in photos]
 
 
 @contextlib.contextmanager
 def _threads() -> Iterator[ThreadPoolExecutor]:
-    """Make threads that take no more work when the block raises, as at an interrupt."""
+    """Make threads that drop their waiting work when the block raises, as at an interrupt."""
     pool = ThreadPoolExecutor()
     try:
         yield pool
@@ -185,7 +155,7 @@ def _read_photo(folder: Path, name: str, as_stored: bool) -> Photo:
 
 
 def _numbers(value: Any) -> tuple[float, ...]:
-    """Return EXIF's number or numbers, and none where there is none or one of them is not finite, as 0/0 is not."""
+    """Return EXIF's number or numbers, or none if one of them is not finite, such as 0/0."""
     try:
         numbers = tuple(float(number) for number in (value if isinstance(value, tuple) else (value,)))
     except (TypeError, ValueError, ZeroDivisionError):
@@ -196,10 +166,8 @@ def _numbers(value: Any) -> tuple[float, ...]:
 def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tuple[Path, list[Photo]]:
     """Convert photos in formats that COLMAP does not read, turn those that lie and cut panoramas, if there are any.
 
-    `converted` is made of conversions and of links to the other photos, where there is no such folder yet.
-
-    Returns:
-        The folder of photos that COLMAP reads, and the photos and views in it.
+    The folder `converted` then holds conversions, and links to the other photos, unless it exists already. Return the
+    folder of photos that COLMAP reads, and the photos and views in it.
     """
 
     def converted_name(photo: Photo) -> str:
@@ -247,10 +215,7 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
 
 
 def write_alpha(folder: Path, photos: Sequence[Photo], alphas: Path) -> int:
-    """Write the opacity of a folder's photos that are partly transparent, which COLMAP leaves out, as grey images.
-
-    That of `NAME` is `NAME.png` in the folder `alphas`, which is emptied. Return how many these are.
-    """
+    """Empty `alphas`, write the opacity of each partly transparent photo `NAME` there as `NAME.png`, and count them."""
     empty_folder(alphas)
     for photo in photos:
         if photo.has_alpha:
@@ -266,9 +231,9 @@ def write_alpha(folder: Path, photos: Sequence[Photo], alphas: Path) -> int:
 def write_masks(
     folder: Path, masks: Mapping[str, str], photos: Sequence[Photo], converted: Sequence[Photo], target: Path
 ) -> None:
-    """Write a mask for each of a folder's photos, as it was `converted`; that of `NAME` is `NAME.png` in `target`.
+    """Write a mask for each photo `NAME` as it was `converted`, `NAME.png` in `target`, a white one if it has none.
 
-    A photo without one gets a white mask. Raise an InputError if a mask has another shape than its photo.
+    Raise InputError if a mask has another shape than its photo.
     """
     names = iter(f"{photo.name}.png" for photo in converted)
     for photo in photos:
@@ -290,7 +255,7 @@ def write_masks(
 
 
 def restore_alpha(images: Path, alphas: Path) -> None:
-    """Give a folder's images the opacity that `write_alpha` wrote, of the same size; some images may be missing."""
+    """Give those images that exist the opacity that `write_alpha` wrote, which has their size."""
     for path in alphas.rglob("*.png"):
         target = images / path.relative_to(alphas).with_suffix("")
         if target.exists():
@@ -301,17 +266,17 @@ def restore_alpha(images: Path, alphas: Path) -> None:
 
 
 def empty_folder(folder: Path) -> Path:
-    """Make a folder, and remove what an interrupted run left in it."""
+    """Make a folder anew, and return it."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     return folder
 
 
 def photos_by_camera(photos: Sequence[Photo]) -> list[list[str]]:
-    """Group the names of photos that one camera at one focal length took, as far as their size and EXIF tell."""
-    groups: dict[tuple, list[str]] = {}
+    """Group the names of photos by their camera."""
+    groups: dict[tuple, list[str]] = defaultdict(list)
     for photo in photos:
-        groups.setdefault(photo.camera, []).append(photo.name)
+        groups[photo.camera].append(photo.name)
     return list(groups.values())
 
 

@@ -1,4 +1,4 @@
-"""What is decided before any work, which is the pairs of photos to match, and the summary after it."""
+"""The choice of the pairs of photos to match, the expected time, and the summary."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sadgs_ns.cli.process.photos import Photo
 from sadgs_ns.errors import InputError, RunError
 
 EXHAUSTIVE_LIMIT = 200
-"""Photos up to which every pair is matched; twice the photos take four times as long."""
+"""Most photos of which every pair is matched; twice the photos take four times as long."""
 _FEATURES_PER_MEGAPIXEL = 0.55
 """Processor time in s to find features in a million pixels, as measured on castle, fox and tree."""
 _PAIR_PER_MEGAPIXEL, _LONGEST_PAIR = 0.12, 0.14
@@ -36,11 +36,10 @@ class Summary:
     reprojection_error: float
     """Mean over all observations, px."""
     left_out: dict[str, str]
-    """Photos that were not registered, and why."""
+    """The reason for each photo that did not register."""
     matching: Matching
-    """Which pairs were matched."""
     attempts: str = ""
-    """A sentence on a second attempt to place the cameras, where one was made."""
+    """A sentence on a second attempt to place the cameras, if one was made."""
 
     def __str__(self) -> str:
         lines = [
@@ -58,16 +57,10 @@ class Summary:
 def choose_matching(
     asked: Matching, photos: Sequence[Photo], is_video: bool, fetch_vocabulary: Callable[[], None]
 ) -> tuple[Matching, str]:
-    """Decide which pairs of photos, or of frames of a video, are matched.
+    """Return any way of matching photos but "auto", and a sentence on the choice, which may be empty.
 
-    Args:
-        fetch_vocabulary: Makes sure that COLMAP's vocabulary tree is on this machine; raises RunError if it cannot.
-
-    Returns:
-        Any way of matching but "auto", and what the user should know about the choice; empty if there is nothing.
-
-    Raises:
-        InputError: If what was asked for cannot work on these photos or this machine.
+    `fetch_vocabulary` brings COLMAP's vocabulary tree to this machine, or raises RunError. Raise InputError if the way
+    that was asked for cannot work on these photos or this machine.
     """
     nowhere = [photo.name for photo in photos if not photo.position]
     if asked == "spatial" and nowhere:
@@ -103,16 +96,13 @@ def choose_matching(
 
 
 def searched_pixels(size: tuple[int, int]) -> float:
-    """Return in how many pixels the features of a photo of this width and height in px are searched."""
+    """Return the number of pixels in which features of a photo of this width and height are searched."""
     width, height = size
     return width * height * min(1.0, MAX_SIDE / max(width, height)) ** 2
 
 
 def expected_work(photos: Sequence[Photo], matching: str, known: int = 0) -> tuple[str, str]:
-    """Return a sentence on how much there is to do, and how long it takes on this machine, as "roughly a minute".
-
-    An earlier run has matched `known` of the photos with each other.
-    """
+    """Return a sentence on the work without the `known` photos, and its duration here, such as "roughly a minute"."""
     new, megapixels = len(photos) - known, sum(searched_pixels(photo.size) for photo in photos) / 1e6
 
     def all_pairs(count: int) -> int:

@@ -1,6 +1,6 @@
-"""The stages from photos to a scene are features, matches, cameras with points, and undistortion, all by pycolmap.
+"""The stages from photos to a scene: features, matches, cameras with points, and undistortion, all by pycolmap.
 
-Each stage goes on where an interrupted run left it. They run in a process of their own (`colmap.py`), so no other
+Each stage goes on where an interrupted run left it. They run in a process of their own (`colmap.py`), so that no other
 module of the package may import this one.
 """
 
@@ -32,28 +32,28 @@ if TYPE_CHECKING:
 _SEED = 0
 """Seed of COLMAP's random samples, so that equal photos give nearly equal cameras; COLMAP's own seed is the clock."""
 _TRIALS = 2000
-"""Random samples after which COLMAP gives a pair of photos up. Its own 10,000 take three times as long, for pairs that
-have hardly anything in common, and find no more matches in the others."""
+"""Random samples after which COLMAP gives a pair of photos up. Its own 10,000 take three times as long, for pairs with
+hardly anything in common, and find no more matches in the others."""
 _PAIRS, _PAIRS_ON_GPU = 50, 400
-"""Pairs of photos after which the progress is told, and what was matched is not lost. Each time COLMAP starts its
-threads anew, and the descriptors travel to the GPU."""
+"""Pairs of photos that are matched, saved and reported together; for each lot COLMAP starts its threads anew, and the
+descriptors travel to the GPU."""
 _ADJUSTMENT = {
     "ba_global_frames_ratio": 2.0,
     "ba_global_points_ratio": 2.0,
     "ba_local_function_tolerance": 1e-4,
     "ba_global_function_tolerance": 1e-5,
 }
-"""By how much a model grows until all of it is adjusted again, and the relative change of the cost at which an
-adjustment ends. COLMAP's own are 1.1 and 0 (docs/results.md#finding-cameras)."""
+"""Growth of a model until all of it is adjusted again, and the relative change of the cost at which an adjustment
+ends. COLMAP's own are 1.1 and 0 (docs/results.md#finding-cameras)."""
 _ADJUSTED_PHOTOS = 2
-"""Photos that are adjusted after each that is placed; COLMAP's own are 6. With these numbers placing cameras takes
-.32 to .41 of the time that it takes with COLMAP's on three captures, .74 to .81 where photos are added to a model, and
-puts them within .3 % of where it puts them."""
+"""Photos that are adjusted after each that is placed; COLMAP's own are 6. With these numbers placing cameras takes .32
+to .41 of the time that it takes with COLMAP's on three captures, .74 to .81 if photos are added to a model, and moves
+them by at most .3 %."""
 _RELAXED = {"init_max_forward_motion": 1.0, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
 """Limits of a second attempt (COLMAP's own: .95, 16° and 30), which takes .9 to 1.5 times as long as a first."""
 _ENOUGH, _MOST_STRETCH = 0.9, 0.05
-"""Share of the photos that suffices at the first attempt, and the most by which its two focal lengths may differ:
-those of lenses do less, those of models that went wrong in the beginning more."""
+"""Share of the photos that suffices at the first attempt, and the largest difference of the two focal lengths: those
+of lenses differ less, those of models that went wrong in the beginning more."""
 FEW_FEATURES = 500
 """Keypoints under which a photo counts as blurred or empty."""
 
@@ -64,16 +64,15 @@ def make_model(
 ) -> Summary:  # fmt: skip
     """Make a model of photos, and from it the undistorted scene in the folder `undistorted` beside it.
 
-    Where an earlier model is given, the photos that are not in it are added to it, and they alone are undistorted.
-
     Args:
         photos: The folder of the photos.
         groups: The photos' names, those of one camera together.
         matching: Any but "auto".
         max_size: Longest side of the undistorted photos in px; 0 keeps them as they are.
-        model: The model's folder. Beside it `alpha` and `masks` hold what `write_alpha` and `write_masks` write, and
-            what an interrupted run left there is used again.
-        base: The earlier model's folder, whose cameras stay as they are; None begins anew.
+        model: The model's folder. Beside it lie `alpha` and `masks` of `write_alpha` and `write_masks`, and what an
+            interrupted run left, which is used again.
+        base: An earlier model's folder, to which photos are added; its cameras stay as they are, and the added photos
+            alone are undistorted.
         rigs: The names of the views of each panorama.
 
     Raises:
@@ -100,7 +99,7 @@ def make_model(
 
 
 def wake_gpu() -> torch.device | None:
-    """Import torch, and return the CUDA device, ready to compute, if there is one."""
+    """Import torch, and return the CUDA device if there is one, ready to compute."""
     import torch
 
     if not torch.cuda.is_available():
@@ -111,11 +110,7 @@ def wake_gpu() -> torch.device | None:
 
 
 def fetch_vocabulary(folder: Path) -> None:
-    """Have COLMAP load its vocabulary tree, or download it, for two made-up photos; the process aborts if it cannot.
-
-    Args:
-        folder: An empty folder.
-    """
+    """Match two made-up photos in an empty folder: COLMAP downloads its vocabulary tree, or aborts the process."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
     progress("vocabulary tree", 0, 1)
     database = folder / "database.db"
@@ -134,8 +129,10 @@ def fetch_vocabulary(folder: Path) -> None:
 
 
 def hold_out_panoramas(file: Path, rigs: Sequence[Sequence[str]]) -> None:
-    """Hold every tenth panorama or photo out, from the fifth, in a `transforms.json`; nerfstudio would divide the views
-    of a panorama. Where there are fewer, it does."""
+    """Hold out every tenth panorama or photo, from the fifth, in a `transforms.json`; of fewer nerfstudio chooses.
+
+    It would hold out single views of a panorama.
+    """
     described, first = json.loads(file.read_text()), {view: views[0] for views in rigs for view in views}
     names = in_order([frame["file_path"] for frame in described["frames"]])
     whole = {name: first.get(name.removeprefix("images/"), name) for name in names}
@@ -147,10 +144,10 @@ def hold_out_panoramas(file: Path, rigs: Sequence[Sequence[str]]) -> None:
 
 
 def choose_pairs(names: Sequence[str], rigs: Sequence[Sequence[str]], matching: Matching) -> list[tuple[str, str]]:
-    """Pair all photos, or each with some that follow it for "sequential".
+    """Pair all photos, or with "sequential" each with some that follow it.
 
-    The views of a panorama, which have one centre, are not paired with each other. For "sequential" those of two
-    panoramas are paired that look the same way, and fewer panoramas follow, because each overlaps with many.
+    The views of a panorama, which have one centre, are not paired with each other. With "sequential" only those views
+    of two panoramas are paired that look the same way, and fewer follow, because a panorama overlaps with many.
     """
     in_turn, units = matching == "sequential", {views[0]: views for views in rigs}
     first, axes = {view: views[0] for views in rigs for view in views}, rotations()[:, :, 2]
@@ -164,7 +161,7 @@ def choose_pairs(names: Sequence[str], rigs: Sequence[Sequence[str]], matching: 
 
 
 def sequential_pairs(names: Sequence[str], overlap: int = 10) -> list[tuple[str, str]]:
-    """Pair each frame with the next `overlap` ones and with ever fewer of those farther on, which close loops."""
+    """Pair each frame with the next `overlap` ones, and with ever fewer of the later ones, which close loops."""
     steps = sorted({*range(1, overlap + 1), *(2**k for k in range(4, 10))})
     return [(names[i], names[i + step]) for i in range(len(names)) for step in steps if i + step < len(names)]
 
@@ -176,14 +173,10 @@ def match(
     gpu: torch.device | None,
     rigs: Sequence[Sequence[str]] = (),
 ) -> None:
-    """Match features between photos; pairs that an earlier run matched are skipped.
+    """Match the features in COLMAP's database between photos; pairs that an earlier run matched are skipped.
 
-    Args:
-        names: All photos.
-        database: COLMAP's database, which holds their features. A file `pairs.txt` is written beside it.
-        matching: Any but "auto".
-        gpu: The device that compares features where COLMAP does not choose the pairs; None leaves all to COLMAP.
-        rigs: The names of the views of each panorama.
+    The GPU compares features unless COLMAP chooses the pairs; None leaves all to COLMAP. A file `pairs.txt` is written
+    beside the database.
     """
     stage, pair_list = f"matches ({matching})", database.with_name("pairs.txt")
     verification = pycolmap.TwoViewGeometryOptions()
@@ -191,7 +184,7 @@ def match(
     verification.ransac.max_num_trials = _TRIALS
     # COLMAP separates the names in a list of pairs by spaces.
     listable = not any(character.isspace() for name in names for character in name)
-    if matching in ("spatial", "vocabulary") or not listable:  # These functions tell nothing of their progress.
+    if matching in ("spatial", "vocabulary") or not listable:  # These functions do not report their progress.
         progress(stage, 0, 1)
         function = getattr(pycolmap, "match_vocabtree" if matching == "vocabulary" else f"match_{matching}")
         function(database, verification_options=verification)
@@ -215,8 +208,8 @@ def match(
 def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Path, base: Path | None) -> None:
     """Estimate cameras and points, and write the model with the most photos; its folder appears when it is complete.
 
-    Where there is an earlier model, photos are added to it: poses and intrinsics of the cameras that it has stay as
-    they are, points are triangulated with the new photos, and photos that did not register before are tried again.
+    Photos are added to an earlier model: its poses and intrinsics stay as they are, points are triangulated with the
+    new photos, and photos that did not register before are tried again.
 
     Raises:
         InputError: If no two photos could be related, or no photo could be added.
@@ -286,17 +279,14 @@ def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Pat
 
 
 def registered_photos(model: pycolmap.Reconstruction) -> set[str]:
-    """Return the names of the photos whose poses a model has."""
+    """Return the names of the photos with a pose in a model."""
     return {image.name for image in model.images.values() if image.has_pose}
 
 
 def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
-    """Compare the sizes of a written model's files with the model, because COLMAP does not say when the disk is full.
+    """Raise OSError if the files of a written model are smaller than it; COLMAP does not say that a disk is full.
 
-    COLMAP is not asked to read them: of a file that is cut off it takes any bytes for a length, and memory for that.
-
-    Raises:
-        OSError: If the folder holds less than the model.
+    COLMAP must not read them: it takes any bytes of a file that is cut off for a length, and asks for as much memory.
     """
     images = (image for image in model.images.values() if image.has_pose)
     expected = {  # COLMAP's binary formats
@@ -308,17 +298,10 @@ def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
 
 
 def undistort(photos: Path, model: Path, made: pycolmap.Reconstruction, max_size: int, known: Collection[str]) -> None:
-    """Write `images`, `alpha`, `masks`, and their model, `sparse/0`, to the folder `undistorted`, which is emptied.
+    """Write `images`, `alpha`, `masks` and their model, `sparse/0`, to the folder `undistorted`, which is made anew.
 
-    Args:
-        photos: The folder of the photos.
-        model: The folder of their model, with their opacities in `alpha` and their masks in `masks` beside it.
-        made: That model.
-        max_size: Longest side of the undistorted photos in px; 0 keeps them as they are.
-        known: Names of photos that were undistorted before, by the same cameras.
-
-    Raises:
-        OSError: If the model could not be written.
+    `made` is what the folder `model` holds, and photos that are `known` were undistorted before, by the same cameras.
+    Raise OSError if the model could not be written.
     """
     folder = model.with_name("undistorted")
     registered = [image for image in made.images.values() if image.has_pose and image.name not in known]
@@ -357,7 +340,7 @@ def undistort(photos: Path, model: Path, made: pycolmap.Reconstruction, max_size
 def summarize(
     names: Sequence[str], model: pycolmap.Reconstruction, database: Path, matching: Matching, attempts: str
 ) -> Summary:
-    """Count what was registered, and find out why the rest was not."""
+    """Count the registered photos, and find out why the others are none."""
     registered, left_out = registered_photos(model), {}
     with pycolmap.Database.open(database) as opened:
         identities = {image.name: image.image_id for image in opened.read_all_images()}

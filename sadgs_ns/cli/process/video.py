@@ -1,4 +1,4 @@
-"""Photos from videos: the sharpest frame of each of their stretches."""
+"""Photos from videos: the sharpest frame of each stretch."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ VIDEO_SUFFIXES = (".3gp", ".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpg
 
 def find_videos(folder: Path) -> list[str]:
     """Return the sorted names of a folder's videos, relative to it, without hidden ones."""
-    found = [path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in VIDEO_SUFFIXES]
-    names = sorted(path.as_posix() for path in found if not (folder / path).is_dir())
-    return [name for name in names if not any(part.startswith(".") for part in name.split("/"))]
+    found = [path for path in folder.rglob("*") if path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir()]
+    names = sorted(path.relative_to(folder).as_posix() for path in found)
+    return [name for name in names if "/." not in f"/{name}"]
 
 
 def count_frames(video: Path) -> int:
-    """Count a video's frames where its header does not tell, as in recordings; raise an InputError if it is none."""
+    """Return the number of a video's frames, which recordings do not tell; raise InputError if it is no video."""
     try:
         with av.open(os.fspath(video)) as container:
             stream = container.streams.best("video")
@@ -54,9 +54,9 @@ def read_frames(video: Path) -> Iterator[np.ndarray]:
 
 
 def sharpest_frames(video: Path, count: int, total: int) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield number and picture of the sharpest frame of each of `count` stretches of a video of `total` frames.
+    """Yield the number of each of `count` stretches of a video of `total` frames, and its sharpest frame, BGR.
 
-    The sharpest is the one whose Laplacian varies most. Pictures are BGR, uint8 [H, W, 3].
+    The sharpest is the one whose Laplacian varies most.
     """
     stretches = itertools.groupby(enumerate(read_frames(video)), lambda numbered: numbered[0] * count // total)
     for number, group in itertools.takewhile(lambda stretch: stretch[0] < count, stretches):
@@ -65,10 +65,10 @@ def sharpest_frames(video: Path, count: int, total: int) -> Iterator[tuple[int, 
 
 
 def video_frames(source: Path, names: Sequence[str], count: int) -> Iterator[tuple[str, np.ndarray]]:
-    """Return names and pictures of `count` frames, the `sharpest_frames` of a video or of those `names` in a folder.
+    """Return names and pictures of `count` sharp frames of a video, or of the videos with these names in a folder.
 
-    A video of a folder gives a share by its length, and the names of its frames begin with its own. Raise an InputError
-    if a file is no video, or they give fewer than three frames.
+    A video of a folder gives a share by its length, and the names of its frames begin with its own. Raise InputError if
+    a file is no video, or there are fewer than three frames.
     """
     totals = {name: count_frames(source / name) for name in names or [""]}
     everything = max(sum(totals.values()), 1)
@@ -87,7 +87,7 @@ def video_frames(source: Path, names: Sequence[str], count: int) -> Iterator[tup
 
 
 def write_frames(frames: Iterable[tuple[str, np.ndarray]], folder: Path, report: Callable[[int], None]) -> None:
-    """Write frames, as `video_frames` yields them, to a folder as photos; raise a WriteError if one fails."""
+    """Write frames of `video_frames` to a folder as photos; raise WriteError if one cannot be written."""
     for done, (name, frame) in enumerate(frames, 1):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(folder / name) as partial:
