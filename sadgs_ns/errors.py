@@ -1,4 +1,4 @@
-"""Errors whose message is one sentence that is all their reader needs."""
+"""Errors whose message is one sentence, which names the problem and the remedy."""
 
 from __future__ import annotations
 
@@ -64,8 +64,8 @@ _NERFSTUDIOS: tuple[tuple[str, str, type[Exception], str, str], ...] = (
         "The logger that --vis names could not start ({reason}): log in to its service, or choose another --vis.",
     ),
 )  # fmt: skip
-"""Errors of nerfstudio's commands that users meet: the innermost function of nerfstudio in the traceback, with its
-module; the kind of error, and a part of its text; what to say instead. None of our code runs around these functions."""
+"""Errors of nerfstudio's commands, around which none of our code runs: module and name of nerfstudio's innermost
+function in the traceback; the kind of error, and a part of its text; the sentence to print instead."""
 
 
 class InputError(ValueError):
@@ -73,11 +73,11 @@ class InputError(ValueError):
 
 
 class RunError(RuntimeError):
-    """A run cannot go on; the message says why, what is left of it and what helps."""
+    """A run cannot go on; the message says why, what was saved and what helps."""
 
 
 class WriteError(OSError):
-    """A file could not be written for an error; the message names it, the free space and the remedy."""
+    """A file could not be written; the message names it, the error, the free space and the remedy."""
 
     def __init__(self, path: Path, error: Exception) -> None:
         super().__init__(
@@ -87,10 +87,7 @@ class WriteError(OSError):
 
 
 def refuse_deleted_working_directory() -> None:
-    """Raise InputError if the folder in which the process works was deleted.
-
-    There MKL, a library of torch's, ends the process as soon as torch is imported, and it does not say why.
-    """
+    """Raise InputError if the working directory was deleted; there importing torch ends the process without a word."""
     try:
         os.getcwd()
     except FileNotFoundError:
@@ -99,11 +96,10 @@ def refuse_deleted_working_directory() -> None:
 
 
 def print_uncaught_errors_as_sentences() -> None:
-    """Have Python print our errors, where nobody catches them, as their sentence alone instead of a traceback.
+    """Have Python print our errors, and some of nerfstudio's, that nobody catches as a sentence without a traceback.
 
-    nerfstudio's commands run none of our code around what they do, but all of them import the package's `plugin`
-    folder, which calls this. Some errors of nerfstudio's own become a sentence, too. Python's exit code stays 1, and
-    other errors are shown as before.
+    nerfstudio's commands run none of our code around their work, but all import the package's `plugin` folder, which
+    calls this. The exit code stays 1, and other errors are shown as before.
     """
     show = sys.excepthook
 
@@ -117,7 +113,7 @@ def print_uncaught_errors_as_sentences() -> None:
 
 
 def sentence_of(error: BaseException) -> str | None:
-    """Return what to tell the user of an error of ours or of nerfstudio's; None if a traceback tells more."""
+    """Return the sentence for an error of ours or of nerfstudio's; None if a traceback says more."""
     if isinstance(error, InputError | RunError | WriteError):
         return str(error)
     frames = [frame for frame, _ in tracebacks.walk_tb(error.__traceback__)]
@@ -133,13 +129,13 @@ def sentence_of(error: BaseException) -> str | None:
 
 
 def reason(error: BaseException) -> str:
-    """Shorten a library's error to a few words: its first line without the full stop."""
+    """Return the first line of a library's error without the full stop."""
     text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     lines = text.strip().splitlines()
     return lines[0].strip().rstrip(".:") if lines else type(error).__name__
 
 
 def free_space(path: Path) -> str:
-    """Return the room on the disk of a file or folder, which need not exist, such as "12.3 GB"."""
+    """Return the free space, such as "12.3 GB", on the disk of a file or folder, which need not exist."""
     existing = next((p for p in (path, *path.parents) if os.path.exists(p)), Path())  # Path.exists may raise.
     return f"{shutil.disk_usage(existing).free / 1e9:.1f} GB"

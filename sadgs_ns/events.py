@@ -1,4 +1,4 @@
-"""Events with fields, by which a function tells the process that had it called how far it is."""
+"""Events with fields, by which a function reports its progress to the process that started its own."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from contextlib import suppress
 from typing import Any
 
 FILE = "SADGS_EVENTS"
-"""Environment variable with the path of the file from which a listener reads events, each of which is a JSON line."""
+"""Environment variable with the path of a file, from which a listener reads each event as a line of JSON."""
 
 
 def report(event: str, **fields: Any) -> None:
-    """Tell the listener, if there is one, of an event, whose fields are what JSON holds and dataclasses."""
+    """Report an event to the listener, if there is one; its fields are JSON or dataclasses."""
     if path := os.environ.get(FILE):
         line = json.dumps({"event": event, **fields}, default=dataclasses.asdict) + "\n"
         with suppress(OSError):
@@ -25,5 +25,5 @@ def report(event: str, **fields: Any) -> None:
 
 
 def progress(stage: str, done: int, total: int) -> None:
-    """Tell the listener how much of a stage is done."""
+    """Report how much of a stage is done."""
     report("progress", stage=stage, done=done, total=total)

@@ -12,14 +12,14 @@ from sadgs_ns.errors import WriteError
 
 @contextmanager
 def atomic_path(path: Path, beside: Path | None = None) -> Iterator[Path]:
-    """Give a temporary path that becomes `path` when the block ends well, and is removed when the block raises.
+    """Give a temporary path that becomes `path` when the block ends, and is removed when the block raises.
 
-    Its name is the same each time, so that the next write replaces what a killed one left.
+    Its name is the same each time, so that the next write replaces the rest of a killed one.
 
     Args:
-        path: The file to write. Its folder is made if there is none, and a file that is there is replaced.
-        beside: The temporary path lies beside this one and is named after it; None takes `path` itself. It is for
-            folders that must hold no other files.
+        path: The file to write or replace. Its folder is made if there is none.
+        beside: The temporary path lies beside this path and is named after it, by default beside `path`, whose folder
+            may have to hold no other files.
 
     Raises:
         WriteError: If the disk is full or the folder cannot be written.

@@ -1,4 +1,4 @@
-"""Which of some positions lie so far from the others that nothing should be measured by them."""
+"""Positions that lie too far from the others to measure anything by them."""
 
 from __future__ import annotations
 
@@ -6,25 +6,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 REACH = 30.0
-"""A position that is this many times as far out as most of the others is an outlier.
-In the captures that this was tried on, the farthest SfM point is 2 to 9 times as far out as 99 % of the points, and the
-farthest camera at most 1.4 times as far out as 90 % of the cameras."""
-
-POINT_SHARE = 0.99
-"""The part of the SfM points that tells how far out a point usually lies."""
-CAMERA_SHARE = 0.9
-"""The part of the cameras that tells how far out a camera usually lies."""
+"""A position that is this many times as far out as most of the others is an outlier. In the captures on which this was
+tried, the farthest SfM point is 2 to 9 times as far out as 99 % of the points, and the farthest camera at most 1.4
+times as far out as 90 % of the cameras."""
+POINT_SHARE, CAMERA_SHARE = 0.99, 0.9
+"""The shares of the SfM points and of the cameras that tell how far out one usually lies."""
 
 
 def far_outliers(positions: NDArray[np.floating], share: float) -> NDArray[np.bool_]:
-    """Which positions are not finite, or lie more than `REACH` times as far from the median as most of them. bool [P]
+    """Return which positions are not finite, or more than `REACH` times as far from the median as most. [P, 3] → [P]
 
-    Of fewer than four positions, and where most of them coincide, only those are that are not finite.
-
-    Args:
-        positions: Points or camera centres in any unit. [P, 3]
-        share: The part of the positions, in (0, 1), that tells how far out is usual. At least one is never part of it,
-            so that a single wild position is found among as few as four.
+    Of fewer than four positions, or if most coincide, only those that are not finite are outliers. The share, in
+    (0, 1), of the positions tells how far out is usual; it leaves out at least one of them.
     """
     outliers = ~np.isfinite(positions).all(axis=-1)
     if (~outliers).sum() < 4:

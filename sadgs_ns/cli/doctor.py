@@ -103,10 +103,8 @@ def _check_cuda() -> Iterator[Finding]:
     else:
         why = "; ".join(str(warning.message) for warning in caught) or "Triton is not installed or failed before"
         needed = ".".join(map(str, kernels.OLDEST_TRITON))
-        yield warning(
-            f"Training will take twice as long ({why}): install a torch whose Triton is {needed} or newer, a C "
-            "compiler and Python's headers."
-        )
+        told = f"Training will take twice as long ({why})"
+        yield warning(f"{told}: install a torch whose Triton is {needed} or newer, a C compiler and Python's headers.")
     try:
         from sadgs_ns import gsplat_compat
 

@@ -105,7 +105,7 @@ def export(given: Export) -> int:
     is_page, is_mesh = format_of(given.output) == ".html", format_of(given.output) == MESH
     _check(given)
     if is_mesh:
-        load_open3d()  # A machine that lacks it is told before views are rendered.
+        load_open3d()  # It may be missing, which the user shall know before views are rendered.
     folders = _checkpoint_of(given.run).absolute().parents[:2]
     folder = next((folder for folder in folders if (folder / TRANSFORMS_NAME).is_file()), folders[-1])
     from sadgs_ns.method.cleaning import Cleaning  # It imports torch.
@@ -114,10 +114,8 @@ def export(given: Export) -> int:
     similarity = None
     if given.frame == "colmap":
         if not (folder / TRANSFORMS_NAME).is_file():
-            raise InputError(
-                f"{folder} holds no {TRANSFORMS_NAME}, where nerfstudio notes how it moved the data: give the run "
-                "where it was made, or export in nerfstudio's frame."
-            )
+            problem = f"{folder} holds no {TRANSFORMS_NAME}, where nerfstudio notes how it moved the data"
+            raise InputError(f"{problem}: give the run where it was made, or export in nerfstudio's frame.")
         similarity = from_data(folder / TRANSFORMS_NAME).inverse()
     checkpoint, params, near_plane = read_checkpoint(given.run)
     drawing = {"max_off_axis": _MAX_OFF_AXIS, "near_plane": near_plane}

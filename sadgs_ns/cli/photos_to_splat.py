@@ -1,10 +1,10 @@
 """`sadgs PHOTOS_OR_VIDEO`: one command from photos or a video to a splat that opens in a browser.
 
-Its folder holds the cameras in `scene`, the run in `training`, all that was printed in `log`, the splats, and
-`settings.json`, which says what is done.
+Its folder holds the cameras in `scene`, the run in `training`, all output in `log`, the splats, and the state of the
+work in `settings.json`.
 
-Cameras of photos that were added since join those of the scene, which stay, and another run is trained in the same
-frame, with the same views held out. The earlier run is removed when the splats of the new one are written.
+The cameras of added photos join those of the scene, which stay as they are, and another run is trained in the same
+frame, with the same views held out. The earlier run is removed when the new splats are written.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _OURS = ("data", "output-dir", "experiment-name", "timestamp", "vis", "load-dir"
 """Options of ns-train that this command sets."""
 _TRAINING = "nerfstudio.scripts.train:entrypoint"
 _LOCK_SECONDS = 10.0
-"""Time that a killed run's last stage is given to save."""
+"""Time in which the last stage of a killed run may save."""
 _FORMATS = [suffix[1:] for suffix in (*FORMATS, MESH)]
 _ON_CPU = (
     "torch finds no GPU on this machine, so training runs on the CPU, which is for small scenes: a GPU with CUDA is "
@@ -84,11 +84,7 @@ class Sadgs:
 
 
 class PhotosToSplat:
-    """One run of the command, with more options for ns-train; `make` does all of it.
-
-    Raises:
-        InputError: If the source, the folder or an option cannot be used; nothing is written then.
-    """
+    """One run of the command, with options for ns-train; raises InputError before anything is written."""
 
     def __init__(self, given: Sadgs, options: Sequence[str], console: Console) -> None:
         source = Path(os.path.realpath(given.source))
@@ -151,7 +147,7 @@ class PhotosToSplat:
         return max(self._run.glob("nerfstudio_models/step-*.ckpt"), default=None)
 
     def make(self) -> list[Path]:
-        """Do what is not done yet, and return the splats. `exit_code` knows all errors that this raises."""
+        """Do the stages that are not done yet, and return the splats; `exit_code` knows all errors of this."""
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -182,12 +178,12 @@ class PhotosToSplat:
             return [self.folder / f"splat.{name}" for name in self._formats]
 
     def _views(self) -> list[str]:
-        """Return the scene's images, in the order in which nerfstudio chooses those that it holds out."""
+        """Return the scene's images in the order in which nerfstudio divides them."""
         described = json.loads((self._scene / "transforms.json").read_bytes())
         return sorted((frame["file_path"] for frame in described["frames"]), key=Path)
 
     def _choose_run(self) -> None:
-        """Begin another run where photos were added since the present one began."""
+        """Begin another run if photos were added since the present one began."""
         views, before = self._views(), self._settings.get("views")
         if views == before:
             return
@@ -197,10 +193,10 @@ class PhotosToSplat:
         self._note(views=views, **({"run": f"run-{len(views)}", "trained": None} if begun else {}))
 
     def _keep_frame_and_split(self, before: Sequence[str]) -> None:
-        """Note in the scene how the present run moved its images, `before`, and that those held out are so again.
+        """Write into the scene how the present run moved its images, `before`, and which of them it held out.
 
-        Of the photos that were added as many are held out as nerfstudio would. Where an option says which views are
-        held out, that option decides. Before a run has begun there is nothing to keep.
+        The added photos are divided as nerfstudio would divide them. An option on held-out views takes precedence.
+        Without a run there is nothing to keep.
         """
         from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fraction
 
@@ -226,15 +222,14 @@ class PhotosToSplat:
         worker = Worker(function, self.folder / "log" / f"{stage}.txt", [self._lock], saves=True)
         return self._workers.enter_context(worker)
 
-    def _call(self, worker: Worker, line: StatusLine, hear: OnEvent, command: Sequence[str], *arguments: Any) -> Any:
-        def on_event(event: str, **fields: Any) -> None:
-            if event == "stopping":
-                line.update(event)
-            else:
-                hear(event, **fields)
+    def _call(
+        self, worker: Worker, line: StatusLine, on_event: OnEvent, command: Sequence[str], *arguments: Any
+    ) -> Any:
+        def listen(event: str, **fields: Any) -> None:
+            line.update(event) if event == "stopping" else on_event(event, **fields)
 
         try:
-            return worker.run(*arguments, on_event=on_event, command=command)
+            return worker.run(*arguments, on_event=listen, command=command)
         except (InputError, WorkerError) as error:
             line.update("failed")
             told = f"{worker.log.stem}: {str(error).rstrip('.')}. All that it printed is in {worker.log}"
@@ -245,7 +240,7 @@ class PhotosToSplat:
     def _find_cameras(self, line: StatusLine) -> str:
         if self._given:
             return f"those of {self._given}; --cameras new finds others"
-        with contextlib.suppress(InputError):  # It is another folder's.
+        with contextlib.suppress(InputError):  # It is about another folder.
             if self.source.name.startswith("images") and (other := find_cameras(self.source.parent)):
                 line.print(f"{other} is not used: `sadgs {shlex.quote(str(self.source.parent))}` takes these cameras.")
         few = self._settings.get("few")
@@ -253,7 +248,7 @@ class PhotosToSplat:
             return f"{few}; done before"
         added, duration, done_before = "", "", ""
 
-        def hear(event: str, **fields: Any) -> None:
+        def on_event(event: str, **fields: Any) -> None:
             nonlocal added, duration, done_before
             if event == "added":
                 added = f"{fields['photos']}: "
@@ -270,7 +265,7 @@ class PhotosToSplat:
         source = Path(os.path.abspath(self.source))
         command = ["sadgs-process", str(source), str(self._scene), "--max-size", str(self.given.max_size)]
         given = Process(source, self._scene, max_size=self.given.max_size)
-        summary = Summary(**self._call(worker, line, hear, command, given))
+        summary = Summary(**self._call(worker, line, on_event, command, given))
         again = " after a second attempt" if summary.attempts else ""
         found = f"{added}{summary.registered} of {summary.photos} photos registered{again}"
         self._settings.pop("few", None)
@@ -289,7 +284,7 @@ class PhotosToSplat:
         return found + missing + done_before
 
     def _trained(self) -> str | None:
-        """Return what a finished training said."""
+        """Return the sentence of a finished training."""
         return self._settings.get("trained") if self._checkpoint() else None
 
     def _train(self, line: StatusLine) -> str:
@@ -299,7 +294,7 @@ class PhotosToSplat:
             return f"{trained}; done before"
         total, count = "", ""
 
-        def hear(event: str, **fields: Any) -> None:
+        def on_event(event: str, **fields: Any) -> None:
             nonlocal total, count
             if event == "training begins":
                 total = f"{fields['iterations']:,}"
@@ -319,7 +314,7 @@ class PhotosToSplat:
         command += ["--steps-per-eval-image", "0", "--pipeline.effort", f"{self.given.effort:g}"]
         command += ["--load-dir", str(self._run.absolute())] if begun else []
         worker = self._trainer or self._worker("training", _TRAINING)
-        self._call(worker, line, hear, [*command, *self.options])
+        self._call(worker, line, on_event, [*command, *self.options])
         if not self._checkpoint():
             raise RunError(f"training ended without a checkpoint; all that it printed is in {self.folder}/log.")
         told = f"{total} iterations, {count} Gaussians"
@@ -340,7 +335,7 @@ class PhotosToSplat:
 
 
 def _given_cameras(given: Sadgs) -> Path | None:
-    """Return the file of the source's cameras, or None; raise an InputError if they cannot be trained on."""
+    """Return the file of the source's cameras, or None; raise InputError if they cannot be trained on."""
     try:
         if given.cameras == "new" or (file := find_cameras(given.source)) is None:
             return None
@@ -358,7 +353,7 @@ def _shown(value: Any) -> str:
 
 
 def _formats(asked: str | None, console: Console) -> list[str]:
-    """Return the formats to export; raise an InputError for an unknown one, or for a page without Node.js."""
+    """Return the formats to export; raise InputError for an unknown one, or for a page without Node.js."""
     has_node = shutil.which("npx") is not None
     if asked is None:
         if not has_node:
@@ -370,7 +365,7 @@ def _formats(asked: str | None, console: Console) -> list[str]:
     if "html" in chosen and not has_node:
         raise InputError("a page is made with the help of Node.js: install version 22 or newer, or leave html out.")
     if MESH[1:] in chosen:
-        load_open3d()  # A machine that lacks it is told before cameras are found.
+        load_open3d()  # It may be missing, which the user shall know before cameras are found.
     return chosen
 
 

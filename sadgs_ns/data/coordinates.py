@@ -137,10 +137,8 @@ def from_data(path: Path) -> Similarity:
         content = json.loads(path.read_bytes())
         return _moved_by(content["transform"], content["scale"])
     except (OSError, KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{path} does not tell how to return to the data's frame ({reason(error)}): copy it from the run again, or "
-            "export in nerfstudio's frame."
-        ) from error
+        told = f"{path} does not tell how to return to the data's frame ({reason(error)})"
+        raise InputError(f"{told}: copy it from the run again, or export in nerfstudio's frame.") from error
 
 
 def fixed_frame(meta: Mapping[str, Any], path: Path) -> Similarity | None:
@@ -154,10 +152,8 @@ def fixed_frame(meta: Mapping[str, Any], path: Path) -> Similarity | None:
     try:
         return _moved_by(*(meta[name] for name in FRAME_KEYS))
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{path} does not tell with {' and '.join(FRAME_KEYS)} how its data is to be moved ({reason(error)}): "
-            "remove both, or copy them from the dataparser_transforms.json of a run."
-        ) from error
+        told = f"{path} does not tell with {' and '.join(FRAME_KEYS)} how its data is to be moved ({reason(error)})"
+        raise InputError(f"{told}: remove both, or copy them from the dataparser_transforms.json of a run.") from error
 
 
 def _moved_by(transform: Any, scale: Any) -> Similarity:

@@ -340,7 +340,9 @@ def commands(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     """The commands of the stages of `sadgs`, which are not run, but for a checkpoint and a splat of 0 bytes."""
     called: list[list[str]] = []
 
-    def call(work: PhotosToSplat, worker: object, line: object, hear: object, command: list[str], *others: Any) -> Any:
+    def call(
+        work: PhotosToSplat, worker: object, line: object, on_event: object, command: list[str], *others: Any
+    ) -> Any:
         called.append(command)
         if command[0] == "sadgs-process":
             Path(command[2]).mkdir()

@@ -127,10 +127,8 @@ class _Scene:
             option = name if name == "source" else "--" + name.replace("_", "-")
             told.append(f"{option} was {self.begun.get(name)}, is {asked[name]}")
         if told:
-            raise InputError(
-                f"{self.given.out} was begun with other photos or settings ({'; '.join(told)}); {back}give another "
-                "folder or delete it."
-            )
+            problem = f"{self.given.out} was begun with other photos or settings ({'; '.join(told)})"
+            raise InputError(f"{problem}; {back}give another folder or delete it.")
 
     def note(self, **settings: Any) -> None:
         self.settings |= settings
@@ -174,13 +172,13 @@ def process(given: Process) -> Summary:
             summary = Summary(**scene.finished)
         else:
             if given.source.is_dir() and (poses := poses_elsewhere(given.source)):
-                _say("aside", told := f"Poses are computed anew. {poses}", told=told)
+                _say("aside", f"Poses are computed anew. {poses}")
             columns = (TextColumn("{task.description:>24}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
             with Progress(*columns, disable=not sys.stdout.isatty()) as progress:
                 summary = _make(scene, _reporter(progress))
     print(summary)
-    for told in scene.left_out:
-        _say("aside", told, told=told)
+    for sentence in scene.left_out:
+        _say("aside", sentence)
     if not scene.is_video and (videos := find_videos(given.source)):
         print(f"Its videos ({len(videos)}, such as {videos[0]}) are not used: give them in a folder of their own.")
     return summary
@@ -237,15 +235,15 @@ def _make(scene: _Scene, report: Report) -> Summary:
 def _tell_work(scene: _Scene, photos: Sequence[Photo], matching: Matching, notice: str) -> None:
     before = {*scene.begun["photos"]} if scene.added else set()
     if scene.added:
-        told = f"{scene.added} photo{'s' * (scene.added > 1)} added to {len(before)}"
-        _say("added", f"{told}.", photos=told)
+        added = f"{scene.added} photo{'s' * (scene.added > 1)} added to {len(before)}"
+        _say("added", f"{added}.", photos=added)
     if panoramas := sum(photo.is_panorama for photo in photos):
         held_out = "all those of a panorama" if len(photos) > 4 else "single ones"
-        told = (
+        _say(
+            "panoramas",
             f"{panoramas} of the {len(photos)} photos are panoramas: each is cut into {VIEWS} views of 90°, which "
-            f"leave out 30° about the zenith and the nadir; {held_out} are held out."
+            f"leave out 30° about the zenith and the nadir; {held_out} are held out.",
         )
-        _say("panoramas", told, told=told)
     views = [view for photo in photos for view in photo.views]
     known = sum(len(photo.views) for photo in photos if photo.name in before)
     expected, duration = expected_work(views, matching, known)
@@ -262,7 +260,7 @@ def _convert(scene: _Scene, folder: Path, stored: Sequence[Photo]) -> tuple[Path
         write_masks(scene.given.source, masks, stored, photos, work / "masks")
     if masks:
         why = "used" if has_masks else "not used, because the scene has none: give another folder for it"
-        _say("aside", told := f"Masks of {len(masks)} photos are {why}.", told=told)
+        _say("aside", f"Masks of {len(masks)} photos are {why}.")
     if transparent := write_alpha(converted, photos, work / "alpha"):
         _say("transparent", f"{transparent} photos are partly transparent; their images in the scene are, too.")
     return converted, photos
@@ -275,9 +273,9 @@ def photos_added(source: Path, out: Path) -> list[str]:
 
 
 def _say(event: str, sentence: str, **fields: str) -> None:
-    """Print a sentence, and report the event that it is about."""
+    """Print a sentence, and report the event that it is about, with the sentence as the field `told`."""
     print(sentence, flush=True)
-    events.report(event, **fields)
+    events.report(event, told=sentence, **fields)
 
 
 def _reporter(progress: Progress) -> Report:
@@ -361,8 +359,8 @@ def _run(given: Process) -> int:
     again = "the same command with --matching exhaustive, which uses the features found so far; or "
     print(
         f"warning: {given.out} shows only what {summary.registered} of {summary.photos} photos saw. Try "
-        f"{'' if summary.matching == 'exhaustive' else again}another folder with more photos between those that "
-        f"did not register, with two thirds of overlap. This trains on what is there: ns-train sadgs --data {out}",
+        f"{again * (summary.matching != 'exhaustive')}another folder with more photos between those that did not "
+        f"register, with two thirds of overlap. This trains on what is there: ns-train sadgs --data {out}",
         file=sys.stderr,
     )
     return 1

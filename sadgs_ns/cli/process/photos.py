@@ -106,10 +106,8 @@ def read_photos(
     if broken:
         more = [f"{len(broken) - _NAMED} more"] if len(broken) > _NAMED else []
         them = "it" if len(broken) == 1 else "them"
-        raise InputError(
-            f"{len(broken)} of the {len(names)} photos in {folder} cannot be read as a whole image: "
-            f"{', '.join(broken[:_NAMED] + more)}; copy {them} again or remove {them}."
-        )
+        told = f"{len(broken)} of the {len(names)} photos in {folder} cannot be read as a whole image"
+        raise InputError(f"{told}: {', '.join(broken[:_NAMED] + more)}; copy {them} again or remove {them}.")
     looks: dict[tuple[int, int], list[bool]] = defaultdict(list)
     for photo in photos:
         looks[photo.size].append(photo.is_panorama)

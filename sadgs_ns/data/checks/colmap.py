@@ -121,10 +121,8 @@ def _read_views(poses_path: Path, cameras_path: Path) -> tuple[list[str], list[V
     called = {camera_id: f"{cameras_path}: camera {camera_id}" for camera_id in stored}
     cameras = {camera_id: _camera(stored[camera_id], where) for camera_id, where in called.items()}
     if len({cameras[camera_id].fisheye for _, camera_id, _ in poses}) > 1:
-        raise InputError(
-            f"{cameras_path} mixes fisheye and other cameras, which nerfstudio cannot read: undistort the images with "
-            "`colmap image_undistorter`."
-        )
+        told = f"{cameras_path} mixes fisheye and other cameras, which nerfstudio cannot read"
+        raise InputError(f"{told}: undistort the images with `colmap image_undistorter`.")
     rotations = _rotations(np.array([pose[:4] for _, _, pose in poses]))
     views = [
         View(f"{poses_path}: image {name}", called[number], rotation, -rotation.T @ pose[4:], cameras[number])
@@ -171,10 +169,8 @@ def _camera(camera: colmap.Camera, where: str) -> Camera:
     """Return a camera for the checks; raise InputError if nerfstudio cannot read it, or one of its values is wrong."""
     model, params, number = camera.model, camera.params, colmap.CAMERA_PARAMETERS.get(camera.model)
     if number is None or model in UNSUPPORTED_CAMERAS:
-        raise InputError(
-            f"{where} has the model {model}, which nerfstudio cannot read: undistort the images with "
-            "`colmap image_undistorter`."
-        )
+        told = f"{where} has the model {model}, which nerfstudio cannot read"
+        raise InputError(f"{told}: undistort the images with `colmap image_undistorter`.")
     focals = 1 if model.startswith("SIMPLE") or "RADIAL" in model else 2
     values = {"width": camera.width, "height": camera.height}
     values |= {f"focal length {axis}": value for axis, value in zip("xy", params[:focals], strict=False)}

@@ -59,10 +59,8 @@ def check_splits(
         state = "is empty" if "test" in located else "is missing"
         yield warning(f"{called('test')} {state}: `ns-eval` will have nothing to measure; name some images.")
     elif both := located["train"] & located["test"]:
-        yield warning(
-            f"{called('test')} names {len(both)} of the {len(located['train'])} training images: what `ns-eval` "
-            "measures of them shows nothing about new views."
-        )
+        told = f"{called('test')} names {len(both)} of the {len(located['train'])} training images"
+        yield warning(f"{told}: what `ns-eval` measures of them shows nothing about new views.")
     return len(located["train"])
 
 
@@ -75,10 +73,8 @@ def _count_training_images(names: Sequence[str], options: ParserOptions) -> int:
         return len(names)
     for name in names:
         if not any(word in PurePosixPath(name).name for word in ("train", "eval")):
-            raise InputError(
-                f"{name} has neither train nor eval in its name, by which `--eval-mode filename` divides the images: "
-                "rename them, or leave that option out."
-            )
+            told = f"{name} has neither train nor eval in its name, by which `--eval-mode filename` divides the images"
+            raise InputError(f"{told}: rename them, or leave that option out.")
     return sum("train" in PurePosixPath(name).name for name in names)
 
 
