@@ -1,4 +1,4 @@
-"""Which process composites which rows of which view of a step."""
+"""The rows of a step's views that each process composites."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
-ROWS = 16
-"""px. Views are cut between rows that this divides, as do the sides of all our tiles."""
-MARGIN = 16
-"""px. Rows beyond a band that are drawn, too: SSIM's window reaches 5 px beyond the rows that count."""
+ROWS, MARGIN = 16, 16
+"""px. Views are cut at multiples of the first, as tiles are. The second are rows beyond a band that are drawn, too,
+because SSIM's window reaches 5 px beyond the rows that count."""
 
 
 class Band(NamedTuple):
@@ -21,25 +20,18 @@ class Band(NamedTuple):
     rank: int
     """The process that composites it."""
     first: int
-    """First row that counts in the loss."""
     last: int
-    """One past the last row that counts."""
+    """First row that counts in the loss, and the one after the last."""
     top: int
-    """First row that is drawn."""
     bottom: int
-    """One past the last row that is drawn."""
+    """First row that is drawn, and the one after the last."""
 
 
 def share_out(num_views: int, height: int, num_ranks: int) -> list[Band]:
-    """Share the rows of a step's views out evenly: where the number of processes divides that of views, whole views.
+    """Share the rows of one view or more, of one height in px, evenly among processes.
 
-    Args:
-        num_views: Number of views, at least 1.
-        height: px.
-        num_ranks: Number of processes.
-
-    Returns:
-        Bands in the order of their processes, which is that of the views and rows, too.
+    The bands are in the order of their processes, views and rows. They are whole views if the number of processes
+    divides that of views.
     """
     # The last unit of a view also has the rows that ROWS leaves over, so that SSIM's window fits each band.
     units = max(height // ROWS, 1)
@@ -56,25 +48,16 @@ def share_out(num_views: int, height: int, num_ranks: int) -> list[Band]:
 
 
 def first_ranks(bands: Sequence[Band]) -> dict[int, int]:
-    """Return, by the numbers of the views, the processes that composite their first rows.
-
-    Args:
-        bands: All bands, as `share_out` returns them.
-    """
+    """Return for each view the process that composites its first rows."""
     return {band.view: band.rank for band in reversed(bands)}
 
 
 @lru_cache(maxsize=1024)
 def views_of_rank(sizes: tuple[tuple[int, int], ...], num_ranks: int, rank: int) -> tuple[int, ...]:
-    """Return of which views of a step a process composites rows; many steps are looked ahead at, and most are alike.
+    """Return the numbers of the views of which a process composites rows, in its order.
 
-    Args:
-        sizes: Height and width of each view in px; views of one size are shared out together.
-        num_ranks: Number of processes.
-        rank: The process.
-
-    Returns:
-        Numbers of the views in the step, in the order in which it composites them.
+    `sizes` are height and width of each view in px; views of one size are shared out together. Many steps are looked
+    ahead at, most of them alike.
     """
     groups: dict[tuple[int, int], list[int]] = defaultdict(list)
     for view, size in enumerate(sizes):

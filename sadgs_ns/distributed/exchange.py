@@ -17,27 +17,26 @@ from sadgs_ns.kernels import use_triton
 from sadgs_ns.render.projected import Projected
 
 _GRADIENTS = (2, 3, 1, 3, 2, 1)
-"""Widths of the columns in the rows of gradients that our compositing makes: of centre, conic, opacity, colour and the
-centre's absolute gradient, and one that nobody uses."""
+"""Widths of the columns in our compositing's rows of gradients: centre, conic, opacity, colour, the centre's absolute
+gradient, and an unused one."""
 
 
 class Exchange:
     """Sends the Gaussians that each band draws to the process that composites it.
 
-    The host waits for the device once, to learn how many these are; what the processes ask of each other comes along.
+    The host waits for the device once, to learn their number; the processes' flags come along.
 
     Attributes:
         bands: Those that this process composites.
         counts: Rows that each process has for each of these bands.
         places: Indices in V · N of the rows that this process sends, in the order of all bands. int64 [M]
-        fused: Whether rows are written and read by kernels, and gradients have the columns of `_GRADIENTS`; the same in
-            all processes.
+        fused: Whether kernels write and read rows, and gradients have the columns of `_GRADIENTS`; the same in all
+            processes.
         whole_views: Whether each view is one band, so that no row is sent twice.
-        absolute: The centres in which compositing leaves absolute gradients for `backward`, for each of these bands;
-            none where nobody asked for them.
+        absolute: The centres in which compositing leaves absolute gradients for `backward`, for each of these bands, if
+            they are asked for.
 
     Args:
-        world: The processes.
         projected: The Gaussians of this process in all V views.
         bands: All bands, as `share_out` returns them.
     """
@@ -46,7 +45,7 @@ class Exchange:
         self.fused = projected.colors.shape[-1] == 3 and world.agree_once("kernels", lambda: use_triton(world.device))
         self.whole_views = len(bands) == len(projected.opacities)
         reached = _reached(projected, bands)  # [B, N]
-        counted = torch.cat([reached.sum(1), torch.tensor([world.request], device=world.device)])
+        counted = torch.cat([reached.sum(1), torch.tensor([world.flags_out], device=world.device)])
         gathered = world.gather(counted)  # [R, B + 1]
         n = reached.shape[1]
         self.places = reached.flatten().nonzero()[:, 0]  # [M], in B · N
@@ -55,7 +54,7 @@ class Exchange:
             self.places = views[self.places // n] * n + self.places % n
         table = gathered.tolist()
         for row in table:
-            world.heard |= row.pop()
+            world.flags_in |= row.pop()
         mine = [index for index, band in enumerate(bands) if band.rank == world.rank]
         self.bands = [bands[index] for index in mine]
         self.counts = [[row[index] for index in mine] for row in table]
@@ -69,42 +68,32 @@ class Exchange:
         """Send the Gaussians, differentiably; call once.
 
         Args:
-            projected: The Gaussians of this process in all V views.
             absgrad: Whether `backward` also brings the absolute gradients of the centres, as `absgrad` of `means2d`.
                 The gradient of the centres then is `grad2d` of `means2d`.
 
         Returns:
-            Zero, which must be added to the loss: where a process composites nothing, its gradients would not come. And
-            what each of the bands of this process is composited of, one view each, shifted to the first drawn row.
+            Zero, which must be added to the loss so that gradients come to a process that composites nothing; and the
+            Gaussians of each band of this process, one view each, shifted to the first drawn row.
         """
         if absgrad:
             projected.means2d.grad2d = None  # type: ignore[attr-defined] # `keep_gradient` looks for it.
         anchor, *flat = _Exchanged.apply(self, absgrad, *projected)  # type: ignore[misc]
         received = [Projected(*flat[i : i + 6]) for i in range(0, len(flat), 6)]
         if absgrad and torch.is_grad_enabled():
-            # These hold the graph, which holds this object, until `backward` lets them go.
+            # These hold the graph, which holds this object, until `backward` releases them.
             self.absolute = [part.means2d for part in received]
         return anchor, received
 
     def forth(self, rows: Tensor) -> list[Tensor]:
-        """Send rows to those who composite them, and return those of each of this process's bands.
-
-        Args:
-            rows: In the order of `places`. [M, K]
-        """
+        """Send rows, in the order of `places` [M, K], and return those of each band of this process."""
         received = rows.new_empty((sum(self._received), rows.shape[1]))
         dist.all_to_all_single(received, rows, self._received, self._sent)
         return _transposed(received, self.counts)
 
     def back(self, parts: Sequence[Tensor], nothing: Tensor) -> Tensor:
-        """Send rows of this process's bands back to those who sent these, and return what the others send back.
+        """Send rows of each band of this process back, and return the others', in the order of `places`. [M, K]
 
-        Args:
-            parts: Rows of each band. [·, K] each
-            nothing: What is sent where this process composites nothing. [0, K]
-
-        Returns:
-            In the order of `places`. [M, K]
+        `nothing` [0, K] is sent if this process composites nothing.
         """
         rows = nothing
         if len(parts) == 1:
@@ -172,14 +161,9 @@ class _Exchanged(torch.autograd.Function):
 
 
 def pack(projected: Projected, places: Tensor) -> Tensor:
-    """Put what compositing reads of the Gaussians at some places into rows.
+    """Return rows of centre, conic, opacity, colour, depth and radius of the Gaussians at some places in V · N.
 
-    Args:
-        projected: Gaussians in V views.
-        places: Indices in V · N. int64 [M]
-
-    Returns:
-        Columns of centre, conic, opacity, colour, depth and radius. [M, 7 + D + 1 or 2]
+    int64 [M] → [M, 7 + D + 1 or 2]
     """
     radii, means2d, depths, conics, opacities, colors = projected
     size = opacities.numel()
@@ -188,13 +172,7 @@ def pack(projected: Projected, places: Tensor) -> Tensor:
 
 
 def unpack(rows: Tensor, num_colors: int, top: int) -> Projected:
-    """Take the Gaussians of one view out of rows.
-
-    Args:
-        rows: As `pack` makes them. [M, K]
-        num_colors: Number D of the colours' channels.
-        top: Image row from which centres are counted, px.
-    """
+    """Return the Gaussians of one view from rows of `pack` with D colours; centres are counted from row `top`."""
     per_gaussian = rows.shape[1] - 7 - num_colors
     means2d, conics, opacities, colors, depths, radii = (
         column.clone(memory_format=torch.contiguous_format)
@@ -225,13 +203,9 @@ def _splats_of(rows: Tensor, num_colors: int, top: int, exchange: Exchange) -> P
 
 
 def _gradient_rows(columns: Sequence[Tensor | None], widths: Sequence[int], number: int, like: Tensor) -> Tensor:
-    """Put gradients into rows, unless they are parts of such rows already, as those of our compositing are.
+    """Put gradients of one view, or zeros for None, into M rows, unless they are parts of such rows already.
 
-    Args:
-        columns: Gradients of one view; None stands for zeros. [1, at least M, ·] each, or [1, at least M]
-        widths: Number of columns of each.
-        number: M.
-        like: A tensor of their type and device.
+    [1, at least M, width] each, or [1, at least M] → [M, sum of the widths]. Those of our compositing are such parts.
     """
     width, first = sum(widths), columns[0]
     whole = all(value is not None for value in columns[:4])
@@ -248,7 +222,7 @@ def _gradient_rows(columns: Sequence[Tensor | None], widths: Sequence[int], numb
 
 @torch.no_grad()
 def _reached(projected: Projected, bands: Sequence[Band]) -> Tensor:
-    """Tell which Gaussians each band draws. bool [B, N]"""
+    """Return which Gaussians each band draws. bool [B, N]"""
     radii, means2d = projected.radii, projected.means2d
     visible = drawn(radii, means2d)  # [V, N]
     if all(band.view == index for index, band in enumerate(bands)) and len(bands) == len(visible):
@@ -266,11 +240,7 @@ def _reached(projected: Projected, bands: Sequence[Band]) -> Tensor:
 
 
 def _beside(values: Sequence[Tensor]) -> Tensor:
-    """Put the columns of tensors beside each other; `torch.cat` along them took several times as long on a GPU.
-
-    Args:
-        values: [M, ·] each
-    """
+    """Put columns beside each other; `torch.cat` along them took several times as long on a GPU. [M, ·] each"""
     widths = [value.shape[1] for value in values]
     rows = values[0].new_empty((len(values[0]), sum(widths)))
     for columns, value in zip(rows.split(widths, dim=1), values, strict=True):
@@ -279,15 +249,7 @@ def _beside(values: Sequence[Tensor]) -> Tensor:
 
 
 def _transposed(rows: Tensor, numbers: Sequence[Sequence[int]]) -> list[Tensor]:
-    """Put rows that lie in order of A and then of B in the order of B and then of A.
-
-    Args:
-        rows: [·, K]
-        numbers: How many there are of each A and B.
-
-    Returns:
-        The rows of each B.
-    """
+    """Return the rows of each B, in the order of A, of rows in order of A and then of B, given their numbers."""
     groups = len(numbers[0])
     if groups <= 1:
         return [rows] * groups

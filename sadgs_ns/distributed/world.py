@@ -1,4 +1,4 @@
-"""What the processes of a run know of each other: how many Gaussians each holds, and what any of them asks of all."""
+"""The processes of a run, and what they tell each other."""
 
 from __future__ import annotations
 
@@ -12,27 +12,25 @@ from torch import Tensor
 from sadgs_ns.errors import InputError
 
 REBALANCED_BEYOND = 1.1
-"""Shards are made equal when the largest has more than this many times the Gaussians of the smallest."""
+"""Shards are made equal if the largest has more than this many times the Gaussians of the smallest."""
 _ROWS_AT_ONCE = 1 << 20
-"""Rows that are sent at once to where they are gathered, so that gathering takes little of the device's memory."""
+"""Rows that are gathered at once, so that it takes little of the device's memory."""
 
 
 class World:
-    """The processes that train a splat together, each of which holds a shard of it.
+    """The R processes that train a splat together, each of which holds a shard of it.
 
-    The Gaussians of all processes, in the order of their ranks, are those of one process. Every method must be called
-    by all processes, in the same order. A world of one process asks nobody: its sums return their argument.
+    The Gaussians of all processes, in the order of their ranks, are those of one process. All processes must call every
+    method in the same order. A world of one process asks nobody: its sums return their argument.
 
     Attributes:
-        rank: Number of this process, from 0.
-        num_ranks: Number R of processes.
-        device: Where this process computes.
+        rank, num_ranks: The number of this process, from 0, and R.
         sizes: Numbers of Gaussians of all processes, in the order of their ranks.
-        request: What this process asks of all, a number of bits; `Exchange` sends it along.
-        heard: What any process has asked for since it was last set to 0.
+        flags_out: Bits by which this process asks something of all; `Exchange` sends them along.
+        flags_in: All bits that any process has sent since this was last set to 0.
 
     Args:
-        device: Where this process computes; for CUDA it must be torch's current device. None makes a world of this
+        device: The device of this process, which must be torch's current one if it is CUDA. None makes a world of this
             process alone.
     """
 
@@ -40,16 +38,11 @@ class World:
         self.rank, self.num_ranks = (0, 1) if device is None else (dist.get_rank(), dist.get_world_size())
         self.device = torch.device("cpu") if device is None else device
         self.sizes: list[int] = [0] * self.num_ranks
-        self.request = self.heard = 0
+        self.flags_out = self.flags_in = 0
         self._agreed: dict[str, bool] = {}
 
     def agree_once(self, question: str, answer: Callable[[], bool]) -> bool:
-        """Return whether all processes answered yes when they were first asked a question.
-
-        Args:
-            question: Its name.
-            answer: Called the first time.
-        """
+        """Return whether the `answer` of all processes was yes when they were first asked the question of this name."""
         if question not in self._agreed:
             self._agreed[question] = self.all(answer())
         return self._agreed[question]
@@ -65,17 +58,14 @@ class World:
         return sum(self.sizes)
 
     def even_sizes(self, total: int) -> list[int]:
-        """Return the numbers of Gaussians that the processes have where none has two more than another."""
+        """Return the sizes of equal shards, which differ by one at most."""
         return [(r + 1) * total // self.num_ranks - r * total // self.num_ranks for r in range(self.num_ranks)]
 
     def take_even_part(self, total: int) -> slice:
-        """Let every process hold an equal part of Gaussians that all of them have, and return which is this one's.
-
-        Args:
-            total: Number of the Gaussians.
+        """Let each process hold an equal shard of Gaussians that all of them have, and return this one's.
 
         Raises:
-            InputError: If they are fewer than the processes.
+            InputError: If there are fewer Gaussians than processes.
         """
         if total < self.num_ranks:
             raise InputError(f"{self.num_ranks} processes cannot share out {total} Gaussians: start fewer processes.")
@@ -84,22 +74,11 @@ class World:
         return slice(start, start + self.sizes[self.rank])
 
     def count(self, number: int) -> None:
-        """Tell the others how many Gaussians this process holds now, and learn the same of them.
-
-        Args:
-            number: Gaussians of this process.
-        """
+        """Update `sizes`, given the number of Gaussians of this process."""
         self.sizes = self.gather(torch.tensor([number], device=self.device))[:, 0].tolist()
 
     def gather(self, values: Tensor) -> Tensor:
-        """Return what every process passes, in the order of their ranks.
-
-        Args:
-            values: Of the same length everywhere. [n]
-
-        Returns:
-            [R, n]
-        """
+        """Return the values of all processes, of one length, in the order of their ranks. [n] → [R, n]"""
         if self.alone:
             return values[None]
         gathered = values.new_empty(self.num_ranks * len(values))
@@ -107,11 +86,7 @@ class World:
         return gathered.view(self.num_ranks, -1)
 
     def sum(self, values: Tensor) -> Tensor:
-        """Add up, in place, what every process passes, and return it.
-
-        Args:
-            values: Of one shape everywhere.
-        """
+        """Add up the values of all processes, of one shape, in place, and return them."""
         if not self.alone:
             dist.all_reduce(values)
         return values
@@ -121,36 +96,25 @@ class World:
         return list(numbers) if self.alone else self.sum(torch.tensor(numbers, device=self.device)).tolist()
 
     def broadcast(self, values: Tensor, rank: int) -> None:
-        """Overwrite a tensor, in place, with what one process passes.
-
-        Args:
-            values: Contiguous, and of one shape everywhere.
-            rank: That process.
-        """
+        """Overwrite a contiguous tensor, of one shape everywhere, with that of one process."""
         if not self.alone:
             dist.broadcast(values, rank)
 
     def least(self, number: float) -> float:
-        """Return the least of the numbers that the processes pass, of which any may be infinite."""
+        """Return the least of the numbers of all processes, of which any may be infinite."""
         if self.alone:
             return number
         return float(self.gather(torch.tensor([number], dtype=torch.float64, device=self.device)).min())
 
     def all(self, condition: bool) -> bool:
-        """Tell whether a condition holds in all processes."""
+        """Return whether a condition holds in all processes."""
         return self.least(float(condition)) > 0
 
     def rand(self, like: Tensor) -> Tensor:
-        """Draw the part of this process of what one process would draw for all Gaussians.
+        """Draw this process's part of random numbers in [0, 1) for all Gaussians, of the tensor's shape. [V, N, 2]
 
         All processes draw all numbers, so that random generators in the same state stay so. On the CPU the numbers are
-        those that `torch.rand((V, total, 2))` draws.
-
-        Args:
-            like: A tensor of this process's Gaussians in V views, for its shape and device. [V, N, 2]
-
-        Returns:
-            In [0, 1). [V, N, 2]
+        those of `torch.rand((V, total, 2))`.
         """
         if self.alone:
             return torch.rand(like.shape, device=like.device)
@@ -161,19 +125,13 @@ class World:
         return torch.stack(kept)
 
     def is_uneven(self) -> bool:
-        """Tell whether the largest shard has more than `REBALANCED_BEYOND` times the Gaussians of the smallest."""
+        """Return whether the shards should be made equal."""
         return max(self.sizes) > REBALANCED_BEYOND * min(self.sizes)
 
-    def even_out(self, rows: Tensor) -> Tensor:
-        """Return the part of this process of rows that are spread evenly, in the order that they have.
+    def rebalance(self, rows: Tensor) -> Tensor:
+        """Return this process's rows after all are spread evenly in their order. [N, …] → [N', …]
 
         `sizes` stays as it is, so that several tensors can be spread.
-
-        Args:
-            rows: What this process holds. [N, …]
-
-        Returns:
-            What it will hold. [N', …]
         """
         new = self.even_sizes(self.total)
         sent, received = _overlaps(self.sizes, new, self.rank), _overlaps(new, self.sizes, self.rank)
@@ -183,14 +141,7 @@ class World:
         return result
 
     def gather_rows(self, rows: Tensor) -> Tensor:
-        """Gather rows of all processes in the host's memory of rank 0.
-
-        Args:
-            rows: What this process holds, `sizes[rank]` rows. [N, …]
-
-        Returns:
-            At rank 0 the rows of all, in the order of the ranks [total, …]; elsewhere this process's own.
-        """
+        """Gather the rows of all Gaussians on the host of rank 0 [N, …] → [total, …]; others get their own back."""
         rows = rows.detach()
         starts = [range(0, size if math.prod(rows.shape[1:]) else 0, _ROWS_AT_ONCE) for size in self.sizes]
         if self.rank > 0:
@@ -210,7 +161,7 @@ class World:
 
 
 def _overlaps(ours: Sequence[int], theirs: Sequence[int], rank: int) -> list[int]:
-    """Return how many of the rows of `rank` in one division of rows lie in each part of another division."""
+    """Return how many of the rows that `rank` has by `ours` each rank has by `theirs`."""
     start = sum(ours[:rank])
     end = start + ours[rank]
     overlaps, first = [], 0

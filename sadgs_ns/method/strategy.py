@@ -353,12 +353,12 @@ class StructureAwareStrategy(Strategy):
             return
 
         def param_fn(name: str, p: Tensor) -> Tensor:
-            return torch.nn.Parameter(world.even_out(p.detach()), requires_grad=p.requires_grad)
+            return torch.nn.Parameter(world.rebalance(p.detach()), requires_grad=p.requires_grad)
 
-        update_param_with_optimizer(param_fn, lambda key, v: world.even_out(v), params, optimizers)
+        update_param_with_optimizer(param_fn, lambda key, v: world.rebalance(v), params, optimizers)
         for key, value in state.items():
             if isinstance(value, Tensor):
-                state[key] = world.even_out(value)
+                state[key] = world.rebalance(value)
         world.count(len(params["means"]))
 
     @staticmethod

@@ -408,8 +408,10 @@ class SadgsTrainer(Trainer):
         self._stepping = True
         if not self.world.alone:
             # Processes agree on what to do after a step in the step itself. A signal has the bit of its number.
-            self.world.heard, signalled = 0, self._interrupts.received
-            self.world.request = int(time.monotonic() >= self._save_due) | (0 if signalled is None else 1 << signalled)
+            self.world.flags_in, signalled = 0, self._interrupts.received
+            self.world.flags_out = int(time.monotonic() >= self._save_due) | (
+                0 if signalled is None else 1 << signalled
+            )
             _, _, metrics = super().train_iteration(step)
             return metrics["loss"], {"main_loss": metrics["loss"]}, metrics
         trained = None if self.graphed is None else self.graphed.train(step)
@@ -425,9 +427,9 @@ class SadgsTrainer(Trainer):
             self._interrupts.poll()
             due = time.monotonic() >= self._save_due
         else:
-            due = bool(self.world.heard & 1)
+            due = bool(self.world.flags_in & 1)
             for number in SIGNALS:
-                if self.world.heard >> number & 1:
+                if self.world.flags_in >> number & 1:
                     raise Interrupted(number)
         self._stop_if_stuck()
         if due:

@@ -30,7 +30,7 @@ def draw_together(world: World, views: int, mode: str, uneven: bool, fused: bool
         part = slice(start, start + world.sizes[world.rank])
     leaves = inputs(part)
     options: dict[str, Any] = {"sh_degree": 1, "absgrad": True, "rasterize_mode": mode, "max_off_axis": 1.5}
-    world.request = 1 << world.rank
+    world.flags_out = 1 << world.rank
     rendered, loss, info = rasterize(world, *splats(leaves, views), **options)
     images = []
     for band, colors, alphas in rendered:
@@ -46,7 +46,7 @@ def draw_together(world: World, views: int, mode: str, uneven: bool, fused: bool
         "absgrad": info["means2d"].absgrad,
         "grad2d": info["means2d"].grad2d,
         "visible": visible(info),
-        "heard": world.heard,
+        "flags": world.flags_in,
     }
 
 
@@ -85,7 +85,7 @@ def test_processes_draw_and_differentiate_what_one_does(
         for band, image in result["images"]:
             covered[band.view, band.first : band.last] += 1
             torch.testing.assert_close(image, expected[band.view, band.first : band.last], atol=1e-5, rtol=0)
-        assert result["heard"] == (1 << ranks) - 1
+        assert result["flags"] == (1 << ranks) - 1
     assert (covered == 1).all()
     torch.testing.assert_close(sum(result["loss"] for result in results), loss.detach(), rtol=1e-5, atol=0)
 

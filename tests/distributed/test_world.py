@@ -61,8 +61,8 @@ def exchange_rows(world: World) -> dict[str, Any]:
     start = sum(sizes[: world.rank])
     mine = rows[start : start + sizes[world.rank]]
     world.count(len(mine))
-    uneven, gathered, evened = world.is_uneven(), world.gather_rows(mine), world.even_out(mine)
-    world.even_out(mine[:, :0])  # Coefficients of harmonics have no numbers where the degree is 0.
+    uneven, gathered, evened = world.is_uneven(), world.gather_rows(mine), world.rebalance(mine)
+    world.rebalance(mine[:, :0])  # Coefficients of harmonics have no numbers where the degree is 0.
     world.count(len(evened))
     torch.manual_seed(4)
     drawn = world.rand(torch.empty((2, len(evened), 2)))
