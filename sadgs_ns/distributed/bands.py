@@ -56,8 +56,8 @@ def first_ranks(bands: Sequence[Band]) -> dict[int, int]:
 def views_of_rank(sizes: tuple[tuple[int, int], ...], num_ranks: int, rank: int) -> tuple[int, ...]:
     """Return the numbers of the views of which a process composites rows, in its order.
 
-    `sizes` are height and width of each view in px; views of one size are shared out together. Many steps are looked
-    ahead at, most of them alike.
+    `sizes` are height and width of each view in px; views of one size are shared out together. Results are kept,
+    because those who look ahead ask for many steps, most of them alike.
     """
     groups: dict[tuple[int, int], list[int]] = defaultdict(list)
     for view, size in enumerate(sizes):
