@@ -30,7 +30,7 @@ def measure(trainer: Any, steps: int = STEPS) -> dict[str, Any] | None:
     if torch.device(trainer.device).type != "cuda":
         return None
     measured = steps_after_run(trainer, steps)
-    with within_densification(getattr(trainer.pipeline.model, "strategy", None)):
+    with within_densification(trainer.pipeline.model):
         for step in range(measured.start - WARMUP, measured.start):
             train_step(trainer, step)
         profile = profiler.profile(use_device="cuda")

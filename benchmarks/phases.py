@@ -11,7 +11,7 @@ import itertools
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -146,26 +146,25 @@ def booked(trainer: Any, watch: Stopwatch) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def within_densification(strategy: Any) -> Iterator[None]:
-    """For the duration, a strategy collects its statistics as before it stopped, and never acts on them.
+def within_densification(model: Any) -> Iterator[None]:
+    """For the duration, a model's strategy collects its statistics as before it stopped, and never acts on them.
 
     Its window is opened and the next clone, split, prune and reset is put out of reach; what is off (0) stays off.
     """
+    strategy, plan = getattr(model, "strategy", None), getattr(model, "plan", None)
     if strategy is None:
         yield
         return
-    derived = getattr(strategy, "windows", None)
-    before = vars(strategy).copy()
-    now = before if derived is None else before | asdict(derived) | {"run_length": sys.maxsize}
+    far = {name: _FAR.get(name, sys.maxsize // 4) for name in _SCHEDULE if getattr(strategy, name, 0)}
     try:
-        vars(strategy).update(now)
-        for name in _SCHEDULE:
-            if now.get(name, 0) > 0:
-                setattr(strategy, name, _FAR.get(name, sys.maxsize // 4))
+        model.strategy = replace(strategy, **far)
+        if plan is not None:
+            model.plan = replace(plan, iterations=sys.maxsize)  # The parameters are not averaged, either.
         yield
     finally:
-        vars(strategy).clear()
-        vars(strategy).update(before)
+        model.strategy = strategy
+        if plan is not None:
+            model.plan = plan
 
 
 def measure(trainer: Any, steps: int = STEPS) -> dict[str, float]:
@@ -181,7 +180,7 @@ def measure(trainer: Any, steps: int = STEPS) -> dict[str, float]:
     """
     model, measured = trainer.pipeline.model, steps_after_run(trainer, steps)
     watch = Stopwatch(torch.device(model.device))
-    with within_densification(getattr(model, "strategy", None)), booked(trainer, watch):
+    with within_densification(model), booked(trainer, watch):
         for step in range(measured.start - WARMUP, measured.stop):
             if step == measured.start:
                 watch.restart()

@@ -31,7 +31,7 @@ Box = tuple[float, float, float, float, float, float]
 """Lowest x, y and z, and highest."""
 _OUTPUT = f"The file to write: {', '.join(FORMATS)}, or {MESH} for a mesh."
 _MAX_OFF_AXIS = 4.0
-"""As `sadgs` draws; what it leaves out has no true size on the screen."""
+"""Limit for runs of splatfacto, which has none; what it leaves out has no true size on the screen."""
 _PREFIX = "_model.gauss_params."
 _REMEDY = "give another checkpoint step-*.ckpt of a run of sadgs or splatfacto"
 
@@ -117,8 +117,7 @@ def export(given: Export) -> int:
             problem = f"{folder} holds no {TRANSFORMS_NAME}, where nerfstudio notes how it moved the data"
             raise InputError(f"{problem}: give the run where it was made, or export in nerfstudio's frame.")
         similarity = from_data(folder / TRANSFORMS_NAME).inverse()
-    checkpoint, params, near_plane = read_checkpoint(given.run)
-    drawing = {"max_off_axis": _MAX_OFF_AXIS, "near_plane": near_plane}
+    checkpoint, params, drawing = read_checkpoint(given.run)
     if params["features_rest"].shape[1] == 0:  # then training holds colours' logits
         params["features_dc"] = (params["features_dc"].sigmoid() - 0.5) / DEGREE_0
     cameras = None
@@ -194,11 +193,11 @@ def _checkpoint_of(run: Path) -> Path:
     return max(found, key=lambda path: int(path.stem[5:]))
 
 
-def read_checkpoint(run: Path) -> tuple[Path, dict[str, Tensor], float]:
-    """Read a run's checkpoint, its parameters as `of_parameters` takes them, and its near plane in world units.
+def read_checkpoint(run: Path) -> tuple[Path, dict[str, Tensor], dict[str, float]]:
+    """Read a run's checkpoint, its parameters as `of_parameters` takes them, and the options with which it drew them.
 
-    The tensors are mapped from the file, so that they take no memory before they are read. Raise InputError if there is
-    no checkpoint of this method or of splatfacto.
+    These are `near_plane` and `max_off_axis`, as for `rasterize`. The tensors are mapped from the file, so that they
+    take no memory before they are read. Raise InputError if there is no checkpoint of this method or of splatfacto.
     """
     # These import torch, which takes seconds, and `--help` and a wrong path need not wait for it.
     from torch import Tensor
@@ -218,9 +217,10 @@ def read_checkpoint(run: Path) -> tuple[Path, dict[str, Tensor], float]:
         if not isinstance(value, Tensor) or value.dim() < 2:
             raise InputError(f"{checkpoint} holds no {name} of Gaussians, so another method made it: {_REMEDY}.")
         params[name] = value
-    state = loaded.get("_model._extra_state")
-    near_plane = state.get("near_plane", NEAR_PLANE) if isinstance(state, dict) else NEAR_PLANE
-    return checkpoint, params, near_plane
+    state = loaded.get("_extra_state")
+    plan = state.get("plan", {}) if isinstance(state, dict) else {}
+    drawing = {"near_plane": NEAR_PLANE, "max_off_axis": _MAX_OFF_AXIS}
+    return checkpoint, params, {name: plan.get(name, value) for name, value in drawing.items()}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

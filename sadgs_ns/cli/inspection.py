@@ -95,7 +95,6 @@ def load_run(path: Path, load_step: int | None = None, data: Path | None = None)
     pipeline.eval()
     try:
         pipeline.load_pipeline(state["pipeline"], state["step"])
-        pipeline.model.strategy.fit_to_run(state["pipeline"]["_extra_state"]["schedule"]["iterations"])
     except InputError as error:
         raise InputError(f"{checkpoint} does not fit its run: {str(error).rstrip('.')}; {_REMEDY}.") from error
     except (KeyError, RuntimeError) as error:  # A part is missing or has another size.

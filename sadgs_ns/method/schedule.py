@@ -53,20 +53,14 @@ class Schedule:
 
 @dataclass(frozen=True)
 class Windows:
-    """When densification does what, in iterations counted from 1."""
+    """When densification does what, as the options of `StructureAwareStrategy` that have these names."""
 
     structure_every: int
-    """Iterations between structure-aware split and prune steps; 0 is never."""
     absgs_every: int
-    """Iterations between AbsGS steps; 0 is never."""
     refine_start_iter: int
-    """First iteration at which densification may run."""
     refine_stop_iter: int
-    """Last iteration at which densification may run; 0 is never."""
     reset_every: int
-    """Iterations between opacity resets; 0 is never."""
     eta_every: int
-    """Iterations between observations of η."""
 
 
 def schedule(
@@ -129,9 +123,6 @@ def growth_threshold(effort: float) -> float:
 
     Effort above 1 adds more of them, which resolves more on few views as on many; a draft has the thresholds of
     effort 1, since its steps are fewer already.
-
-    Args:
-        effort: As in `schedule`.
     """
     power, least = GROWTH_WITH_EFFORT
     return max(effort**power, least) if effort > 1 else 1.0
@@ -141,10 +132,7 @@ def between_one_and_four(views_per_iteration: int, at_four: float) -> float:
     """Interpolate a factor on a learning rate, which is 1 in steps of one view, to steps of several views.
 
     The mean over several views is less noisy, so that other rates are best. They were measured in steps of one view and
-    of four; those between lie on the power of the number of views that leads from one to the other.
-
-    Args:
-        views_per_iteration: At least 1; from 4 on the factor is that of 4.
-        at_four: Factor in steps of four views, > 0.
+    of four; those between lie on the power of the number of views that leads from one to the other. From four views on
+    the factor is `at_four`, > 0.
     """
     return float(at_four ** min(math.log(views_per_iteration, MOST_VIEWS), 1.0))

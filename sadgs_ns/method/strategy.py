@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, MutableMapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields, replace
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -23,6 +24,8 @@ from sadgs_ns.method.split import Params, children_per_axis, grid_split, limit_g
 from sadgs_ns.method.statistics import consistent, empty_statistics, observe
 
 Info = Mapping[str, Any]
+_WINDOWS = tuple(field.name for field in fields(Windows))
+_exactly = lru_cache(maxsize=64)(Windows)
 
 TAU_PRUNE = 0.8
 """τ_prune: fraction of observations that must be low (η < 0.1) on every axis before a faint Gaussian is pruned (paper,
@@ -45,8 +48,7 @@ class StructureAwareStrategy(Strategy):
 
     A gsplat `Strategy`. Iterations are counted from 1: `step` s is iteration s + 1. In a training loop:
 
-        strategy = StructureAwareStrategy()
-        strategy.fit_to_run(num_iterations)
+        strategy = StructureAwareStrategy().for_run(num_iterations)
         state = strategy.initialize_state(scene_scale)
         renders, alphas, info = rasterization(..., packed=False, absgrad=strategy.needs_absgrad(step))
         info |= {"structure_tensors": ..., "viewmats": ..., "Ks": ...}   # [C, H, W, 3], [C, 4, 4], [C, 3, 3]
@@ -97,34 +99,32 @@ class StructureAwareStrategy(Strategy):
     reset_every: int | None = None
     """Iterations between opacity resets inside the densification window; 0 turns them off.
     None is 12/30 of the run, and 0 in runs of fewer than 600 iterations, which would not recover."""
-    # These two are no options, so that they have no annotation, which would make them fields.
-    run_length = 3000
-    """Iterations of the run, which `fit_to_run` sets: windows that are None follow it."""
+    # This is no option, so it has no annotation, which would make it a field.
     world = World()
     """The processes among which the Gaussians are shared out.
     The cap and the ranking of what may grow are those of all, and densification ends with equal shards."""
 
+    def for_run(self, num_iterations: int, world: World | None = None) -> StructureAwareStrategy:
+        """Return this strategy for a run: windows that are None are derived from its length, and all fit into it.
+
+        `world` are the processes among which the Gaussians are shared out; None keeps this strategy's.
+        """
+        fitted = replace(self, **asdict(windows(num_iterations, **self._given)))
+        fitted.world = self.world if world is None else world
+        return fitted
+
     @property
     def windows(self) -> Windows:
-        """When densification does what: what is given, and the rest from the length of the run."""
-        return windows(
-            self.run_length,
-            structure_every=self.structure_every,
-            absgs_every=self.absgs_every,
-            refine_start_iter=self.refine_start_iter,
-            refine_stop_iter=self.refine_stop_iter,
-            reset_every=self.reset_every,
-            eta_every=self.eta_every,
-        )
+        """When densification does what; where a window is None, as in a run of 3,000 iterations."""
+        given = self._given
+        return windows(3000, **given) if None in given.values() else _exactly(**given)
+
+    @property
+    def _given(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in _WINDOWS}
 
     def check(self) -> None:
-        """See whether densification can work with these options.
-
-        Raises:
-            ValueError: If `max_gaussians`, `eta_every` or `min_observations` is not positive, another number of
-                iterations or a threshold of gradients is negative, a fraction or an opacity not in [0, 1], or
-                `child_scale` not in [1, 2).
-        """
+        """Raise ValueError if an option is out of its range."""
         for name in ("max_gaussians", "eta_every", "min_observations"):
             if (value := getattr(self, name)) is not None and value < 1:
                 raise ValueError(f"strategy.{name} must be at least 1, got {value}.")
@@ -151,17 +151,8 @@ class StructureAwareStrategy(Strategy):
         self.check()
         return {"scene_scale": scene_scale}
 
-    def fit_to_run(self, num_iterations: int) -> None:
-        """Let the windows that are not given follow the length of a run; without this call it is 3,000 iterations."""
-        self.run_length = num_iterations
-
     def check_sanity(self, params: Params, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
-        """Check names and optimizers.
-
-        Raises:
-            AssertionError: As gsplat's `Strategy.check_sanity`.
-            ValueError: If a parameter that the method needs is missing.
-        """
+        """Check as gsplat's strategies do, and raise ValueError if a parameter that the method needs is missing."""
         super().check_sanity(params, optimizers)  # type: ignore[arg-type]
         missing = {"means", "scales", "quats", "opacities"} - set(params)
         if missing:
@@ -204,7 +195,8 @@ class StructureAwareStrategy(Strategy):
         """Keep the screen gradients and observe η, before `loss.backward()`."""
         if step >= self.windows.refine_stop_iter:
             return
-        self._ensure_statistics(params, state)
+        if "n_total" not in state:
+            self._clear_statistics(params, state)
         for view in _views(info):
             if self.needs_absgrad(step):
                 keep_gradient(view["means2d"])
@@ -398,14 +390,8 @@ class StructureAwareStrategy(Strategy):
             param_fn, lambda key, v: torch.zeros_like(v), params, optimizers, names=["opacities"]
         )
 
-    @staticmethod
-    def _ensure_statistics(params: Any, state: MutableMapping[str, Any]) -> None:
-        if "n_total" not in state:
-            StructureAwareStrategy._clear_statistics(params, state)
-
-    @staticmethod
-    def _clear_statistics(params: Any, state: MutableMapping[str, Any]) -> None:
-        state.update(StructureAwareStrategy._empty_state(len(params["means"]), params["means"].device))
+    def _clear_statistics(self, params: Any, state: MutableMapping[str, Any]) -> None:
+        state.update(self._empty_state(len(params["means"]), params["means"].device))
 
     @staticmethod
     def _empty_state(n: int, device: torch.device) -> dict[str, Tensor]:

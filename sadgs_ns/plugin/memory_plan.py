@@ -11,6 +11,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from torch import Tensor
 
 from sadgs_ns.distributed.bands import views_of_rank
+from sadgs_ns.errors import InputError
 from sadgs_ns.gsplat_compat import NEAR_PLANE, SCREEN_BLUR
 from sadgs_ns.kernels import TILE_SIZE
 from sadgs_ns.method import memory
@@ -184,32 +185,28 @@ def _count_pairs(
 
 
 def fit_to_memory(
-    strategy: StructureAwareStrategy,
-    params: Params,
-    size: TrainingSize,
-    budget_gb: float | None = None,
-    processes: int = 1,
-) -> tuple[str | None, str | None]:
-    """Lower `max_gaussians` to what the budget, or the device's free memory, holds; call before the first step.
+    cap: int, params: Params, size: TrainingSize, budget_gb: float | None = None, processes: int = 1
+) -> tuple[int, str, str | None]:
+    """Lower the cap of Gaussians to what the budget, or the device's free memory, holds; call before the first step.
 
-    A cap under the present number of Gaussians adds none and takes none away. Without a budget, a `max_gaussians` that
-    is not the default stays as it is. Raises ValueError if the budget leaves no room for Gaussians.
+    A cap under the present number of Gaussians adds none and takes none away. Without a budget, a cap that is not the
+    default of `max_gaussians` stays as it is, as all do without CUDA. Raises InputError if the budget leaves no room.
 
     Args:
-        strategy: Its `max_gaussians` is lowered.
+        cap: The strategy's `max_gaussians`.
         params: The initial Gaussians of this process, on the device of training.
         size: What the run keeps and renders besides.
         budget_gb: Memory that the run may take on each device, in 10⁹ bytes; None is `PLANNED_SHARE` of what is free.
         processes: Number of processes, each of which holds an equal part of the Gaussians on a device of its own.
 
     Returns:
-        A line for the user, and a warning if the first step will probably not fit; both None without CUDA, where
-        nothing is changed.
+        The cap, a line for the user, and a warning if the first step will probably not fit.
     """
     device, n = params["means"].device, len(params["means"])
     free, total = memory.available_bytes(device)
     if math.isinf(free):
-        return None, None
+        told = f"At most {cap:,} Gaussians: this device's memory is not planned with, so this is max_gaussians."
+        return cap, told, None
     state = empty_statistics(0, device) | empty_gradients(0, device)
     each = memory.kept_bytes(params, state) + memory.widest_bytes(params)
 
@@ -218,7 +215,7 @@ def fit_to_memory(
         return size.image_bytes + each * num_gaussians + working
 
     why = ""
-    if budget_gb is not None or strategy.max_gaussians == StructureAwareStrategy.max_gaussians:
+    if budget_gb is not None or cap == StructureAwareStrategy.max_gaussians:
         budget = PLANNED_SHARE * free if budget_gb is None else min(1e9 * budget_gb, free)
         none = {name: value[:0] for name, value in params.items()}
         left = budget - size.image_bytes
@@ -226,28 +223,29 @@ def fit_to_memory(
         affordable = processes * min(affordable, (left - size.structure_bytes) / each)
         if budget_gb is not None and affordable < 1:
             fixed = need(0, replace(size.step, pairs=0))
-            raise ValueError(
-                f"memory_budget_gb is {budget_gb:g} and leaves no room for Gaussians: images and rendering "
+            raise InputError(
+                f"pipeline.memory_budget_gb is {budget_gb:g} and leaves no room for Gaussians: images and rendering "
                 f"take {fixed / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; raise it, take fewer or "
                 "smaller images, or lower pipeline.views-per-iteration."
             )
-        if affordable < strategy.max_gaussians:
-            strategy.max_gaussians = max(int(affordable), 1)
+        if affordable < cap:
+            cap = max(int(affordable), 1)
             why = f"; {free / 1e9:.1f} GB are free" if budget_gb is None else f"; memory_budget_gb is {budget_gb:g}"
-            if strategy.max_gaussians < n * processes:
+            if cap < n * processes:
                 why += f", which holds no more than the {n * processes:,} at the start: none will be added"
-    most = max(-(-strategy.max_gaussians // processes), n)
+    most = max(-(-cap // processes), n)
     at_most = need(most, replace(size.step, pairs=memory.PAIRS_PER_GAUSSIAN * size.step.views * most))
     line = (
-        f"At most {strategy.max_gaussians:,} Gaussians: {at_most / 1e9:.1f} GB of "
+        f"At most {cap:,} Gaussians: {at_most / 1e9:.1f} GB of "
         f"{'the card' if processes == 1 else 'each card'}'s {total / 1e9:.1f} GB{why}."
     )
     first = need(n, size.step)
     if first <= free:
-        return line, None
+        return cap, line, None
     fewer_views = "lower --pipeline.views-per-iteration, or " if size.step.views > 1 else ""
-    return line, (
+    warning = (
         f"The first step will probably not fit the GPU's memory: {n:,} Gaussians, which reach "
         f"{size.step.pairs / 1e6:,.0f} million tiles of {size.step.views} views, take {first / 1e9:.1f} GB with the "
         f"images, and {free / 1e9:.1f} GB are free; {fewer_views}take smaller images."
     )
+    return cap, line, warning

@@ -15,7 +15,6 @@ from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.configs.base_config import InstantiateConfig
 from nerfstudio.data.scene_box import OrientedBox
-from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.models.splatfacto import RGB2SH, SplatfactoModel, num_sh_bases, random_quat_tensor
 from nerfstudio.utils.rich_utils import CONSOLE
 from pytorch_msssim import SSIM
@@ -44,6 +43,7 @@ from sadgs_ns.outliers import POINT_SHARE, REACH
 from sadgs_ns.plugin import gaussian_maps
 from sadgs_ns.plugin.options import check_ranges, hide
 from sadgs_ns.plugin.outputs import LazyOutputs
+from sadgs_ns.plugin.run_plan import RunPlan
 from sadgs_ns.render.activations import activate
 from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world
 from sadgs_ns.render.tile_forecast import TileForecast
@@ -192,6 +192,7 @@ class SadgsModel(SplatfactoModel):
     strategy: StructureAwareStrategy
     view_numbers: Tensor
     near_plane: float
+    plan: RunPlan
 
     def populate_modules(self) -> None:
         """Make parameters, metrics and the strategy, or raise InputError as `SadgsModelConfig.check`.
@@ -218,6 +219,8 @@ class SadgsModel(SplatfactoModel):
         self.color_matrices: torch.nn.Parameter | None = None  # [V, 3, 4]
         self.crop_box: OrientedBox | None = None
         self.viewer_outputs: Callable[[Cameras, dict[str, Tensor]], dict[str, Tensor]] | None = None
+        self.world = World()
+        """The processes among which the Gaussians are shared out."""
         if config.color_model == "affine":
             self.learn_color_matrices()
 
@@ -347,29 +350,18 @@ class SadgsModel(SplatfactoModel):
         part = world.take_even_part(self.num_points)
         for parameter in self.gauss_params.values():
             parameter.data = parameter.data[part].clone()
-        self.strategy.world = world
+        self.world = world
         self.tile_forecast = None  # How many pairs a view has depends on the Gaussians of all.
 
     @property
     def num_gaussians(self) -> int:
         """Number of Gaussians of all processes."""
-        return self.num_points if self.strategy.world.alone else self.strategy.world.total
+        return self.num_points if self.world.alone else self.world.total
 
-    def get_training_callbacks(
-        self, training_callback_attributes: TrainingCallbackAttributes
-    ) -> list[TrainingCallback]:
-        """Fit densification to the length of the run and return splatfacto's two callbacks."""
-        if training_callback_attributes.trainer is not None:
-            iterations = training_callback_attributes.trainer.config.max_num_iterations
-            self.strategy.fit_to_run(iterations)
-            windows = self.strategy.windows
-            if windows.refine_stop_iter < windows.structure_every and self.strategy.refine_stop_iter != 0:
-                CONSOLE.print(
-                    f"[yellow]{iterations} iterations are too few for a structure-aware split: densification ends at "
-                    f"{windows.refine_stop_iter}, the first split would come at {windows.structure_every}. "
-                    "Train longer or lower pipeline.model.strategy.structure-every.[/]"
-                )
-        return super().get_training_callbacks(training_callback_attributes)
+    def follow(self, plan: RunPlan) -> None:
+        """Densify, average and draw as a plan says from now on."""
+        self.plan, self.near_plane = plan, plan.near_plane
+        self.strategy = plan.strategy.for_run(plan.iterations, self.world)
 
     def step_post_backward(self, step: int) -> None:
         """Hand the step's forward passes to the strategy, limit scales, and average the parameters at the run's end."""
@@ -378,7 +370,7 @@ class SadgsModel(SplatfactoModel):
                 self.gauss_params, self.optimizers, self.strategy_state, self.step, self.infos
             )
         self.infos = []
-        iterations, done = self.strategy.run_length, self.step + 1
+        iterations, done = self.plan.iterations, self.step + 1
         if done <= iterations - round(self.config.averaged_share * iterations):
             self.average.clear()  # A run that was to end here, and is trained on, may have begun to average.
         else:
@@ -737,14 +729,11 @@ class SadgsModel(SplatfactoModel):
                 for key, value in self.strategy_state.items()
             },
             "average": self.average.state_dict(),
-            "near_plane": self.near_plane,
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` saved."""
         self.step = state["step"]
-        if self.config.near_plane is None:
-            self.near_plane = state["near_plane"]
         self.strategy_state = {
             key: value.to(self.device) if isinstance(value, Tensor) else value
             for key, value in state["strategy_state"].items()

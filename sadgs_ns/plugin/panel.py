@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -32,6 +33,7 @@ from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin import color_scales, gaussian_maps, texture
 from sadgs_ns.plugin.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
 from sadgs_ns.plugin.model import SadgsModel, in_viewer
+from sadgs_ns.plugin.run_plan import RunPlan
 from sadgs_ns.plugin.structure_cache import StructureCache, observe_training_views
 from sadgs_ns.plugin.viewer import ViewerMarkdown, show_output
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
@@ -52,12 +54,13 @@ ROWS = 8
 """Number of structure steps in the table, which shows the last ones."""
 
 
-def change(strategy: StructureAwareStrategy, name: str, value: float) -> None:
-    """Set one of `RANGES`' fields, on which the next densification acts; raise ValueError if it is out of range."""
+def changed(plan: RunPlan, name: str, value: float) -> RunPlan:
+    """Return a plan with another value of one of `RANGES`' fields; raise ValueError if it is out of range."""
     low, high = RANGES[name]
     if not (isinstance(value, int | float) and math.isfinite(value) and low <= value <= high):
-        raise ValueError(f"{name} must be in {low} … {high}, got {value}; it stays {getattr(strategy, name)}.")
-    setattr(strategy, name, int(value) if isinstance(low, int) else float(value))
+        raise ValueError(f"{name} must be in {low} … {high}, got {value}; it stays {getattr(plan.strategy, name)}.")
+    option: dict[str, Any] = {name: int(value) if isinstance(low, int) else float(value)}
+    return replace(plan, strategy=replace(plan.strategy, **option))
 
 
 def describe(strategy: StructureAwareStrategy, num_points: int, state: dict[str, Any]) -> str:
@@ -156,13 +159,13 @@ class StructurePanel(torch.nn.Module):
         self.table.refresh()
 
     def _change(self, name: str, element: ViewerParameter) -> None:
-        strategy = self._model.strategy
+        plan = self._model.plan
         try:
-            if element.value != getattr(strategy, name):
-                change(strategy, name, element.value)
+            if element.value != getattr(plan.strategy, name):
+                self._model.follow(changed(plan, name, element.value))
         except ValueError as error:
             CONSOLE.print(f"[yellow]{error}[/]")
-            element.value = getattr(strategy, name)
+            element.value = getattr(plan.strategy, name)
         self.table.refresh()
 
     def _told(self, act: Callable[[], None]) -> None:

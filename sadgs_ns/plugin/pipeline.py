@@ -26,17 +26,17 @@ from sadgs_ns.gsplat_compat import FAR_PLANE
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.method.initialization import camera_extent
 from sadgs_ns.method.quantization import HIGHEST_FREQUENCY
-from sadgs_ns.method.schedule import growth_threshold, schedule
 from sadgs_ns.method.structure_tensor import ENERGY_BLUR, FREQUENCY_CONSTANT
 from sadgs_ns.plugin import nonfinite
 from sadgs_ns.plugin.cleaning_panel import CleaningPanel
 from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig, check_options
-from sadgs_ns.plugin.memory_plan import fit_to_memory, place_images, training_size
+from sadgs_ns.plugin.memory_plan import place_images
 from sadgs_ns.plugin.model import NORMALS, SadgsModel, SadgsModelConfig, in_viewer
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
 from sadgs_ns.plugin.optimizers import FusedAdam
 from sadgs_ns.plugin.options import check_ranges
 from sadgs_ns.plugin.panel import StructurePanel
+from sadgs_ns.plugin.run_plan import RunPlan
 from sadgs_ns.plugin.sharded_steps import losses_of_views
 from sadgs_ns.plugin.structure_cache import StructureCache
 from sadgs_ns.plugin.viewer import shows_output
@@ -143,17 +143,11 @@ class SadgsPipeline(VanillaPipeline):
         self.structure_cache = StructureCache(
             self.views, config.frequency_constant, energy_blur=config.energy_blur, epsilon=config.epsilon
         )
-        number, asked = max(len(self.datamanager.train_dataset), 1), config.views_per_iteration
-        self.schedule = schedule(number, effort=config.effort, views_per_iteration=asked)
-        """Length of the run and views of a step; the trainer, which knows more, puts its own here."""
-        strategy, less = self.model.strategy, growth_threshold(config.effort)
-        strategy.clone_grad2d, strategy.split_absgrad2d = less * strategy.clone_grad2d, less * strategy.split_absgrad2d
         self.log = NonFiniteLog(self.device)
         self.world = World()
         """The processes among which the Gaussians are shared out."""
         self.put_aside: Drawn | None = None
         """Views that were drawn for the present step and not rendered yet."""
-        self._checkpoint_cap: int | None = None
         self.checkpoint_views: tuple[list[str], Tensor] | None = None
         """What `refuse_other_capture` takes of the checkpoint that was loaded, if there is one."""
         self.stuck = ""  # It says why, where nothing is learned any more.
@@ -177,6 +171,12 @@ class SadgsPipeline(VanillaPipeline):
         """The model, which is never wrapped for several devices."""
         return self._model  # type: ignore[return-value]
 
+    def follow(self, plan: RunPlan) -> None:
+        """Train, and draw, as a plan says from now on."""
+        self.model.follow(plan)
+        self.structure.set_max_gaussians.value = plan.strategy.max_gaussians
+        self.structure.set_tau_split.value = plan.strategy.tau_split
+
     def share_out(self, world: World) -> None:
         """Keep this process's part of the Gaussians, all of which it has until now; call before optimizers are made."""
         self.world = self.views.world = world
@@ -189,41 +189,12 @@ class SadgsPipeline(VanillaPipeline):
     @property
     def views_per_iteration(self) -> int:
         """Number of views in a step, at most as many as there are: a view that is rendered twice would count twice."""
-        return self.schedule.views_per_iteration
+        return self.model.plan.views_per_iteration
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Return the callbacks of data and model, and two that read what was not finite; plan the memory.
-
-        Raises:
-            InputError: If no camera sees a Gaussian, or `memory_budget_gb` leaves no room for them.
-        """
-        self._refuse_empty_views()
-        if self.config.model.strategy.refine_stop_iter != 0:
-            model = self.model
-            processes, views = self.world.num_ranks, self.views_per_iteration
-            gaussians: Any = model.gauss_params
-            size = training_size(self.datamanager, gaussians, views, processes, model.near_plane)
-            try:
-                line, warning = fit_to_memory(
-                    model.strategy,
-                    model.gauss_params,
-                    size,
-                    self.config.memory_budget_gb,
-                    processes,  # type: ignore[arg-type]
-                )
-            except ValueError as error:
-                raise InputError(f"pipeline.{error}") from error
-            if line is None:
-                cap = self.model.strategy.max_gaussians
-                line = f"At most {cap:,} Gaussians: this device's memory is not planned with, so this is max_gaussians."
-            CONSOLE.print(line, highlight=False, soft_wrap=True)
-            if warning is not None:
-                CONSOLE.print(f"[yellow]{escape(warning)}[/]", soft_wrap=True)
-            model.strategy.max_gaussians = int(self.world.least(model.strategy.max_gaussians))
-            self._keep_cap()
-            self.structure.set_max_gaussians.value = self.model.strategy.max_gaussians
+        """Return the callbacks of data and model, and two that read what was not finite."""
         optimizers = training_callback_attributes.optimizers
         for optimizer in optimizers.optimizers.values() if optimizers is not None else ():
             if isinstance(optimizer, FusedAdam):
@@ -236,7 +207,7 @@ class SadgsPipeline(VanillaPipeline):
         # The log is read before densification makes new parameters, which have no gradients.
         return [read, *super().get_training_callbacks(training_callback_attributes), counts, last]
 
-    def _refuse_empty_views(self) -> None:
+    def refuse_empty_views(self) -> None:
         """Raise InputError if fewer than 1 % of the Gaussians lie between the near and the far plane of any camera."""
         cameras = self.datamanager.train_dataset.cameras
         viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds[:: -(-len(cameras) // _SAMPLED)])
@@ -253,23 +224,6 @@ class SadgsPipeline(VanillaPipeline):
                 f"cameras lie within {extent:.2g}: set the parser's scale-factor so that they lie within about 1, or "
                 "leave its auto-scale-poses on."
             )
-
-    def _keep_cap(self) -> None:
-        """Go on with the cap that the checkpoint's run had in effect; say so if memory now allows more, or less."""
-        strategy, before = self.model.strategy, self._checkpoint_cap
-        if before is None or strategy.max_gaussians == before:
-            return
-        if strategy.max_gaussians > before:
-            strategy.max_gaussians = before
-            text = f"At most {before:,} Gaussians, as in the checkpoint's run."
-        else:
-            now = strategy.max_gaussians
-            text = (
-                f"[yellow]The checkpoint's run had room for {before:,} Gaussians, the GPU's free memory now has for "
-                f"{now:,}, which is the cap from here on: stop this run and end other programs on the GPU to keep "
-                f"{before:,}.[/]"
-            )
-        CONSOLE.print(text, highlight=False, soft_wrap=True)
 
     def _report_nonfinite(self, last: bool = False) -> None:
         """Say in which of the last iterations, and with which images, a loss or gradient was not finite.
@@ -434,25 +388,16 @@ class SadgsPipeline(VanillaPipeline):
                 soft_wrap=True,
             )
 
-    def _settings(self) -> dict[str, Any]:
-        """Return the options that decide how training goes on from a checkpoint, by their names."""
-        strategy = asdict(self.config.model.strategy)
-        settings = {f"model.strategy.{name}": strategy[name] for name in strategy}
-        own = {name: getattr(self.config, name) for name in ("views_per_iteration", "memory_budget_gb")}
-        return {**own, **settings}
-
     def get_extra_state(self) -> dict[str, Any]:
         """Return what lets a resumed run go on as if it had never been stopped, and tells of which data it is.
 
-        This is random states, the order of the views, the settings, and the names and cameras of the images.
+        This is random states, the order of the views, the plan, and the names and cameras of the images.
         """
         self._repeat_overflowed(wait=True)  # The sampler's state holds the views that are put back.
         state: dict[str, Any] = {
             "torch": torch.get_rng_state(),
             "views": self.views.sampler.state_dict(),
-            "settings": self._settings(),
-            "schedule": {**asdict(self.schedule), "effort": self.config.effort},
-            "max_gaussians": self.model.strategy.max_gaussians,  # It may be lower than the setting.
+            "plan": asdict(self.model.plan),
             "images": [path.name for path in self.datamanager.train_dataset.image_filenames],
             "camera_positions": _positions(self.datamanager.train_dataset.cameras),
         }
@@ -461,20 +406,8 @@ class SadgsPipeline(VanillaPipeline):
         return state
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what `get_extra_state` saved; the order of the views only where the data still has that many.
-
-        A line says where densification goes on with other settings than the checkpoint's run had.
-        """
-        now, before = self._settings(), state["settings"]
-        changed = [name for name in before if name in now and now[name] != before[name]]
-        if changed:
-            listed = ", ".join(f"pipeline.{name} was {before[name]} and is {now[name]}" for name in changed)
-            CONSOLE.print(
-                f"[yellow]The checkpoint's run had other settings; this one goes on with its own: {escape(listed)}.[/]",
-                soft_wrap=True,
-            )
-        if not any(name.endswith(("max_gaussians", "memory_budget_gb")) for name in changed):
-            self._checkpoint_cap = state["max_gaussians"]
+        """Restore what `get_extra_state` saved; the order of the views only where the data still has that many."""
+        self.follow(RunPlan.of(state["plan"]))
         self.checkpoint_views = state["images"], state["camera_positions"]
         torch.set_rng_state(state["torch"].cpu())
         self.views.sampler.load_state_dict(state["views"])

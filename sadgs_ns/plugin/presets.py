@@ -31,7 +31,7 @@ RATES: dict[str, tuple[float, float, float]] = {
 """Learning rate of each group of parameters, and the factors on it at the first and at the last iteration.
 
 The rates of positions, colours and opacities are 3DGS's at the start; the scales' is four times 3DGS's, the rotations'
-twice. They are those of a step of one view; `trainer.RATES_OF_FOUR_VIEWS` says how they change with more.
+twice. They are those of a step of one view; `run_plan.RATES_OF_FOUR_VIEWS` says how they change with more.
 """
 UNLISTED = ("color_matrices",)
 """Groups whose rates `--help` does not list, since what they learn hardly depends on the capture."""

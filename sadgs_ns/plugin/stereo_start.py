@@ -19,9 +19,6 @@ from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 FEWEST_VIEWS, MOST_VIEWS = 3, 60
 """Numbers of training views between which a run starts from stereo depth, where nobody says. More views make up for
 sparse points, and end with more Gaussians at equal quality (docs/results.md#dense-start)."""
-THRESHOLDS = 1.25
-"""Factor on AbsGS's thresholds in a run that starts from stereo depth. It takes back the Gaussians that such a start
-adds, with a higher SSIM than without the factor on all of four scenes (docs/results.md#dense-start)."""
 
 
 def number_of_points(pipeline: SadgsPipeline) -> int:
@@ -40,17 +37,18 @@ def number_of_points(pipeline: SadgsPipeline) -> int:
     return NUMBER
 
 
-def start_from_stereo(pipeline: SadgsPipeline, resumed: bool) -> None:
-    """Start from points of stereo depth, too, where the run is to and is not resumed, and let it grow less.
+def start_from_stereo(pipeline: SadgsPipeline, resumed: bool) -> bool:
+    """Start from points of stereo depth, too, where the run is to and is not resumed.
 
     Call it before optimizers are made. The images are loaded, where they are not yet.
+
+    Returns:
+        Whether the run starts, or a resumed one started, from such points.
     """
-    number, strategy = number_of_points(pipeline), pipeline.model.strategy
-    if number:
-        strategy.clone_grad2d *= THRESHOLDS
-        strategy.split_absgrad2d *= THRESHOLDS
+    number = number_of_points(pipeline)
     if number and not resumed:
         _add_points(pipeline, number)
+    return number > 0
 
 
 def _add_points(pipeline: SadgsPipeline, number: int) -> None:

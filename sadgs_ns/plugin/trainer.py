@@ -1,4 +1,4 @@
-"""The trainer of `ns-train sadgs`: it derives the schedule, saves, resumes, and ends a run in one sentence."""
+"""The trainer of `ns-train sadgs`: it plans, saves, resumes, and ends a run in one sentence."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import os
 import shlex
 import signal
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,15 +25,15 @@ from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
 from sadgs_ns.files import atomic_path
 from sadgs_ns.kernels import use_triton
-from sadgs_ns.method.schedule import between_one_and_four, schedule
 from sadgs_ns.plugin import checkpoints, processes
 from sadgs_ns.plugin.compilation import compile_kernels
 from sadgs_ns.plugin.config import CheckedTrainerConfig
 from sadgs_ns.plugin.graphed_steps import GraphedSteps
 from sadgs_ns.plugin.interrupts import HANG_UP, SIGNALS, Interrupted, Interrupts
 from sadgs_ns.plugin.lost_output import drop_lost_output, print_elsewhere_once_unread
-from sadgs_ns.plugin.optimizers import RunLengthDecaySchedulerConfig, SadgsOptimizers
+from sadgs_ns.plugin.optimizers import SadgsOptimizers
 from sadgs_ns.plugin.pipeline import SadgsPipeline
+from sadgs_ns.plugin.planning import plan_length, plan_of, plan_run
 from sadgs_ns.plugin.progress import about_cpu, remove_tables, what_next
 from sadgs_ns.plugin.stereo_start import start_from_stereo
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
@@ -41,10 +43,6 @@ _LESS_MEMORY = (
     "(`--downscale-factor 2` after `nerfstudio-data` or `colmap`), or several devices (`--share-always True`)"
 )
 _NOTHING_DONE = "stopped before an iteration was done; the same command starts again."
-RATES_OF_FOUR_VIEWS = {"means": (3.0, 3.0), "opacities": (1.5, 1.5), "scales": (2.25, 0.375), "quats": (2.25, 0.375)}
-"""Factors on learning rates at the first and at the last iteration in steps of four views
-(docs/results.md#splits-and-rates).
-Rates that fall once densification has ended fall less in steps of several views, and not at all in steps of four."""
 LEAST_PIXELS = 1.5e6
 """Pixels that a step must draw on each of several devices. Runs whose steps drew 1.9 and 3 million pixels on each of
 two took 1/1.1 of the time on one (one run of the latter 1/1.3), and a run of .7 million took 2.3 times as long
@@ -129,15 +127,15 @@ class SadgsTrainer(Trainer):
             raise SystemExit(128 + signal.SIGINT) from None
 
     def _say_what_was_chosen(self) -> None:
-        """Print the run's size after the memory plan's line, and what decided it."""
-        cameras, config, schedule = self.pipeline.datamanager.train_dataset.cameras, self.config, self.pipeline.schedule
-        views, asked, taken = len(cameras), config.pipeline.views_per_iteration, schedule.views_per_iteration
+        """Print the run's size after the memory plan's line, and what decided it; write the whole plan."""
+        cameras, config, plan = self.pipeline.datamanager.train_dataset.cameras, self.config, self.pipeline.model.plan
+        views, asked, taken = len(cameras), config.pipeline.views_per_iteration, plan.views_per_iteration
         megapixels = self._pixels_of_a_view() / 1e6
         done = f", of which {self._start_step:,} are done" if self._start_step else ""
-        times = round(schedule.iterations * taken / views)
+        times = round(plan.iterations * taken / views)
         lines = [
             f"{config.method_name} on {views:,} training views of {megapixels:.2g} megapixels: "
-            f"{schedule.iterations:,} iterations of {taken} view{'s' * (taken > 1)}{done}, so that each view is "
+            f"{plan.iterations:,} iterations of {taken} view{'s' * (taken > 1)}{done}, so that each view is "
             f"rendered about {times:,} time{'s' * (times != 1)}."
         ]
         if self._derived:
@@ -153,7 +151,9 @@ class SadgsTrainer(Trainer):
         if self.device == "cpu":
             lines.append(f"[yellow]{about_cpu(torch.get_num_threads())}[/]")
         CONSOLE.print("\n".join(lines), highlight=False, soft_wrap=True)
-        events.report("training begins", iterations=schedule.iterations, on_cpu=self.device == "cpu")
+        if processes.is_first():
+            plan.write(self.base_dir)
+        events.report("training begins", iterations=plan.iterations, on_cpu=self.device == "cpu")
 
     def _pixels_of_a_view(self) -> float:
         """Return the mean number of pixels of the training views."""
@@ -167,28 +167,13 @@ class SadgsTrainer(Trainer):
             CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
             events.report("training ends", gaussians=self.pipeline.model.num_gaussians)
 
-    def _load_checkpoint(self) -> None:
-        """Resume as nerfstudio does, but with the safe loader. Raise InputError for another method's checkpoint."""
-        if self._checkpoint is None:
-            return super()._load_checkpoint()
-        config, (path, state), self._checkpoint = self.config, self._checkpoint, None
+    @contextmanager
+    def _told_of_checkpoint(self) -> Iterator[None]:
+        """Let an error that a checkpoint's content raises become one sentence, an InputError."""
+        assert self._checkpoint is not None
+        path = self._checkpoint[0]
         try:
-            self._start_step = state["step"] + 1
-            if not self.world.alone:
-                part = self.world.take_even_part(len(state["pipeline"]["_model.gauss_params.means"]))
-                state = checkpoints.of_gaussians(state, lambda rows: rows[part].clone())
-            self.pipeline.load_pipeline(state["pipeline"], state["step"])
-            if self.pipeline.checkpoint_views is not None:
-                self.pipeline.refuse_other_capture(*self.pipeline.checkpoint_views)
-            if more := sorted(state["optimizers"].keys() - self.optimizers.optimizers.keys()):
-                raise InputError(
-                    f"It optimized {' and '.join(more)}, too: set pipeline.model.color-model and "
-                    "pipeline.model.camera-optimizer.mode as they were."
-                )
-            self.optimizers.load_optimizers(state["optimizers"])
-            if "schedulers" in state and config.load_scheduler:
-                self.optimizers.load_schedulers(state["schedulers"])
-            self.grad_scaler.load_state_dict(state["scalers"])
+            yield
         except torch.cuda.OutOfMemoryError:
             raise
         except InputError as error:
@@ -198,38 +183,46 @@ class SadgsTrainer(Trainer):
             raise InputError(
                 f"{path} is not a checkpoint of this version of sadgs ({what}): {checkpoints.REMEDY}."
             ) from error
+
+    def _load_gaussians(self) -> None:
+        """Load the checkpoint's Gaussians and what the pipeline knows; the optimizers, made of them, come later."""
+        with self._told_of_checkpoint():
+            path, state = self._checkpoint  # type: ignore[misc]
+            self._start_step = state["step"] + 1
+            if not self.world.alone:
+                part = self.world.take_even_part(len(state["pipeline"]["_model.gauss_params.means"]))
+                state = checkpoints.of_gaussians(state, lambda rows: rows[part].clone())
+                self._checkpoint = path, state
+            self.pipeline.load_pipeline(state["pipeline"], state["step"])
+            if self.pipeline.checkpoint_views is not None:
+                self.pipeline.refuse_other_capture(*self.pipeline.checkpoint_views)
+            if more := sorted(state["optimizers"].keys() - self.pipeline.get_param_groups().keys()):
+                raise InputError(
+                    f"It optimized {' and '.join(more)}, too: set pipeline.model.color-model and "
+                    "pipeline.model.camera-optimizer.mode as they were."
+                )
+
+    def _load_checkpoint(self) -> None:
+        """Resume the optimizers as nerfstudio does. Raise InputError where they are another method's."""
+        if self._checkpoint is None:
+            return super()._load_checkpoint()
+        with self._told_of_checkpoint():
+            path, state = self._checkpoint
+            self.optimizers.load_optimizers(state["optimizers"])
+            if "schedulers" in state and self.config.load_scheduler:
+                self.optimizers.load_schedulers(state["schedulers"])
+            self.grad_scaler.load_state_dict(state["scalers"])
+        self._checkpoint = None
         CONSOLE.print(f"Resuming after step {state['step']} of {path}", markup=False, soft_wrap=True)
 
-    def _derive_schedule(self) -> None:
-        """Decide the length of the run and the views of a step: by hand, as in the checkpoint's run, or by rule.
-
-        The configuration of `config.yml` keeps saying what was asked for, and the trainer's what was decided.
-        """
-        config, pipeline = copy.copy(self.config), self.pipeline
-        before: dict[str, Any] = {}
-        if self._checkpoint is not None:
-            loaded = self._checkpoint[1]["pipeline"]
-            before = loaded.get("_extra_state", {}).get("schedule", {}) if isinstance(loaded, dict) else {}
-        if before.get("effort") != config.pipeline.effort:
-            before = {}
-        asked = config.pipeline.views_per_iteration
-        pipeline.schedule = schedule(
-            len(pipeline.datamanager.train_dataset),
-            effort=config.pipeline.effort,
-            iterations=before.get("iterations") if self._derived else config.max_num_iterations,
-            views_per_iteration=before.get("views_per_iteration") if asked is None else asked,
-        )
-        config.max_num_iterations = pipeline.schedule.iterations
-        self.config = config
-
-    def _take_one_device_if_quicker(self) -> None:
-        """Train on the first device alone, and say so, where a step has too few pixels for several.
+    def _take_one_device_if_quicker(self, views: int) -> None:
+        """Train on the first device alone, and say so, where a step of so many views has too few pixels for several.
 
         On several machines all devices are kept. The other processes end with SystemExit, once the first has ended.
         """
         if self._peers is None or self.config.share_always or not self._peers.all_here():
             return
-        devices, pixels = self.world.num_ranks, self.pipeline.views_per_iteration * self._pixels_of_a_view()
+        devices, pixels = self.world.num_ranks, views * self._pixels_of_a_view()
         if pixels >= LEAST_PIXELS * devices:
             return
         CONSOLE.print(
@@ -250,38 +243,31 @@ class SadgsTrainer(Trainer):
             self.config.vis = others or "none"  # type: ignore[assignment]
 
     def setup_optimizers(self) -> SadgsOptimizers:
-        """Derive the run's length and build optimizers with schedules as long; raises as `checkpoints.read_chosen`."""
-        config = self.config
+        """Load the checkpoint's Gaussians, if there is one, plan the run, and build optimizers with the planned rates.
+
+        Raises InputError if checkpoint, data or options cannot be used, or do not fit each other.
+        """
+        config, pipeline = self.config, self.pipeline
         self._checkpoint = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
-        start_from_stereo(self.pipeline, resumed=self._checkpoint is not None)
+        dense, before = start_from_stereo(pipeline, resumed=self._checkpoint is not None), None
+        cameras = pipeline.datamanager.train_dataset.cameras
         if self._checkpoint is None:
-            cameras = self.pipeline.datamanager.train_dataset.cameras
-            self.pipeline.model.clear_paths(viewmats_from_camera_to_world(cameras.camera_to_worlds))
-        self._derive_schedule()
-        self._take_one_device_if_quicker()
+            pipeline.model.clear_paths(viewmats_from_camera_to_world(cameras.camera_to_worlds))
+        else:
+            with self._told_of_checkpoint():
+                before = plan_of(self._checkpoint[1])
+        length = plan_length(config, len(cameras), before)
+        self._take_one_device_if_quicker(length.views_per_iteration)
         if not self.world.alone:
             self._turn_viewer_off()
-            self.pipeline.share_out(self.world)
-        optimizers: dict[str, Any] = copy.deepcopy(dict(self.config.optimizers))
-        for name, at_four in RATES_OF_FOUR_VIEWS.items() if self.config.rates_follow_views else ():
-            start, end = (between_one_and_four(self.pipeline.views_per_iteration, factor) for factor in at_four)
-            optimizers[name]["optimizer"].lr *= start
-            decay = optimizers[name].get("scheduler") or RunLengthDecaySchedulerConfig()
-            if start != end and isinstance(decay, RunLengthDecaySchedulerConfig):
-                optimizers[name]["scheduler"] = decay
-                decay.final_factor *= end / start
-        for group in optimizers.values():
-            scheduler = group.setdefault("scheduler", None)
-            if not isinstance(scheduler, RunLengthDecaySchedulerConfig):
-                continue
-            if self.config.rates_follow_views and scheduler.hold_share > 0:
-                constant = 1 / scheduler.final_factor
-                scheduler.final_factor *= between_one_and_four(self.pipeline.views_per_iteration, constant)
-            if scheduler.max_steps is None:
-                scheduler.max_steps = self.config.max_num_iterations
-        # Positions move in proportion to the cameras' extent, as in 3DGS; splatfacto does not do so.
-        optimizers["means"]["optimizer"].lr *= self.pipeline.model.strategy_state["scene_scale"]
-        return SadgsOptimizers(optimizers, self.pipeline.get_param_groups())
+            pipeline.share_out(self.world)
+        if self._checkpoint is not None:
+            self._load_gaussians()
+        pipeline.refuse_empty_views()
+        plan = plan_run(config, pipeline, length, dense=dense, before=before)
+        pipeline.follow(plan)
+        config.max_num_iterations = plan.iterations  # nerfstudio's loop and table read it.
+        return SadgsOptimizers(plan.optimizers(config.optimizers), pipeline.get_param_groups())
 
     def train(self) -> None:
         """Train up to `max_num_iterations` in all, where nerfstudio 1.1.5 would train that many more after resuming.
@@ -292,7 +278,7 @@ class SadgsTrainer(Trainer):
             SystemExit: If SIGINT, SIGTERM or SIGHUP came. A checkpoint is saved then, a line says how to go on, and the
                 exit code is the one that shells give these signals.
         """
-        total = self.pipeline.schedule.iterations
+        total = self.pipeline.model.plan.iterations
         self.step: int = max(self._start_step - 1, 0)  # It names the checkpoint where nothing is left to do.
         self._completed_step = self._saved_step = self._start_step - 1
         self.config.max_num_iterations = max(total - self._start_step, 0)
@@ -341,14 +327,7 @@ class SadgsTrainer(Trainer):
         processes.leave()
 
     def _train_until_interrupted(self, total: int) -> None:
-        """Train as nerfstudio does, until the last iteration or a signal.
-
-        Args:
-            total: Iterations of the run.
-
-        Raises:
-            SystemExit: If a signal came, and what was trained is saved.
-        """
+        """Train as nerfstudio does, until the last iteration of all or a signal, which raises SystemExit once saved."""
         with self._interrupts:
             try:
                 if not self.world.alone:  # nerfstudio's way to make it fails where another process is as fast.

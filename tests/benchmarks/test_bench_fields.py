@@ -149,8 +149,9 @@ def runs(request: pytest.FixtureRequest, root: Path, tmp_path_factory: pytest.Te
 def test_the_curve_changes_nothing_in_the_training(runs: Runs):
     (_, measured), (_, plain) = runs["with"], runs["without"]
     assert len(plain["pipeline"]["_model.gauss_params.means"]) != 200, "densification took part"
-    for states in (measured, plain):
-        states["pipeline"].get("_extra_state", {}).pop("images", None)  # which are names, and no numbers
+    for name in ("images", "plan"):  # These are not numbers alone.
+        here, there = (states["pipeline"].get("_extra_state", {}).pop(name, None) for states in (measured, plain))
+        assert here == there
     torch.testing.assert_close(measured, plain, rtol=0, atol=0)
 
 
@@ -477,9 +478,9 @@ def test_curve_every_is_a_positive_whole_number(wrong: object):
         protocol.parse(content(curve_every=wrong))
 
 
-def test_a_strategy_that_was_never_fitted_to_a_run_is_left_as_it_was():
-    strategy = StructureAwareStrategy()
-    before = vars(strategy).copy()
-    with phases.within_densification(strategy):
-        assert strategy.run_length > 3000
-    assert vars(strategy) == before and strategy.run_length == 3000
+def test_a_model_has_its_own_strategy_again_after_a_measurement():
+    model = SimpleNamespace(strategy=StructureAwareStrategy().for_run(300))
+    strategy, before = model.strategy, vars(model.strategy).copy()
+    with phases.within_densification(model):
+        assert model.strategy.observes(10**6) and not model.strategy.densifies(10**6)
+    assert model.strategy is strategy and vars(strategy) == before

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 import re
 import shutil
@@ -30,7 +31,7 @@ from sadgs_ns.method.quantization import INVALID
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin import color_scales, gaussian_maps, texture
 from sadgs_ns.plugin.model import _say_once
-from sadgs_ns.plugin.panel import CHOICES, OFF, OUTPUT, StructurePanel, change, describe, nearest_view
+from sadgs_ns.plugin.panel import CHOICES, OFF, OUTPUT, StructurePanel, changed, describe, nearest_view
 from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.plugin.structure_cache import observe_training_views
 from sadgs_ns.render import rasterization
@@ -401,20 +402,23 @@ def test_where_every_pixel_is_masked_the_panel_says_that_none_was_observed(panel
 
 def test_sliders_reach_the_strategy_and_the_plan(panel: StructurePanel):
     pipeline = pipeline_of(panel)
-    strategy, statistics = pipeline.model.strategy, observe_training_views(pipeline.structure_cache)
-    split = []
+    asked, statistics = pipeline.model.strategy, observe_training_views(pipeline.structure_cache)
+    before, split = dataclasses.asdict(asked), []
     for tau in (1.0, 0.5, 0.0):
         panel.set_tau_split.value = tau
         panel.set_tau_split.cb_hook(panel.set_tau_split)
+        strategy = pipeline.model.strategy
         assert strategy.tau_split == tau
         counts, _ = strategy.split_plan(pipeline.model.gauss_params, statistics, math.inf)
         split.append(int((counts > 1).any(dim=1).sum()))
     assert split[0] == 0 < split[1] < split[2]
     panel.set_max_gaussians.value = 777
     panel.set_max_gaussians.cb_hook(panel.set_max_gaussians)
+    strategy = pipeline.model.strategy
     assert strategy.max_gaussians == 777 and type(strategy.max_gaussians) is int
     assert "cap 777" in panel.table.text()
     assert pipeline.config.model.strategy.max_gaussians != 777, "what was configured stays"
+    assert dataclasses.asdict(asked) == before, "a plan is replaced, not changed"
 
 
 @pytest.mark.parametrize(
@@ -425,14 +429,14 @@ def test_sliders_reach_the_strategy_and_the_plan(panel: StructurePanel):
     ],
 )
 def test_values_out_of_range_are_refused_and_put_back(name: str, values: list[Any], panel: StructurePanel):
-    strategy, element = pipeline_of(panel).model.strategy, getattr(panel, f"set_{name}")
-    before = getattr(strategy, name)
+    plan, element = pipeline_of(panel).model.plan, getattr(panel, f"set_{name}")
+    before = getattr(plan.strategy, name)
     for value in values:
         with pytest.raises(ValueError, match=name):
-            change(strategy, name, value)
+            changed(plan, name, value)
         element.value = value
         element.cb_hook(element)
-        assert getattr(strategy, name) == before == element.value
+        assert pipeline_of(panel).model.plan == plan and before == element.value
 
 
 def test_counts_of_the_structure_steps_are_kept_in_checkpoints_and_told(run: Path, panel: StructurePanel):
@@ -451,13 +455,14 @@ def test_the_table_is_refreshed_while_training_only_where_somebody_looks(panel: 
     class Handle:
         content = ""
 
-    pipeline_of(panel).model.strategy.max_gaussians = 4321
+    model = pipeline_of(panel).model
+    model.follow(changed(model.plan, "max_gaussians", 4321))
     panel.refresh()
     assert panel.table.gui_handle is None
     panel.table.gui_handle = Handle()
     panel.refresh()
     assert "cap 4,321" in panel.table.gui_handle.content
-    pipeline_of(panel).model.strategy.max_gaussians = 1234
+    model.follow(changed(model.plan, "max_gaussians", 1234))
     panel.refresh()
     assert "cap 4,321" in panel.table.gui_handle.content, "once a second is enough"
 

@@ -118,24 +118,23 @@ def test_nothing_happens_outside_the_window():
 
 def test_window_fits_short_runs_and_keeps_long_ones():
     for length, expected in ((3000, 1600), (300, 190), (30_000, 1600)):
-        strategy = StructureAwareStrategy(refine_stop_iter=1600)
-        strategy.fit_to_run(length)
+        strategy = StructureAwareStrategy(refine_stop_iter=1600).for_run(length)
         assert strategy.windows.refine_stop_iter == expected
 
 
 def test_windows_follow_the_length_of_the_run_but_for_those_that_are_given():
     strategy = StructureAwareStrategy(reset_every=0, eta_every=7)
-    strategy.fit_to_run(6000)
-    assert strategy.windows == Windows(
+    assert strategy.for_run(6000).windows == Windows(
         structure_every=1000, absgs_every=200, refine_start_iter=200, refine_stop_iter=3200, reset_every=0, eta_every=7
     )
-    strategy.fit_to_run(3000)
-    assert strategy.windows.structure_every == 500 and strategy.structure_every is None
+    fitted = strategy.for_run(3000)
+    assert fitted.windows.structure_every == fitted.structure_every == strategy.windows.structure_every == 500
+    assert strategy.structure_every is None and fitted.for_run(3000) == fitted
 
 
 def test_a_run_too_short_to_densify_prepares_nothing_for_it():
     strategy = StructureAwareStrategy(structure_every=50, absgs_every=10, refine_start_iter=500)
-    strategy.fit_to_run(700)  # 443 would be before 500
+    strategy = strategy.for_run(700)  # 443 would be before 500
     assert not any(strategy.observes(step) or strategy.needs_absgrad(step) for step in range(700))
     assert strategy.windows.refine_stop_iter == 0
 

@@ -40,7 +40,7 @@ else:
     import tomli as tomllib
 
 CHECKOUT = Path(__file__).parents[2]
-NO_OPTIONS = {"run_length", "world"}
+NO_OPTIONS = {"world"}
 """Attributes of the strategy that are decided in each run."""
 METHODS = ("sadgs", "sadgs-paper", "sadgs-paper-indoor")
 CONFIG_CLASSES = (
@@ -262,8 +262,7 @@ def test_options_of_the_pipeline_that_are_out_of_range_are_refused(option: str, 
 
 
 def test_gaussians_are_neither_added_nor_removed_where_densification_ends_at_0():
-    strategy = StructureAwareStrategy(refine_stop_iter=0)
-    strategy.fit_to_run(3000)
+    strategy = StructureAwareStrategy(refine_stop_iter=0).for_run(3000)
     assert not any(strategy.observes(step) or strategy.needs_absgrad(step) for step in range(3000))
 
 

@@ -81,15 +81,14 @@ def fit(
     pixels: int = 0,
     pairs: float = 0,
     budget_gb: float | None = None,
-    **changes: Any,
+    cap: int = DEFAULT,
 ):
     """The cap, and what the user is told."""
-    strategy = StructureAwareStrategy(**changes)
     size = TrainingSize(other, StepSize(views, pixels, pairs))
     with triton_switched(True):  # The loss is computed by our kernels, as on a card.
-        line, warning = fit_to_memory(strategy, params(n), size, budget_gb)  # type: ignore[arg-type]
+        cap, line, warning = fit_to_memory(cap, params(n), size, budget_gb)  # type: ignore[arg-type]
     assert line is not None
-    return strategy.max_gaussians, line, warning
+    return cap, line, warning
 
 
 def test_what_a_gaussian_takes_is_what_a_split_asks_for():
@@ -164,16 +163,16 @@ def test_a_budget_bounds_it_and_never_raises_max_gaussians(card: Any):
     assert cap == int(3e9 // each())
     assert line == f"At most {cap:,} Gaussians: 4.0 GB of the card's 140.0 GB; memory_budget_gb is 4."
     assert fit(budget_gb=100.0)[0] == DEFAULT
-    assert fit(budget_gb=100.0, max_gaussians=1000)[0] == 1000
-    assert fit(budget_gb=4.0, max_gaussians=1000)[0] == 1000
-    assert fit(budget_gb=4.0, max_gaussians=3_000_000)[0] == int(4e9 // each())
+    assert fit(budget_gb=100.0, cap=1000)[0] == 1000
+    assert fit(budget_gb=4.0, cap=1000)[0] == 1000
+    assert fit(budget_gb=4.0, cap=3_000_000)[0] == int(4e9 // each())
     card(2, 8)  # more than is free is not there to be taken
     assert fit(budget_gb=4.0)[0] == int(2e9 // each())
 
 
 def test_a_cap_that_the_user_chose_stays_without_a_budget(card: Any):
     card(2, 8)
-    cap, line, _ = fit(max_gaussians=1_000_000)
+    cap, line, _ = fit(cap=1_000_000)
     assert cap == 1_000_000 and line.startswith("At most 1,000,000 Gaussians: 1.8 GB of the card's 8.0 GB.")
 
 
@@ -182,27 +181,28 @@ def test_a_full_card_still_starts_and_a_budget_for_nothing_is_refused(card: Any)
     card(0.5, 8)
     cap, line, _ = fit(other=1e9)
     assert cap == 1 and line.endswith("which holds no more than the 10 at the start: none will be added.")
-    with pytest.raises(ValueError) as error:
+    with pytest.raises(InputError) as error:
         fit(other=1e9, budget_gb=0.5)
     assert str(error.value) == (
-        "memory_budget_gb is 0.5 and leaves no room for Gaussians: images and rendering take 1.0 GB, and 0.5 "
+        "pipeline.memory_budget_gb is 0.5 and leaves no room for Gaussians: images and rendering take 1.0 GB, and 0.5 "
         "GB are free; raise it, take fewer or smaller images, or lower pipeline.views-per-iteration."
     )
 
 
 def test_a_structure_tensor_that_is_computed_late_has_its_room_beside_the_gaussians(card: Any):
     card(7.5, 8)
-    strategy = StructureAwareStrategy()
     size = TrainingSize(0.0, StepSize(), structure_bytes=3e9)
-    fit_to_memory(strategy, params(), size)  # type: ignore[arg-type]
-    assert strategy.max_gaussians == int((0.8 * 7.5e9 - 3e9) // (KEPT + WIDEST)) < fit()[0]
+    cap, *_ = fit_to_memory(DEFAULT, params(), size)  # type: ignore[arg-type]
+    assert cap == int((0.8 * 7.5e9 - 3e9) // (KEPT + WIDEST)) < fit()[0]
 
 
 def test_without_cuda_nothing_changes():
-    strategy = StructureAwareStrategy()
     size = TrainingSize(1e9, StepSize(1, 10**6, 10**6))
-    assert fit_to_memory(strategy, params(), size, 0.1) == (None, None)  # type: ignore[arg-type]
-    assert strategy.max_gaussians == DEFAULT
+    assert fit_to_memory(DEFAULT, params(), size, 0.1) == (  # type: ignore[arg-type]
+        DEFAULT,
+        "At most 4,000,000 Gaussians: this device's memory is not planned with, so this is max_gaussians.",
+        None,
+    )
 
 
 def test_what_is_free_counts_what_this_process_holds_as_its_own(monkeypatch: pytest.MonkeyPatch):

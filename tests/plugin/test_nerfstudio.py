@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import json
 import math
 import sys
@@ -37,7 +38,6 @@ from examples.drawn_scene.scene import SPARSE_FOLDER
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.near_plane import NEAR_SHARE
 from sadgs_ns.method.quantization import dequantize
-from sadgs_ns.method.schedule import Schedule
 from sadgs_ns.plugin.model import SadgsModel, _load_lpips
 from sadgs_ns.plugin.presets import RATES
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
@@ -533,7 +533,7 @@ def test_the_loss_of_views_is_the_mean_of_their_own(tmp_path: Path, camera_optim
     pipeline = set_up(config).pipeline
 
     def loss(*indices: int) -> torch.Tensor:
-        pipeline.schedule = Schedule(iterations=3, views_per_iteration=len(indices))
+        pipeline.follow(dataclasses.replace(pipeline.model.plan, views_per_iteration=len(indices)))
         pipeline.views.sampler.requeue(indices)
         _, losses, metrics = pipeline.get_train_loss_dict(0)
         assert metrics["gaussian_count"] == pytest.approx(pipeline.model.num_points)
@@ -646,7 +646,7 @@ def test_held_out_cameras_render_as_nerfstudio_expects(trained: SadgsTrainer):
 @torch.no_grad()
 def test_training_evaluation_and_a_loaded_run_draw_from_the_same_plane(finished: Path, colmap: ColmapDataParserConfig):
     (path,) = (finished / "nerfstudio_models").iterdir()
-    stored = torch.load(path, weights_only=True)["pipeline"]["_model._extra_state"]["near_plane"]
+    stored = torch.load(path, weights_only=True)["pipeline"]["_extra_state"]["plan"]["near_plane"]
     _, pipeline, _, _ = eval_setup(finished / "config.yml")
     model: Any = pipeline.model
     assert isinstance(model, SadgsModel) and model.config.near_plane is None

@@ -44,8 +44,7 @@ from scenes import ITERATIONS
 from examples.drawn_scene.scene import SPARSE_FOLDER
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.schedule import Schedule, schedule
-from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.plugin import pipeline
+from sadgs_ns.plugin import planning
 from sadgs_ns.plugin.checkpoints import checkpoint_paths
 from sadgs_ns.plugin.interrupts import SIGNALS
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
@@ -657,23 +656,28 @@ def test_a_checkpoint_goes_on_with_more_or_fewer_views_of_its_world_alone(
             set_up(config)
 
 
+def length_of(trainer: SadgsTrainer) -> Schedule:
+    plan = trainer.pipeline.model.plan
+    return Schedule(plan.iterations, plan.views_per_iteration)
+
+
 def test_a_resumed_run_keeps_the_length_that_was_derived_unless_another_is_asked_for(
     config: SadgsTrainerConfig, tmp_path: Path
 ):
     config.max_num_iterations = None
     trainer = set_up(config)
     trainer.save_checkpoint(0)
-    derived = trainer.pipeline.schedule
+    derived = length_of(trainer)
     config.load_dir, config.output_dir = trainer.checkpoint_dir, tmp_path / "resumed"
     parser: Any = config.pipeline.datamanager.dataparser
     config.pipeline.datamanager.dataparser = dataclasses.replace(parser, eval_mode="all")  # It has more views.
-    assert set_up(config).pipeline.schedule == derived
+    assert length_of(set_up(config)) == derived
 
     config.pipeline.effort = 2.0
     views = len(set_up(config).pipeline.datamanager.train_dataset)
-    assert set_up(config).pipeline.schedule == schedule(views, effort=2.0) != derived
+    assert length_of(set_up(config)) == schedule(views, effort=2.0) != derived
     config.pipeline.effort, config.max_num_iterations, config.pipeline.views_per_iteration = 1.0, 7, 3
-    assert set_up(config).pipeline.schedule == Schedule(iterations=7, views_per_iteration=3)
+    assert length_of(set_up(config)) == Schedule(iterations=7, views_per_iteration=3)
 
 
 @pytest.mark.hard_case(
@@ -727,12 +731,10 @@ def plan(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """Lets the memory plan of the next runs allow so many Gaussians, unless they ask for another cap themselves."""
 
     def allow(cap: int) -> None:
-        def fit(strategy: StructureAwareStrategy, *_: Any) -> tuple[None, None]:
-            if strategy.max_gaussians == 2000:  # of these tests' runs
-                strategy.max_gaussians = min(cap, strategy.max_gaussians)
-            return None, None
+        def fit(asked: int, *_: Any) -> tuple[int, str, None]:
+            return min(cap, asked) if asked == 2000 else asked, "", None  # These tests' runs ask for 2000.
 
-        monkeypatch.setattr(pipeline, "fit_to_memory", fit)
+        monkeypatch.setattr(planning, "fit_to_memory", fit)
 
     return allow
 

@@ -11,7 +11,6 @@ import pytest
 from kill_and_resume import set_up
 from scenes import HEIGHT, ITERATIONS, WIDTH
 
-from sadgs_ns.method.schedule import Schedule
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 LATER = (
@@ -60,12 +59,12 @@ def test_the_number_of_views_and_the_effort_decide_what_is_not_set_by_hand(
 ):
     config.max_num_iterations, config.pipeline.effort = None, 0.5
     trainer, printed = says(config)
-    pipeline = trainer.pipeline
+    pipeline, plan = trainer.pipeline, trainer.pipeline.model.plan
     visits = 0.5 * (2000 + 50 * len(pipeline.datamanager.train_dataset))
-    assert pipeline.schedule == Schedule(iterations=math.ceil(visits), views_per_iteration=1)
-    assert trainer.config.max_num_iterations == pipeline.schedule.iterations
-    assert pipeline.model.strategy.run_length == pipeline.schedule.iterations
-    assert f": {pipeline.schedule.iterations:,} iterations of 1 view, so that each view is rendered about" in printed
+    assert (plan.iterations, plan.views_per_iteration) == (math.ceil(visits), 1)
+    assert trainer.config.max_num_iterations == plan.iterations
+    assert pipeline.model.strategy == config.pipeline.model.strategy.for_run(plan.iterations)
+    assert f": {plan.iterations:,} iterations of 1 view, so that each view is rendered about" in printed
     assert (
         "\nThe number of views and --pipeline.effort 0.5 decide this: 0.5 is a draft of half as many renderings, 2 "
         in printed

@@ -60,7 +60,7 @@ def test_the_panel_shows_and_sets_what_is_chosen_in_a_browser(tmp_path: Path):
     trainer = set_up(config)
     trainer.train()
     pipeline = trainer.pipeline
-    panel, strategy = pipeline.structure, pipeline.model.strategy
+    panel = pipeline.structure
     config.viewer.websocket_port_default = 7137  # the first free port from there
     viewer = Viewer(config.viewer, tmp_path / "log", tmp_path, pipeline, train_lock=threading.Lock())
     viewer.init_scene(pipeline.datamanager.train_dataset, "completed")
@@ -82,7 +82,7 @@ def test_the_panel_shows_and_sets_what_is_chosen_in_a_browser(tmp_path: Path):
             page.run(f"{ELEMENT.format('max_gaussians')}.select()")
             page.type("4567")
             page.press("Enter", 13)
-            eventually(lambda: strategy.max_gaussians == 4567)
+            eventually(lambda: pipeline.model.strategy.max_gaussians == 4567)
             page.wait_for("document.body.innerText.includes('cap 4,567')")
             select(page, "Preview", "what stays")
             number = pipeline.model.num_points

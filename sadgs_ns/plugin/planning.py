@@ -1,0 +1,130 @@
+"""Planning a run from its options, its data, the machine's memory and the checkpoint that it goes on from."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from typing import Any
+
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
+
+from sadgs_ns.method.schedule import Schedule, growth_threshold, schedule
+from sadgs_ns.plugin.config import CheckedTrainerConfig
+from sadgs_ns.plugin.memory_plan import fit_to_memory, training_size
+from sadgs_ns.plugin.pipeline import SadgsPipeline, SadgsPipelineConfig
+from sadgs_ns.plugin.run_plan import RunPlan, plan_rates
+
+DENSE_THRESHOLDS = 1.25
+"""Factor on AbsGS's thresholds in a run that starts from stereo depth. It takes back the Gaussians that such a start
+adds, with a higher SSIM than without the factor on all of four scenes (docs/results.md#dense-start)."""
+_OF_THE_CAP = ("memory_budget_gb", "model.strategy.max_gaussians")
+"""Options that decide the cap of Gaussians."""
+
+
+def plan_of(checkpoint: dict[str, Any]) -> RunPlan | None:
+    """Return the plan of the run that wrote a checkpoint; None in one of another method."""
+    pipeline = checkpoint["pipeline"]
+    state = pipeline.get("_extra_state") if isinstance(pipeline, dict) else None
+    return RunPlan.of(state["plan"]) if isinstance(state, dict) and "plan" in state else None
+
+
+def plan_length(config: CheckedTrainerConfig, views: int, before: RunPlan | None) -> Schedule:
+    """Decide the length of a run of so many training views, and the views of a step.
+
+    By hand, or as in the checkpoint's run, whose plan is `before`, if the effort is the same, or by rule.
+    """
+    effort, iterations, in_step = config.pipeline.effort, config.max_num_iterations, config.pipeline.views_per_iteration
+    if before is not None and before.asked["effort"] == effort:
+        iterations = before.iterations if iterations is None else iterations
+        in_step = before.views_per_iteration if in_step is None else in_step
+    return schedule(views, effort=effort, iterations=iterations, views_per_iteration=in_step)
+
+
+def plan_run(
+    config: CheckedTrainerConfig, pipeline: SadgsPipeline, length: Schedule, *, dense: bool, before: RunPlan | None
+) -> RunPlan:
+    """Decide what a run's options leave open, and print the cap, and which options changed since the checkpoint's run.
+
+    Raises InputError if `memory_budget_gb` leaves no room for Gaussians.
+
+    Args:
+        config, pipeline: Of the run, each process with the Gaussians from which it starts.
+        length, before: As for `plan_length`.
+        dense: Whether the run starts, or started, from stereo depth.
+    """
+    options, model, asked = config.pipeline, pipeline.model, _asked(config.pipeline)
+    if before is not None:
+        _tell_changes(asked, before.asked)
+    strategy, growth = options.model.strategy, growth_threshold(options.effort)
+    clone, split = growth * strategy.clone_grad2d, growth * strategy.split_absgrad2d
+    if dense:
+        clone, split = clone * DENSE_THRESHOLDS, split * DENSE_THRESHOLDS
+    cap = strategy.max_gaussians
+    if strategy.refine_stop_iter != 0:
+        cap = _cap_in_memory(options, pipeline, length.views_per_iteration)
+        if before is not None and all(asked[name] == before.asked[name] for name in _OF_THE_CAP):
+            cap = _kept_cap(cap, before.strategy.max_gaussians)
+    planned = replace(strategy, max_gaussians=cap, clone_grad2d=clone, split_absgrad2d=split)
+    planned = planned.for_run(length.iterations)
+    windows = planned.windows
+    if windows.refine_stop_iter < windows.structure_every and strategy.refine_stop_iter != 0:
+        CONSOLE.print(
+            f"[yellow]{length.iterations} iterations are too few for a structure-aware split: densification ends at "
+            f"{windows.refine_stop_iter}, the first split would come at {windows.structure_every}. "
+            "Train longer or lower pipeline.model.strategy.structure-every.[/]"
+        )
+    extent = model.strategy_state["scene_scale"]
+    return RunPlan(
+        **vars(length),
+        devices=pipeline.world.num_ranks,
+        images=pipeline.datamanager.config.cache_images,
+        near_plane=model.near_plane if options.model.near_plane is None else options.model.near_plane,
+        max_off_axis=options.model.max_off_axis,
+        strategy=planned,
+        rates=plan_rates(config.optimizers, length, extent, config.rates_follow_views),
+        asked=asked,
+    )
+
+
+def _asked(options: SadgsPipelineConfig) -> dict[str, Any]:
+    """Return the options that decide how training goes on from a checkpoint, by their names."""
+    own = {name: getattr(options, name) for name in ("effort", "views_per_iteration", "memory_budget_gb")}
+    return own | {f"model.strategy.{name}": value for name, value in asdict(options.model.strategy).items()}
+
+
+def _tell_changes(now: dict[str, Any], before: dict[str, Any]) -> None:
+    """Say which options are others than the checkpoint's run had."""
+    changed = [name for name in before if name in now and now[name] != before[name]]
+    if changed:
+        listed = ", ".join(f"pipeline.{name} was {before[name]} and is {now[name]}" for name in changed)
+        CONSOLE.print(
+            f"[yellow]The checkpoint's run had other settings; this one goes on with its own: {escape(listed)}.[/]",
+            soft_wrap=True,
+        )
+
+
+def _cap_in_memory(options: SadgsPipelineConfig, pipeline: SadgsPipeline, views: int) -> int:
+    """Return the cap of Gaussians that all devices hold, and say what decided it."""
+    model, processes, cap = pipeline.model, pipeline.world.num_ranks, options.model.strategy.max_gaussians
+    gaussians: Any = model.gauss_params
+    size = training_size(pipeline.datamanager, gaussians, views, processes, model.near_plane)
+    cap, line, warning = fit_to_memory(cap, gaussians, size, options.memory_budget_gb, processes)
+    CONSOLE.print(line, highlight=False, soft_wrap=True)
+    if warning is not None:
+        CONSOLE.print(f"[yellow]{escape(warning)}[/]", soft_wrap=True)
+    return int(pipeline.world.least(cap))
+
+
+def _kept_cap(now: int, before: int) -> int:
+    """Return the cap with which a run goes on from a checkpoint, and say so if memory now allows more, or less."""
+    if now > before:
+        text = f"At most {before:,} Gaussians, as in the checkpoint's run."
+    else:
+        text = (
+            f"[yellow]The checkpoint's run had room for {before:,} Gaussians, the GPU's free memory now has for "
+            f"{now:,}, which is the cap from here on: stop this run and end other programs on the GPU to keep "
+            f"{before:,}.[/]"
+        )
+    if now != before:
+        CONSOLE.print(text, highlight=False, soft_wrap=True)
+    return min(now, before)
