@@ -5,8 +5,8 @@ from __future__ import annotations
 import copy
 import io
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,9 @@ from sadgs_ns.plugin.processes import processes_on_this_machine
 
 _MOST_THREADS = 16
 """Threads that decode images on a machine of at least as many cores."""
+_Undistort = Callable[[dict[str, Any], NDArray[Any]], tuple[NDArray[np.float32], NDArray[Any], Tensor | None]]
+"""Takes the data and the image [H, W] or [H, W, C] of a camera; returns its intrinsics in px [3, 3], image and mask
+[H, W, 1], where there is one, without distortion."""
 
 
 def thread_count(asked: int | None) -> int:
@@ -33,27 +36,6 @@ def thread_count(asked: int | None) -> int:
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return asked or min(max(cores // processes_on_this_machine(), 1), _MOST_THREADS)
-
-
-@dataclass(frozen=True)
-class _Lens:
-    """A camera whose images nerfstudio undistorts, as it was before that."""
-
-    camera: Cameras
-    """Camera without batch dimension."""
-    K: NDArray[np.float32]
-    """Intrinsics in px. [3, 3]"""
-    distortion: NDArray[np.float32]
-    """Coefficients in nerfstudio's order. [6], or [12] for FISHEYE624"""
-
-    def undistort(
-        self, data: dict[str, Any], image: NDArray[Any]
-    ) -> tuple[NDArray[np.float32], NDArray[Any], Tensor | None]:
-        """Return what nerfstudio's function returns for an image [H, W] or [H, W, C] of the camera.
-
-        This is K [3, 3], the image and the mask [H, W, 1], if it has one, after undistortion.
-        """
-        return _undistort_image(self.camera, self.distortion, data, image, self.K.copy())
 
 
 class LazyImages(Sequence[dict[str, Any]]):
@@ -71,11 +53,12 @@ class LazyImages(Sequence[dict[str, Any]]):
     def __init__(self, dataset: InputDataset, keep_files: bool = False) -> None:
         self._names = dataset.image_filenames
         self._sizes = torch.cat([dataset.cameras.width, dataset.cameras.height], dim=-1).tolist()  # [C][2] px
-        self._lenses = _undistort_cameras(dataset.cameras)
-        outputs, kept = copy.copy(dataset._dataparser_outputs), {} if keep_files else None
-        outputs.image_filenames = _Files(outputs.image_filenames, kept)  # type: ignore[assignment]
+        self._undistort = _undistort_cameras(dataset.cameras)
+        read = cache(Path.read_bytes) if keep_files else Path.read_bytes
+        outputs = copy.copy(dataset._dataparser_outputs)
+        outputs.image_filenames = _Files(outputs.image_filenames, read)  # type: ignore[assignment]
         if outputs.mask_filenames is not None:
-            outputs.mask_filenames = _Files(outputs.mask_filenames, kept)  # type: ignore[assignment]
+            outputs.mask_filenames = _Files(outputs.mask_filenames, read)  # type: ignore[assignment]
         self._dataset = copy.copy(dataset)
         self._dataset._dataparser_outputs = outputs
         self._opencv_agrees: bool | None = None  # It is known once a JPEG has been decoded.
@@ -95,7 +78,7 @@ class LazyImages(Sequence[dict[str, Any]]):
         Raises:
             InputError: If the image or its mask cannot be read any more, or has another size than its camera.
         """
-        name, size, lens = self._names[index], tuple(self._sizes[index]), self._lenses[index]
+        name, size, undistort = self._names[index], tuple(self._sizes[index]), self._undistort[index]
         try:
             data = self._dataset.get_data(index, image_type="uint8")
         except MemoryError:
@@ -110,8 +93,8 @@ class LazyImages(Sequence[dict[str, Any]]):
         if (width_and_height := (image.shape[1], image.shape[0])) != size:
             sizes = "{} × {} px, but its camera {} × {}".format(*width_and_height, *size)
             raise InputError(f"{name} has {sizes}: use the images that the poses were computed from.")
-        if lens is not None:
-            _, undistorted, mask = lens.undistort(data, image.numpy())
+        if undistort is not None:
+            _, undistorted, mask = undistort(data, image.numpy())
             # nerfstudio's crop is a view of the larger image.
             image = torch.from_numpy(np.ascontiguousarray(undistorted))
             if mask is not None:
@@ -142,47 +125,48 @@ class LazyImages(Sequence[dict[str, Any]]):
         return expected
 
 
-def _undistort_cameras(cameras: Cameras) -> list[_Lens | None]:
+def _undistort_cameras(cameras: Cameras) -> list[_Undistort | None]:
     """Give C cameras the intrinsics and sizes that they have once nerfstudio has undistorted their images.
 
-    Cameras that are alike, which most are, are computed once. Returns what each was before, or None where nothing is to
-    undo.
+    Cameras that are alike, which most are, are computed once. Returns what undistorts an image of each; None where that
+    changes nothing.
     """
-    lenses: list[_Lens | None] = [None] * len(cameras)
+    undistorts: list[_Undistort | None] = [None] * len(cameras)
     distortion = cameras.distortion_params  # [C, D]
     if distortion is None or not distortion.any():
-        return lenses
+        return undistorts
     fields = [cameras.camera_type, cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height]
     rows = torch.cat([field.double() for field in (*fields, distortion)], dim=-1).numpy()  # [C, 7 + D]
     _, firsts, numbers = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     for number, first in enumerate(firsts.tolist()):
         if not distortion[first].any():
             continue
-        camera = copy.deepcopy(cameras[first].reshape(()))
-        lens = _Lens(camera, camera.get_intrinsics_matrices().numpy(), distortion[first].clone().numpy())
+        undistort = _undistort_as(cameras[first].reshape(()))
         # The new intrinsics do not depend on the pixels.
-        blank = np.zeros((int(camera.height.item()), int(camera.width.item())), np.uint8)
-        K, image, _ = lens.undistort({}, blank)
+        K, image, _ = undistort({}, np.zeros((int(cameras.height[first]), int(cameras.width[first])), np.uint8))
         for index in np.flatnonzero(numbers.reshape(-1) == number).tolist():
-            lenses[index] = lens
+            undistorts[index] = undistort
             cameras.fx[index], cameras.fy[index] = float(K[0, 0]), float(K[1, 1])
             cameras.cx[index], cameras.cy[index] = float(K[0, 2]), float(K[1, 2])
             cameras.width[index], cameras.height[index] = image.shape[1], image.shape[0]
-    return lenses
+    return undistorts
+
+
+def _undistort_as(camera: Cameras) -> _Undistort:
+    """Return what undistorts images of a camera, without batch dimension, as it is now."""
+    camera = copy.deepcopy(camera)
+    K, distortion = camera.get_intrinsics_matrices().numpy(), camera.distortion_params.numpy()  # type: ignore[union-attr]
+    return lambda data, image: _undistort_image(camera, distortion, data, image, K.copy())
 
 
 class _Files(Sequence[io.BytesIO]):
-    """The content of files in the place of their paths, since Pillow opens both; `kept` keeps what has been read."""
+    """The content of files in the place of their paths, since Pillow opens both."""
 
-    def __init__(self, paths: Sequence[Path], kept: dict[Path, bytes] | None) -> None:
-        self._paths, self._kept = paths, kept
+    def __init__(self, paths: Sequence[Path], read: Callable[[Path], bytes]) -> None:
+        self._paths, self._read = paths, read
 
     def __len__(self) -> int:
         return len(self._paths)
 
     def __getitem__(self, index: Any) -> Any:
-        path, kept = self._paths[index], self._kept
-        content = path.read_bytes() if kept is None or path not in kept else kept[path]
-        if kept is not None:
-            kept[path] = content
-        return io.BytesIO(content)
+        return io.BytesIO(self._read(self._paths[index]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import torch
@@ -33,14 +33,17 @@ class StructureCache:
         views: The training views, and the model that decides how transparent images look.
         frequency_constant: c of ω_l = c / σ_l in 1/px.
         options: Other arguments of `multiscale_structure_tensor`.
+
+    Attributes:
+        of_images: `multiscale_structure_tensor` with these arguments.
+        filled: Whether `fill` has been called.
     """
 
     def __init__(self, views: TrainingViews, frequency_constant: float, **options: float | None) -> None:
         self.views = views
         self.frequency_constant = frequency_constant
-        self.options = options
+        self.of_images = partial(multiscale_structure_tensor, frequency_constant=frequency_constant, **options)  # type: ignore[arg-type]
         self.filled = False
-        """Whether `fill` has been called."""
         self._kept: dict[int, Tensor] = {}
 
     def fill(self) -> None:
@@ -116,21 +119,6 @@ class StructureCache:
                 everything = torch.ones(images.shape[1:3], dtype=torch.bool, device=images.device)
                 masks = torch.stack([d["mask"][..., 0].to(images.device) if "mask" in d else everything for d in batch])
             yield from quantize(self.of_images(images, masks, known_finite=True))
-
-    def of_images(
-        self,
-        images: Tensor,  # [B, H, W, 3]
-        masks: Tensor | None = None,  # [B, H, W]
-        known_finite: bool = False,
-    ) -> Tensor:
-        """S̄ of images in [0, 1], where they have one, within their masks. [B, H, W, 3]"""
-        return multiscale_structure_tensor(
-            images,
-            masks,
-            frequency_constant=self.frequency_constant,
-            known_finite=known_finite,
-            **self.options,  # type: ignore[arg-type]
-        )
 
 
 @torch.no_grad()

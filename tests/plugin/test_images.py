@@ -23,6 +23,8 @@ from scenes import HEIGHT, VIEWS, WIDTH
 
 from sadgs_ns.cli.inspection import get_view
 from sadgs_ns.errors import InputError, RunError
+from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
+from sadgs_ns.plugin import structure_cache
 from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig
 from sadgs_ns.plugin.prefetch import ImagePrefetcher
 from sadgs_ns.plugin.structure_cache import StructureCache, observe_training_views
@@ -309,15 +311,15 @@ def test_images_in_bytes_are_not_searched_for_nan_because_the_host_would_wait(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     known: list[bool] = []
-    compute = StructureCache.of_images
+    compute = multiscale_structure_tensor
 
-    def noted(cache: StructureCache, images: Any, masks: Any = None, known_finite: bool = False) -> Any:
+    def noted(*args: Any, known_finite: bool = False, **options: Any) -> Any:
         known.append(known_finite)
         with monkeypatch.context() as patch:
             patch.setattr(torch.Tensor, "isfinite", None)  # Asking for it is an error.
-            return compute(cache, images, masks, known_finite)
+            return compute(*args, known_finite=known_finite, **options)
 
-    monkeypatch.setattr(StructureCache, "of_images", noted)
+    monkeypatch.setattr(structure_cache, "multiscale_structure_tensor", noted)
     run(nerfstudio_data(tmp_path / "data", masks=True), COMPRESSED, tmp_path)
     assert known and all(known)
 
