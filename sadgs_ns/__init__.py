@@ -1,5 +1,5 @@
 """Structure-aware densification for Gaussian splatting, as a nerfstudio method."""
 
-from sadgs_ns.errors import refuse_deleted_working_directory
+from sadgs_ns.errors import check_working_directory
 
-refuse_deleted_working_directory()
+check_working_directory()

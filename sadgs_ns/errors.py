@@ -86,7 +86,7 @@ class WriteError(OSError):
         )
 
 
-def refuse_deleted_working_directory() -> None:
+def check_working_directory() -> None:
     """Raise InputError if the working directory was deleted; there importing torch ends the process without a word."""
     try:
         os.getcwd()

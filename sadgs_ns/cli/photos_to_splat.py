@@ -37,7 +37,7 @@ from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_
 from sadgs_ns.cli.status_line import StatusLine, clock
 from sadgs_ns.cli.worker import OnEvent, Worker, WorkerError
 from sadgs_ns.data.checks import check_data
-from sadgs_ns.data.checks.findings import refuse
+from sadgs_ns.data.checks.findings import check_findings
 from sadgs_ns.data.checks.layouts import find_cameras
 from sadgs_ns.data.coordinates import FRAME_KEYS, TRANSFORMS_NAME
 from sadgs_ns.errors import InputError, RunError, WriteError
@@ -339,7 +339,7 @@ def _given_cameras(given: Sadgs) -> Path | None:
     try:
         if given.cameras == "new" or (file := find_cameras(given.source)) is None:
             return None
-        refuse(check_data(given.source), given.source)
+        check_findings(check_data(given.source), given.source)
     except InputError as error:
         raise InputError(f"{str(error).rstrip('.')}; or find new cameras with --cameras new.") from None
     if given.max_size != Sadgs.max_size:

@@ -15,7 +15,7 @@ _UNDISTORTED = (CameraType.FISHEYE, CameraType.FISHEYE624)
 """Types whose images nerfstudio's FullImageDatamanager turns into pinhole images, if a coefficient is not 0."""
 
 
-def refuse_unsupported_cameras(cameras: Cameras) -> None:
+def check_camera_types(cameras: Cameras) -> None:
     """Raise InputError for the first of C cameras that neither is a pinhole nor becomes one.
 
     nerfstudio gives full images of any camera type to a splatting model, and undistorts those of perspective and
@@ -36,7 +36,7 @@ def refuse_unsupported_cameras(cameras: Cameras) -> None:
             )
 
 
-def refuse_failed_undistortion(cameras: Cameras, names: Sequence[Path]) -> None:
+def check_undistortion(cameras: Cameras, names: Sequence[Path]) -> None:
     """Raise InputError for the first of C fisheye images that became black when nerfstudio undistorted it.
 
     `cameras` are those after undistortion, and `names` their files. Near a field of view of 180° OpenCV gives them a

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sadgs_ns.data.text import refuse_byte_order_mark
+from sadgs_ns.data.text import check_byte_order_mark
 from sadgs_ns.errors import InputError, reason
 
 CAMERA_PARAMETERS = {
@@ -136,7 +136,7 @@ def _read_text(path: Path, minimum: int) -> Iterator[tuple[list[str], Iterator[s
     """Yield the fields of each line that is neither empty nor a comment, and the lines after it."""
     try:
         with path.open(encoding="utf8") as file:
-            refuse_byte_order_mark(file.read(1), path)
+            check_byte_order_mark(file.read(1), path)
             file.seek(0)
             for line in file:
                 if line.strip() and not line.lstrip().startswith("#"):

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from sadgs_ns.data import colmap, ply
 from sadgs_ns.data.checks.colmap import automatic_options, check_colmap
-from sadgs_ns.data.checks.findings import Finding, refuse, unreadable
+from sadgs_ns.data.checks.findings import Finding, check_findings, unreadable
 from sadgs_ns.data.checks.images import mask_name
 from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS, ParserOptions, find_reconstruction, layout_of
 from sadgs_ns.data.checks.transforms import check_blender, check_nerfstudio, read_blender, read_json, read_transforms
@@ -102,7 +102,7 @@ def check_capture(config: FullImageDatamanagerConfig, open_images: bool = True) 
     options = ParserOptions(**{name: getattr(parser, name) for name in names})
     checks = [check for kind, check in CHECKS.items() if isinstance(parser, kind)]
     findings = checks[0](data, options, open_images) if checks else []
-    refuse(findings, data)
+    check_findings(findings, data)
     return findings
 
 

@@ -13,11 +13,11 @@ def read_text(path: Path) -> str:
         text = path.read_text("utf8")
     except UnicodeDecodeError:
         raise InputError(f"{path} is not text in UTF-8: save it in that encoding.") from None
-    refuse_byte_order_mark(text, path)
+    check_byte_order_mark(text, path)
     return text
 
 
-def refuse_byte_order_mark(text: str, path: Path) -> None:
+def check_byte_order_mark(text: str, path: Path) -> None:
     """Raise InputError if the text of a file, or its first line, starts with a byte order mark."""
     if text.startswith("\ufeff"):
         raise InputError(

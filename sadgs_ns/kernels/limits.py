@@ -26,7 +26,7 @@ MAX_BLOCKS = 2**16 - 1
 MAX_HEIGHT = 2 * MAX_BLOCKS
 
 
-def _refuse_beyond(limit: int, size: int, what: str, remedy: str) -> None:
+def _check_limit(limit: int, size: int, what: str, remedy: str) -> None:
     if size > limit:
         raise InputError(f"{what} are {size:,}, and the Triton kernels can address {limit:,}: {remedy}.")
 
@@ -38,9 +38,9 @@ def check_gaussians(num_views: int, num_gaussians: int) -> None:
         num_views: C
         num_gaussians: N
     """
-    _refuse_beyond(MAX_BLOCKS, num_views, "The views of one step", "take fewer views at once")
+    _check_limit(MAX_BLOCKS, num_views, "The views of one step", "take fewer views at once")
     what = f"The Gaussians of all views of one step, {num_views:,} × {num_gaussians:,},"
-    _refuse_beyond(MAX_ROWS, num_views * num_gaussians, what, "take fewer views at once, or fewer Gaussians")
+    _check_limit(MAX_ROWS, num_views * num_gaussians, what, "take fewer views at once, or fewer Gaussians")
 
 
 def check_pixels(num_views: int, height: int, width: int) -> None:
@@ -51,10 +51,10 @@ def check_pixels(num_views: int, height: int, width: int) -> None:
         height: H in px.
         width: W in px.
     """
-    _refuse_beyond(MAX_BLOCKS, num_views, "The views of one step", "take fewer views at once")
-    _refuse_beyond(MAX_HEIGHT, height, "The rows of an image", "make the images smaller")
+    _check_limit(MAX_BLOCKS, num_views, "The views of one step", "take fewer views at once")
+    _check_limit(MAX_HEIGHT, height, "The rows of an image", "make the images smaller")
     what = f"The pixels of all views of one step, {num_views:,} × {height:,} × {width:,},"
-    _refuse_beyond(MAX_ROWS, num_views * height * width, what, "take fewer views at once, or smaller images")
+    _check_limit(MAX_ROWS, num_views * height * width, what, "take fewer views at once, or smaller images")
 
 
 def check_batch(batch: int, channels: int, height: int, width: int) -> None:
@@ -69,9 +69,9 @@ def check_batch(batch: int, channels: int, height: int, width: int) -> None:
     Raises:
         InputError: If B · max(C, 3), H or H · W is too large.
     """
-    _refuse_beyond(MAX_BLOCKS, batch * max(channels, 3), "The planes of a batch of images", "take fewer at once")
-    _refuse_beyond(MAX_HEIGHT, height, "The rows of an image", "make the images smaller")
-    _refuse_beyond(MAX_ROWS, height * width, f"The pixels of an image, {height:,} × {width:,},", "make it smaller")
+    _check_limit(MAX_BLOCKS, batch * max(channels, 3), "The planes of a batch of images", "take fewer at once")
+    _check_limit(MAX_HEIGHT, height, "The rows of an image", "make the images smaller")
+    _check_limit(MAX_ROWS, height * width, f"The pixels of an image, {height:,} × {width:,},", "make it smaller")
 
 
 def check_pairs(num_pairs: int) -> None:
@@ -81,4 +81,4 @@ def check_pairs(num_pairs: int) -> None:
         num_pairs: Of a Gaussian and a tile that it reaches, in all views.
     """
     remedy = "take fewer views at once, smaller images, or fewer and smaller Gaussians"
-    _refuse_beyond(MAX_PAIRS, num_pairs, "The pairs of a Gaussian and a tile of all views of one step", remedy)
+    _check_limit(MAX_PAIRS, num_pairs, "The pairs of a Gaussian and a tile of all views of one step", remedy)

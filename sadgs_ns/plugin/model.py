@@ -21,7 +21,7 @@ from pytorch_msssim import SSIM
 from rich.markup import escape
 from torch import Tensor
 
-from sadgs_ns.data.cameras import refuse_unsupported_cameras
+from sadgs_ns.data.cameras import check_camera_types
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
 from sadgs_ns.gsplat_compat import NEAR_PLANE
@@ -574,7 +574,7 @@ class SadgsModel(SplatfactoModel):
             `rgb` [H, W, 3] in [0, 1]; `depth` [H, W, 1], the mean of the drawn Gaussians' depths along the viewing axis
             in the run's units, and the largest one where nothing is; `accumulation` [H, W, 1]; `background` [H, W, 3].
         """
-        refuse_unsupported_cameras(camera)
+        check_camera_types(camera)
         width, height = int(camera.width.item()), int(camera.height.item())
         background = self.background
         if self.crop_box is not None and not self.crop_box.within(self.means).any():

@@ -18,7 +18,7 @@ from rich.markup import escape
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from sadgs_ns.data.cameras import refuse_unsupported_cameras
+from sadgs_ns.data.cameras import check_camera_types
 from sadgs_ns.data.parsers import findings_of
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
@@ -119,7 +119,7 @@ class SadgsPipeline(VanillaPipeline):
                 CONSOLE.print(f"[yellow]{escape(finding.sentence)}[/]")
         super().__init__(config, *args, **kwargs)
         for dataset in (self.datamanager.train_dataset, self.datamanager.eval_dataset):
-            refuse_unsupported_cameras(dataset.cameras)
+            check_camera_types(dataset.cameras)
         if config.datamanager.cache_images != "compressed" and kwargs.get("test_mode") != "inference":
             line = place_images(self.datamanager, self.device)
             if line is not None:

@@ -12,7 +12,7 @@ import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
 from torch import Tensor
 
-from sadgs_ns.data.cameras import refuse_failed_undistortion
+from sadgs_ns.data.cameras import check_undistortion
 from sadgs_ns.distributed.bands import views_of_rank
 from sadgs_ns.distributed.world import World
 from sadgs_ns.plugin.images import thread_count
@@ -159,7 +159,7 @@ class TrainingViews:
         dataset = self.datamanager.train_dataset
         _ = self.datamanager.cached_train  # Undistorting the images has changed the intrinsics.
         cameras, device = dataset.cameras, self.model.device
-        refuse_failed_undistortion(cameras, dataset.image_filenames)
+        check_undistortion(cameras, dataset.image_filenames)
         viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
         return viewmats.to(device).unbind(), cameras.get_intrinsics_matrices().to(device).unbind()
 

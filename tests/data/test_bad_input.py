@@ -44,7 +44,7 @@ from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
 from sadgs_ns.cli import doctor
 from sadgs_ns.data import colmap, parsers
 from sadgs_ns.data.checks import check_data
-from sadgs_ns.data.checks.findings import Finding, refuse
+from sadgs_ns.data.checks.findings import Finding, check_findings
 from sadgs_ns.data.checks.layouts import ParserOptions
 from sadgs_ns.data.checks.transforms import check_blender, check_nerfstudio
 from sadgs_ns.errors import InputError, RunError
@@ -994,7 +994,7 @@ def test_several_problems_of_one_kind_are_one_finding_and_other_kinds_are_counte
     with pytest.raises(
         InputError, match=r"002\.png \(and 2 more\) has 0 bytes: .*\(`sadgs-doctor .*` shows 1 more\.\)"
     ):
-        refuse(findings, data)
+        check_findings(findings, data)
 
 
 # --- what is unlikely ---

@@ -27,7 +27,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from PIL import Image
 from torch import Tensor
 
-from sadgs_ns.data.cameras import refuse_failed_undistortion, refuse_unsupported_cameras
+from sadgs_ns.data.cameras import check_camera_types, check_undistortion
 from sadgs_ns.gsplat_compat import SCREEN_BLUR
 from sadgs_ns.kernels import triton_switched
 from sadgs_ns.method import losses
@@ -492,11 +492,11 @@ def test_cameras_are_pinholes_or_undistorted_or_refused_by_name(
 ):
     distorted = distortion is not None and any(distortion)
     if camera_type is CameraType.PERSPECTIVE or ("FISHEYE" in camera_type.name and distorted):
-        refuse_unsupported_cameras(cameras(camera_type, distortion))
+        check_camera_types(cameras(camera_type, distortion))
         return
     remedy = "k1 = 1e-9" if "FISHEYE" in camera_type.name else "Make perspective images of it"
     with pytest.raises(ValueError, match=rf"^Camera 1 is {camera_type.name}\b.*{remedy}"):
-        refuse_unsupported_cameras(cameras(camera_type, distortion))
+        check_camera_types(cameras(camera_type, distortion))
 
 
 @pytest.mark.hard_case(
@@ -543,7 +543,7 @@ def test_a_fisheye_that_nerfstudio_undistorts_is_right(tmp_path: Path):
     """The dots lie where the pinhole of the changed intrinsics puts them; the coefficient is what the refusal names."""
     datamanager: SadgsDatamanager = fisheye_data(tmp_path, k1=1e-9).setup(device="cpu")
     dataset = datamanager.train_dataset
-    refuse_unsupported_cameras(dataset.cameras)
+    check_camera_types(dataset.cameras)
     image = datamanager.cached_train[0]["image"].float().mean(-1)
     K = dataset.cameras.get_intrinsics_matrices()[0]
     assert float(K[0, 0]) != FISHEYE_FOCAL
@@ -558,7 +558,7 @@ def test_a_fisheye_that_nerfstudio_undistorts_is_right(tmp_path: Path):
         assert (centre - at[:2]).norm() < 0.3, (u, v)
         n_inside += 1
     assert n_inside == len(DIRECTIONS)
-    refuse_failed_undistortion(dataset.cameras, dataset.image_filenames)
+    check_undistortion(dataset.cameras, dataset.image_filenames)
 
 
 @pytest.mark.hard_case("a fisheye of about 180°, which nerfstudio makes black", "ValueError naming the file")

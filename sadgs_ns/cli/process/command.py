@@ -95,7 +95,7 @@ class _Scene:
         self.begun = read_settings(self.noted, out)
         self.finished = self.begun.get("finished") if (out / "transforms.json").exists() else None
         if self.begun:
-            self._refuse_changes()
+            self._check_unchanged()
         # The cameras of photos that an earlier version began with are those of the pixels as they are stored.
         self.settings["as_stored"] = self.begun.get("as_stored", self.begun.get("photos", []))
         self.added, self.base, self.model = 0, None, self.work / "model"
@@ -107,7 +107,7 @@ class _Scene:
                 told = f"{self.work} no longer holds the features and the model that photos could be added to"
                 raise InputError(f"{told}: give another folder or delete it.")
 
-    def _refuse_changes(self) -> None:
+    def _check_unchanged(self) -> None:
         asked: dict[str, Any] = self.settings | ({"max_size": self.given.max_size} if self.finished else {})
         differing = [name for name in asked if self.begun.get(name) != asked[name]]
         told, back, kind = [], "", "videos" if self.is_video else "photos"

@@ -54,7 +54,7 @@ def and_more(where: object, count: int) -> str:
     return f"{where} (and {count - 1} more)" if count > 1 else f"{where}"
 
 
-def refuse(findings: Sequence[Finding], data: Path) -> None:
+def check_findings(findings: Sequence[Finding], data: Path) -> None:
     """Raise InputError with the first error among findings, if there is one, and how many more there are."""
     errors = [finding.sentence for finding in findings if finding.severity == "error"]
     if errors:
