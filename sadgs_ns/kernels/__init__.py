@@ -1,4 +1,4 @@
-"""Triton kernels for CUDA. Each computes what a torch function of the same name does; tests hold both together."""
+"""Triton kernels for CUDA, each with a torch function of the same name as its twin; tests compare the two."""
 
 from __future__ import annotations
 
@@ -16,37 +16,37 @@ from torch import Tensor
 from sadgs_ns.errors import reason
 
 OLDEST_TRITON = (3, 5)
-"""Older versions do not compile all of the kernels: Triton 3.4 has no matrix products with 8 columns."""
+"""Older versions do not compile all kernels: Triton 3.4 has no matrix products with 8 columns."""
 
 TILE_SIZE = 8
-"""Size of our rasterizer's tiles in px. gsplat's default of 16 saves list entries; with exact lists, saved pixels
-matter more (docs/results.md#parts-of-a-step). Each lane of the one warp that a tile gets has two pixels."""
+"""Side of our rasterizer's tiles in px. gsplat's default of 16 saves list entries; with exact lists, saved pixels
+matter more (docs/results.md#parts-of-a-step). A tile has one warp, and each of its lanes two pixels."""
 SWITCH = "SADGS_TRITON"
-"""Environment variable that keeps a process from using the kernels where it is 0."""
+"""Environment variable; 0 keeps a process from using the kernels."""
 
 _forced: bool | None = False if os.environ.get(SWITCH) == "0" else None
-"""What `use_triton` answers; None where the device decides."""
+"""The answer of `use_triton`; None if the device decides."""
 _working: set[torch.device] = set()
 """Devices on which a kernel has run."""
 _asked: Counter[torch.device] = Counter()
-"""How often `available` was asked about a device while no kernel had run there."""
+"""Number of questions to `available` about a device on which no kernel had run."""
 
 
 def cdiv(number: int, block: int) -> int:
-    """Return how many blocks cover a number. `triton.cdiv` takes the host some 5 µs, twenty times a step."""
+    """Return how many blocks cover a number; `triton.cdiv` takes the host some 5 µs, twenty times a step."""
     return -(-number // block)
 
 
 def switched_off() -> bool:
-    """Whether this process does without the kernels wherever it computes."""
+    """Return whether this process uses no kernels on any device."""
     return _forced is False
 
 
 def use_triton(place: torch.device | Tensor) -> bool:
-    """Whether to compute with the kernels of this package. Otherwise torch and gsplat compute the same, more slowly.
+    """Return whether to use the kernels of this package; torch and gsplat compute the same, more slowly.
 
     Args:
-        place: The device on which is computed, or a tensor that a kernel would read: the kernels know float32 alone.
+        place: The device that computes, or a tensor that a kernel would read, which must be float32.
     """
     if isinstance(place, Tensor):
         if place.dtype != torch.float32:
@@ -57,12 +57,9 @@ def use_triton(place: torch.device | Tensor) -> bool:
 
 @contextmanager
 def triton_switched(on: bool) -> Iterator[None]:
-    """Use the kernels on every device, or on none, within a block of code.
+    """Use the kernels for float32 on every device, or on none, within a block of code.
 
     Without CUDA, Triton runs them in its interpreter if `TRITON_INTERPRET` is 1 when they are imported.
-
-    Args:
-        on: What `use_triton` answers, to tensors of float32 at least.
     """
     global _forced
     before, _forced = _forced, on
@@ -73,12 +70,12 @@ def triton_switched(on: bool) -> Iterator[None]:
 
 
 def available(device: torch.device) -> bool:
-    """Whether the kernels run on a device.
+    """Return whether the kernels run on a device.
 
-    They do if it is CUDA's current device, on which Triton launches whatever tensors it is given, and if Triton, which
-    comes with torch, compiles for it: Triton also needs a C compiler, Python's headers and a GPU that it knows. One
-    small kernel is tried. Success is remembered. A failure may pass, as that of a full memory does, so the kernel is
-    tried again when the question is asked for the 2nd, 4th, 8th, … time; a warning tells the first failure.
+    It must be CUDA's current device, on which Triton launches any tensors, and Triton must compile for it, which needs
+    a C compiler, Python's headers and a GPU that Triton knows. One small kernel is tried, and success is remembered. A
+    failure may pass, such as a full memory, so the kernel is tried again at the 2nd, 4th, 8th, … question; a warning
+    tells of the first failure.
     """
     if device.type != "cuda" or device.index not in (None, torch.cuda.current_device()):
         return False
@@ -87,7 +84,7 @@ def available(device: torch.device) -> bool:
 
 @cache
 def _has_triton() -> bool:
-    """Whether Triton is installed and new enough, which does not change while Python runs."""
+    """Return whether Triton is installed and new enough, which does not change while Python runs."""
     if find_spec("triton") is None:
         return False
     import triton
@@ -104,7 +101,7 @@ def _has_triton() -> bool:
 
 
 def _compiles(device: torch.device) -> bool:
-    """Whether a small kernel has run on a device, or does so now."""
+    """Return whether a small kernel has run on a device, or does so now."""
     if device in _working:
         return True
     if not _has_triton():

@@ -53,14 +53,14 @@ def accumulate_gradients(
     absolute: Tensor,
     scales: tuple[float, float],
 ) -> None:
-    """Do what `method.absgs.accumulate_gradients` does; a gradient longer than 1e19 counts as infinite.
+    """Compute `method.absgs.accumulate_gradients`; a gradient longer than 1e19 counts as infinite.
 
     Args:
         sums: grad2d, absgrad2d and grad_count, contiguous float32, updated in place. Each [N]
-        radii: px, int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5; not positive where a Gaussian was culled.
-        gradient: Of the loss by the centres in px, float32; it may be part of the rows of a larger tensor. [C, N, 2]
-        absolute: Sum over the pixels of that gradient's absolute values, with the same freedom of layout. [C, N, 2]
-        scales: Factors of the x and y components of both gradients.
+        radii: px, int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5; not positive if a Gaussian was culled.
+        gradient, absolute: The loss's gradient by the centres in px, and the sum of its absolute values over the
+            pixels, float32; they may be parts of the rows of larger tensors. [C, N, 2]
+        scales: Factors of the x and y components of both.
     """
     num_views, n = radii.shape[:2]
     # The kernel reads parts of rows where they lie, but expects x and y side by side: other layouts are copied.

@@ -1,6 +1,6 @@
 """`render.activations.activate` in one kernel forward and one backward.
 
-The torch functions and the mean opacity take five launches forward and six backward, which small scenes wait for.
+The torch functions and the mean opacity take five launches forward and six backward, for which small scenes wait.
 """
 
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportIndexIssue=false
@@ -90,16 +90,11 @@ class _Activate(torch.autograd.Function):
 
 
 def activate(log_scales: Tensor, logits: Tensor, penalty: float) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Do what `render.activations.activate` does.
-
-    Args:
-        log_scales: Logarithms of the standard deviations, float32. [N, 3]
-        logits: Logits of the opacities, float32, N > 0. [N, 1]
-        penalty: Factor on the mean opacity.
+    """Compute `render.activations.activate`, in float32, for N > 0.
 
     Returns:
-        Standard deviations [N, 3], opacities [N], and the penalty in parts [P], or None where the factor is 0. The
-        gradient of the first part is taken for that of all, which are to be summed.
+        Standard deviations [N, 3], opacities [N], and the penalty in parts [P], which are to be summed, or None if the
+        factor on the mean opacity is 0. The gradient of the first part is taken for that of all.
     """
     scales, opacities, sums = _Activate.apply(log_scales.contiguous(), logits.contiguous(), penalty / len(logits))  # type: ignore[misc]
     return scales, opacities, sums if penalty > 0 else None

@@ -136,7 +136,7 @@ def adam_step_with_factors(
     eps: float,
     max_gradient: float,
 ) -> None:
-    """Do what `adam_step` does, to the bit, in a launch whose arguments are the same in every update of a parameter.
+    """Compute `adam_step` to the bit, in a launch whose arguments are the same in every update of a parameter.
 
     `factors` are what `rates_and_scales` returns for this update, on the device, contiguous float32 [2, P], in the
     place of `steps` and `lrs`.

@@ -102,6 +102,6 @@ def correct_colors(
     alpha: Tensor,  # [C, H, W, 1] float32
     matrices: Tensor,  # [C, 3, 4] float32
 ) -> Tensor:
-    """Do what `method.color_matrices.correct_colors` does, and raise the same."""
+    """Compute `method.color_matrices.correct_colors`, and raise the same."""
     check_pixels(*render.shape[:3])
     return _CorrectColors.apply(render.contiguous(), alpha.contiguous(), matrices.contiguous())  # type: ignore[return-value]

@@ -265,7 +265,7 @@ def rasterize_to_pixels(
     flatten_ids: Tensor,  # int32 [number of pairs]
     absgrad: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Do what `composite_forward` does, whose arguments these are, and differentiate it.
+    """Compute `composite_forward`, whose arguments these are, differentiably.
 
     With `absgrad`, `backward` sets two attributes of `means2d`: `absgrad`, the sum of its absolute gradients, and
     `grad2d`, its gradient, which is None until then: `retain_grad` would copy the gradient.

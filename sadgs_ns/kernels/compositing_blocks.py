@@ -99,16 +99,13 @@ def highest_alpha(listed, opacity):
 
 @triton.jit
 def alphas(dx, dy, a, b, c, opacity, limit):
-    """Return the opacity of each Gaussian at each pixel, 0 where it is not drawn.
+    """Return the opacity of each Gaussian at each pixel, 0 if it is not drawn.
 
     Args:
-        dx: SCALE times the offset from the pixel to the centre. [Gaussians, pixels]
-        dy: Along y.
-        a: Conic, in 1/px². [Gaussians]
-        b: Its second number.
-        c: Its third number.
+        dx, dy: SCALE times the offset from the pixel to the centre. [Gaussians, pixels]
+        a, b, c: Conic, in 1/px². [Gaussians]
         opacity: In [0, 1]. [Gaussians]
-        limit: Of `highest_alpha`, or 0 where a Gaussian is not drawn. [Gaussians, 1 or pixels]
+        limit: Of `highest_alpha`, or 0 if a Gaussian is not drawn. [Gaussians, 1 or pixels]
     """
     exponent = dx * (a[:, None] * dx) + dy * (b[:, None] * (dx + dx) + c[:, None] * dy)
     alpha = opacity[:, None] * tl.exp2(-exponent)

@@ -73,7 +73,7 @@ def pack(
     colors: Tensor,  # [V, N, 3]
     places: Tensor,  # [M]
 ) -> Tensor:
-    """Do what `distributed.exchange.pack` does for colours of three channels; all tensors are contiguous."""
+    """Compute `distributed.exchange.pack` for colours of three channels; all tensors are contiguous."""
     per_gaussian = radii.dim() - 1
     rows = means2d.new_empty((len(places), 10 + per_gaussian))
     if len(places):
@@ -85,14 +85,9 @@ def pack(
 
 
 def unpack(rows: Tensor, top: int) -> tuple[Tensor, ...]:
-    """Do what `distributed.exchange.unpack` does for colours of three channels.
+    """Compute `distributed.exchange.unpack` for colours of three channels.
 
-    Args:
-        rows: As `pack` makes them, contiguous. [M, 11 or 12]
-        top: Image row from which centres are counted, px.
-
-    Returns:
-        What `pack` takes, of one view and without `places`.
+    `rows` [M, 11 or 12] are contiguous. Return the arguments of `pack` for one view, without `places`.
     """
     n, per_gaussian = len(rows), rows.shape[1] - 10
     radii = rows.new_empty((1, n, 2) if per_gaussian == 2 else (1, n), dtype=torch.int32)

@@ -1,4 +1,4 @@
-"""The largest sizes that the kernels can address, and their refusal beyond.
+"""The largest sizes that the kernels can address, and their checks.
 
 Addresses are computed in 64 bits, except where that would cost registers or where gsplat's own kernels, which run in
 between, have 32. What remains limited, with C views in one step, N Gaussians and images of H × W px:
@@ -32,25 +32,14 @@ def _check_limit(limit: int, size: int, what: str, remedy: str) -> None:
 
 
 def check_gaussians(num_views: int, num_gaussians: int) -> None:
-    """Refuse more Gaussians than one step can render; raises InputError if C or C · N is too large.
-
-    Args:
-        num_views: C
-        num_gaussians: N
-    """
+    """Raise InputError if one step cannot render so many Gaussians in so many views."""
     _check_limit(MAX_BLOCKS, num_views, "The views of one step", "take fewer views at once")
     what = f"The Gaussians of all views of one step, {num_views:,} × {num_gaussians:,},"
     _check_limit(MAX_ROWS, num_views * num_gaussians, what, "take fewer views at once, or fewer Gaussians")
 
 
 def check_pixels(num_views: int, height: int, width: int) -> None:
-    """Refuse more pixels than one step can render and compare; raises InputError if C, H or C · H · W is too large.
-
-    Args:
-        num_views: C
-        height: H in px.
-        width: W in px.
-    """
+    """Raise InputError if one step cannot render and compare so many views of H × W px."""
     _check_limit(MAX_BLOCKS, num_views, "The views of one step", "take fewer views at once")
     _check_limit(MAX_HEIGHT, height, "The rows of an image", "make the images smaller")
     what = f"The pixels of all views of one step, {num_views:,} × {height:,} × {width:,},"
@@ -58,27 +47,13 @@ def check_pixels(num_views: int, height: int, width: int) -> None:
 
 
 def check_batch(batch: int, channels: int, height: int, width: int) -> None:
-    """Refuse images that are too large, or too many at once, for the structure tensor's kernels.
-
-    Args:
-        batch: B
-        channels: C of an image.
-        height: H in px.
-        width: W in px.
-
-    Raises:
-        InputError: If B · max(C, 3), H or H · W is too large.
-    """
+    """Raise InputError if images are too many at once, or too large, for the structure tensor's kernels."""
     _check_limit(MAX_BLOCKS, batch * max(channels, 3), "The planes of a batch of images", "take fewer at once")
     _check_limit(MAX_HEIGHT, height, "The rows of an image", "make the images smaller")
     _check_limit(MAX_ROWS, height * width, f"The pixels of an image, {height:,} × {width:,},", "make it smaller")
 
 
 def check_pairs(num_pairs: int) -> None:
-    """Refuse tile lists that are too long; raises InputError if they are too many.
-
-    Args:
-        num_pairs: Of a Gaussian and a tile that it reaches, in all views.
-    """
+    """Raise InputError if there are too many pairs of a Gaussian and a tile that it reaches, in all views."""
     remedy = "take fewer views at once, smaller images, or fewer and smaller Gaussians"
     _check_limit(MAX_PAIRS, num_pairs, "The pairs of a Gaussian and a tile of all views of one step", remedy)

@@ -250,7 +250,7 @@ def photometric_loss(
     l2_lambda: float,
     parts: Tensor | None = None,  # [P] contiguous float32
 ) -> tuple[Tensor, Tensor]:
-    """Do what `method.losses.photometric_loss` does, for views at least as large as SSIM's window.
+    """Compute `method.losses.photometric_loss` for views at least as large as SSIM's window.
 
     `window` has the weights of that window along one axis, and is symmetric. Raises InputError if the views have more
     pixels than the kernels can address (limits.py).

@@ -295,7 +295,7 @@ def project(
     calc_compensations: bool,
     near_plane: float = NEAR_PLANE,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None, Tensor]:
-    """Do what `gsplat_compat.project` does, but differentiate it with one kernel.
+    """Compute `gsplat_compat.project`, but differentiate it with one kernel.
 
     Returns:
         What `gsplat_compat.project` returns, whose radii may be set to 0 in place until the backward pass; and

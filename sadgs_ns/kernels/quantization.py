@@ -48,7 +48,7 @@ def _quantize(
 
 
 def quantize(tensor: Tensor, highest_frequency: float, octaves: float, invalid: int) -> Tensor:
-    """Do what `method.quantization.quantize` does; where rounding decides, a byte may be its neighbour.
+    """Compute `method.quantization.quantize`; a byte may be its neighbour if rounding decides.
 
     Args:
         tensor: S̄ as (xx, xy, yy) in 1/px², finite or NaN, float32. [..., 3]

@@ -182,7 +182,7 @@ def observe_views(
     constants: tuple[float, float, float],
     quantization: tuple[float, float, int],
 ) -> None:
-    """Do what the loop in `method.statistics.observe` does, for all views at once; `statistics` change in place.
+    """Compute the loop of `method.statistics.observe` for all views at once; `statistics` change in place.
 
     Args:
         thresholds: η above the first is high, and below the second it is low.

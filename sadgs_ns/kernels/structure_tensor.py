@@ -103,7 +103,7 @@ def _aggregate(
 
 
 def correlate(image: Tensor, kernel: Tensor, axis: int) -> Tensor:
-    """Do what `_correlate` of `method.structure_tensor` does, in float32.
+    """Compute `_correlate` of `method.structure_tensor` in float32.
 
     Args:
         image: float32 [B, C, H, W]
@@ -122,7 +122,7 @@ def correlate(image: Tensor, kernel: Tensor, axis: int) -> Tensor:
 def differentiate(
     blurs: tuple[Tensor, Tensor, Tensor], totals: tuple[Tensor, Tensor, Tensor], weight: Tensor, previous: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Do what `_differentiate` of `method.structure_tensor` does, in float32; the first of `blurs` is overwritten."""
+    """Compute `_differentiate` of `method.structure_tensor` in float32; the first of `blurs` is overwritten."""
     batch, channels, height, width = blurs[0].shape
     products, energy = (blurs[0].new_empty((batch, planes, height, width)) for planes in (3, 1))
     n = height * width
@@ -142,7 +142,7 @@ def aggregate(
     exponent: float,
     frequency: float,
 ) -> None:
-    """Do what `_aggregate` of `method.structure_tensor` does, in float32."""
+    """Compute `_aggregate` of `method.structure_tensor` in float32."""
     n = tensor[0].shape[2] * tensor[0].shape[3]
     _aggregate[cdiv(n, _PIXELS), len(tensor[0])](
         *tensor, *energy, trace_floor, numerator, denominator,
