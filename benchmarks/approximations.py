@@ -69,14 +69,14 @@ def structure_tensor_rows(images: Tensor, repeats: int) -> Iterator[Row]:
     single = reference.float()
     variants: dict[str, tuple[Callable[[], Tensor], Callable[[Tensor], Tensor], int]] = {
         "as shipped: float32, stored in 8 bits": (lambda: quantize(multiscale_structure_tensor(images)), dequantize, 3),
-        "precision alone: float32": (lambda: multiscale_structure_tensor(images), lambda code: code, 12),
-        "storage alone: float16": (single.half, lambda code: code, 6),
+        "precision alone: float32": (lambda: multiscale_structure_tensor(images), lambda tensor: tensor, 12),
+        "storage alone: float16": (single.half, lambda tensor: tensor, 6),
         "storage alone: 8 bits": (lambda: quantize(single), dequantize, 3),
     }
-    made = {"reference: float64": (reference, ms, lambda code: code, 24)}
+    made = {"reference: float64": (reference, ms, lambda tensor: tensor, 24)}
     made |= {name: (*measure(store), read, size) for name, (store, read, size) in variants.items()}
-    for name, (code, ms, read, size) in made.items():
-        row = {"table": "structure_tensor", "variant": name, "bytes": size, **map_errors(read(code), reference)}
+    for name, (stored, ms, read, size) in made.items():
+        row = {"table": "structure_tensor", "variant": name, "bytes": size, **map_errors(read(stored), reference)}
         yield {**row, "ms": ms / len(images)}
 
 

@@ -83,7 +83,7 @@ class Step:
         K = torch.tensor([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]], device=device)
         self.Ks = K.repeat(views, 1, 1)
         self.images = torch.full((views, height, width, 3), 100, dtype=torch.uint8, device=device)
-        self.codes = torch.full_like(self.images, 60)
+        self.structure_tensors = torch.full_like(self.images, 60)
         self.rendered = (self.images / 255).requires_grad_()
         self.capacity: int | None = None
         self.count = 0
@@ -100,7 +100,7 @@ class Step:
         keep_gradient(info["means2d"])
         if "pair_counts" in info and self.capacity is None:
             self.capacity = int(ROOM * sum(info["pair_counts"].wait()))
-        self.info = {**info, "viewmats": self.viewmats, "Ks": self.Ks, "structure_tensors": self.codes}
+        self.info = {**info, "viewmats": self.viewmats, "Ks": self.Ks, "structure_tensors": self.structure_tensors}
         return drawn
 
     def forget_gradients(self) -> None:

@@ -36,7 +36,7 @@ def test_without_a_gpu_one_sentence_says_what_it_needs(
 def plan(step: Step) -> dict[str, float]:
     """Bytes of all that a step has at its peak in each phase, as the memory plan counts them."""
     n, size = len(step.params["means"]), StepSize.of([step.info])
-    kept = kept_bytes(step.params, step.state) * n + step.images.numel() + step.codes.numel()  # type: ignore[arg-type]
+    kept = kept_bytes(step.params, step.state) * n + step.images.numel() + step.structure_tensors.numel()  # type: ignore[arg-type]
     return {name: kept + value for name, value in step_bytes(n, size, step.images.device).items()}
 
 
