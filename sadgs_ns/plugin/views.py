@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Sequence
 from functools import cached_property
@@ -129,12 +130,11 @@ class TrainingViews:
             cached, device = self.datamanager.cached_train, self.model.device
             return [(i, {**cached[i], "image": cached[i]["image"].to(device, non_blocking=True)}) for i in indices]
         data = prefetcher.take(self._composited(indices))
-        # As many are brought nearer in each step, so that no view is forgotten that was on its way.
-        share = -(-number // self.world.num_ranks)
-        steps = self.sampler.foresee(number, 2 + -(-prefetcher.threads // share))
-        following, *later = [self._composited(step) for step in steps]
-        upcoming = list(dict.fromkeys(chain(following, *later)))
-        prefetcher.prefetch(upcoming[: max(prefetcher.threads + 2 * share, len(following))], following)
+        share, threads = math.ceil(number / self.world.num_ranks), prefetcher.threads
+        steps = [self._composited(step) for step in self.sampler.foresee(number, 2 + math.ceil(threads / share))]
+        # As many views are on their way in each step, so that none is forgotten before its step.
+        most = max(threads + 2 * share, len(steps[0]))
+        prefetcher.prefetch(list(dict.fromkeys(chain(*steps)))[:most], following=steps[0])
         return [(index, data.get(index, {})) for index in indices]
 
     def _composited(self, indices: Sequence[int]) -> list[int]:
