@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import zipfile
 from collections.abc import Callable
@@ -13,6 +14,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from sadgs_ns.errors import InputError, reason
+from sadgs_ns.files import atomic_path
 
 REMEDY = "give --load-dir the folder of a run of sadgs, or train from scratch"
 """What errors advise about a checkpoint that cannot be used."""
@@ -137,6 +139,26 @@ def of_gaussians(state: dict[str, Any], change: Callable[[Tensor], Tensor]) -> d
 def _changed(value: Any, change: Callable[[Tensor], Tensor]) -> Any:
     """Change a tensor that has rows; Adam's number of steps is one without."""
     return change(value) if isinstance(value, Tensor) and value.dim() > 0 else value
+
+
+def write(folder: Path, step: int, state: dict[str, Any], keep: bool) -> None:
+    """Save under a temporary name and rename, so that a killed save leaves the previous checkpoint as it was.
+
+    The temporary file lies beside the folder of checkpoints, because nerfstudio takes every file inside for one. Unless
+    they are to be kept, other checkpoints are deleted then. Raises WriteError.
+    """
+    path = folder / f"step-{step:09d}.ckpt"
+    others = [other for other in folder.glob("*.ckpt") if other != path]
+    with atomic_path(path, beside=folder) as partial:
+        try:
+            torch.save(state, partial)
+        except RuntimeError as error:  # torch's writer reports a full disk in this way.
+            raise OSError(reason(error)) from error
+        if others:  # These are about to be deleted, so the new one must survive a power cut first.
+            with partial.open("rb+") as file:
+                os.fsync(file.fileno())
+    for other in [] if keep else others:
+        other.unlink()
 
 
 def check_chosen(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from sadgs_ns.data.cameras import check_camera_types
@@ -24,7 +22,6 @@ from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
 from sadgs_ns.gsplat_compat import FAR_PLANE
 from sadgs_ns.kernels import use_triton
-from sadgs_ns.method.initialization import camera_extent
 from sadgs_ns.method.quantization import HIGHEST_FREQUENCY
 from sadgs_ns.method.structure_tensor import ENERGY_BLUR, FREQUENCY_CONSTANT
 from sadgs_ns.plugin import nonfinite
@@ -54,8 +51,6 @@ _SAMPLED = 1000
 Drawn = dict[tuple[int, ...], list[tuple[int, dict[str, Any]]]]
 """Indices and data of a step's views by the shapes of their images, [H, W, 3 or 4], or by height and width alone where
 several processes train, since one does not have the images that only others composite."""
-_SAME_PLACE = 1e-3
-"""Share of the cameras' extent up to which two cameras are taken for one."""
 
 
 @dataclass
@@ -133,7 +128,7 @@ class SadgsPipeline(VanillaPipeline):
         if self.device.type == "cuda" and not use_triton(self.device):
             CONSOLE.print("[yellow]Triton's kernels are not used: training takes about twice as long without them.[/]")
         cameras = self.datamanager.train_dataset.cameras
-        self.model.set_cameras(_positions(cameras))
+        self.model.set_cameras(camera_positions(cameras))
         self.model.set_near_plane(
             viewmats_from_camera_to_world(cameras.camera_to_worlds),
             cameras.get_intrinsics_matrices(),
@@ -148,8 +143,6 @@ class SadgsPipeline(VanillaPipeline):
         """The processes among which the Gaussians are shared out."""
         self.put_aside: Drawn | None = None
         """Views that were drawn for the present step and not rendered yet."""
-        self.checkpoint_views: tuple[list[str], Tensor] | None = None
-        """What `refuse_other_capture` takes of the checkpoint that was loaded, if there is one."""
         self.stuck = ""  # It says why, where nothing is learned any more.
         self.structure = StructurePanel(self.structure_cache)
         self.cleaning = CleaningPanel(self.views)
@@ -359,35 +352,6 @@ class SadgsPipeline(VanillaPipeline):
                 )
         super().load_pipeline(loaded_state, step)
 
-    def refuse_other_capture(self, before: Sequence[str], positions_before: Tensor) -> None:
-        """Check whether a checkpoint is of the data that training is about to go on with.
-
-        Images may have been added or taken away since, if the others' poses stayed where they were. A warning is
-        printed where the cameras are the same and no image has its old name. Raises InputError if more than half of the
-        cameras of either are where the other has none.
-
-        Args:
-            before: Names of the images that the checkpoint's run was trained on.
-            positions_before: Centres of their cameras in world units. [C, 3]
-        """
-        dataset = self.datamanager.train_dataset
-        now, positions = [path.name for path in dataset.image_filenames], _positions(dataset.cameras)
-        distances, _ = KDTree(positions).query(positions_before)  # [C]
-        same = int((distances < _SAME_PLACE * camera_extent(positions)).sum())
-        if 2 * same < min(len(before), len(now)):
-            raise InputError(
-                "It was trained on other data, or with other options of the parser: of its "
-                f"{len(before)} cameras ({before[0]}, …) {same or 'none'} stand where one of these {len(now)} "
-                f"({now[0]}, …) does."
-            )
-        if not {Path(name).stem for name in before} & {Path(name).stem for name in now}:
-            CONSOLE.print(
-                "[yellow]The checkpoint's run had the same cameras, but none of its images had the name of one of "
-                f"these ({escape(before[0])} and {escape(now[0])} are the first): the Gaussians fit only if the images "
-                "were renamed.[/]",
-                soft_wrap=True,
-            )
-
     def get_extra_state(self) -> dict[str, Any]:
         """Return what lets a resumed run go on as if it had never been stopped, and tells of which data it is.
 
@@ -399,7 +363,7 @@ class SadgsPipeline(VanillaPipeline):
             "views": self.views.sampler.state_dict(),
             "plan": asdict(self.model.plan),
             "images": [path.name for path in self.datamanager.train_dataset.image_filenames],
-            "camera_positions": _positions(self.datamanager.train_dataset.cameras),
+            "camera_positions": camera_positions(self.datamanager.train_dataset.cameras),
         }
         if self.device.type == "cuda":
             state["cuda"] = torch.cuda.get_rng_state(self.device)
@@ -408,14 +372,13 @@ class SadgsPipeline(VanillaPipeline):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` saved; the order of the views only where the data still has that many."""
         self.follow(RunPlan.of(state["plan"]))
-        self.checkpoint_views = state["images"], state["camera_positions"]
         torch.set_rng_state(state["torch"].cpu())
         self.views.sampler.load_state_dict(state["views"])
         if "cuda" in state and self.device.type == "cuda":
             torch.cuda.set_rng_state(state["cuda"].cpu(), self.device)
 
 
-def _positions(cameras: Cameras) -> Tensor:
+def camera_positions(cameras: Cameras) -> Tensor:
     """Return the centres of cameras in world units. [C, 3]"""
     return cameras.camera_to_worlds[:, :3, 3].cpu()
 

@@ -21,13 +21,6 @@ _OF_THE_CAP = ("memory_budget_gb", "model.strategy.max_gaussians")
 """Options that decide the cap of Gaussians."""
 
 
-def plan_of(checkpoint: dict[str, Any]) -> RunPlan | None:
-    """Return the plan of the run that wrote a checkpoint; None in one of another method."""
-    pipeline = checkpoint["pipeline"]
-    state = pipeline.get("_extra_state") if isinstance(pipeline, dict) else None
-    return RunPlan.of(state["plan"]) if isinstance(state, dict) and "plan" in state else None
-
-
 def plan_length(config: CheckedTrainerConfig, views: int, before: RunPlan | None) -> Schedule:
     """Decide the length of a run of so many training views, and the views of a step.
 

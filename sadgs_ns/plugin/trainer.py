@@ -8,8 +8,6 @@ import os
 import shlex
 import signal
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +21,6 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from sadgs_ns import events
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
-from sadgs_ns.files import atomic_path
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.plugin import checkpoints, processes
 from sadgs_ns.plugin.compilation import compile_kernels
@@ -33,8 +30,9 @@ from sadgs_ns.plugin.interrupts import HANG_UP, SIGNALS, Interrupted, Interrupts
 from sadgs_ns.plugin.lost_output import drop_lost_output, print_elsewhere_once_unread
 from sadgs_ns.plugin.optimizers import SadgsOptimizers
 from sadgs_ns.plugin.pipeline import SadgsPipeline
-from sadgs_ns.plugin.planning import plan_length, plan_of, plan_run
+from sadgs_ns.plugin.planning import plan_length, plan_run
 from sadgs_ns.plugin.progress import about_cpu, remove_tables, what_next
+from sadgs_ns.plugin.resume import Resumption
 from sadgs_ns.plugin.stereo_start import start_from_stereo
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
@@ -89,7 +87,7 @@ class SadgsTrainer(Trainer):
         self._stepping = False
         self.graphed: GraphedSteps | None = None
         """What trains steps by CUDA graphs; None where all are launched one by one."""
-        self._checkpoint: tuple[Path, dict[str, Any]] | None = None  # It is kept from its reading to its loading.
+        self._resumed: Resumption | None = None
         self._derived = config.max_num_iterations is None
         self._completed_step = self._saved_step = -1
         self._save_due = math.inf
@@ -167,53 +165,12 @@ class SadgsTrainer(Trainer):
             CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
             events.report("training ends", gaussians=self.pipeline.model.num_gaussians)
 
-    @contextmanager
-    def _told_of_checkpoint(self) -> Iterator[None]:
-        """Let an error that a checkpoint's content raises become one sentence, an InputError."""
-        assert self._checkpoint is not None
-        path = self._checkpoint[0]
-        try:
-            yield
-        except torch.cuda.OutOfMemoryError:
-            raise
-        except InputError as error:
-            raise InputError(f"{path} cannot be continued: {str(error).rstrip('.')}; {checkpoints.REMEDY}.") from error
-        except Exception as error:  # The parts of a foreign file may raise anything.
-            what = f"{type(error).__name__}: {reason(error)}"
-            raise InputError(
-                f"{path} is not a checkpoint of this version of sadgs ({what}): {checkpoints.REMEDY}."
-            ) from error
-
-    def _load_gaussians(self) -> None:
-        """Load the checkpoint's Gaussians and what the pipeline knows; the optimizers, made of them, come later."""
-        with self._told_of_checkpoint():
-            path, state = self._checkpoint  # type: ignore[misc]
-            self._start_step = state["step"] + 1
-            if not self.world.alone:
-                part = self.world.take_even_part(len(state["pipeline"]["_model.gauss_params.means"]))
-                state = checkpoints.of_gaussians(state, lambda rows: rows[part].clone())
-                self._checkpoint = path, state
-            self.pipeline.load_pipeline(state["pipeline"], state["step"])
-            if self.pipeline.checkpoint_views is not None:
-                self.pipeline.refuse_other_capture(*self.pipeline.checkpoint_views)
-            if more := sorted(state["optimizers"].keys() - self.pipeline.get_param_groups().keys()):
-                raise InputError(
-                    f"It optimized {' and '.join(more)}, too: set pipeline.model.color-model and "
-                    "pipeline.model.camera-optimizer.mode as they were."
-                )
-
     def _load_checkpoint(self) -> None:
-        """Resume the optimizers as nerfstudio does. Raise InputError where they are another method's."""
-        if self._checkpoint is None:
+        """Load the optimizers of the checkpoint, whose Gaussians are there since they were made."""
+        if self._resumed is None:
             return super()._load_checkpoint()
-        with self._told_of_checkpoint():
-            path, state = self._checkpoint
-            self.optimizers.load_optimizers(state["optimizers"])
-            if "schedulers" in state and self.config.load_scheduler:
-                self.optimizers.load_schedulers(state["schedulers"])
-            self.grad_scaler.load_state_dict(state["scalers"])
-        self._checkpoint = None
-        CONSOLE.print(f"Resuming after step {state['step']} of {path}", markup=False, soft_wrap=True)
+        self._resumed.load_optimizers(self.optimizers, self.grad_scaler, self.config.load_scheduler)
+        self._resumed = None
 
     def _take_one_device_if_quicker(self, views: int) -> None:
         """Train on the first device alone, and say so, where a step of so many views has too few pixels for several.
@@ -248,21 +205,21 @@ class SadgsTrainer(Trainer):
         Raises InputError if checkpoint, data or options cannot be used, or do not fit each other.
         """
         config, pipeline = self.config, self.pipeline
-        self._checkpoint = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
-        dense, before = start_from_stereo(pipeline, resumed=self._checkpoint is not None), None
+        chosen = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
+        self._resumed = resumed = None if chosen is None else Resumption(*chosen)
+        before = None if resumed is None else resumed.plan
+        dense = start_from_stereo(pipeline, resumed=resumed is not None)
         cameras = pipeline.datamanager.train_dataset.cameras
-        if self._checkpoint is None:
+        if resumed is None:
             pipeline.model.clear_paths(viewmats_from_camera_to_world(cameras.camera_to_worlds))
-        else:
-            with self._told_of_checkpoint():
-                before = plan_of(self._checkpoint[1])
         length = plan_length(config, len(cameras), before)
         self._take_one_device_if_quicker(length.views_per_iteration)
         if not self.world.alone:
             self._turn_viewer_off()
             pipeline.share_out(self.world)
-        if self._checkpoint is not None:
-            self._load_gaussians()
+        if resumed is not None:
+            resumed.load_gaussians(pipeline, self.world)
+            self._start_step = resumed.state["step"] + 1
         pipeline.refuse_empty_views()
         plan = plan_run(config, pipeline, length, dense=dense, before=before)
         pipeline.follow(plan)
@@ -473,15 +430,13 @@ class SadgsTrainer(Trainer):
         )
 
     def save_checkpoint(self, step: int) -> None:
-        """Save under a temporary name and rename, so that a killed save leaves the previous checkpoint as it was.
-
-        The temporary file lies beside the folder of checkpoints, because nerfstudio takes every file inside for one.
-        Where several processes train, the first one writes what all of them hold. Raises WriteError.
-        """
+        """Save as `checkpoints.write` does. Where several processes train, the first writes what all of them hold."""
         start = time.monotonic()
         state = self._state(step)
         if processes.is_first():
-            self._write_checkpoint(step, state)
+            # An earlier checkpoint may be better where nothing is learned any more.
+            keep = not self.config.save_only_latest_checkpoint or bool(self.pipeline.stuck)
+            checkpoints.write(self.checkpoint_dir, step, state, keep)
         self.world.all(True)
         self._saved_step = step
         self._set_clock(time.monotonic() - start)
@@ -496,18 +451,3 @@ class SadgsTrainer(Trainer):
             "scalers": self.grad_scaler.state_dict(),
         }
         return state if self.world.alone else checkpoints.of_gaussians(state, self.world.gather_rows)
-
-    def _write_checkpoint(self, step: int, state: dict[str, Any]) -> None:
-        path: Path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
-        others = [other for other in self.checkpoint_dir.glob("*.ckpt") if other != path]
-        with atomic_path(path, beside=self.checkpoint_dir) as partial:
-            try:
-                torch.save(state, partial)
-            except RuntimeError as error:  # torch's writer reports a full disk in this way.
-                raise OSError(reason(error)) from error
-            if others:  # These are about to be deleted, so the new one must survive a power cut first.
-                with partial.open("rb+") as file:
-                    os.fsync(file.fileno())
-        if self.config.save_only_latest_checkpoint and not self.pipeline.stuck:  # An earlier one may then be better.
-            for other in others:
-                other.unlink()

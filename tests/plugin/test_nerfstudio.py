@@ -475,13 +475,12 @@ def test_what_a_killed_save_leaves_does_not_hinder_resuming(colmap: ColmapDataPa
     code = f"""
 import os, signal, torch
 from pathlib import Path
-from types import SimpleNamespace as Space
-from sadgs_ns.plugin.trainer import SadgsTrainer
+from sadgs_ns.plugin import checkpoints
 def killed(state, path):
     path.write_bytes(b"half a checkpoint")
     os.kill(os.getpid(), signal.SIGKILL)
 torch.save = killed
-SadgsTrainer._write_checkpoint(Space(checkpoint_dir=Path({str(trainer.checkpoint_dir)!r})), 2, {{}})
+checkpoints.write(Path({str(trainer.checkpoint_dir)!r}), 2, {{}}, keep=False)
 """
     assert processes.python(code).returncode == -9
     assert len(list(tmp_path.rglob("*.partial"))) == 1

@@ -47,6 +47,8 @@ from sadgs_ns.method.schedule import Schedule, schedule
 from sadgs_ns.plugin import planning
 from sadgs_ns.plugin.checkpoints import checkpoint_paths
 from sadgs_ns.plugin.interrupts import SIGNALS
+from sadgs_ns.plugin.pipeline import camera_positions
+from sadgs_ns.plugin.resume import refuse_other_capture
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
 
@@ -708,18 +710,19 @@ def test_images_with_other_names_at_the_same_cameras_are_told_of(
 ):
     config.load_dir = finished
     trainer = set_up(config)
-    known = trainer.pipeline.checkpoint_views
-    assert known is not None
+    pipeline = trainer.pipeline
+    known = [path.name for path in pipeline.datamanager.train_dataset.image_filenames]
+    positions = camera_positions(pipeline.datamanager.train_dataset.cameras)
     assert "same cameras" not in capsys.readouterr().out
     files: Any = trainer.pipeline.datamanager.train_dataset.image_filenames
     files[:] = [path.with_name(f"of_another_{path.name}") for path in files]
-    trainer.pipeline.refuse_other_capture(*known)
+    refuse_other_capture(pipeline, known, positions)
     line = one_line(capsys.readouterr().out, "The checkpoint's run")
     assert line.endswith(
         "(001.png and of_another_001.png are the first): the Gaussians fit only if the images were renamed."
     )
     files[:] = [path.with_name(path.name.removeprefix("of_another_")).with_suffix(".jpg") for path in files]
-    trainer.pipeline.refuse_other_capture(*known)
+    refuse_other_capture(pipeline, known, positions)
     assert "same cameras" not in capsys.readouterr().out
 
 
