@@ -66,7 +66,7 @@ def plan_run(
             f"{windows.refine_stop_iter}, the first split would come at {windows.structure_every}. "
             "Train longer or lower pipeline.model.strategy.structure-every.[/]"
         )
-    extent = model.strategy_state["scene_scale"]
+    extent = float(model.strategy_state["scene_scale"])
     return RunPlan(
         **vars(length),
         devices=pipeline.world.num_ranks,
