@@ -93,7 +93,7 @@ def _arrays(params: Mapping[str, Tensor]) -> dict[str, NDArray[np.floating]]:
     return {name: tensor.detach().cpu().numpy() for name, tensor in params.items()}
 
 
-def export(given: Export) -> int:
+def export(options: Export) -> int:
     """Write the Gaussians of a run of sadgs or splatfacto, or a mesh; return the number of Gaussians or triangles.
 
     A printed line says what each option took away. Nothing in the run's folder is executed, not even `config.yml`.
@@ -102,29 +102,29 @@ def export(given: Export) -> int:
         InputError: If the run, the capture, an option or the output cannot be used.
         WriteError: If the file could not be written.
     """
-    is_page, is_mesh = format_of(given.output) == ".html", format_of(given.output) == MESH
-    _check(given)
+    is_page, is_mesh = format_of(options.output) == ".html", format_of(options.output) == MESH
+    _check(options)
     if is_mesh:
         load_open3d()  # It may be missing, which the user shall know before views are rendered.
-    folders = _checkpoint_of(given.run).absolute().parents[:2]
+    folders = _checkpoint_of(options.run).absolute().parents[:2]
     folder = next((folder for folder in folders if (folder / TRANSFORMS_NAME).is_file()), folders[-1])
     from sadgs_ns.method.cleaning import Cleaning  # It imports torch.
 
-    cleaning = Cleaning(given.min_views, given.max_extent, given.crop, given.dust)
+    cleaning = Cleaning(options.min_views, options.max_extent, options.crop, options.dust)
     similarity = None
-    if given.frame == "colmap":
+    if options.frame == "colmap":
         if not (folder / TRANSFORMS_NAME).is_file():
             problem = f"{folder} holds no {TRANSFORMS_NAME}, where nerfstudio notes how it moved the data"
             raise InputError(f"{problem}: give the run where it was made, or export in nerfstudio's frame.")
         similarity = from_data(folder / TRANSFORMS_NAME).inverse()
-    checkpoint, params, drawing = read_checkpoint(given.run)
+    checkpoint, params, drawing = read_checkpoint(options.run)
     if params["features_rest"].shape[1] == 0:  # then training holds colours' logits
         params["features_dc"] = (params["features_dc"].sigmoid() - 0.5) / DEGREE_0
     cameras = None
     if is_page or is_mesh or cleaning.needs_views:
         from sadgs_ns.data.run_cameras import read_cameras
 
-        cameras = read_cameras(folder, given.data)
+        cameras = read_cameras(folder, options.data)
     try:
         of_parameters(_arrays(params))
     except ValueError as error:
@@ -134,17 +134,17 @@ def export(given: Export) -> int:
     if is_mesh and cameras is not None:
         from sadgs_ns.cli.meshing import write_mesh
 
-        return write_mesh(given.output, params, cameras, similarity, given.voxel_size, **drawing)
+        return write_mesh(options.output, params, cameras, similarity, options.voxel_size, **drawing)
     if is_page and cameras is not None:
         pose, focal = cameras.camera_to_worlds[0].double().numpy(), float(cameras.Ks[0, 0, 0])
         start = html.start_at(pose, max(cameras.sizes[0]), focal, params["means"].numpy())
-    return write_gaussians(given.output, params, given.frame, similarity, start)
+    return write_gaussians(options.output, params, options.frame, similarity, start)
 
 
-def _check(given: Export) -> None:
+def _check(options: Export) -> None:
     """Raise InputError if an option does not suit the format."""
-    suffix, voxel_size = format_of(given.output), given.voxel_size
-    if suffix == ".html" and given.frame != "nerfstudio":
+    suffix, voxel_size = format_of(options.output), options.voxel_size
+    if suffix == ".html" and options.frame != "nerfstudio":
         raise InputError("--frame colmap is for files that other programs read: leave it out for a page.")
     if voxel_size is not None and suffix != MESH:
         raise InputError(f"--voxel-size is for meshes: let --output end in {MESH}, or leave it out.")
@@ -176,8 +176,8 @@ def _cleaned(
     stays, sentences = find(shapes, cleaning, seen)
     print("\n".join(sentences))
     if not stays.any():
-        told = f"These options take away all {len(stays):,} Gaussians"
-        raise InputError(f"{told}: nothing is written, so take fewer away.")
+        problem = f"These options take away all {len(stays):,} Gaussians"
+        raise InputError(f"{problem}: nothing is written, so take fewer away.")
     return {name: value[stays.cpu()] for name, value in params.items()}
 
 
@@ -225,13 +225,13 @@ def read_checkpoint(run: Path) -> tuple[Path, dict[str, Tensor], dict[str, float
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code, 2 if the run or the output cannot be used."""
-    given = parse(Export, "sadgs-export", argv)
+    options = parse(Export, "sadgs-export", argv)
     try:
-        count = export(given)
+        count = export(options)
     except (InputError, RunError, WriteError) as error:
         print(f"sadgs-export: {error}", file=sys.stderr)
         return 2
-    what = "triangles fused from rendered depth" if format_of(given.output) == MESH else "Gaussians"
-    size = given.output.stat().st_size / 1e6
-    print(f"{given.output}: {count:,} {what}, {size:,.1f} MB, in the frame of {given.frame}")
+    what = "triangles fused from rendered depth" if format_of(options.output) == MESH else "Gaussians"
+    size = options.output.stat().st_size / 1e6
+    print(f"{options.output}: {count:,} {what}, {size:,.1f} MB, in the frame of {options.frame}")
     return 0

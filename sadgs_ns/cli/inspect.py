@@ -36,7 +36,7 @@ class Inspect:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code, 2 if the input is wrong."""
-    given = parse(Inspect, "sadgs-inspect", argv)
+    options = parse(Inspect, "sadgs-inspect", argv)
     # nerfstudio and torch warn about their own internals.
     warnings.filterwarnings("ignore", module=r"(torch|nerfstudio|torchmetrics)\b")
     # These imports take ten seconds, which `--help` and wrong arguments need not wait for.
@@ -45,13 +45,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     from sadgs_ns.cli.inspection import inspect_run
 
     try:
-        written = inspect_run(**vars(given))
+        written = inspect_run(**vars(options))
     except (ValueError, OSError) as error:
         print(f"sadgs-inspect: {error}", file=sys.stderr)
         return 2
     except torch.cuda.OutOfMemoryError:
         remedy = "end other programs on it, or draw on the CPU: CUDA_VISIBLE_DEVICES= sadgs-inspect …"
-        print(f"sadgs-inspect: the GPU's memory does not hold {given.config}: {remedy}", file=sys.stderr)
+        print(f"sadgs-inspect: the GPU's memory does not hold {options.config}: {remedy}", file=sys.stderr)
         return 2
     for path in written:
         print(path)

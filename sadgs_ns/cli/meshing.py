@@ -64,8 +64,8 @@ def write_mesh(
         fusion.add(view)
     found = fusion.mesh()
     if not len(found.triangles):
-        told = f"No surface came out of {number} training views with voxels of {voxel_size:.3g}"
-        raise InputError(f"{told}: take fewer Gaussians away, or leave --voxel-size out.")
+        problem = f"No surface came out of {number} training views with voxels of {voxel_size:.3g}"
+        raise InputError(f"{problem}: take fewer Gaussians away, or leave --voxel-size out.")
     with atomic_path(path) as partial, partial.open("wb") as file:
         mesh.write(file, found if similarity is None else mesh.moved(found, similarity))
     return len(found.triangles)

@@ -86,20 +86,20 @@ class Sadgs:
 class PhotosToSplat:
     """One run of the command, with options for ns-train; raises InputError before anything is written."""
 
-    def __init__(self, given: Sadgs, options: Sequence[str], console: Console) -> None:
-        source = Path(os.path.realpath(given.source))
+    def __init__(self, options: Sadgs, train_options: Sequence[str], console: Console) -> None:
+        source = Path(os.path.realpath(options.source))
         name = f"{(source.name if source.is_dir() else source.stem) or 'photos'}-splat"
-        self.source, self.folder = given.source, given.output or Path(name)
-        self.given, self.options, self.console = given, options, console
-        self._formats = sorted(_formats(given.formats, console), key=lambda name: name == "html")
-        self._given = _given_cameras(given)
+        self.source, self.folder = options.source, options.output or Path(name)
+        self.options, self.train_options, self.console = options, train_options, console
+        self._formats = sorted(_formats(options.formats, console), key=lambda name: name == "html")
+        self._camera_file = _cameras_of(options)
         self._scene, self._runs = self.folder / "scene", self.folder / "training" / "sadgs"
-        self._data = self.source if self._given else self._scene
+        self._data = self.source if self._camera_file else self._scene
         self._settings: dict[str, Any] = {}
-        if not 0 < given.effort < math.inf:
+        if not 0 < options.effort < math.inf:
             raise InputError("--effort must be more than 0.")
-        check_size(given.max_size)
-        for option in options:
+        check_size(options.max_size)
+        for option in train_options:
             name = option.partition("=")[0].lstrip("-").replace("_", "-")
             if option.startswith("--") and name in _OURS:
                 raise InputError(f"--{name} is set by sadgs itself: leave it out, or use ns-train.")
@@ -107,7 +107,7 @@ class PhotosToSplat:
         for path in (self.source, self.folder):
             if not str(path).isprintable():
                 raise InputError(f"{str(path)!a} has unprintable characters in its name: rename it.")
-        if not self._given:
+        if not self._camera_file:
             count_frames(self.source) if self.source.is_file() else find_source(self.source, self._scene)
 
     def _read_settings(self) -> None:
@@ -116,11 +116,11 @@ class PhotosToSplat:
         Raises:
             InputError: If they are others than those asked for, or the folder is something else.
         """
-        folder, given = self.folder, self.given
-        asked = {"source": os.path.realpath(self.source), "--cameras": "new", "--max-size": given.max_size}
-        if self._given:
-            asked["--cameras"] = f"{self._given} (checksum {zlib.crc32(self._given.read_bytes()):08x})"
-        asked |= {"--effort": given.effort, "options of ns-train": list(self.options)}
+        folder, options = self.folder, self.options
+        asked = {"source": os.path.realpath(self.source), "--cameras": "new", "--max-size": options.max_size}
+        if self._camera_file:
+            asked["--cameras"] = f"{self._camera_file} (checksum {zlib.crc32(self._camera_file.read_bytes()):08x})"
+        asked |= {"--effort": options.effort, "options of ns-train": list(self.train_options)}
         self._settings = begun = read_settings(folder / "settings.json", folder)
         if not begun and (folder.is_file() or (folder.is_dir() and any(folder.iterdir()))):
             raise InputError(f"{folder} exists and is not a folder that sadgs began; give another --output.")
@@ -158,7 +158,7 @@ class PhotosToSplat:
             self._read_settings()  # Another run may have gone on meanwhile.
             self._note()
             # Importing nerfstudio takes some 12 s, in which cameras can be found.
-            needs_training = not self._trained() or (not self._given and photos_added(self.source, self._scene))
+            needs_training = not self._trained() or (not self._camera_file and photos_added(self.source, self._scene))
             self._trainer = self._worker("training", _TRAINING) if needs_training else None
             stages: tuple[tuple[str, Callable[[StatusLine], str]], ...] = (
                 ("cameras", self._find_cameras),
@@ -207,7 +207,7 @@ class PhotosToSplat:
                 return
             moved = json.loads((self._run / TRANSFORMS_NAME).read_bytes())
             described |= dict(zip(FRAME_KEYS, (moved["transform"], moved["scale"]), strict=True))
-        if not any(re.match("--(eval|train|test)", option) for option in self.options):
+        if not any(re.match("--(eval|train|test)", option) for option in self.train_options):
             trained, held_out = described.get("train_filenames", []), described.get("test_filenames", [])
             known = {*trained, *held_out}
             for names in (before, self._views()):
@@ -232,19 +232,19 @@ class PhotosToSplat:
             return worker.run(*arguments, on_event=listen, command=command)
         except (InputError, WorkerError) as error:
             line.update("failed")
-            told = f"{worker.log.stem}: {str(error).rstrip('.')}. All that it printed is in {worker.log}"
+            problem = f"{worker.log.stem}: {str(error).rstrip('.')}. All that it printed is in {worker.log}"
             if isinstance(error, InputError) or error.exitcode == 2:
-                raise InputError(f"{told}.") from None
-            raise RunError(f"{told}, and the same command goes on.") from None
+                raise InputError(f"{problem}.") from None
+            raise RunError(f"{problem}, and the same command goes on.") from None
 
     def _find_cameras(self, line: StatusLine) -> str:
-        if self._given:
-            return f"those of {self._given}; --cameras new finds others"
+        if self._camera_file:
+            return f"those of {self._camera_file}; --cameras new finds others"
         with contextlib.suppress(InputError):  # It is about another folder.
             if self.source.name.startswith("images") and (other := find_cameras(self.source.parent)):
                 line.print(f"{other} is not used: `sadgs {shlex.quote(str(self.source.parent))}` takes these cameras.")
         few = self._settings.get("few")
-        if few and (self.given.anyway or self._checkpoint()) and not photos_added(self.source, self._scene):
+        if few and (self.options.anyway or self._checkpoint()) and not photos_added(self.source, self._scene):
             return f"{few}; done before"
         added, duration, done_before = "", "", ""
 
@@ -263,15 +263,15 @@ class PhotosToSplat:
 
         worker = self._worker("cameras", "sadgs_ns.cli.process.command:process")
         source = Path(os.path.abspath(self.source))
-        command = ["sadgs-process", str(source), str(self._scene), "--max-size", str(self.given.max_size)]
-        given = Process(source, self._scene, max_size=self.given.max_size)
-        summary = Summary(**self._call(worker, line, on_event, command, given))
+        command = ["sadgs-process", str(source), str(self._scene), "--max-size", str(self.options.max_size)]
+        options = Process(source, self._scene, max_size=self.options.max_size)
+        summary = Summary(**self._call(worker, line, on_event, command, options))
         again = " after a second attempt" if summary.attempts else ""
         found = f"{added}{summary.registered} of {summary.photos} photos registered{again}"
         self._settings.pop("few", None)
         if summary.is_poor:
             self._note(few=found)
-            if not self.given.anyway:
+            if not self.options.anyway:
                 line.update(found)
                 command = ["sadgs-process", str(self.source), str(self._scene), "--matching", "exhaustive"]
                 again = f"or compare more pairs of them with `{shlex.join(command)}`, and give the same command again; "
@@ -288,7 +288,7 @@ class PhotosToSplat:
         return self._settings.get("trained") if self._checkpoint() else None
 
     def _train(self, line: StatusLine) -> str:
-        if not self._given:  # These are those that the folder was begun with.
+        if not self._camera_file:  # These are those that the folder was begun with.
             self._choose_run()
         if trained := self._trained():
             return f"{trained}; done before"
@@ -311,10 +311,10 @@ class PhotosToSplat:
         command = ["ns-train", "sadgs", "--data", os.path.abspath(self._data)]
         command += ["--output-dir", str(self.folder.absolute()), "--experiment-name", "training"]
         command += ["--timestamp", self._run.name, "--vis", "tensorboard"]
-        command += ["--steps-per-eval-image", "0", "--pipeline.effort", f"{self.given.effort:g}"]
+        command += ["--steps-per-eval-image", "0", "--pipeline.effort", f"{self.options.effort:g}"]
         command += ["--load-dir", str(self._run.absolute())] if begun else []
         worker = self._trainer or self._worker("training", _TRAINING)
-        self._call(worker, line, on_event, [*command, *self.options])
+        self._call(worker, line, on_event, [*command, *self.train_options])
         if not self._checkpoint():
             raise RunError(f"training ended without a checkpoint; all that it printed is in {self.folder}/log.")
         told = f"{total} iterations, {count} Gaussians"
@@ -328,21 +328,21 @@ class PhotosToSplat:
         line.update(str(output))
         worker = self._worker("export", "sadgs_ns.cli.export:export")
         # The folder may have been renamed since the run's config.yml noted where the scene is.
-        given = Export(self._run, output, data=self._data)
+        options = Export(self._run, output, data=self._data)
         command = ["sadgs-export", str(self._run), "--output", str(output), "--data", str(self._data)]
-        self._call(worker, line, lambda event, **fields: None, command, given)
+        self._call(worker, line, lambda event, **fields: None, command, options)
         return f"{output}, {output.stat().st_size / 1e6:,.1f} MB"
 
 
-def _given_cameras(given: Sadgs) -> Path | None:
+def _cameras_of(options: Sadgs) -> Path | None:
     """Return the file of the source's cameras, or None; raise InputError if they cannot be trained on."""
     try:
-        if given.cameras == "new" or (file := find_cameras(given.source)) is None:
+        if options.cameras == "new" or (file := find_cameras(options.source)) is None:
             return None
-        check_findings(check_data(given.source), given.source)
+        check_findings(check_data(options.source), options.source)
     except InputError as error:
         raise InputError(f"{str(error).rstrip('.')}; or find new cameras with --cameras new.") from None
-    if given.max_size != Sadgs.max_size:
+    if options.max_size != Sadgs.max_size:
         smaller = "or for images of half the size `-- --pipeline.datamanager.camera-res-scale-factor 0.5` at the end"
         raise InputError(f"--max-size is for new cameras, and those of {file} are used: leave it out, {smaller}.")
     return file
@@ -373,15 +373,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Make a splat and return the exit code, as `exit_code` says."""
     words, console, start = list(sys.argv[1:] if argv is None else argv), Console(highlight=False), time.monotonic()
     end = words.index("--") if "--" in words else len(words)
-    given, options = parse(Sadgs, "sadgs", words[:end]), words[end + 1 :]
+    options, train_options = parse(Sadgs, "sadgs", words[:end]), words[end + 1 :]
     print_elsewhere_once_unread(console)
 
     def run() -> int:
         with Interrupts(waiting=lambda: True):
-            made = PhotosToSplat(given, options, console).make()
+            made = PhotosToSplat(options, train_options, console).make()
         page = next((path for path in made if path.suffix == ".html"), None)
         shown = f"Open {page.resolve().as_uri()}" if page else f"The splat is {made[0]}."
         print(f"{'in all':<9}{clock(time.monotonic() - start):>8}  {shown}")
         return 0
 
-    return exit_code("sadgs", given.output, run)
+    return exit_code("sadgs", options.output, run)

@@ -177,8 +177,8 @@ def _read_text_poses(path: Path) -> Iterator[Pose]:
         except ValueError as error:
             raise _not_colmap(path, error) from error
         if len(keypoints) % 3:  # Each has x, y and the number of its point.
-            told = f"{path}: the line after image {fields[9]!r} does not hold its keypoints"
-            raise InputError(f"{told}: each image needs such a line, which may be empty.")
+            problem = f"{path}: the line after image {fields[9]!r} does not hold its keypoints"
+            raise InputError(f"{problem}: each image needs such a line, which may be empty.")
         yield pose
 
 

@@ -137,8 +137,8 @@ def from_data(path: Path) -> Similarity:
         content = json.loads(path.read_bytes())
         return _moved_by(content["transform"], content["scale"])
     except (OSError, KeyError, TypeError, ValueError) as error:
-        told = f"{path} does not tell how to return to the data's frame ({reason(error)})"
-        raise InputError(f"{told}: copy it from the run again, or export in nerfstudio's frame.") from error
+        problem = f"{path} does not tell how to return to the data's frame ({reason(error)})"
+        raise InputError(f"{problem}: copy it from the run again, or export in nerfstudio's frame.") from error
 
 
 def fixed_frame(meta: Mapping[str, Any], path: Path) -> Similarity | None:

@@ -58,8 +58,8 @@ def write(file: IO[bytes], gaussians: Gaussians, rotation: tuple[float, float, f
     head += b" " * (-len(head) % 4)
     total = 12 + 8 + len(head) + 8 + sum(sizes)
     if total > _MOST_BYTES:
-        told = f"{len(gaussians):,} Gaussians take more than the 4 GB that glTF can hold"
-        raise InputError(f"{told}: choose another format.")
+        problem = f"{len(gaussians):,} Gaussians take more than the 4 GB that glTF can hold"
+        raise InputError(f"{problem}: choose another format.")
     file.write(struct.pack("<4sIIII", b"glTF", 2, total, len(head), 0x4E4F534A) + head)
     file.write(struct.pack("<II", sum(sizes), 0x004E4942))
     for array in arrays:

@@ -100,8 +100,8 @@ class Fusion:
         voxels = self._grid.hashmap()
         known = voxels.find(blocks)[1].numpy().sum() if voxels.size() else 0
         if (voxels.size() + len(blocks) - known) * _RESOLUTION**3 > MOST_VOXELS:
-            told = f"A mesh of voxels of {self.voxel_size:.3g} does not fit in memory"
-            raise InputError(f"{told}: give a larger one, such as --voxel-size {2 * self.voxel_size:.2g}.")
+            problem = f"A mesh of voxels of {self.voxel_size:.3g} does not fit in memory"
+            raise InputError(f"{problem}: give a larger one, such as --voxel-size {2 * self.voxel_size:.2g}.")
         color = self._image(self._core.Tensor(view.color))
         self._grid.integrate(blocks, camera.pop("depth"), color, **camera)
 
@@ -136,8 +136,8 @@ def load_open3d() -> Any:
     try:
         import open3d
     except (ImportError, OSError) as error:
-        told = f"A mesh is made by open3d, which cannot be imported ({reason(error)})"
-        raise InputError(f"{told}: install open3d with pip, and the system's package libusb-1.0-0.") from error
+        problem = f"A mesh is made by open3d, which cannot be imported ({reason(error)})"
+        raise InputError(f"{problem}: install open3d with pip, and the system's package libusb-1.0-0.") from error
     return open3d
 
 

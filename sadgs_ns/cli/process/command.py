@@ -79,20 +79,20 @@ class Process:
 class _Scene:
     """A scene that was begun, and what is asked of it now; raises InputError if the two do not fit."""
 
-    def __init__(self, given: Process) -> None:
-        self.given, self.work = given, given.out / "work"
-        self.noted = self.work / "settings.json"
-        out, source = given.out, given.source
-        if out.is_file() or (not self.noted.exists() and any(not path.is_dir() for path in out.rglob("*"))):
+    def __init__(self, options: Process) -> None:
+        self.options, self.work = options, options.out / "work"
+        self.settings_file = self.work / "settings.json"
+        out, source = options.out, options.source
+        if out.is_file() or (not self.settings_file.exists() and any(not path.is_dir() for path in out.rglob("*"))):
             raise InputError(f"{out} exists and is not a scene that sadgs-process began; give another folder.")
         photos, self.is_video, self.masks, self.left_out = find_source(source, out)
         self.settings: dict[str, Any] = {
             "source": os.path.realpath(source),
-            "camera_per_photo": given.camera_per_photo,
+            "camera_per_photo": options.camera_per_photo,
             "photos": photos,
-            **({"frames": given.frames} if self.is_video else {}),
+            **({"frames": options.frames} if self.is_video else {}),
         }
-        self.begun = read_settings(self.noted, out)
+        self.begun = read_settings(self.settings_file, out)
         self.finished = self.begun.get("finished") if (out / "transforms.json").exists() else None
         if self.begun:
             self._check_unchanged()
@@ -104,11 +104,11 @@ class _Scene:
         if self.added:
             self.base, self.model = self.model, self.work / f"model-{len(photos)}"
             if not (self.base.exists() and (self.work / "database.db").exists()):
-                told = f"{self.work} no longer holds the features and the model that photos could be added to"
-                raise InputError(f"{told}: give another folder or delete it.")
+                problem = f"{self.work} no longer holds the features and the model that photos could be added to"
+                raise InputError(f"{problem}: give another folder or delete it.")
 
     def _check_unchanged(self) -> None:
-        asked: dict[str, Any] = self.settings | ({"max_size": self.given.max_size} if self.finished else {})
+        asked: dict[str, Any] = self.settings | ({"max_size": self.options.max_size} if self.finished else {})
         differing = [name for name in asked if self.begun.get(name) != asked[name]]
         told, back, kind = [], "", "videos" if self.is_video else "photos"
         if "source" in differing:  # The rest follows from it.
@@ -116,7 +116,7 @@ class _Scene:
         else:
             before, now = {*self.begun.get("photos", [])}, {*asked["photos"]}
             for verb, names in (
-                ("changed", changed_photos(self.given.source, self.begun.get("files", {}))),
+                ("changed", changed_photos(self.options.source, self.begun.get("files", {}))),
                 ("added", set() if self.finished and not self.is_video else now - before),
                 ("removed", before - now),
             ):
@@ -127,19 +127,19 @@ class _Scene:
             option = name if name == "source" else "--" + name.replace("_", "-")
             told.append(f"{option} was {self.begun.get(name)}, is {asked[name]}")
         if told:
-            problem = f"{self.given.out} was begun with other photos or settings ({'; '.join(told)})"
+            problem = f"{self.options.out} was begun with other photos or settings ({'; '.join(told)})"
             raise InputError(f"{problem}; {back}give another folder or delete it.")
 
     def note(self, **settings: Any) -> None:
         self.settings |= settings
-        write_json(self.noted, self.settings)
+        write_json(self.settings_file, self.settings)
 
     @contextlib.contextmanager
     def alone(self) -> Iterator[None]:
         """Lock the work folder, and leave nothing half-written there."""
         if not self.begun:
             self.note()
-        with locked(self.work, f"another sadgs-process works on {self.given.out}; wait for it, or stop it."):
+        with locked(self.work, f"another sadgs-process works on {self.options.out}; wait for it, or stop it."):
             try:
                 yield
             finally:
@@ -149,11 +149,11 @@ class _Scene:
 
     def remove_intermediate_files(self) -> None:
         """Remove what adding photos to the finished scene does not need."""
-        for path in {*self.work.iterdir()} - {self.model, self.work / "database.db", self.noted}:
+        for path in {*self.work.iterdir()} - {self.model, self.work / "database.db", self.settings_file}:
             shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
-def process(given: Process) -> Summary:
+def process(options: Process) -> Summary:
     """Make a scene of photos or a video, and report its progress in print and as events.
 
     A run that was interrupted goes on. New photos are added to a finished scene, whose other cameras stay as they are.
@@ -165,13 +165,13 @@ def process(given: Process) -> Summary:
         RunError: If COLMAP fails.
     """
     with Interrupts(waiting=lambda: True):
-        scene = _Scene(given)
+        scene = _Scene(options)
         if scene.finished and not scene.added:
             scene.remove_intermediate_files()
-            _say("unchanged", f"{given.out} is finished; delete it to make it again.")
+            _say("unchanged", f"{options.out} is finished; delete it to make it again.")
             summary = Summary(**scene.finished)
         else:
-            if given.source.is_dir() and (poses := poses_elsewhere(given.source)):
+            if options.source.is_dir() and (poses := poses_elsewhere(options.source)):
                 _say("aside", f"Poses are computed anew. {poses}")
             columns = (TextColumn("{task.description:>24}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
             with Progress(*columns, disable=not sys.stdout.isatty()) as progress:
@@ -179,36 +179,36 @@ def process(given: Process) -> Summary:
     print(summary)
     for sentence in scene.left_out:
         _say("aside", sentence)
-    if not scene.is_video and (videos := find_videos(given.source)):
+    if not scene.is_video and (videos := find_videos(options.source)):
         print(f"Its videos ({len(videos)}, such as {videos[0]}) are not used: give them in a folder of their own.")
     return summary
 
 
 def _make(scene: _Scene, report: Report) -> Summary:
-    given, work = scene.given, scene.work
+    options, work = scene.options, scene.work
 
     def fetch_vocabulary() -> None:
         with tempfile.TemporaryDirectory() as scratch:
             run_colmap("fetch_vocabulary", Path(scratch), folder=Path(scratch), report=report)
 
     with contextlib.ExitStack() as alone:
-        folder, names = given.source, scene.settings["photos"]
+        folder, names = options.source, scene.settings["photos"]
         if scene.is_video:
             folder = work / "frames"
             if names:
                 _say("videos", f"Frames of {len(names)} videos are taken, each with a camera of its own.")
-            chosen = [] if folder.exists() else video_frames(given.source, names, given.frames)
+            chosen = [] if folder.exists() else video_frames(options.source, names, options.frames)
             alone.enter_context(scene.alone())  # It notes the settings, by which an interrupted run goes on.
             if not folder.exists():
                 partial = empty_folder(work / "frames.partial")
-                write_frames(chosen, partial, lambda done: report("frames", done, given.frames))
+                write_frames(chosen, partial, lambda done: report("frames", done, options.frames))
                 partial.rename(folder)
             names = sorted(photo.relative_to(folder).as_posix() for photo in folder.rglob("*.jpg"))
         photos = read_photos(folder, names, report, scene.settings["as_stored"])
         if scene.is_video:
             photos = [dataclasses.replace(photo, camera=(os.path.dirname(photo.name), photo.size)) for photo in photos]
         views = [view for photo in photos for view in photo.views]
-        matching, notice = choose_matching(given.matching, views, given.source.is_file(), fetch_vocabulary)
+        matching, notice = choose_matching(options.matching, views, options.source.is_file(), fetch_vocabulary)
         if not scene.is_video:
             stamps = scene.begun.get("files", {})
             scene.settings["files"] = stamps | photo_stamps(folder, [name for name in names if name not in stamps])
@@ -220,14 +220,14 @@ def _make(scene: _Scene, report: Report) -> Summary:
         rigs = [[view.name for view in photo.views] for photo in photos if photo.is_panorama]
         folder, photos = _convert(scene, folder, photos)
         photos = [photo for photo in photos if photo.camera]  # without the views
-        groups = [[photo.name] for photo in photos] if given.camera_per_photo else photos_by_camera(photos)
-        arguments = (folder, groups, matching, given.max_size, scene.model, scene.base, rigs)
+        groups = [[photo.name] for photo in photos] if options.camera_per_photo else photos_by_camera(photos)
+        arguments = (folder, groups, matching, options.max_size, scene.model, scene.base, rigs)
         summary = Summary(**run_colmap("make_model", *arguments, folder=work, report=report))
-        _publish(work / "undistorted", given.out, bool(scene.added))
+        _publish(work / "undistorted", options.out, bool(scene.added))
         if summary.is_poor and not scene.added:  # The features serve another way of matching.
             shutil.rmtree(scene.model)
         else:
-            scene.note(max_size=given.max_size, finished=dataclasses.asdict(summary), model=scene.model.name)
+            scene.note(max_size=options.max_size, finished=dataclasses.asdict(summary), model=scene.model.name)
             scene.remove_intermediate_files()
     return summary
 
@@ -254,10 +254,10 @@ def _convert(scene: _Scene, folder: Path, stored: Sequence[Photo]) -> tuple[Path
     """Convert photos as `convert_photos`, and write their opacities, and masks if they or the scene have any."""
     work, masks = scene.work, scene.masks
     converted, photos = convert_photos(folder, stored, work / "photos")
-    has_masks = (scene.given.out / "masks").exists() if scene.added else bool(masks)
+    has_masks = (scene.options.out / "masks").exists() if scene.added else bool(masks)
     shutil.rmtree(work / "masks", ignore_errors=True)
     if has_masks:
-        write_masks(scene.given.source, masks, stored, photos, work / "masks")
+        write_masks(scene.options.source, masks, stored, photos, work / "masks")
     if masks:
         why = "used" if has_masks else "not used, because the scene has none: give another folder for it"
         _say("aside", f"Masks of {len(masks)} photos are {why}.")
@@ -344,21 +344,21 @@ def check_size(max_size: int) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Make a scene and return the exit code, which is 1 also if fewer than half of the photos registered."""
-    given = parse(Process, "sadgs-process", argv)
-    return exit_code("sadgs-process", given.out, lambda: _run(given))
+    options = parse(Process, "sadgs-process", argv)
+    return exit_code("sadgs-process", options.out, lambda: _run(options))
 
 
-def _run(given: Process) -> int:
-    if given.frames < 3:
+def _run(options: Process) -> int:
+    if options.frames < 3:
         raise InputError("--frames must be at least 3.")
-    check_size(given.max_size)
-    summary, out = process(given), shlex.quote(str(given.out))
+    check_size(options.max_size)
+    summary, out = process(options), shlex.quote(str(options.out))
     if not summary.is_poor:
         print(f"\nCheck machine and data before a long run:  sadgs-doctor {out}\nTrain:  ns-train sadgs --data {out}")
         return 0
     again = "the same command with --matching exhaustive, which uses the features found so far; or "
     print(
-        f"warning: {given.out} shows only what {summary.registered} of {summary.photos} photos saw. Try "
+        f"warning: {options.out} shows only what {summary.registered} of {summary.photos} photos saw. Try "
         f"{again * (summary.matching != 'exhaustive')}another folder with more photos between those that did not "
         f"register, with two thirds of overlap. This trains on what is there: ns-train sadgs --data {out}",
         file=sys.stderr,

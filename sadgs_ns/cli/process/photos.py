@@ -106,8 +106,8 @@ def read_photos(
     if broken:
         more = [f"{len(broken) - _NAMED} more"] if len(broken) > _NAMED else []
         them = "it" if len(broken) == 1 else "them"
-        told = f"{len(broken)} of the {len(names)} photos in {folder} cannot be read as a whole image"
-        raise InputError(f"{told}: {', '.join(broken[:_NAMED] + more)}; copy {them} again or remove {them}.")
+        problem = f"{len(broken)} of the {len(names)} photos in {folder} cannot be read as a whole image"
+        raise InputError(f"{problem}: {', '.join(broken[:_NAMED] + more)}; copy {them} again or remove {them}.")
     looks: dict[tuple[int, int], list[bool]] = defaultdict(list)
     for photo in photos:
         looks[photo.size].append(photo.is_panorama)
@@ -244,8 +244,8 @@ def write_masks(
                     mask.getexif()[ExifTags.Base.Orientation] = stored.getexif()[ExifTags.Base.Orientation]
                     mask = ImageOps.exif_transpose(mask)
         if not 0.97 < mask.width * photo.size[1] / (mask.height * photo.size[0]) < 1.03:
-            told = f"{folder / masks[photo.name]} has another shape than {photo.name}, whose mask it is by its name"
-            raise InputError(f"{told}: make it of the whole photo, or take it out of the folder.")
+            problem = f"{folder / masks[photo.name]} has another shape than {photo.name}, whose mask it is by its name"
+            raise InputError(f"{problem}: make it of the whole photo, or take it out of the folder.")
         mask = mask.resize(photo.size, Image.Resampling.NEAREST)
         for part, name in zip(cut(mask) if photo.is_panorama else [mask], names, strict=False):
             (target / name).parent.mkdir(parents=True, exist_ok=True)

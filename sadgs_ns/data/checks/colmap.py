@@ -47,8 +47,8 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
     images, model_folder = data / options.images_path, data / options.colmap_path
     if (kind := colmap.model_kind(model_folder)) is None:
         if found := find_reconstruction(data):
-            told = f"{model_folder} holds no COLMAP reconstruction, but {data / found} does"
-            raise InputError(f"{told}: add `{_words(data, automatic_options(data, found))}` after `colmap`.")
+            problem = f"{model_folder} holds no COLMAP reconstruction, but {data / found} does"
+            raise InputError(f"{problem}: add `{_words(data, automatic_options(data, found))}` after `colmap`.")
         raise InputError(no_layout(data))
     cameras_path, poses_path = model_folder / f"cameras.{kind}", model_folder / f"images.{kind}"
     names, views = _read_views(poses_path, cameras_path)
@@ -62,8 +62,8 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
         random = f"{this_model} --load-3D-points False` to start from random points"
         yield from _check_points(model_folder, views if sound else [], random)
     if options.masks_path is None and images_in(data / "masks"):
-        told = f"{data / 'masks'} holds masks that are not used"
-        yield warning(f"{told}: {this_model} --masks-path masks` to leave out what is black in them.")
+        problem = f"{data / 'masks'} holds masks that are not used"
+        yield warning(f"{problem}: {this_model} --masks-path masks` to leave out what is black in them.")
     if not open_images:
         return
     factor = yield from _check_factor(images, names, options)
@@ -80,9 +80,9 @@ def _check_folders(data: Path, options: ParserOptions, names: Sequence[str], pos
     images = data / options.images_path
     if not any(os.path.isfile(images / name) for name in names):
         if found := images_folder(data, options.colmap_path):
-            told = f"{poses}: image {names[0]} is not in {images}, but in {data / found}"
+            problem = f"{poses}: image {names[0]} is not in {images}, but in {data / found}"
             remedy = _words(data, dataclasses.replace(options, images_path=found))
-            raise InputError(f"{told}: add `{remedy}` after `colmap`.")
+            raise InputError(f"{problem}: add `{remedy}` after `colmap`.")
         if not images.is_dir():
             raise InputError(
                 f"{poses} has poses of {len(names)} images, but there is no folder {images}: put them there, or end "
@@ -90,9 +90,9 @@ def _check_folders(data: Path, options: ParserOptions, names: Sequence[str], pos
             )
     for other, count in find_reconstructions(data).items():
         if count > len(names):
-            told = f"{poses} has {len(names)} images, {data / other} has {count}"
+            problem = f"{poses} has {len(names)} images, {data / other} has {count}"
             remedy = f"end the command with `colmap {_words(data, dataclasses.replace(options, colmap_path=other))}`"
-            yield warning(f"{told}: {remedy} to train on those.")
+            yield warning(f"{problem}: {remedy} to train on those.")
 
 
 def _words(data: Path, options: ParserOptions) -> str:
@@ -121,8 +121,8 @@ def _read_views(poses_path: Path, cameras_path: Path) -> tuple[list[str], list[V
     called = {camera_id: f"{cameras_path}: camera {camera_id}" for camera_id in stored}
     cameras = {camera_id: _camera(stored[camera_id], where) for camera_id, where in called.items()}
     if len({cameras[camera_id].fisheye for _, camera_id, _ in poses}) > 1:
-        told = f"{cameras_path} mixes fisheye and other cameras, which nerfstudio cannot read"
-        raise InputError(f"{told}: undistort the images with `colmap image_undistorter`.")
+        problem = f"{cameras_path} mixes fisheye and other cameras, which nerfstudio cannot read"
+        raise InputError(f"{problem}: undistort the images with `colmap image_undistorter`.")
     rotations = _rotations(np.array([pose[:4] for _, _, pose in poses]))
     views = [
         View(f"{poses_path}: image {name}", called[number], rotation, -rotation.T @ pose[4:], cameras[number])
@@ -169,8 +169,8 @@ def _camera(camera: colmap.Camera, where: str) -> Camera:
     """Return a camera for the checks; raise InputError if nerfstudio cannot read it, or one of its values is wrong."""
     model, params, number = camera.model, camera.params, colmap.CAMERA_PARAMETERS.get(camera.model)
     if number is None or model in UNSUPPORTED_CAMERAS:
-        told = f"{where} has the model {model}, which nerfstudio cannot read"
-        raise InputError(f"{told}: undistort the images with `colmap image_undistorter`.")
+        problem = f"{where} has the model {model}, which nerfstudio cannot read"
+        raise InputError(f"{problem}: undistort the images with `colmap image_undistorter`.")
     focals = 1 if model.startswith("SIMPLE") or "RADIAL" in model else 2
     values = {"width": camera.width, "height": camera.height}
     values |= {f"focal length {axis}": value for axis, value in zip("xy", params[:focals], strict=False)}

@@ -166,11 +166,11 @@ def _check_camera(camera: Camera, where: str) -> Iterator[Finding]:
             yield fault(f"{where} is a fisheye {NO_COEFFICIENTS}")
         return
     coefficients = ", ".join(f"{value:g}" for value in camera.radial)
-    told = f"{where} has the radial distortion {coefficients}, which cannot be undone"
+    problem = f"{where} has the radial distortion {coefficients}, which cannot be undone"
     if not _can_be_undone(camera, min(half_width, half_height)):
-        yield fault(f"{told}: calibrate the camera again, or undistort the images yourself.")
+        yield fault(f"{problem}: calibrate the camera again, or undistort the images yourself.")
     elif not camera.fisheye and not _can_be_undone(camera, math.hypot(half_width, half_height)):
-        yield warning(f"{told} in the image's corners: they will be wrong; calibrate the camera again.")
+        yield warning(f"{problem} in the image's corners: they will be wrong; calibrate the camera again.")
 
 
 def _can_be_undone(camera: Camera, radius: float) -> bool:

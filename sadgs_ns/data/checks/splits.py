@@ -59,8 +59,8 @@ def check_splits(
         state = "is empty" if "test" in located else "is missing"
         yield warning(f"{called('test')} {state}: `ns-eval` will have nothing to measure; name some images.")
     elif both := located["train"] & located["test"]:
-        told = f"{called('test')} names {len(both)} of the {len(located['train'])} training images"
-        yield warning(f"{told}: what `ns-eval` measures of them shows nothing about new views.")
+        problem = f"{called('test')} names {len(both)} of the {len(located['train'])} training images"
+        yield warning(f"{problem}: what `ns-eval` measures of them shows nothing about new views.")
     return len(located["train"])
 
 

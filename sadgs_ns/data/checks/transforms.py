@@ -66,8 +66,8 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
         frames.append(Frame(locate(frame["file_path"]), size, None if mask is None else locate(mask, "masks")))
     for name, what in (("mask_path", "masks"), ("depth_file_path", "depths")):
         if 0 < (having := sum(name in frame for frame in described)) < len(frames):
-            told = f"{path} names {what} for {having} of {len(frames)} frames"
-            raise InputError(f"{told}: give all of them one, or none.")
+            problem = f"{path} names {what} for {having} of {len(frames)} frames"
+            raise InputError(f"{problem}: give all of them one, or none.")
     names = [frame["file_path"] for frame in described]
     lists = {split: meta[f"{split}_filenames"] for split in SPLITS if f"{split}_filenames" in meta}
     training = yield from check_splits(names, lists, lambda split: f"{path}: {split}_filenames", locate, options)
@@ -83,8 +83,8 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
 def _no_transforms(data: Path, path: Path) -> str:
     """Return the sentence for data without a `transforms.json`."""
     if (found := find_reconstruction(data)) is not None:
-        told = f"{path} does not exist, but {data / found} holds a COLMAP reconstruction"
-        return f"{told}: leave `nerfstudio-data` out of the command."
+        problem = f"{path} does not exist, but {data / found} holds a COLMAP reconstruction"
+        return f"{problem}: leave `nerfstudio-data` out of the command."
     return no_layout(data) if data.suffix != ".json" else f"{path} does not exist: {GIVE_POSES}."
 
 
