@@ -25,6 +25,7 @@ from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
 from sadgs_ns.plugin.optimizers import FusedAdam, step_together
 from sadgs_ns.render.rasterization import rasterize
+from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
 
 REPEATS = 20
 """Calls in a row that are timed together."""
@@ -92,11 +93,11 @@ class Step:
     def draw(self) -> Tensor:
         """Rasterize the views. [V, H, W, 3]"""
         p = self.params
-        splats: Any = (
-            p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid().squeeze(-1),
-            (p["features_dc"], p["features_rest"]), self.viewmats, self.Ks, self.width, self.height,
-        )  # fmt: skip
-        drawn, _, info = rasterize(*splats, sh_degree=3, absgrad=True, tile_capacity=self.capacity)
+        opacities, colors = p["opacities"].sigmoid().squeeze(-1), (p["features_dc"], p["features_rest"])
+        gaussians = Gaussians(p["means"], p["quats"], p["scales"].exp(), opacities, colors)
+        cameras = Cameras(self.viewmats, self.Ks, self.width, self.height)
+        options = RenderOptions(sh_degree=3, absgrad=True, tile_capacity=self.capacity)
+        drawn, _, info = rasterize(gaussians, cameras, options)
         keep_gradient(info["means2d"])
         if "pair_counts" in info and self.capacity is None:
             self.capacity = int(ROOM * sum(info["pair_counts"].wait()))

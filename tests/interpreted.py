@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
-import torch
-from gsplat.cuda._torch_impl import _fully_fused_projection
+from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
+from gsplat_stub import rasterize_to_pixels
 from torch import Tensor
 
 from sadgs_ns import gsplat_compat
 from sadgs_ns.kernels import TILE_SIZE
-from sadgs_ns.render import backend_torch, rasterization
+from sadgs_ns.render import rasterization
 
 compositing = pytest.importorskip("sadgs_ns.kernels.compositing", reason="Triton is not installed")
 harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")
@@ -32,7 +30,7 @@ def project(
     near_plane: float = 0.01,
 ) -> tuple[Tensor, ...]:
     """`gsplat_compat.project` in torch."""
-    covariances = gsplat_compat.torch_quat_scale_to_covar_preci(quats, scales, True, False)[0]
+    covariances = _quat_scale_to_covar_preci(quats, scales, True, False)[0]
     return _fully_fused_projection(
         means,
         covariances,  # type: ignore[arg-type]
@@ -46,27 +44,19 @@ def project(
 
 
 def composite(
-    means2d: Tensor,  # [C, N, 2]
-    conics: Tensor,  # [C, N, 3]
-    colors: Tensor,  # [C, N, 3]
-    opacities: Tensor,  # [C, N]
+    means2d: Tensor,
+    conics: Tensor,
+    colors: Tensor,
+    opacities: Tensor,
     width: int,
     height: int,
-    starts: Tensor,  # [C, tile rows, tile columns]
-    ids: Tensor,  # [number of pairs]
+    starts: Tensor,
+    ids: Tensor,
     absgrad: bool,
 ) -> tuple[Tensor, Tensor]:
-    """`compositing.rasterize_to_pixels` in torch: a list ends where the next begins, and the last at the end."""
-    views, size = len(starts), TILE_SIZE
-    rows, columns = -(-height // size), -(-width // size)
-    ends = torch.cat([starts.flatten()[1:], torch.tensor([len(ids)])]).view_as(starts)
-    starts, ends = (places[:, :rows].flatten().long() for places in (starts, ends))
-    row, column = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
-    origins = (torch.stack([column, row], dim=-1) * size).reshape(-1, 2).repeat(views, 1)
-    tiles = backend_torch._Tiles(size, origins, starts, ends - starts, ids.long())
-    canvas: Any = backend_torch._Composite.apply(means2d, conics, colors, opacities, tiles, absgrad)
-    image = canvas.reshape(views, rows, columns, size, size, 4).transpose(2, 3).reshape(views, rows * size, -1, 4)
-    return image[:, :height, :width, :3], image[:, :height, :width, 3:]
+    """`compositing.rasterize_to_pixels` in torch."""
+    splats = means2d, conics, colors, opacities, width, height
+    return rasterize_to_pixels(*splats, TILE_SIZE, starts, ids, absgrad)
 
 
 def use_our_rasterizer(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from gsplat_like import rasterization
 from torch import Tensor
 
 from sadgs_ns.kernels import triton_switched
-from sadgs_ns.render.rasterization import rasterize, visible
+from sadgs_ns.render.rasterization import visible
 
 _PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
 
@@ -61,7 +62,7 @@ def render_with_gradients(scene: dict[str, Tensor], device: str, dtype: torch.dt
         arguments[name].requires_grad_()
     height, width = weights.shape[1:3]
     with triton_switched(False):
-        colors, alphas, info = rasterize(**arguments, width=width, height=height, sh_degree=3, absgrad=True)
+        colors, alphas, info = rasterization(**arguments, width=width, height=height, sh_degree=3, absgrad=True)
     (weights * colors.square()).mean().backward()
     results = {"colour": colors, "alpha": alphas, "means2d": info["means2d"], "conics": info["conics"]}
     results |= {f"gradient of {name}": arguments[name].grad for name in _PARAMETERS}

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from gsplat_like import splatted
 from torch import Tensor
 
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.render.backend_torch import rasterization
 
 WIDTH, HEIGHT, VIEWS, POINTS = 48, 36, 10, 300
 """Of the drawn scene that the fixture `scene` is."""
@@ -67,7 +67,7 @@ def centres_of(viewmats: Tensor) -> Tensor:
 
 def splat(params: dict[str, torch.nn.Parameter], viewmats: Tensor, Ks: Tensor, width: int, height: int, **options: Any):
     """The splatter's colours [C, H, W, 3], alphas [C, H, W, 1] and info of `random_params`' parameters."""
-    return rasterization(
+    return splatted(
         params["means"],
         params["quats"],
         params["scales"].exp(),

@@ -8,6 +8,8 @@ import torch
 from scenes import random_params
 from torch import Tensor
 
+from sadgs_ns.render.types import Cameras, Gaussians
+
 WIDTH, HEIGHT, GAUSSIANS = 64, 75, 200
 
 
@@ -34,11 +36,12 @@ def inputs(part: slice = slice(None)) -> dict[str, Tensor]:
     return {name: value[part].clone().requires_grad_() for name, value in values.items()}
 
 
-def splats(leaves: dict[str, Tensor], views: int) -> tuple[Any, ...]:
-    """The arguments of `rasterize` that need no name, with cameras on the Gaussians' device."""
-    *others, colors = leaves.values()
-    placed = (value.to(colors.device) for value in cameras(views))
-    return *others, (colors[:, 0], colors[:, 1:]), *placed, WIDTH, HEIGHT
+def splats(leaves: dict[str, Tensor], views: int) -> tuple[Gaussians, Cameras]:
+    """What `rasterize` takes, with cameras on the Gaussians' device."""
+    colors = leaves["colors"]
+    viewmats, Ks = (value.to(colors.device) for value in cameras(views))
+    halves: dict[str, Any] = {**leaves, "colors": (colors[:, 0], colors[:, 1:])}
+    return Gaussians(**halves), Cameras(viewmats, Ks, WIDTH, HEIGHT)
 
 
 def weights(views: int) -> Tensor:

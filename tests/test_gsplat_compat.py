@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import ast
-import importlib.util
 import inspect
+import sys
 from collections.abc import Callable
-from pathlib import Path
-from types import FunctionType
+from types import SimpleNamespace
 from typing import Any
 
 import gsplat
@@ -17,6 +15,7 @@ import torch
 from gsplat.cuda import _torch_impl
 
 from sadgs_ns import gsplat_compat
+from sadgs_ns.render import ewa
 
 EXPECTED = {
     # function: its first parameters, which are given by their places; then those with defaults that are relied on
@@ -30,12 +29,9 @@ EXPECTED = {
         "means2d conics colors opacities image_width image_height tile_size isect_offsets flatten_ids",
         {"backgrounds": None, "masks": None, "packed": False, "absgrad": False},
     ),
-    gsplat_compat.torch_quat_scale_to_covar_preci: (
-        "quats scales compute_covar compute_preci", {"compute_covar": True, "compute_preci": True, "triu": False}
+    gsplat.isect_tiles: (
+        "means2d radii depths tile_size tile_width tile_height", {"sort": True, "packed": False}
     ),
-    gsplat_compat.torch_world_to_cam: ("means covars viewmats", {}),
-    gsplat_compat.torch_persp_proj: ("means covars Ks width height", {}),
-    gsplat_compat.update_param_with_optimizer: ("param_fn optimizer_fn params optimizers", {"names": None}),
 }  # fmt: skip
 N = 5
 
@@ -86,10 +82,10 @@ def test_signatures(function: Callable[..., Any]):
     assert leading.startswith(" ".join(required)), "a parameter without a default is new"
 
 
-def test_harmonics_in_torch_take_three_arguments_by_their_places():
-    parameters = inspect.signature(gsplat_compat.torch_spherical_harmonics).parameters.values()
-    assert len(parameters) == 3
-    assert all(parameter.kind is inspect.Parameter.POSITIONAL_OR_KEYWORD for parameter in parameters)
+def test_the_starts_of_tile_lists_take_four_arguments_by_their_places():
+    """The second has another name in 1.5, n_images."""
+    parameters = list(inspect.signature(gsplat.isect_offset_encode).parameters)
+    assert len(parameters) == 4 and parameters[0] == "isect_ids" and parameters[2:] == ["tile_width", "tile_height"]
 
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
@@ -112,21 +108,10 @@ def test_the_projection_gets_what_gsplats_rasterization_gives_it(monkeypatch: py
     assert all(found[name] is expected[name] or found[name] == expected[name] for name in found)
 
 
-def test_two_kernels_get_their_arguments_in_their_places(monkeypatch: pytest.MonkeyPatch):
-    values = [object() for _ in range(10)]
-    for name, count in (("spherical_harmonics", 4), ("rasterize_to_pixels", 10)):
-        signature = inspect.signature(getattr(gsplat, name))
-        monkeypatch.setattr(gsplat, name, lambda *args, s=signature, **options: s.bind(*args, **options).arguments)
-        found = getattr(gsplat_compat, name)(*values[:count])
-        last = "masks" if count == 4 else "absgrad"
-        assert list(found.values()) == values[:count] and list(found)[-1] == last
-
-
 def test_radii_of_the_installed_gsplat_have_the_layout_that_is_stated():
     viewmats, Ks = cameras()
     scene = gaussians()
-    covars, precis = gsplat_compat.torch_quat_scale_to_covar_preci(scene["quats"], scene["scales"], compute_preci=False)
-    assert covars is not None and covars.shape == (N, 3, 3) and precis is None
+    covars = ewa.covariances(scene["quats"], scene["scales"])
     radii, means2d, *_ = _torch_impl._fully_fused_projection(scene["means"], covars, viewmats, Ks, 40, 30)
     assert radii.dtype == torch.int32
     assert radii.shape == ((2, N, 2) if gsplat_compat.RADII_PER_AXIS else (2, N))
@@ -134,60 +119,36 @@ def test_radii_of_the_installed_gsplat_have_the_layout_that_is_stated():
     assert gsplat_compat.drawn(radii, means2d).tolist() == [[True] * N] * 2
 
 
-def test_the_functions_in_torch_return_the_shapes_that_are_stated():
-    viewmats, Ks = cameras()
-    scene = {name: value.double() for name, value in gaussians().items()}
-    covars, _ = gsplat_compat.torch_quat_scale_to_covar_preci(scene["quats"], scene["scales"], compute_preci=False)
-    assert covars is not None
-    means_c, covars_c = gsplat_compat.torch_world_to_cam(scene["means"], covars, viewmats.double())
-    means2d, covars2d = gsplat_compat.torch_persp_proj(means_c, covars_c, Ks.double(), 40, 30)
-    shapes = [tuple(value.shape) for value in (means_c, covars_c, means2d, covars2d)]
-    assert shapes == [(2, N, 3), (2, N, 3, 3), (2, N, 2), (2, N, 2, 2)]
-    colors = gsplat_compat.torch_spherical_harmonics(1, means_c, torch.ones(2, N, 4, 3, dtype=torch.float64))
-    assert colors.shape == (2, N, 3) and colors.dtype == torch.float64
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_projection_and_harmonics_in_torch_are_gsplats_bit_by_bit(dtype: torch.dtype):
+    generator = torch.Generator().manual_seed(0)
+    means, quats, scales, coefficients, directions = (
+        torch.randn(shape, generator=generator, dtype=dtype)
+        for shape in ((200, 3), (200, 4), (200, 3), (2, 200, 16, 3), (2, 200, 3))
+    )
+    viewmats, Ks = (value.to(dtype) for value in cameras())
+    viewmats[1, :3, 3] = torch.tensor([0.3, -0.2, 4.0])
+    covars, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
+    assert covars is not None and torch.equal(ewa.covariances(quats, scales), covars)
+    seen = _torch_impl._world_to_cam(means, covars, viewmats)
+    found = ewa.world_to_camera(means, covars, viewmats)
+    assert torch.equal(found[0], seen[0]) and torch.equal(found[1], seen[1])
+    projected, expected = (f(*seen, Ks, 40, 30) for f in (ewa.perspective, _torch_impl._persp_proj))
+    assert torch.equal(projected[0], expected[0]) and torch.equal(projected[1], expected[1])
+    for degree in range(4):
+        gradients = []
+        for function in (ewa.spherical_harmonics, _torch_impl._spherical_harmonics):
+            leaves = directions.clone().requires_grad_(), coefficients.clone().requires_grad_()
+            value = function(degree, *leaves)
+            value.square().sum().backward()
+            gradients.append([value, *(leaf.grad for leaf in leaves if leaf.grad is not None)])
+        assert all(torch.equal(one, other) for one, other in zip(*gradients, strict=True)), degree
+        assert len(gradients[0]) == (3 if degree else 2), "colours of degree 0 depend on no direction"
 
 
-def test_gsplats_rasterization_finds_the_projection_among_its_modules_names():
-    function = gsplat.rendering.rasterization
-    assert isinstance(function, FunctionType) and function.__closure__ is None
-    assert function.__globals__["fully_fused_projection"] is gsplat.fully_fused_projection
-    assert "fully_fused_projection" in function.__code__.co_names
-
-
-def test_width_and_height_are_the_seventh_and_eighth_that_the_projection_gets(monkeypatch: pytest.MonkeyPatch):
-    sizes = []
-
-    def project(*args: Any, **options: Any) -> tuple[Any, ...]:
-        return torch.ones(2, N), torch.ones(2, N, 2), None, None, None
-
-    def change(radii: torch.Tensor, means2d: torch.Tensor, width: int, height: int) -> torch.Tensor:
-        sizes.append((width, height))
-        raise _Called
-
-    monkeypatch.setattr(gsplat.rendering, "fully_fused_projection", project)
-    rasterization = gsplat_compat.with_changed_radii(gsplat.rendering.rasterization, change)
-    with pytest.raises(_Called):
-        rasterization(*gaussians().values(), torch.ones(N, 3), *cameras(), 40, 30, packed=False)
-    assert sizes == [(40, 30)]
-
-
-def test_an_optimizer_whose_moments_were_being_changed_has_no_state():
-    def fail(key: str, moment: torch.Tensor) -> torch.Tensor:
-        raise MemoryError
-
-    params = {"means": torch.nn.Parameter(torch.zeros(N, 3))}
-    optimizers: dict[str, torch.optim.Optimizer] = {"means": torch.optim.Adam(params.values())}
-    params["means"].sum().backward()
-    optimizers["means"].step()
-    assert optimizers["means"].state
-    with pytest.raises(MemoryError):
-        gsplat_compat.update_param_with_optimizer(lambda name, p: p, fail, params, optimizers)
-    assert not optimizers["means"].state
-
-
-def test_the_module_of_the_cuda_extension_has_it():
-    """The module is not imported: without a GPU it may begin to compile."""
-    spec = importlib.util.find_spec("gsplat.cuda._backend")
-    assert spec is not None and spec.origin is not None
-    body = ast.parse(Path(spec.origin).read_text("utf8")).body
-    assert any(isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "_C" for node in body)
+def test_a_gsplat_without_its_kernels_is_told(monkeypatch: pytest.MonkeyPatch):
+    ones = torch.ones
+    monkeypatch.setattr(torch, "ones", lambda shape, device: ones(shape))
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", SimpleNamespace(_C=None))
+    with pytest.raises(RuntimeError, match=r"^neither prebuilt nor compiled$"):
+        gsplat_compat.try_kernels()

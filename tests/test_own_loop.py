@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import gsplat
+import gsplat_like
 import pytest
 import torch
 from scenes import adam, camera, random_params
 
 from sadgs_ns.method import strategy as strategy_module
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.render.rasterization import rasterize
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "strategy.md"
 WIDTH, HEIGHT, VIEWS, START = 64, 48, 3, 60
@@ -50,7 +50,7 @@ def test_the_loop_of_the_document_runs_and_splits(monkeypatch: pytest.MonkeyPatc
         calls += 1
         signature.bind(*args, packed=packed, **options)  # gsplat's takes these arguments
         assert not packed
-        return rasterize(*args, **options)
+        return gsplat_like.rasterization(*args, **options)
 
     monkeypatch.setattr(gsplat, "rasterization", rasterization)
     monkeypatch.setattr(strategy_module, "StructureAwareStrategy", Short)

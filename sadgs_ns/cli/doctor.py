@@ -108,13 +108,12 @@ def _check_cuda() -> Iterator[Finding]:
     try:
         from sadgs_ns import gsplat_compat
 
-        problem = None if gsplat_compat.cuda_extension() is not None else "neither prebuilt nor compiled"
+        gsplat_compat.try_kernels()
     except Exception as error:  # Its compilation fails in many ways.
-        problem = reason(error)
-    remedy = "install its wheel for this torch, or the CUDA toolkit"
-    yield (
-        fault(f"gsplat has no CUDA kernels ({problem}): {remedy}.") if problem else note("gsplat has its CUDA kernels.")
-    )
+        remedy = "install its wheel for this torch, or the CUDA toolkit"
+        yield fault(f"gsplat has no CUDA kernels ({reason(error)}): {remedy}.")
+    else:
+        yield note("gsplat has its CUDA kernels.")
 
 
 def check_all(data: Path | None) -> Iterator[Finding]:

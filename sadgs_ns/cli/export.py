@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # torch takes seconds, which `--help` and a wrong path need n
 
     from sadgs_ns.data.run_cameras import RunCameras
     from sadgs_ns.method.cleaning import Cleaning
+    from sadgs_ns.render.types import RenderOptions
 
 Box = tuple[float, float, float, float, float, float]
 """Lowest x, y and z, and highest."""
@@ -134,7 +135,7 @@ def export(options: Export) -> int:
     if is_mesh and cameras is not None:
         from sadgs_ns.cli.meshing import write_mesh
 
-        return write_mesh(options.output, params, cameras, similarity, options.voxel_size, **drawing)
+        return write_mesh(options.output, params, cameras, similarity, options.voxel_size, drawing)
     if is_page and cameras is not None:
         pose, focal = cameras.camera_to_worlds[0].double().numpy(), float(cameras.Ks[0, 0, 0])
         start = html.start_at(pose, max(cameras.sizes[0]), focal, params["means"].numpy())
@@ -153,7 +154,7 @@ def _check(options: Export) -> None:
 
 
 def _cleaned(
-    params: dict[str, Tensor], cleaning: Cleaning, cameras: RunCameras | None, drawing: Mapping[str, float]
+    params: dict[str, Tensor], cleaning: Cleaning, cameras: RunCameras | None, drawing: RenderOptions
 ) -> dict[str, Tensor]:
     """Return the parameters of the Gaussians that stay, and print how many each option takes away."""
     import torch
@@ -172,7 +173,7 @@ def _cleaned(
         views = [(viewmat, K, *size) for viewmat, K, size in zip(viewmats, Ks, cameras.sizes, strict=True)]
         console = Console(stderr=True)
         shown = track(views, "Looking from the training views", console=console, disable=not console.is_terminal)
-        seen = see(shapes, shown, **drawing)
+        seen = see(shapes, shown, drawing)
     stays, sentences = find(shapes, cleaning, seen)
     print("\n".join(sentences))
     if not stays.any():
@@ -193,17 +194,18 @@ def _checkpoint_of(run: Path) -> Path:
     return max(found, key=lambda path: int(path.stem[5:]))
 
 
-def read_checkpoint(run: Path) -> tuple[Path, dict[str, Tensor], dict[str, float]]:
+def read_checkpoint(run: Path) -> tuple[Path, dict[str, Tensor], RenderOptions]:
     """Read a run's checkpoint, its parameters as `of_parameters` takes them, and the options with which it drew them.
 
-    These are `near_plane` and `max_off_axis`, as for `rasterize`. The tensors are mapped from the file, so that they
-    take no memory before they are read. Raise InputError if there is no checkpoint of this method or of splatfacto.
+    The tensors are mapped from the file, so that they take no memory before they are read. Raise InputError if there is
+    no checkpoint of this method or of splatfacto.
     """
     # These import torch, which takes seconds, and `--help` and a wrong path need not wait for it.
     from torch import Tensor
 
     from sadgs_ns.gsplat_compat import NEAR_PLANE
     from sadgs_ns.plugin import checkpoints
+    from sadgs_ns.render.types import RenderOptions
 
     checkpoint = _checkpoint_of(run)
     folder, single = (None, checkpoint) if checkpoint == run else (checkpoint.parent, None)
@@ -219,8 +221,8 @@ def read_checkpoint(run: Path) -> tuple[Path, dict[str, Tensor], dict[str, float
         params[name] = value
     state = loaded.get("_extra_state")
     plan = state.get("plan", {}) if isinstance(state, dict) else {}
-    drawing = {"near_plane": NEAR_PLANE, "max_off_axis": _MAX_OFF_AXIS}
-    return checkpoint, params, {name: plan.get(name, value) for name, value in drawing.items()}
+    options = {"near_plane": NEAR_PLANE, "max_off_axis": _MAX_OFF_AXIS}
+    return checkpoint, params, RenderOptions(**{name: plan.get(name, value) for name, value in options.items()})
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -27,6 +27,7 @@ from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.plugin.structure_cache import observe_training_views
 from sadgs_ns.plugin.trainer import SadgsTrainerConfig
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
+from sadgs_ns.render.types import Cameras as Pinholes
 
 Split = Literal["train", "eval"]
 SEED = 0
@@ -133,7 +134,8 @@ def screen_gradients(pipeline: SadgsPipeline, progress: Callable[[range], Iterab
         height, width = data["image"].shape[:2]
         viewmats, Ks = pipeline.views.stacked_cameras([index])
         with torch.enable_grad():
-            render, alpha, info = model.render(viewmats.detach(), Ks, width, height, "RGB", absgrad=True)
+            cameras = Pinholes(viewmats.detach(), Ks, width, height)
+            render, alpha, info = model.render(cameras, model.color_options(absgrad=True))
             keep_gradient(info["means2d"])
             outputs = {"rgb": render[..., :3] + (1 - alpha) * model.background, "background": model.background}
             batch = {name: data[name][None].to(pipeline.device) for name in ("image", "mask") if name in data}
@@ -187,9 +189,9 @@ def view_panels(pipeline: SadgsPipeline, view: View, statistics: dict[str, Tenso
     split, added = int((counts > 1).any(dim=1).sum()), int((num_children(counts) - 1).sum())
     of_all = f"of {model.num_points:,} Gaussians"
     period = texture.texture_period(view.structure_tensor, constant)
-    eta = gaussian_maps.eta_map(params, statistics, *view.camera, **options)
-    children = gaussian_maps.children_map(params, counts, *view.camera, **options)
-    low = gaussian_maps.share_map(params, is_low, *view.camera, **options)
+    eta = gaussian_maps.eta_map(params, statistics, *view.camera, options)
+    children = gaussian_maps.children_map(params, counts, *view.camera, options)
+    low = gaussian_maps.share_map(params, is_low, *view.camera, options)
     panels = {
         name: Panel(f"{view.name}: {title}", scale(values), scale)
         for name, title, scale, values in (
@@ -215,7 +217,7 @@ def step_panels(
     camera = (viewmat, K * K.new_tensor([[enlarge], [enlarge], [1.0]]), enlarge * width, enlarge * height)
 
     def panel(title: str, params: Any, its_colors: Tensor) -> Panel:
-        render, _ = gaussian_maps.blend(params, its_colors, *camera, **model.drawing)
+        render, _ = gaussian_maps.blend(params, its_colors, *camera, model.drawing)
         return Panel(f"{title}: {len(params['means']):,} Gaussians", to_picture(render))
 
     return [

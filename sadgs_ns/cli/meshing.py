@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from sadgs_ns.formats import mesh
 from sadgs_ns.formats.gaussians import DEGREE_0
 from sadgs_ns.formats.mesh import DepthView, Fusion
 from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world
+from sadgs_ns.render.types import DEFAULTS, Cameras, Gaussians, RenderOptions
 
 MIN_ALPHA = 0.5
 """Pixels with less accumulated opacity show no surface."""
@@ -33,7 +34,7 @@ def write_mesh(
     cameras: RunCameras,
     similarity: Similarity | None = None,
     voxel_size: float | None = None,
-    **drawing: float,
+    drawing: RenderOptions = DEFAULTS,
 ) -> int:
     """Fuse what the training views see into a mesh, write it as `atomic_path` does, and return its number of triangles.
 
@@ -42,7 +43,7 @@ def write_mesh(
         cameras: The training views, in the parameters' frame.
         similarity: From the parameters' frame to the file's; None leaves the mesh as it is.
         voxel_size: Edge of a voxel in the parameters' frame; None derives it from the median depth.
-        drawing: `max_off_axis` and `near_plane`, as for `rasterize`.
+        drawing: How Gaussians are drawn.
 
     Raises:
         InputError: If no view shows a surface, voxels do not fit in memory, or open3d cannot be imported.
@@ -56,10 +57,10 @@ def write_mesh(
     params = {name: value[sound].to(device) for name, value in params.items()}
     if voxel_size is None:
         step = -(-number // _SAMPLED)
-        voxel_size = derive_voxel_size(list(render_depths(params, cameras, range(0, number, step), **drawing)))
+        voxel_size = derive_voxel_size(list(render_depths(params, cameras, range(0, number, step), drawing)))
     fusion = Fusion(voxel_size)
     console = Console(stderr=True)
-    views = render_depths(params, cameras, range(number), **drawing)
+    views = render_depths(params, cameras, range(number), drawing)
     for view in track(views, "Fusing depth", number, console=console, disable=not console.is_terminal):
         fusion.add(view)
     found = fusion.mesh()
@@ -87,20 +88,24 @@ def derive_voxel_size(views: Sequence[DepthView]) -> float:
 
 @torch.no_grad()
 def render_depths(
-    params: Mapping[str, Tensor], cameras: RunCameras, indices: Sequence[int], **drawing: Any
+    params: Mapping[str, Tensor],
+    cameras: RunCameras,
+    indices: Sequence[int],
+    drawing: RenderOptions = DEFAULTS,
 ) -> Iterator[DepthView]:
     """Render colours and expected depth in some of the views; the parameters are finite, on the device that renders."""
     device = params["means"].device
     viewmats, Ks = viewmats_from_camera_to_world(cameras.camera_to_worlds), cameras.Ks
-    quats, scales, opacities = params["quats"], params["scales"].exp(), params["opacities"].flatten().sigmoid()
+    scales, opacities = params["scales"].exp(), params["opacities"].flatten().sigmoid()
     first, rest = params["features_dc"], params["features_rest"]
     degree = round((1 + rest.shape[1]) ** 0.5) - 1
     colors = (first, rest) if degree else (0.5 + DEGREE_0 * first).clamp_min(0.0)
+    gaussians = Gaussians(params["means"], params["quats"], scales, opacities, colors)
+    options = replace(drawing, sh_degree=degree or None, expected_depth=True)
     for index in indices:
         width, height = cameras.sizes[index]
-        camera = viewmats[index : index + 1].to(device), Ks[index : index + 1].to(device), width, height
-        options = {"sh_degree": degree or None, "render_mode": "RGB+ED", **drawing}
-        render, alpha, _ = rasterize(params["means"], quats, scales, opacities, colors, *camera, **options)
+        camera = Cameras(viewmats[index : index + 1].to(device), Ks[index : index + 1].to(device), width, height)
+        render, alpha, _ = rasterize(gaussians, camera, options)
         seen = alpha >= MIN_ALPHA  # [1, H, W, 1]
         own = (render[..., :3] / alpha.clamp_min(MIN_ALPHA)).clamp(0, 1)  # The background, black, is taken away.
         depth = torch.where(seen, render[..., 3:], 0.0)

@@ -14,7 +14,7 @@ from sadgs_ns.distributed.bands import Band
 from sadgs_ns.distributed.world import World
 from sadgs_ns.gsplat_compat import drawn
 from sadgs_ns.kernels import use_triton
-from sadgs_ns.render.projected import Projected
+from sadgs_ns.render.types import Projected
 
 _GRADIENTS = (2, 3, 1, 3, 2, 1)
 """Widths of the columns in our compositing's rows of gradients: centre, conic, opacity, colour, the centre's absolute
@@ -77,8 +77,11 @@ class Exchange:
         """
         if absgrad:
             projected.means2d.grad2d = None  # type: ignore[attr-defined] # `keep_gradient` looks for it.
-        anchor, *flat = _Exchanged.apply(self, absgrad, *projected)  # type: ignore[misc]
-        received = [Projected(*flat[i : i + 6]) for i in range(0, len(flat), 6)]
+        anchor, *flat = _Exchanged.apply(self, absgrad, *projected[:6])  # type: ignore[misc]
+        received = [
+            Projected(*flat[6 * i : 6 * i + 6], width=projected.width, height=band.bottom - band.top)
+            for i, band in enumerate(self.bands)
+        ]
         if absgrad and torch.is_grad_enabled():
             # These hold the graph, which holds this object, until `backward` releases them.
             self.absolute = [part.means2d for part in received]
@@ -123,14 +126,13 @@ class _Exchanged(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         ctx.exchange, ctx.absgrad, ctx.shape = exchange, absgrad, opacities.shape
         ctx.save_for_backward(means2d)
-        projected = Projected(radii, means2d, depths, conics, opacities, colors)
         ctx.num_colors = colors.shape[-1]
-        rows, outputs = _rows_of(projected, exchange), []
+        rows, outputs = _rows_of((radii, means2d, depths, conics, opacities, colors), exchange), []
         for band, received in zip(exchange.bands, exchange.forth(rows), strict=True):
             if not len(received):
                 received = received.new_zeros((1, received.shape[1]))  # A Gaussian whose radius is 0 is not drawn.
             part = _splats_of(received, ctx.num_colors, band.top, exchange)
-            ctx.mark_non_differentiable(part.radii)
+            ctx.mark_non_differentiable(part[0])
             outputs += part
         return means2d.new_zeros(()), *outputs
 
@@ -160,10 +162,10 @@ class _Exchanged(torch.autograd.Function):
         return None, None, None, v_means2d, None, v_conics, v_opacities[..., 0], v_colors
 
 
-def pack(projected: Projected, places: Tensor) -> Tensor:
+def pack(projected: Sequence[Tensor], places: Tensor) -> Tensor:
     """Return rows of centre, conic, opacity, colour, depth and radius of the Gaussians at some places in V · N.
 
-    int64 [M] → [M, 7 + D + 1 or 2]
+    `projected` are the six tensors of `Projected`. int64 [M] → [M, 7 + D + 1 or 2]
     """
     radii, means2d, depths, conics, opacities, colors = projected
     size = opacities.numel()
@@ -171,8 +173,9 @@ def pack(projected: Projected, places: Tensor) -> Tensor:
     return _beside([*taken[:-1], taken[-1].to(means2d.dtype)])
 
 
-def unpack(rows: Tensor, num_colors: int, top: int) -> Projected:
-    """Return the Gaussians of one view from rows of `pack` with D colours; centres are counted from row `top`."""
+def unpack(rows: Tensor, num_colors: int, top: int) -> tuple[Tensor, ...]:
+    """Return the six tensors of `Projected` of one view from rows of `pack` with D colours; centres are counted from
+    row `top`."""
     per_gaussian = rows.shape[1] - 7 - num_colors
     means2d, conics, opacities, colors, depths, radii = (
         column.clone(memory_format=torch.contiguous_format)
@@ -180,12 +183,12 @@ def unpack(rows: Tensor, num_colors: int, top: int) -> Projected:
     )
     means2d[..., 1] -= top
     radii = radii.int() if per_gaussian == 2 else radii[..., 0].int()
-    return Projected(radii, means2d, depths[..., 0], conics, opacities[..., 0], colors)
+    return radii, means2d, depths[..., 0], conics, opacities[..., 0], colors
 
 
-def _rows_of(projected: Projected, exchange: Exchange) -> Tensor:
+def _rows_of(projected: Sequence[Tensor], exchange: Exchange) -> Tensor:
     """Call `pack`, or its kernel."""
-    projected = Projected(*(value.detach() for value in projected))
+    projected = [value.detach() for value in projected]
     if not exchange.fused:
         return pack(projected, exchange.places)
     from sadgs_ns.kernels.exchange import pack as pack_fused  # Triton need not be installed.
@@ -193,13 +196,13 @@ def _rows_of(projected: Projected, exchange: Exchange) -> Tensor:
     return pack_fused(*(value.contiguous() for value in projected), places=exchange.places)
 
 
-def _splats_of(rows: Tensor, num_colors: int, top: int, exchange: Exchange) -> Projected:
+def _splats_of(rows: Tensor, num_colors: int, top: int, exchange: Exchange) -> tuple[Tensor, ...]:
     """Call `unpack`, or its kernel."""
     if not exchange.fused:
         return unpack(rows, num_colors, top)
     from sadgs_ns.kernels.exchange import unpack as unpack_fused
 
-    return Projected(*unpack_fused(rows.contiguous(), top))
+    return unpack_fused(rows.contiguous(), top)
 
 
 def _gradient_rows(columns: Sequence[Tensor | None], widths: Sequence[int], number: int, like: Tensor) -> Tensor:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
 from sadgs_ns.distributed.bands import Band, share_out
 from sadgs_ns.distributed.exchange import Exchange
 from sadgs_ns.distributed.world import World
-from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.render.rasterization import composite, project
+from sadgs_ns.render.types import DEFAULTS, Cameras, Gaussians, RenderOptions
 
 
 class RenderedBand(NamedTuple):
@@ -25,63 +26,31 @@ class RenderedBand(NamedTuple):
 
 
 def rasterize(
-    world: World,
-    means: Tensor,  # [N, 3]
-    quats: Tensor,  # [N, 4]
-    scales: Tensor,  # [N, 3]
-    opacities: Tensor,  # [N]
-    colors: Tensor | tuple[Tensor, Tensor],  # [(V,) N, D], [(V,) N, K, 3] or [N, 3] and [N, K - 1, 3]
-    viewmats: Tensor,  # [V, 4, 4]
-    Ks: Tensor,  # [V, 3, 3]
-    width: int,
-    height: int,
-    *,
-    sh_degree: int | None = None,
-    absgrad: bool = False,
-    rasterize_mode: Literal["classic", "antialiased"] = "classic",
-    max_off_axis: float = 0.0,
-    near_plane: float = NEAR_PLANE,
+    world: World, gaussians: Gaussians, cameras: Cameras, options: RenderOptions = DEFAULTS
 ) -> tuple[list[RenderedBand], Tensor, dict[str, Any]]:
-    """Render the Gaussians of all processes into V pinhole cameras, of which each process composites its share.
+    """Render the Gaussians of all processes into V cameras, of which each process composites its share.
 
     Every process must call this, and `backward` of something to which the anchor was added, in the same order. Raises
     InputError as `render.rasterization.rasterize`.
 
     Args:
         world: The processes, whose `sizes` are right.
-        means, quats, scales, opacities, colors: The Gaussians of this process, as for `render.rasterization.rasterize`.
-        viewmats, Ks, width, height: The same cameras in all processes; `viewmats` gets no gradient.
-        sh_degree, absgrad, rasterize_mode, max_off_axis, near_plane: As for `render.rasterization.rasterize`,
-            the same in all processes.
+        gaussians: Those of this process.
+        cameras: The same in all processes; `viewmats` gets no gradient.
+        options: The same in all processes. The exact lengths of tile lists are waited for.
 
     Returns:
         The bands of this process; the anchor, a zero that must be added to the loss; and gsplat's `info` of this
         process's Gaussians in all views, whose `means2d` has `absgrad` and `grad2d` after `backward` where `absgrad`
         was asked for. In `info`, `num_pairs` and `num_pixels` are those of what this process composited.
     """
-    projected = project(
-        means, quats, scales, opacities, colors, viewmats, Ks, width, height,
-        sh_degree=sh_degree, rasterize_mode=rasterize_mode, max_off_axis=max_off_axis, near_plane=near_plane,
-    )  # fmt: skip
-    exchange = Exchange(world, projected, share_out(len(viewmats), height, world.num_ranks))
-    anchor, received = exchange.send(projected, absgrad)
+    options = replace(options, tile_capacity=None)
+    projected = project(gaussians, cameras, options, begin_tiles=False)
+    exchange = Exchange(world, projected, share_out(len(cameras.viewmats), cameras.height, world.num_ranks))
+    anchor, received = exchange.send(projected, options.absgrad)
     rendered, num_pairs, num_pixels = [], 0, 0
     for band, splats in zip(exchange.bands, received, strict=True):
-        rows = band.bottom - band.top
-        renders, alphas, info = composite(splats, width, rows, absgrad=absgrad)
+        renders, alphas, info = composite(splats, options)
         rendered.append(RenderedBand(band, renders, alphas))
-        num_pairs, num_pixels = num_pairs + len(info["flatten_ids"]), num_pixels + rows * width
-    radii, means2d, depths, conics, opacities, _ = projected
-    info = {
-        "radii": radii,
-        "means2d": means2d,
-        "depths": depths,
-        "conics": conics,
-        "opacities": opacities,
-        "width": width,
-        "height": height,
-        "n_cameras": len(viewmats),
-        "num_pairs": num_pairs,
-        "num_pixels": num_pixels,
-    }
-    return rendered, anchor, info
+        num_pairs, num_pixels = num_pairs + len(info["flatten_ids"]), num_pixels + splats.height * splats.width
+    return rendered, anchor, projected.info() | {"num_pairs": num_pairs, "num_pixels": num_pixels}

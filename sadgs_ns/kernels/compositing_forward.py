@@ -110,7 +110,7 @@ def composite_forward(
     isect_offsets: Tensor,  # int32 [C, tile rows, tile columns]
     flatten_ids: Tensor,  # int32 [number of pairs]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute `gsplat_compat.composite` for three channels in tiles of TILE_SIZE.
+    """Compute gsplat's `rasterize_to_pixels` for three channels in tiles of TILE_SIZE.
 
     All tensors must be contiguous. `isect_offsets` tells where each tile's list starts; lists of tiles below the image
     are passed over. `flatten_ids` are the lists: indices in C·N, from front to back. A colour that is not finite makes

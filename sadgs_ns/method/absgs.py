@@ -12,7 +12,8 @@ from gsplat.strategy.ops import duplicate, split
 from torch import Tensor
 
 from sadgs_ns.kernels import use_triton
-from sadgs_ns.method.split import Params, grid_split, limit_growth
+from sadgs_ns.method.ops import Params
+from sadgs_ns.method.split import grid_split, limit_growth
 from sadgs_ns.render.rasterization import visible
 
 _OTHER_AXES = 0.8

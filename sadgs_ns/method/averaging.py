@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sadgs_ns.method.split import Params
+from sadgs_ns.method.ops import Params
 
 
 class RunningMean:

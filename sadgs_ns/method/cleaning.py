@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from sadgs_ns.errors import InputError
 from sadgs_ns.render.rasterization import rasterize
+from sadgs_ns.render.types import DEFAULTS, Cameras, Gaussians, RenderOptions
 
 Box = tuple[float, float, float, float, float, float]
 """Lowest x, y and z, then highest x, y and z."""
@@ -73,14 +73,14 @@ class Seen:
 def see(
     params: Mapping[str, Tensor],
     cameras: Iterable[tuple[Tensor, Tensor, int, int]],
-    **drawing: Any,
+    drawing: RenderOptions = DEFAULTS,
 ) -> Seen:
     """Measure how many pixels Gaussians make up in training views: opacity × area, less what is hidden by others.
 
     Args:
         params: `means` [N, 3], `quats` [N, 4], log `scales` [N, 3], logit `opacities` [N] or [N, 1].
         cameras: World-to-camera matrix [4, 4], intrinsics in px [3, 3], width and height in px of each view.
-        drawing: Further options of `rasterize`.
+        drawing: How Gaussians are drawn, of whatever colour.
     """
     shapes = [params[name].detach() for name in ("means", "quats", "scales")]
     opacities = params["opacities"].detach().flatten().sigmoid()
@@ -93,9 +93,8 @@ def see(
         with torch.enable_grad():
             # An image is a sum of colours times weights, so its derivative by a colour is the weight.
             colors = torch.ones_like(means, requires_grad=True)
-            image, _, _ = rasterize(
-                means, quats, scales, opacities, colors, viewmat[None], K[None], width, height, **drawing
-            )
+            gaussians = Gaussians(means, quats, scales, opacities, colors)
+            image, _, _ = rasterize(gaussians, Cameras(viewmat[None], K[None], width, height), drawing)
             (weights,) = torch.autograd.grad(image.sum(), colors)
         views += weights[:, 0] >= _SEEN
         pixels = torch.maximum(pixels, weights[:, 0])

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.method.host_memory import available_host_bytes as available_host_bytes
-from sadgs_ns.method.split import Params
+from sadgs_ns.method.ops import Params
 
 COPIES = 4
 """Tensors of a parameter's size: the parameter, its gradient and Adam's two moments. The mean over the last iterations

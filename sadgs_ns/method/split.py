@@ -11,10 +11,7 @@ import torch.nn.functional as F
 from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 
-from sadgs_ns.gsplat_compat import update_param_with_optimizer
-
-Params = MutableMapping[str, torch.nn.Parameter] | torch.nn.ParameterDict
-"""gsplat's parameters by name, each with leading dimension N."""
+from sadgs_ns.method.ops import Params, update_param_with_optimizer
 
 MAX_CHILDREN_PER_AXIS = 8
 """Bound on n_k, reached at η = 64 with the square root: no parent has more than 8³ = 512 children."""
@@ -134,7 +131,7 @@ def grid_split(
     shrink = torch.where(is_axis_split, (n / child_scale).log(), 0.0)  # [Q, 3]
     log_share = -math.log(child_scale) * is_axis_split.sum(dim=1).to(n.dtype)  # [Q]
 
-    def param_fn(name: str, p: Tensor) -> Tensor:
+    def param_fn(name: str, p: Tensor) -> torch.nn.Parameter:
         children = p[parents]
         if name == "means":
             children = children + offsets

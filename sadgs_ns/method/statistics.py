@@ -22,8 +22,8 @@ from sadgs_ns.method.eta import (
     sample_footprint,
     sample_map,
 )
+from sadgs_ns.method.ops import Params
 from sadgs_ns.method.quantization import HIGHEST_FREQUENCY, INVALID, OCTAVES
-from sadgs_ns.method.split import Params
 from sadgs_ns.render.rasterization import visible
 
 HIGH_ETA = 1.0

@@ -16,11 +16,11 @@ from torch import Tensor
 
 from sadgs_ns.distributed import ranking
 from sadgs_ns.distributed.world import World
-from sadgs_ns.gsplat_compat import update_param_with_optimizer
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow, keep_gradient
 from sadgs_ns.method.memory import StepSize, affordable_growth, free_bytes
+from sadgs_ns.method.ops import Params, update_param_with_optimizer
 from sadgs_ns.method.schedule import Windows, windows
-from sadgs_ns.method.split import Params, children_per_axis, grid_split, limit_growth, num_children
+from sadgs_ns.method.split import children_per_axis, grid_split, limit_growth, num_children
 from sadgs_ns.method.statistics import consistent, empty_statistics, observe
 
 Info = Mapping[str, Any]
@@ -344,7 +344,7 @@ class StructureAwareStrategy(Strategy):
         if not world.is_uneven():
             return
 
-        def param_fn(name: str, p: Tensor) -> Tensor:
+        def param_fn(name: str, p: Tensor) -> torch.nn.Parameter:
             return torch.nn.Parameter(world.rebalance(p.detach()), requires_grad=p.requires_grad)
 
         update_param_with_optimizer(param_fn, lambda key, v: world.rebalance(v), params, optimizers)
@@ -382,7 +382,7 @@ class StructureAwareStrategy(Strategy):
     def _map_opacities(params: Any, optimizers: Any, function: Any) -> None:
         """Change the opacities (not their logits) and forget their optimizer moments, as gsplat's reset does."""
 
-        def param_fn(name: str, p: Tensor) -> Tensor:
+        def param_fn(name: str, p: Tensor) -> torch.nn.Parameter:
             changed = torch.logit(function(torch.sigmoid(p)).clamp(1e-6, 1 - 1e-6))
             return torch.nn.Parameter(changed, requires_grad=p.requires_grad)
 

@@ -97,7 +97,7 @@ class CleaningPanel(torch.nn.Module):
         now = (model.num_points, model.step)  # While a run trains, what was seen becomes untrue.
         if cleaning.needs_views and (self._seen is None or self._seen[0] != now):
             self._say("Looking from all training views …")
-            self._seen = now, see(params, self._cameras(), **model.drawing)
+            self._seen = now, see(params, self._cameras(), model.drawing)
         stays, sentences = find(params, cleaning, None if self._seen is None else self._seen[1])
         self._stays, self._shown = stays, self.choice.value
         left = f"{int(stays.sum()):,} of {len(stays):,} Gaussians would stay."

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -24,6 +25,7 @@ from sadgs_ns.plugin.optimizers import FusedAdam, RepeatedUpdate, step_together
 from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.render.activations import activate
 from sadgs_ns.render.rasterization import rasterize
+from sadgs_ns.render.types import Cameras, Gaussians
 
 _GAUSSIANS, _SIZE = 64, 64
 """Number of Gaussians, and width and height in px, of the picture on which the kernels are tried."""
@@ -46,13 +48,14 @@ class _Stages:
         n, device = _GAUSSIANS, pipeline.device
         ramp = torch.linspace(-0.5, 0.5, n, device=device)
         self.means = torch.stack([ramp, ramp.flip(0), torch.full_like(ramp, 2.0)], dim=-1)
-        self.quats = self.means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
+        quats = self.means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
         self.scales, self.opacities = torch.full_like(self.means, 0.05), torch.full_like(ramp, 0.5)
-        self.viewmats = torch.eye(4, device=device).repeat(self.views, 1, 1)
+        self.gaussians = Gaussians(self.means, quats, self.scales, self.opacities, self.means)
+        viewmats = torch.eye(4, device=device).repeat(self.views, 1, 1)
         intrinsics = [[_SIZE, 0.0, _SIZE / 2], [0.0, _SIZE, _SIZE / 2], [0.0, 0.0, 1.0]]
-        self.Ks = self.means.new_tensor(intrinsics).repeat(self.views, 1, 1)
+        Ks = self.means.new_tensor(intrinsics).repeat(self.views, 1, 1)
         self.image = torch.linspace(0.0, 1.0, 3 * _SIZE * _SIZE, device=device).view(1, _SIZE, _SIZE, 3)
-        self.camera = self.viewmats, self.Ks, _SIZE, _SIZE
+        self.cameras = Cameras(viewmats, Ks, _SIZE, _SIZE)
         self.info: dict[str, Any] = {}
         """What `rasterize` says of the projection, once `project` was called."""
 
@@ -79,21 +82,15 @@ class _Stages:
         return stages if self.pipeline.world.alone else stages | {"what travels between devices": self.exchange}
 
     def project(self) -> None:
-        _, _, self.info = rasterize(
-            self.means, self.quats, self.scales, self.opacities, self.means, *self.camera,
-            max_off_axis=self.model.config.max_off_axis,
-        )  # fmt: skip
+        _, _, self.info = rasterize(self.gaussians, self.cameras, self.model.drawing)
 
     def tile_lists(self) -> None:
         # The size is the run's: whether tiles are numbered in 16 or in 32 bits depends on how many there are, and lists
         # of a given length have one more row of them.
-        cameras = self.pipeline.datamanager.train_dataset.cameras
-        width, height = int(cameras.width.max()), int(cameras.height.max())
+        sizes = self.pipeline.datamanager.train_dataset.cameras
+        cameras = self.cameras._replace(width=int(sizes.width.max()), height=int(sizes.height.max()))
         for capacity in (None, 2**20):
-            rasterize(
-                self.means, self.quats, self.scales, self.opacities, self.means, self.viewmats, self.Ks, width, height,
-                tile_capacity=capacity, max_off_axis=self.model.config.max_off_axis,
-            )  # fmt: skip
+            rasterize(self.gaussians, cameras, replace(self.model.drawing, tile_capacity=capacity))
 
     def blank(self, name: str) -> Tensor:
         return self.means.new_zeros((_GAUSSIANS, *self.model.gauss_params[name].shape[1:]))
@@ -128,11 +125,8 @@ class _Stages:
             repeated.launch(gradients, log.gradients, repeated.factors().to(self.device))
 
     def composite(self, absgrad: bool) -> None:
-        centres = self.means.clone().requires_grad_()
-        renders, alphas, info = rasterize(
-            centres, self.quats, self.scales, self.opacities, self.means, *self.camera,
-            absgrad=absgrad, **self.model.drawing,
-        )  # fmt: skip
+        gaussians = self.gaussians._replace(means=self.means.clone().requires_grad_())
+        renders, alphas, info = rasterize(gaussians, self.cameras, replace(self.model.drawing, absgrad=absgrad))
         black = self.model.config.background_color == "black" and self.model.color_matrices is None
         result = renders.sum() if black else renders.sum() + alphas.sum()
         # The projection is differentiated elsewhere.
@@ -151,23 +145,24 @@ class _Stages:
         from sadgs_ns.kernels.projection import project
 
         config = self.model.config
-        centres, rotations, sizes = (value.clone().requires_grad_() for value in (self.means, self.quats, self.scales))
+        means, quats, scales = (value.clone().requires_grad_() for value in self.gaussians[:3])
         radii, means2d, _, conics, compensations, centres = project(
-            centres, rotations, sizes, self.opacities, *self.camera, config.rasterize_mode == "antialiased"
+            means, quats, scales, self.opacities, *self.cameras, self.model.drawing.antialiased
         )
         results = [means2d, conics] if compensations is None else [means2d, conics, compensations]
         if config.sh_degree > 0:
             coefficients = self.blank("features_dc"), self.blank("features_rest")
-            results.append(colors_from_harmonics(config.sh_degree, centres, *coefficients, self.viewmats, radii))
+            viewmats = self.cameras.viewmats
+            results.append(colors_from_harmonics(config.sh_degree, centres, *coefficients, viewmats, radii))
         torch.autograd.backward([value.sum() for value in results])
 
     def observation(self) -> None:
-        params = {"means": self.means, "quats": self.quats, "scales": self.scales.log()}
+        params = {"means": self.means, "quats": self.gaussians.quats, "scales": self.scales.log()}
         tensors = self.image.byte().repeat(self.views, 1, 1, 1)
         observe(
             empty_statistics(_GAUSSIANS, self.device),
             params,  # type: ignore[arg-type]
-            self.info | {"structure_tensors": tensors, "viewmats": self.viewmats, "Ks": self.Ks},
+            self.info | {"structure_tensors": tensors, "viewmats": self.cameras.viewmats, "Ks": self.cameras.Ks},
             generator=torch.Generator(self.device).manual_seed(0),
         )
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -11,9 +10,9 @@ from gsplat.utils import normalized_quat_to_rotmat
 from matplotlib.colors import hsv_to_rgb
 from torch import Tensor
 
-from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.method.split import num_children
 from sadgs_ns.render.rasterization import rasterize
+from sadgs_ns.render.types import DEFAULTS, Cameras, Gaussians, RenderOptions
 
 MIN_COVER = 0.05
 """Share of a pixel that Gaussians with a value must make up; otherwise the pixel counts as empty."""
@@ -27,68 +26,55 @@ def blend(
     K: Tensor,  # [3, 3]
     width: int,
     height: int,
-    rasterize_mode: Literal["classic", "antialiased"] = "classic",
-    max_off_axis: float = 0.0,
-    near_plane: float = NEAR_PLANE,
+    drawing: RenderOptions = DEFAULTS,
 ) -> tuple[Tensor, Tensor]:
     """Blend D values of each Gaussian as their colours are blended, front to back.
 
-    `params` are `means` [N, 3], `quats` [N, 4], log `scales` [N, 3] and logit `opacities` [N] or [N, 1]; the rest is as
-    for `rasterize`.
+    `params` are `means` [N, 3], `quats` [N, 4], log `scales` [N, 3] and logit `opacities` [N] or [N, 1]; `drawing`
+    says how they are drawn.
 
     Returns:
         The blended values [H, W, D], and how much of each pixel is covered, in [0, 1] [H, W, 1].
     """
-    render, alpha, _ = rasterize(
-        params["means"],
-        params["quats"],
-        params["scales"].exp(),
-        torch.sigmoid(params["opacities"].flatten()),
-        values,
-        viewmat[None],
-        K[None],
-        width,
-        height,
-        rasterize_mode=rasterize_mode,
-        max_off_axis=max_off_axis,
-        near_plane=near_plane,
-    )
+    opacities = torch.sigmoid(params["opacities"].flatten())
+    gaussians = Gaussians(params["means"], params["quats"], params["scales"].exp(), opacities, values)
+    render, alpha, _ = rasterize(gaussians, Cameras(viewmat[None], K[None], width, height), drawing)
     return render[0], alpha[0]
 
 
-def eta_map(params: Mapping[str, Tensor], statistics: Mapping[str, Tensor], *view, **options) -> Tensor:
+def eta_map(params: Mapping[str, Tensor], statistics: Mapping[str, Tensor], *view) -> Tensor:
     """Return the largest η [H, W] of the Gaussians of each pixel, as a geometric mean by what each adds to it.
 
-    It is NaN where hardly anything observed is drawn. `statistics` holds `eta_max` [N, 3] and `n_total` [N]. `view` and
-    `options` are, here and below, what `blend` takes after its first two arguments.
+    It is NaN where hardly anything observed is drawn. `statistics` holds `eta_max` [N, 3] and `n_total` [N]. `view` is,
+    here and below, what `blend` takes after its first two arguments.
     """
     largest = statistics["eta_max"].amax(dim=1)
     known = ((statistics["n_total"] > 0) & (largest > 0)).float()
     values = torch.stack([torch.where(known > 0, largest, 1.0).log(), known], dim=-1)
-    total, cover = blend(params, values, *view, **options)[0].unbind(-1)
+    total, cover = blend(params, values, *view)[0].unbind(-1)
     return torch.where(cover > MIN_COVER, (total / cover).exp(), torch.nan)
 
 
-def children_map(params: Mapping[str, Tensor], counts: Tensor, *view, **options) -> Tensor:
+def children_map(params: Mapping[str, Tensor], counts: Tensor, *view) -> Tensor:
     """Return the number of children, ≥ 1 along each axis [N, 3], of each pixel's Gaussians, as a geometric mean. [H, W]
 
     It is NaN where hardly anything is drawn.
     """
-    total, cover = blend(params, num_children(counts)[:, None].float().log(), *view, **options)
+    total, cover = blend(params, num_children(counts)[:, None].float().log(), *view)
     return torch.where(cover > MIN_COVER, (total / cover).exp(), torch.nan)[..., 0]
 
 
-def share_map(params: Mapping[str, Tensor], chosen: Tensor, *view, **options) -> Tensor:
+def share_map(params: Mapping[str, Tensor], chosen: Tensor, *view) -> Tensor:
     """Return the share of what is drawn at each pixel that the chosen Gaussians, bool [N], make up. [H, W]
 
     It is NaN where hardly anything is drawn.
     """
-    total, cover = blend(params, chosen[:, None].float(), *view, **options)
+    total, cover = blend(params, chosen[:, None].float(), *view)
     return torch.where(cover > MIN_COVER, total / cover, torch.nan)[..., 0]
 
 
 @torch.no_grad()
-def normals_map(params: Mapping[str, Tensor], viewmat: Tensor, *view, **options) -> Tensor:
+def normals_map(params: Mapping[str, Tensor], viewmat: Tensor, *view) -> Tensor:
     """Return the normals of the Gaussians that make up each pixel, blended as their colours are. [H, W, 3]
 
     They have unit length and world axes, and are 0 where nothing is drawn. A Gaussian's normal is the axis of its
@@ -100,7 +86,7 @@ def normals_map(params: Mapping[str, Tensor], viewmat: Tensor, *view, **options)
     normals = rotmats.gather(2, thinnest)[..., 0]  # [N, 3]
     rays = params["means"] + viewmat[:3, :3].T @ viewmat[:3, 3]  # [N, 3] from the camera's centre, −Rᵀ t
     away = (rays * normals).sum(dim=1, keepdim=True) > 0
-    return F.normalize(blend(params, torch.where(away, -normals, normals), viewmat, *view, **options)[0], dim=-1)
+    return F.normalize(blend(params, torch.where(away, -normals, normals), viewmat, *view)[0], dim=-1)
 
 
 def random_colors(number: int, generator: torch.Generator) -> Tensor:

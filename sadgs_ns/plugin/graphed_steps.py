@@ -161,13 +161,13 @@ def launch_step(
         kind: What the step's launches depend on.
         inputs: Cameras, images and rates.
         update: The update of all parameters.
-        sums: AbsGS's sums, as `empty_gradients` makes them, which are read and changed with `kind.absgrad` only.
+        sums: AbsGS's sums, as `empty_gradients` makes them, read and changed with `kind.options.absgrad` only.
     """
     # Gradients of the parameters themselves would be added up on the stream on which these were first used, which is
     # not the one that is captured.
     leaves = {name: parameter.detach().requires_grad_() for name, parameter in update.parameters.items()}
     outputs, info = model.render_step(kind, inputs.viewmats, inputs.Ks, leaves, inputs.numbers)
-    if kind.absgrad:
+    if kind.options.absgrad:
         keep_gradient(info["means2d"])
     loss = model.get_loss_dict(outputs, {"image": inputs.images})["main_loss"]
     loss.backward()
@@ -175,7 +175,7 @@ def launch_step(
     values = torch.zeros(5, device=loss.device)
     gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
     update.launch(gradients, values[4:], inputs.factors)
-    if kind.absgrad:
+    if kind.options.absgrad:
         accumulate_gradients(dict(sums), info, len(inputs.viewmats))
     # These are copies of memory. A kernel that no step has launched before would be loaded while it is captured.
     values[0].copy_(loss.detach())
@@ -266,7 +266,7 @@ class GraphedSteps:
         update = RepeatedUpdate(self._optimizers)
         kind = model.kind_of_step(width, height, indices)
         sums = {name: value for name, value in model.strategy_state.items() if isinstance(value, Tensor)}
-        if kind.tile_capacity is None or not update.begun or (kind.absgrad and "grad2d" not in sums):
+        if kind.options.tile_capacity is None or not update.begun or (kind.options.absgrad and "grad2d" not in sums):
             return None
         viewmats, Ks = pipeline.views.stacked_cameras(indices)
         numbers = model.numbers_of(indices)
@@ -287,7 +287,7 @@ class GraphedSteps:
         pipeline.log.begin_step(step, indices, loss)
         pipeline.log.gradients.copy_(values[4:])
         counts = PairCounts.sent(results.pair_counts)
-        forecast.rendered(indices, (width, height), kind.tile_capacity, counts)
+        forecast.rendered(indices, (width, height), kind.options.tile_capacity, counts)
         return loss, {"main_loss": loss}, model.get_metrics_dict({"psnr": psnr}, {})
 
     def _graph(

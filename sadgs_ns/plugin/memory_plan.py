@@ -17,7 +17,7 @@ from sadgs_ns.kernels import TILE_SIZE
 from sadgs_ns.method import memory
 from sadgs_ns.method.absgs import empty_gradients
 from sadgs_ns.method.memory import StepSize
-from sadgs_ns.method.split import Params
+from sadgs_ns.method.ops import Params
 from sadgs_ns.method.statistics import empty_statistics
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin.processes import least, number_of_processes, processes_on_this_machine

@@ -6,7 +6,7 @@ import copy
 import math
 import threading
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
@@ -47,6 +47,8 @@ from sadgs_ns.plugin.run_plan import RunPlan
 from sadgs_ns.render.activations import activate
 from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world
 from sadgs_ns.render.tile_forecast import TileForecast
+from sadgs_ns.render.types import Cameras as Pinholes
+from sadgs_ns.render.types import Gaussians, RenderOptions
 
 CAMERA_CLEARANCE = 2.0
 """Initial Gaussians nearer to a camera than this many of their standard deviations are dropped. The paper keeps them;
@@ -157,10 +159,6 @@ class SadgsModelConfig(InstantiateConfig):
             raise InputError(f"pipeline.model.{error}") from error
 
 
-Splats = tuple[Tensor, Tensor, Tensor, Tensor, Tensor | tuple[Tensor, Tensor]]
-"""Centres [N, 3], quaternions [N, 4], standard deviations [N, 3], opacities [N] and colours, as for `rasterize`."""
-
-
 class StepKind(NamedTuple):
     """What the launches of a training step depend on, besides tensors; the views of the step have one size."""
 
@@ -168,14 +166,10 @@ class StepKind(NamedTuple):
     """px."""
     height: int
     """px."""
-    sh_degree: int | None
-    """Degree of the harmonics that are drawn; None where colours do not depend on the direction."""
-    absgrad: bool
-    """Whether absolute screen gradients are summed, for AbsGS."""
+    options: RenderOptions
+    """How Gaussians are drawn."""
     opacity_reg: float
     """Factor on the mean opacity in the loss."""
-    tile_capacity: int | None
-    """Places in the tile lists of our kernels; None waits for the exact number."""
 
 
 class SadgsModel(SplatfactoModel):
@@ -296,7 +290,7 @@ class SadgsModel(SplatfactoModel):
         """Derive the near plane from the SfM points before the training cameras; call `set_cameras` before.
 
         Args:
-            viewmats, Ks: As for `rasterize`, of C views.
+            viewmats, Ks: As `render.types.Cameras` has them, of C views.
             sizes: Width and height in px. [C, 2]
         """
         points = self.means.new_zeros((0, 3)) if self.seed_points is None else self.seed_points[0].to(self.means)
@@ -417,76 +411,57 @@ class SadgsModel(SplatfactoModel):
         return min(self.step, self.config.sh_degree) if self.config.sh_degree > 0 else None
 
     @property
-    def drawing(self) -> dict[str, Any]:
-        """The options of `rasterize` that every picture of these Gaussians shares."""
-        return {
-            "rasterize_mode": self.config.rasterize_mode,
-            "max_off_axis": self.config.max_off_axis,
-            "near_plane": self.near_plane,
-        }
+    def drawing(self) -> RenderOptions:
+        """The options that every picture of these Gaussians shares; colours are drawn with `color_options`."""
+        config = self.config
+        return RenderOptions(
+            near_plane=self.near_plane, max_off_axis=config.max_off_axis, rasterize_mode=config.rasterize_mode
+        )
+
+    def color_options(self, **changes: Any) -> RenderOptions:
+        """Return the options with which colours are drawn at this step, and others of their fields."""
+        return replace(self.drawing, sh_degree=self.sh_degree_now, **changes)
 
     def render(
         self,
-        viewmats: Tensor,
-        Ks: Tensor,
-        width: int,
-        height: int,
-        render_mode: Literal["RGB", "RGB+ED"],
-        absgrad: bool = False,
-        tile_capacity: int | None = None,
-        opacity_reg: float = 0.0,
-        *,
+        cameras: Pinholes,
+        options: RenderOptions,
         params: Mapping[str, Tensor] | None = None,
-        sh_degree: int | None = None,
+        opacity_reg: float = 0.0,
     ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-        """Rasterize the Gaussians; in the viewer, those inside its crop box.
+        """Rasterize the Gaussians in their colours.
 
         Args:
-            viewmats, Ks, width, height, absgrad, tile_capacity: As for `rasterize`.
-            render_mode: "RGB+ED" adds the expected depth as a fourth channel.
-            opacity_reg: Factor on the mean opacity.
-            params: Parameters by name; None is the model's own.
-            sh_degree: Degree of the harmonics; None is the present step's.
+            cameras: Views of one size.
+            options: As `color_options` makes them.
+            params, opacity_reg: As for `gaussians`.
 
         Returns:
-            Colours, not clamped, and depth [C, H, W, 3 or 4]; accumulated opacity [C, H, W, 1]; gsplat's meta, and in
-            it `opacity_reg`, numbers [P] whose sum is the mean opacity times this factor, or None where it is 0.
+            Colours, not clamped, and depth if it was asked for [C, H, W, 3 or 4]; accumulated opacity [C, H, W, 1]; the
+            rasterizer's info, and in it `opacity_reg`, the penalty that `gaussians` returns.
         """
-        splats, penalty, options = self.splats(opacity_reg, params, sh_degree)
-        render, alpha, info = rasterize(
-            *splats,
-            viewmats,
-            Ks,
-            width,
-            height,
-            render_mode=render_mode,
-            absgrad=absgrad,
-            tile_capacity=tile_capacity,
-            **options,
-        )
+        gaussians, penalty = self.gaussians(params, opacity_reg)
+        render, alpha, info = rasterize(gaussians, cameras, options)
         return render, alpha, info | {"opacity_reg": penalty}
 
-    def splats(
-        self, opacity_reg: float = 0.0, params: Mapping[str, Tensor] | None = None, sh_degree: int | None = None
-    ) -> tuple[Splats, Tensor | None, dict[str, Any]]:
+    def gaussians(
+        self, params: Mapping[str, Tensor] | None = None, opacity_reg: float = 0.0
+    ) -> tuple[Gaussians, Tensor | None]:
         """Return what the rasterizer takes of the Gaussians; in the viewer, of those inside its crop box.
 
         Args:
-            opacity_reg, params, sh_degree: As for `render`.
+            params: Parameters by name; None is the model's own.
+            opacity_reg: Factor on the mean opacity.
 
         Returns:
-            The first arguments of `rasterize`; numbers [P] whose sum is the mean opacity times `opacity_reg`, or None
-            where that is 0; and further options of `rasterize`.
+            The Gaussians; and numbers [P] whose sum is the mean opacity times `opacity_reg`, or None where that is 0.
         """
         params = self.cropped(dict(self.gauss_params.items()) if params is None else params)
-        if self.config.sh_degree > 0:
-            colors: Tensor | tuple[Tensor, Tensor] = (params["features_dc"], params["features_rest"])
-            sh_degree = self.sh_degree_now if sh_degree is None else sh_degree
-        else:
-            colors, sh_degree = torch.sigmoid(params["features_dc"]), None  # [N, 3]
+        colors: Tensor | tuple[Tensor, Tensor] = (params["features_dc"], params["features_rest"])
+        if self.config.sh_degree == 0:
+            colors = torch.sigmoid(params["features_dc"])  # [N, 3]
         scales, opacities, penalty = activate(params["scales"], params["opacities"], opacity_reg)
-        splats = (params["means"], params["quats"], scales, opacities, colors)
-        return splats, penalty, {"sh_degree": sh_degree, **self.drawing}
+        return Gaussians(params["means"], params["quats"], scales, opacities, colors), penalty
 
     def kind_of_step(self, width: int, height: int, cam_indices: list[int]) -> StepKind:
         """Return what the launches of a step depend on, whose views have one size in px."""
@@ -494,8 +469,8 @@ class SadgsModel(SplatfactoModel):
         if forecast is not None:
             capacity = forecast.capacity(cam_indices, (width, height), self.num_points)
         opacity_reg = self.config.opacity_reg if self.step < self.strategy.windows.refine_stop_iter else 0.0
-        absgrad = self.strategy.needs_absgrad(self.step)
-        return StepKind(width, height, self.sh_degree_now, absgrad, opacity_reg, capacity)
+        options = self.color_options(absgrad=self.strategy.needs_absgrad(self.step), tile_capacity=capacity)
+        return StepKind(width, height, options, opacity_reg)
 
     def render_step(
         self, kind: StepKind, viewmats: Tensor, Ks: Tensor, params: Mapping[str, Tensor], view_numbers: Tensor | None
@@ -504,17 +479,15 @@ class SadgsModel(SplatfactoModel):
 
         Args:
             kind: What `kind_of_step` returned.
-            viewmats, Ks: As for `rasterize`.
+            viewmats, Ks: As `render.types.Cameras` has them, of C views.
             params: As `trained_params`.
             view_numbers: What `numbers_of` returned. int64 [C]
 
         Returns:
             The outputs of `get_training_outputs`, and gsplat's meta.
         """
-        render, alpha, info = self.render(
-            viewmats, Ks, kind.width, kind.height, "RGB", kind.absgrad, kind.tile_capacity, kind.opacity_reg,
-            params=params, sh_degree=kind.sh_degree,
-        )  # fmt: skip
+        cameras = Pinholes(viewmats, Ks, kind.width, kind.height)
+        render, alpha, info = self.render(cameras, kind.options, params, kind.opacity_reg)
         if view_numbers is not None:
             matrices = anchored(params["color_matrices"], view_numbers)
             render = correct_colors(render, alpha, matrices)
@@ -552,7 +525,7 @@ class SadgsModel(SplatfactoModel):
         short nothing is drawn, no gradient flows and the strategy counts nothing; `tile_forecast` then names the views.
 
         Args:
-            viewmats, Ks, width, height: As for `rasterize`.
+            viewmats, Ks, width, height: As `render.types.Cameras` has them.
             cam_indices: The views' indices among the training cameras, C of them.
             structure_tensors: S̄ of the views, which may be quantized, [C, H, W, 3]; None where η is not observed.
 
@@ -563,7 +536,7 @@ class SadgsModel(SplatfactoModel):
         kind, forecast = self.kind_of_step(width, height, cam_indices), self.tile_forecast
         outputs, info = self.render_step(kind, viewmats, Ks, self.trained_params, self.numbers_of(cam_indices))
         if forecast is not None and "pair_counts" in info:  # Only our kernels count pairs.
-            forecast.rendered(cam_indices, (width, height), kind.tile_capacity, info["pair_counts"])
+            forecast.rendered(cam_indices, (width, height), kind.options.tile_capacity, info["pair_counts"])
         self.show_to_strategy(info, viewmats, Ks, structure_tensors)
         return outputs
 
@@ -581,7 +554,8 @@ class SadgsModel(SplatfactoModel):
             return self.get_empty_outputs(width, height, background)
         viewmats = viewmats_from_camera_to_world(camera.camera_to_worlds)
         Ks = camera.get_intrinsics_matrices().to(self.device)
-        render, alpha, _ = self.render(viewmats, Ks, width, height, "RGB+ED")
+        cameras = Pinholes(viewmats, Ks, width, height)
+        render, alpha, _ = self.render(cameras, self.color_options(expected_depth=True))
         depth = render[..., 3:4]
         return {
             "rgb": (render[..., :3] + (1 - alpha) * background).clamp(0.0, 1.0)[0],
@@ -603,7 +577,7 @@ class SadgsModel(SplatfactoModel):
             return torch.zeros((height, width, 3), device=self.device)
         viewmat = viewmats_from_camera_to_world(camera.camera_to_worlds)[0].to(self.device)
         K = camera.get_intrinsics_matrices()[0].to(self.device)
-        normals = gaussian_maps.normals_map(params, viewmat, K, width, height, **self.drawing)
+        normals = gaussian_maps.normals_map(params, viewmat, K, width, height, self.drawing)
         return torch.where((normals != 0).any(dim=-1, keepdim=True), 0.5 + 0.5 * normals, 0.0)
 
     def get_outputs_for_camera(  # type: ignore[override]

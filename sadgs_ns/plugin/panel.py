@@ -313,13 +313,13 @@ class StructurePanel(torch.nn.Module):
         view = viewmat, camera.get_intrinsics_matrices()[0].to(model.device), width, height
         seen = f"{int((statistics['n_total'] > 0).sum()):,} of {model.num_points:,} Gaussians observed"
         if choice == ETA_OF:
-            drawn, scale = gaussian_maps.eta_map(rows, rows, *view, **model.drawing), ETA
+            drawn, scale = gaussian_maps.eta_map(rows, rows, *view, model.drawing), ETA
             text = f"largest η: over 1 violates, under 0.1 is low ({seen})"
         elif choice == CHILDREN_OF:
-            drawn, scale = gaussian_maps.children_map(rows, rows["children"], *view, **model.drawing), CHILDREN
+            drawn, scale = gaussian_maps.children_map(rows, rows["children"], *view, model.drawing), CHILDREN
             split = int((kept["children"] > 1).any(dim=1).sum())
             text = f"children at a structure step now: {split:,} Gaussians would split ({seen})"
         else:
-            drawn, scale = gaussian_maps.share_map(rows, rows["low"], *view, **model.drawing), LOW
+            drawn, scale = gaussian_maps.share_map(rows, rows["low"], *view, model.drawing), LOW
             text = f"share of consistently low Gaussians, {int(kept['low'].sum()):,} in all ({seen})"
         return Panel(text, scale(drawn), scale)

@@ -12,6 +12,7 @@ from sadgs_ns.distributed.rasterization import rasterize
 from sadgs_ns.distributed.world import World
 from sadgs_ns.method.losses import photometric_part
 from sadgs_ns.plugin.model import SadgsModel
+from sadgs_ns.render.types import Cameras
 
 
 def losses_of_views(
@@ -29,7 +30,7 @@ def losses_of_views(
     Args:
         model: The model of this process's Gaussians.
         world: The processes, all of which call this with the same views.
-        viewmats, Ks, width, height: As for `rasterize`, of V views.
+        viewmats, Ks, width, height: As `render.types.Cameras` has them, of V views.
         views: Index and data of each view; the images of those of which this process composites rows are on the
             training device.
         structure_tensors: S̄ of the views, which may be quantized, [V, H, W, 3]; None where η is not observed.
@@ -40,8 +41,8 @@ def losses_of_views(
     """
     kind = model.kind_of_step(width, height, [index for index, _ in views])
     share = len(model.means) / world.total
-    splats, penalty, options = model.splats(kind.opacity_reg * share)
-    rendered, loss, info = rasterize(world, *splats, viewmats, Ks, width, height, absgrad=kind.absgrad, **options)
+    gaussians, penalty = model.gaussians(opacity_reg=kind.opacity_reg * share)
+    rendered, loss, info = rasterize(world, gaussians, Cameras(viewmats, Ks, width, height), kind.options)
     model.show_to_strategy(info, viewmats, Ks, structure_tensors)
     background, error = model.background, torch.zeros((), device=world.device)
     for band, colors, alphas in rendered:

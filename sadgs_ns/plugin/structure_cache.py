@@ -16,6 +16,7 @@ from sadgs_ns.method.quantization import quantize
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.plugin.views import TrainingViews
+from sadgs_ns.render.types import Cameras
 
 PIXELS_PER_BATCH = 4_000_000
 """Structure tensors are computed for as many images at once as have this many pixels; each pixel takes at most about
@@ -137,7 +138,8 @@ def observe_training_views(
     statistics = empty_statistics(model.num_points, model.device)
     for index in progress(range(len(views))):
         tensors, (viewmats, Ks) = cache[index][None], views.stacked_cameras([index])
-        _, _, info = model.render(viewmats, Ks, tensors.shape[2], tensors.shape[1], "RGB")
+        cameras = Cameras(viewmats, Ks, tensors.shape[2], tensors.shape[1])
+        _, _, info = model.render(cameras, model.color_options())
         info |= {"viewmats": viewmats, "Ks": Ks, "structure_tensors": tensors}
         observe(statistics, params, info, generator=generator)
     return statistics

@@ -1,39 +1,29 @@
 """Gaussian splatting in plain torch, for machines without a CUDA device.
 
-`rasterization` draws what gsplat's `rasterization` draws, with the same arguments, cut-offs, tile lists and `info`, in
-float32 or float64, on any device. It exists so that models and densification strategies can be trained and tested on a
-CPU; on a GPU gsplat is much faster.
+It draws what gsplat draws, with the same cut-offs and tile lists, in float32 or float64, on any device, so that models
+and densification strategies can be trained and tested on a CPU; on a GPU gsplat is much faster.
 
-Projection and spherical harmonics are gsplat's own torch functions. Compositing is an autograd function which handles
-bounded chunks of (pixel, Gaussian) pairs and evaluates them again in the backward pass, so that the peak memory does
-not grow with the number of pairs.
+Compositing is an autograd function which handles bounded chunks of (pixel, Gaussian) pairs and evaluates them again in
+the backward pass, so that the peak memory does not grow with the number of pairs.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sadgs_ns.gsplat_compat import (
-    FAR_PLANE,
-    NEAR_PLANE,
-    RADII_PER_AXIS,
-    SCREEN_BLUR,
-    torch_persp_proj,
-    torch_quat_scale_to_covar_preci,
-    torch_spherical_harmonics,
-    torch_world_to_cam,
-)
-from sadgs_ns.render.off_axis import near_axis
-from sadgs_ns.render.projected import Projected
+from sadgs_ns.gsplat_compat import FAR_PLANE, RADII_PER_AXIS, SCREEN_BLUR
+from sadgs_ns.render.ewa import MAX_DEGREE, covariances, perspective, spherical_harmonics, world_to_camera
+from sadgs_ns.render.off_axis import cull_off_axis
+from sadgs_ns.render.types import Cameras, Gaussians, Projected, RenderOptions
 
-RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
-RasterizeMode = Literal["classic", "antialiased"]
+TILE_SIZE = 16
+"""Size of tiles in px."""
 
 # These are the constants of gsplat's compositing.
 _MAX_ALPHA = 0.999
@@ -72,219 +62,80 @@ class _Segment(NamedTuple):
     weights: Tensor  # [B, S, S, L] alpha * transmittance, zero once the pixel is done
 
 
-def rasterization(
-    means: Tensor,  # [N, 3]
-    quats: Tensor,  # [N, 4]
-    scales: Tensor,  # [N, 3]
-    opacities: Tensor,  # [N]
-    colors: Tensor,  # [(C,) N, D] or [(C,) N, K, 3]
-    viewmats: Tensor,  # [C, 4, 4]
-    Ks: Tensor,  # [C, 3, 3]
-    width: int,
-    height: int,
-    near_plane: float = NEAR_PLANE,
-    far_plane: float = FAR_PLANE,
-    radius_clip: float = 0.0,
-    eps2d: float = SCREEN_BLUR,
-    sh_degree: int | None = None,
-    packed: bool = False,
-    tile_size: int = 16,
-    backgrounds: Tensor | None = None,  # [C, D]
-    render_mode: RenderMode = "RGB",
-    *,
-    absgrad: bool = False,
-    rasterize_mode: RasterizeMode = "classic",
-    per_axis_radii: bool | None = None,
-    max_off_axis: float = 0.0,
-) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Render N Gaussians into C pinhole cameras, as gsplat's `rasterization(..., packed=False)` does.
+def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions, begin_tiles: bool = True) -> Projected:
+    """Do what `rasterization.project` says; differentiable by all but `Ks`."""
+    means, quats, scales, opacities, colors = gaussians
+    if isinstance(colors, tuple):
+        colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
+    _check_shapes(gaussians, cameras, colors, options.sh_degree)
+    viewmats, Ks, width, height = cameras
+    C, N = len(viewmats), len(means)
+    means2d, depths, conics, compensations, covars2d, valid = _project(
+        means, quats, scales, viewmats, Ks, width, height, options.near_plane
+    )
+    opacities = opacities.expand(C, N)
+    if options.antialiased:
+        opacities = opacities * compensations
+    radii = _radii(means2d, covars2d, opacities, valid, width, height)
+    if options.max_off_axis > 0:
+        radii = cull_off_axis(radii, means2d, width, height, options.max_off_axis)
+    if options.sh_degree is not None:
+        dirs = means - torch.inverse(viewmats)[:, None, :3, 3]  # [C, N, 3]
+        colors = spherical_harmonics(options.sh_degree, dirs, colors.expand(C, N, -1, 3))
+        colors = (colors + 0.5).clamp_min(0.0)
+    return Projected(radii, means2d, depths, conics, opacities, colors.expand(C, N, -1), width, height)
 
-    Differentiable with respect to all float arguments except `Ks`. Where nothing is said here, an argument is gsplat's,
-    and is explained for `render.rasterization.rasterize`, too.
 
-    Args:
-        far_plane: Gaussians whose centre is farther are culled, in world units.
-        radius_clip: Gaussians with a screen radius of at most this many pixels are culled.
-        eps2d: Added to the diagonal of the projected covariances, in pixels squared.
-        packed: Only False is supported.
-        tile_size: Pixels per side of a tile.
-        backgrounds: Colours behind the Gaussians. [C, D]
-        render_mode: "RGB" renders colours, "D" accumulated depth, "ED" expected depth; the sums append depth.
-        rasterize_mode: "antialiased" multiplies opacities by the area ratio of the Gaussians before and after `eps2d`.
-        per_axis_radii: Whether `info["radii"]` and the culling follow gsplat >= 1.5 (int32 [C, N, 2], the extent in x
-            and y at which alpha falls below 1/255) or gsplat 1.4 (int32 [C, N], three standard deviations of the long
-            axis); None follows the installed gsplat.
-        max_off_axis: Gaussians further off the axis are culled, which gsplat cannot (off_axis.py); 0 culls none.
-
-    Returns:
-        `render_colors` [C, height, width, X] with X = D, 1 or D + 1 by `render_mode`; `render_alphas`
-        [C, height, width, 1] in [0, 1]; and gsplat's `info`. As in gsplat, rows of `info["means2d"]`,
-        `info["conics"]` and `info["opacities"]` have no meaning where the radii are zero.
-
-    Raises:
-        ValueError: If `packed` is True, a mode is unknown, or a shape does not match.
-    """
-    C, N = viewmats.shape[0], means.shape[0]
-    if packed:
-        raise ValueError("packed=True is not supported by the torch splatter; pass packed=False")
-    if render_mode not in ("RGB", "D", "ED", "RGB+D", "RGB+ED"):
-        raise ValueError(f"unknown render_mode {render_mode!r}")
-    if rasterize_mode not in ("classic", "antialiased"):
-        raise ValueError(f"unknown rasterize_mode {rasterize_mode!r}")
-    shapes = {
-        "means": (means, (N, 3)),
-        "quats": (quats, (N, 4)),
-        "scales": (scales, (N, 3)),
-        "opacities": (opacities, (N,)),
-        "viewmats": (viewmats, (C, 4, 4)),
-        "Ks": (Ks, (C, 3, 3)),
-    }
-    for name, (tensor, shape) in shapes.items():
-        if tensor.shape != shape:
-            raise ValueError(f"{name} has shape {tuple(tensor.shape)}, expected {shape}")
+def _check_shapes(gaussians: Gaussians, cameras: Cameras, colors: Tensor, sh_degree: int | None) -> None:
+    """Raise ValueError if a shape is not what types.py says, or a degree is higher than MAX_DEGREE."""
+    C, N = len(cameras.viewmats), len(gaussians.means)
+    expected = {"means": (N, 3), "quats": (N, 4), "scales": (N, 3), "opacities": (N,)}
+    expected |= {"viewmats": (C, 4, 4), "Ks": (C, 3, 3)}
+    tensors = {**gaussians._asdict(), **cameras._asdict()}
+    for name, shape in expected.items():
+        if tensors[name].shape != shape:
+            raise ValueError(f"{name} has shape {tuple(tensors[name].shape)}, expected {shape}")
     features = 1 if sh_degree is None else 2
     if colors.shape[:-features] not in ((N,), (C, N)) or (sh_degree is not None and colors.shape[-1] != 3):
         raise ValueError(f"colors has shape {tuple(colors.shape)}, which does not fit {C} cameras and {N} Gaussians")
-    if sh_degree is not None and (sh_degree + 1) ** 2 > colors.shape[-2]:
+    if sh_degree is not None and not (sh_degree + 1) ** 2 <= min(colors.shape[-2], (MAX_DEGREE + 1) ** 2):
         raise ValueError(f"sh_degree {sh_degree} needs {(sh_degree + 1) ** 2} coefficients, got {colors.shape[-2]}")
-    options = (eps2d, near_plane, far_plane, radius_clip, rasterize_mode == "antialiased", max_off_axis, per_axis_radii)
-    projected = project(
-        means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree, *options
-    )  # fmt: skip
-    return composite(projected, width, height, tile_size, render_mode, backgrounds, absgrad)
 
 
-def project(
-    means: Tensor,  # [N, 3]
-    quats: Tensor,  # [N, 4]
-    scales: Tensor,  # [N, 3]
-    opacities: Tensor,  # [N]
-    colors: Tensor,  # [(C,) N, D] or [(C,) N, K, 3]
-    viewmats: Tensor,  # [C, 4, 4]
-    Ks: Tensor,  # [C, 3, 3]
-    width: int,
-    height: int,
-    sh_degree: int | None,
-    eps2d: float = SCREEN_BLUR,
-    near_plane: float = NEAR_PLANE,
-    far_plane: float = FAR_PLANE,
-    radius_clip: float = 0.0,
-    antialiased: bool = False,
-    max_off_axis: float = 0.0,
-    per_axis_radii: bool | None = None,
-) -> Projected:
-    """Project Gaussians and compute their colours; arguments are those of `rasterization`, and are not checked."""
-    C, N = viewmats.shape[0], means.shape[0]
-    if per_axis_radii is None:
-        per_axis_radii = RADII_PER_AXIS
-    means2d, depths, conics, compensations, covars2d, valid = _project(
-        means, quats, scales, viewmats, Ks, width, height, eps2d, near_plane, far_plane
-    )
-    if max_off_axis > 0:
-        valid = valid & near_axis(means2d, width, height, max_off_axis)
-    opacities = opacities.expand(C, N)
-    if antialiased:
-        opacities = opacities * compensations
-    extents = _extents(means2d, covars2d, opacities, valid, width, height, radius_clip, per_axis_radii)
-    radii = extents.int() if per_axis_radii else extents[..., 0].int()
-    if sh_degree is not None:
-        dirs = means - torch.inverse(viewmats)[:, None, :3, 3]  # [C, N, 3]
-        colors = torch_spherical_harmonics(sh_degree, dirs, colors.expand(C, N, -1, 3))
-        colors = (colors + 0.5).clamp_min(0.0)
-    return Projected(radii, means2d, depths, conics, opacities, colors.expand(C, N, -1))
-
-
-def composite(
-    projected: Projected,
-    width: int,
-    height: int,
-    tile_size: int = 16,
-    render_mode: RenderMode = "RGB",
-    backgrounds: Tensor | None = None,  # [C, D]
-    absgrad: bool = False,
-) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Make the tile lists and composite; arguments and results are those of `rasterization`."""
-    radii, means2d, depths, conics, opacities, colors = projected
+def composite(projected: Projected, options: RenderOptions) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Do what `rasterization.composite` says, but for the depth; the last result is what it adds to the info."""
+    radii, means2d, depths, conics, opacities, colors, width, height, _ = projected
     C = len(means2d)
-    per_axis_radii = radii.dim() == means2d.dim()
-    extents = (radii if per_axis_radii else radii[..., None].expand_as(means2d)).to(means2d.dtype)
-    tiles_per_gauss, isect_ids, flatten_ids, tiles = _bin_into_tiles(means2d, depths, extents, width, height, tile_size)
-    tile_height, tile_width = math.ceil(height / tile_size), math.ceil(width / tile_size)
-    info: dict[str, Any] = {
-        "camera_ids": None,
-        "gaussian_ids": None,
-        "radii": radii,
-        "means2d": means2d,
-        "depths": depths,
-        "conics": conics,
-        "opacities": opacities,
-        "tile_width": tile_width,
-        "tile_height": tile_height,
-        "tiles_per_gauss": tiles_per_gauss,
-        "isect_ids": isect_ids,
-        "flatten_ids": flatten_ids,
-        "isect_offsets": tiles.offsets.int().reshape(C, tile_height, tile_width),
-        "width": width,
-        "height": height,
-        "tile_size": tile_size,
-        "n_cameras": C,
-    }
-    if per_axis_radii:
-        info |= {"batch_ids": None, "n_batches": 1}
-
-    if render_mode != "RGB":
-        colors = depths[..., None] if render_mode in ("D", "ED") else torch.cat([colors, depths[..., None]], dim=-1)
-        if backgrounds is not None:
-            nothing = backgrounds.new_zeros(C, 1)
-            backgrounds = nothing if render_mode in ("D", "ED") else torch.cat([backgrounds, nothing], dim=-1)
-
-    canvas: Tensor = _Composite.apply(means2d, conics, colors, opacities, tiles, absgrad)  # type: ignore[assignment]
+    extents = (radii if radii.dim() == means2d.dim() else radii[..., None].expand_as(means2d)).to(means2d.dtype)
+    tiles = _bin_into_tiles(means2d, depths, extents, width, height)
+    rows, columns = math.ceil(height / TILE_SIZE), math.ceil(width / TILE_SIZE)
+    canvas: Tensor = _Composite.apply(means2d, conics, colors, opacities, tiles, options.absgrad)  # type: ignore[assignment]
     # [T, S * S, D + 1] -> [C, H, W, D + 1]: put the tiles' pixels in rows and crop what overhangs the image.
-    canvas = canvas.reshape(C, tile_height, tile_width, tile_size, tile_size, -1).transpose(2, 3)
-    canvas = canvas.reshape(C, tile_height * tile_size, tile_width * tile_size, -1)[:, :height, :width]
-    render_colors, render_alphas = canvas[..., :-1], canvas[..., -1:]
-    if backgrounds is not None:
-        render_colors = render_colors + (1.0 - render_alphas) * backgrounds[:, None, None, :]
-    if render_mode in ("ED", "RGB+ED"):
-        expected_depths = render_colors[..., -1:] / render_alphas.clamp_min(1e-10)
-        render_colors = torch.cat([render_colors[..., :-1], expected_depths], dim=-1)
-    return render_colors, render_alphas, info
+    canvas = canvas.reshape(C, rows, columns, TILE_SIZE, TILE_SIZE, -1).transpose(2, 3)
+    canvas = canvas.reshape(C, rows * TILE_SIZE, columns * TILE_SIZE, -1)[:, :height, :width]
+    return canvas[..., :-1], canvas[..., -1:], {"flatten_ids": tiles.flatten_ids}
 
 
 def _project(
-    means: Tensor,  # [N, 3]
-    quats: Tensor,  # [N, 4]
-    scales: Tensor,  # [N, 3]
-    viewmats: Tensor,  # [C, 4, 4]
-    Ks: Tensor,  # [C, 3, 3]
-    width: int,
-    height: int,
-    eps2d: float,
-    near_plane: float,
-    far_plane: float,
+    means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int, near: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Project the Gaussians as EWA splatting does.
-
-    gsplat's own `_fully_fused_projection` is not used because its radii differ between versions and from its kernels,
-    and because its gradients are NaN for Gaussians in the camera plane.
 
     Returns:
         means2d [C, N, 2], depths [C, N], conics [C, N, 3], compensations [C, N], covars2d [C, N, 2, 2], valid [C, N].
     """
-    covars, _ = torch_quat_scale_to_covar_preci(quats, scales, compute_preci=False)
-    assert covars is not None
-    means_c, covars_c = torch_world_to_cam(means, covars, viewmats)  # [C, N, 3], [C, N, 3, 3]
+    means_c, covars_c = world_to_camera(means, covariances(quats, scales), viewmats)  # [C, N, 3], [C, N, 3, 3]
     depths = means_c[..., 2]
-    valid = (depths >= near_plane) & (depths <= far_plane)
+    valid = (depths >= near) & (depths <= FAR_PLANE)
     # Culled Gaussians are projected from somewhere harmless, or dividing by their depth could put NaN in gradients.
     means_c = torch.where(valid[..., None], means_c, means_c.new_tensor([0.0, 0.0, 1.0]))
-    means2d, covars2d = torch_persp_proj(means_c, covars_c, Ks, width, height)
+    means2d, covars2d = perspective(means_c, covars_c, Ks, width, height)
     # Gaussians of billions of px, whose determinant overflows, have no inverse and are culled, too.
     valid = valid & _determinant(covars2d.detach()).isfinite()
     covars2d = torch.where(valid[..., None, None], covars2d, torch.eye(2, dtype=means.dtype, device=means.device))
 
     det_sharp = _determinant(covars2d)
-    covars2d = covars2d + eps2d * torch.eye(2, dtype=means.dtype, device=means.device)
+    covars2d = covars2d + SCREEN_BLUR * torch.eye(2, dtype=means.dtype, device=means.device)
     det = _determinant(covars2d)
     valid = valid & (det > 0)
     det = torch.where(valid, det, 1.0)
@@ -300,18 +151,9 @@ def _determinant(matrices: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def _extents(
-    means2d: Tensor,  # [C, N, 2]
-    covars2d: Tensor,  # [C, N, 2, 2]
-    opacities: Tensor,  # [C, N]
-    valid: Tensor,  # [C, N]
-    width: int,
-    height: int,
-    radius_clip: float,
-    per_axis: bool,
-) -> Tensor:
-    """Half sizes in whole pixels of the rectangles in which the Gaussians are drawn, zero where culled. [C, N, 2]"""
-    if per_axis:
+def _radii(means2d: Tensor, covars2d: Tensor, opacities: Tensor, valid: Tensor, width: int, height: int) -> Tensor:
+    """Half sizes in whole pixels of the rectangles in which the Gaussians are drawn, as `Projected.radii`."""
+    if RADII_PER_AXIS:
         valid = valid & (opacities >= _MIN_ALPHA)
         sigmas = (2.0 * (opacities / _MIN_ALPHA).clamp_min(1.0).log()).sqrt().clamp_max(3.33)
         extents = (sigmas[..., None] * covars2d.diagonal(dim1=-2, dim2=-1).sqrt()).ceil()
@@ -321,9 +163,9 @@ def _extents(
         extents = (3.0 * long_axis.sqrt()).ceil()[..., None].expand_as(means2d)
     image = extents.new_tensor([width, height])
     on_screen = ((means2d + extents > 0) & (means2d - extents < image)).all(dim=-1)
-    valid = valid & on_screen & (extents > radius_clip).any(dim=-1)
     # The ceiling keeps the radii of enormous Gaussians inside int32.
-    return torch.where(valid[..., None], extents.clamp_max(1e9), 0.0)
+    radii = torch.where((valid & on_screen)[..., None], extents.clamp_max(1e9), 0.0).int()
+    return radii if RADII_PER_AXIS else radii[..., 0]
 
 
 @torch.no_grad()
@@ -333,11 +175,10 @@ def _bin_into_tiles(
     extents: Tensor,  # [C, N, 2]
     width: int,
     height: int,
-    tile_size: int,
-) -> tuple[Tensor, Tensor, Tensor, _Tiles]:
-    """Make gsplat's `tiles_per_gauss` [C, N], `isect_ids` and `flatten_ids` [n_isects], and the tiles' lists."""
+) -> _Tiles:
+    """Make the tiles' lists, as gsplat's `isect_tiles` and `isect_offset_encode` do."""
     C, N = depths.shape
-    device = means2d.device
+    device, tile_size = means2d.device, TILE_SIZE
     tile_width, tile_height = math.ceil(width / tile_size), math.ceil(height / tile_size)
     n_tiles = tile_width * tile_height
     grid = torch.tensor([tile_width, tile_height], device=device)
@@ -347,9 +188,8 @@ def _bin_into_tiles(
     low = (centers - reach).floor().clamp(-1e9, 1e9).long().clamp_min(0).minimum(grid)  # [C, N, 2]
     high = (centers + reach).ceil().clamp(-1e9, 1e9).long().clamp_min(0).minimum(grid)
     spans = (high - low) * visible[..., None]
-    tiles_per_gauss = spans.prod(dim=-1)
 
-    counts = tiles_per_gauss.flatten()
+    counts = spans.prod(dim=-1).flatten()
     flatten_ids = torch.repeat_interleave(counts)  # [n_isects]
     nth = torch.arange(len(flatten_ids), device=device) - (counts.cumsum(0) - counts)[flatten_ids]
     columns = spans.reshape(-1, 2)[flatten_ids, 0]
@@ -359,17 +199,15 @@ def _bin_into_tiles(
     camera_ids = flatten_ids // max(N, 1)
     # A key has the camera, the tile and the bits of the float32 depth, whose order is that of depths ≥ 0.
     depth_bits = depths.flatten().float().view(torch.int32).long()[flatten_ids]
-    isect_ids = (camera_ids << (32 + n_tiles.bit_length())) | (tile_ids << 32) | depth_bits
-    isect_ids, order = isect_ids.sort(stable=True)
-    flatten_ids = flatten_ids[order]
+    keys = (camera_ids << (32 + n_tiles.bit_length())) | (tile_ids << 32) | depth_bits
+    flatten_ids = flatten_ids[keys.argsort(stable=True)]
 
     per_tile = torch.bincount(camera_ids * n_tiles + tile_ids, minlength=C * n_tiles)  # [T]
     rows, cols = torch.meshgrid(
         torch.arange(tile_height, device=device), torch.arange(tile_width, device=device), indexing="ij"
     )
     origins = (torch.stack([cols, rows], dim=-1) * tile_size).reshape(-1, 2).repeat(C, 1)
-    tiles = _Tiles(tile_size, origins, per_tile.cumsum(0) - per_tile, per_tile, flatten_ids)
-    return tiles_per_gauss.int(), isect_ids, flatten_ids.int(), tiles
+    return _Tiles(tile_size, origins, per_tile.cumsum(0) - per_tile, per_tile, flatten_ids)
 
 
 class _Composite(torch.autograd.Function):

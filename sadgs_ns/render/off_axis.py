@@ -7,14 +7,10 @@ Viewers on the web leave out Gaussians whose centre is 1.2 to 1.4 half images fr
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-from typing import Any
-
 import torch
 from torch import Tensor
 
-from sadgs_ns.gsplat_compat import has_radius_per_axis, with_changed_radii
+from sadgs_ns.gsplat_compat import has_radius_per_axis
 
 
 @torch.no_grad()
@@ -37,7 +33,7 @@ def near_axis(means2d: Tensor, width: int, height: int, max_off_axis: float) -> 
 
 
 def cull_off_axis(radii: Tensor, means2d: Tensor, width: int, height: int, max_off_axis: float) -> Tensor:
-    """Make the radii of Gaussians zero that are too far off the axis; gsplat draws no Gaussian whose radius is zero.
+    """Make the radii of Gaussians zero that are too far off the axis: compositing draws none whose radius is zero.
 
     Args:
         radii: px, of gsplat 1.4 [C, N] or 1.5 [C, N, 2].
@@ -51,18 +47,3 @@ def cull_off_axis(radii: Tensor, means2d: Tensor, width: int, height: int, max_o
     """
     near = near_axis(means2d, width, height, max_off_axis)  # [C, N]
     return radii * (near[..., None] if has_radius_per_axis(radii, means2d) else near)
-
-
-def culling(rasterization: Callable[..., Any], max_off_axis: float) -> Callable[..., Any]:
-    """Make gsplat's `rasterization` cull Gaussians far off the axis.
-
-    Args:
-        rasterization: `gsplat.rendering.rasterization`.
-        max_off_axis: As for `near_axis`; 0 culls none.
-
-    Returns:
-        A function of the same arguments, for unpacked calls; where none is culled, the same function.
-    """
-    if max_off_axis <= 0:
-        return rasterization
-    return with_changed_radii(rasterization, partial(cull_off_axis, max_off_axis=max_off_axis))

@@ -1,167 +1,102 @@
-"""The one entrance to rasterization: gsplat or our Triton kernels on CUDA, the torch splatter elsewhere."""
+"""The one door to rasterization: Gaussians are projected, and composited, by one of three backends."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from importlib import import_module
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from sadgs_ns import gsplat_compat
-from sadgs_ns.gsplat_compat import NEAR_PLANE
+from sadgs_ns.errors import InputError
 from sadgs_ns.kernels import use_triton
-from sadgs_ns.render import backend_torch
-from sadgs_ns.render.off_axis import culling
-from sadgs_ns.render.projected import Projected
+from sadgs_ns.render.types import DEFAULTS, BackendName, Cameras, Gaussians, Projected, RenderOptions
 
 
 def rasterize(
-    means: Tensor,  # [N, 3] centres in world space
-    quats: Tensor,  # [N, 4] wxyz, of any length
-    scales: Tensor,  # [N, 3] standard deviations along the axes, in world units, > 0
-    opacities: Tensor,  # [N] in [0, 1]
-    colors: Tensor | tuple[Tensor, Tensor],  # [(C,) N, D], [(C,) N, K, 3] or [N, 3] and [N, K - 1, 3]
-    viewmats: Tensor,  # [C, 4, 4] world to camera, rigid, OpenCV axes (x right, y down, z forward)
-    Ks: Tensor,  # [C, 3, 3] px
-    width: int,
-    height: int,
-    *,
-    sh_degree: int | None = None,
-    render_mode: Literal["RGB", "RGB+ED"] = "RGB",
-    absgrad: bool = False,
-    rasterize_mode: Literal["classic", "antialiased"] = "classic",
-    max_off_axis: float = 0.0,
-    near_plane: float = NEAR_PLANE,
-    tile_capacity: int | None = None,
+    gaussians: Gaussians, cameras: Cameras, options: RenderOptions = DEFAULTS
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Render N Gaussians into C pinhole cameras on the device of `means`, unpacked.
-
-    With our Triton kernels a tile lists only the Gaussians that reach it; what is drawn is the same as gsplat's.
-
-    Args:
-        colors: Features [(C,) N, D] or, with `sh_degree`, spherical harmonics coefficients: [(C,) N, K, 3], or the pair
-            of those of degree 0 [N, 3] and of the others [N, K − 1, 3].
-        sh_degree: Degree to evaluate, (sh_degree + 1)^2 <= K; None takes `colors` as they are.
-        render_mode: "RGB" renders colours, "RGB+ED" appends the expected depth.
-        absgrad: Whether `backward` sets `info["means2d"].absgrad`. [C, N, 2]
-        rasterize_mode: "antialiased" compensates opacities for the screen-space blur.
-        max_off_axis: Gaussians whose centre is projected further from the image's centre, in half images along x or y,
-            are culled (off_axis.py); 0 culls none.
-        near_plane: Gaussians whose centre is nearer along the viewing axis are culled, in world units.
-        tile_capacity: Number of pairs of a Gaussian and a tile, in all views, for which the Triton kernels make room,
-            so that the host does not wait for the exact number. If there are more, nothing is drawn, no gradient flows
-            and all `radii` are 0. With None the host waits. gsplat and the splatter need no such number.
-
-    Returns:
-        Colours [C, height, width, X] with X = D or D + 1 by `render_mode`, alphas [C, height, width, 1] in [0, 1],
-        and what strategies read of gsplat's `info`, in which `radii` depends on the gsplat version: read it through
-        `visible`. From the Triton kernels it also holds `pair_counts` (kernels/tiles.py), the exact numbers of pairs.
-
-    Raises:
-        ValueError: From the splatter, if a mode is unknown or a shape does not match. gsplat raises AssertionError; our
-            Triton kernels do not check shapes.
-        InputError: If there are more Gaussians, pixels or tile pairs than the Triton kernels can address
-            (kernels/limits.py).
-    """
-    options: dict[str, Any] = {"max_off_axis": max_off_axis}
-    rasterization: Any = backend_torch.rasterization
-    triton = use_triton(means.device)
-    # gsplat compiles its CUDA kernels when they are first used. These imports stand here so that nothing touches them
-    # without a GPU.
-    if triton:
-        from sadgs_ns.render.backend_triton import rasterization
-
-        options["tile_capacity"] = tile_capacity
-    elif means.is_cuda:
-        import gsplat.rendering
-
-        rasterization, options = culling(gsplat.rendering.rasterization, max_off_axis), {}
-    if isinstance(colors, tuple) and not triton:
-        colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
-    return rasterization(
-        means,
-        quats,
-        scales,
-        opacities,
-        colors,
-        viewmats,
-        Ks,
-        width,
-        height,
-        sh_degree=sh_degree,
-        packed=False,
-        render_mode=render_mode,
-        absgrad=absgrad,
-        rasterize_mode=rasterize_mode,
-        near_plane=near_plane,
-        **options,
-    )
+    """Project and composite Gaussians, on their device; see `project` and `composite`."""
+    return composite(project(gaussians, cameras, options), options)
 
 
 def project(
-    means: Tensor,  # [N, 3]
-    quats: Tensor,  # [N, 4]
-    scales: Tensor,  # [N, 3]
-    opacities: Tensor,  # [N]
-    colors: Tensor | tuple[Tensor, Tensor],  # [(C,) N, D], [(C,) N, K, 3] or [N, 3] and [N, K - 1, 3]
-    viewmats: Tensor,  # [C, 4, 4]
-    Ks: Tensor,  # [C, 3, 3]
-    width: int,
-    height: int,
-    *,
-    sh_degree: int | None = None,
-    rasterize_mode: Literal["classic", "antialiased"] = "classic",
-    max_off_axis: float = 0.0,
-    near_plane: float = NEAR_PLANE,
+    gaussians: Gaussians, cameras: Cameras, options: RenderOptions = DEFAULTS, *, begin_tiles: bool = True
 ) -> Projected:
-    """Do the first half of `rasterize`, whose arguments these are: project Gaussians and compute their colours.
+    """Project Gaussians into cameras and compute their colours, differentiably.
 
-    Without our Triton kernels, that is the splatter's, on CUDA, too. Raises InputError if there are more Gaussians than
-    the Triton kernels can address (kernels/limits.py).
+    Args:
+        gaussians: They are float32, or float64 for the torch backend.
+        cameras: On the same device. With the Triton backend `Ks` gets no gradient.
+        options: The same as for `composite`.
+        begin_tiles: Whether the result is composited as it is. The Triton backend then begins its tile lists here, so
+            that the host waits for their length while the device computes colours.
+
+    Raises:
+        InputError: If `options.backend` cannot draw on this device, or there are more Gaussians or pixels than the
+            Triton kernels can address (kernels/limits.py).
+        ValueError: From the torch backend, if a shape does not match. gsplat raises AssertionError, and the Triton
+            kernels do not check shapes.
     """
-    antialiased = rasterize_mode == "antialiased"
-    if use_triton(means.device):
-        from sadgs_ns.render.backend_triton import project
-
-        return project(
-            means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree,
-            antialiased=antialiased, max_off_axis=max_off_axis, near_plane=near_plane,
-        )  # fmt: skip
-    if isinstance(colors, tuple):
-        colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
-    return backend_torch.project(
-        means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree,
-        antialiased=antialiased, max_off_axis=max_off_axis, near_plane=near_plane,
-    )  # fmt: skip
+    return _backend(options.backend, gaussians.means.device).project(gaussians, cameras, options, begin_tiles)
 
 
-def composite(
-    projected: Projected, width: int, height: int, *, absgrad: bool = False
-) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Do the second half of `rasterize`, whose arguments and results these are, for colours alone.
+def composite(projected: Projected, options: RenderOptions = DEFAULTS) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Composite Gaussians front to back, differentiably.
 
     Args:
         projected: What `project` returned, or rows of it that cameras of this size draw.
-        width: Image width in pixels.
-        height: Image height in pixels.
-        absgrad: Whether `backward` sets `means2d.absgrad`. [C, N, 2]
+        options: The same as for `project`.
+
+    Returns:
+        Colours [C, height, width, D], with the expected depth in the last of them where it was asked for; alphas in
+        [0, 1] [C, height, width, 1]; and `projected.info()` with `flatten_ids`, the tile lists, and from the Triton
+        backend `pair_counts` (kernels/tiles.py), the numbers of pairs of a Gaussian and a tile.
 
     Raises:
-        InputError: As `rasterize`.
+        InputError: If there are more Gaussians, pixels or tile pairs than the Triton kernels can address.
     """
-    if use_triton(projected.means2d.device):
-        from sadgs_ns.render.backend_triton import composite
+    drawn = projected
+    if options.expected_depth:
+        drawn = projected._replace(colors=torch.cat([projected.colors, projected.depths[..., None]], dim=-1))
+    backend = _backend(options.backend, projected.means2d.device)
+    renders, alphas, lists = backend.composite(drawn, options)
+    if options.expected_depth:
+        renders = torch.cat([renders[..., :-1], renders[..., -1:] / alphas.clamp_min(1e-10)], dim=-1)
+    return renders, alphas, projected.info() | lists
 
-        return composite(projected, width, height, absgrad=absgrad)
-    return backend_torch.composite(projected, width, height, absgrad=absgrad)
+
+def choose_backend(wanted: BackendName, device: torch.device) -> str:
+    """Return which backend draws on a device: "triton", "gsplat" or "torch".
+
+    "auto" is Triton where its kernels run, gsplat on CUDA without them, and torch elsewhere. Triton's lists hold only
+    tiles that a Gaussian reaches; what is drawn is the same, but for what gsplat 1.4 draws beyond three standard
+    deviations.
+
+    Raises:
+        InputError: If the backend that is wanted does not draw here.
+    """
+    if wanted == "auto":
+        return "triton" if use_triton(device) else "gsplat" if device.type == "cuda" else "torch"
+    if wanted == "triton" and not use_triton(device):
+        raise InputError(f"The backend triton does not run on {device} here (see sadgs-doctor): leave it at auto.")
+    if wanted == "gsplat" and device.type != "cuda":
+        raise InputError(f"The backend gsplat needs a CUDA device, and this is {device}: leave it at auto.")
+    return wanted
+
+
+def _backend(wanted: BackendName, device: torch.device) -> Any:
+    """Import the module of a backend. Triton need not be installed, and gsplat's loads nothing before it draws."""
+    return import_module(f"sadgs_ns.render.backend_{choose_backend(wanted, device)}")
 
 
 def visible(info: Mapping[str, Any]) -> Tensor:
     """Tell which Gaussians were drawn, from an `info` of gsplat 1.4 (one radius) or 1.5 (a radius for each axis).
 
     Args:
-        info: Third value of `rasterize`; `radii` is int [C, N] or [C, N, 2], in pixels, zero where culled.
+        info: Third value of `rasterize`, or gsplat's.
 
     Returns:
         bool [C, N]

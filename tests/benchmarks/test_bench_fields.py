@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from gsplat_like import splatted
 from PIL import Image
 from processes import HANGS
 from torch import Tensor
@@ -28,7 +29,6 @@ from benchmarks.phases import PHASES, Stopwatch
 from benchmarks.protocol import Job, Row, Scene
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.render import backend_torch
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 WIDTH, HEIGHT, VIEWS = 48, 36, 10
@@ -112,8 +112,8 @@ def replace_gsplat(patch: pytest.MonkeyPatch) -> None:
     if torch.cuda.is_available():
         return
 
-    def rasterization(packed: bool, sparse_grad: bool, **options: Any) -> Any:
-        return backend_torch.rasterization(**options)
+    def rasterization(sparse_grad: bool, far_plane: float, **options: Any) -> Any:
+        return splatted(**options)
 
     patch.setattr(splatfacto, "rasterization", rasterization)
     patch.setattr(torch.Tensor, "cuda", lambda tensor: tensor)

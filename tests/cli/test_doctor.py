@@ -39,18 +39,22 @@ def about(word: str) -> tuple[str, str]:
 @pytest.fixture
 def cuda(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     """Pretend that there is a GPU, on which everything works until the fields say otherwise."""
-    state = SimpleNamespace(extension=object(), compiles=True)
+    state = SimpleNamespace(compiles=True, has_gsplat=True)
 
     def available(device: torch.device) -> bool:
         if not state.compiles:
             warnings.warn("Triton's kernels do not run here: no C compiler", stacklevel=2)
         return state.compiles
 
+    def try_kernels() -> None:
+        if not state.has_gsplat:
+            raise RuntimeError("neither prebuilt nor compiled")
+
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (6_000_000_000, 8_000_000_000))
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "A GPU")
     monkeypatch.setattr(kernels, "available", available)
-    monkeypatch.setattr(gsplat_compat, "cuda_extension", lambda: state.extension)
+    monkeypatch.setattr(gsplat_compat, "try_kernels", try_kernels)
     return state
 
 
@@ -131,7 +135,7 @@ def test_a_gpu_s_memory_and_its_kernels_are_notes(cuda: SimpleNamespace):
 
 
 def test_kernels_that_do_not_compile_say_why(cuda: SimpleNamespace):
-    cuda.compiles, cuda.extension = False, None
+    cuda.compiles = cuda.has_gsplat = False
     severity, sentence = about("Triton")
     assert severity == "warning" and "(Triton's kernels do not run here: no C compiler): " in sentence
     assert sentence.endswith("install a torch whose Triton is 3.5 or newer, a C compiler and Python's headers.")

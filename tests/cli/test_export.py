@@ -15,6 +15,8 @@ import pytest
 import torch
 import trimesh
 import yaml
+from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci, _spherical_harmonics
+from gsplat_like import splatted
 from hypothesis import given
 from hypothesis import strategies as st
 from kill_and_resume import configure, parser_of, set_up
@@ -29,9 +31,7 @@ from sadgs_ns.data.coordinates import Similarity, from_data, spherical_harmonics
 from sadgs_ns.data.run_cameras import find_capture, read_cameras
 from sadgs_ns.errors import InputError
 from sadgs_ns.formats import FORMATS, html
-from sadgs_ns.gsplat_compat import torch_quat_scale_to_covar_preci, torch_spherical_harmonics
 from sadgs_ns.plugin.trainer import SadgsTrainer
-from sadgs_ns.render import backend_torch
 
 WIDTH, HEIGHT, VIEWS = 48, 36, 10
 PARAMS = {
@@ -104,7 +104,7 @@ def test_the_harmonics_are_gsplat_s_and_orthonormal():
     basis = spherical_harmonics(directions(), 3)
     for band in range(16):
         coefficients = torch.eye(16, dtype=torch.float64)[band].repeat(100, 1)[..., None]
-        theirs = torch_spherical_harmonics(3, torch.from_numpy(directions()), coefficients)[:, 0]
+        theirs = _spherical_harmonics(3, torch.from_numpy(directions()), coefficients)[:, 0]
         np.testing.assert_allclose(basis[:, band], theirs, atol=2e-14)
     identity = Similarity(1.0, np.eye(3), np.zeros(3)).harmonics(3)
     np.testing.assert_allclose(identity, np.eye(16), atol=1e-14)
@@ -142,7 +142,7 @@ def test_covariances_turn_with_the_world(seed: int, reflection: bool):
     quats, scales, means = generator.normal(size=(5, 4)), generator.normal(size=(5, 3)), generator.normal(size=(5, 3))
 
     def covariances(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
-        covars, _ = torch_quat_scale_to_covar_preci(torch.tensor(quats), torch.tensor(scales).exp(), True, False)
+        covars, _ = _quat_scale_to_covar_preci(torch.tensor(quats), torch.tensor(scales).exp(), True, False)
         assert covars is not None
         return covars.numpy()
 
@@ -192,7 +192,7 @@ def test_the_export_in_colmap_s_frame_looks_through_colmap_s_cameras_as_the_mode
         pose = pose() if callable(pose) else pose
         viewmat = np.eye(4)
         viewmat[:3] = pose.matrix()
-        render, _, _ = backend_torch.rasterization(
+        render, _, _ = splatted(
             torch.from_numpy(means),
             torch.from_numpy(quats),
             torch.from_numpy(scales),

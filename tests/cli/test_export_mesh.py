@@ -25,6 +25,7 @@ from sadgs_ns.data.run_cameras import read_cameras
 from sadgs_ns.errors import InputError
 from sadgs_ns.formats import mesh
 from sadgs_ns.formats.gaussians import DEGREE_0
+from sadgs_ns.render.types import RenderOptions
 
 ROOM = room_surfaces()
 WIDTH, HEIGHT, VIEWS = 80, 60, 12
@@ -118,7 +119,7 @@ def test_without_a_size_voxels_are_two_pixels_wide_or_as_many_as_fit(
 ):
     _, params, _ = export.read_checkpoint(run[1])
     cameras = read_cameras(run[1], run[0])
-    views = list(meshing.render_depths(params, cameras, range(3), max_off_axis=4.0))
+    views = list(meshing.render_depths(params, cameras, range(3), RenderOptions(max_off_axis=4.0)))
     depths = np.median([np.median(view.depth[view.depth > 0]) for view in views])
     size = meshing.derive_voxel_size(views)
     assert size == pytest.approx(2 * depths / (0.8 * WIDTH), rel=1e-4)
@@ -156,7 +157,7 @@ def test_depth_is_along_the_axis_and_pixels_that_are_mostly_empty_are_left_out()
     pose = torch.eye(4)[None, :3]
     K = torch.tensor([[[40.0, 0, 16], [0, 40, 16], [0, 0, 1]]])
     cameras = meshing.RunCameras(pose, K, [(32, 32)], [Path("a.png")])
-    (view,) = meshing.render_depths(params, cameras, [0], max_off_axis=0.0)
+    (view,) = meshing.render_depths(params, cameras, [0], RenderOptions(max_off_axis=0.0))
     assert view.depth[16, 16] == pytest.approx(2.0) and view.depth[0, 0] == 0
     alpha = 0.8 * np.exp(-0.5 * ((np.arange(32) + 0.5 - 16) ** 2) / ((0.3 * 20) ** 2 + 0.3))
     assert ((view.depth[16] > 0) == (alpha * np.exp(-0.5 * 0.25 / 36.3) >= 0.5)).all()
@@ -219,7 +220,7 @@ def test_what_views_see_on_a_gpu_is_what_they_see_on_the_cpu(run: tuple[Path, Pa
     params["features_rest"] = params["features_rest"][:, :bands].contiguous()
     cameras = read_cameras(run[1], run[0])
     moved = {name: value.cuda() for name, value in params.items()}
-    both = (meshing.render_depths(p, cameras, range(2), max_off_axis=4.0) for p in (params, moved))
+    both = (meshing.render_depths(p, cameras, range(2), RenderOptions(max_off_axis=4.0)) for p in (params, moved))
     for on_cpu, on_gpu in zip(*both, strict=True):
         seen = (on_cpu.depth > 0) & (on_gpu.depth > 0)
         assert (seen == (on_cpu.depth > 0)).mean() > 0.99

@@ -35,6 +35,7 @@ from sadgs_ns.plugin.panel import CHOICES, OFF, OUTPUT, StructurePanel, changed,
 from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.plugin.structure_cache import observe_training_views
 from sadgs_ns.render import rasterization
+from sadgs_ns.render.types import Gaussians
 
 WIDTH, HEIGHT, TRAIN_VIEWS, EVAL_VIEWS = 48, 36, 8, 2
 ITERATIONS = 60
@@ -337,9 +338,9 @@ def test_drawing_which_the_viewer_may_break_off_loads_no_photo(choice: str, pane
 def test_the_pictures_survive_tiny_windows_and_crop_boxes(panel: StructurePanel, monkeypatch: pytest.MonkeyPatch):
     rendered: list[int] = []
 
-    def rasterize(means: torch.Tensor, *args: Any, **options: Any) -> Any:
-        rendered.append(len(means))
-        return rasterization.rasterize(means, *args, **options)
+    def rasterize(gaussians: Gaussians, *args: Any) -> Any:
+        rendered.append(len(gaussians.means))
+        return rasterization.rasterize(gaussians, *args)
 
     monkeypatch.setattr(gaussian_maps, "rasterize", rasterize)
     pipeline = pipeline_of(panel)

@@ -20,6 +20,7 @@ from sadgs_ns.distributed.rasterization import rasterize
 from sadgs_ns.distributed.world import World
 from sadgs_ns.render.rasterization import rasterize as rasterize_alone
 from sadgs_ns.render.rasterization import visible
+from sadgs_ns.render.types import RenderOptions
 
 GPUS = pytest.mark.skipif(torch.cuda.device_count() < 2, reason="two GPUs are needed")
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
@@ -34,16 +35,16 @@ def run(command: list[str]) -> subprocess.CompletedProcess[str]:
 def compare_with_one(world: World, views: int) -> None:
     """Compare this process's part of images, gradients and absolute gradients with those of one process."""
     device = world.device
-    weight = weights(views).to(device)
+    weight, options = weights(views).to(device), RenderOptions(sh_degree=1, absgrad=True)
     alone = {name: value.detach().to(device).requires_grad_() for name, value in inputs().items()}
-    colors, alphas, info = rasterize_alone(*splats(alone, views), sh_degree=1, absgrad=True)
+    colors, alphas, info = rasterize_alone(*splats(alone, views), options)
     expected = torch.cat([colors, alphas], dim=-1)
     info["means2d"].grad2d = None
     (expected * weight).sum().backward()
 
     part = world.take_even_part(GAUSSIANS)
     mine = {name: value.detach().to(device).requires_grad_() for name, value in inputs(part).items()}
-    rendered, loss, own = rasterize(world, *splats(mine, views), sh_degree=1, absgrad=True)
+    rendered, loss, own = rasterize(world, *splats(mine, views), options)
     for band, colors, alphas in rendered:
         image = torch.cat([colors, alphas], dim=-1)[0, band.first - band.top : band.last - band.top]
         rows = slice(band.first, band.last)

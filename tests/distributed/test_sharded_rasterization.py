@@ -16,9 +16,10 @@ from sadgs_ns.distributed.rasterization import rasterize
 from sadgs_ns.distributed.world import World
 from sadgs_ns.render.rasterization import rasterize as rasterize_alone
 from sadgs_ns.render.rasterization import visible
+from sadgs_ns.render.types import RenderOptions
 
 
-def draw_together(world: World, views: int, mode: str, uneven: bool, fused: bool) -> dict[str, Any]:
+def draw_together(world: World, views: int, mode: Any, uneven: bool, fused: bool) -> dict[str, Any]:
     if fused:
         from interpreted import use_our_rasterizer
 
@@ -29,9 +30,9 @@ def draw_together(world: World, views: int, mode: str, uneven: bool, fused: bool
         start = sum(world.sizes[: world.rank])
         part = slice(start, start + world.sizes[world.rank])
     leaves = inputs(part)
-    options: dict[str, Any] = {"sh_degree": 1, "absgrad": True, "rasterize_mode": mode, "max_off_axis": 1.5}
+    options = RenderOptions(sh_degree=1, absgrad=True, rasterize_mode=mode, max_off_axis=1.5)
     world.flags_out = 1 << world.rank
-    rendered, loss, info = rasterize(world, *splats(leaves, views), **options)
+    rendered, loss, info = rasterize(world, *splats(leaves, views), options)
     images = []
     for band, colors, alphas in rendered:
         rows = slice(band.first - band.top, band.last - band.top)
@@ -68,10 +69,8 @@ def test_processes_draw_and_differentiate_what_one_does(
             pytest.skip("Triton is interpreted where there is no GPU")
         pytest.importorskip("interpreted", reason="Triton is not installed", exc_type=ImportError)
     leaves = inputs()
-    colors, alphas, info = rasterize_alone(
-        *splats(leaves, views),
-        sh_degree=1, absgrad=True, rasterize_mode=mode, max_off_axis=1.5,
-    )  # fmt: skip
+    options = RenderOptions(sh_degree=1, absgrad=True, rasterize_mode=mode, max_off_axis=1.5)
+    colors, alphas, info = rasterize_alone(*splats(leaves, views), options)
     info["means2d"].retain_grad()
     expected = torch.cat([colors, alphas], dim=-1)
     loss = (expected * weights(views)).sum()

@@ -11,13 +11,13 @@ import pytest
 import torch
 from browser import open_page
 from gaussians import random_gaussians
+from gsplat_like import splatted
 from PIL import Image
 
 from sadgs_ns import formats
 from sadgs_ns.errors import InputError
 from sadgs_ns.formats import html
 from sadgs_ns.formats.gaussians import Gaussians
-from sadgs_ns.render import backend_torch
 
 START = html.Start((1.0, -8.0, 2.0), (0.5, 0.5, 0.5), 60.0)
 
@@ -34,7 +34,7 @@ def render(gaussians: Gaussians, width: int, height: int) -> np.ndarray:
     focal = width / (2 * np.tan(np.radians(START.degrees) / 2))
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float32)
     harmonics = np.concatenate([gaussians.features_dc[:, None], gaussians.features_rest], axis=1)
-    image, _, _ = backend_torch.rasterization(
+    image, _, _ = splatted(
         torch.from_numpy(gaussians.means),
         torch.from_numpy(gaussians.quats),
         torch.from_numpy(gaussians.scales).exp(),

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from typing import Any
 
+import gsplat
 import pytest
 import scenes
 import torch
-from gsplat.cuda._torch_impl import _fully_fused_projection
+from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
+from gsplat_like import rasterization
 from torch import Tensor
 
 from sadgs_ns import gsplat_compat
+from sadgs_ns.kernels import triton_switched
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, keep_gradient
-from sadgs_ns.render import backend_torch
 from sadgs_ns.render.rasterization import visible
 
 compositing = pytest.importorskip("sadgs_ns.kernels.compositing", reason="Triton is not installed")
 forward = pytest.importorskip("sadgs_ns.kernels.compositing_forward", reason="Triton is not installed")
-rasterization = pytest.importorskip("sadgs_ns.render.backend_triton", reason="Triton is not installed")
 tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not installed")
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -334,7 +335,7 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
     width, height = 22, 18
 
     def project(means, quats, scales, opacities, viewmats, Ks, width, height, calc_compensations, near_plane):
-        covariances = gsplat_compat.torch_quat_scale_to_covar_preci(quats, scales, True, False)[0]
+        covariances = _quat_scale_to_covar_preci(quats, scales, True, False)[0]
         assert covariances is not None
         return _fully_fused_projection(
             means,
@@ -356,20 +357,18 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
     Ks = scenes.camera(width, height, 30.0)[1].repeat(2, 1, 1)
     rest, v_renders = (0.1 * torch.randn(shape, generator=generator) for shape in ((60, 15, 3), (2, height, width, 3)))
     results, drawn = [], []
-    for function, dtype in ((rasterization.rasterization, torch.float32), (backend_torch.rasterization, torch.float64)):
+    for backend, dtype in (("triton", torch.float32), ("torch", torch.float64)):
         values = {name: p.detach() for name, p in scenes.random_params(60).items()} | {"rest": rest}
         values = {name: value.to(dtype, copy=True).requires_grad_() for name, value in values.items()}
         colors: Any = values["features_dc"], values["rest"]
-        if dtype == torch.float64:
-            colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
         geometry = values["means"], values["quats"], values["scales"].exp(), torch.sigmoid(values["opacities"])
         options = {"tile_capacity": capacity} if dtype == torch.float32 else {}
-        renders, _, info = function(
-            *geometry, colors, viewmats.to(dtype), Ks.to(dtype), width, height, **options,
-            sh_degree=3, packed=False, render_mode="RGB", absgrad=True, rasterize_mode=mode, max_off_axis=max_off_axis,
-        )  # fmt: skip
+        with triton_switched(backend == "triton"):
+            renders, _, info = rasterization(
+                *geometry, colors, viewmats.to(dtype), Ks.to(dtype), width, height, **options, backend=backend,
+                sh_degree=3, absgrad=True, rasterize_mode=mode, max_off_axis=max_off_axis,
+            )  # fmt: skip
         if options:
-            assert info["tile_height"] == info["tile_width"] == 3
             needed = sum(info["pair_counts"].wait())
             assert len(info["flatten_ids"]) == (capacity or needed) >= needed > 150
         drawn.append(int(visible(info).sum()))
@@ -394,8 +393,8 @@ def test_what_is_drawn_is_as_close_to_float64_as_what_gsplat_draws(kind):
     scene = make_scene(kind, num_views=3, n=300, width=93, height=70)
     _, true_alphas, _ = reference(scene)
     means2d, conics, colors, opacities = (scene[name].contiguous() for name in NAMES[:4])
-    expected = gsplat_compat.rasterize_to_pixels(
-        means2d, conics, colors, opacities, 93, 70, 8, scene["starts"], scene["ids"], False
+    expected = gsplat.rasterize_to_pixels(
+        means2d, conics, colors, opacities, 93, 70, 8, scene["starts"], scene["ids"], absgrad=False
     )  # fmt: skip
     truths = (scene["renders"], true_alphas)
     for ours, gsplats, true in zip(drawn_by_the_kernel(scene)[:2], expected, truths, strict=True):
@@ -421,8 +420,8 @@ def test_gradients_are_as_close_to_float64_as_gsplats(kind):
         if ours:
             outputs = compositing.rasterize_to_pixels(means2d, conics, colors, opacities, 93, 70, *lists, True)
         else:
-            outputs = gsplat_compat.rasterize_to_pixels(
-                means2d, conics, colors, opacities, 93, 70, 8, *lists, True
+            outputs = gsplat.rasterize_to_pixels(
+                means2d, conics, colors, opacities, 93, 70, 8, *lists, absgrad=True
             )  # fmt: skip
         torch.autograd.backward(outputs, [scene["v_renders"], scene["v_alphas"]])
         gradients: dict[str, Any] = dict(

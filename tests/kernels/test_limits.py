@@ -7,10 +7,11 @@ import torch
 
 from sadgs_ns.errors import InputError
 from sadgs_ns.kernels import limits
+from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
 
 harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")
 losses = pytest.importorskip("sadgs_ns.kernels.losses", reason="Triton is not installed")
-rasterization = pytest.importorskip("sadgs_ns.render.backend_triton", reason="Triton is not installed")
+backend_triton = pytest.importorskip("sadgs_ns.render.backend_triton", reason="Triton is not installed")
 tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not installed")
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -40,10 +41,8 @@ def test_the_largest_sizes_pass_and_one_more_is_refused():
 
 def render(num_views: int, num_gaussians: int, side: int) -> None:
     means, viewmats = torch.empty((num_gaussians, 3), device="meta"), torch.empty((num_views, 4, 4), device="meta")
-    rasterization.rasterization(
-        means, means, means, means, means, viewmats, viewmats, side, side,
-        sh_degree=None, packed=False, render_mode="RGB", absgrad=False, rasterize_mode="classic",
-    )  # fmt: skip
+    gaussians, cameras = Gaussians(means, means, means, means, means), Cameras(viewmats, viewmats, side, side)
+    backend_triton.project(gaussians, cameras, RenderOptions())
 
 
 @pytest.mark.hard_case("more Gaussians, pixels or tile pairs than the kernels address", "refused before anything runs")

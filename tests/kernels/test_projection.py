@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from gsplat.cuda._torch_impl import _fully_fused_projection
+from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
 from torch import Tensor
 
 from sadgs_ns import gsplat_compat
@@ -51,7 +51,7 @@ def project_in_torch(
     width: int, height: int, calc_compensations: bool, near_plane: float = 0.01, per_axis_radii: bool = False,
 ) -> tuple[Any, ...]:  # fmt: skip
     """Do what `gsplat_compat.project` does, with radii in either layout."""
-    covariances, _ = gsplat_compat.torch_quat_scale_to_covar_preci(quats, scales, True, False)
+    covariances, _ = _quat_scale_to_covar_preci(quats, scales, True, False)
     assert covariances is not None
     radii, *others = _fully_fused_projection(
         means, covariances, viewmats, Ks, width, height, near_plane=near_plane, calc_compensations=calc_compensations

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from gsplat_like import splatted
 
 from sadgs_ns.method import clearance
 from sadgs_ns.method.clearance import clear_of_cameras, limit_scales
-from sadgs_ns.render.backend_torch import rasterization
 
 
 def test_points_are_clear_of_cameras_from_their_radius_on():
@@ -63,7 +63,7 @@ def test_a_giant_beside_the_view_covers_all_of_it_until_it_is_limited():
     K = torch.tensor([[[40.0, 0.0, 20.0], [0.0, 40.0, 15.0], [0.0, 0.0, 1.0]]])
 
     def opacity() -> torch.Tensor:
-        _, alphas, _ = rasterization(
+        _, alphas, _ = splatted(
             means, quats, scales.exp(), torch.tensor([0.97]), torch.ones((1, 3)), torch.eye(4)[None], K, 40, 30
         )
         return alphas

@@ -6,10 +6,11 @@ import math
 
 import pytest
 import torch
+from gsplat.cuda._torch_impl import _persp_proj, _quat_scale_to_covar_preci, _world_to_cam
 from scenes import camera, random_params
 from torch import Tensor
 
-from sadgs_ns.gsplat_compat import SCREEN_BLUR, torch_persp_proj, torch_quat_scale_to_covar_preci, torch_world_to_cam
+from sadgs_ns.gsplat_compat import SCREEN_BLUR
 from sadgs_ns.method.eta import (
     eta,
     principal_eigenvalue,
@@ -78,12 +79,12 @@ def test_projected_axes_span_gsplat_s_2d_covariance():
     params["means"].data[:10, 0] += 8.0  # far outside the image, where the clamp acts
     viewmats, Ks = view(n)
     axes = axes_of(params, n)
-    covars, _ = torch_quat_scale_to_covar_preci(
+    covars, _ = _quat_scale_to_covar_preci(
         torch.nn.functional.normalize(params["quats"].detach(), dim=-1), params["scales"].detach().exp(), True, False
     )
     assert covars is not None
-    means_c, covars_c = torch_world_to_cam(params["means"].detach(), covars, viewmats[:1])
-    _, expected = torch_persp_proj(means_c, covars_c, Ks[:1], WIDTH, HEIGHT)
+    means_c, covars_c = _world_to_cam(params["means"].detach(), covars, viewmats[:1])
+    _, expected = _persp_proj(means_c, covars_c, Ks[:1], WIDTH, HEIGHT)
     torch.testing.assert_close(axes.transpose(1, 2) @ axes, expected[0], rtol=1e-9, atol=1e-9)
 
 

@@ -9,6 +9,7 @@ from torch import Tensor
 from sadgs_ns.method import near_plane
 from sadgs_ns.method.near_plane import NEAR_SHARE, NEAREST_POINTS, UNKNOWN_SHARE
 from sadgs_ns.render.rasterization import rasterize
+from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
 
 EXTENT = 7.0
 
@@ -115,7 +116,8 @@ def test_a_faint_gaussian_before_a_camera_is_haze_without_the_plane_and_nothing_
 
     def draw(count: int, near_plane: float) -> Tensor:
         rows = [value[:count] for value in (means, quats, scales, opacities, colors)]
-        return rasterize(rows[0], rows[1], rows[2], rows[3], rows[4], viewmats, Ks, 100, 100, near_plane=near_plane)[0]
+        cameras = Cameras(viewmats, Ks, 100, 100)
+        return rasterize(Gaussians(*rows), cameras, RenderOptions(near_plane=near_plane))[0]
 
     clean = draw(1, 0.01)
     assert (draw(2, 0.01) - clean).abs().mean() > 0.1

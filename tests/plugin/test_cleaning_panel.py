@@ -79,9 +79,9 @@ def test_what_views_see_is_measured_once_and_again_when_training_went_on(
     panel, model = pipeline.cleaning, pipeline.model
     looks: list[int] = []
 
-    def look(params: Any, cameras: Any, **drawing: Any) -> Any:
+    def look(params: Any, cameras: Any, drawing: Any) -> Any:
         looks.append(len(cameras))
-        return see(params, cameras, **drawing)
+        return see(params, cameras, drawing)
 
     monkeypatch.setattr("sadgs_ns.plugin.cleaning_panel.see", look)
     said = set_to(panel, min_views=3)
@@ -89,7 +89,7 @@ def test_what_views_see_is_measured_once_and_again_when_training_went_on(
     views = len(pipeline.views)
     assert looks == [views]
     params = dict(model.gauss_params.items())
-    seen = see(params, panel._cameras(), **model.drawing)
+    seen = see(params, panel._cameras(), model.drawing)
     _, sentences = find(params, Cleaning(min_views=3), seen)
     assert said.startswith(sentences[0])
     model.step += 1

@@ -58,8 +58,8 @@ def test_tile_lists_are_tried_in_the_size_of_the_run(config: SadgsTrainerConfig,
     trainer.setup()
     sizes = []
 
-    def rasterize(*args, **options):
-        sizes.append(args[7:9])
+    def rasterize(gaussians, cameras, options):
+        sizes.append((cameras.width, cameras.height))
         return None, None, {}
 
     monkeypatch.setattr(compilation, "rasterize", rasterize)

@@ -43,6 +43,7 @@ from sadgs_ns.plugin.presets import RATES
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 from sadgs_ns.plugin.views import ViewSampler
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world, visible
+from sadgs_ns.render.types import Cameras as Pinholes
 
 
 @pytest.fixture(scope="module")
@@ -663,7 +664,7 @@ def test_training_evaluation_and_a_loaded_run_draw_from_the_same_plane(finished:
         pose[0, :, 3] = model.means.data[0] + share * stored * pose[0, :, 2]
         viewmat = viewmats_from_camera_to_world(pose).to(model.device)
         Ks = cameras.get_intrinsics_matrices()[:1].to(model.device)
-        _, _, info = model.render(viewmat, Ks, WIDTH, HEIGHT, "RGB")
+        _, _, info = model.render(Pinholes(viewmat, Ks, WIDTH, HEIGHT), model.color_options())
         assert int(visible(info).sum()) == drawn
 
 

@@ -25,15 +25,15 @@ from typing import Any
 import pytest
 import scenes
 import torch
+from gsplat.cuda._torch_impl import _spherical_harmonics
+from gsplat_like import splatted
 from kill_and_resume import differences
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from runs import checkpoint, configure, train
 from torch import Tensor
 
 from sadgs_ns import kernels
-from sadgs_ns.gsplat_compat import torch_spherical_harmonics
 from sadgs_ns.method import losses
-from sadgs_ns.render import backend_torch
 
 harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")
 photometric = pytest.importorskip("sadgs_ns.kernels.losses", reason="Triton is not installed")
@@ -201,9 +201,7 @@ def render_hard(gaussians: dict[str, Any], **options: Any) -> Tensor:
     dtype, device = gaussians["means"].dtype, gaussians["means"].device
     viewmats = torch.eye(4, dtype=dtype, device=device)[None]
     Ks = torch.tensor([[[9.0, 0, 3.1], [0, 9.0, 2.6], [0, 0, 1]]], dtype=dtype, device=device)
-    colors, alphas, _ = backend_torch.rasterization(
-        **gaussians, viewmats=viewmats, Ks=Ks, width=6, height=5, tile_size=4, **options
-    )
+    colors, alphas, _ = splatted(**gaussians, viewmats=viewmats, Ks=Ks, width=6, height=5, tile_size=4, **options)
     return torch.cat([colors, alphas], dim=-1)
 
 
@@ -241,7 +239,7 @@ def test_loss_and_splatter_together_by_finite_differences():
 
     def loss(*values: Tensor) -> Tensor:
         arguments: dict[str, Any] = dict(zip(names, values, strict=True))
-        rgb, _, _ = backend_torch.rasterization(**arguments, viewmats=viewmats, Ks=Ks, width=11, height=12)
+        rgb, _, _ = splatted(**arguments, viewmats=viewmats, Ks=Ks, width=11, height=12)
         return losses.photometric_loss(rgb, target)[0]
 
     inputs = [gaussians[name].clone().requires_grad_() for name in names]
@@ -274,7 +272,7 @@ def compare_harmonics(degree: int, values: list[Tensor], viewmats: Tensor, drawn
     (colors * (weights * drawn[..., None]).to(DEVICE)).sum().backward()
     slow = means, first, rest = [value.double().requires_grad_() for value in values]
     coefficients = torch.cat([first[:, None], rest], dim=1).expand(views, -1, -1, -1)
-    expected = (torch_spherical_harmonics(degree, means - scenes.centres_of(viewmats), coefficients) + 0.5).clamp_min(0)
+    expected = (_spherical_harmonics(degree, means - scenes.centres_of(viewmats), coefficients) + 0.5).clamp_min(0)
     (expected * weights * drawn[..., None]).sum().backward()
     torch.testing.assert_close(colors[drawn.to(DEVICE)].double().cpu(), expected[drawn], atol=1e-5, rtol=1e-5)
     gradients = []

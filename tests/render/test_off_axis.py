@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 from typing import Any
 
-import gsplat.rendering
 import pytest
 import torch
+from gsplat_like import rasterization
 from random_scene import random_scene
-from torch import Tensor
 
-from sadgs_ns.render import backend_torch
-from sadgs_ns.render.off_axis import cull_off_axis, culling, near_axis
-from sadgs_ns.render.rasterization import rasterize, visible
+from sadgs_ns.render.off_axis import cull_off_axis, near_axis
+from sadgs_ns.render.rasterization import visible
 
 WIDTH, HEIGHT = 40, 30
 
@@ -45,8 +42,8 @@ def scene() -> dict[str, Any]:
 
 def test_what_is_left_is_drawn_as_if_the_culled_were_not_there():
     arguments = scene()
-    colors, alphas, info = rasterize(**arguments, width=40, height=40, sh_degree=3, max_off_axis=2.0)
-    _, everything, all_info = rasterize(**arguments, width=40, height=40, sh_degree=3)
+    colors, alphas, info = rasterization(**arguments, width=40, height=40, sh_degree=3, max_off_axis=2.0)
+    _, everything, all_info = rasterization(**arguments, width=40, height=40, sh_degree=3)
     drawn = visible(info)
     assert (visible(all_info) & ~drawn).sum(dim=1).min() > 0, "the cameras should both lose Gaussians"
     assert (drawn[0] != drawn[1]).any()
@@ -54,14 +51,14 @@ def test_what_is_left_is_drawn_as_if_the_culled_were_not_there():
     for view in range(2):
         rest = {name: value[drawn[view]] for name, value in arguments.items() if name not in ("viewmats", "Ks")}
         cameras = {name: arguments[name][view : view + 1] for name in ("viewmats", "Ks")}
-        expected, _, _ = backend_torch.rasterization(**rest, **cameras, width=40, height=40, sh_degree=3)
+        expected, _, _ = rasterization(**rest, **cameras, width=40, height=40, sh_degree=3)
         assert torch.equal(colors[view], expected[0])
 
 
 def test_what_is_not_drawn_has_no_gradient():
     arguments = scene()
     means = arguments["means"].requires_grad_()
-    colors, _, info = rasterize(**arguments, width=40, height=40, sh_degree=3, max_off_axis=2.0)
+    colors, _, info = rasterization(**arguments, width=40, height=40, sh_degree=3, max_off_axis=2.0)
     colors.sum().backward()
     nowhere = ~visible(info).any(dim=0)
     assert means.grad is not None and (means.grad[nowhere] == 0).all() and (means.grad[~nowhere] != 0).any()
@@ -75,53 +72,8 @@ def test_a_giant_beside_the_view_covers_none_of_it():
     # As on a capture of 30 photos (tests/method/test_clearance.py): 30 units to the side, an axis of 324 units.
     K = torch.tensor([[[40.0, 0.0, 20.0], [0.0, 40.0, 15.0], [0.0, 0.0, 1.0]]])
     for max_off_axis, covered in ((0.0, True), (4.0, False)):
-        _, alphas, _ = rasterize(
+        _, alphas, _ = rasterization(
             torch.tensor([[30.0, 0.0, 0.85]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.tensor([[324.0, 26.0, 1.6]]),
             torch.tensor([0.97]), torch.ones((1, 3)), torch.eye(4)[None], K, WIDTH, HEIGHT, max_off_axis=max_off_axis,
         )  # fmt: skip
         assert bool((alphas > 0.5).all()) is covered and bool((alphas == 0).all()) is not covered
-
-
-class _TileListsWanted(Exception):
-    """Raised where gsplat would make its tile lists, which needs CUDA."""
-
-
-@pytest.mark.parametrize("per_axis", [False, True])
-def test_gsplats_own_code_gets_the_culled_radii(per_axis: bool, monkeypatch: pytest.MonkeyPatch):
-    """On CUDA without Triton gsplat's `rasterization` draws; only its projection and its tile lists are replaced."""
-    means2d = torch.tensor([[[20.0, 15.0], [500.0, 15.0]]])
-    radii = torch.full((1, 2, 2) if per_axis else (1, 2), 7, dtype=torch.int32)
-    seen: dict[str, Tensor] = {}
-
-    def project(*args: Any, **options: Any) -> tuple[Any, ...]:
-        return radii, means2d, torch.ones(1, 2), torch.ones(1, 2, 3), None
-
-    def isect_tiles(means2d: Tensor, radii: Tensor, *args: Any, **options: Any) -> None:
-        seen["radii"] = radii
-        raise _TileListsWanted
-
-    monkeypatch.setattr(gsplat.rendering, "fully_fused_projection", project)
-    monkeypatch.setattr(gsplat.rendering, "isect_tiles", isect_tiles)
-    arguments = scene()
-    arguments = {name: value[: 1 if name in ("viewmats", "Ks") else 2] for name, value in arguments.items()}
-    arguments |= {"colors": torch.ones(2, 3), "width": WIDTH, "height": HEIGHT, "packed": False}
-    for max_off_axis, expected in ((4.0, [True, False]), (0.0, [True, True])):
-        function = culling(gsplat.rendering.rasterization, max_off_axis)
-        with pytest.raises(_TileListsWanted):
-            function(**arguments)
-        assert visible({"radii": seen["radii"], "means2d": means2d})[0].tolist() == expected
-    assert gsplat.rendering.fully_fused_projection is project, "the module's own names should stay"
-
-
-def test_cuda_without_triton_gets_gsplat_that_culls(monkeypatch: pytest.MonkeyPatch):
-    asked: list[float] = []
-
-    def made(rasterization: Any, max_off_axis: float) -> Any:
-        asked.append(max_off_axis)
-        return lambda *args, **options: ("colors", "alphas", options)
-
-    monkeypatch.setattr("sadgs_ns.render.rasterization.culling", made)
-    means = SimpleNamespace(is_cuda=True, device=torch.device("cpu"))
-    arguments: list[Any] = [means, *[None] * 6, 32, 24]
-    _, _, options = rasterize(*arguments, max_off_axis=3.0)
-    assert asked == [3.0] and "max_off_axis" not in options

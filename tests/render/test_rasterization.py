@@ -1,4 +1,4 @@
-"""The seam between gsplat and the torch splatter, and the helpers that read what both return."""
+"""Which backend draws, that gsplat and the torch backend agree, and the functions that read what they return."""
 
 from __future__ import annotations
 
@@ -6,45 +6,43 @@ import os
 import subprocess
 import sys
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 import torch
 from random_scene import random_scene, render_with_gradients
 
-from sadgs_ns.render import backend_torch
-from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world, visible
+from sadgs_ns.errors import InputError
+from sadgs_ns.render import rasterization
+from sadgs_ns.render.rasterization import viewmats_from_camera_to_world, visible
 
 
-def test_the_cpu_gets_the_splatter(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsplat.rendering.rasterization", Mock(side_effect=AssertionError("gsplat on a CPU")))
-    scene: dict[str, Any] = random_scene(50, 32, seed=0)
-    del scene["weights"]
-    scene["means"][:5, 2] = -4.0  # behind the camera
-    options: dict[str, Any] = {"sh_degree": 3, "rasterize_mode": "antialiased", "render_mode": "RGB+ED"}
-    colors, alphas, info = rasterize(**scene, width=32, height=32, **options)
-    expected_colors, expected_alphas, expected_info = backend_torch.rasterization(
-        **scene, width=32, height=32, **options
-    )
-    assert torch.equal(colors, expected_colors) and torch.equal(alphas, expected_alphas)
-    assert torch.equal(visible(info), visible(expected_info))
-    assert 0 < visible(info).sum() < 50
+def devices_have(monkeypatch: pytest.MonkeyPatch, triton: bool) -> None:
+    monkeypatch.setattr(rasterization, "use_triton", lambda place: triton)
 
 
-def test_cuda_gets_gsplat_unpacked(monkeypatch: pytest.MonkeyPatch) -> None:
-    gsplat = Mock(return_value=("colors", "alphas", {}))
-    monkeypatch.setattr("gsplat.rendering.rasterization", gsplat)
-    arguments: list[Any] = [Mock(is_cuda=True), *(Mock() for _ in range(6)), 32, 24]
-    assert rasterize(*arguments, absgrad=True)[:2] == ("colors", "alphas")
-    gsplat.assert_called_once_with(
-        *arguments,
-        sh_degree=None,
-        packed=False,
-        render_mode="RGB",
-        absgrad=True,
-        rasterize_mode="classic",
-        near_plane=0.01,
-    )
+@pytest.mark.parametrize(
+    ("wanted", "device", "triton", "chosen"),
+    [
+        ("auto", "cuda", True, "triton"),
+        ("auto", "cuda", False, "gsplat"),
+        ("auto", "cpu", False, "torch"),
+        ("gsplat", "cuda", True, "gsplat"),
+        ("torch", "cuda", True, "torch"),
+        ("triton", "cuda", True, "triton"),
+    ],
+)
+def test_the_backend_follows_the_device(
+    wanted: Any, device: str, triton: bool, chosen: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    devices_have(monkeypatch, triton)
+    assert rasterization.choose_backend(wanted, torch.device(device)) == chosen
+
+
+@pytest.mark.parametrize(("wanted", "device"), [("gsplat", "cpu"), ("triton", "cpu"), ("triton", "cuda")])
+def test_a_backend_that_does_not_run_here_is_refused(wanted: Any, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    devices_have(monkeypatch, triton=False)
+    with pytest.raises(InputError, match=rf"^The backend {wanted} [^.]+{device}[^.]+\.$"):
+        rasterization.choose_backend(wanted, torch.device(device))
 
 
 def test_the_cpu_never_loads_gsplats_kernels() -> None:

@@ -1,0 +1,42 @@
+"""Changes of parameters together with the moments of their optimizers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, MutableMapping, Sequence
+
+import torch
+from torch import Tensor
+
+Params = MutableMapping[str, torch.nn.Parameter] | torch.nn.ParameterDict
+"""gsplat's parameters by name, each with leading dimension N."""
+
+
+@torch.no_grad()
+def update_param_with_optimizer(
+    param_fn: Callable[[str, Tensor], torch.nn.Parameter],
+    optimizer_fn: Callable[[str, Tensor], Tensor],
+    params: Params,
+    optimizers: Mapping[str, torch.optim.Optimizer],
+    names: Sequence[str] | None = None,
+) -> None:
+    """Put others in the place of parameters and of their optimizers' moments, as gsplat's `duplicate` and `split` do.
+
+    While a parameter is changed, its optimizer has no state, by which plugin/trainer.py recognizes that memory ran out
+    meanwhile.
+
+    Args:
+        param_fn: Makes a parameter of its name and what it was.
+        optimizer_fn: Makes a moment of its key and what it was; `step` stays.
+        params: The parameters.
+        optimizers: One per parameter; a parameter that is not trained may have none.
+        names: Which parameters are changed; None changes all.
+    """
+    for name in list(params) if names is None else names:
+        old, optimizer = params[name], optimizers.get(name)
+        state = {} if optimizer is None else optimizer.state.pop(old, {})
+        for key, value in state.items():
+            if key != "step":
+                state[key] = optimizer_fn(key, value)
+        params[name] = new = param_fn(name, old)
+        if optimizer is not None:
+            optimizer.param_groups[0]["params"], optimizer.state[new] = [new], state

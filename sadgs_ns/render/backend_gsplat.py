@@ -1,0 +1,64 @@
+"""gsplat's CUDA kernels behind `project` and `composite`, by gsplat's public functions alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gsplat
+import torch
+from torch import Tensor
+
+from sadgs_ns import gsplat_compat
+from sadgs_ns.render.off_axis import cull_off_axis
+from sadgs_ns.render.types import Cameras, Gaussians, Projected, RenderOptions
+
+TILE_SIZE = 16
+"""Size of tiles in px: gsplat's own choice, with which its kernels are fastest."""
+
+
+def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions, begin_tiles: bool = True) -> Projected:
+    """Do what `rasterization.project` says."""
+    viewmats, _, width, height = cameras
+    radii, means2d, depths, conics, compensations = gsplat_compat.project(
+        *gaussians[:4], *cameras, options.antialiased, options.near_plane
+    )
+    if options.max_off_axis > 0:
+        radii = cull_off_axis(radii, means2d, width, height, options.max_off_axis)
+    opacities = opacities_in_views(gaussians.opacities, compensations, len(viewmats))
+    colors = colors_in_views(gaussians, viewmats, gsplat_compat.drawn(radii, means2d), options.sh_degree)
+    return Projected(radii, means2d, depths, conics, opacities, colors, width, height)
+
+
+def opacities_in_views(opacities: Tensor, compensations: Tensor | None, num_views: int) -> Tensor:
+    """Return opacities [N] as cameras see them, after compensation [C, N] for the blur if there is one. [C, N]"""
+    if compensations is not None:
+        return opacities * compensations
+    # One copy serves the tiles and compositing. `expand` would be slower: torch reduces its gradient over the views ten
+    # times as slowly as it adds.
+    return opacities[None] if num_views == 1 else torch.stack([opacities] * num_views)
+
+
+def colors_in_views(gaussians: Gaussians, viewmats: Tensor, drawn: Tensor, sh_degree: int | None) -> Tensor:
+    """Return colours as cameras see them [C, N, D], computed where Gaussians are drawn, bool [C, N]."""
+    num_views, colors = len(viewmats), gaussians.colors
+    if isinstance(colors, tuple):
+        colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
+    if sh_degree is None:
+        return colors.expand(num_views, -1, -1)
+    # gsplat inverts the matrices, which makes the host wait for the device.
+    positions = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:]).mT  # [C, 1, 3]
+    coefficients = colors.expand(num_views, -1, -1, -1)
+    colors = gsplat.spherical_harmonics(sh_degree, gaussians.means - positions, coefficients, masks=drawn)
+    return torch.clamp_min(colors + 0.5, 0.0)
+
+
+def composite(projected: Projected, options: RenderOptions) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Do what `rasterization.composite` says, but for the depth; the last result is what it adds to the info."""
+    radii, means2d, depths, conics, opacities, colors, width, height, _ = projected
+    columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
+    _, keys, flatten_ids = gsplat.isect_tiles(means2d, radii, depths, TILE_SIZE, columns, rows)
+    starts = gsplat.isect_offset_encode(keys, len(means2d), columns, rows)
+    renders, alphas = gsplat.rasterize_to_pixels(
+        means2d, conics, colors, opacities, width, height, TILE_SIZE, starts, flatten_ids, absgrad=options.absgrad
+    )
+    return renders, alphas, {"flatten_ids": flatten_ids}

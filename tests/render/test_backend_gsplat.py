@@ -1,0 +1,94 @@
+"""The gsplat backend: with torch functions in the place of gsplat's on a CPU, and beside Triton's on a GPU."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from gsplat_stub import stub_gsplat
+from random_scene import random_scene
+from torch import Tensor
+
+from sadgs_ns import kernels
+from sadgs_ns.method.absgs import keep_gradient
+from sadgs_ns.render import backend_gsplat, backend_torch, rasterization
+from sadgs_ns.render.rasterization import visible
+from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
+
+CASES = {
+    "harmonics": (RenderOptions(sh_degree=3, absgrad=True), 1),
+    "two views": (RenderOptions(sh_degree=2, absgrad=True), 2),
+    "antialiased with depth": (RenderOptions(sh_degree=1, rasterize_mode="antialiased", expected_depth=True), 2),
+    "off the axis": (RenderOptions(sh_degree=3, max_off_axis=0.7, absgrad=True), 2),
+    "near plane": (RenderOptions(sh_degree=3, near_plane=2.9, absgrad=True), 1),
+    "features": (RenderOptions(absgrad=True), 2),
+}
+
+
+def drawn_by(
+    module: Any, options: RenderOptions, views: int, size: int, device: str, dtype: torch.dtype, pose: bool = False
+) -> dict[str, Tensor]:
+    """Images, absolute and plain gradients of a random scene, and what was drawn, in float64 on the CPU."""
+    values = {name: value.to(device, dtype) for name, value in random_scene(800, size, seed=0).items()}
+    viewmats, Ks = values["viewmats"].repeat(views, 1, 1), values["Ks"].repeat(views, 1, 1)
+    viewmats[-1, 0, 3] = 0.4
+    viewmats.requires_grad_(pose)
+    leaves = {name: values[name].clone().requires_grad_() for name in ("means", "quats", "scales", "opacities")}
+    leaves |= {"first": values["colors"][:, 0].clone().requires_grad_()}
+    leaves |= {"rest": values["colors"][:, 1:].clone().requires_grad_()} if options.sh_degree is not None else {}
+    colors: Any = (leaves["first"], leaves["rest"]) if "rest" in leaves else leaves["first"]
+    gaussians = Gaussians(leaves["means"], leaves["quats"], leaves["scales"], leaves["opacities"], colors)
+    rasterize = rasterization.rasterize
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rasterization, "_backend", lambda wanted, place: module)
+        colors, alphas, info = rasterize(gaussians, Cameras(viewmats, Ks, size, size), options)
+    if options.absgrad:
+        keep_gradient(info["means2d"])
+    weights = values["weights"].repeat(views, 1, 1, 1)
+    loss = (weights * colors[..., :3].square()).mean() + (weights[..., :1] * alphas).mean()
+    (loss + (alphas.detach() * colors[..., 3:]).sum() / alphas.numel()).backward()
+    found: dict[str, Any] = {"colors": colors, "alphas": alphas} | {
+        f"gradient of {name}": leaf.grad for name, leaf in leaves.items()
+    }
+    if options.absgrad:
+        means2d: Any = info["means2d"]
+        gradient = getattr(means2d, "grad2d", None)
+        found |= {"absgrad": means2d.absgrad, "grad2d": means2d.grad if gradient is None else gradient}
+    # Of rotations, an inverse and a transpose are differentiated differently.
+    found |= {"gradient of translations": viewmats.grad[:, :3, 3]} if viewmats.grad is not None else {}
+    assert len(info["flatten_ids"]) > 100
+    return {"visible": visible(info).cpu()} | {name: value.detach().cpu().double() for name, value in found.items()}
+
+
+@pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
+@pytest.mark.parametrize("case", CASES)
+def test_it_draws_what_the_torch_backend_draws(case: str, per_axis_radii: bool, monkeypatch: pytest.MonkeyPatch):
+    options, views = CASES[case]
+    stub_gsplat(monkeypatch, per_axis_radii)
+    ours, expected = (
+        drawn_by(module, options, views, 40, "cpu", torch.float64, pose=True)
+        for module in (backend_gsplat, backend_torch)
+    )
+    assert torch.equal(ours.pop("visible"), seen := expected.pop("visible")) and seen.any()
+    if case in ("off the axis", "near plane"):
+        assert not seen.all()
+    assert ours.keys() == expected.keys() and "gradient of translations" in ours
+    for name, value in expected.items():
+        torch.testing.assert_close(ours[name], value, rtol=1e-9, atol=1e-12, msg=name)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat's kernels need CUDA")
+@pytest.mark.parametrize("case", CASES)
+def test_it_draws_what_the_triton_backend_draws(case: str, monkeypatch: pytest.MonkeyPatch):
+    backend_triton = pytest.importorskip("sadgs_ns.render.backend_triton", reason="Triton is not installed")
+    monkeypatch.setattr(backend_gsplat, "TILE_SIZE", kernels.TILE_SIZE)  # gsplat 1.4 cuts off at borders of tiles
+    options, views = CASES[case]
+    theirs, ours = (
+        drawn_by(module, options, views, 128, "cuda", torch.float32) for module in (backend_gsplat, backend_triton)
+    )
+    assert (ours.pop("visible") != theirs.pop("visible")).sum() <= 3
+    assert ours.keys() == theirs.keys()
+    for name, expected in theirs.items():
+        # Rounding moves a few pairs over a cut-off, so single values may differ by more than rounding: compare norms.
+        assert (ours[name] - expected).norm() < 2e-3 * expected.norm(), name
