@@ -70,6 +70,7 @@ class PoseOptimizerConfig(CameraOptimizerConfig):
     """Whether and how the cameras' poses are refined; SO3xR3 turns and moves each camera."""
 
 
+@hide("rasterize_mode")  # Files of the result look right with the default alone.
 @dataclass
 class SadgsModelConfig(InstantiateConfig):
     """Options of the Gaussians, their loss and their densification.

@@ -1,4 +1,4 @@
-"""What the classes of options share: inherited options that `--help` does not show, and the ranges of values."""
+"""What the classes of options share: options that `--help` does not show, and the ranges of values."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _Class = TypeVar("_Class", bound=type)
 
 
 def hide(*names: str) -> Callable[[_Class], _Class]:
-    """Make a decorator of a dataclass that keeps inherited fields, by their names, out of `--help`."""
+    """Make a decorator of a dataclass that keeps fields, by their names, out of `--help`."""
 
     def mark(cls: _Class) -> _Class:
         hints = get_type_hints(cls, include_extras=True)
