@@ -45,6 +45,10 @@ def switched_off() -> bool:
 def use_triton(place: torch.device | Tensor) -> bool:
     """Return whether to use the kernels of this package; torch and gsplat compute the same, more slowly.
 
+    What projects and composites is chosen by `render.rasterization.choose_backend`, which asks this function where the
+    backend is "auto". With another backend than Triton's, everything else stays with these kernels: activations, loss,
+    matrices of colours, Adam, limits of scales, S̄, and the statistics of η and AbsGS.
+
     Args:
         place: The device that computes, or a tensor that a kernel would read, which must be float32.
     """

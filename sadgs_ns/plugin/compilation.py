@@ -72,13 +72,13 @@ class _Stages:
 
     def after_projection(self) -> dict[str, Callable[[], None]]:
         """Return the stages that read what `project` has computed."""
-        stages = {
-            "projection and spherical harmonics": self.projection,
-            "η": self.observation,
-            "tile lists": self.tile_lists,
-            "compositing with AbsGS": partial(self.composite, True),
-            "compositing": partial(self.composite, False),
-        }
+        stages = {"η": self.observation, "compositing with AbsGS": partial(self.composite, True)}
+        if self.model.backend == "triton":
+            stages |= {
+                "projection and spherical harmonics": self.projection,
+                "tile lists": self.tile_lists,
+                "compositing": partial(self.composite, False),
+            }
         return stages if self.pipeline.world.alone else stages | {"what travels between devices": self.exchange}
 
     def project(self) -> None:

@@ -26,6 +26,7 @@ from sadgs_ns.plugin.optimizers import RunLengthDecaySchedulerConfig
 from sadgs_ns.plugin.options import check_ranges, hide
 from sadgs_ns.plugin.pipeline import SadgsPipelineConfig
 from sadgs_ns.plugin.progress import ProgressTable
+from sadgs_ns.render.rasterization import choose_backend
 
 
 @hide("num_machines", "machine_rank", "dist_url")
@@ -197,9 +198,11 @@ class CheckedTrainerConfig(TrainerConfig):
             )
         if not 0 <= self.machine.seed < 2**32:
             raise InputError(f"machine.seed must be in [0, 2³²), got {self.machine.seed}.")
-        if not processes.check_devices(self.machine):
+        model, several = self.pipeline.model, processes.check_devices(self.machine)
+        if model.backend != "auto":  # That is decided in the process that trains, where Triton tries a kernel.
+            choose_backend(model.backend, torch.device(device), not several)
+        if not several:
             return
-        model = self.pipeline.model
         for name, given, remedy in (
             ("pipeline.model.color_model", model.color_model != "none", "set it to none"),
             ("pipeline.model.camera_optimizer.mode", model.camera_optimizer.mode != "off", "set it to off"),

@@ -21,7 +21,6 @@ from rich.markup import escape
 from torch import Tensor
 
 from sadgs_ns.errors import reason
-from sadgs_ns.kernels import use_triton
 from sadgs_ns.method.absgs import accumulate_gradients, keep_gradient
 from sadgs_ns.plugin.config import CheckedTrainerConfig
 from sadgs_ns.plugin.model import SadgsModel, StepKind
@@ -222,7 +221,7 @@ class GraphedSteps:
         if not pipeline.world.alone:
             return None
         # Without a forecast the host waits in each step, and what a camera optimizer does is not in the graphs.
-        if not use_triton(model.device) or model.tile_forecast is None:
+        if model.backend != "triton" or model.tile_forecast is None:
             return None
         if model.camera_optimizer.config.mode != "off" or optimizers.optimizers.keys() != model.trained_params.keys():
             return None

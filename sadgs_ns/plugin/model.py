@@ -45,10 +45,10 @@ from sadgs_ns.plugin.options import check_ranges, hide
 from sadgs_ns.plugin.outputs import LazyOutputs
 from sadgs_ns.plugin.run_plan import RunPlan
 from sadgs_ns.render.activations import activate
-from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world
+from sadgs_ns.render.rasterization import choose_backend, rasterize, viewmats_from_camera_to_world
 from sadgs_ns.render.tile_forecast import TileForecast
+from sadgs_ns.render.types import BackendName, Gaussians, RenderOptions
 from sadgs_ns.render.types import Cameras as Pinholes
-from sadgs_ns.render.types import Gaussians, RenderOptions
 
 CAMERA_CLEARANCE = 2.0
 """Initial Gaussians nearer to a camera than this many of their standard deviations are dropped. The paper keeps them;
@@ -84,6 +84,9 @@ class SadgsModelConfig(InstantiateConfig):
     """When and how Gaussians are split, cloned and pruned."""
     camera_optimizer: PoseOptimizerConfig = field(default_factory=PoseOptimizerConfig)
     """Whether and how the cameras' poses are refined in training."""
+    backend: BackendName = "auto"
+    """What draws: auto takes Triton's kernels where they work, gsplat's on other CUDA devices, and torch elsewhere.
+    gsplat trains on one GPU, without CUDA graphs."""
     background_color: Literal["black", "white"] = "black"
     """Colour behind the Gaussians."""
     random_init: bool = False
@@ -341,7 +344,11 @@ class SadgsModel(SplatfactoModel):
         self.register_buffer("view_numbers", numbers, persistent=False)
 
     def share_out(self, world: World) -> None:
-        """Keep this process's part of the Gaussians, all of which it has until now; call before optimizers are made."""
+        """Keep this process's part of the Gaussians, all of which it has until now; call before optimizers are made.
+
+        Raises InputError if the backend draws in one process alone.
+        """
+        choose_backend(self.config.backend, world.device, world.alone)
         part = world.take_even_part(self.num_points)
         for parameter in self.gauss_params.values():
             parameter.data = parameter.data[part].clone()
@@ -412,11 +419,19 @@ class SadgsModel(SplatfactoModel):
         return min(self.step, self.config.sh_degree) if self.config.sh_degree > 0 else None
 
     @property
+    def backend(self) -> str:
+        """Name of what draws; raises InputError if the backend that is wanted cannot."""
+        return choose_backend(self.config.backend, self.device)
+
+    @property
     def drawing(self) -> RenderOptions:
         """The options that every picture of these Gaussians shares; colours are drawn with `color_options`."""
         config = self.config
         return RenderOptions(
-            near_plane=self.near_plane, max_off_axis=config.max_off_axis, rasterize_mode=config.rasterize_mode
+            near_plane=self.near_plane,
+            max_off_axis=config.max_off_axis,
+            rasterize_mode=config.rasterize_mode,
+            backend=config.backend,
         )
 
     def color_options(self, **changes: Any) -> RenderOptions:

@@ -21,7 +21,6 @@ from sadgs_ns.data.parsers import findings_of
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
 from sadgs_ns.gsplat_compat import FAR_PLANE
-from sadgs_ns.kernels import use_triton
 from sadgs_ns.method.quantization import HIGHEST_FREQUENCY
 from sadgs_ns.method.structure_tensor import ENERGY_BLUR, FREQUENCY_CONSTANT
 from sadgs_ns.plugin import nonfinite
@@ -113,6 +112,7 @@ class SadgsPipeline(VanillaPipeline):
             if finding.severity == "warning":
                 CONSOLE.print(f"[yellow]{escape(finding.sentence)}[/]")
         super().__init__(config, *args, **kwargs)
+        backend = self.model.backend  # It may be refused.
         for dataset in (self.datamanager.train_dataset, self.datamanager.eval_dataset):
             check_camera_types(dataset.cameras)
         if config.datamanager.cache_images != "compressed" and kwargs.get("test_mode") != "inference":
@@ -125,7 +125,7 @@ class SadgsPipeline(VanillaPipeline):
                 f"[yellow]The images were put on {parsed_on}, the Gaussians lie on {config.model.background_color}: "
                 f"consider --pipeline.model.background-color {parsed_on}.[/]"
             )
-        if self.device.type == "cuda" and not use_triton(self.device):
+        if config.model.backend == "auto" and backend == "gsplat":
             CONSOLE.print("[yellow]Triton's kernels are not used: training takes about twice as long without them.[/]")
         cameras = self.datamanager.train_dataset.cameras
         self.model.set_cameras(camera_positions(cameras))

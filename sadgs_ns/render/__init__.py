@@ -1,1 +1,1 @@
-"""Rasterization has one entrance: gsplat and Triton kernels draw on CUDA, a torch splatter elsewhere."""
+"""Rasterization behind one door: Triton's or gsplat's kernels draw on CUDA, torch elsewhere."""

@@ -68,23 +68,29 @@ def composite(projected: Projected, options: RenderOptions = DEFAULTS) -> tuple[
     return renders, alphas, projected.info() | lists
 
 
-def choose_backend(wanted: BackendName, device: torch.device) -> str:
+def choose_backend(wanted: BackendName, device: torch.device, alone: bool = True) -> str:
     """Return which backend draws on a device: "triton", "gsplat" or "torch".
 
-    "auto" is Triton where its kernels run, gsplat on CUDA without them, and torch elsewhere. Triton's lists hold only
-    tiles that a Gaussian reaches; what is drawn is the same, but for what gsplat 1.4 draws beyond three standard
-    deviations.
+    "auto" is Triton where its kernels run, gsplat on CUDA without them, and torch elsewhere. They draw the same, but
+    that gsplat 1.4 cuts Gaussians off at borders of larger tiles. Only Triton foresees the lengths of its tile lists,
+    so only its steps become CUDA graphs. gsplat draws where one process trains alone.
 
     Raises:
         InputError: If the backend that is wanted does not draw here.
     """
+    chosen: str = wanted
     if wanted == "auto":
-        return "triton" if use_triton(device) else "gsplat" if device.type == "cuda" else "torch"
-    if wanted == "triton" and not use_triton(device):
+        chosen = "triton" if use_triton(device) else "gsplat" if device.type == "cuda" else "torch"
+    if chosen == "triton" and not use_triton(device):
         raise InputError(f"The backend triton does not run on {device} here (see sadgs-doctor): leave it at auto.")
-    if wanted == "gsplat" and device.type != "cuda":
+    if chosen == "gsplat" and device.type != "cuda":
         raise InputError(f"The backend gsplat needs a CUDA device, and this is {device}: leave it at auto.")
-    return wanted
+    if chosen == "gsplat" and not alone:
+        raise InputError(
+            "The backend gsplat works on one device only, and this run takes several: take one, or let Triton draw "
+            "(sadgs-doctor says whether it works)."
+        )
+    return chosen
 
 
 def _backend(wanted: BackendName, device: torch.device) -> Any:

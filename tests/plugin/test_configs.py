@@ -191,7 +191,7 @@ def test_the_help_shows_what_users_of_splatfacto_look_for_and_of_optimizers_only
     expected = """
         data output-dir experiment-name vis viewer.websocket-port viewer.websocket-host max-num-iterations
         steps-per-save load-dir load-checkpoint load-config machine.seed machine.device-type machine.num-devices
-        pipeline.model.camera-optimizer.mode pipeline.model.color-model
+        pipeline.model.camera-optimizer.mode pipeline.model.color-model pipeline.model.backend
         pipeline.model.background-color pipeline.model.sh-degree pipeline.model.random-init pipeline.model.num-random
     """
     assert {f"--{name}" for name in expected.split()} <= set(options)

@@ -62,8 +62,7 @@ class Reruns:
 def without_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
     """Our rasterizer and Adam in Triton's interpreter, and graphs that are called again."""
     use_our_rasterizer(monkeypatch)
-    for module in (optimizers, graphed_steps):
-        monkeypatch.setattr(module, "use_triton", lambda place: True)
+    monkeypatch.setattr(optimizers, "use_triton", lambda place: True)
     monkeypatch.setattr(graphed_steps, "CudaGraphs", Reruns)
     monkeypatch.setattr(adam, "_BLOCK", 2**16)  # The interpreter runs one program after the other.
 
