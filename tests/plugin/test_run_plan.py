@@ -20,6 +20,7 @@ from sadgs_ns.cli import export
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin.run_plan import Rate, RunPlan
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
+from sadgs_ns.render.types import RenderOptions
 
 OPTIONS, RATES = ({field.name for field in dataclasses.fields(cls)} for cls in (StructureAwareStrategy, Rate))
 
@@ -87,7 +88,7 @@ def test_the_plan_is_written_beside_config_yml_and_kept_in_the_checkpoint(config
     assert written == kept == dataclasses.asdict(plan_of(trainer))
     assert RunPlan.of(kept) == plan_of(trainer)
     _, _, drawing = export.read_checkpoint(file)
-    assert drawing == {"near_plane": trainer.pipeline.model.near_plane, "max_off_axis": 2.5}
+    assert drawing == RenderOptions(near_plane=trainer.pipeline.model.near_plane, max_off_axis=2.5)
     assert [path.name for path in trainer.base_dir.iterdir() if ".partial" in path.name] == []
 
 
