@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, replace
 from typing import Any
 
+import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 
@@ -12,11 +14,16 @@ from sadgs_ns.method.schedule import Schedule, growth_threshold, schedule
 from sadgs_ns.plugin.config import CheckedTrainerConfig
 from sadgs_ns.plugin.memory_plan import fit_to_memory, training_size
 from sadgs_ns.plugin.pipeline import SadgsPipeline, SadgsPipelineConfig
+from sadgs_ns.plugin.progress import about_cpu
 from sadgs_ns.plugin.run_plan import RunPlan, plan_rates
 
 DENSE_THRESHOLDS = 1.25
 """Factor on AbsGS's thresholds in a run that starts from stereo depth. It takes back the Gaussians that such a start
 adds, with a higher SSIM than without the factor on all of four scenes (docs/results.md#dense-start)."""
+LEAST_PIXELS = 1.5e6
+"""Pixels that a step must draw on each of several devices. Runs whose steps drew 1.9 and 3 million pixels on each of
+two took 1/1.1 of the time on one (one run of the latter 1/1.3), and a run of .7 million took 2.3 times as long
+(docs/results.md#several-devices)."""
 _OF_THE_CAP = ("memory_budget_gb", "model.strategy.max_gaussians")
 """Options that decide the cap of Gaussians."""
 
@@ -33,10 +40,36 @@ def plan_length(config: CheckedTrainerConfig, views: int, before: RunPlan | None
     return schedule(views, effort=effort, iterations=iterations, views_per_iteration=in_step)
 
 
+def one_device_is_quicker(cameras: Cameras, views: int, devices: int) -> bool:
+    """Tell whether steps of so many of these views have too few pixels for several devices, and say so."""
+    pixels = views * _pixels(cameras)
+    if pixels >= LEAST_PIXELS * devices:
+        return False
+    CONSOLE.print(
+        f"Training on one device: a step draws {pixels / 1e6:.2f} megapixels, and {devices} devices are expected to be "
+        f"quicker from {LEAST_PIXELS * devices / 1e6:.1f} on (docs/results.md). If one device does not hold the "
+        "Gaussians, set --share-always True.",
+        highlight=False,
+        soft_wrap=True,
+    )
+    return True
+
+
+def _pixels(cameras: Cameras) -> float:
+    """Return the mean number of pixels of a view."""
+    return float((cameras.height * cameras.width).double().mean())
+
+
 def plan_run(
-    config: CheckedTrainerConfig, pipeline: SadgsPipeline, length: Schedule, *, dense: bool, before: RunPlan | None
+    config: CheckedTrainerConfig,
+    pipeline: SadgsPipeline,
+    length: Schedule,
+    *,
+    dense: bool,
+    before: RunPlan | None,
+    done: int,
 ) -> RunPlan:
-    """Decide what a run's options leave open, and print the cap, and which options changed since the checkpoint's run.
+    """Decide what a run's options leave open, and print what a user should know of that.
 
     Raises InputError if `memory_budget_gb` leaves no room for Gaussians.
 
@@ -44,6 +77,7 @@ def plan_run(
         config, pipeline: Of the run, each process with the Gaussians from which it starts.
         length, before: As for `plan_length`.
         dense: Whether the run starts, or started, from stereo depth.
+        done: Iterations that are done already.
     """
     options, model, asked = config.pipeline, pipeline.model, _asked(config.pipeline)
     if before is not None:
@@ -66,6 +100,7 @@ def plan_run(
             f"{windows.refine_stop_iter}, the first split would come at {windows.structure_every}. "
             "Train longer or lower pipeline.model.strategy.structure-every.[/]"
         )
+    _tell_length(config, pipeline, length, done)
     extent = float(model.strategy_state["scene_scale"])
     return RunPlan(
         **vars(length),
@@ -94,6 +129,31 @@ def _tell_changes(now: dict[str, Any], before: dict[str, Any]) -> None:
             f"[yellow]The checkpoint's run had other settings; this one goes on with its own: {escape(listed)}.[/]",
             soft_wrap=True,
         )
+
+
+def _tell_length(config: CheckedTrainerConfig, pipeline: SadgsPipeline, length: Schedule, done: int) -> None:
+    """Print how long the run is, and what decided it."""
+    cameras, options, taken = pipeline.datamanager.train_dataset.cameras, config.pipeline, length.views_per_iteration
+    views, asked, iterations = len(cameras), options.views_per_iteration, length.iterations
+    times = round(iterations * taken / views)
+    lines = [
+        f"{config.method_name} on {views:,} training views of {_pixels(cameras) / 1e6:.2g} megapixels: "
+        f"{iterations:,} iterations of {taken} view{'s' * (taken > 1)}{f', of which {done:,} are done' if done else ''}"
+        f", so that each view is rendered about {times:,} time{'s' * (times != 1)}."
+    ]
+    if config.max_num_iterations is None:
+        lines.append(
+            f"The number of views and --pipeline.effort {options.effort:g} decide this: 0.5 is a draft of half as many "
+            "renderings, 2 resolves more, with more Gaussians and, where views are many, renderings."
+        )
+    if asked is not None and asked > taken:
+        lines.append(
+            f"[yellow]pipeline.views_per_iteration is {asked}, but there are {views} training views: all are taken "
+            "each time.[/]"
+        )
+    if pipeline.device.type == "cpu":
+        lines.append(f"[yellow]{about_cpu(torch.get_num_threads())}[/]")
+    CONSOLE.print("\n".join(lines), highlight=False, soft_wrap=True)
 
 
 def _cap_in_memory(options: SadgsPipelineConfig, pipeline: SadgsPipeline, views: int) -> int:

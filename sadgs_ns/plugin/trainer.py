@@ -30,8 +30,8 @@ from sadgs_ns.plugin.interrupts import HANG_UP, SIGNALS, Interrupted, Interrupts
 from sadgs_ns.plugin.lost_output import drop_lost_output, print_elsewhere_once_unread
 from sadgs_ns.plugin.optimizers import SadgsOptimizers
 from sadgs_ns.plugin.pipeline import SadgsPipeline
-from sadgs_ns.plugin.planning import plan_length, plan_run
-from sadgs_ns.plugin.progress import about_cpu, remove_tables, what_next
+from sadgs_ns.plugin.planning import one_device_is_quicker, plan_length, plan_run
+from sadgs_ns.plugin.progress import remove_tables, what_next
 from sadgs_ns.plugin.resume import Resumption
 from sadgs_ns.plugin.stereo_start import start_from_stereo
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
@@ -41,10 +41,6 @@ _LESS_MEMORY = (
     "(`--downscale-factor 2` after `nerfstudio-data` or `colmap`), or several devices (`--share-always True`)"
 )
 _NOTHING_DONE = "stopped before an iteration was done; the same command starts again."
-LEAST_PIXELS = 1.5e6
-"""Pixels that a step must draw on each of several devices. Runs whose steps drew 1.9 and 3 million pixels on each of
-two took 1/1.1 of the time on one (one run of the latter 1/1.3), and a run of .7 million took 2.3 times as long
-(docs/results.md#several-devices)."""
 _SAVING_SHARE = 0.01
 """Largest share of the time between two checkpoints by the clock that saving may take."""
 
@@ -88,7 +84,6 @@ class SadgsTrainer(Trainer):
         self.graphed: GraphedSteps | None = None
         """What trains steps by CUDA graphs; None where all are launched one by one."""
         self._resumed: Resumption | None = None
-        self._derived = config.max_num_iterations is None
         self._completed_step = self._saved_step = -1
         self._save_due = math.inf
         # A run that is paused or done polls no signal, because nerfstudio waits for the viewer's user.
@@ -106,7 +101,10 @@ class SadgsTrainer(Trainer):
         """
         try:
             super().setup(*args, **kwargs)
-            self._say_what_was_chosen()
+            plan = self.pipeline.model.plan
+            if processes.is_first():
+                plan.write(self.base_dir)
+            events.report("training begins", iterations=plan.iterations, on_cpu=self.device == "cpu")
             last = [TrainingCallbackLocation.AFTER_TRAIN]
             self.callbacks.append(TrainingCallback(last, lambda step: self._say_what_is_next()))
             with processes.first_of_each_machine_before_others(self.world, self.local_rank):
@@ -124,40 +122,6 @@ class SadgsTrainer(Trainer):
             CONSOLE.print(f"SIGINT: {_NOTHING_DONE}", soft_wrap=True)
             raise SystemExit(128 + signal.SIGINT) from None
 
-    def _say_what_was_chosen(self) -> None:
-        """Print the run's size after the memory plan's line, and what decided it; write the whole plan."""
-        cameras, config, plan = self.pipeline.datamanager.train_dataset.cameras, self.config, self.pipeline.model.plan
-        views, asked, taken = len(cameras), config.pipeline.views_per_iteration, plan.views_per_iteration
-        megapixels = self._pixels_of_a_view() / 1e6
-        done = f", of which {self._start_step:,} are done" if self._start_step else ""
-        times = round(plan.iterations * taken / views)
-        lines = [
-            f"{config.method_name} on {views:,} training views of {megapixels:.2g} megapixels: "
-            f"{plan.iterations:,} iterations of {taken} view{'s' * (taken > 1)}{done}, so that each view is "
-            f"rendered about {times:,} time{'s' * (times != 1)}."
-        ]
-        if self._derived:
-            lines.append(
-                f"The number of views and --pipeline.effort {config.pipeline.effort:g} decide this: 0.5 is a draft of "
-                "half as many renderings, 2 resolves more, with more Gaussians and, where views are many, renderings."
-            )
-        if asked is not None and asked > taken:
-            lines.append(
-                f"[yellow]pipeline.views_per_iteration is {asked}, but there are {views} training views: all are taken "
-                "each time.[/]"
-            )
-        if self.device == "cpu":
-            lines.append(f"[yellow]{about_cpu(torch.get_num_threads())}[/]")
-        CONSOLE.print("\n".join(lines), highlight=False, soft_wrap=True)
-        if processes.is_first():
-            plan.write(self.base_dir)
-        events.report("training begins", iterations=plan.iterations, on_cpu=self.device == "cpu")
-
-    def _pixels_of_a_view(self) -> float:
-        """Return the mean number of pixels of the training views."""
-        cameras = self.pipeline.datamanager.train_dataset.cameras
-        return float((cameras.height * cameras.width).double().mean())
-
     def _say_what_is_next(self) -> None:
         """Print the commands for a run that is done, below nerfstudio's box; not where the run ends with an error."""
         if not self.pipeline.stuck:
@@ -171,26 +135,6 @@ class SadgsTrainer(Trainer):
             return super()._load_checkpoint()
         self._resumed.load_optimizers(self.optimizers, self.grad_scaler, self.config.load_scheduler)
         self._resumed = None
-
-    def _take_one_device_if_quicker(self, views: int) -> None:
-        """Train on the first device alone, and say so, where a step of so many views has too few pixels for several.
-
-        On several machines all devices are kept. The other processes end with SystemExit, once the first has ended.
-        """
-        if self._peers is None or self.config.share_always or not self._peers.all_here():
-            return
-        devices, pixels = self.world.num_ranks, views * self._pixels_of_a_view()
-        if pixels >= LEAST_PIXELS * devices:
-            return
-        CONSOLE.print(
-            f"Training on one device: a step draws {pixels / 1e6:.2f} megapixels, and {devices} devices are expected "
-            f"to be quicker from {LEAST_PIXELS * devices / 1e6:.1f} on (docs/results.md). If one device does not hold "
-            "the Gaussians, set --share-always True.",
-            highlight=False,
-            soft_wrap=True,
-        )
-        processes.leave_the_rest_to_the_first(self.world, self._peers)
-        self.world, self._peers = World(), None
 
     def _turn_viewer_off(self) -> None:
         """Keep nerfstudio from starting a viewer, and say so where one was asked for."""
@@ -213,7 +157,11 @@ class SadgsTrainer(Trainer):
         if resumed is None:
             pipeline.model.clear_paths(viewmats_from_camera_to_world(cameras.camera_to_worlds))
         length = plan_length(config, len(cameras), before)
-        self._take_one_device_if_quicker(length.views_per_iteration)
+        peers, views = None if config.share_always else self._peers, length.views_per_iteration
+        if peers is not None and peers.all_here() and one_device_is_quicker(cameras, views, self.world.num_ranks):
+            # The other processes end with SystemExit, once this one, the first, has ended.
+            processes.leave_the_rest_to_the_first(self.world, peers)
+            self.world, self._peers = World(), None
         if not self.world.alone:
             self._turn_viewer_off()
             pipeline.share_out(self.world)
@@ -221,7 +169,7 @@ class SadgsTrainer(Trainer):
             resumed.load_gaussians(pipeline, self.world)
             self._start_step = resumed.state["step"] + 1
         pipeline.refuse_empty_views()
-        plan = plan_run(config, pipeline, length, dense=dense, before=before)
+        plan = plan_run(config, pipeline, length, dense=dense, before=before, done=self._start_step)
         pipeline.follow(plan)
         config.max_num_iterations = plan.iterations  # nerfstudio's loop and table read it.
         return SadgsOptimizers(plan.optimizers(config.optimizers), pipeline.get_param_groups())
