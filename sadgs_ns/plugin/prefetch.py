@@ -85,12 +85,14 @@ class ImagePrefetcher:
 
     def _load(self, indices: Iterable[int]) -> None:
         """Have threads load images, in this order, unless they are under way."""
-        for index in indices if not self.decoded else ():
+        if self.decoded:
+            return
+        for index in indices:
             if index in self._loading or index in self._sent:
                 continue
             if self._pool is None:
-                on_cuda = {"initializer": torch.cuda.set_device, "initargs": (self.device,)}
-                self._pool = ThreadPoolExecutor(self.threads, "images", **(on_cuda if self._stream is not None else {}))  # type: ignore[arg-type]
+                initializer: Any = (torch.cuda.set_device, (self.device,)) if self._stream is not None else ()
+                self._pool = ThreadPoolExecutor(self.threads, "images", *initializer)
             self._loading[index] = self._pool.submit(self._pinned, index)
 
     def _pinned(self, index: int) -> dict[str, Any]:
