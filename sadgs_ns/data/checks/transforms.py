@@ -12,18 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sadgs_ns.data import IMAGE_SUFFIXES, colmap
+from sadgs_ns.data.checks import geometry
 from sadgs_ns.data.checks.findings import Finding, collect_findings, note, warning
-from sadgs_ns.data.checks.geometry import (
-    NO_COEFFICIENTS,
-    Camera,
-    View,
-    check_ply,
-    check_points,
-    check_positive,
-    check_rotations,
-    check_views,
-    finite,
-)
 from sadgs_ns.data.checks.images import Frame, automatic_factor, check_images, image_size, no_copies, scaled_size
 from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS, GIVE_POSES, ParserOptions, find_reconstruction, no_layout
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
@@ -60,7 +50,7 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
     frames, views = [], []
     for frame in described:
         where, mask = f"{path}: frame {frame['file_path']}", frame.get("mask_path")
-        check_positive(frame, where, _PINHOLE)
+        geometry.check_positive(frame, where, _PINHOLE)
         views.append(view_of(frame, where, _camera(frame, model, where)))
         size = scaled_size((int(frame["w"]), int(frame["h"])), factor, "floor")
         frames.append(Frame(locate(frame["file_path"]), size, None if mask is None else locate(mask, "masks")))
@@ -71,7 +61,7 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
     names = [frame["file_path"] for frame in described]
     lists = {split: meta[f"{split}_filenames"] for split in SPLITS if f"{split}_filenames" in meta}
     training = yield from check_splits(names, lists, lambda split: f"{path}: {split}_filenames", locate, options)
-    sound = yield from check_views(views, training, path)
+    sound = yield from geometry.check_views(views, training, path)
     if 3 <= training == len(frames) < 10:  # With more frames all are trained on only where that was asked for.
         yield note(f"{path} has {training} views, none of them held out: `ns-eval` cannot measure any.")
     if open_images:
@@ -106,17 +96,17 @@ def check_blender(data: Path, options: ParserOptions, open_images: bool = True) 
         taken = {"fl_x": focal, "fl_y": focal, "cx": width / 2, "cy": height / 2, **dict.fromkeys(_DISTORTION, 0)}
         for values in (meta, *described) if open_images and any(size) else ():
             for name, value in taken.items():
-                if abs(finite(values.get(name, value), name, str(path)) - value) > 1e-3 * value:
+                if abs(geometry.finite(values.get(name, value), name, str(path)) - value) > 1e-3 * value:
                     raise InputError(f"{path}: of Blender scenes {name} is not read; rename it to transforms.json.")
-        camera = Camera(width, height, focal, focal, width / 2, height / 2)
+        camera = geometry.Camera(width, height, focal, focal, width / 2, height / 2)
         views = [view_of(frame, f"{path}: frame {frame['file_path']}", camera) for frame in described]
         if split == "train":
-            sound = yield from check_views(views, len(views), path)
+            sound = yield from geometry.check_views(views, len(views), path)
             if options.ply_path is not None:
                 remedy = "restore it, or leave `--ply-path` out to start from random points"
-                yield from check_ply(data / options.ply_path, views if sound else [], remedy)
+                yield from geometry.check_ply(data / options.ply_path, views if sound else [], remedy)
         else:
-            yield from check_rotations(views)
+            yield from geometry.check_rotations(views)
         if open_images:
             yield from check_images([Frame(image, size if any(size) else None) for image in images], path)
 
@@ -148,7 +138,7 @@ def _completed(frame: dict[str, Any], meta: dict[str, Any], path: Path) -> dict[
         values = {"w": size[0], "h": size[1], **values}
     for side, focal, center, angle in (("w", "fl_x", "cx", "camera_angle_x"), ("h", "fl_y", "cy", "camera_angle_y")):
         if side in values:
-            values.setdefault(center, finite(values[side], side, where) / 2)
+            values.setdefault(center, geometry.finite(values[side], side, where) / 2)
             if focal not in values and angle in values:
                 values[focal] = _focal_length(values, values[side], angle, where)
     if "fl_x" in values:
@@ -160,7 +150,7 @@ def _completed(frame: dict[str, Any], meta: dict[str, Any], path: Path) -> dict[
 
 def _focal_length(values: dict[str, Any], side: float, angle: str, where: str) -> float:
     """Return the focal length in px of a named angle of view over a side in px; raise InputError if it is no angle."""
-    check_positive(values, where, [angle])
+    geometry.check_positive(values, where, [angle])
     if not values[angle] < math.pi:
         raise InputError(f"{where} has {angle} = {values[angle]:g}, which is no angle of view in radians: correct it.")
     return 0.5 * side / math.tan(0.5 * values[angle])
@@ -184,11 +174,11 @@ def _check_transform(meta: dict[str, Any], path: Path) -> None:
         applied = np.empty(0)
     if applied.shape != (3, 4) or not np.isfinite(applied).all():
         raise InputError(f"{path} has an applied_transform that is not 3 × 4 finite numbers: correct or remove it.")
-    if finite(meta.get("applied_scale", 1), "applied_scale", str(path)) <= 0:
+    if geometry.finite(meta.get("applied_scale", 1), "applied_scale", str(path)) <= 0:
         raise InputError(f"{path} has applied_scale = {meta['applied_scale']}, which must be positive: correct it.")
     fixed_frame(meta, path)
     if meta.get("fisheye_crop_radius") is not None:
-        finite(meta["fisheye_crop_radius"], "fisheye_crop_radius", str(path))
+        geometry.finite(meta["fisheye_crop_radius"], "fisheye_crop_radius", str(path))
     methods = ("pca", "up", "vertical", "none")
     if (method := meta.get("orientation_override", "none")) not in methods:
         raise InputError(f"{path} has orientation_override = {method!r}: give one of {', '.join(methods)}.")
@@ -240,39 +230,41 @@ def frames_of(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
     return frames
 
 
-def view_of(frame: dict[str, Any], where: str, camera: Camera) -> View:
+def view_of(frame: dict[str, Any], where: str, camera: geometry.Camera) -> geometry.View:
     """Return the view of a frame that `frames_of` found good."""
     pose = np.array(frame["transform_matrix"], dtype=np.float64)
-    return View(where, where, (pose[:3, :3] * [1, -1, -1]).T, pose[:3, 3], camera)  # The axes become OpenCV's.
+    return geometry.View(where, where, (pose[:3, :3] * [1, -1, -1]).T, pose[:3, 3], camera)  # The axes become OpenCV's.
 
 
-def _camera(values: dict[str, Any], model: str, where: str) -> Camera:
+def _camera(values: dict[str, Any], model: str, where: str) -> geometry.Camera:
     """Return the camera of good values; raise InputError for a distortion that nerfstudio does not support."""
     pinhole = (int(values["w"]), int(values["h"]), *(values[name] for name in _PINHOLE[:4]))
     listed = values.get("distortion_params", [values.get(name, 0.0) for name in _DISTORTION])
     if not isinstance(listed, list) or len(listed) not in (6, 12):  # FISHEYE624 has 12.
         named = f"distortion_params that are no list of 6 numbers ({', '.join(_DISTORTION)})"
         raise InputError(f"{where} has {named}: correct or remove them.")
-    k1, k2, k3, k4, p1, p2 = (finite(value, name, where) for value, name in zip(listed, _DISTORTION, strict=False))
+    k1, k2, k3, k4, p1, p2 = (
+        geometry.finite(value, name, where) for value, name in zip(listed, _DISTORTION, strict=False)
+    )
     if model == "FISHEYE624":
         if not any((k1, k2, k3, k4, p1, p2)):
-            raise InputError(f"{where} is a fisheye {NO_COEFFICIENTS}")
-        return Camera(*pinhole, fisheye=True)  # Its coefficients mean something else.
+            raise InputError(f"{where} is a fisheye {geometry.NO_COEFFICIENTS}")
+        return geometry.Camera(*pinhole, fisheye=True)  # Its coefficients mean something else.
     if model == "OPENCV_FISHEYE":
-        return Camera(*pinhole, radial=(k1, k2, k3, k4), fisheye=True)
+        return geometry.Camera(*pinhole, radial=(k1, k2, k3, k4), fisheye=True)
     if k4 != 0:
         raise InputError(f"{where} has k4 = {k4:g}, which nerfstudio cannot undo: undistort the images yourself.")
-    return Camera(*pinhole, radial=(k1, k2, k3), tangential=(p1, p2))
+    return geometry.Camera(*pinhole, radial=(k1, k2, k3), tangential=(p1, p2))
 
 
-def _check_ply(meta: dict[str, Any], path: Path, views: Sequence[View]) -> Iterator[Finding]:
+def _check_ply(meta: dict[str, Any], path: Path, views: Sequence[geometry.View]) -> Iterator[Finding]:
     """Check the SfM points that belong to a file of poses."""
     if "ply_file_path" in meta:
         remedy = f"restore it, or remove ply_file_path from {path} to start from random points"
-        yield from check_ply(path.parent / str(meta["ply_file_path"]), views, remedy)
+        yield from geometry.check_ply(path.parent / str(meta["ply_file_path"]), views, remedy)
     elif (source := colmap.points_file(path.parent / COLMAP_FOLDERS[0])) is not None:
         positions, transform = colmap.read_points(source)[0], applied_transform(meta)
         positions = positions[np.isfinite(positions).all(axis=1)]
-        yield from check_points(positions @ transform[:, :3].T + transform[:, 3], views, source)
+        yield from geometry.check_points(positions @ transform[:, :3].T + transform[:, 3], views, source)
     else:
         yield note(f"{path} has no ply_file_path: training will start from random points.")
