@@ -41,9 +41,8 @@ RUN_BY = {
     "make gate": ".ci/run",
     "make docs": ".ci/run",
     ".ci/run": ".github/workflows/tests.yml",
-    "sadgs": "tests/cli/test_photos_to_splat.py::"
-    "test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothing",
-    "sadgs photos": "tests/cli/test_photos_to_splat.py::"
+    "sadgs": "tests/cli/test_sadgs.py::test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothing",
+    "sadgs photos": "tests/cli/test_sadgs.py::"
     "test_photos_that_are_added_are_registered_and_the_splat_is_trained_anew_where_it_was",
     "sadgs-process": "tests/cli/test_process.py::test_photos_are_registered_where_they_were_taken",
     "sadgs-export RUN/config.yml -o splat.html": "tests/cli/test_export.py::"

@@ -21,10 +21,10 @@ from rich.console import Console
 from room import draw_photos
 from runs import nerfstudio_data
 
-from sadgs_ns.cli import photos_to_splat
-from sadgs_ns.cli.photos_to_splat import PhotosToSplat, Sadgs, main
+from sadgs_ns.cli import sadgs
 from sadgs_ns.cli.process.plan import Summary
 from sadgs_ns.cli.program import locked
+from sadgs_ns.cli.sadgs import PhotosToSplat, Sadgs, main
 from sadgs_ns.cli.status_line import StatusLine
 from sadgs_ns.data.ply import read_points
 
@@ -121,7 +121,7 @@ def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothin
     printed = capsys.readouterr()
     assert printed.err == "sadgs: stopped; the same command goes on.\n"
     assert lines_of(printed.out) == {"cameras": "10 of 10 photos registered", "training": "stopping"}
-    assert photos_to_splat._ON_CPU in printed.out
+    assert sadgs._ON_CPU in printed.out
     (checkpoint,) = folder.glob("training/sadgs/run/nerfstudio_models/step-*.ckpt")
     assert 10 <= int(checkpoint.stem[5:]) < 14
     assert main([*command, "--pipeline.effort", "2"]) == 2
@@ -152,7 +152,7 @@ def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothin
     assert times_of_results(folder) == before
     read, written = os.pipe()
     os.close(read)  # as of `| head` that has read enough
-    code = f"from {photos_to_splat.__name__} import main; raise SystemExit(main({command}))"
+    code = f"from {sadgs.__name__} import main; raise SystemExit(main({command}))"
     words = [sys.executable, "-W", "ignore", "-c", code]
     unread = subprocess.run(words, stdout=written, stderr=subprocess.PIPE, text=True)
     os.close(written)
@@ -326,7 +326,7 @@ def test_wrong_input_is_told_in_a_sentence_before_any_work(
         ([source, "--effort", "0"], "--effort must be more than 0"),
         ([source, "--max-size", "20"], "--max-size must be at least 64 px, or 0 to keep the photos' size"),
     ):
-        monkeypatch.setattr(photos_to_splat.shutil, "which", lambda _: None)
+        monkeypatch.setattr(sadgs.shutil, "which", lambda _: None)
         assert main(arguments) == 2, arguments
         printed = capsys.readouterr().err
         assert printed.startswith(f"sadgs: {told}") and printed.count("\n") == 1
@@ -425,7 +425,7 @@ def test_cameras_of_the_folder_above_are_told(
 def test_two_runs_do_not_work_in_one_folder(
     photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    monkeypatch.setattr(photos_to_splat, "_LOCK_SECONDS", 0.0)
+    monkeypatch.setattr(sadgs, "_LOCK_SECONDS", 0.0)
     (tmp_path / "out").mkdir()
     with locked(tmp_path / "out", "refused"):
         assert main([str(photos), "-o", str(tmp_path / "out"), "--formats", "ply"]) == 2
