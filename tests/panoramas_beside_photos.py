@@ -14,8 +14,8 @@ from pathlib import Path
 from PIL import Image
 from room import draw_panorama, draw_photo, panorama_centres
 
-from sadgs_ns.cli.process.command import main as process
-from sadgs_ns.cli.process.panoramas import VIEWS, rotations
+from sadgs_ns.cli.cameras.command import main as process
+from sadgs_ns.cli.cameras.panoramas import VIEWS, rotations
 
 COUNT, HEIGHT, TURN, SIZE = 12, 320, 0.3, 80
 

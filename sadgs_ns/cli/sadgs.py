@@ -28,11 +28,11 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
+from sadgs_ns.cli.cameras.command import Process, check_size, photos_added
+from sadgs_ns.cli.cameras.folder import find_source
+from sadgs_ns.cli.cameras.plan import Summary
+from sadgs_ns.cli.cameras.video import count_frames
 from sadgs_ns.cli.export import Export
-from sadgs_ns.cli.process.command import Process, check_size, photos_added
-from sadgs_ns.cli.process.folder import find_source
-from sadgs_ns.cli.process.plan import Summary
-from sadgs_ns.cli.process.video import count_frames
 from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_json
 from sadgs_ns.cli.status_line import StatusLine, clock
 from sadgs_ns.cli.worker import OnEvent, Worker, WorkerError
@@ -261,7 +261,7 @@ class PhotosToSplat:
             elif event == "progress":
                 line.update(f"{added}{fields['stage']} {fields['done']} of {fields['total']}{duration}")
 
-        worker = self._worker("cameras", "sadgs_ns.cli.process.command:process")
+        worker = self._worker("cameras", "sadgs_ns.cli.cameras.command:process")
         source = Path(os.path.abspath(self.source))
         command = ["sadgs-process", str(source), str(self._scene), "--max-size", str(self.options.max_size)]
         options = Process(source, self._scene, max_size=self.options.max_size)

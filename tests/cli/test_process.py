@@ -38,16 +38,15 @@ from PIL.TiffImagePlugin import IFDRational
 from rich.progress import Progress
 from room import HEIGHT, VIEWS, WIDTH, camera_centres, draw_photos, walk_centres
 
-from sadgs_ns.cli.process import command as program
-from sadgs_ns.cli.process import features
-from sadgs_ns.cli.process import stages as colmap_stages
-from sadgs_ns.cli.process.colmap import run_colmap
-from sadgs_ns.cli.process.command import Process, main, photos_added, process
-from sadgs_ns.cli.process.folder import find_source, look_into
-from sadgs_ns.cli.process.photos import Photo, photos_by_camera, read_photos, write_masks
-from sadgs_ns.cli.process.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching, expected_work
-from sadgs_ns.cli.process.stages import check_written, fetch_vocabulary, match, sequential_pairs
-from sadgs_ns.cli.process.video import sharpest_frames, video_frames
+from sadgs_ns.cli.cameras import command as program
+from sadgs_ns.cli.cameras import features, reconstruct
+from sadgs_ns.cli.cameras.colmap import run_colmap
+from sadgs_ns.cli.cameras.command import Process, main, photos_added, process
+from sadgs_ns.cli.cameras.folder import find_source, look_into
+from sadgs_ns.cli.cameras.photos import Photo, photos_by_camera, read_photos, write_masks
+from sadgs_ns.cli.cameras.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching, expected_work
+from sadgs_ns.cli.cameras.reconstruct import check_written, fetch_vocabulary, match, sequential_pairs
+from sadgs_ns.cli.cameras.video import sharpest_frames, video_frames
 from sadgs_ns.data.checks.layouts import ParserOptions
 from sadgs_ns.data.checks.transforms import check_nerfstudio
 from sadgs_ns.errors import InputError, RunError
@@ -205,7 +204,7 @@ def test_a_doubtful_model_is_tried_again_and_the_better_one_kept(
 
     monkeypatch.setattr(pycolmap, "incremental_mapping", spoil_the_first)
     names = sorted(photo.name for photo in photos.iterdir())
-    colmap_stages.place_cameras(photos, names, tmp_path / "database.db", tmp_path / "model", None)
+    reconstruct.place_cameras(photos, names, tmp_path / "database.db", tmp_path / "model", None)
     (camera,) = (made := pycolmap.Reconstruction(tmp_path / "model")).cameras.values()
     assert angles == [16, 4] and made.num_reg_images() == VIEWS
     assert camera.focal_length_x == pytest.approx(camera.focal_length_y, rel=0.05)
@@ -634,7 +633,7 @@ def test_a_vocabulary_tree_that_is_there_is_found(tmp_path: Path, monkeypatch: p
     matching = functools.partial(pycolmap.match_vocabtree, pairing_options=pairing)
     monkeypatch.setattr(pycolmap, "match_vocabtree", matching)
     steps: list[tuple] = []
-    monkeypatch.setattr(colmap_stages, "progress", lambda *step: steps.append(step))
+    monkeypatch.setattr(reconstruct, "progress", lambda *step: steps.append(step))
     fetch_vocabulary(tmp_path)
     assert steps == [("vocabulary tree", 0, 1), ("vocabulary tree", 1, 1)]
 
@@ -925,13 +924,13 @@ def test_damaged_settings_are_told_in_a_sentence(tmp_path: Path, capsys):
 )
 def test_the_command_starts_without_slow_or_harmful_imports():
     """pycolmap replaces Pillow's zlib, which crashes Pillow where it is loaded later and writes a PNG."""
-    imports = "import sys; from sadgs_ns.cli.process import command"
+    imports = "import sys; from sadgs_ns.cli.cameras import command"
     code = f"{imports}; assert not {{'pycolmap', 'scipy', 'torch'}} & {{*sys.modules}}"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_features_are_found_while_torch_is_imported():
-    imports = "import sys; from sadgs_ns.cli.process import stages"
+    imports = "import sys; from sadgs_ns.cli.cameras import reconstruct"
     subprocess.run([sys.executable, "-c", f"{imports}; assert 'torch' not in sys.modules"], check=True)
 
 
@@ -939,7 +938,7 @@ def test_a_gpu_matches_the_pairs_that_colmap_verifies(tmp_path: Path, monkeypatc
     """The device is the CPU here, which goes the GPU's way."""
     calls: list[tuple] = []
     monkeypatch.setattr(
-        "sadgs_ns.cli.process.matching.write_matches", lambda database, pairs, device: calls.append((*pairs, device))
+        "sadgs_ns.cli.cameras.matching.write_matches", lambda database, pairs, device: calls.append((*pairs, device))
     )
     monkeypatch.setattr(pycolmap, "match_image_pairs", lambda database, **options: calls.append(("verified",)))
     device = torch.device("cpu")
@@ -1128,7 +1127,7 @@ def test_a_film_whose_frames_were_being_written_goes_on(tmp_path: Path, monkeypa
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr("sadgs_ns.cli.process.video.sharpest_frames", interrupted)
+        patched.setattr("sadgs_ns.cli.cameras.video.sharpest_frames", interrupted)
         assert main(command) == 130 and not list((tmp_path / "out").rglob("*.jpg"))
     assert main(command) == 130 and taken == [[f"{i:05d}.jpg" for i in range(6)]]
     monkeypatch.setattr(program, "video_frames", None)  # a third run reads none again

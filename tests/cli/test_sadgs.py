@@ -22,7 +22,7 @@ from room import draw_photos
 from runs import nerfstudio_data
 
 from sadgs_ns.cli import sadgs
-from sadgs_ns.cli.process.plan import Summary
+from sadgs_ns.cli.cameras.plan import Summary
 from sadgs_ns.cli.program import locked
 from sadgs_ns.cli.sadgs import PhotosToSplat, Sadgs, main
 from sadgs_ns.cli.status_line import StatusLine

@@ -25,10 +25,10 @@ import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from sadgs_ns import events
-from sadgs_ns.cli.process.colmap import Report, run_colmap
-from sadgs_ns.cli.process.folder import find_source
-from sadgs_ns.cli.process.panoramas import VIEWS
-from sadgs_ns.cli.process.photos import (
+from sadgs_ns.cli.cameras.colmap import Report, run_colmap
+from sadgs_ns.cli.cameras.folder import find_source
+from sadgs_ns.cli.cameras.panoramas import VIEWS
+from sadgs_ns.cli.cameras.photos import (
     Photo,
     changed_photos,
     convert_photos,
@@ -40,8 +40,8 @@ from sadgs_ns.cli.process.photos import (
     write_alpha,
     write_masks,
 )
-from sadgs_ns.cli.process.plan import Matching, Summary, choose_matching, expected_work
-from sadgs_ns.cli.process.video import find_videos, video_frames, write_frames
+from sadgs_ns.cli.cameras.plan import Matching, Summary, choose_matching, expected_work
+from sadgs_ns.cli.cameras.video import find_videos, video_frames, write_frames
 from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_json
 from sadgs_ns.data.checks.layouts import poses_elsewhere
 from sadgs_ns.data.coordinates import FRAME_KEYS

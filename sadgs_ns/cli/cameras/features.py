@@ -13,8 +13,8 @@ import numpy as np
 import pycolmap
 from PIL import Image
 
-from sadgs_ns.cli.process.panoramas import VIEWS, rotations
-from sadgs_ns.cli.process.plan import MAX_SIDE, searched_pixels
+from sadgs_ns.cli.cameras.panoramas import VIEWS, rotations
+from sadgs_ns.cli.cameras.plan import MAX_SIDE, searched_pixels
 from sadgs_ns.events import progress
 from sadgs_ns.method.host_memory import available_host_bytes
 

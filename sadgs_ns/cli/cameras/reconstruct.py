@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pycolmap
 
-from sadgs_ns.cli.process.features import extract
-from sadgs_ns.cli.process.panoramas import rotations
-from sadgs_ns.cli.process.photos import empty_folder, in_order
-from sadgs_ns.cli.process.plan import Matching, Summary
+from sadgs_ns.cli.cameras.features import extract
+from sadgs_ns.cli.cameras.panoramas import rotations
+from sadgs_ns.cli.cameras.photos import empty_folder, in_order
+from sadgs_ns.cli.cameras.plan import Matching, Summary
 from sadgs_ns.errors import InputError
 from sadgs_ns.events import progress
 
@@ -196,7 +196,7 @@ def match(
     for start in range(0, len(pairs), at_once):
         chunk = pairs[start : start + at_once]
         if gpu is not None:
-            from sadgs_ns.cli.process.matching import write_matches
+            from sadgs_ns.cli.cameras.matching import write_matches
 
             write_matches(database, chunk, gpu)  # COLMAP then only verifies these.
         pair_list.write_text("".join(f"{a} {b}\n" for a, b in chunk), "utf8")

@@ -27,7 +27,7 @@ _ERROR_LINE = re.compile(r"^[EF]\d{8} |^\s*what\(\): |Error: ")
 
 
 def run_colmap(function: str, *arguments: Any, folder: Path, report: Report) -> Any:
-    """Call a function of `stages.py`, which writes to `folder`, in another process, as `Worker.run` does.
+    """Call a function of `reconstruct.py`, which writes to `folder`, in another process, as `Worker.run` does.
 
     Raises:
         InputError: If the function raises it.
@@ -42,7 +42,7 @@ def run_colmap(function: str, *arguments: Any, folder: Path, report: Report) -> 
         report(stage, done, total)
 
     try:
-        with Worker(f"sadgs_ns.cli.process.stages:{function}", log) as worker:
+        with Worker(f"sadgs_ns.cli.cameras.reconstruct:{function}", log) as worker:
             return worker.run(*arguments, on_event=on_event)
     except WorkerError as error:
         raise _error_of(error, begun, folder) from None

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
-from sadgs_ns.cli.process.folder import COLMAP_FORMATS
-from sadgs_ns.cli.process.panoramas import VIEWS, cut, is_panorama
+from sadgs_ns.cli.cameras.folder import COLMAP_FORMATS
+from sadgs_ns.cli.cameras.panoramas import VIEWS, cut, is_panorama
 from sadgs_ns.data.checks.images import NOT_UPRIGHT, SIDEWAYS
 from sadgs_ns.errors import InputError, reason
 

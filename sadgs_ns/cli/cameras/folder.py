@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageOps
 
-from sadgs_ns.cli.process.video import find_videos
+from sadgs_ns.cli.cameras.video import find_videos
 from sadgs_ns.cli.program import read_settings
 from sadgs_ns.data import IMAGE_SUFFIXES
 from sadgs_ns.data.checks.images import image_size

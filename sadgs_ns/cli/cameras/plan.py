@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from sadgs_ns.cli.process.photos import Photo
+from sadgs_ns.cli.cameras.photos import Photo
 from sadgs_ns.errors import InputError, RunError
 
 EXHAUSTIVE_LIMIT = 200
