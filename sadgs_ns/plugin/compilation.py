@@ -14,6 +14,7 @@ from rich.markup import escape
 from torch import Tensor
 
 from sadgs_ns.errors import reason
+from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients
 from sadgs_ns.method.color_matrices import correct_colors, identities
@@ -56,6 +57,8 @@ class _Stages:
         Ks = self.means.new_tensor(intrinsics).repeat(self.views, 1, 1)
         self.image = torch.linspace(0.0, 1.0, 3 * _SIZE * _SIZE, device=device).view(1, _SIZE, _SIZE, 3)
         self.cameras = Cameras(viewmats, Ks, _SIZE, _SIZE)
+        # The run's own near plane may lie behind these Gaussians, and what nobody sees launches no compositing.
+        self.drawing = replace(self.model.drawing, near_plane=NEAR_PLANE)
         self.info: dict[str, Any] = {}
         """What `rasterize` says of the projection, once `project` was called."""
 
@@ -82,7 +85,7 @@ class _Stages:
         return stages if self.pipeline.world.alone else stages | {"what travels between devices": self.exchange}
 
     def project(self) -> None:
-        _, _, self.info = rasterize(self.gaussians, self.cameras, self.model.drawing)
+        _, _, self.info = rasterize(self.gaussians, self.cameras, self.drawing)
 
     def tile_lists(self) -> None:
         # The size is the run's: whether tiles are numbered in 16 or in 32 bits depends on how many there are, and lists
@@ -90,7 +93,7 @@ class _Stages:
         sizes = self.pipeline.datamanager.train_dataset.cameras
         cameras = self.cameras._replace(width=int(sizes.width.max()), height=int(sizes.height.max()))
         for capacity in (None, 2**20):
-            rasterize(self.gaussians, cameras, replace(self.model.drawing, tile_capacity=capacity))
+            rasterize(self.gaussians, cameras, replace(self.drawing, tile_capacity=capacity))
 
     def blank(self, name: str) -> Tensor:
         return self.means.new_zeros((_GAUSSIANS, *self.model.gauss_params[name].shape[1:]))
@@ -126,7 +129,7 @@ class _Stages:
 
     def composite(self, absgrad: bool) -> None:
         gaussians = self.gaussians._replace(means=self.means.clone().requires_grad_())
-        renders, alphas, info = rasterize(gaussians, self.cameras, replace(self.model.drawing, absgrad=absgrad))
+        renders, alphas, info = rasterize(gaussians, self.cameras, replace(self.drawing, absgrad=absgrad))
         black = self.model.config.background_color == "black" and self.model.color_matrices is None
         result = renders.sum() if black else renders.sum() + alphas.sum()
         # The projection is differentiated elsewhere.
@@ -147,7 +150,7 @@ class _Stages:
         config = self.model.config
         means, quats, scales = (value.clone().requires_grad_() for value in self.gaussians[:3])
         radii, means2d, _, conics, compensations, centres = project(
-            means, quats, scales, self.opacities, *self.cameras, self.model.drawing.antialiased
+            means, quats, scales, self.opacities, *self.cameras, self.drawing.antialiased
         )
         results = [means2d, conics] if compensations is None else [means2d, conics, compensations]
         if config.sh_degree > 0:

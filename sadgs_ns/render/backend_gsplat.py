@@ -25,7 +25,7 @@ def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions, begi
     if options.max_off_axis > 0:
         radii = cull_off_axis(radii, means2d, width, height, options.max_off_axis)
     opacities = opacities_in_views(gaussians.opacities, compensations, len(viewmats))
-    colors = colors_in_views(gaussians, viewmats, gsplat_compat.drawn(radii, means2d), options.sh_degree)
+    colors = colors_in_views(gaussians, viewmats, radii, means2d, options.sh_degree)
     return Projected(radii, means2d, depths, conics, opacities, colors, width, height)
 
 
@@ -38,8 +38,10 @@ def opacities_in_views(opacities: Tensor, compensations: Tensor | None, num_view
     return opacities[None] if num_views == 1 else torch.stack([opacities] * num_views)
 
 
-def colors_in_views(gaussians: Gaussians, viewmats: Tensor, drawn: Tensor, sh_degree: int | None) -> Tensor:
-    """Return colours as cameras see them [C, N, D], computed where Gaussians are drawn, bool [C, N]."""
+def colors_in_views(
+    gaussians: Gaussians, viewmats: Tensor, radii: Tensor, means2d: Tensor, sh_degree: int | None
+) -> Tensor:
+    """Return colours as cameras see them [C, N, D], computed where Gaussians are drawn."""
     num_views, colors = len(viewmats), gaussians.colors
     if isinstance(colors, tuple):
         colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
@@ -47,7 +49,7 @@ def colors_in_views(gaussians: Gaussians, viewmats: Tensor, drawn: Tensor, sh_de
         return colors.expand(num_views, -1, -1)
     # gsplat inverts the matrices, which makes the host wait for the device.
     positions = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:]).mT  # [C, 1, 3]
-    coefficients = colors.expand(num_views, -1, -1, -1)
+    coefficients, drawn = colors.expand(num_views, -1, -1, -1), gsplat_compat.drawn(radii, means2d)
     colors = gsplat.spherical_harmonics(sh_degree, gaussians.means - positions, coefficients, masks=drawn)
     return torch.clamp_min(colors + 0.5, 0.0)
 

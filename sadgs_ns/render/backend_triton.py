@@ -49,7 +49,7 @@ def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions, begi
     if isinstance(colors, tuple) and degree is not None and degree <= MAX_DEGREE and not differentiates_cameras:
         colors = colors_from_harmonics(degree, gaussians.means, *colors, viewmats, radii)
     else:
-        colors = colors_in_views(gaussians, viewmats, gsplat_compat.drawn(radii, means2d), degree)
+        colors = colors_in_views(gaussians, viewmats, radii, means2d, degree)
     return Projected(radii, means2d, depths, conics, opacities, colors, width, height, tiles)
 
 

@@ -113,7 +113,8 @@ def replace_gsplat(patch: pytest.MonkeyPatch) -> None:
         return
 
     def rasterization(sparse_grad: bool, far_plane: float, **options: Any) -> Any:
-        return splatted(**options)
+        colors, alphas, info = splatted(**options)
+        return colors, alphas, info | {"gaussian_ids": None}  # of packed calls, which gsplat's strategy asks for
 
     patch.setattr(splatfacto, "rasterization", rasterization)
     patch.setattr(torch.Tensor, "cuda", lambda tensor: tensor)

