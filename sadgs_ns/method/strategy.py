@@ -6,8 +6,7 @@ import math
 import warnings
 from collections.abc import Mapping, MutableMapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from functools import lru_cache
-from typing import Any
+from typing import Any, cast
 
 import torch
 from gsplat.strategy.base import Strategy
@@ -25,7 +24,6 @@ from sadgs_ns.method.statistics import consistent, empty_statistics, observe
 
 Info = Mapping[str, Any]
 _WINDOWS = tuple(field.name for field in fields(Windows))
-_exactly = lru_cache(maxsize=64)(Windows)
 
 TAU_PRUNE = 0.8
 """τ_prune: fraction of observations that must be low (η < 0.1) on every axis before a faint Gaussian is pruned (paper,
@@ -99,7 +97,8 @@ class StructureAwareStrategy(Strategy):
     reset_every: int | None = None
     """Iterations between opacity resets inside the densification window; 0 turns them off.
     None is 12/30 of the run, and 0 in runs of fewer than 600 iterations, which would not recover."""
-    # This is no option, so it has no annotation, which would make it a field.
+    # These are no options, so they have no annotation, which would make them fields.
+    _fitted = cast("Windows | None", None)
     world = World()
     """The processes among which the Gaussians are shared out.
     The cap and the ranking of what may grow are those of all, and densification ends with equal shards."""
@@ -109,15 +108,18 @@ class StructureAwareStrategy(Strategy):
 
         `world` are the processes among which the Gaussians are shared out; None keeps this strategy's.
         """
-        fitted = replace(self, **asdict(windows(num_iterations, **self._given)))
-        fitted.world = self.world if world is None else world
+        derived = windows(num_iterations, **self._given)
+        fitted = replace(self, **asdict(derived))
+        fitted._fitted, fitted.world = derived, self.world if world is None else world
         return fitted
 
     @property
     def windows(self) -> Windows:
         """When densification does what; where a window is None, as in a run of 3,000 iterations."""
+        if self._fitted is not None:  # Steps ask for them often.
+            return self._fitted
         given = self._given
-        return windows(3000, **given) if None in given.values() else _exactly(**given)
+        return windows(3000, **given) if None in given.values() else Windows(**given)
 
     @property
     def _given(self) -> dict[str, Any]:

@@ -40,7 +40,7 @@ else:
     import tomli as tomllib
 
 CHECKOUT = Path(__file__).parents[2]
-NO_OPTIONS = {"world"}
+NO_OPTIONS = {"_fitted", "world"}
 """Attributes of the strategy that are decided in each run."""
 METHODS = ("sadgs", "sadgs-paper", "sadgs-paper-indoor")
 CONFIG_CLASSES = (
