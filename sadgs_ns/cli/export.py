@@ -44,8 +44,8 @@ class Export:
     The end of the file's name chooses the format: .ply, the largest, which all viewers read; .compressed.ply, .spz and
     .sog, which are smaller and lose a little; .glb, which is glTF with KHR_gaussian_splatting; .html, a page that opens
     in a browser without a network, for which Node.js must be installed. A name that ends in .mesh.ply is for a mesh
-    fused from rendered depth, for measuring and previews; splats keep no surface. A GPU is not needed, and nothing of
-    the run's files is executed. Lengths are in units of nerfstudio's frame.
+    fused from rendered depth, for measuring and previews; splats have no surface. No GPU is needed, and no code of the
+    run's files is executed. Lengths are in units of nerfstudio's frame.
     """
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]

@@ -51,9 +51,9 @@ def exit_code(name: str, folder: Path | None, run: Callable[[], int]) -> int:
         told, code = str(error), 1
         if isinstance(error, OSError) and error.errno is not None:
             where, free = error.filename or folder or Path(), free_space(folder or Path())
-            told = f"{where}: {reason(error)} ({free} free there); the same command goes on."
+            told = f"{where}: {reason(error)} ({free} free there); run the same command again to resume."
     except KeyboardInterrupt as stopped:
-        told = "stopped; the same command goes on."
+        told = "stopped; run the same command again to resume."
         code = 128 + (stopped.number if isinstance(stopped, Interrupted) else signal.SIGINT)
     print(f"{name}: {told}", file=sys.stderr)
     return code

@@ -61,26 +61,25 @@ _ON_CPU = (
 @dataclass
 class Sadgs:
     """From photos or a video to a splat that opens in a browser: cameras (sadgs-process), training (ns-train sadgs) and
-    export (sadgs-export), each of which also is a command of its own. The same command goes on where an earlier one
-    stopped, and does nothing twice. What follows after -- goes to ns-train as it is, as in `sadgs photos --
-    --max-num-iterations 500`."""
+    export (sadgs-export), each of which is a command of its own, too. Run the same command again to resume; nothing is
+    done twice. Options after -- go to ns-train, as in `sadgs photos -- --max-num-iterations 500`."""
 
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS_OR_VIDEO")]
     """Folder of photos or of videos, or a video."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = None
-    """Folder for all that is made; by default the source's name and -splat, in the working directory."""
+    """Folder for all results; by default the source's name and -splat, in the working directory."""
     effort: Annotated[float, tyro.conf.arg(metavar="X")] = 1.0
     """How much training: 0.5 is a draft, 2 resolves more."""
     cameras: Literal["given", "new"] = "given"
-    """Use the cameras that the folder brings, a COLMAP model or transforms.json, if any, or find new ones."""
+    """Use the folder's cameras, a COLMAP model or transforms.json, if it has any, or find new ones."""
     max_size: Annotated[int, tyro.conf.arg(metavar="PX")] = 1600
     """Longest side of the photos, at least 64, 0 to keep it."""
     formats: Annotated[
         str | None,
-        tyro.conf.arg(metavar="A,B", help=f"What is exported, of {', '.join(_FORMATS)}; by default html,ply."),
+        tyro.conf.arg(metavar="A,B", help=f"Formats to export, of {', '.join(_FORMATS)}; by default html,ply."),
     ] = None
     anyway: bool = False
-    """Go on where fewer than half of the photos registered."""
+    """Continue even if fewer than half of the photos registered."""
 
 
 class PhotosToSplat:
@@ -235,7 +234,7 @@ class PhotosToSplat:
             problem = f"{worker.log.stem}: {str(error).rstrip('.')}. All that it printed is in {worker.log}"
             if isinstance(error, InputError) or error.exitcode == 2:
                 raise InputError(f"{problem}.") from None
-            raise RunError(f"{problem}, and the same command goes on.") from None
+            raise RunError(f"{problem}; run the same command again to resume.") from None
 
     def _find_cameras(self, line: StatusLine) -> str:
         if self._camera_file:
@@ -274,7 +273,7 @@ class PhotosToSplat:
             if not self.options.anyway:
                 line.update(found)
                 command = ["sadgs-process", str(self.source), str(self._scene), "--matching", "exhaustive"]
-                again = f"or compare more pairs of them with `{shlex.join(command)}`, and give the same command again; "
+                again = f"or compare more pairs of them with `{shlex.join(command)}`, and run this command again; "
                 raise RunError(
                     f"only {found}, so the splat would show only what these saw: take more photos between the others, "
                     "with two thirds of overlap, and begin another --output; "

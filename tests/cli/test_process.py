@@ -2,7 +2,7 @@
 
 Tried by hand: a downloaded vocabulary tree that is damaged (wrong SHA-256) counts as none, and the sentence says that
 it does not match. SIGKILL of the command ends COLMAP's process, too. If COLMAP's process is killed for want of memory,
-one sentence names the stage and the remedy. In both cases the same command goes on. CMYK, palette, grey, 16-bit PNG and
+one sentence names the stage and the remedy. In both cases the same command resumes. CMYK, palette, grey, 16-bit PNG and
 TIFF, LZW TIFF and BMP become 8-bit RGB in the scene.
 """
 
@@ -132,11 +132,11 @@ def run(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 @pytest.mark.hard_case(
     "SIGTERM, SIGHUP or Ctrl-C in `sadgs-process`",
-    'ends in 0.5 s with "stopped; the same command goes on.", exit code 143, 129 or 130; half-written folders '
-    "are removed, COLMAP's process is gone",
+    'ends in 0.5 s with "stopped; run the same command again to resume.", exit code 143, 129 or 130; half-written '
+    "folders are removed, COLMAP's process is gone",
 )
 def test_an_interrupted_run_ends_in_a_sentence_and_goes_on(run: Run):
-    assert run.exit_code == 143 and run.printed == "sadgs-process: stopped; the same command goes on.\n"
+    assert run.exit_code == 143 and run.printed == "sadgs-process: stopped; run the same command again to resume.\n"
     assert run.left - {"database.db-shm", "database.db-wal"} == {"settings.json", "database.db", "alpha"}
     assert run.stages == ["photos", "features", "matches (exhaustive)", "cameras", "undistorted photos"]
     assert run.matches[0] == run.matches[1] > 0
@@ -798,7 +798,7 @@ def test_digital_zoom_is_another_camera(tmp_path: Path):
 def test_an_abort_of_colmap_is_an_error_like_others(tmp_path: Path):
     """Its vocabulary tree is not asked for here, because this database cannot be made."""
     steps: list[str] = []
-    with pytest.raises(RunError, match=r"^COLMAP failed while it worked on vocabulary tree \(.+\); the same command"):
+    with pytest.raises(RunError, match=r"^COLMAP failed while it worked on vocabulary tree \(.+\); run the same com"):
         run_colmap(
             "fetch_vocabulary", tmp_path / "none", folder=tmp_path, report=lambda stage, *others: steps.append(stage)
         )
@@ -807,7 +807,7 @@ def test_an_abort_of_colmap_is_an_error_like_others(tmp_path: Path):
 
 @pytest.mark.hard_case(
     "the disk is full while features are found or matched",
-    "one sentence names the folder and the free space; the same command goes on",
+    "one sentence names the folder and the free space; the same command resumes",
 )
 def test_a_full_disk_is_told_in_a_sentence_that_names_the_folder(photos: Path, tmp_path: Path, capsys):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -818,7 +818,7 @@ def test_a_full_disk_is_told_in_a_sentence_that_names_the_folder(photos: Path, t
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     printed = capsys.readouterr().err
     assert f"{tmp_path / 'out' / 'work'} could not be written while COLMAP worked on features (" in printed
-    assert "free there): make room, and the same command goes on." in printed and printed.count("\n") == 1
+    assert "free there): make room, and run the same command again to resume." in printed and printed.count("\n") == 1
 
 
 @pytest.fixture
@@ -885,7 +885,7 @@ def test_two_runs_do_not_disturb_each_other(tmp_path: Path, monkeypatch: pytest.
 
 @pytest.mark.hard_case(
     "the disk is full while cameras are written",
-    "the model is read again before it counts; one sentence, the same command goes on",
+    "the model is read again before it counts; one sentence; the same command resumes",
 )
 @pytest.mark.parametrize("name", ["points3D.bin", "images.bin"])
 def test_a_model_that_colmap_could_not_write_is_told(run: Run, tmp_path: Path, name: str):
@@ -901,7 +901,7 @@ def test_a_model_that_colmap_could_not_write_is_told(run: Run, tmp_path: Path, n
 
 
 @pytest.mark.hard_case(
-    "the disk is full or the folder read-only at the start", "one sentence; the same command goes on"
+    "the disk is full or the folder read-only at the start", "one sentence; the same command resumes"
 )
 def test_a_folder_in_which_no_settings_could_be_noted_can_be_used(tmp_path: Path, taken: list[list[str]]):
     (tmp_path / "out" / "work").mkdir(parents=True)

@@ -92,7 +92,7 @@ def times_of_results(folder: Path) -> dict[Path, int]:
 
 @pytest.mark.hard_case(
     "Ctrl-C on `sadgs` in its first, second and third stage",
-    "the stage saves; the same command goes on, and does nothing twice",
+    "the stage saves; the same command resumes, and does nothing twice",
 )
 @pytest.mark.hard_case("the reader of the output of `sadgs` ends", "all stages run; it prints where errors go")
 @pytest.mark.hard_case(
@@ -112,14 +112,14 @@ def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothin
     stop("^matches")
     assert main(command) == 130
     printed = capsys.readouterr()
-    assert printed.err == "sadgs: stopped; the same command goes on.\n"
+    assert printed.err == "sadgs: stopped; run the same command again to resume.\n"
     assert lines_of(printed.out) == {"cameras": "stopping"}
     assert not (folder / "scene" / "transforms.json").exists()
 
     stop("^iteration 10 of 15, about .* left")
     assert main(command) == 130
     printed = capsys.readouterr()
-    assert printed.err == "sadgs: stopped; the same command goes on.\n"
+    assert printed.err == "sadgs: stopped; run the same command again to resume.\n"
     assert lines_of(printed.out) == {"cameras": "10 of 10 photos registered", "training": "stopping"}
     assert sadgs._ON_CPU in printed.out
     (checkpoint,) = folder.glob("training/sadgs/run/nerfstudio_models/step-*.ckpt")

@@ -135,7 +135,7 @@ def test_a_signal_is_passed_on_once_and_the_function_may_save(program):
     assert heard == ["ready", "stopping"] and log.read_text("utf8") == "saved\n"
 
 
-@pytest.mark.hard_case("the training of `sadgs` is killed", "one sentence, and the same command goes on")
+@pytest.mark.hard_case("the training of `sadgs` is killed", "one sentence; the same command resumes")
 def test_a_function_that_is_killed_is_told_of(program):
     log = program("import os, signal\ndef function(): os.kill(os.getpid(), signal.SIGKILL)")
     with pytest.raises(WorkerError, match=r"^it was ended by SIGKILL, most likely for want of memory$") as failed:

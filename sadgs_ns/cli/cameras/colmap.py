@@ -55,12 +55,12 @@ def _error_of(error: WorkerError, stage: str, folder: Path) -> Exception:
     if _FULL_DISK.search(error.output) or shutil.disk_usage(folder).free < _FULL_BELOW:
         return OSError(
             f"{folder} could not be written while COLMAP worked on {stage} ({free_space(folder)} free there): "
-            "make room, and the same command goes on."
+            "make room, and run the same command again to resume."
         )
     if error.exitcode == -signal.SIGKILL:
         return RunError(
             f"COLMAP was killed while it worked on {stage}, most likely for want of memory: close other programs, or "
-            "give it smaller photos; the same command goes on."
+            "give it smaller photos, and run the same command again to resume."
         )
     why = f"({told[-1]})" if told else f"(exit code {error.exitcode})"
-    return RunError(f"COLMAP failed while it worked on {stage} {why}; the same command tries it again.")
+    return RunError(f"COLMAP failed while it worked on {stage} {why}; run the same command to try again.")

@@ -65,15 +65,15 @@ class Process:
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS_OR_VIDEO")]
     """Folder of photos or of videos, or a video."""
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
-    """Folder for the scene; an interrupted run goes on in it."""
+    """Folder for the scene; run the same command again to resume."""
     matching: Matching = "auto"
-    """Which photos are compared; auto decides by their kind and number."""
+    """How pairs of photos are chosen; auto decides by their kind and number."""
     frames: int = 200
     """Frames to take of a video, at least 3."""
     max_size: Annotated[int, tyro.conf.arg(metavar="PX")] = 1600
     """Longest side of the result, at least 64, 0 to keep it."""
     camera_per_photo: bool = False
-    """Every photo has its own zoom, and EXIF does not tell."""
+    """Every photo has its own zoom, which EXIF does not tell."""
 
 
 class _Scene:
