@@ -13,11 +13,10 @@ from torch import Tensor
 
 from sadgs_ns.gsplat_compat import SCREEN_BLUR
 from sadgs_ns.method.quantization import dequantize
+from sadgs_ns.render.ewa import FRUSTUM_MARGIN
 
 WAVELENGTH_EPSILON = 1e-5
 """ε of Λ_min = 1 / (√λ_1 + ε) in 1/px: a textureless region has a wavelength of 10⁵ px, not infinity."""
-FRUSTUM_MARGIN = 0.3
-"""gsplat evaluates the projection Jacobian at most this fraction of half the image beyond the image's border."""
 
 
 def principal_eigenvalue(structure_tensor: Tensor) -> Tensor:

@@ -15,7 +15,6 @@ from torch import Tensor
 from sadgs_ns.gsplat_compat import SCREEN_BLUR
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.method.eta import (
-    FRUSTUM_MARGIN,
     WAVELENGTH_EPSILON,
     eta,
     projected_axes,
@@ -24,6 +23,7 @@ from sadgs_ns.method.eta import (
 )
 from sadgs_ns.method.ops import Params
 from sadgs_ns.method.quantization import HIGHEST_FREQUENCY, INVALID, OCTAVES
+from sadgs_ns.render.ewa import FRUSTUM_MARGIN
 from sadgs_ns.render.rasterization import visible
 
 HIGH_ETA = 1.0

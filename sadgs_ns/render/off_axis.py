@@ -14,36 +14,19 @@ from sadgs_ns.gsplat_compat import has_radius_per_axis
 
 
 @torch.no_grad()
-def near_axis(means2d: Tensor, width: int, height: int, max_off_axis: float) -> Tensor:
-    """Tell which Gaussians' centres are projected near enough to the image.
-
-    Args:
-        means2d: Projected centres in px. [C, N, 2]
-        width: px.
-        height: px.
-        max_off_axis: Largest distance from the image's centre, in halves of its width and height along x and y, > 0.
-
-    Returns:
-        bool [C, N], False where the centre is not finite.
-    """
-    # Numbers, not a tensor of them, which the host would have to send to the device.
-    x, y = means2d.unbind(dim=-1)
-    half_width, half_height = width / 2, height / 2
-    return ((x - half_width).abs() < max_off_axis * half_width) & ((y - half_height).abs() < max_off_axis * half_height)
-
-
 def cull_off_axis(radii: Tensor, means2d: Tensor, width: int, height: int, max_off_axis: float) -> Tensor:
     """Make the radii of Gaussians zero that are too far off the axis: compositing draws none whose radius is zero.
 
     Args:
-        radii: px, of gsplat 1.4 [C, N] or 1.5 [C, N, 2].
-        means2d: As for `near_axis`. [C, N, 2]
-        width: px.
-        height: px.
-        max_off_axis: As for `near_axis`.
+        radii, means2d, width, height: As `Projected` has them. Where a centre is not finite, nothing is drawn.
+        max_off_axis: Largest distance from the image's centre, in halves of its width and height along x and y, > 0.
 
     Returns:
         Radii of the same shape and type.
     """
-    near = near_axis(means2d, width, height, max_off_axis)  # [C, N]
+    # Numbers, not a tensor of them, which the host would have to send to the device.
+    x, y = means2d.unbind(dim=-1)
+    half_width, half_height = width / 2, height / 2
+    near = (x - half_width).abs() < max_off_axis * half_width
+    near &= (y - half_height).abs() < max_off_axis * half_height  # [C, N]
     return radii * (near[..., None] if has_radius_per_axis(radii, means2d) else near)

@@ -10,7 +10,7 @@ import torch
 from gsplat_like import rasterization
 from random_scene import random_scene
 
-from sadgs_ns.render.off_axis import cull_off_axis, near_axis
+from sadgs_ns.render.off_axis import cull_off_axis
 from sadgs_ns.render.rasterization import visible
 
 WIDTH, HEIGHT = 40, 30
@@ -21,7 +21,6 @@ def test_the_distance_counts_in_half_images_along_each_axis():
     points = [(20, 15), (59.9, 15), (60.1, 15), (-19.9, 15), (20, 44.9), (20, 45.1), (20, -15.1), (math.nan, 15)]
     means2d = torch.tensor([points], dtype=torch.float32)
     expected = [True, True, False, True, True, False, False, False]
-    assert near_axis(means2d, WIDTH, HEIGHT, 2.0)[0].tolist() == expected
     for radii in (torch.full((1, 8), 3, dtype=torch.int32), torch.full((1, 8, 2), 3, dtype=torch.int32)):
         culled = cull_off_axis(radii, means2d, WIDTH, HEIGHT, 2.0)
         assert culled.dtype == torch.int32 and culled.shape == radii.shape
