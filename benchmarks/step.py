@@ -10,7 +10,6 @@ import math
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import torch
@@ -22,8 +21,7 @@ from sadgs_ns import kernels
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, keep_gradient
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.statistics import empty_statistics, observe
-from sadgs_ns.plugin.nonfinite import NonFiniteLog
-from sadgs_ns.plugin.optimizers import FusedAdam, step_together
+from sadgs_ns.plugin.optimizers import AdamUpdate, FusedAdam
 from sadgs_ns.render.rasterization import rasterize
 from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
 
@@ -70,11 +68,8 @@ class Step:
             "opacities": torch.logit(uniform(0.05, 0.95, gaussians, 1)),
         }
         self.params = {name: torch.nn.Parameter(value) for name, value in values.items()}
-        ours, log = not kernels.switched_off(), NonFiniteLog(device, capacity=1)
-        adam = FusedAdam if ours else partial(torch.optim.Adam, fused=True)
-        self.optimizers: list[Any] = [adam([p], lr=1e-6, eps=1e-15) for p in self.params.values()]
-        for optimizer in self.optimizers if ours else ():
-            optimizer.log = log  # one for all, as in training: what shares it is updated in one launch
+        self.optimizers = {name: FusedAdam([p], lr=1e-6, eps=1e-15) for name, p in self.params.items()}
+        self.noted = torch.zeros(1, device=device)
         self.state: dict[str, Any] = empty_statistics(gaussians, device) | empty_gradients(gaussians, device)
         angles = torch.arange(views, device=device) * (2 * math.pi / views)
         self.viewmats = torch.eye(4, device=device).repeat(views, 1, 1)
@@ -126,10 +121,11 @@ class Step:
 
     def optimize(self) -> None:
         """Adam on all parameters that have gradients: our kernel in one launch, as in training."""
-        together = [o for o in self.optimizers if isinstance(o, FusedAdam) and o.triton]
-        step_together(together)
-        for optimizer in () if together else self.optimizers:
-            optimizer.step()
+        gradients = {name: p.grad for name, p in self.params.items() if p.grad is not None}
+        update = AdamUpdate({name: self.optimizers[name] for name in gradients})
+        update.launch(gradients, update.factors().to(self.noted.device, non_blocking=True), self.noted)
+        for name, gradient in gradients.items():
+            self.params[name].grad = gradient  # torch's Adam has used it up, and this may be called again.
 
     def __call__(self, after: Callable[[str], None] = lambda phase: None) -> None:
         """A whole step; every `ETA_EVERY`th observes η, and `after` hears the phases of `memory.step_bytes`."""

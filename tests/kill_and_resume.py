@@ -37,6 +37,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from examples.drawn_scene.demonstration import fit_densification
 from examples.drawn_scene.scene import EVAL_INTERVAL, SPARSE_FOLDER, write_scene
+from sadgs_ns.plugin.optimizers import AdamUpdate
 from sadgs_ns.plugin.presets import sadgs
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 
@@ -90,15 +91,16 @@ def _arm(trainer: SadgsTrainer, kill: Kill) -> None:
         location = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
         trainer.callbacks.append(TrainingCallback(location, lambda step: _die() if step == kill.step else None))
     elif kill.place == "within a step":
-        optimize = trainer.optimizers.optimizer_scaler_step_some
+        launch = AdamUpdate.launch
 
-        def optimize_half(grad_scaler: Any, param_groups: list[str]) -> None:
-            killed = trainer.step == kill.step
-            optimize(grad_scaler, param_groups[: len(param_groups) // 2] if killed else param_groups)
-            if killed:
+        def launch_half(update: AdamUpdate, *args: Any) -> None:
+            if trainer.step == kill.step:
+                some = dict(list(update._optimizers.items())[: len(update._optimizers) // 2])
+                launch(AdamUpdate(some), *args)
                 _die()
+            launch(update, *args)
 
-        trainer.optimizers.optimizer_scaler_step_some = optimize_half
+        AdamUpdate.launch = launch_half  # type: ignore[method-assign]
     elif kill.place == "saving":
         save = torch.save
 

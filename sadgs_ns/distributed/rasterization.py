@@ -10,24 +10,25 @@ from torch import Tensor
 from sadgs_ns.distributed.bands import Band, share_out
 from sadgs_ns.distributed.exchange import Exchange
 from sadgs_ns.distributed.world import World
-from sadgs_ns.render.rasterization import composite, project
-from sadgs_ns.render.types import DEFAULTS, Cameras, Gaussians, RenderOptions
+from sadgs_ns.render import rasterization as render
+from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
 
 
-class RenderedBand(NamedTuple):
-    """Rows of a view that this process composited, from `band.top` to `band.bottom`."""
+class Picture(NamedTuple):
+    """What this process composited of some views, or of one."""
 
-    band: Band
-    """Which rows they are, and which of them count."""
+    band: Band | None
+    """Which rows of one view they are, from `band.top` to `band.bottom`, and which of them count. None is all rows of
+    all views."""
     colors: Tensor
-    """[1, H', W, D]"""
+    """[B, H', W, D]"""
     alphas: Tensor
-    """[1, H', W, 1]"""
+    """[B, H', W, 1]"""
 
 
 def rasterize(
-    world: World, gaussians: Gaussians, cameras: Cameras, options: RenderOptions = DEFAULTS
-) -> tuple[list[RenderedBand], Tensor, dict[str, Any]]:
+    world: World, gaussians: Gaussians, cameras: Cameras, options: RenderOptions
+) -> tuple[list[Picture], dict[str, Any]]:
     """Render the Gaussians of all processes into V cameras, of which each process composites its share.
 
     Every process must call this, and `backward` of something to which the anchor was added, in the same order. Raises
@@ -36,21 +37,25 @@ def rasterize(
     Args:
         world: The processes, whose `sizes` are right.
         gaussians: Those of this process.
-        cameras: The same in all processes; `viewmats` gets no gradient.
-        options: The same in all processes. The exact lengths of tile lists are waited for.
+        cameras: The same in all processes; with several, `viewmats` gets no gradient.
+        options: The same in all processes. Several wait for the exact lengths of tile lists.
 
     Returns:
-        The bands of this process; the anchor, a zero that must be added to the loss; and gsplat's `info` of this
-        process's Gaussians in all views, whose `means2d` has `absgrad` and `grad2d` after `backward` where `absgrad`
-        was asked for. In `info`, `num_pairs` and `num_pixels` are those of what this process composited.
+        What this process composited, one picture of everything where it is alone; and the `info` of this process's
+        Gaussians in all views. With several processes, `info` has `anchor`, a zero that must be added to the loss;
+        `num_pairs` and `num_pixels` of what this process composited; and, after `backward`, `absgrad` and `grad2d` of
+        `means2d` where `absgrad` was asked for.
     """
+    if world.alone:
+        colors, alphas, info = render.rasterize(gaussians, cameras, options)
+        return [Picture(None, colors, alphas)], info
     options = replace(options, tile_capacity=None)
-    projected = project(gaussians, cameras, options, begin_tiles=False)
+    projected = render.project(gaussians, cameras, options, begin_tiles=False)
     exchange = Exchange(world, projected, share_out(len(cameras.viewmats), cameras.height, world.num_ranks))
     anchor, received = exchange.send(projected, options.absgrad)
-    rendered, num_pairs, num_pixels = [], 0, 0
+    pictures, num_pairs, num_pixels = [], 0, 0
     for band, splats in zip(exchange.bands, received, strict=True):
-        renders, alphas, info = composite(splats, options)
-        rendered.append(RenderedBand(band, renders, alphas))
+        colors, alphas, info = render.composite(splats, options)
+        pictures.append(Picture(band, colors, alphas))
         num_pairs, num_pixels = num_pairs + len(info["flatten_ids"]), num_pixels + splats.height * splats.width
-    return rendered, anchor, projected.info() | {"num_pairs": num_pairs, "num_pixels": num_pixels}
+    return pictures, projected.info() | {"anchor": anchor, "num_pairs": num_pairs, "num_pixels": num_pixels}

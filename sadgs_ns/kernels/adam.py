@@ -8,8 +8,6 @@ On parameters of Gaussians torch's fused Adam reaches a third of the memory's ba
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import triton
 import triton.language as tl
 from torch import Tensor
@@ -33,12 +31,10 @@ def _moments_and_step(g, m, v, rate, scale, beta1, beta2, eps, noted, i, exists,
 
 @triton.jit(do_not_specialize=["rows"])
 def _update(
-    parameters, gradients, means, squares, rates, scales, noted, rows, beta1, beta2, eps,
-    WIDTHS: tl.constexpr, MAX: tl.constexpr, BLOCK: tl.constexpr, ON_DEVICE: tl.constexpr,
+    parameters, gradients, means, squares, rates, scales, noted, overflowed, rows, beta1, beta2, eps,
+    WIDTHS: tl.constexpr, FLAGS: tl.constexpr, MAX: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Update a block of one of the parameters, which together are covered by the grid.
-
-    With ON_DEVICE `rates` and `scales` are pointers to the numbers.
+    """Update a block of one of the parameters, which together are covered by the grid, unless all flags are set.
 
     The parameters' sizes are computed from `rows` here. If they were passed as a tuple, Triton would specialise the
     kernel on which of them 16 divides, and compile anew when densification changes that.
@@ -55,8 +51,11 @@ def _update(
             parameter, gradient, mean, square, rate, scale = (
                 parameters[k], gradients[k], means[k], squares[k], rates[k], scales[k]
             )  # fmt: skip
-    if ON_DEVICE:
-        rate, scale = tl.load(rate), tl.load(scale)
+    drawn = FLAGS == 0
+    for k in tl.static_range(FLAGS):
+        drawn = drawn | (tl.load(overflowed[k]) == 0)
+    n = tl.where(drawn, n, 0)
+    rate, scale = tl.load(rate), tl.load(scale)
     i = block * BLOCK + tl.arange(0, BLOCK)
     if (block + 1) * BLOCK <= n:  # the block is whole: without a mask, memory is read in wide words
         g, m, v = tl.load(gradient + i), tl.load(mean + i), tl.load(square + i)
@@ -73,22 +72,18 @@ def _update(
         tl.store(parameter + i, tl.load(parameter + i, exists) - change, exists)
 
 
-def rates_and_scales(
-    steps: Sequence[int], lrs: Sequence[float], betas: tuple[float, float]
-) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def rate_and_scale(step: int, lr: float, betas: tuple[float, float]) -> tuple[float, float]:
     """Return what an update does with the corrections of Adam's running means, which begin at 0.
 
     Args:
-        steps: Which update this is of each parameter, from 1.
-        lrs: Learning rate of each.
+        step: Which update this is of the parameter, from 1.
+        lr: Its learning rate.
         betas: Decay of the two running means, in [0, 1).
 
     Returns:
-        Factors on the running means of the gradients, and on the roots of those of their squares.
+        Factors on the running mean of the gradients, and on the root of that of their squares.
     """
-    beta1, beta2 = betas
-    rates = tuple(lr / (1 - beta1**step) for lr, step in zip(lrs, steps, strict=True))
-    return rates, tuple((1 - beta2**step) ** -0.5 for step in steps)
+    return lr / (1 - betas[0] ** step), (1 - betas[1] ** step) ** -0.5
 
 
 def adam_step(
@@ -96,10 +91,10 @@ def adam_step(
     gradients: tuple[Tensor, ...],
     exp_avgs: tuple[Tensor, ...],
     exp_avg_sqs: tuple[Tensor, ...],
+    factors: Tensor,
     noted: Tensor,
+    overflowed: tuple[Tensor, ...] = (),
     *,
-    steps: Sequence[int],
-    lrs: Sequence[float],
     betas: tuple[float, float],
     eps: float,
     max_gradient: float,
@@ -109,58 +104,23 @@ def adam_step(
     A gradient that is NaN, or not below `max_gradient`, counts as 0.
 
     Args:
-        parameters: One or more, contiguous float32, all of the same length. [N, ...] each
+        parameters: P of them, contiguous float32, all of the same length. [N, ...] each
         gradients: Contiguous, each of its parameter's shape; so are the moments.
         exp_avgs: Running means of the gradients.
         exp_avg_sqs: Running means of their squares.
+        factors: What `rate_and_scale` returns for each, on the device, so that a CUDA graph can repeat the launch.
+            Contiguous float32 [2, P]
         noted: Becomes NaN if there was such a gradient. float32 [1]
-        steps: Which update this is of each parameter, from 1.
-        lrs: Learning rate of each.
+        overflowed: Flags; if there are some and none is 0, nothing is changed. int64 [1] each
         betas: Decay of the two running means, in [0, 1).
         eps: Added to the denominator.
         max_gradient: Absolute value from which a gradient is left out.
     """
-    factors = rates_and_scales(steps, lrs, betas)
-    _launch(parameters, gradients, exp_avgs, exp_avg_sqs, noted, factors, betas, eps, max_gradient)
-
-
-def adam_step_with_factors(
-    parameters: tuple[Tensor, ...],
-    gradients: tuple[Tensor, ...],
-    exp_avgs: tuple[Tensor, ...],
-    exp_avg_sqs: tuple[Tensor, ...],
-    noted: Tensor,
-    factors: Tensor,
-    *,
-    betas: tuple[float, float],
-    eps: float,
-    max_gradient: float,
-) -> None:
-    """Compute `adam_step` to the bit, in a launch whose arguments are the same in every update of a parameter.
-
-    `factors` are what `rates_and_scales` returns for this update, on the device, contiguous float32 [2, P], in the
-    place of `steps` and `lrs`.
-    """
-    rates, scales = (row.unbind() for row in factors)
-    _launch(parameters, gradients, exp_avgs, exp_avg_sqs, noted, (rates, scales), betas, eps, max_gradient)
-
-
-def _launch(
-    parameters: tuple[Tensor, ...],
-    gradients: tuple[Tensor, ...],
-    exp_avgs: tuple[Tensor, ...],
-    exp_avg_sqs: tuple[Tensor, ...],
-    noted: Tensor,
-    factors: tuple[tuple[float, ...], tuple[float, ...]] | tuple[tuple[Tensor, ...], tuple[Tensor, ...]],
-    betas: tuple[float, float],
-    eps: float,
-    max_gradient: float,
-) -> None:
-    """Launch the kernel with factors that are numbers, or scalars on the device."""
     rows = parameters[0].shape[:1].numel()  # 1 without dimensions
     widths = tuple(parameter.shape[1:].numel() for parameter in parameters)
+    rates, scales = (row.unbind() for row in factors)
     grid = (sum(cdiv(rows * width, _BLOCK) for width in widths),)
     _update[grid](
-        parameters, gradients, exp_avgs, exp_avg_sqs, *factors, noted, rows, *betas, eps,
-        widths, max_gradient, _BLOCK, isinstance(factors[0][0], Tensor),
+        parameters, gradients, exp_avgs, exp_avg_sqs, rates, scales, noted, overflowed or (noted,), rows, *betas, eps,
+        widths, len(overflowed), max_gradient, _BLOCK,
     )  # fmt: skip

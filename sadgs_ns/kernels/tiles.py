@@ -12,6 +12,7 @@ is drawn stays the same.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import triton
@@ -133,7 +134,7 @@ def _count(
     do_not_specialize=["n", "num_gaussians", "num_pairs", "num_tiles", "tile_width", "tile_height", "rows_per_view"]
 )
 def _list(
-    means2d, radii, conics, opacities, order, ends, tiles, ids, parts, part_count,
+    means2d, radii, conics, opacities, order, ends, tiles, ids, parts, part_count, overflowed,
     n, num_gaussians, num_pairs, num_tiles, tile_width, tile_height, rows_per_view,
     PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr, LANES: tl.constexpr, FEW: tl.constexpr, PART: tl.constexpr,
 ):  # fmt: skip
@@ -143,12 +144,13 @@ def _list(
     its place in the order plus the part's number, and counted in `part_count`.
 
     The rest of the `num_pairs` places is given to the last tile. If there are more pairs than places, this tile gets
-    all places, and all radii become 0: nothing is drawn, and nobody counts the views.
+    all places, all radii become 0 and `overflowed` 1: nothing is drawn, and nobody counts the views.
     """
     lane = tl.program_id(0) * LANES + tl.arange(0, LANES)
     exists = lane < n
     needed = tl.load(ends + n - 1)
     fits = needed <= num_pairs
+    tl.store(overflowed, 1, needed > num_pairs)
     g = tl.load(order + lane, exists, 0).to(tl.int32)
     at = tl.load(ends + lane - 1, exists & (lane > 0), 0)
     pairs = tl.load(ends + lane, exists & fits, 0) - at
@@ -295,6 +297,17 @@ class PairCounts:
         return self.counts.tolist()
 
 
+class TileLists(NamedTuple):
+    """Which Gaussians each tile draws."""
+
+    starts: Tensor
+    """Where each tile's list starts. int32 [C, tile rows, tile columns], with one more row of given length"""
+    ids: Tensor
+    """Indices in C · N that the lists hold, from front to back. int32 [number of pairs, or `capacity`]"""
+    overflowed: Tensor
+    """1 if the given length was too short, so that nothing is drawn, else 0. int64 [1]"""
+
+
 @dataclass(frozen=True)
 class PendingTiles:
     """Tile lists whose length is on its way to the host, which may give the device other work meanwhile."""
@@ -313,7 +326,7 @@ class PendingTiles:
     """Numbers of views, and of rows and columns of tiles in each."""
 
     @torch.no_grad()
-    def lists(self, capacity: int | None = None) -> tuple[Tensor, Tensor]:
+    def lists(self, capacity: int | None = None) -> TileLists:
         """Make the lists, in the length that they need or in a given one.
 
         Lists of a given length have one more row of tiles in each view, which lies below the image. The last tile of
@@ -325,10 +338,6 @@ class PendingTiles:
         Args:
             capacity: Length of the lists, in [1, 2³¹), for which the host does not wait. With None it waits for the
                 exact length.
-
-        Returns:
-            Where each tile's list starts, int32 [C, tile rows (+ 1), tile columns]; and the indices in C · N that the
-            lists hold, from front to back, int32 [number of pairs, or `capacity`].
         """
         views, rows, columns = self.tile_counts
         if capacity is None:
@@ -343,10 +352,12 @@ class PendingTiles:
         n, per_gaussian = len(self.order), self.ellipses[1].dim() - 1
         # A Gaussian of p > _FEW_PAIRS pairs has at most p / _PART_PAIRS + 1 parts.
         most_parts = num_pairs // _PART_PAIRS + num_pairs // (_FEW_PAIRS + 1) + 1
-        parts, part_count = self.order.new_empty(most_parts), self.order.new_zeros(())
+        # Each of the two numbers begins at 16 bytes, because Triton would compile anew for what is less aligned.
+        parts, numbers = self.order.new_empty(most_parts), self.order.new_zeros(3)
+        part_count, overflowed = numbers[:1], numbers[2:]
         listed = (*self.ellipses, self.order, self.ends, tiles, ids, parts, part_count)
         _list[cdiv(n, _LANES),](
-            *listed, n, n // views, num_pairs, num_tiles, columns, rows, rows_per_view,
+            *listed, overflowed, n, n // views, num_pairs, num_tiles, columns, rows, rows_per_view,
             per_gaussian, self.tile_size, _LANES, _FEW_PAIRS, _PART_PAIRS, num_warps=1,
         )  # fmt: skip
         _list_parts[min(most_parts, _PROGRAMS),](
@@ -359,7 +370,7 @@ class PendingTiles:
         _order[of_pairs + cdiv(num_tiles, _ORDER_LANES),](
             tiles, by_tile, ids, ordered, starts, num_pairs, num_tiles, of_pairs, num_pairs.bit_length(), _ORDER_LANES
         )
-        return starts, ordered
+        return TileLists(starts, ordered, overflowed)
 
 
 @torch.no_grad()

@@ -221,14 +221,30 @@ class StructureAwareStrategy(Strategy):
         """
         if packed:
             raise ValueError("StructureAwareStrategy reads gsplat's unpacked meta: call rasterization(packed=False)")
-        iteration, windows = step + 1, self.windows
-        if iteration > windows.refine_stop_iter:
+        self.accumulate(state, step, info)
+        self.densify(params, optimizers, state, step, info)
+
+    def accumulate(self, state: MutableMapping[str, Any], step: int, info: Info | Sequence[Info]) -> None:
+        """Add the screen gradients of a backward pass, where an AbsGS step will read them."""
+        if step >= self.windows.refine_stop_iter or not self.needs_absgrad(step):
             return
         views = _views(info)
-        if self.needs_absgrad(step):
-            num_views = sum(view["n_cameras"] for view in views)
-            for view in views:
-                accumulate_gradients(state, view, num_views)
+        num_views = sum(view["n_cameras"] for view in views)
+        for view in views:
+            accumulate_gradients(state, view, num_views)
+
+    def densify(
+        self,
+        params: Params,
+        optimizers: MutableMapping[str, torch.optim.Optimizer],
+        state: MutableMapping[str, Any],
+        step: int,
+        info: Info | Sequence[Info],
+    ) -> None:
+        """Split, clone, prune and reset what is due after this step."""
+        iteration, windows, views = step + 1, self.windows, _views(info)
+        if iteration > windows.refine_stop_iter:
+            return
         if iteration >= windows.refine_start_iter:
             if _due(iteration, windows.structure_every):
                 self._structure_step(params, optimizers, state, iteration, views)

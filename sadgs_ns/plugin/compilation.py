@@ -21,8 +21,7 @@ from sadgs_ns.method.color_matrices import correct_colors, identities
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.quantization import quantize
 from sadgs_ns.method.statistics import empty_statistics, observe
-from sadgs_ns.plugin.nonfinite import NonFiniteLog
-from sadgs_ns.plugin.optimizers import FusedAdam, RepeatedUpdate, step_together
+from sadgs_ns.plugin.optimizers import AdamUpdate, FusedAdam
 from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.render.activations import activate
 from sadgs_ns.render.rasterization import rasterize
@@ -41,10 +40,8 @@ class _Stages:
         pipeline: As for `compile_kernels`, like what follows.
     """
 
-    def __init__(
-        self, pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer], cuda_graphs: bool
-    ) -> None:
-        self.pipeline, self.optimizers, self.cuda_graphs = pipeline, optimizers, cuda_graphs
+    def __init__(self, pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
+        self.pipeline, self.optimizers = pipeline, optimizers
         self.model, self.device, self.views = pipeline.model, pipeline.device, pipeline.views_per_iteration
         n, device = _GAUSSIANS, pipeline.device
         ramp = torch.linspace(-0.5, 0.5, n, device=device)
@@ -112,20 +109,19 @@ class _Stages:
         correct_colors(renders, alphas, matrices).sum().backward()
 
     def update(self) -> None:
-        log, twins = NonFiniteLog(self.device, capacity=1), {}
+        twins: dict[str, FusedAdam] = {}
         for name, optimizer in self.optimizers.items():
-            if name in self.model.trained_params and isinstance(optimizer, FusedAdam) and optimizer.triton:
+            if name in self.model.trained_params:
                 # Matrices of colours are fewer than the Gaussians, and so updated in a launch of their own.
                 of_gaussians = name in self.model.gauss_params
                 value = self.blank(name) if of_gaussians else torch.zeros((1, 3, 4), device=self.device)
-                parameter = torch.nn.Parameter(value)
-                parameter.grad = torch.zeros_like(parameter)
-                twins[name] = FusedAdam([parameter], **{key: optimizer.defaults[key] for key in ("betas", "eps")})
-                twins[name].log = log  # all share one log, like the run's, and are stepped in one launch
-        step_together(twins.values())
-        if self.cuda_graphs and twins and (repeated := RepeatedUpdate(twins)).begun:
-            gradients = {name: torch.zeros_like(parameter) for name, parameter in repeated.parameters.items()}
-            repeated.launch(gradients, log.gradients, repeated.factors().to(self.device))
+                options = {key: optimizer.defaults[key] for key in ("betas", "eps")}
+                twins[name] = FusedAdam([torch.nn.Parameter(value)], **options)
+        update = AdamUpdate({name: twin for name, twin in twins.items() if twin.param_groups[0]["params"][0].numel()})
+        gradients = {name: torch.zeros_like(parameter) for name, parameter in update.parameters.items()}
+        # Several processes wait for the exact lengths of tile lists, which then cannot overflow.
+        flags = (torch.zeros(1, dtype=torch.int64, device=self.device),) if self.pipeline.world.alone else ()
+        update.launch(gradients, update.factors().to(self.device), torch.zeros(1, device=self.device), flags)
 
     def composite(self, absgrad: bool) -> None:
         gaussians = self.gaussians._replace(means=self.means.clone().requires_grad_())
@@ -178,9 +174,7 @@ class _Stages:
         unpack(pack(*(value.contiguous() for value in (*seen, colors)), places=places), 0)
 
 
-def compile_kernels(
-    pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer], cuda_graphs: bool = False
-) -> None:
+def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
     """Launch the kernels of training once, on a few Gaussians and in threads, whose compilations then overlap.
 
     Triton keeps what it compiled on the disk: a machine's first run takes seconds here, a later one none. The run
@@ -192,12 +186,11 @@ def compile_kernels(
     Args:
         pipeline: A pipeline whose model and data are set up.
         optimizers: The run's optimizers, by the names of their parameters.
-        cuda_graphs: Whether steps may be captured, whose Adam reads its rates from the device.
     """
     device = pipeline.device
     if not use_triton(device):
         return
-    stages = _Stages(pipeline, optimizers, cuda_graphs)
+    stages = _Stages(pipeline, optimizers)
     failures: dict[str, BaseException] = {}
     pending: dict[str, Future[None]] = {}
 

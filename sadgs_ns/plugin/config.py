@@ -22,7 +22,7 @@ from sadgs_ns.errors import InputError, reason
 from sadgs_ns.files import atomic_path
 from sadgs_ns.kernels import SWITCH, switched_off
 from sadgs_ns.plugin import checkpoints, processes
-from sadgs_ns.plugin.optimizers import RunLengthDecaySchedulerConfig
+from sadgs_ns.plugin.optimizers import FusedAdam, RunLengthDecaySchedulerConfig
 from sadgs_ns.plugin.options import check_ranges, hide
 from sadgs_ns.plugin.pipeline import SadgsPipelineConfig
 from sadgs_ns.plugin.progress import ProgressTable
@@ -174,10 +174,10 @@ class CheckedTrainerConfig(TrainerConfig):
             raise InputError(f"viewer.websocket_port must be in [1, 65535], got {port}.")
         self._check_machine()
         self._check_rates()
-        if self.mixed_precision or self.use_grad_scaler:
+        if self.mixed_precision or self.use_grad_scaler or self.log_gradients:
             raise InputError(
-                "sadgs trains in float32, and its densification reads gradients as they are: leave mixed_precision and "
-                "use_grad_scaler off."
+                "sadgs trains in float32, and its densification reads gradients as they are: leave mixed_precision, "
+                "use_grad_scaler and log_gradients off."
             )
         if any(steps != 1 for steps in self.gradient_accumulation_steps.values()):
             raise InputError(
@@ -215,7 +215,13 @@ class CheckedTrainerConfig(TrainerConfig):
     def _check_rates(self) -> None:
         """Raise InputError if a learning rate ever leaves [0, 1], or a factor is not positive and finite."""
         for group, configs in self.optimizers.items():
-            rate, scheduler = configs["optimizer"].lr, configs.get("scheduler")
+            adam, rate, scheduler = configs["optimizer"], configs["optimizer"].lr, configs.get("scheduler")
+            # One launch updates all parameters.
+            if adam._target is not FusedAdam or adam.max_norm is not None or adam.weight_decay:
+                raise InputError(
+                    f"optimizers.{group}.optimizer must be sadgs's Adam without max_norm and weight_decay: leave out "
+                    "all but its lr."
+                )
             if not 0 <= rate <= 1:
                 raise InputError(f"optimizers.{group}.optimizer.lr must be in [0, 1], got {rate:g}.")
             if isinstance(scheduler, RunLengthDecaySchedulerConfig):

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
@@ -28,7 +28,7 @@ from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.method.averaging import RunningMean
 from sadgs_ns.method.camera_paths import MOST_VIEWS, CameraPaths
 from sadgs_ns.method.clearance import clear_of_cameras, limit_scales
-from sadgs_ns.method.color_matrices import anchored, correct_colors, identities
+from sadgs_ns.method.color_matrices import identities
 from sadgs_ns.method.initialization import (
     POINT_OPACITY,
     camera_extent,
@@ -161,19 +161,6 @@ class SadgsModelConfig(InstantiateConfig):
             self.strategy.check()
         except ValueError as error:
             raise InputError(f"pipeline.model.{error}") from error
-
-
-class StepKind(NamedTuple):
-    """What the launches of a training step depend on, besides tensors; the views of the step have one size."""
-
-    width: int
-    """px."""
-    height: int
-    """px."""
-    options: RenderOptions
-    """How Gaussians are drawn."""
-    opacity_reg: float
-    """Factor on the mean opacity in the loss."""
 
 
 class SadgsModel(SplatfactoModel):
@@ -366,11 +353,8 @@ class SadgsModel(SplatfactoModel):
         self.strategy = plan.strategy.for_run(plan.iterations, self.world)
 
     def step_post_backward(self, step: int) -> None:
-        """Hand the step's forward passes to the strategy, limit scales, and average the parameters at the run's end."""
-        if self.infos:
-            self.strategy.step_post_backward(
-                self.gauss_params, self.optimizers, self.strategy_state, self.step, self.infos
-            )
+        """Densify where that is due, limit scales, and average the parameters at the run's end."""
+        self.strategy.densify(self.gauss_params, self.optimizers, self.strategy_state, self.step, self.infos)
         self.infos = []
         iterations, done = self.plan.iterations, self.step + 1
         if done <= iterations - round(self.config.averaged_share * iterations):
@@ -400,10 +384,6 @@ class SadgsModel(SplatfactoModel):
         if self.color_matrices is None:
             return None
         return torch.cat([self.view_numbers[index : index + 1] for index in cam_indices])
-
-    def wants_structure_tensors(self, step: int) -> bool:
-        """Tell whether the strategy will observe η at this step."""
-        return self.strategy.observes(step)
 
     def cropped(self, values: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
         """Return the rows of tensors [N, …] of Gaussians in the viewer's crop box; in training, all rows."""
@@ -438,27 +418,18 @@ class SadgsModel(SplatfactoModel):
         """Return the options with which colours are drawn at this step, and others of their fields."""
         return replace(self.drawing, sh_degree=self.sh_degree_now, **changes)
 
-    def render(
-        self,
-        cameras: Pinholes,
-        options: RenderOptions,
-        params: Mapping[str, Tensor] | None = None,
-        opacity_reg: float = 0.0,
-    ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-        """Rasterize the Gaussians in their colours.
+    def render(self, cameras: Pinholes, options: RenderOptions) -> tuple[Tensor, Tensor, dict[str, Any]]:
+        """Rasterize the Gaussians, in the viewer those inside its crop box, in their colours.
 
         Args:
             cameras: Views of one size.
             options: As `color_options` makes them.
-            params, opacity_reg: As for `gaussians`.
 
         Returns:
             Colours, not clamped, and depth if it was asked for [C, H, W, 3 or 4]; accumulated opacity [C, H, W, 1]; the
-            rasterizer's info, and in it `opacity_reg`, the penalty that `gaussians` returns.
+            rasterizer's info.
         """
-        gaussians, penalty = self.gaussians(params, opacity_reg)
-        render, alpha, info = rasterize(gaussians, cameras, options)
-        return render, alpha, info | {"opacity_reg": penalty}
+        return rasterize(self.gaussians()[0], cameras, options)
 
     def gaussians(
         self, params: Mapping[str, Tensor] | None = None, opacity_reg: float = 0.0
@@ -479,82 +450,26 @@ class SadgsModel(SplatfactoModel):
         scales, opacities, penalty = activate(params["scales"], params["opacities"], opacity_reg)
         return Gaussians(params["means"], params["quats"], scales, opacities, colors), penalty
 
-    def kind_of_step(self, width: int, height: int, cam_indices: list[int]) -> StepKind:
-        """Return what the launches of a step depend on, whose views have one size in px."""
+    def step_options(self, cameras: Pinholes, indices: Sequence[int]) -> RenderOptions:
+        """Return how training views, by their indices, are drawn at this step.
+
+        With our kernels the host does not wait for the length of the tile lists, but foresees it.
+        """
         forecast, capacity = self.tile_forecast, None
         if forecast is not None:
-            capacity = forecast.capacity(cam_indices, (width, height), self.num_points)
-        opacity_reg = self.config.opacity_reg if self.step < self.strategy.windows.refine_stop_iter else 0.0
-        options = self.color_options(absgrad=self.strategy.needs_absgrad(self.step), tile_capacity=capacity)
-        return StepKind(width, height, options, opacity_reg)
+            capacity = forecast.capacity(indices, cameras[2:], self.num_points)
+        return self.color_options(absgrad=self.strategy.needs_absgrad(self.step), tile_capacity=capacity)
 
-    def render_step(
-        self, kind: StepKind, viewmats: Tensor, Ks: Tensor, params: Mapping[str, Tensor], view_numbers: Tensor | None
-    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Render training views, and change nothing of the model.
-
-        Args:
-            kind: What `kind_of_step` returned.
-            viewmats, Ks: As `render.types.Cameras` has them, of C views.
-            params: As `trained_params`.
-            view_numbers: What `numbers_of` returned. int64 [C]
-
-        Returns:
-            The outputs of `get_training_outputs`, and gsplat's meta.
-        """
-        cameras = Pinholes(viewmats, Ks, kind.width, kind.height)
-        render, alpha, info = self.render(cameras, kind.options, params, kind.opacity_reg)
-        if view_numbers is not None:
-            matrices = anchored(params["color_matrices"], view_numbers)
-            render = correct_colors(render, alpha, matrices)
-        penalty, background = info.pop("opacity_reg"), self.background
-        outputs = {"rgb": self.before_background(render, alpha, background), "background": background}
-        return outputs if penalty is None else outputs | {"opacity_reg": penalty}, info
+    @property
+    def opacity_reg_now(self) -> float:
+        """Factor on the mean opacity in this step's loss."""
+        return self.config.opacity_reg if self.step < self.strategy.windows.refine_stop_iter else 0.0
 
     def before_background(self, render: Tensor, alpha: Tensor, background: Tensor) -> Tensor:
         """Put renderings [C, H, W, ≥ 3] of accumulated opacity [C, H, W, 1] before a background [3]. → [C, H, W, 3]"""
         if self.config.background_color == "black":
             return render[..., :3]
         return render[..., :3] + (1 - alpha) * background
-
-    def show_to_strategy(
-        self, info: dict[str, Any], viewmats: Tensor, Ks: Tensor, structure_tensors: Tensor | None
-    ) -> None:
-        """Let the strategy see a forward pass and gsplat's meta of it, as long as densification runs."""
-        if self.step < self.strategy.windows.refine_stop_iter:
-            info |= {"viewmats": viewmats.detach(), "Ks": Ks, "structure_tensors": structure_tensors}
-            self.strategy.step_pre_backward(self.gauss_params, self.optimizers, self.strategy_state, self.step, info)
-            self.infos.append(info)
-
-    def get_training_outputs(
-        self,
-        viewmats: Tensor,
-        Ks: Tensor,
-        width: int,
-        height: int,
-        cam_indices: list[int],
-        structure_tensors: Tensor | None,
-    ) -> dict[str, Tensor]:
-        """Render training views of one size and let the strategy see the forward pass.
-
-        With our kernels the host does not wait for the length of the tile lists, but foresees it. Where that was too
-        short nothing is drawn, no gradient flows and the strategy counts nothing; `tile_forecast` then names the views.
-
-        Args:
-            viewmats, Ks, width, height: As `render.types.Cameras` has them.
-            cam_indices: The views' indices among the training cameras, C of them.
-            structure_tensors: S̄ of the views, which may be quantized, [C, H, W, 3]; None where η is not observed.
-
-        Returns:
-            `rgb` [C, H, W, 3], not clamped, and `background` [3]; while densification runs, and where the loss has that
-            part, `opacity_reg`, numbers [P] whose sum is that part.
-        """
-        kind, forecast = self.kind_of_step(width, height, cam_indices), self.tile_forecast
-        outputs, info = self.render_step(kind, viewmats, Ks, self.trained_params, self.numbers_of(cam_indices))
-        if forecast is not None and "pair_counts" in info:  # Only our kernels count pairs.
-            forecast.rendered(cam_indices, (width, height), kind.options.tile_capacity, info["pair_counts"])
-        self.show_to_strategy(info, viewmats, Ks, structure_tensors)
-        return outputs
 
     def get_outputs(self, camera: Cameras) -> dict[str, Any]:
         """Render one camera, shape [1], for the viewer, evaluation and rendering. Raise InputError if it is no pinhole.
@@ -639,52 +554,39 @@ class SadgsModel(SplatfactoModel):
             return alpha * image[..., :3] + (1 - alpha) * background
         return image
 
-    def get_metrics_dict(self, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Any]:
-        """Return PSNR of the batch and the number of Gaussians; in training, PSNR comes with the loss."""
-        if "psnr" not in outputs:
-            return super().get_metrics_dict(outputs, batch)  # type: ignore[arg-type]
-        metrics: dict[str, Any] = {"psnr": outputs["psnr"], "gaussian_count": self.num_points}
+    def training_metrics(self, psnr: Tensor) -> dict[str, Any]:
+        """Return what is logged of a step whose views have this PSNR in dB, a scalar."""
+        metrics: dict[str, Any] = {"psnr": psnr, "gaussian_count": self.num_gaussians}
         self.camera_optimizer.get_metrics_dict(metrics)
         return metrics
 
     def get_loss_dict(
-        self, outputs: dict[str, Any], batch: Mapping[str, Any], metrics_dict: Mapping[str, Any] | None = None
+        self, outputs: Mapping[str, Any], batch: Mapping[str, Any], metrics_dict: Mapping[str, Any] | None = None
     ) -> dict[str, Tensor]:
-        """Return the loss of views of one size: the photometric one with the mean opacity's, and other regularizers.
+        """Return the photometric loss of renderings, `rgb` […, H, W, 3]; training has its own (train_step.py)."""
+        pair = self.masked_pair(outputs["rgb"], batch, outputs["background"])
+        views = [image.reshape(-1, *image.shape[-3:]) for image in pair]
+        return {"main_loss": photometric_loss(views[0], views[1], ssim_lambda=self.config.ssim_lambda)[0]}
 
-        Args:
-            outputs: `rgb` [C, H, W, 3] or [H, W, 3], `background`, and in training `opacity_reg` where that is a part
-                of the loss: it is added to `main_loss`, for which the kernels need no launch more. In training, PSNR is
-                added as `psnr`.
-            batch: `image` of the same leading shape and, optionally, a boolean `mask` [..., H, W, 1].
-        """
-        predicted, target = self.compared(outputs, batch)
-        height, width = target.shape[-3:-1]
-        loss, psnr = photometric_loss(
-            predicted.reshape(-1, height, width, 3),
-            target.reshape(-1, height, width, 3),
-            ssim_lambda=self.config.ssim_lambda,
-            parts=outputs.get("opacity_reg") if self.training else None,
-        )
-        losses = {"main_loss": loss}
-        if self.training:
-            outputs["psnr"] = psnr
-            self.camera_optimizer.get_loss_dict(losses)
-        return losses
-
-    def compared(self, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
+    def masked_pair(self, rgb: Tensor, batch: Mapping[str, Any], background: Tensor) -> tuple[Tensor, Tensor]:
         """Return a rendering and its photo as the loss compares them: within the mask, before the same background.
 
-        The arguments are as for `get_loss_dict`, or some of their rows. Both results are on the model's device, the
-        photo as floats in [0, 1] or as bytes. […, H, W, 3]
+        Args:
+            rgb: Not clamped. […, H, W, 3]
+            batch: `image` of the same leading shape, uint8 or floats in [0, 1] […, H, W, 3 or 4], and perhaps a boolean
+                `mask` […, H, W, 1].
+            background: [3] or [H, W, 3]
+
+        Returns:
+            Both on the model's device, the photo as floats in [0, 1] or as bytes. […, H, W, 3]
         """
-        target, predicted = batch["image"].to(self.device), outputs["rgb"]
+        target = batch["image"].to(self.device)
         if "mask" in batch or target.shape[-1] == 4:  # Otherwise the loss reads bytes as they are.
-            target = self.composite_with_background(self.get_gt_img(target), outputs["background"])
+            target = self.composite_with_background(self.get_gt_img(target), background)
         if "mask" in batch:
             mask = batch["mask"].to(self.device)
-            target, predicted = target * mask, predicted * mask
-        return predicted, target
+            target, rgb = target * mask, rgb * mask
+        return rgb, target
 
     def psnr(self, predicted: Tensor, target: Tensor) -> Tensor:
         """Return PSNR in dB of images in [0, 1], [1, 3, H, W] or [H, W, 3]."""

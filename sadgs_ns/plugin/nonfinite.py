@@ -40,15 +40,15 @@ class NonFiniteLog:
         """Whether the log must be read before it can hold another step."""
         return len(self._steps) >= self.capacity
 
-    def begin_step(self, step: int, views: list[int], loss: Tensor) -> None:
-        """Note the loss of a step of these views, a scalar that nobody changes in place; the device has no work."""
-        self._losses.append(loss.detach())
-        self._steps.append((step, views))
-
     @property
-    def gradients(self) -> Tensor:
-        """Where the present step notes with NaN that a gradient was not finite, float32 [1]."""
-        return self._slots[max(len(self._steps) - 1, 0)]
+    def slot(self) -> Tensor:
+        """Where the present step, before it is recorded, notes with NaN that a gradient was not finite, float32 [1]."""
+        return self._slots[len(self._steps)]
+
+    def record(self, step: int, views: list[int], loss: Tensor) -> None:
+        """Note the loss of a step of these views, a scalar that nobody changes in place; the device has no work."""
+        self._losses.append(loss)
+        self._steps.append((step, views))
 
     def read(self) -> list[tuple[int, list[int], str]]:
         """Return the steps in which something was not finite, and empty the log; this waits for the device.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,194 +10,130 @@ import torch
 from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from torch import Tensor
-from torch.cuda.amp.grad_scaler import GradScaler
-from torch.optim import Optimizer
+from torch.optim import Adam, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 from tyro.conf import Suppress
 
 from sadgs_ns.kernels import use_triton
-from sadgs_ns.plugin.nonfinite import MAX_GRADIENT, NonFiniteLog, leave_out_nonfinite
+from sadgs_ns.plugin.nonfinite import MAX_GRADIENT, leave_out_nonfinite
 from sadgs_ns.plugin.options import hide
 
 _ONE = torch.tensor(1.0, device="cpu")
 """Adding it to the count of steps costs the host a third of adding Python's 1."""
 
 
-class FusedAdam(torch.optim.Adam):
-    """torch's Adam, updated by our Triton kernel where that runs; its state and its results are torch's.
+class FusedAdam(Adam):
+    """torch's fused Adam, or the state of it that our kernel updates, of one parameter."""
 
-    Gradients that are NaN, infinite or beyond `nonfinite.MAX_GRADIENT` count as 0: parameters, all on one device, and
-    moments stay finite.
-    """
-
-    def __init__(self, params: Iterable[torch.Tensor], **options: Any) -> None:
-        parameters = list(params)
-        plain = not any(options.get(name) for name in ("weight_decay", "amsgrad", "maximize"))
-        self.triton = plain and use_triton(parameters[0].device)
-        """Whether the Triton kernel is used."""
+    def __init__(self, params: Iterable[Tensor], **options: Any) -> None:
+        (parameter,) = params
         # torch's fused Adam keeps the step count on the device, and our kernel would make the host wait for it.
-        super().__init__(parameters, fused=not self.triton, **options)
-        self.log = NonFiniteLog(parameters[0].device, capacity=1)
-        """Log of gradients that were left out; the pipeline puts its own here."""
-
-    @torch.no_grad()
-    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
-        """Update the parameters that have a gradient."""
-        loss = None
-        if closure is not None:
-            with torch.enable_grad():
-                loss = closure()
-        if not self.triton:
-            noted = self.log.gradients
-            for group in self.param_groups:
-                for parameter in group["params"]:
-                    if parameter.grad is not None:
-                        leave_out_nonfinite(parameter.grad, noted)
-            super().step()
-            return loss
-        step_together([self])
-        return loss
+        super().__init__([parameter], fused=not use_triton(parameter.device), **options)
 
 
-def step_together(optimizers: Iterable[FusedAdam]) -> None:
-    """Step several optimizers that use Triton, equal to the bit to one after the other.
+class AdamUpdate:
+    """One update of parameters, by our kernel where that runs, else by torch's fused Adam.
 
-    Parameters of one length whose betas, eps and log agree are updated in one launch.
-    """
-    from sadgs_ns.kernels.adam import adam_step
+    At 300k Gaussians the GPU would wait for the host, which took a quarter of a step for six optimizers. One launch
+    updates all parameters that are equally many and have equal betas and eps.
 
-    launches: dict[Any, list[tuple[Any, ...]]] = {}
-    for optimizer in optimizers:
-        for group in optimizer.param_groups:
-            for parameter in group["params"]:
-                gradient = parameter.grad
-                if gradient is None:
-                    continue
-                state = optimizer.state[parameter]
-                if not state:
-                    state["step"] = torch.tensor(0.0)
-                    state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-                step = _count(state)
-                key = optimizer.log, group["betas"], group["eps"], parameter.shape[:1]
-                launches.setdefault(key, []).append(
-                    (parameter, gradient.contiguous(), state["exp_avg"], state["exp_avg_sq"], step, group["lr"])
-                )
-    for (log, betas, eps, _), updates in launches.items():
-        parameters, gradients, exp_avgs, exp_avg_sqs, steps, lrs = zip(*updates, strict=True)
-        adam_step(
-            parameters, gradients, exp_avgs, exp_avg_sqs, log.gradients,
-            steps=steps, lrs=lrs, betas=betas, eps=eps, max_gradient=MAX_GRADIENT,
-        )  # fmt: skip
-
-
-def _count(state: dict[str, Any]) -> int:
-    """Count an update in the state of a parameter, and return which one it is, from 1."""
-    state["step"] = state["step"].cpu() + _ONE
-    return int(state["step"])
-
-
-class RepeatedUpdate:
-    """An update of the same parameters that a CUDA graph repeats, with rates that are read from the device.
-
-    It equals `step_together` to the bit. Those that do not differ in length, betas or eps are updated in one launch.
+    Gradients that are NaN, infinite or beyond `nonfinite.MAX_GRADIENT` count as 0: parameters and moments stay finite.
 
     Attributes:
-        parameters: By names, as they are now.
+        parameters: What is updated, by name, as it is now.
         exp_avgs: Their first moments.
         exp_avg_sqs: Their second moments.
-        begun: Whether each of them has been updated before.
 
     Args:
-        optimizers: Optimizers that use the Triton kernel, of one parameter each, by names.
+        optimizers: By name, all on one device.
     """
 
-    def __init__(self, optimizers: Mapping[str, FusedAdam]) -> None:
-        alike: dict[Any, dict[str, FusedAdam]] = {}
+    def __init__(self, optimizers: Mapping[str, Adam]) -> None:
+        alike: dict[Any, dict[str, Adam]] = {}
         for name, optimizer in optimizers.items():
             group = optimizer.param_groups[0]
             alike.setdefault((len(group["params"][0]), group["betas"], group["eps"]), {})[name] = optimizer
         self._launches: list[tuple[Any, list[str]]] = [(key, list(chosen)) for key, chosen in alike.items()]
-        in_order = {name: optimizer for chosen in alike.values() for name, optimizer in chosen.items()}
-        self._groups = [optimizer.param_groups[0] for optimizer in in_order.values()]
-        self.parameters: dict[str, Tensor] = {}
-        self._states: list[dict[str, Any]] = []
-        for (name, optimizer), group in zip(in_order.items(), self._groups, strict=True):
-            self.parameters[name] = parameter = group["params"][0]
-            self._states.append(optimizer.state.get(parameter) or {})
-        self.begun = all(self._states)
+        self._optimizers = {name: optimizer for chosen in alike.values() for name, optimizer in chosen.items()}
+        self._groups = [optimizer.param_groups[0] for optimizer in self._optimizers.values()]
+        self.parameters: dict[str, Tensor] = {
+            name: group["params"][0] for name, group in zip(self._optimizers, self._groups, strict=True)
+        }
+        self.device = next(iter(self.parameters.values())).device
+        self._triton = use_triton(self.device)
+        self._states = [
+            optimizer.state[parameter]
+            for optimizer, parameter in zip(self._optimizers.values(), self.parameters.values(), strict=True)
+        ]
+        for state, parameter in zip(self._states, self.parameters.values(), strict=True):
+            if self._triton and not state:
+                state["step"] = torch.tensor(0.0)
+                state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
         self.exp_avgs, self.exp_avg_sqs = (
             tuple(state[key] for state in self._states if state) for key in ("exp_avg", "exp_avg_sq")
         )
 
     def factors(self) -> Tensor:
-        """Count an update of each parameter and return its factors on the host, float32 [2, P].
+        """Count an update of each parameter; return what the kernel multiplies with, on the host. float32 [2, P]
 
-        They are in pinned memory where there is CUDA.
+        It is in pinned memory where there is CUDA. torch's Adam counts by itself and reads nothing of it.
         """
-        from sadgs_ns.kernels.adam import rates_and_scales
+        if not self._triton:
+            return torch.empty((2, 0))
+        from sadgs_ns.kernels.adam import rate_and_scale
 
-        columns = [
-            rates_and_scales([_count(state)], [group["lr"]], group["betas"])
-            for state, group in zip(self._states, self._groups, strict=True)
-        ]
-        on_cuda = next(iter(self.parameters.values())).is_cuda
-        return torch.tensor([[rate for (rate,), _ in columns], [scale for _, (scale,) in columns]], pin_memory=on_cuda)
+        columns = []
+        for state, group in zip(self._states, self._groups, strict=True):
+            state["step"] = state["step"].cpu() + _ONE
+            columns.append(rate_and_scale(int(state["step"]), group["lr"], group["betas"]))
+        return torch.tensor(list(zip(*columns, strict=True)), pin_memory=self.device.type == "cuda")
 
     @torch.no_grad()
-    def launch(self, gradients: Mapping[str, Tensor], noted: Tensor, factors: Tensor) -> None:
-        """Update the parameters, without counting that.
+    def launch(
+        self, gradients: Mapping[str, Tensor], factors: Tensor, noted: Tensor, overflowed: tuple[Tensor, ...] = ()
+    ) -> None:
+        """Update the parameters.
 
         Args:
             gradients: By the parameters' names, of their shapes.
-            noted: Becomes NaN if a gradient was not finite. float32 [1]
             factors: What `factors` returned, on the parameters' device. [2, P]
+            noted: Becomes NaN if a gradient was not finite. float32 [1]
+            overflowed: As for `kernels.adam.adam_step`; torch's Adam takes none.
         """
-        from sadgs_ns.kernels.adam import adam_step_with_factors
+        if not self._triton:
+            for name, optimizer in self._optimizers.items():
+                leave_out_nonfinite(gradients[name], noted)
+                self.parameters[name].grad = gradients[name]
+                optimizer.step()
+                self.parameters[name].grad = None
+            return
+        from sadgs_ns.kernels.adam import adam_step
 
         begin = 0
         for (_, betas, eps), names in self._launches:
             these, begin = slice(begin, begin + len(names)), begin + len(names)
             parameters = tuple(self.parameters[name] for name in names)
             in_order = tuple(gradients[name].contiguous() for name in names)
-            adam_step_with_factors(
-                parameters, in_order, self.exp_avgs[these], self.exp_avg_sqs[these], noted, factors[:, these],
-                betas=betas, eps=eps, max_gradient=MAX_GRADIENT,
+            adam_step(
+                parameters, in_order, self.exp_avgs[these], self.exp_avg_sqs[these], factors[:, these], noted,
+                overflowed, betas=betas, eps=eps, max_gradient=MAX_GRADIENT,
             )  # fmt: skip
 
 
 class SadgsOptimizers(Optimizers):
-    """nerfstudio's set of optimizers, which updates in one launch all parameters that `FusedAdam` updates in Triton.
+    """nerfstudio's set of optimizers, each a `FusedAdam`, whose parameters are updated together."""
 
-    At 300k Gaussians the GPU waits for the host, which spent a quarter of a step on six optimizers. Parameters whose
-    gradients are scaled or clipped (max_norm), and those of other optimizers, are updated as in nerfstudio. Hooks on
-    the `step` of optimizers that are updated together are not called.
-    """
+    def __init__(self, config: dict[str, Any], param_groups: dict[str, list[torch.nn.Parameter]]) -> None:
+        super().__init__(config, param_groups)
+        # nerfstudio would keep the parameters of the start, which densification replaces, to clip their gradients.
+        self.parameters.clear()
 
-    def zero_grad_some(self, param_groups: list[str]) -> None:
-        """Forget the gradients of the named parameters; torch's own way takes the host 60 times as long."""
-        for name in param_groups:
-            optimizer = self.optimizers[name]
-            # nerfstudio would keep the parameters of the start, which densification has replaced: they would hold
-            # memory, and gradients would be clipped on them instead of on the present ones.
-            self.parameters[name] = optimizer.param_groups[0]["params"]
-            if not isinstance(optimizer, FusedAdam):
-                optimizer.zero_grad()
-                continue
-            for group in optimizer.param_groups:
-                for parameter in group["params"]:
-                    parameter.grad = None
-
-    def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
-        """Update the named parameters."""
-        together: dict[str, FusedAdam] = {}
-        for name in param_groups:
-            optimizer = self.optimizers[name]
-            plain = self.config[name]["optimizer"].max_norm is None and not grad_scaler.is_enabled()
-            if plain and isinstance(optimizer, FusedAdam) and optimizer.triton:
-                together[name] = optimizer
-                optimizer._opt_called = True  # type: ignore[attr-defined] # torch's schedulers look for it.
-        step_together(together.values())
-        super().optimizer_scaler_step_some(grad_scaler, [name for name in param_groups if name not in together])
+    def update(self) -> AdamUpdate:
+        """Return an update of all parameters that hold numbers, as they are now."""
+        adams: Any = self.optimizers.items()
+        for _, adam in adams:
+            adam._opt_called = True  # torch's schedulers look for it.
+        return AdamUpdate({name: adam for name, adam in adams if adam.param_groups[0]["params"][0].numel()})
 
 
 @hide("max_norm", "weight_decay")

@@ -29,15 +29,15 @@ from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig
 from sadgs_ns.plugin.memory_plan import place_images
 from sadgs_ns.plugin.model import NORMALS, SadgsModel, SadgsModelConfig, in_viewer
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
-from sadgs_ns.plugin.optimizers import FusedAdam
 from sadgs_ns.plugin.options import check_ranges
 from sadgs_ns.plugin.panel import StructurePanel
 from sadgs_ns.plugin.run_plan import RunPlan
-from sadgs_ns.plugin.sharded_steps import losses_of_views
 from sadgs_ns.plugin.structure_cache import StructureCache
+from sadgs_ns.plugin.train_step import StepResult, ViewGroup, stack
 from sadgs_ns.plugin.viewer import shows_output
 from sadgs_ns.plugin.views import TrainingViews
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
+from sadgs_ns.render.types import Cameras as Pinholes
 
 _MOST_EFFORT = 100
 """Largest `effort`, which is a million iterations of four views for a capture of 760 views."""
@@ -47,9 +47,6 @@ _WIDEST_BLUR = 100
 """Largest window of `energy_blur`, which makes kernels of thousands of pixels."""
 _SAMPLED = 1000
 """About so many cameras, and Gaussians, are enough to find out whether training can see anything."""
-Drawn = dict[tuple[int, ...], list[tuple[int, dict[str, Any]]]]
-"""Indices and data of a step's views by the shapes of their images, [H, W, 3 or 4], or by height and width alone where
-several processes train, since one does not have the images that only others composite."""
 
 
 @dataclass
@@ -141,8 +138,7 @@ class SadgsPipeline(VanillaPipeline):
         self.log = NonFiniteLog(self.device)
         self.world = World()
         """The processes among which the Gaussians are shared out."""
-        self.put_aside: Drawn | None = None
-        """Views that were drawn for the present step and not rendered yet."""
+        self._means_gradient: Tensor | None = None  # [N, 3], of the last step
         self.stuck = ""  # It says why, where nothing is learned any more.
         self.structure = StructurePanel(self.structure_cache)
         self.cleaning = CleaningPanel(self.views)
@@ -188,10 +184,6 @@ class SadgsPipeline(VanillaPipeline):
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
         """Return the callbacks of data and model, and two that read what was not finite."""
-        optimizers = training_callback_attributes.optimizers
-        for optimizer in optimizers.optimizers.values() if optimizers is not None else ():
-            if isinstance(optimizer, FusedAdam):
-                optimizer.log = self.log
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN]
         counts = TrainingCallback(after, lambda step: self.structure.refresh())
         after_step = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
@@ -234,7 +226,7 @@ class SadgsPipeline(VanillaPipeline):
         if len(wrong) > _NAMED_STEPS:
             CONSOLE.print(f"[yellow]The same in {len(wrong) - _NAMED_STEPS} more of the last iterations.[/]")
         enough = nonfinite.HOPELESS_STEPS if not last else min(nonfinite.HOPELESS_STEPS, self.log.steps)
-        gradient = self.model.means.grad
+        gradient = self._means_gradient
         stuck = bool(wrong) and self.log.streak >= enough and gradient is not None and nonfinite.is_useless(gradient)
         if self.world.all(stuck):
             step, _, what = wrong[-1]
@@ -264,52 +256,32 @@ class SadgsPipeline(VanillaPipeline):
                 soft_wrap=True,
             )
 
-    def draw(self, step: int) -> Drawn:
-        """Draw the views of a step, unless they were drawn and put aside, and bring their images to the device."""
-        drawn, self.put_aside = self.put_aside, None
-        if drawn is None:
-            self._repeat_overflowed()
-            drawn = defaultdict(list)
-            for index, data in self.views.draw(self.views_per_iteration):
-                shape = data["image"].shape if self.world.alone else self.views.sizes[index]
-                drawn[shape].append((index, data))
-        return drawn
-
-    def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
-        """Render the iteration's views and return the outputs of the last size, mean losses and mean metrics."""
-        groups, observes = self.draw(step), self.model.wants_structure_tensors(step)
-        losses: dict[str, Tensor] = {}
-        metrics: dict[str, Any] = {}
-        outputs: dict[str, Any] = {}
-        # Several processes have the same groups, and autograd goes back through them in the reverse order in each.
+    def next_views(self, step: int) -> list[ViewGroup]:
+        """Draw the views of a step, bring their images to the device, and group them by their sizes."""
+        self._repeat_overflowed()
+        model = self.model
+        groups: dict[tuple[int, ...], list[tuple[int, dict[str, Any]]]] = defaultdict(list)
+        for index, data in self.views.draw(self.views_per_iteration):
+            # One of several processes does not have the images that only others composite.
+            groups[data["image"].shape if self.world.alone else self.views.sizes[index]].append((index, data))
+        result = []
         for (height, width, *_), views in groups.items():
-            indices = [index for index, _ in views]
-            tensors = _stack(self.structure_cache.get(views)) if observes else None
-            viewmats, Ks = self.views.stacked_cameras(indices)
-            if not self.world.alone:
-                parts = losses_of_views(self.model, self.world, viewmats, Ks, width, height, views, tensors)
-            else:
-                batch = self._batch(views)
-                outputs = self.model.get_training_outputs(viewmats, Ks, width, height, indices, tensors)
-                parts = self.model.get_loss_dict(outputs, batch), self.model.get_metrics_dict(outputs, batch)
-            weight = len(views) / self.views_per_iteration
-            for total, part in zip((losses, metrics), parts, strict=True):
-                for name, value in part.items():
-                    # The mean over one size, the usual case, is no work for the device, here or in the backward pass.
-                    total[name] = value if len(groups) == 1 else total.get(name, 0) + weight * value
-        loss = metrics.get("loss", losses["main_loss"])  # With several processes each has a part.
-        self.log.begin_step(step, [index for views in groups.values() for index, _ in views], loss)
-        return outputs, losses, metrics
+            indices, data = [index for index, _ in views], [data for _, data in views]
+            quantized = stack(self.structure_cache.get(views)) if model.strategy.observes(step) else None
+            cameras = Pinholes(*self.views.stacked_cameras(indices), width, height)
+            options = model.step_options(cameras, indices)
+            result.append(ViewGroup(indices, cameras, options, data, model.numbers_of(indices), quantized))
+        return result
 
-    def _batch(self, views: list[tuple[int, dict[str, Any]]]) -> dict[str, Tensor]:
-        """Return the images [C, H, W, 3 or 4] of views of one size and, where one has a mask, masks [C, H, W, 1]."""
-        batch = {"image": _stack([data["image"] for _, data in views])}
-        if any("mask" in data for _, data in views):
-            everything = torch.ones((*batch["image"].shape[1:3], 1), dtype=torch.bool, device=self.device)
-            batch["mask"] = _stack(
-                [data.get("mask", everything).to(self.device, non_blocking=True) for _, data in views]
-            )
-        return batch
+    def finish_step(self, step: int, groups: list[ViewGroup], result: StepResult) -> None:
+        """Keep what later steps and reports ask for; nothing of it is waited for."""
+        self.model.infos, self._means_gradient = result.infos, result.means_gradient
+        self.log.record(step, [index for group in groups for index in group.indices], result.loss)
+        forecast = self.model.tile_forecast
+        for group, info in zip(groups, result.infos, strict=True):
+            if forecast is not None and "pair_counts" in info:  # Only our kernels count pairs.
+                size, capacity = group.cameras[2:], group.options.tile_capacity
+                forecast.rendered(group.indices, size, capacity, info["pair_counts"])
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
@@ -381,8 +353,3 @@ class SadgsPipeline(VanillaPipeline):
 def camera_positions(cameras: Cameras) -> Tensor:
     """Return the centres of cameras in world units. [C, 3]"""
     return cameras.camera_to_worlds[:, :3, 3].cpu()
-
-
-def _stack(tensors: list[Tensor]) -> Tensor:
-    """Stack tensors as `torch.stack` does, but do not copy a single one."""
-    return tensors[0][None] if len(tensors) == 1 else torch.stack(tensors)

@@ -17,6 +17,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
 
 from sadgs_ns import events
 from sadgs_ns.distributed.world import World
@@ -25,7 +26,7 @@ from sadgs_ns.kernels import use_triton
 from sadgs_ns.plugin import checkpoints, processes
 from sadgs_ns.plugin.compilation import compile_kernels
 from sadgs_ns.plugin.config import CheckedTrainerConfig
-from sadgs_ns.plugin.graphed_steps import GraphedSteps
+from sadgs_ns.plugin.cuda_graphs import GraphedSteps
 from sadgs_ns.plugin.interrupts import HANG_UP, SIGNALS, Interrupted, Interrupts
 from sadgs_ns.plugin.lost_output import drop_lost_output, print_elsewhere_once_unread
 from sadgs_ns.plugin.optimizers import SadgsOptimizers
@@ -34,6 +35,7 @@ from sadgs_ns.plugin.planning import one_device_is_quicker, plan_length, plan_ru
 from sadgs_ns.plugin.progress import remove_tables, what_next
 from sadgs_ns.plugin.resume import Resumption
 from sadgs_ns.plugin.stereo_start import start_from_stereo
+from sadgs_ns.plugin.train_step import training_step
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 _LESS_MEMORY = (
@@ -65,6 +67,7 @@ class SadgsTrainer(Trainer):
 
     config: SadgsTrainerConfig
     pipeline: SadgsPipeline
+    optimizers: SadgsOptimizers
 
     def __init__(self, config: SadgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         print_elsewhere_once_unread(CONSOLE)
@@ -108,8 +111,8 @@ class SadgsTrainer(Trainer):
             last = [TrainingCallbackLocation.AFTER_TRAIN]
             self.callbacks.append(TrainingCallback(last, lambda step: self._say_what_is_next()))
             with processes.first_of_each_machine_before_others(self.world, self.local_rank):
-                compile_kernels(self.pipeline, self.optimizers.optimizers, self.config.cuda_graphs)
-            self.graphed = GraphedSteps.of(self.config, self.pipeline, self.optimizers)
+                compile_kernels(self.pipeline, self.optimizers.optimizers)
+            self.graphed = GraphedSteps(self.pipeline.model) if self._may_graph_steps() else None
         except torch.cuda.OutOfMemoryError as error:
             raise RunError(f"The GPU's memory is too small to start ({_memory(error)}): {_LESS_MEMORY}.") from error
         except RunError:
@@ -121,6 +124,16 @@ class SadgsTrainer(Trainer):
         except KeyboardInterrupt:
             CONSOLE.print(f"SIGINT: {_NOTHING_DONE}", soft_wrap=True)
             raise SystemExit(128 + signal.SIGINT) from None
+
+    def _may_graph_steps(self) -> bool:
+        """Tell whether steps of this run can be CUDA graphs.
+
+        The host must not wait in a step, as it does for lists of an exact length, and for the numbers of Gaussians that
+        several processes send each other. A camera optimizer computes what is not in the graphs.
+        """
+        model = self.pipeline.model
+        known = model.backend == "triton" and model.tile_forecast is not None
+        return self.config.cuda_graphs and self.world.alone and known and model.camera_optimizer.config.mode == "off"
 
     def _say_what_is_next(self) -> None:
         """Print the commands for a run that is done, below nerfstudio's box; not where the run ends with an error."""
@@ -284,25 +297,28 @@ class SadgsTrainer(Trainer):
             f"{_LESS_MEMORY}; {kept}."
         )
 
-    def train_iteration(self, step: int) -> Any:
-        """Run nerfstudio's iteration, by a graph where there is one.
+    def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
+        """Train on the views of a step, in the place of nerfstudio's iteration, and return its loss and metrics.
 
         No signal may stop the run from here to `_update_viewer_state`.
         """
         self._stepping = True
-        if not self.world.alone:
-            # Processes agree on what to do after a step in the step itself. A signal has the bit of its number.
-            self.world.flags_in, signalled = 0, self._interrupts.received
-            self.world.flags_out = int(time.monotonic() >= self._save_due) | (
-                0 if signalled is None else 1 << signalled
-            )
-            _, _, metrics = super().train_iteration(step)
-            return metrics["loss"], {"main_loss": metrics["loss"]}, metrics
-        trained = None if self.graphed is None else self.graphed.train(step)
-        if trained is None:
-            return super().train_iteration(step)
+        # Several processes agree on what to do after a step in the step itself. A signal has the bit of its number.
+        self.world.flags_in, signalled = 0, self._interrupts.received
+        bit = 0 if signalled is None else 1 << signalled
+        self.world.flags_out = int(time.monotonic() >= self._save_due) | bit
+        pipeline, model, graphed = self.pipeline, self.pipeline.model, self.graphed
+        if graphed is not None and model.tile_forecast is not None:
+            model.tile_forecast.coarse = graphed.prepare(pipeline.views_per_iteration)
+        groups, update = pipeline.next_views(step), self.optimizers.update()
+        inputs = groups, model.opacity_reg_now, update
+        factors, slot = update.factors(), pipeline.log.slot
+        result = None if graphed is None else graphed.replay(*inputs, factors, slot)
+        if result is None:
+            result = training_step(model, *inputs, factors.to(update.device, non_blocking=True), slot)
+        pipeline.finish_step(step, groups, result)
         self.optimizers.scheduler_step_all(step)
-        return trained
+        return result.loss, {"main_loss": result.loss}, model.training_metrics(result.psnr)
 
     def _update_viewer_state(self, step: int) -> None:
         """Stop or save where that is due; nerfstudio calls this after every step, when densification is done."""

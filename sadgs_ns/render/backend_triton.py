@@ -66,10 +66,11 @@ def composite(projected: Projected, options: RenderOptions) -> tuple[Tensor, Ten
         tiles = intersect_tiles(means2d, radii, depths, conics, opacities, width, height, TILE_SIZE)
     splats = (means2d, conics, colors, opacities, width, height)
     if colors.shape[-1] == 3:
-        starts, flatten_ids = tiles.lists(options.tile_capacity)
+        starts, flatten_ids, overflowed = tiles.lists(options.tile_capacity)
         renders, alphas = compositing.rasterize_to_pixels(*splats, starts, flatten_ids, options.absgrad)
     else:
         # gsplat's backward kernel would read unused places, too, one after the other in a single block.
-        starts, flatten_ids = tiles.lists(None)
+        starts, flatten_ids, overflowed = tiles.lists(None)
         renders, alphas = gsplat.rasterize_to_pixels(*splats, TILE_SIZE, starts, flatten_ids, absgrad=options.absgrad)
-    return renders, alphas, {"flatten_ids": flatten_ids, "pair_counts": tiles.pair_counts}
+    lists = {"flatten_ids": flatten_ids, "pair_counts": tiles.pair_counts, "overflowed": overflowed}
+    return renders, alphas, lists

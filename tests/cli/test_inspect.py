@@ -35,6 +35,7 @@ from sadgs_ns.plugin.panel import CHOICES, OFF, OUTPUT, StructurePanel, changed,
 from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.plugin.structure_cache import observe_training_views
 from sadgs_ns.render import rasterization
+from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.render.types import Gaussians
 
 WIDTH, HEIGHT, TRAIN_VIEWS, EVAL_VIEWS = 48, 36, 8, 2
@@ -214,7 +215,10 @@ def test_observing_all_views_finds_what_training_finds(run: Path):
     for index in range(TRAIN_VIEWS):
         tensors, Ks = pipeline.structure_cache[index][None], pipeline.views.cameras[1][index][None]
         viewmats = pipeline.views.viewmat(index)[None]
-        model.get_training_outputs(viewmats, Ks, WIDTH, HEIGHT, [index], tensors)
+        cameras = Pinholes(viewmats, Ks, WIDTH, HEIGHT)
+        _, _, info = model.render(cameras, model.step_options(cameras, [index]))
+        info |= {"viewmats": viewmats, "Ks": Ks, "structure_tensors": tensors}
+        model.strategy.step_pre_backward(model.gauss_params, {}, model.strategy_state, model.step, info)
     trained = model.strategy_state
     # The places of the samples are drawn anew, so some fall inside the image here and outside there.
     assert float((trained["n_total"] - observed["n_total"]).abs().mean()) < 0.5 < float(observed["n_total"].mean())

@@ -44,7 +44,8 @@ def compare_with_one(world: World, views: int) -> None:
 
     part = world.take_even_part(GAUSSIANS)
     mine = {name: value.detach().to(device).requires_grad_() for name, value in inputs(part).items()}
-    rendered, loss, own = rasterize(world, *splats(mine, views), options)
+    rendered, own = rasterize(world, *splats(mine, views), options)
+    loss = own["anchor"]
     for band, colors, alphas in rendered:
         image = torch.cat([colors, alphas], dim=-1)[0, band.first - band.top : band.last - band.top]
         rows = slice(band.first, band.last)

@@ -32,7 +32,8 @@ def draw_together(world: World, views: int, mode: Any, uneven: bool, fused: bool
     leaves = inputs(part)
     options = RenderOptions(sh_degree=1, absgrad=True, rasterize_mode=mode, max_off_axis=1.5)
     world.flags_out = 1 << world.rank
-    rendered, loss, info = rasterize(world, *splats(leaves, views), options)
+    rendered, info = rasterize(world, *splats(leaves, views), options)
+    loss = info["anchor"]
     images = []
     for band, colors, alphas in rendered:
         rows = slice(band.first - band.top, band.last - band.top)

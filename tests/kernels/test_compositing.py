@@ -73,7 +73,7 @@ def make_scene(
     scene["pending"] = tiles.intersect_tiles(
         scene["means2d"], radii, scene["depths"], scene["conics"], scene["opacities"], width, height, 8
     )
-    scene["starts"], scene["ids"] = scene["pending"].lists()
+    scene["starts"], scene["ids"], _ = scene["pending"].lists()
     return scene
 
 
@@ -189,10 +189,10 @@ def test_places_below_the_image_are_not_drawn_and_nothing_in_sight_is_black():
     scene = make_scene("usual")
     expected = drawn_by_the_kernel(scene)
     needed = len(scene["ids"])
-    scene["starts"], scene["ids"] = scene["pending"].lists(needed + 50)
+    scene["starts"], scene["ids"], _ = scene["pending"].lists(needed + 50)
     for one, other in zip(expected, drawn_by_the_kernel(scene), strict=True):
         assert torch.equal(one, other)
-    scene["starts"], scene["ids"] = scene["pending"].lists(needed - 1)
+    scene["starts"], scene["ids"], _ = scene["pending"].lists(needed - 1)
     assert all(not value.any() for value in drawn_by_the_kernel(scene))
     scene["starts"], scene["ids"] = torch.zeros_like(scene["starts"]), scene["ids"][:0]
     assert all(not value.any() for value in drawn_by_the_kernel(scene))
@@ -265,7 +265,7 @@ def test_places_that_no_list_needs_change_nothing(num_views, width, height):
     scene = make_scene("usual", num_views, 30, width, height)
     _, alphas, last_ids = reference(scene)
     expected = gradients_of(scene, alphas, last_ids)
-    scene["starts"], scene["ids"] = scene["pending"].lists(len(scene["ids"]) + 300)
+    scene["starts"], scene["ids"], _ = scene["pending"].lists(len(scene["ids"]) + 300)
     _, alphas_again, last_ids_again = reference(scene)
     assert torch.equal(alphas_again, alphas) and torch.equal(last_ids_again, last_ids)
     gradients = gradients_of(scene, alphas, last_ids)
@@ -278,7 +278,7 @@ def test_places_that_no_list_needs_change_nothing(num_views, width, height):
 
 def test_lists_that_are_too_short_have_gradients_of_zero():
     scene = make_scene("usual", 2, 30)
-    scene["starts"], scene["ids"] = scene["pending"].lists(len(scene["ids"]) - 1)
+    scene["starts"], scene["ids"], _ = scene["pending"].lists(len(scene["ids"]) - 1)
     alphas, last_ids = torch.zeros(2, 18, 21, 1), torch.zeros(2, 18, 21, dtype=torch.int32)
     assert all((value == 0).all() for value in gradients_of(scene, alphas, last_ids).values())
 
@@ -286,7 +286,7 @@ def test_lists_that_are_too_short_have_gradients_of_zero():
 def test_tiles_without_gaussians_stay_out_of_the_others_lists():
     # The one Gaussian is first in the only list; pixels that draw nothing name the same place as their last.
     scene = make_scene("usual", n=1, width=40, height=40)
-    scene["starts"], scene["ids"] = tiles.intersect_tiles(
+    scene["starts"], scene["ids"], _ = tiles.intersect_tiles(
         scene["means2d"].fill_(20.0), torch.full((1, 1), 4, dtype=torch.int32, device=DEVICE), scene["depths"],
         scene["conics"], scene["opacities"].fill_(0.9), 40, 40, 8,
     ).lists()  # fmt: skip

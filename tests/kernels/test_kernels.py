@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections import Counter
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -26,7 +27,7 @@ from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients
 from sadgs_ns.method.quantization import quantize
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
-from sadgs_ns.plugin.optimizers import FusedAdam
+from sadgs_ns.plugin.optimizers import AdamUpdate, FusedAdam
 from sadgs_ns.render import backend_gsplat
 from sadgs_ns.render.activations import activate
 from sadgs_ns.render.off_axis import cull_off_axis
@@ -420,6 +421,12 @@ def with_moments(start: list[Tensor]) -> tuple[tuple[Tensor, ...], ...]:
     return tuple(p.to(DEVICE).clone() for p in start), *zeros
 
 
+def factors(steps: Sequence[int], lrs: Sequence[float]) -> Tensor:
+    """Of the updates with these numbers."""
+    columns = [adam.rate_and_scale(step, lr, ADAM["betas"]) for step, lr in zip(steps, lrs, strict=True)]
+    return torch.tensor(columns, device=DEVICE).T.contiguous()
+
+
 @pytest.mark.parametrize("rows", [0, 1, 37, 1024], ids="{} Gaussians".format)
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-5), (torch.float32, 2e-5)], ids=str)
 def test_adam_in_one_launch_equals_torchs_and_one_launch_for_each_parameter(rows, dtype, tolerance):
@@ -436,9 +443,9 @@ def test_adam_in_one_launch_equals_torchs_and_one_launch_for_each_parameter(rows
             parameter.grad = gradient.to(dtype)
         optimizer.step()
         gradients = tuple(gradient.to(DEVICE) for gradient in gradients)
-        adam.adam_step(together[0], gradients, *together[1:], noted, steps=[step] * 5, lrs=LRS, **OURS)
+        adam.adam_step(together[0], gradients, *together[1:], factors([step] * 5, LRS), noted, **OURS)
         for gradient, lr, (p, m, v) in zip(gradients, LRS, zip(*separate, strict=True), strict=True):
-            adam.adam_step((p,), (gradient,), (m,), (v,), noted, steps=[step], lrs=[lr], **OURS)
+            adam.adam_step((p,), (gradient,), (m,), (v,), factors([step], [lr]), noted, **OURS)
     assert float(noted) == 0
     for one, other in zip(together, separate, strict=True):
         if torch.device("cpu") == DEVICE:
@@ -449,22 +456,18 @@ def test_adam_in_one_launch_equals_torchs_and_one_launch_for_each_parameter(rows
         torch.testing.assert_close(actual.to("cpu", dtype), parameter.detach(), atol=tolerance, rtol=tolerance)
 
 
-def test_adam_with_factors_on_the_device_equals_adam_with_factors_from_the_host():
-    start = [torch.linspace(-1, 1, 37 * math.prod(width)).view(37, *width) for width in WIDTHS]
-    host, device, noted = with_moments(start), with_moments(start), torch.zeros(1, device=DEVICE)
-    factors, options = torch.empty((2, 5), device=DEVICE), {name: OURS[name] for name in ("eps", "max_gradient")}
-    for step in range(1, 5):
-        gradients, steps = tuple(p.sin() for p in host[0]), [step, step, 3 * step, step, 2 * step]
-        adam.adam_step(host[0], gradients, *host[1:], noted, steps=steps, lrs=LRS, betas=(0.9, 0.999), **options)
-        factors.copy_(torch.tensor(adam.rates_and_scales(steps, LRS, (0.9, 0.999))))
-        adam.adam_step_with_factors(
-            device[0], gradients, *device[1:], noted, factors, betas=(0.9, 0.999), **options
-        )  # fmt: skip
-    for one, other in zip(host, device, strict=True):
-        if torch.device("cpu") == DEVICE:
-            assert all(map(torch.equal, one, other))
-        else:  # compiled, a product and a sum may round once in one kernel and twice in another
-            torch.testing.assert_close(one, other, atol=1e-7, rtol=2e-6)
+@pytest.mark.parametrize("flags", [[], [0], [1], [0, 1], [1, 1]])
+def test_an_update_of_a_step_that_overflowed_changes_nothing(flags):
+    parameters = with_moments([torch.ones((37, *width)) for width in WIDTHS])
+    gradients, noted = tuple(torch.full_like(p, math.nan) for p in parameters[0]), torch.zeros(1, device=DEVICE)
+    overflowed = tuple(torch.tensor([flag], device=DEVICE) for flag in flags)
+    adam.adam_step(parameters[0], gradients, *parameters[1:], factors([1] * 5, LRS), noted, overflowed, **OURS)
+    drawn = not flags or 0 in flags
+    assert bool(noted.isnan()) == drawn, "nothing is noted, either"
+    gradients = tuple(torch.ones_like(p) for p in parameters[0])
+    adam.adam_step(parameters[0], gradients, *parameters[1:], factors([1] * 5, LRS), noted, overflowed, **OURS)
+    for values, start in zip(parameters, (1, 0, 0), strict=True):
+        assert all(bool((value == start).all()) != drawn for value in values)
 
 
 def test_adam_counts_each_parameters_own_updates():
@@ -479,10 +482,11 @@ def test_adam_counts_each_parameters_own_updates():
             optimizers[k].step()
         gradients = tuple(torch.full_like(p, step) for p in actual[0])
         if step > 2:
-            adam.adam_step(actual[0], gradients, *actual[1:], noted, steps=[step, step - 2], lrs=[0.1, 0.1], **OURS)
+            both = factors([step, step - 2], [0.1, 0.1])
+            adam.adam_step(actual[0], gradients, *actual[1:], both, noted, **OURS)
         else:
             first = [values[:1] for values in (actual[0], gradients, *actual[1:])]
-            adam.adam_step(*first, noted, steps=[step], lrs=[0.1], **OURS)
+            adam.adam_step(*first, factors([step], [0.1]), noted, **OURS)
     for p, q in zip(actual[0], expected, strict=True):
         torch.testing.assert_close(p.double().cpu(), q.detach(), atol=1e-5, rtol=1e-5)
 
@@ -497,32 +501,29 @@ def test_a_gradient_that_is_not_finite_is_noted_and_left_out_of_its_parameter_al
         noted = torch.zeros(1, device=DEVICE)
         gradients = tuple(torch.full_like(p, 0.5) for p in parameters[0])
         gradients[k].flatten()[-1:] = value  # within the block that is not full
-        adam.adam_step(parameters[0], gradients, *parameters[1:], noted, steps=[1] * 5, lrs=LRS, **OURS)
+        adam.adam_step(parameters[0], gradients, *parameters[1:], factors([1] * 5, LRS), noted, **OURS)
         assert bool(noted.isnan()) == (value != 0.0)
         results.append([tensor for tensors in parameters for tensor in tensors])
     assert all(map(torch.equal, *results))
 
 
-def test_optimizer_keeps_torchs_state_while_it_runs_the_kernel(monkeypatch):
+def test_an_update_keeps_torchs_state_while_it_runs_the_kernel(monkeypatch):
     states = []
     for triton in (False, True):
         monkeypatch.setattr(kernels, "available", lambda device, triton=triton: triton)
-        parameters = [torch.nn.Parameter(torch.linspace(-1, 1, 50, device=DEVICE)), torch.nn.Parameter(torch.zeros(3))]
-        optimizer = FusedAdam(parameters, lr=0.01)
+        start = torch.linspace(-1, 1, 50, device=DEVICE)
+        adam_of, noted = {"a": FusedAdam([torch.nn.Parameter(start.clone())], lr=0.01)}, torch.zeros(1, device=DEVICE)
         for _ in range(3):
-            parameters[0].grad = parameters[0].detach().clone()  # the other parameter has no gradient
-            optimizer.step()
-        restored = FusedAdam([torch.nn.Parameter(p.detach().clone()) for p in parameters], lr=0.01)
-        restored.load_state_dict(optimizer.state_dict())
-        restored.param_groups[0]["params"][0].grad = torch.ones(50, device=DEVICE)
-        restored.step()
-        states.append((parameters, optimizer.state_dict()["state"], restored.param_groups[0]["params"]))
-    (slow, slow_state, slow_on), (fast, fast_state, fast_on) = states
-    for one, other in zip([*slow, *slow_on], [*fast, *fast_on], strict=True):
-        torch.testing.assert_close(other, one, atol=1e-6, rtol=1e-6)
-    assert slow_state.keys() == fast_state.keys() == {0}
-    assert slow_state[0].keys() == fast_state[0].keys()
-    assert float(fast_state[0]["step"]) == 3
+            update = AdamUpdate(adam_of)
+            update.launch({"a": update.parameters["a"].detach().clone()}, update.factors().to(DEVICE), noted)
+        restored = FusedAdam([torch.nn.Parameter(update.parameters["a"].detach().clone())], lr=0.01)
+        restored.load_state_dict(adam_of["a"].state_dict())
+        again = AdamUpdate({"a": restored})
+        again.launch({"a": torch.ones(50, device=DEVICE)}, again.factors().to(DEVICE), noted)
+        states.append((update.parameters["a"], again.parameters["a"], adam_of["a"].state_dict()["state"]))
+    (*slow, slow_state), (*fast, fast_state) = states
+    torch.testing.assert_close(fast, slow, atol=1e-6, rtol=1e-6)
+    assert slow_state.keys() == fast_state.keys() == {0} and slow_state[0].keys() == fast_state[0].keys()
 
 
 def projected_gaussians(num_views: int, n: int, width: int, height: int) -> dict[str, Tensor]:
@@ -560,7 +561,7 @@ def test_tiles_list_the_gaussians_that_reach_them_and_hardly_more(tile_size, rad
         gaussians["radii"] = gaussians["radii"][..., None] * torch.tensor([1, 2], dtype=torch.int32)
         radii = gaussians["radii"].float()
     on_device = {name: value.to(DEVICE) for name, value in gaussians.items()}
-    starts, ids = tiles.intersect_tiles(**on_device, width=width, height=height, tile_size=tile_size).lists()
+    starts, ids, _ = tiles.intersect_tiles(**on_device, width=width, height=height, tile_size=tile_size).lists()
     rows, columns = math.ceil(height / tile_size), math.ceil(width / tile_size)
     assert starts.shape == (2, rows, columns)
     lists = ids.cpu().tensor_split(starts.cpu().flatten().tolist()[1:])
@@ -590,12 +591,12 @@ def test_tiles_list_the_gaussians_that_reach_them_and_hardly_more(tile_size, rad
 def test_more_tiles_than_16_bits_number_are_listed_as_view_by_view():
     n, width, height = 40, 1480, 1000  # 23,125 tiles a view, 69,375 in three
     gaussians = {name: value.to(DEVICE) for name, value in projected_gaussians(3, n, width, height).items()}
-    starts, ids = tiles.intersect_tiles(**gaussians, width=width, height=height, tile_size=8).lists()
+    starts, ids, _ = tiles.intersect_tiles(**gaussians, width=width, height=height, tile_size=8).lists()
     assert starts.shape == (3, 125, 185) and starts.numel() > 2**16
     parts = []
     for view in range(3):
         alone = {name: value[view : view + 1] for name, value in gaussians.items()}
-        start, listed = tiles.intersect_tiles(**alone, width=width, height=height, tile_size=8).lists()
+        start, listed, _ = tiles.intersect_tiles(**alone, width=width, height=height, tile_size=8).lists()
         parts.append((start[0] + sum(len(ids) for _, ids in parts), listed + view * n))
     assert torch.equal(starts, torch.stack([start for start, _ in parts]))
     assert torch.equal(ids, torch.cat([listed for _, listed in parts])) and len(ids) > 500
@@ -615,9 +616,9 @@ def test_a_gaussian_that_is_listed_in_parts_is_listed_as_by_one_lane(monkeypatch
     assert all((found[0][1] == g).sum() == 40 * 30 for g in (1, 61)) and len(found[0][1]) > 2 * 40 * 30 + 500
 
 
-def listed_by_tile(lists: tuple[Tensor, Tensor], rows: int) -> list[list[int]]:
+def listed_by_tile(lists: tuple[Tensor, ...], rows: int) -> list[list[int]]:
     """What gsplat's forward pass reads for each tile of the image, view by view."""
-    starts, ids = (values.cpu() for values in lists)
+    starts, ids = (values.cpu() for values in lists[:2])
     places = starts.flatten().tolist()
     by_tile = [ids[begin:end].tolist() for begin, end in zip(places, [*places[1:], len(ids)], strict=True)]
     tiles_per_view, columns = starts[0].numel(), starts.shape[2]
@@ -651,7 +652,8 @@ def test_lists_longer_than_needed_equal_the_exact_ones_tile_by_tile(
     ]
     assert counts.ready() and sum(counts.wait()) == num_pairs > 500
     for capacity in (num_pairs, num_pairs + 1, 2 * num_pairs):
-        starts, ids = pending.lists(capacity)
+        starts, ids, overflowed = pending.lists(capacity)
+        assert overflowed.tolist() == [0]
         assert starts.shape == (num_views, rows + 1, columns) and len(ids) == capacity
         assert starts.dtype == ids.dtype == torch.int32
         assert listed_by_tile((starts, ids), rows) == listed_by_tile(exact, rows)
@@ -669,7 +671,7 @@ def test_lists_shorter_than_needed_are_empty_and_nothing_counts_as_drawn(few_pro
     pending = tiles.intersect_tiles(**on_device, width=75, height=50, tile_size=8)
     needed = sum(pending.pair_counts.wait())
     lists = pending.lists(needed - missing)
-    assert len(lists[1]) == needed - missing and (lists[1] == 0).all()
+    assert len(lists[1]) == needed - missing and (lists[1] == 0).all() and lists.overflowed.tolist() == [1]
     assert not any(listed_by_tile(lists, rows=7))
     assert (on_device["radii"] == 0).all()
     assert sum(pending.pair_counts.wait()) == needed
@@ -687,7 +689,7 @@ def test_no_gaussian_in_sight_makes_empty_lists():
     gaussians = projected_gaussians(1, 5, 32, 32)
     gaussians["radii"] = torch.zeros_like(gaussians["radii"])
     on_device = {name: value.to(DEVICE) for name, value in gaussians.items()}
-    starts, ids = tiles.intersect_tiles(**on_device, width=32, height=32, tile_size=16).lists()
+    starts, ids, _ = tiles.intersect_tiles(**on_device, width=32, height=32, tile_size=16).lists()
     assert len(ids) == 0 and (starts == 0).all()
 
 

@@ -37,9 +37,11 @@ from sadgs_ns.method.split import children_per_axis, limit_growth
 from sadgs_ns.method.statistics import empty_statistics
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
-from sadgs_ns.plugin import nonfinite
+from sadgs_ns.plugin import nonfinite, train_step
 from sadgs_ns.plugin.model import SadgsModel, SadgsModelConfig
-from sadgs_ns.plugin.optimizers import FusedAdam
+from sadgs_ns.plugin.optimizers import AdamUpdate, FusedAdam
+from sadgs_ns.plugin.train_step import ViewGroup
+from sadgs_ns.render.types import Cameras
 
 CPU = torch.device("cpu")
 WIDTH, HEIGHT = 32, 24
@@ -377,19 +379,15 @@ def test_few_duplicate_and_collinear_points_start_and_train(name: str):
     assert all(bool(p.isfinite().all()) for p in params.values())
     optimizers = {key: FusedAdam([p], lr=0.01) for key, p in params.items()}
     model.train()
-    model.optimizers = optimizers  # type: ignore[assignment]
     viewmats, Ks = camera(WIDTH, HEIGHT, focal=30.0)
     viewmats[:, 2, 3] = 4.0
+    cameras, noted = Cameras(viewmats, Ks, WIDTH, HEIGHT), torch.zeros(1)
+    data, tensors = [{"image": torch.full((HEIGHT, WIDTH, 3), 0.5)}], torch.ones(1, HEIGHT, WIDTH, 3)
     for _ in range(2):
-        outputs = model.get_training_outputs(viewmats, Ks, WIDTH, HEIGHT, [0], torch.ones(1, HEIGHT, WIDTH, 3))
-        loss = model.get_loss_dict(outputs, {"image": torch.full((1, HEIGHT, WIDTH, 3), 0.5)})["main_loss"]
-        loss.backward()
-        assert loss.isfinite()
-        for key, optimizer in optimizers.items():
-            gradient = params[key].grad
-            assert gradient is None or gradient.isfinite().all(), key
-            optimizer.step()
-            optimizer.zero_grad()
+        group = ViewGroup([0], cameras, model.step_options(cameras, [0]), data, structure_tensors=tensors)
+        update = AdamUpdate(optimizers)
+        result = train_step.training_step(model, [group], model.opacity_reg_now, update, update.factors(), noted)
+        assert result.loss.isfinite() and noted == 0, "gradients are finite, too"
     assert is_finite(model)
 
 
@@ -425,13 +423,14 @@ def test_adam_counts_gradients_it_could_not_recover_from_as_zero(triton: bool, m
     for wrong in (torch.zeros(4), torch.tensor(WRONG)):
         parameter = torch.nn.Parameter(torch.linspace(-1, 1, 1500, device=device))
         optimizer = FusedAdam([parameter], lr=0.01, eps=1e-15)
+        noted = torch.zeros(1, device=device)
         for step in range(4):
-            parameter.grad = torch.linspace(-1, 2, 1500, device=device)
+            gradient = torch.linspace(-1, 2, 1500, device=device)
             if step == 1:
-                parameter.grad[[3, 40, 1030, 1499]] = wrong.to(device)
-            optimizer.step()
-            noted = step >= 1 and bool(wrong.any())
-            assert optimizer.log.gradients.isnan().item() == noted
+                gradient[[3, 40, 1030, 1499]] = wrong.to(device)
+            update = AdamUpdate({"means": optimizer})
+            update.launch({"means": gradient}, update.factors().to(device), noted)
+            assert noted.isnan().item() == (step >= 1 and bool(wrong.any()))
         moments = [optimizer.state[parameter][name] for name in ("exp_avg", "exp_avg_sq")]
         results.append([parameter.detach(), *moments])
     for value, expected in zip(*results, strict=True):
@@ -501,8 +500,8 @@ def test_the_guard_never_waits_within_a_step():
     with HostWaits() as waits:
         for step in range(10):
             assert not log.full
-            log.begin_step(step, [step], loss)
-            nonfinite.leave_out_nonfinite(gradient, log.gradients)
+            nonfinite.leave_out_nonfinite(gradient, log.slot)
+            log.record(step, [step], loss)
     assert waits.number == 0 and log.full and not gradient.any()
     with HostWaits() as waits:
         float(loss)
@@ -512,20 +511,20 @@ def test_the_guard_never_waits_within_a_step():
 def test_noting_a_loss_gives_the_device_no_work():
     log, loss = nonfinite.NonFiniteLog(CPU, capacity=2), torch.tensor(math.nan)
     with HostWaits() as operations:
-        log.begin_step(0, [0], loss)
-    assert operations.names <= {"detach", "alias"}, "these make views"
+        log.record(0, [0], loss)
+    assert not operations.names
     assert log.read() == [(0, [0], "the loss was nan")]
 
 
 @pytest.mark.hard_case("the log of bad steps", "names steps, and forgets them once they are read")
 def test_the_log_names_steps_and_forgets_them_once_read():
     log = nonfinite.NonFiniteLog(CPU, capacity=4)
-    log.begin_step(7, [3], torch.tensor(0.5))
-    log.begin_step(8, [1, 2], torch.tensor(math.inf))
-    log.begin_step(9, [0], torch.tensor(0.5))
-    log.gradients.fill_(math.nan)
+    log.record(7, [3], torch.tensor(0.5))
+    log.record(8, [1, 2], torch.tensor(math.inf))
+    log.slot.fill_(math.nan)
+    log.record(9, [0], torch.tensor(0.5))
     assert log.read() == [(8, [1, 2], "the loss was inf"), (9, [0], "gradients were not finite")]
-    log.begin_step(10, [0], torch.tensor(0.5))
+    log.record(10, [0], torch.tensor(0.5))
     assert log.read() == [] and log.read() == []
 
 
@@ -559,18 +558,23 @@ def test_an_image_that_makes_nan_is_named_and_does_not_poison_the_model(
     pipeline, bad = trainer.pipeline, 5
     pipeline.structure_cache.fill()  # before the image breaks
     name = pipeline.datamanager.train_dataset.image_filenames[bad].name
-    render_views, hit = pipeline.model.get_training_outputs, []
+    next_views, before_background, hit = pipeline.next_views, pipeline.model.before_background, []
+    drawn: list[int] = []
 
-    def poisoned(viewmats: Any, Ks: Any, width: int, height: int, cam_indices: list[int], *rest: Any) -> Any:
-        outputs = render_views(viewmats, Ks, width, height, cam_indices, *rest)
-        if bad in cam_indices:
-            hit.append(trainer.step + 1)
-            if where == "gradient":
-                rows = torch.arange(len(cam_indices), device=viewmats.device) == cam_indices.index(bad)
-                outputs["rgb"].register_hook(lambda g: torch.where(rows[:, None, None, None], torch.nan, g))
-        return outputs
+    def noted(step: int) -> list[ViewGroup]:
+        groups = next_views(step)
+        drawn[:] = groups[0].indices
+        hit.extend([step + 1] * (bad in drawn))
+        return groups
 
-    pipeline.model.get_training_outputs = poisoned  # type: ignore[method-assign]
+    def poisoned(*args: Any) -> torch.Tensor:
+        rgb = before_background(*args)
+        if where == "gradient" and bad in drawn:
+            rows = torch.tensor(drawn, device=rgb.device) == bad
+            rgb.register_hook(lambda g: torch.where(rows[:, None, None, None], torch.nan, g))
+        return rgb
+
+    pipeline.next_views, pipeline.model.before_background = noted, poisoned  # type: ignore[method-assign]
     if where == "image":
         _ = pipeline.views.cameras  # which looks for such images, once
         image = pipeline.datamanager.cached_train[bad]["image"]
@@ -598,7 +602,7 @@ def test_many_bad_iterations_are_summed_up(
 ):
     trainer = set_up(configure(tmp_path, colmap))
     for step in range(9):
-        trainer.pipeline.log.begin_step(step, [step % 8], torch.tensor(math.nan))
+        trainer.pipeline.log.record(step, [step % 8], torch.tensor(math.nan))
     trainer.pipeline._report_nonfinite()
     printed = " ".join(capsys.readouterr().out.split())
     assert printed.count("the loss was nan") == 5 and "The same in 4 more of the last iterations." in printed

@@ -65,7 +65,7 @@ def test_tile_lists_are_tried_in_the_size_of_the_run(config: SadgsTrainerConfig,
     monkeypatch.setattr(compilation, "rasterize", rasterize)
     monkeypatch.setattr(kernels, "available", lambda device: True)
     monkeypatch.setattr(trainer.pipeline.structure_cache, "of_images", None)
-    for name in ("quantize", "photometric_loss", "step_together", "observe"):
+    for name in ("quantize", "photometric_loss", "AdamUpdate", "observe"):
         monkeypatch.setattr(compilation, name, None)  # the stages that need a GPU end at once
     compilation.compile_kernels(trainer.pipeline, trainer.optimizers.optimizers)
     cameras = trainer.pipeline.datamanager.train_dataset.cameras
@@ -89,7 +89,7 @@ def test_what_cannot_be_compiled_leaves_the_run_as_it_was(
         compilation, "ThreadPoolExecutor", lambda **options: ThreadPoolExecutor(1, **options)
     )  # the interpreter knows one thread
     monkeypatch.setattr(kernels, "available", lambda device: True)
-    for name in ("quantize", "photometric_loss", "step_together", "rasterize", "observe", "activate"):
+    for name in ("quantize", "photometric_loss", "AdamUpdate", "rasterize", "observe", "activate"):
         original = getattr(compilation, name)
 
         def launch(*args, name=name, original=original, **options):
@@ -100,7 +100,7 @@ def test_what_cannot_be_compiled_leaves_the_run_as_it_was(
     parameters = {name: value.detach().clone() for name, value in trainer.pipeline.model.gauss_params.items()}
     random_state = torch.get_rng_state()
     compilation.compile_kernels(trainer.pipeline, trainer.optimizers.optimizers)
-    assert sorted(launched) == [*["activate"] * 2, *["photometric_loss"] * 2, "quantize", "rasterize", "step_together"]
+    assert sorted(launched) == ["AdamUpdate", *["activate"] * 2, *["photometric_loss"] * 2, "quantize", "rasterize"]
     assert "The kernels of rasterization could not be compiled and tried before training (" in capsys.readouterr().out
     assert torch.equal(torch.get_rng_state(), random_state)
     assert all(torch.equal(trainer.pipeline.model.gauss_params[name], value) for name, value in parameters.items())
@@ -121,7 +121,7 @@ def test_kernels_that_fail_are_told_in_one_sentence(
     monkeypatch.setattr(kernels, "available", lambda device: True)
     monkeypatch.setattr(compilation, "rasterize", lambda *args, **options: (None, None, {}))
     monkeypatch.setattr(trainer.pipeline.structure_cache, "of_images", lambda image: image)
-    for name in ("step_together", "observe"):
+    for name in ("AdamUpdate", "observe"):
         monkeypatch.setattr(compilation, name, lambda *args, **options: None)
     monkeypatch.setattr(compilation, "quantize", full)
     monkeypatch.setattr(compilation, "photometric_loss", full)

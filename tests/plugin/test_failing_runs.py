@@ -337,10 +337,10 @@ def test_a_logger_s_full_disk_is_one_sentence_and_other_errors_of_reading_are_th
     def failing(error: OSError) -> SadgsTrainer:
         trainer = set_up(config)
 
-        def fail(step: int) -> None:
+        def fail(step: int) -> Any:
             raise error
 
-        trainer.pipeline.get_train_loss_dict = fail  # type: ignore[assignment]
+        trainer.pipeline.next_views = fail  # type: ignore[assignment]
         return trainer
 
     with pytest.raises(WriteError, match=r"^/x/events could not be written \(No space left on device; [^\n]+\.$"):
@@ -528,26 +528,24 @@ def test_what_is_given_to_the_wrong_option_is_told_where_it_belongs(saved: Path,
 def poison(trainer: SadgsTrainer, what: str) -> None:
     """Let every loss, or every gradient of means, be NaN from now on; or the gradient of the first Gaussian alone."""
     trainer.graphed = None  # A graph repeats what was launched before it was poisoned.
-    get_loss = trainer.pipeline.get_train_loss_dict
+    model = trainer.pipeline.model
+    before_background, gaussians = model.before_background, model.gaussians
+    rows = slice(None) if what == "gradients" else slice(1)
 
-    def poisoned(step: int) -> Any:
-        outputs, losses, metrics = get_loss(step)
-        if what == "loss":
-            losses["main_loss"] = losses["main_loss"] * math.nan
-            trainer.pipeline.log._losses[-1] = losses["main_loss"].detach()
-        return outputs, losses, metrics
+    def spoil(gradient: torch.Tensor) -> torch.Tensor:
+        gradient = gradient.clone()
+        gradient[rows] = math.nan
+        return gradient
 
-    trainer.pipeline.get_train_loss_dict = poisoned  # type: ignore[method-assign]
-    if what != "loss":
-        rows = slice(None) if what == "gradients" else slice(1)
+    def spoiled(params: dict[str, torch.Tensor], *args: Any) -> Any:
+        for leaf in params.values():
+            leaf.register_hook(spoil)
+        return gaussians(params, *args)
 
-        def spoil(gradient: torch.Tensor) -> torch.Tensor:
-            gradient = gradient.clone()
-            gradient[rows] = math.nan
-            return gradient
-
-        for parameter in trainer.pipeline.model.gauss_params.values():
-            parameter.register_hook(spoil)
+    if what == "loss":
+        model.before_background = lambda *args: before_background(*args) * math.nan  # type: ignore[method-assign]
+    else:
+        model.gaussians = spoiled  # type: ignore[method-assign]
 
 
 @pytest.mark.hard_case(
@@ -630,15 +628,14 @@ FULL = torch.cuda.OutOfMemoryError(
 
 def fail_at(trainer: SadgsTrainer, step: int) -> None:
     """Let the memory be full in the forward pass of this iteration."""
-    get_loss = trainer.pipeline.get_train_loss_dict
+    next_views = trainer.pipeline.next_views
 
-    def full(step_: int | None = None, **kwargs: Any) -> Any:
-        number = kwargs.get("step", step_)
+    def full(number: int) -> Any:
         if number == step:
             raise FULL
-        return get_loss(number)
+        return next_views(number)
 
-    trainer.pipeline.get_train_loss_dict = full  # type: ignore[method-assign]
+    trainer.pipeline.next_views = full  # type: ignore[method-assign]
 
 
 @pytest.mark.hard_case(

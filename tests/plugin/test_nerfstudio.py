@@ -39,7 +39,9 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.method.near_plane import NEAR_SHARE
 from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.plugin.model import SadgsModel, _load_lpips
+from sadgs_ns.plugin.optimizers import AdamUpdate, FusedAdam
 from sadgs_ns.plugin.presets import RATES
+from sadgs_ns.plugin.train_step import training_step
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
 from sadgs_ns.plugin.views import ViewSampler
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world, visible
@@ -316,7 +318,9 @@ def test_max_gaussians_is_never_exceeded(colmap: ColmapDataParserConfig, tmp_pat
     assert max(numbers) == cap
 
 
-def test_the_mean_opacity_weighs_in_the_loss_while_densification_runs(colmap: ColmapDataParserConfig, tmp_path: Path):
+def test_the_mean_opacity_weighs_in_the_loss_while_densification_runs(
+    colmap: ColmapDataParserConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     config = configure(
         tmp_path,
         colmap,
@@ -331,21 +335,16 @@ def test_the_mean_opacity_weighs_in_the_loss_while_densification_runs(colmap: Co
     opacities: list[float] = []
     regularized: list[bool] = []
 
-    trainer = set_up(config)
-    model, get_losses = trainer.pipeline.model, trainer.pipeline.get_train_loss_dict
-
-    def look(step: int) -> Any:
+    def look(model: SadgsModel, groups: Any, opacity_reg: float, *args: Any) -> Any:
         opacities.append(float(torch.sigmoid(model.opacities.detach()).mean()))
-        outputs, losses, metrics = get_losses(step)
-        regularized.append("opacity_reg" in outputs)
-        if regularized[-1]:
-            penalty = float(outputs["opacity_reg"].detach().sum())
-            assert penalty == pytest.approx(100 * opacities[-1], rel=1e-5)
-            assert 0 < float(losses["main_loss"].detach()) - penalty < 2, "the rest is the photometric loss"
-        return outputs, losses, metrics
+        result = training_step(model, groups, opacity_reg, *args)
+        regularized.append(opacity_reg > 0)
+        photometric = float(result.loss) - opacity_reg * opacities[-1]
+        assert 0 < photometric < 2 and opacity_reg in (0, 100)
+        return result
 
-    trainer.pipeline.get_train_loss_dict = look  # type: ignore[method-assign]
-    trainer.train()
+    monkeypatch.setattr("sadgs_ns.plugin.trainer.training_step", look)
+    set_up(config).train()
     assert regularized == [True] * 4 + [False] * 4
     assert opacities[0] > opacities[1] > opacities[2] > opacities[3]
 
@@ -412,8 +411,7 @@ def test_a_training_step_updates_the_gaussians_in_one_launch(
 
     monkeypatch.setattr(adam, "adam_step", counted)
     before = {name: parameter.detach().clone() for name, parameter in trainer.pipeline.model.gauss_params.items()}
-    for name in before:
-        trainer.optimizers.optimizers[name].triton = True  # type: ignore[attr-defined] # in its interpreter, without CUDA
+    monkeypatch.setattr("sadgs_ns.plugin.optimizers.use_triton", lambda place: True)  # in its interpreter, without CUDA
     trainer.train()
     assert launched == [6] * 3
     for name, parameter in trainer.pipeline.model.gauss_params.items():
@@ -499,24 +497,18 @@ def test_views_of_two_sizes_train_together(tmp_path: Path):
     sizes = [(WIDTH, HEIGHT), (40, 30)]
     config = configure(tmp_path / "out", nerfstudio_data(tmp_path / "data", sizes), iterations=13)
     config.pipeline.views_per_iteration = 2
-    config.cuda_graphs = False  # A graph would not ask what is replaced below.
     numbers_of_sizes: list[int] = []
     trainer = set_up(config)
     pipeline = trainer.pipeline
-    get_loss, render_views = pipeline.get_train_loss_dict, pipeline.model.get_training_outputs
-    rendered: list[tuple[int, int]] = []
+    next_views = pipeline.next_views
 
     def count_sizes(step: int) -> Any:
-        rendered.clear()
-        result = get_loss(step)
-        numbers_of_sizes.append(len(rendered))
-        return result
+        groups = next_views(step)
+        numbers_of_sizes.append(len({group.cameras[2:] for group in groups}))
+        assert len(groups) == numbers_of_sizes[-1]
+        return groups
 
-    def note_size(viewmats: Any, Ks: Any, width: int, height: int, *rest: Any) -> Any:
-        rendered.append((width, height))
-        return render_views(viewmats, Ks, width, height, *rest)
-
-    pipeline.get_train_loss_dict, pipeline.model.get_training_outputs = count_sizes, note_size  # type: ignore
+    pipeline.next_views = count_sizes  # type: ignore[method-assign]
     trainer.train()
     assert set(numbers_of_sizes) == {1, 2}
     sizes = {tuple(pipeline.structure_cache[index].shape[:2]) for index in range(len(pipeline.views))}
@@ -531,13 +523,13 @@ def test_the_loss_of_views_is_the_mean_of_their_own(tmp_path: Path, camera_optim
     config.pipeline.model.camera_optimizer.mode = camera_optimizer
     config.pipeline.model.strategy.refine_stop_iter = 0
     pipeline = set_up(config).pipeline
+    model = pipeline.model
 
     def loss(*indices: int) -> torch.Tensor:
         pipeline.follow(dataclasses.replace(pipeline.model.plan, views_per_iteration=len(indices)))
         pipeline.views.sampler.requeue(indices)
-        _, losses, metrics = pipeline.get_train_loss_dict(0)
-        assert metrics["gaussian_count"] == pytest.approx(pipeline.model.num_points)
-        return losses["main_loss"].detach()
+        update = AdamUpdate({"means": FusedAdam([model.means], lr=0.0)})
+        return training_step(model, pipeline.next_views(0), 0.0, update, update.factors(), pipeline.log.slot).loss
 
     alone = [loss(index) for index in range(5)]
     assert len({round(float(value), 4) for value in alone}) == 5

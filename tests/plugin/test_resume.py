@@ -254,14 +254,14 @@ def test_an_interrupt_within_a_step_waits_for_its_end_and_resumes_to_the_same_mo
     number: signal.Signals, finished: Path, config: SadgsTrainerConfig, capsys: pytest.CaptureFixture[str]
 ):
     trainer = set_up(config)
-    get_loss = trainer.pipeline.get_train_loss_dict
+    next_views = trainer.pipeline.next_views
 
     def interrupted(step: int) -> Any:
         if step == 4:  # ends with a structure split
             send(number)
-        return get_loss(step)
+        return next_views(step)
 
-    trainer.pipeline.get_train_loss_dict = interrupted  # type: ignore[method-assign]
+    trainer.pipeline.next_views = interrupted  # type: ignore[method-assign]
     handlers = [signal.getsignal(n) for n in SIGNALS]
     with pytest.raises(SystemExit) as stopped:
         trainer.train()
