@@ -100,11 +100,10 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
         `initialization_seconds` (the model from the points), `load_seconds`, `warmup_seconds` and, where the method has
         them, `structure_tensor_seconds`, one after the other before the loop; `loop_seconds`, of the training loop
         alone. Over the held-out views what `evaluate.quality` measures, and of each `ply_view_psnr` (with the near
-        plane of other programs' viewers) and what `coverage_of_views` tells. `phases` and `launches` as these modules
-        measure them. `curve`, if the job asks for it, has the points of `curve.Curve`, the last one being the finished
-        run; no time contains its evaluations.
+        plane of other programs' viewers) and what `coverage_of_views` tells. `curve`, if the job asks for it, has the
+        points of `curve.Curve`, the last one being the finished run; no time contains its evaluations.
         Where torchrun started several processes, which train one splat on `devices` of them, the first measures all
-        but `phases`, `launches` and `curve`: its checkpoint is evaluated on one device, S̄ is computed in the loop, and
+        but `curve`: its checkpoint is evaluated on one device, S̄ is computed in the loop, and
         `peak_gb` is the first device's. The others return nothing.
 
     Raises as `build_config`, RuntimeError if the training loop stopped early, or whatever the method raises.
@@ -116,7 +115,7 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
     # ns-train's own module: importing it also sets cuDNN as in a user's run.
     from nerfstudio.scripts.train import _set_random_seed
 
-    from benchmarks import evaluate, launches, phases
+    from benchmarks import evaluate
     from benchmarks.curve import Curve, LoopTimer, point
     from sadgs_ns.plugin import processes
 
@@ -133,8 +132,13 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
         config = build_config(job.scene, job.row, job.seed, root, work)
         _set_random_seed(job.seed)
         trainer: Any = config.setup(local_rank=int(os.environ.get("LOCAL_RANK", "0")), world_size=devices)
-        with phases.replaced(config.pipeline.model._target, "populate_modules", timed("initialization")):
+        model_class: Any = config.pipeline.model._target
+        populate = model_class.populate_modules
+        model_class.populate_modules = timed("initialization")(populate)
+        try:
             trainer.setup(test_mode="test")  # "val" would evaluate on blender's validation views
+        finally:
+            model_class.populate_modules = populate
     seconds["setup_seconds"] -= seconds["initialization_seconds"]
     world = getattr(trainer, "world", None)
     if devices > 1 and (world is None or world.alone):
@@ -152,7 +156,8 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
             pipeline.eval()
             outputs = model.get_outputs(camera)
             losses = model.get_loss_dict(outputs, train_images[0]).values()
-            torch.stack(list(losses)).sum().backward()  # the first step forgets the gradients
+            torch.stack(list(losses)).sum().backward()
+            pipeline.zero_grad()
             with torch.no_grad():
                 model.get_outputs(camera)
             pipeline.train()
@@ -195,9 +200,6 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
     if curve is not None:
         end = point(trainer.config.max_num_iterations, timer.seconds, held_out, int(model.num_points))
         record["curve"] = [*curve.points, end]
-    if devices == 1:
-        record["phases"] = phases.measure(trainer)  # from here on the model is trained further
-        record["launches"] = launches.measure(trainer)
     return record
 
 

@@ -1,4 +1,4 @@
-"""What a benchmark's row holds: phases, curve, metrics. Tiny runs on whatever device there is."""
+"""What a benchmark's row holds: times, curve, metrics. Tiny runs on whatever device there is."""
 
 from __future__ import annotations
 
@@ -23,12 +23,10 @@ from processes import HANGS
 from torch import Tensor
 
 from benchmarks import __main__ as bench
-from benchmarks import curve, evaluate, phases, protocol, run
+from benchmarks import curve, evaluate, protocol, run
 from benchmarks.curve import undisturbed
-from benchmarks.phases import PHASES, Stopwatch
 from benchmarks.protocol import Job, Row, Scene
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
-from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 WIDTH, HEIGHT, VIEWS = 48, 36, 10
@@ -206,126 +204,6 @@ def test_undisturbed_restores_what_a_rendering_notes():
     assert model.info is noted and not hasattr(model, "size")
 
 
-# Phases
-
-
-def test_phases_of_real_methods(runs: Runs):
-    record, saved = runs["with"]
-    measured = record["phases"]
-    assert tuple(measured) == PHASES
-    structure_aware = "structure_tensor_seconds" in record
-    assert (measured["eta"] > 0) is structure_aware
-    assert all(value > 0 for name, value in measured.items() if name != "eta")
-    assert record["gaussians"] == len(saved["pipeline"]["_model.gauss_params.means"])
-
-
-class FakeTime:
-    """In the place of the module `time`: the clock stands still except where `sleep` puts it forward."""
-
-    def __init__(self) -> None:
-        self.seconds = 0.0
-
-    def sleep(self, seconds: float) -> None:
-        self.seconds += seconds
-
-    def perf_counter(self) -> float:
-        return self.seconds
-
-
-class Slow(torch.autograd.Function):
-    """The identity; its forward and backward pass take time."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, clock: FakeTime, forward_seconds: float, backward_seconds: float) -> Tensor:
-        ctx.clock, ctx.seconds = clock, backward_seconds
-        clock.sleep(forward_seconds)
-        return x.clone()
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> Any:
-        ctx.clock.sleep(ctx.seconds)
-        return grad_outputs[0], None, None, None
-
-
-class SlowTrainer:
-    """A trainer whose phases take known times; it renders twice in a step, as sadgs does with two sizes of images."""
-
-    def __init__(self, clock: FakeTime) -> None:
-        self.config = SimpleNamespace(max_num_iterations=0)
-        self.callbacks: list[Any] = []
-        self.parameter = torch.ones(1, requires_grad=True)
-        self.pipeline = SimpleNamespace(model=self, train=lambda: None)
-        self.optimizers = SimpleNamespace(
-            zero_grad_some=lambda: clock.sleep(1),
-            optimizer_scaler_step_some=lambda: clock.sleep(10),
-            scheduler_step_all=lambda: clock.sleep(100),
-        )
-        self.clock = clock
-        self.device = "cpu"
-
-    def get_outputs(self) -> dict[str, Any]:
-        return {"rgb": Slow.apply(self.parameter, self.clock, 2, 3)}
-
-    def get_loss_dict(self, outputs: dict[str, Any]) -> dict[str, Any]:
-        return {"main": Slow.apply(outputs["rgb"], self.clock, 0.5, 0.25), "constant": torch.zeros(1)}
-
-    def train_iteration(self, step: int) -> None:
-        self.optimizers.zero_grad_some()
-        losses = [self.get_loss_dict(self.get_outputs()) for _ in range(2)]
-        torch.stack([value for loss in losses for value in loss.values()]).sum().backward()
-        self.optimizers.optimizer_scaler_step_some()
-        self.optimizers.scheduler_step_all()
-        self.clock.sleep(1000)
-
-
-def test_phases_are_told_apart(monkeypatch: pytest.MonkeyPatch):
-    clock, original = FakeTime(), torch.Tensor.backward
-    monkeypatch.setattr(phases, "time", clock)
-    trainer = SlowTrainer(clock)
-    measured = phases.measure(trainer, steps=4)
-    expected = {"rasterize_forward": 4, "rasterize_backward": 6, "loss": 1.5, "eta": 0, "optimizer": 111, "rest": 1000}
-    assert measured == {phase: 1000 * seconds for phase, seconds in expected.items()}
-    assert torch.Tensor.backward is original and "get_outputs" not in vars(trainer)
-
-
-def test_stopwatch_books_everything(monkeypatch: pytest.MonkeyPatch):
-    clock = iter([1.0, 2.0, 4.0, 7.0, 8.0, 16.0])
-    monkeypatch.setattr(phases, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
-    watch = Stopwatch(torch.device("cpu"))
-    watch.restart()
-    inner = watch.during("eta", lambda: watch.phase)
-    assert watch.during("rasterize_forward", inner)() == "eta"
-    assert watch.seconds() == {**dict.fromkeys(PHASES, 0.0), "rasterize_forward": 3.0, "eta": 3.0, "rest": 9.0}
-
-
-def test_measuring_observes_eta_and_densifies_nothing(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    import sadgs_ns.method.strategy
-
-    clock, calls, observe = FakeTime(), 0, sadgs_ns.method.strategy.observe
-
-    def slow_observe(*arguments: Any, **options: Any) -> None:
-        nonlocal calls
-        calls += 1
-        clock.sleep(20)
-        observe(*arguments, **options)
-
-    monkeypatch.setattr(sadgs_ns.method.strategy, "observe", slow_observe)
-    monkeypatch.setattr(phases, "time", clock)
-    config = run.build_config(SCENE, SADGS, 0, root, tmp_path)
-    trainer: Any = config.setup(local_rank=0, world_size=1)
-    trainer.setup(test_mode="test")
-    trainer.train()
-    strategy, model = trainer.pipeline.model.strategy, trainer.pipeline.model
-    schedule, gaussians = dict(vars(strategy)), model.num_points
-    calls = 0
-    measured = phases.measure(trainer, steps=5)
-    # At every second step from 12 on: in two of 3 steps to warm up, in three of the 6 that are measured.
-    assert calls == 5
-    if trainer.device == "cpu":  # elsewhere the GPU's clock counts
-        assert measured == {**dict.fromkeys(PHASES, 0.0), "eta": 10_000.0}
-    assert vars(strategy) == schedule and model.num_points == gaussians
-
-
 # The record
 
 
@@ -408,7 +286,6 @@ def test_two_processes_train_one_splat_whose_row_the_first_writes(
     record = json.loads((tmp_path / "result.json").read_text())
     assert record["status"] == "ok" and record["devices"] == 2 and record["iterations"] == ITERATIONS
     assert record["psnr"] > 10 and record["gaussians"] > 100 and record["loop_seconds"] > 0
-    assert "phases" not in record
 
 
 class FlatModel:
@@ -477,11 +354,3 @@ def test_curve_every_is_part_of_the_key_only_where_it_is_given():
 def test_curve_every_is_a_positive_whole_number(wrong: object):
     with pytest.raises(ValueError, match="curve_every must be a whole number of iterations from 1, not"):
         protocol.parse(content(curve_every=wrong))
-
-
-def test_a_model_has_its_own_strategy_again_after_a_measurement():
-    model = SimpleNamespace(strategy=StructureAwareStrategy().for_run(300))
-    strategy, before = model.strategy, vars(model.strategy).copy()
-    with phases.within_densification(model):
-        assert model.strategy.observes(10**6) and not model.strategy.densifies(10**6)
-    assert model.strategy is strategy and vars(strategy) == before
