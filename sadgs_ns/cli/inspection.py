@@ -33,8 +33,8 @@ Split = Literal["train", "eval"]
 SEED = 0
 """Seed of the random colours and of AbsGS's children."""
 MIN_SIDE, MIN_RENDER_SIDE = 900, 640
-"""Least length in px of the longer side of a picture with ellipses, and of a rendering in random colours, in a smaller
-one of which Gaussians could not be told apart."""
+"""Least length in px of the longer side of a picture with ellipses, and of a rendering in random colours; Gaussians in
+a smaller one could not be told apart."""
 _REMEDY = "give another with --load-step, or another run of sadgs"
 
 

@@ -25,7 +25,7 @@ from sadgs_ns.render.types import DEFAULTS, Cameras, Gaussians, RenderOptions
 MIN_ALPHA = 0.5
 """Pixels with less accumulated opacity show no surface."""
 _SAMPLED = 16
-"""Most views of which the size of voxels is derived."""
+"""Most views from which the size of voxels is derived."""
 
 
 def write_mesh(

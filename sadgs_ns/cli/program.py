@@ -1,4 +1,4 @@
-"""What the commands share: a command line that tyro reads, an exit code, and a folder that one command works in."""
+"""Functions of all commands: a command line that tyro reads, an exit code, and a folder that only one command uses."""
 
 from __future__ import annotations
 

@@ -110,10 +110,10 @@ class PhotosToSplat:
             count_frames(self.source) if self.source.is_file() else find_source(self.source, self._scene)
 
     def _read_settings(self) -> None:
-        """Read the settings that the folder was begun with, and take what is not decided yet as it is asked for now.
+        """Read the settings that the folder was begun with, and replace those that nothing depends on yet.
 
         Raises:
-            InputError: If they are others than those asked for, or the folder is something else.
+            InputError: If the others differ from the options, or the folder is something else.
         """
         folder, options = self.folder, self.options
         asked = {"source": os.path.realpath(self.source), "--cameras": "new", "--max-size": options.max_size}

@@ -1,4 +1,4 @@
-"""Similarities between world frames, and what they do to positions, shapes and spherical harmonics."""
+"""Similarities between world frames, which move positions, shapes and spherical harmonics."""
 
 from __future__ import annotations
 

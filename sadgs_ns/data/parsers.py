@@ -196,7 +196,7 @@ def points_in_the_run(
 
     The transform [3, 4] maps the data's frame to the run's; the scale is applied after it.
     """
-    with np.errstate(over="ignore"):  # What is beyond float32 becomes infinite, and is left out later.
+    with np.errstate(over="ignore"):  # Numbers beyond float32 become infinite, and are left out later.
         positions = positions.astype(np.float32)
     homogeneous = torch.from_numpy(np.pad(positions, ((0, 0), (0, 1)), constant_values=1))
     return {"points3D_xyz": homogeneous @ transform.T * scale, "points3D_rgb": torch.from_numpy(colors)}

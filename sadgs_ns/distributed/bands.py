@@ -54,7 +54,7 @@ def first_ranks(bands: Sequence[Band]) -> dict[int, int]:
 
 @lru_cache(maxsize=1024)
 def views_of_rank(sizes: tuple[tuple[int, int], ...], num_ranks: int, rank: int) -> tuple[int, ...]:
-    """Return the numbers of the views of which a process composites rows, in its order.
+    """Return the numbers of the views with rows that a process composites, in its order.
 
     `sizes` are height and width of each view in px; views of one size are shared out together. Results are kept,
     because those who look ahead ask for many steps, most of them alike.

@@ -1,4 +1,4 @@
-"""The processes of a run, and what they tell each other."""
+"""The processes of a run, and their messages."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class World:
             dist.broadcast(values, rank)
 
     def least(self, number: float) -> float:
-        """Return the least of the numbers of all processes, of which any may be infinite."""
+        """Return the least of the numbers of all processes, which may be infinite."""
         if self.alone:
             return number
         return float(self.gather(torch.tensor([number], dtype=torch.float64, device=self.device)).min())

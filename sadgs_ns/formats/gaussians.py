@@ -89,6 +89,6 @@ def of_parameters(params: Mapping[str, NDArray[np.floating]]) -> Gaussians:
     for name, shape in shapes.items():
         if arrays[name].shape != (count, *shape):
             raise ValueError(f"{name} must have the shape {[count, *shape]}, got {list(arrays[name].shape)}")
-    with np.errstate(all="ignore"):  # What is not finite is dropped later.
+    with np.errstate(all="ignore"):  # Infinities and NaN are dropped later.
         arrays["quats"] = arrays["quats"] / np.maximum(np.linalg.norm(arrays["quats"], axis=1, keepdims=True), 1e-12)
     return Gaussians(**{name: np.ascontiguousarray(arrays[name], dtype=np.float32) for name in shapes})

@@ -15,7 +15,7 @@ from sadgs_ns.formats.packing import sigmoid, to_bytes
 
 _EXTENSION = "KHR_gaussian_splatting"
 _FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
-"""glTF's numbers for types of values, for what a buffer is for, and for what is drawn."""
+"""glTF's numbers for types of values, the purpose of a buffer, and the kind of primitives."""
 _MOST_BYTES = (1 << 32) - 1
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 

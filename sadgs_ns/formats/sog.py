@@ -29,7 +29,7 @@ _PALETTE = 1 << 16
 _SETS_A_ROW = 64
 """Sets of harmonics in a row of their image."""
 _SAMPLE, _ROUNDS = 1 << 16, 8
-"""Sets of which the coarse clusters are made, and rounds of k-means."""
+"""Sets from which the coarse clusters are made, and rounds of k-means."""
 
 
 def write(file: IO[bytes], gaussians: Gaussians) -> None:

@@ -25,7 +25,7 @@ _LANES = 1024
 
 @triton.jit(do_not_specialize=["n"])
 def _correct(render, alpha, matrices, corrected, n, LANES: tl.constexpr):
-    """Write M c + α b of the pixels of one view, of which there are n."""
+    """Write M c + α b of the n pixels of one view."""
     view = tl.program_id(1).to(tl.int64)
     i = tl.program_id(0) * LANES + tl.arange(0, LANES)
     exists = i < n

@@ -1,4 +1,4 @@
-"""What the two passes of compositing share: the size of a tile, and how a warp holds Gaussians and pixels.
+"""Functions of both passes of compositing, for one tile in one warp.
 
 A block is [Gaussians, pixels]. With one warp a thread holds all Gaussians of its two pixels.
 """

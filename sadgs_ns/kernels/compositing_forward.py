@@ -2,7 +2,7 @@
 
 gsplat's kernel gives each pixel a thread, which goes through the tile's list Gaussian by Gaussian. Here a thread holds
 batches of Gaussians of two pixels, as in the backward pass (compositing.py), so that the arithmetic of a batch does not
-wait for one another. What is drawn is the same but for rounding: a weight errs by some 1e-7 of itself.
+wait for one another. The image is the same but for rounding: a weight errs by some 1e-7 of itself.
 """
 
 # pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false

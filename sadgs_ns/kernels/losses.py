@@ -43,7 +43,7 @@ def _target(y, i, exists):
 def _blur_along_rows(x, y, blurred, sums, n, GAUSSIAN: tl.constexpr, STRIP: tl.constexpr):
     """Blur x, y, x², y² and xy along the rows, and sum |x − y| and (x − y)² in parts.
 
-    The window begins at each number. Where it leaves the row, what is written is never read.
+    The window begins at each number. Values of windows that leave the row are never read.
     """
     i = tl.program_id(0) * STRIP + tl.arange(0, STRIP)
     inside = i < n
@@ -67,7 +67,7 @@ def _blur_along_rows(x, y, blurred, sums, n, GAUSSIAN: tl.constexpr, STRIP: tl.c
 
 @triton.jit
 def _blur_along_columns(x, i, row, begin, end, exists, GAUSSIAN: tl.constexpr, RUN: tl.constexpr):
-    """Blur RUN numbers below each other in the columns from i on, of which the rows from `begin` to `end` exist.
+    """Blur RUN numbers below each other in the columns from i on; rows from `begin` to `end` exist.
 
     Each number is loaded once for all of them: with loads for each by itself the kernels took 255 registers, not 96.
     """

@@ -68,7 +68,7 @@ def _by_row(ratio, slope, inverse, scale, by_first, by_last):
     """Differentiate the entries `scale` = focal / z and −scale · slope of the Jacobian; `slope` is the clamped x / z.
 
     Returns:
-        What the entries' gradients `by_first` and `by_last` add to those of x and of z.
+        The parts of the gradients of x and z that come from those of the entries, `by_first` and `by_last`.
     """
     by_x = tl.where(ratio == slope, -scale * inverse * by_last, 0.0)
     return by_x, scale * inverse * (slope * by_last - by_first) - slope * by_x

@@ -144,7 +144,7 @@ def _list(
     its place in the order plus the part's number, and counted in `part_count`.
 
     The rest of the `num_pairs` places is given to the last tile. If there are more pairs than places, this tile gets
-    all places, all radii become 0 and `overflowed` 1: nothing is drawn, and nobody counts the views.
+    all places, all radii become 0 and `overflowed` 1: nothing is drawn, and no statistic counts the views.
     """
     lane = tl.program_id(0) * LANES + tl.arange(0, LANES)
     exists = lane < n
@@ -287,7 +287,7 @@ class PairCounts:
         return PairCounts(on_host, arrived)
 
     def ready(self) -> bool:
-        """Tell whether they have arrived, without waiting."""
+        """Return whether they have arrived, without waiting."""
         return self.arrived is None or self.arrived.query()
 
     def wait(self) -> list[int]:

@@ -16,7 +16,7 @@ def _write_one(target):
 
 
 def run_trial(device: torch.device) -> None:
-    """Run a kernel on a device, and wait for what it writes.
+    """Run a kernel on a device, and wait for its result.
 
     Raises:
         Exception: Whatever Triton raises where it cannot compile or launch a kernel.

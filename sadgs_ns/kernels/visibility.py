@@ -8,7 +8,7 @@ import triton.language as tl
 
 @triton.jit
 def drawn(radii, at, exists, PER_GAUSSIAN: tl.constexpr):
-    """Whether the Gaussian at index `at` in C · N was drawn: by its one radius (gsplat 1.4) or its two (gsplat 1.5)."""
+    """Return whether the Gaussian at index `at` in C · N was drawn, by one radius (gsplat 1.4) or two (gsplat 1.5)."""
     radius = tl.load(radii + PER_GAUSSIAN * at, exists, 0)
     if PER_GAUSSIAN == 2:
         radius = tl.minimum(radius, tl.load(radii + 2 * at + 1, exists, 0))

@@ -43,7 +43,7 @@ def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, rigs:
             reader.existing_camera_id = next((known[name] for name in group if name in known), -1)
             pycolmap.import_images(database, photos, pycolmap.CameraMode.SINGLE, missing, reader)
     with pycolmap.Database.open(database) as opened:
-        for camera in opened.read_all_cameras():  # EXIF may hold nonsense, which COLMAP takes for what is known.
+        for camera in opened.read_all_cameras():  # EXIF may hold nonsense, which COLMAP believes.
             side = max(camera.width, camera.height)
             if not 0.1 < camera.mean_focal_length() / side < 10:  # These limits and the guess are COLMAP's own.
                 camera.focal_length_x = camera.focal_length_y = 1.2 * side

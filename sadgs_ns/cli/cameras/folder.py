@@ -37,7 +37,7 @@ def find_source(source: Path, out: Path) -> tuple[list[str], bool, dict[str, str
     """Return the photos of a folder for a scene, or its videos if it has fewer than three photos.
 
     Returns:
-        The names; whether they are videos, of which a single file has no names; then as `look_into`.
+        The names, which are empty for a single video; whether they are videos; then as `look_into`.
 
     Raises:
         InputError: If there are neither three photos nor a video, or a photo has a name that is no Unicode.

@@ -12,7 +12,7 @@ from sadgs_ns.cli.cameras.photos import Photo
 from sadgs_ns.errors import InputError, RunError
 
 EXHAUSTIVE_LIMIT = 200
-"""Most photos of which every pair is matched; twice the photos take four times as long."""
+"""Most photos for which every pair is matched; twice the photos take four times as long."""
 _FEATURES_PER_MEGAPIXEL = 0.55
 """Processor time in s to find features in a million pixels, as measured on castle, fox and tree."""
 _PAIR_PER_MEGAPIXEL, _LONGEST_PAIR = 0.12, 0.14

@@ -18,7 +18,7 @@ class Finding:
     """One thing to know about a data folder."""
 
     severity: Literal["error", "warning", "note"]
-    """Whether training is refused, may disappoint, or just behaves in a way worth knowing."""
+    """Training is refused, may disappoint, or behaves in a way that is worth knowing."""
     sentence: str
     """A sentence that names the file and the remedy."""
 

@@ -43,7 +43,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class _Image:
-    """What is known of an image file."""
+    """The header of an image file."""
 
     size: Size = (0, 0)
     """Zeros if it is unknown."""
@@ -81,7 +81,7 @@ def mask_name(folder: Path, image: str) -> Path:
 
 
 def no_copies(folder: Path, factor: int) -> tuple[str, str]:
-    """Return what is wrong and what helps where `--downscale-factor` asks for smaller copies that are not there."""
+    """Return problem and remedy if `--downscale-factor` asks for smaller copies that do not exist."""
     return (
         f"{folder} does not exist, which should hold the images scaled down by `--downscale-factor {factor}`",
         f"leave that option out, and put `--pipeline.datamanager.camera-res-scale-factor {1 / factor:.4g}` before the "
@@ -143,7 +143,7 @@ def check_images(frames: Sequence[Frame], source: Path, look_for_unused: bool = 
 
 
 def _problem(frame: Frame, image: _Image, mask: _Image | None, source: Path) -> tuple[str, Path, str] | None:
-    """Return what is wrong with a frame's files, if anything is: its kind, the file and the rest of the sentence."""
+    """Return the problem of a frame's files, or None: its kind, the file and the rest of the sentence."""
     if image.problem.startswith("does not exist"):
         places = (frame.image.parent, source.parent / "images", source.parent)
         if near := [path for place in places for path in images_in(place) if path.stem == frame.image.stem]:
@@ -246,7 +246,7 @@ def _is_flat(path: Path, black: bool = False) -> bool:
         with Image.open(path) as image:
             if not black:  # as in masks
                 image.draft(None, (image.width // 8, image.height // 8))
-            seen = image.convert("RGBa") if image.mode == "RGBA" else image  # What is transparent becomes black.
+            seen = image.convert("RGBa") if image.mode == "RGBA" else image  # Transparent pixels become black.
             extrema: Any = seen.getextrema()
     except Exception:  # What a decoder stumbles over is no single colour; nerfstudio's reader may yet read it.
         return False

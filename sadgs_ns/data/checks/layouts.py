@@ -26,7 +26,7 @@ _EXPORTS = {
     "keyframes/cameras/*.json": (b"", "polycam --data {data}"),
     "metadata.json": (b'"poses"', "record3d --data {data}"),
 }
-"""Files with other programs' poses, what is in them, and the command of `ns-process-data` that reads them."""
+"""Files with other programs' poses, a part of their content, and the command of `ns-process-data` that reads them."""
 GIVE_POSES = "compute poses with `sadgs-process PHOTOS FOLDER` or `ns-process-data`"
 """Remedy where poses are missing, as the end of a sentence."""
 
@@ -59,7 +59,7 @@ def find_reconstruction(data: Path) -> Path | None:
 def find_reconstructions(data: Path) -> dict[Path, int]:
     """Return the folders of COLMAP's reconstructions, relative to the data, and how many images each has.
 
-    The first is the one to read. The usual places precede others, of which the one with the most images comes first.
+    The first is the one to read: one in a usual place, or else the one with the most images.
     A reconstruction right in the data's folder counts if there is no other and its images are at hand. The number is 0
     if a reconstruction cannot be read.
     """
