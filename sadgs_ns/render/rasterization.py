@@ -81,7 +81,7 @@ def choose_backend(wanted: BackendName, device: torch.device, alone: bool = True
     chosen: str = wanted
     if wanted == "auto":
         chosen = "triton" if use_triton(device) else "gsplat" if device.type == "cuda" else "torch"
-    if chosen == "triton" and not use_triton(device):
+    if wanted == "triton" and not use_triton(device):
         raise InputError(f"The backend triton does not run on {device} here (see sadgs-doctor): leave it at auto.")
     if chosen == "gsplat" and device.type != "cuda":
         raise InputError(f"The backend gsplat needs a CUDA device, and this is {device}: leave it at auto.")

@@ -17,6 +17,7 @@ from sadgs_ns.cli import export
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
 from sadgs_ns.gsplat_compat import RADII_PER_AXIS
+from sadgs_ns.plugin import compilation
 from sadgs_ns.plugin import config as config_module
 from sadgs_ns.plugin import model as model_module
 from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
@@ -97,6 +98,16 @@ def test_it_begins_as_a_run_of_another_backend_does(config: SadgsTrainerConfig, 
     assert drawn and len(losses[0]) == 3
     assert losses[0][0] == pytest.approx(losses[1][0], rel=1e-4)
     assert losses[0] == pytest.approx(losses[1], rel=1e-2)  # Adam steps as far where rounding decides a sign.
+
+
+def test_of_kernels_that_draw_none_is_compiled_ahead(config: SadgsTrainerConfig, drawn: list[int]):
+    pipeline = set_up(config).pipeline
+    stages = compilation._Stages(pipeline, {})
+    stages.project()
+    assert stages.after_projection().keys() == {"η", "compositing with AbsGS"}
+    for stage in stages.after_projection().values():
+        stage()
+    assert drawn == [64, 64]
 
 
 @pytest.mark.hard_case("the gsplat backend without CUDA, or on several GPUs", "refused in one sentence")
