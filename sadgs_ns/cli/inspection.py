@@ -171,7 +171,7 @@ def conventional_step(model: SadgsModel, gradients: dict[str, Tensor]) -> dict[s
     strategy, size = model.strategy, SMALL_SCALE * float(model.strategy_state["scene_scale"])
     densify = partial(
         grow, clone_threshold=strategy.clone_grad2d, split_threshold=strategy.split_absgrad2d, size_threshold=size,
-        budget=strategy.max_gaussians - model.num_points,
+        budget=strategy.max_gaussians - model.num_points, world=strategy.world,
     )  # fmt: skip
     with torch.random.fork_rng(devices=[model.device] if model.device.type == "cuda" else []):
         torch.manual_seed(SEED)  # gsplat draws the children's places at random.

@@ -1,4 +1,4 @@
-"""Which Gaussians of all processes may grow under one cap."""
+"""Which Gaussians may grow under one cap, in one process or several."""
 
 from __future__ import annotations
 
@@ -13,11 +13,16 @@ _DIGITS = ((20, 11), (10, 10), (0, 10))
 
 @torch.no_grad()
 def limit_growth(world: World, growth: Tensor, priority: Tensor, budget: float) -> Tensor:
-    """Do what `method.split.limit_growth` does for the Gaussians of all processes, in the order of their ranks.
+    """Choose which Gaussians may grow so that the hard cap holds, those of largest priority first.
 
-    Nobody gathers the priorities. Where the budget does not suffice, histograms of them, summed over the processes,
-    find the priority of the first Gaussian that does not fit; that is repeated with smaller ones, as often as there are
-    sizes.
+    By priority, each one is taken that fits what those before it left over; of equal ones the first come first, in the
+    order of the ranks. One that does not fit is passed over: otherwise a single parent of 512 children would block all
+    others near the cap.
+
+    Nobody sorts or gathers the priorities. Where the budget does not suffice, histograms of them, summed over the
+    processes, find the priority of the first Gaussian that does not fit; that is repeated with smaller ones, at most as
+    often as there are sizes. Alone, too, this is faster than a sort (a million Gaussians on the CPU: 3 to 130 ms, and
+    130 to 160).
 
     Args:
         world: The processes.
@@ -26,7 +31,7 @@ def limit_growth(world: World, growth: Tensor, priority: Tensor, budget: float) 
         budget: Gaussians that may be added in all, the same in all processes; ≤ 0 allows none.
 
     Returns:
-        The chosen ones of this process. bool [N]
+        The chosen ones of this process, among them none that does not grow. bool [N]
     """
     # The bits of floats that are not negative have the order of the floats.
     bits = priority.float().contiguous().view(torch.int32)

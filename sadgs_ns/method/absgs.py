@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, MutableMapping
+from collections.abc import Mapping, MutableMapping
 from typing import Any
 
 import torch
@@ -11,9 +11,11 @@ import torch.nn.functional as F
 from gsplat.strategy.ops import duplicate, split
 from torch import Tensor
 
+from sadgs_ns.distributed.ranking import limit_growth
+from sadgs_ns.distributed.world import World
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.method.ops import Params
-from sadgs_ns.method.split import grid_split, limit_growth
+from sadgs_ns.method.split import grid_split
 from sadgs_ns.render.rasterization import visible
 
 _OTHER_AXES = 0.8
@@ -81,7 +83,7 @@ def grow(
     size_threshold: float,
     budget: float,
     long_axis: bool = False,
-    limit: Callable[[Tensor, Tensor, float], Tensor] = limit_growth,
+    world: World,
 ) -> tuple[int, int]:
     """Clone small Gaussians by their mean gradient, split large ones in two by their absolute gradient.
 
@@ -95,7 +97,7 @@ def grow(
         budget: Gaussians that may be added in all, the steepest gradients first.
         long_axis: Halve the longest axis of a large one as `grid_split` does, and take a fifth off the others, instead
             of drawing the places of two that are 1.6 times as small on all axes, as 3DGS does.
-        limit: What chooses those that may grow, as `limit_growth` does.
+        world: The processes that share the budget.
 
     Returns:
         Numbers of clones and of splits.
@@ -106,7 +108,7 @@ def grow(
     split_ratio = state["absgrad2d"] / count / split_threshold
     steepness = torch.where(is_small, clone_ratio, split_ratio)  # ≥ 1 grows
     grows = (steepness >= 1) & steepness.isfinite()  # a sum that overflowed says nothing
-    chosen = limit(grows.long(), steepness, budget)
+    chosen = limit_growth(world, grows.long(), steepness, budget)
     is_clone, is_split = chosen & is_small, chosen & ~is_small
     n_clone, n_split = int(is_clone.sum()), int(is_split.sum())
     if n_clone > 0:

@@ -42,35 +42,6 @@ def num_children(counts: Tensor) -> Tensor:
     return n_x * n_y * n_z
 
 
-def limit_growth(growth: Tensor, priority: Tensor, budget: float) -> Tensor:
-    """Choose which Gaussians may grow so that the hard cap holds, the largest violations first.
-
-    By priority, each one is taken that fits what those before it left over. One that does not fit is passed over:
-    otherwise a single parent of 512 children would block all others near the cap.
-
-    Args:
-        growth: Gaussians that each one would add, ≥ 0. int64 [N]
-        priority: Larger comes first. [N]
-        budget: Gaussians that may be added in all; ≤ 0 allows none.
-
-    Returns:
-        The chosen ones, among them none that does not grow. bool [N]
-    """
-    allowed = torch.zeros_like(growth, dtype=torch.bool)
-    order = torch.argsort(priority, descending=True, stable=True)
-    order = order[growth[order] > 0]
-    # A pass takes all up to the first that does not fit, and drops all that are as large as that one: there are no more
-    # passes than sizes, and a single one where the budget suffices.
-    while len(order) > 0:
-        fits = torch.cumsum(growth[order], 0) <= budget
-        taken = order[fits]
-        allowed[taken] = True
-        budget -= int(growth[taken].sum())
-        order = order[~fits]
-        order = order[growth[order] <= budget]
-    return allowed
-
-
 def grid_offsets(counts: Tensor, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:
     """Place the cell centres of regular grids of n_x × n_y × n_z cells, centred on their parents.
 

@@ -13,13 +13,13 @@ from gsplat.strategy.base import Strategy
 from gsplat.strategy.ops import remove
 from torch import Tensor
 
-from sadgs_ns.distributed import ranking
+from sadgs_ns.distributed.ranking import limit_growth
 from sadgs_ns.distributed.world import World
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow, keep_gradient
 from sadgs_ns.method.memory import StepSize, affordable_growth, free_bytes
 from sadgs_ns.method.ops import Params, update_param_with_optimizer
 from sadgs_ns.method.schedule import Windows, windows
-from sadgs_ns.method.split import children_per_axis, grid_split, limit_growth, num_children
+from sadgs_ns.method.split import children_per_axis, grid_split, num_children
 from sadgs_ns.method.statistics import consistent, empty_statistics, observe
 
 Info = Mapping[str, Any]
@@ -289,7 +289,7 @@ class StructureAwareStrategy(Strategy):
         violates &= (self._opacities(params) >= self.split_min_opacity)[:, None]
         counts = children_per_axis(statistics["eta_max"], violates)  # [N, 3]
         worst = torch.where(violates, statistics["eta_max"], 0.0).amax(dim=1)  # [N]
-        return counts, self._limit_growth(num_children(counts) - 1, worst, budget)
+        return counts, limit_growth(self.world, num_children(counts) - 1, worst, budget)
 
     def children_now(self, params: Params, statistics: Mapping[str, Tensor]) -> Tensor:
         """n per axis that a structure step would split by now, 1 where whole or over the cap. int64 [N, 3]"""
@@ -333,7 +333,7 @@ class StructureAwareStrategy(Strategy):
             size_threshold=SMALL_SCALE * state["scene_scale"],
             budget=min(under_cap, in_memory),
             long_axis=self.absgs_long_axis,
-            limit=self._limit_growth,
+            world=self.world,
         )
         if in_memory <= self.world.sums(n_clone + n_split)[0] < under_cap:
             _warn_of_memory(iteration, in_memory)
@@ -348,12 +348,6 @@ class StructureAwareStrategy(Strategy):
         # The device with the least room bounds all, since shards are evened out.
         in_memory = self.world.num_ranks * self.world.least(in_memory)
         return self.max_gaussians - self.world.sums(len(params["means"]))[0], in_memory
-
-    def _limit_growth(self, growth: Tensor, priority: Tensor, budget: float) -> Tensor:
-        """`split.limit_growth` of the Gaussians of all processes."""
-        if self.world.alone:
-            return limit_growth(growth, priority, budget)
-        return ranking.limit_growth(self.world, growth, priority, budget)
 
     def _even_out(self, params: Any, optimizers: Any, state: Any) -> None:
         """Count the Gaussians of the processes, and give each equally many where they differ by more than a tenth."""

@@ -12,7 +12,6 @@ from ranks import run_ranks
 from sadgs_ns.distributed.ranking import limit_growth
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
-from sadgs_ns.method.split import limit_growth as limit_growth_alone
 from sadgs_ns.method.strategy import StructureAwareStrategy
 
 BUDGETS = (0, 1, 5, 37, 120, 2000, float("inf"), -3)
@@ -37,7 +36,8 @@ def limit_together(world: World) -> list[torch.Tensor]:
 
 def test_the_budget_goes_to_the_same_gaussians(tmp_path: Path):
     results = run_ranks(limit_together, 3, tmp_path)
-    expected = [limit_growth_alone(growth, priority, budget) for growth, priority in growths() for budget in BUDGETS]
+    alone = World()
+    expected = [limit_growth(alone, growth, priority, budget) for growth, priority in growths() for budget in BUDGETS]
     for i, chosen in enumerate(expected):
         assert torch.equal(torch.cat([result[i] for result in results]), chosen), i
 

@@ -135,7 +135,7 @@ def test_densification_steps_prune_haze_and_the_last_one_forgets_the_paths(itera
     state: dict[str, Any] = strategy.initialize_state() | {
         "camera_paths": CameraPaths.of(row_of_cameras(), NEAR, wall(8.0))
     }
-    StructureAwareStrategy._ensure_statistics(params, state)
+    strategy._clear_statistics(params, state)
     strategy.step_post_backward(params, optimizers, state, iteration - 1, [])
     assert params["means"].tolist() == means[1:].tolist() and ("camera_paths" in state) == (iteration < 1600)
     for step in state.get("structure_steps", []):

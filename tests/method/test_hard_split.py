@@ -27,13 +27,15 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from sadgs_ns import kernels
+from sadgs_ns.distributed.ranking import limit_growth
+from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import RunError
 from sadgs_ns.method import memory
 from sadgs_ns.method import strategy as strategy_module
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow
 from sadgs_ns.method.initialization import bounding_box_points, neighbour_scales
 from sadgs_ns.method.memory import StepSize
-from sadgs_ns.method.split import children_per_axis, limit_growth
+from sadgs_ns.method.split import children_per_axis
 from sadgs_ns.method.statistics import empty_statistics
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
@@ -131,10 +133,10 @@ def test_an_eta_that_is_no_number_splits_nothing_even_where_it_counts_as_a_viola
 def test_a_parent_that_does_not_fit_does_not_block_the_smaller_ones():
     growth = torch.tensor([511, 1, 7, 511, 3])
     priority = torch.tensor([9.0, 1.0, 5.0, 7.0, 6.0])
-    assert limit_growth(growth, priority, 11).tolist() == [False, True, True, False, True]
-    assert limit_growth(growth, priority, 10).tolist() == [False, False, True, False, True]
-    assert limit_growth(growth, priority, 520).tolist() == [True, True, False, False, True]
-    assert limit_growth(growth, priority, math.inf).all()
+    assert limit_growth(World(), growth, priority, 11).tolist() == [False, True, True, False, True]
+    assert limit_growth(World(), growth, priority, 10).tolist() == [False, False, True, False, True]
+    assert limit_growth(World(), growth, priority, 520).tolist() == [True, True, False, False, True]
+    assert limit_growth(World(), growth, priority, math.inf).all()
 
 
 @pytest.mark.hard_case(
@@ -151,7 +153,7 @@ def test_growth_is_chosen_one_by_one_from_the_largest_violation():
         for i in sorted(range(200), key=lambda i: -priority[i]):
             if 0 < growth[i] <= left:
                 expected[i], left = True, left - int(growth[i])
-        assert torch.equal(limit_growth(growth, priority, budget), expected)
+        assert torch.equal(limit_growth(World(), growth, priority, budget), expected)
 
 
 @pytest.mark.hard_case("a cap smaller than the initial count, in your own loop", "nothing is added, training goes on")
@@ -471,6 +473,7 @@ def test_absgs_sums_skip_what_is_no_number_and_ignore_what_overflowed():
         split_threshold=1e-6,
         size_threshold=10.0,
         budget=100,
+        world=World(),
     )
     assert (n_clone, n_split) == (3, 0)
 

@@ -9,12 +9,13 @@ import torch
 from gsplat.utils import normalized_quat_to_rotmat
 from scenes import adam, camera, random_params, splat
 
+from sadgs_ns.distributed.ranking import limit_growth
+from sadgs_ns.distributed.world import World
 from sadgs_ns.method.split import (
     MAX_CHILDREN_PER_AXIS,
     children_per_axis,
     grid_offsets,
     grid_split,
-    limit_growth,
 )
 
 
@@ -36,18 +37,18 @@ def test_no_parent_explodes(eta_max: float):
 def test_budget_goes_to_the_largest_violations():
     growth = torch.tensor([7, 1, 0, 3, 5])
     priority = torch.tensor([2.0, 9.0, 99.0, 4.0, 3.0])
-    assert limit_growth(growth, priority, 9).tolist() == [False, True, False, True, True]
-    assert limit_growth(growth, priority, 8).tolist() == [False, True, False, True, False]
-    assert not limit_growth(growth, priority, 0).any()
-    assert not limit_growth(growth, priority, -5).any()
-    assert limit_growth(growth, priority, 10**9).tolist() == [True, True, False, True, True]
+    assert limit_growth(World(), growth, priority, 9).tolist() == [False, True, False, True, True]
+    assert limit_growth(World(), growth, priority, 8).tolist() == [False, True, False, True, False]
+    assert not limit_growth(World(), growth, priority, 0).any()
+    assert not limit_growth(World(), growth, priority, -5).any()
+    assert limit_growth(World(), growth, priority, 10**9).tolist() == [True, True, False, True, True]
 
 
 def test_the_cap_is_never_exceeded():
     generator = torch.Generator().manual_seed(0)
     for budget in range(0, 400, 7):
         growth = torch.randint(0, 60, (50,), generator=generator)
-        chosen = limit_growth(growth, torch.rand(50, generator=generator), budget)
+        chosen = limit_growth(World(), growth, torch.rand(50, generator=generator), budget)
         assert int(growth[chosen].sum()) <= budget
 
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 from scenes import adam, camera, random_params, training_step
 
+from sadgs_ns.distributed.world import World
 from sadgs_ns.method import strategy as strategy_module
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow
 from sadgs_ns.method.schedule import Windows
@@ -257,6 +258,7 @@ def grow_with(params, state, budget: int = 1000, **options: Any) -> tuple[int, i
         split_threshold=4e-4,
         size_threshold=0.1,
         budget=budget,
+        world=World(),
         **options,
     )
 
