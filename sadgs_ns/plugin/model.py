@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import threading
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
@@ -186,7 +185,7 @@ class SadgsModel(SplatfactoModel):
         """
         config = self.config
         config.check()
-        self.strategy = copy.deepcopy(config.strategy)
+        self.strategy = config.strategy
         self.strategy_state = self.strategy.initialize_state()
         self.gauss_params = torch.nn.ParameterDict(
             {name: torch.nn.Parameter(value) for name, value in self._initial_gaussians().items()}

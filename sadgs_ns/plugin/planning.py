@@ -101,7 +101,8 @@ def plan_run(
             "Train longer or lower pipeline.model.strategy.structure-every.[/]"
         )
     _tell_length(config, pipeline, length, done)
-    extent = float(model.strategy_state["scene_scale"])
+    extent, groups = float(model.strategy_state["scene_scale"]), pipeline.get_param_groups()
+    optimizers = {name: group for name, group in config.optimizers.items() if name in groups}
     return RunPlan(
         **vars(length),
         devices=pipeline.world.num_ranks,
@@ -109,7 +110,7 @@ def plan_run(
         near_plane=model.near_plane if options.model.near_plane is None else options.model.near_plane,
         max_off_axis=options.model.max_off_axis,
         strategy=planned,
-        rates=plan_rates(config.optimizers, length, extent, config.rates_follow_views),
+        rates=plan_rates(optimizers, length, extent, config.rates_follow_views),
         asked=asked,
     )
 

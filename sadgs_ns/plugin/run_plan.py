@@ -75,8 +75,8 @@ class RunPlan:
     def optimizers(self, asked: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
         """Return nerfstudio's configurations of optimizers and schedulers, which are given, with the planned rates."""
         configs = {}
-        for name, group in asked.items():
-            decay = asdict(self.rates[name])
+        for name, rate in self.rates.items():
+            group, decay = asked[name], asdict(rate)
             optimizer = replace(group["optimizer"], lr=decay.pop("lr"))
             ours = decay["max_steps"] is not None
             scheduler = RunLengthDecaySchedulerConfig(**decay) if ours else group.get("scheduler")

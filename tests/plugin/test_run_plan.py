@@ -73,6 +73,7 @@ def test_a_run_is_planned_once_and_its_options_stay_as_they_were_asked_for(confi
     assert plan.strategy.clone_grad2d == pytest.approx(0.8 * given.clone_grad2d)
     assert (plan.iterations, plan.devices, plan.images) == (ITERATIONS, 1, "gpu")
     assert None not in vars(plan.strategy).values() and plan.near_plane == model.near_plane
+    assert plan.rates.keys() == trainer.optimizers.optimizers.keys()
     for name, optimizer in trainer.optimizers.optimizers.items():
         assert optimizer.param_groups[0]["initial_lr" if plan.rates[name].max_steps else "lr"] == plan.rates[name].lr
         assert (plan.rates[name].max_steps == ITERATIONS) == (name in trainer.optimizers.schedulers)
