@@ -490,14 +490,10 @@ def test_photos_that_lie_on_their_side_by_exif_become_upright(tmp_path: Path):
 
 
 @pytest.mark.hard_case(
-    "photos with an EXIF orientation, some of them added to a scene of an earlier version, which ignored it",
-    "the added ones are turned; those that were there stay as its cameras know them",
-)
-@pytest.mark.hard_case(
     "photos with masks, added to a scene", "where it has masks, all of them get one; where it has none, a line says so"
 )
 @pytest.mark.parametrize("has_masks", [False, True])
-def test_photos_are_turned_unless_their_scene_knows_them_otherwise(
+def test_photos_that_are_added_are_turned_and_get_masks_if_the_scene_has_some(
     has_masks: bool, tmp_path: Path, registered: Callable[[int], None], monkeypatch: pytest.MonkeyPatch, capsys
 ):
     source, out, (photo, other) = tmp_path / "photos", tmp_path / "out", itertools.islice(draw_photos(), 2)
@@ -507,9 +503,6 @@ def test_photos_are_turned_unless_their_scene_knows_them_otherwise(
     registered(9)
     process(Process(source, out))
     (out / "transforms.json").write_text("{}")
-    settings = json.loads((out / "work" / "settings.json").read_text())
-    assert settings.pop("as_stored") == []
-    (out / "work" / "settings.json").write_text(json.dumps(settings))
     lying(other, 6, source / "d.jpg")
     (source / "masks").mkdir()
     Image.new("L", photo.size).save(source / "masks" / "d.png")
@@ -519,7 +512,7 @@ def test_photos_are_turned_unless_their_scene_knows_them_otherwise(
     masks: dict[str, Any] = {}
 
     def look(function: str, photos: Path, groups: list[list[str]], *others: object, **named: object) -> None:
-        assert groups == [["a.jpg", "b.jpg"], ["c.jpg", "d.jpg"]]
+        assert groups == [["a.jpg", "b.jpg", "c.jpg", "d.jpg"]]
         for name in itertools.chain(*groups):
             with Image.open(photos / name) as image:
                 made[name] = image.size
@@ -528,7 +521,7 @@ def test_photos_are_turned_unless_their_scene_knows_them_otherwise(
 
     monkeypatch.setattr(program, "run_colmap", look)
     assert main([str(source), str(out)]) == 130
-    assert made == {"a.jpg": (HEIGHT, WIDTH), "b.jpg": (HEIGHT, WIDTH)} | dict.fromkeys(("c.jpg", "d.jpg"), photo.size)
+    assert made == dict.fromkeys(("a.jpg", "b.jpg", "c.jpg", "d.jpg"), photo.size)
     white = dict.fromkeys(("a.jpg.png", "b.jpg.png", "c.jpg.png"), (255, 255))
     assert masks == (white | {"d.jpg.png": (0, 0)} if has_masks else {})
     assert f"Masks of 1 photos are {'used' if has_masks else 'not used'}" in capsys.readouterr().out

@@ -96,8 +96,6 @@ class _Scene:
         self.finished = self.begun.get("finished") if (out / "transforms.json").exists() else None
         if self.begun:
             self._check_unchanged()
-        # The cameras of photos that an earlier version began with are those of the pixels as they are stored.
-        self.settings["as_stored"] = self.begun.get("as_stored", self.begun.get("photos", []))
         self.added, self.base, self.model = 0, None, self.work / "model"
         if self.finished:
             self.added, self.model = len({*photos} - {*self.begun.get("photos", [])}), self.work / self.begun["model"]
@@ -204,7 +202,7 @@ def _make(scene: _Scene, report: Report) -> Summary:
                 write_frames(chosen, partial, lambda done: report("frames", done, options.frames))
                 partial.rename(folder)
             names = sorted(photo.relative_to(folder).as_posix() for photo in folder.rglob("*.jpg"))
-        photos = read_photos(folder, names, report, scene.settings["as_stored"])
+        photos = read_photos(folder, names, report)
         if scene.is_video:
             photos = [dataclasses.replace(photo, camera=(os.path.dirname(photo.name), photo.size)) for photo in photos]
         views = [view for photo in photos for view in photo.views]

@@ -10,7 +10,7 @@ import re
 import shutil
 import zlib
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -79,20 +79,17 @@ def changed_photos(folder: Path, stamps: Mapping[str, Sequence[int]]) -> list[st
     return [name for name in touched if (now[name][0], now[name][2]) != (stamps[name][0], stamps[name][2])]
 
 
-def read_photos(
-    folder: Path, names: Sequence[str], report: Callable[[str, int, int], None], as_stored: Collection[str] = ()
-) -> list[Photo]:
+def read_photos(folder: Path, names: Sequence[str], report: Callable[[str, int, int], None]) -> list[Photo]:
     """Read and decode photos, because COLMAP takes the missing end of a file for black pixels.
 
-    EXIF's orientation is ignored for photos that are taken `as_stored`. Raise InputError, which names them, if some
-    photos cannot be decoded.
+    Raise InputError, which names them, if some cannot be decoded.
     """
     photos: list[Photo] = []
     broken: list[str] = []
 
     def read(name: str) -> Photo | str:
         try:
-            return _read_photo(folder, name, name in as_stored)
+            return _read_photo(folder, name)
         except UnidentifiedImageError:
             why = "no image that Pillow knows" if (folder / name).stat().st_size else "0 bytes"
         except Exception as error:  # Decoders raise whatever they stumble over.
@@ -125,10 +122,10 @@ def _threads() -> Iterator[ThreadPoolExecutor]:
         pool.shutdown(cancel_futures=True)
 
 
-def _read_photo(folder: Path, name: str, as_stored: bool) -> Photo:
+def _read_photo(folder: Path, name: str) -> Photo:
     with Image.open(folder / name) as image:
         exif = image.getexif()
-        orientation = 1 if as_stored else exif.get(ExifTags.Base.Orientation)
+        orientation = exif.get(ExifTags.Base.Orientation)
         width, height = image.size
         size = (height, width) if orientation in SIDEWAYS and image.format != "TIFF" else image.size
         lens, gps = (exif.get_ifd(part) for part in (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo))
