@@ -6,6 +6,7 @@ take a tenth of the time of nerfstudio's, and less than it takes to import pycol
 
 from __future__ import annotations
 
+import contextlib
 import mmap
 import struct
 from collections.abc import Iterator
@@ -57,13 +58,10 @@ class _Binary:
 
     def __init__(self, path: Path) -> None:
         self.path, self.offset = path, 0
-        try:
-            with path.open("rb") as file:
-                self.content: mmap.mmap | bytes = (
-                    mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if path.stat().st_size else b""
-                )
-        except OSError as error:
-            raise InputError(f"{path} cannot be read ({reason(error)}): copy the whole reconstruction.") from error
+        with path.open("rb") as file:
+            self.content: mmap.mmap | bytes = (
+                mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if path.stat().st_size else b""
+            )
 
     def corrupt(self, detail: str) -> InputError:
         """Return the error for content that makes no sense."""
@@ -134,34 +132,20 @@ def _read_binary_points(path: Path) -> Points:
 
 def _read_text(path: Path, minimum: int) -> Iterator[tuple[list[str], Iterator[str]]]:
     """Yield the fields of each line that is neither empty nor a comment, and the lines after it."""
-    try:
-        with path.open(encoding="utf8") as file:
-            check_byte_order_mark(file.read(1), path)
-            file.seek(0)
-            for line in file:
-                if line.strip() and not line.lstrip().startswith("#"):
-                    fields = line.split()
-                    if len(fields) < minimum:
-                        raise ValueError(f"{minimum} fields expected in {line.strip()[:60]!r}")
-                    yield fields, file
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({reason(error)}): copy the whole reconstruction.") from error
-    except InputError:
-        raise
-    except ValueError as error:
-        raise _not_colmap(path, error) from error
-
-
-def _not_colmap(path: Path, error: ValueError) -> InputError:
-    return InputError(f"{path} is not COLMAP's text ({reason(error)}): copy it again, or run COLMAP's mapper again.")
+    with path.open(encoding="utf8") as file:
+        check_byte_order_mark(file.read(1), path)
+        file.seek(0)
+        for line in file:
+            if line.strip() and not line.lstrip().startswith("#"):
+                fields = line.split()
+                if len(fields) < minimum:
+                    raise ValueError(f"{minimum} fields expected in {line.strip()[:60]!r}")
+                yield fields, file
 
 
 def _read_text_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
     for fields, _ in _read_text(path, 5):
-        try:
-            yield int(fields[0]), Camera(fields[1], int(fields[2]), int(fields[3]), tuple(map(float, fields[4:])))
-        except ValueError as error:
-            raise _not_colmap(path, error) from error
+        yield int(fields[0]), Camera(fields[1], int(fields[2]), int(fields[3]), tuple(map(float, fields[4:])))
 
 
 def _read_text_poses(path: Path) -> Iterator[Pose]:
@@ -171,11 +155,8 @@ def _read_text_poses(path: Path) -> Iterator[Pose]:
                 f"{path}: image {' '.join(fields[9:])!r} has a space in its name, where nerfstudio takes the name to "
                 "end: write the model in binary (`colmap model_converter --output_type BIN`), or rename the image."
             )
-        try:
-            keypoints = next(following, "").split()
-            pose = fields[9], int(fields[8]), np.array(fields[1:8], dtype=np.float64)
-        except ValueError as error:
-            raise _not_colmap(path, error) from error
+        keypoints = next(following, "").split()
+        pose = fields[9], int(fields[8]), np.array(fields[1:8], dtype=np.float64)
         if len(keypoints) % 3:  # Each has x, y and the number of its point.
             problem = f"{path}: the line after image {fields[9]!r} does not hold its keypoints"
             raise InputError(f"{problem}: each image needs such a line, which may be empty.")
@@ -184,13 +165,23 @@ def _read_text_poses(path: Path) -> Iterator[Pose]:
 
 def _read_text_points(path: Path) -> Points:
     lines = [fields[1:7] for fields, _ in _read_text(path, 8)]
-    try:
-        positions, colors = np.hsplit(np.array(lines, np.float64).reshape(-1, 6), 2)
-        if not ((colors >= 0) & (colors <= 255)).all():
-            raise ValueError("a colour is not in 0 … 255")
-    except ValueError as error:
-        raise _not_colmap(path, error) from error
+    positions, colors = np.hsplit(np.array(lines, np.float64).reshape(-1, 6), 2)
+    if not ((colors >= 0) & (colors <= 255)).all():
+        raise ValueError("a colour is not in 0 … 255")
     return positions, colors.astype(np.uint8)
+
+
+@contextlib.contextmanager
+def _errors_as_sentences(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except InputError:
+        raise
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({reason(error)}): copy the whole reconstruction.") from error
+    except ValueError as error:
+        why = f"{path} is not COLMAP's text ({reason(error)})"
+        raise InputError(f"{why}: copy it again, or run COLMAP's mapper again.") from error
 
 
 def model_kind(model: Path) -> str | None:
@@ -205,12 +196,14 @@ def image_names(model: Path) -> list[str]:
 
 def read_cameras(path: Path) -> dict[int, Camera]:
     """Return the cameras of a `cameras.bin` or `cameras.txt` by their ids; raise InputError if it cannot be read."""
-    return dict((_read_binary_cameras if path.suffix == ".bin" else _read_text_cameras)(path))
+    with _errors_as_sentences(path):
+        return dict((_read_binary_cameras if path.suffix == ".bin" else _read_text_cameras)(path))
 
 
 def read_poses(path: Path) -> list[Pose]:
     """Return the poses of an `images.bin` or `images.txt`; raises as `read_cameras`."""
-    return list((_read_binary_poses if path.suffix == ".bin" else _read_text_poses)(path))
+    with _errors_as_sentences(path):
+        return list((_read_binary_poses if path.suffix == ".bin" else _read_text_poses)(path))
 
 
 def points_file(model: Path) -> Path | None:
@@ -220,4 +213,5 @@ def points_file(model: Path) -> Path | None:
 
 def read_points(path: Path) -> Points:
     """Return the points of a `points3D.bin` or `points3D.txt`; raises as `read_cameras`."""
-    return (_read_binary_points if path.suffix == ".bin" else _read_text_points)(path)
+    with _errors_as_sentences(path):
+        return (_read_binary_points if path.suffix == ".bin" else _read_text_points)(path)
