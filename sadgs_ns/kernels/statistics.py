@@ -1,4 +1,4 @@
-"""`method.statistics.observe` in one kernel: project the axes, sample S̄ in the footprint, update the counts."""
+"""`method.statistics.observed_eta` in one kernel: project the axes, and sample S̄ in the footprint."""
 
 # pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false
 # (Triton's launch syntax, kernel[grid](...), and its functions are not in its types.)
@@ -53,14 +53,6 @@ def _frequency(byte, HIGHEST: tl.constexpr, OCTAVES: tl.constexpr):
     return tl.where(byte > 0, HIGHEST * tl.exp2(OCTAVES * ((byte - 1) / 254 - 1)), 0.0)
 
 
-@triton.jit
-def _add_axis(n_high, n_low, eta_max, at, high, low, most, changed):
-    """Add what the views brought for one axis to the statistics in memory."""
-    tl.store(n_high + at, tl.load(n_high + at, changed, 0.0) + high, changed)
-    tl.store(n_low + at, tl.load(n_low + at, changed, 0.0) + low, changed)
-    tl.store(eta_max + at, tl.maximum(tl.load(eta_max + at, changed, 0.0), most), changed)
-
-
 # One view's intrinsics and S̄ may be part of a tensor of several views, and begin at no multiple of 16 bytes: Triton
 # would compile another kernel for that.
 @triton.jit(
@@ -69,8 +61,7 @@ def _add_axis(n_high, n_low, eta_max, at, high, low, most, changed):
 )
 def _observe(
     means, quats, scales, radii, means2d, conics, jitter, structure_tensors, viewmats, Ks,
-    n_high, n_low, eta_max, n_total, n, num_views, width, height,
-    HIGH: tl.constexpr, LOW: tl.constexpr, BLUR: tl.constexpr, MARGIN: tl.constexpr, EPSILON: tl.constexpr,
+    eta, n, num_views, width, height, BLUR: tl.constexpr, MARGIN: tl.constexpr, EPSILON: tl.constexpr,
     HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, INVALID: tl.constexpr, PER_GAUSSIAN: tl.constexpr,
     LANES: tl.constexpr,
 ):  # fmt: skip
@@ -87,9 +78,6 @@ def _observe(
     qy, qz = tl.load(quats + 4 * g + 2, candidate, 0.0), tl.load(quats + 4 * g + 3, candidate, 0.0)
     norm = 1 / tl.maximum(tl.sqrt(qw * qw + qx * qx + qy * qy + qz * qz), 1e-12)
     qw, qx, qy, qz = qw * norm, qx * norm, qy * norm, qz * norm
-    zero = tl.zeros([LANES], tl.float32)
-    high0, high1, high2, low0, low1, low2 = zero, zero, zero, zero, zero, zero
-    most0, most1, most2, total = zero, zero, zero, zero
     for view in range(num_views):
         at = view * tl.cast(n, tl.int64) + g
         seen = drawn(radii, at, candidate, PER_GAUSSIAN)
@@ -153,22 +141,12 @@ def _observe(
         eta1 = _eta(u1, v1, s_xx, s_xy, s_yy, EPSILON)
         eta2 = _eta(u2, v2, s_xx, s_xy, s_yy, EPSILON)
         observed = observed & (eta0 < float("inf")) & (eta1 < float("inf")) & (eta2 < float("inf"))
-        eta0, eta1, eta2 = tl.where(observed, eta0, 0.0), tl.where(observed, eta1, 0.0), tl.where(observed, eta2, 0.0)
-        high0, high1, high2 = high0 + (eta0 > HIGH), high1 + (eta1 > HIGH), high2 + (eta2 > HIGH)
-        low0 += observed & (eta0 < LOW)
-        low1 += observed & (eta1 < LOW)
-        low2 += observed & (eta2 < LOW)
-        most0, most1, most2 = tl.maximum(most0, eta0), tl.maximum(most1, eta1), tl.maximum(most2, eta2)
-        total += observed
-    changed = total > 0
-    tl.store(n_total + g, tl.load(n_total + g, changed, 0.0) + total, changed)
-    _add_axis(n_high, n_low, eta_max, 3 * g, high0, low0, most0, changed)
-    _add_axis(n_high, n_low, eta_max, 3 * g + 1, high1, low1, most1, changed)
-    _add_axis(n_high, n_low, eta_max, 3 * g + 2, high2, low2, most2, changed)
+        tl.store(eta + 3 * at, tl.where(observed, eta0, float("nan")), candidate)
+        tl.store(eta + 3 * at + 1, tl.where(observed, eta1, float("nan")), candidate)
+        tl.store(eta + 3 * at + 2, tl.where(observed, eta2, float("nan")), candidate)
 
 
-def observe_views(
-    statistics: tuple[Tensor, Tensor, Tensor, Tensor],  # n_high, n_low, eta_max [N, 3], n_total [N]; float32
+def observed_eta(
     params: tuple[Tensor, Tensor, Tensor],  # means [N, 3], quats [N, 4] and log scales [N, 3]; float32
     radii: Tensor,  # int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5, px; not positive where nothing was drawn
     means2d: Tensor,  # [C, N, 2] px
@@ -178,21 +156,21 @@ def observe_views(
     viewmats: Tensor,  # [C, 4, 4]
     Ks: Tensor,  # [C, 3, 3] px
     *,
-    thresholds: tuple[float, float],
     constants: tuple[float, float, float],
     quantization: tuple[float, float, int],
-) -> None:
-    """Compute the loop of `method.statistics.observe` for all views at once; `statistics` change in place.
+) -> Tensor:
+    """Compute `method.statistics.observed_eta`. [C, N, 3]
 
     Args:
-        thresholds: η above the first is high, and below the second it is low.
         constants: gsplat's blur in px², its margin of the frustum, and ε of the wavelength in 1/px.
         quantization: HIGHEST_FREQUENCY, OCTAVES and INVALID of `method.quantization`.
     """
     inputs = (*params, radii, means2d, conics, jitter, structure_tensors, viewmats, Ks)
     num_views, n = radii.shape[:2]
     height, width = structure_tensors.shape[1:3]
+    eta = means2d.new_empty((num_views, n, 3))
     _observe[cdiv(n, _LANES),](
-        *(value.contiguous() for value in inputs), *statistics, n, num_views, width, height,
-        *thresholds, *constants, *quantization, radii.dim() - 1, _LANES,
+        *(value.contiguous() for value in inputs), eta, n, num_views, width, height,
+        *constants, *quantization, radii.dim() - 1, _LANES,
     )  # fmt: skip
+    return eta

@@ -5,7 +5,9 @@ The bytes are counted from the code that allocates them: `render.backend_triton`
 real peaks.
 
 A step is largest in one of three phases, in which different tensors are alive: while the tile lists are sorted, in the
-loss, and in the backward pass of rasterization. What a Gaussian keeps between steps comes on top of each.
+loss, and in the backward pass of rasterization. What a Gaussian keeps between steps comes on top of each. Observing η
+takes less before the loss than the backward pass: of a Gaussian and view, samples 8, η 12, and 15 for comparisons and
+sums of `statistics.STATISTICS`.
 """
 
 from __future__ import annotations

@@ -6,7 +6,8 @@ removes Gaussians keeps them in step with the parameters.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, MutableMapping
+from collections.abc import Callable, Mapping, MutableMapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -14,13 +15,7 @@ from torch import Tensor
 
 from sadgs_ns.gsplat_compat import SCREEN_BLUR
 from sadgs_ns.kernels import use_triton
-from sadgs_ns.method.eta import (
-    WAVELENGTH_EPSILON,
-    eta,
-    projected_axes,
-    sample_footprint,
-    sample_map,
-)
+from sadgs_ns.method.eta import WAVELENGTH_EPSILON, eta, projected_axes, sample_footprint, sample_map
 from sadgs_ns.method.ops import Params
 from sadgs_ns.method.quantization import HIGHEST_FREQUENCY, INVALID, OCTAVES
 from sadgs_ns.render.ewa import FRUSTUM_MARGIN
@@ -32,15 +27,40 @@ LOW_ETA = 0.1
 """η below this is a low response: the axis covers a smooth region (paper, section 3.4)."""
 
 
-def empty_statistics(num_gaussians: int, device: torch.device) -> dict[str, Tensor]:
-    """Statistics of Gaussians that nobody has seen yet.
+@dataclass(frozen=True)
+class Statistic:
+    """What is kept of η for each Gaussian."""
 
-    Returns:
-        `n_high`, `n_low` (counts per axis) and `eta_max` (largest η per axis), each float32 [N, 3]; `n_total`, the
-        number of observations, float32 [N].
-    """
-    zeros = torch.zeros((num_gaussians, 3), device=device)
-    return {"n_high": zeros, "n_low": zeros.clone(), "eta_max": zeros.clone(), "n_total": zeros[:, 0].clone()}
+    shape: tuple[int, ...]
+    """(3,) is a number for each axis, () one for the Gaussian. All are 0 while there is no observation."""
+    update: Callable[[Tensor, Tensor], object]
+    """Adds a forward pass, in place. It takes the statistic, float32 [N, *shape], and η of C views, float32 [C, N, 3],
+    which is NaN on all axes where the Gaussian was not observed."""
+
+
+def _count(values: Tensor, happened: Tensor) -> None:
+    values.add_(happened.sum(0, dtype=values.dtype))
+
+
+def _keep_largest(values: Tensor, eta: Tensor) -> None:
+    for of_view in eta:  # `amax` would keep NaN.
+        torch.fmax(values, of_view, out=values)
+
+
+# A comparison with NaN is false.
+STATISTICS: dict[str, Statistic] = {
+    "n_high": Statistic((3,), lambda values, eta: _count(values, eta > HIGH_ETA)),
+    "n_low": Statistic((3,), lambda values, eta: _count(values, eta < LOW_ETA)),
+    "eta_max": Statistic((3,), _keep_largest),
+    "n_total": Statistic((), lambda values, eta: _count(values, eta[..., 0] >= 0)),
+}
+"""The statistics by their names in the strategy's state: numbers of violations, of low responses, the largest η of each
+axis, and the number of observations. Whatever is added here is kept, forgotten, stored and planned for as these are."""
+
+
+def empty_statistics(num_gaussians: int, device: torch.device) -> dict[str, Tensor]:
+    """Return the `STATISTICS` of Gaussians that nobody has seen yet."""
+    return {name: torch.zeros((num_gaussians, *s.shape), device=device) for name, s in STATISTICS.items()}
 
 
 @torch.no_grad()
@@ -52,10 +72,7 @@ def observe(
     generator: torch.Generator | None = None,
     jitter: Tensor | None = None,  # [C, N, 2]
 ) -> None:
-    """Add one forward pass: one jittered sample per visible Gaussian and view, counted in place.
-
-    A Gaussian is observed in a view when the rasterizer drew it there, its sample lies in the image and not on a masked
-    pixel, and its η is finite on all axes: NaN and infinities of the projection or of S̄ are no observation.
+    """Add one forward pass: one jittered sample per visible Gaussian and view, in place.
 
     Args:
         statistics: As made by `empty_statistics`.
@@ -65,30 +82,39 @@ def observe(
         generator: Source of the jitter.
         jitter: In [0, 1), where it is not to be drawn here. [C, N, 2]
     """
-    means2d = info["means2d"]
     if jitter is None:
+        means2d = info["means2d"]
         jitter = torch.rand(means2d.shape, generator=generator, device=means2d.device)  # [C, N, 2]
-    if use_triton(params["means"]):
-        from sadgs_ns.kernels.statistics import observe_views
+    of_views = observed_eta(params, info, jitter)
+    for name, statistic in STATISTICS.items():
+        statistic.update(statistics[name], of_views)
 
-        observe_views(
-            (statistics["n_high"], statistics["n_low"], statistics["eta_max"], statistics["n_total"]),
+
+def observed_eta(params: Params, info: Mapping[str, Any], jitter: Tensor) -> Tensor:
+    """Return η of the axes in each view, NaN where there is no observation. [C, N, 3]
+
+    A Gaussian is observed in a view when the rasterizer drew it there, its sample lies in the image and not on a masked
+    pixel, and its η is finite on all axes: NaN and infinities of the projection or of S̄ are no observation. The
+    arguments are those of `observe`.
+    """
+    if use_triton(params["means"]):
+        from sadgs_ns.kernels import statistics as kernel
+
+        return kernel.observed_eta(
             (params["means"], params["quats"], params["scales"]),
             info["radii"],
-            means2d,
+            info["means2d"],
             info["conics"],
             jitter,
             info["structure_tensors"],
             info["viewmats"],
             info["Ks"],
-            thresholds=(HIGH_ETA, LOW_ETA),
             constants=(SCREEN_BLUR, FRUSTUM_MARGIN, WAVELENGTH_EPSILON),
             quantization=(HIGHEST_FREQUENCY, OCTAVES, INVALID),
         )
-        return
     seen = visible(info)  # [C, N]
     num_cameras, num_gaussians = seen.shape
-    scales = torch.exp(params["scales"])
+    scales, views = torch.exp(params["scales"]), []
     # Every Gaussian is measured and the unseen are masked out: selecting them first would make the host wait.
     for camera in range(num_cameras):
         camera_ids = torch.full((num_gaussians,), camera, device=seen.device)  # [N]
@@ -111,11 +137,8 @@ def observe(
         sampled, inside = sample_map(info["structure_tensors"], camera_ids, points)
         violation = eta(axes, sampled)  # [N, 3]
         observed = (seen[camera] & inside & violation.isfinite().all(dim=1))[:, None]  # [N, 1]
-        violation = torch.where(observed, violation, 0.0)
-        statistics["n_high"] += violation > HIGH_ETA
-        statistics["n_low"] += observed & (violation < LOW_ETA)
-        statistics["n_total"] += observed[:, 0]
-        torch.maximum(statistics["eta_max"], violation, out=statistics["eta_max"])
+        views.append(torch.where(observed, violation, torch.nan))
+    return torch.stack(views)
 
 
 def consistent(counts: Tensor, n_total: Tensor, threshold: float, min_observations: int = 1) -> Tensor:

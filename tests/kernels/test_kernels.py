@@ -25,7 +25,7 @@ from sadgs_ns import kernels
 from sadgs_ns.method import losses
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients
 from sadgs_ns.method.quantization import quantize
-from sadgs_ns.method.statistics import empty_statistics, observe
+from sadgs_ns.method.statistics import STATISTICS, Statistic, empty_statistics, observe, observed_eta
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.plugin.optimizers import AdamUpdate, FusedAdam
 from sadgs_ns.render import backend_gsplat
@@ -319,29 +319,30 @@ def test_observation_equals_the_reference(monkeypatch, kept, per_axis_radii):
     tensors = torch.stack([tensors[..., 0, 0], tensors[..., 0, 1], tensors[..., 1, 1]], -1)
     tensors[:, :, 18:22] = math.nan  # masked
     info["structure_tensors"] = kept(tensors)
+    # Whoever adds a statistic adds it in one place.
+    monkeypatch.setitem(STATISTICS, "log_sum", Statistic((3,), lambda values, eta: values.add_(eta.log1p().nansum(0))))
+    on_device = {name: torch.nn.Parameter(value.to(DEVICE)) for name, value in params.items()}
+    info = {k: value.detach().to(DEVICE) if isinstance(value, Tensor) else value for k, value in info.items()}
+    jitters = torch.rand((2, 2, n, 2), generator=generator).to(DEVICE)
     results = []
-    calls = recorded(monkeypatch, observation, "observe_views")
+    calls = recorded(monkeypatch, observation, "observed_eta")
     for fused in (False, True):
-        statistics = {k: v.to(DEVICE) for k, v in empty_statistics(n, torch.device("cpu")).items()}
-        for seed in (1, 2):
-            with kernels.triton_switched(fused):
-                observe(
-                    statistics,
-                    {name: torch.nn.Parameter(value.to(DEVICE)) for name, value in params.items()},
-                    {
-                        name: value.detach().to(DEVICE) if isinstance(value, Tensor) else value
-                        for name, value in info.items()
-                    },
-                    generator=torch.Generator(DEVICE).manual_seed(seed),
-                )
-        results.append(statistics)
-        assert len(calls) == 2 * fused
-    reference, fast = results
+        statistics = empty_statistics(n, torch.device(DEVICE))
+        with kernels.triton_switched(fused):
+            for jitter in jitters:
+                observe(statistics, on_device, info, jitter=jitter)
+            results.append((observed_eta(on_device, info, jitters[0]), statistics))
+        assert len(calls) == 3 * fused
+    (expected, reference), (eta, fast) = results
+    torch.testing.assert_close(eta, expected, atol=1e-6, rtol=2e-5, equal_nan=True)
+    assert torch.equal(eta.isnan().any(dim=2), eta.isnan().all(dim=2)) and 0 < eta.isnan().sum() < eta.numel()
     assert reference["n_total"].sum() > n / 2 and reference["n_low"].sum() > 0 and reference["n_high"].sum() > 0
-    assert (reference["n_total"] == 0).any()
-    for name in ("n_total", "n_high", "n_low"):
-        assert torch.equal(fast[name], reference[name]), name
-    torch.testing.assert_close(fast["eta_max"], reference["eta_max"], atol=1e-6, rtol=2e-5)
+    assert (reference["n_total"] == 0).any() and reference["log_sum"].sum() > 0
+    assert fast.keys() == reference.keys() == STATISTICS.keys()
+    for name in STATISTICS:
+        if name.startswith("n_"):
+            assert torch.equal(fast[name], reference[name]), name
+        torch.testing.assert_close(fast[name], reference[name], atol=1e-6, rtol=2e-5)
 
 
 @pytest.mark.parametrize("layout", ["parts of rows", "apart", "transposed"])

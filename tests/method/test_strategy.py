@@ -12,7 +12,7 @@ from sadgs_ns.distributed.world import World
 from sadgs_ns.method import strategy as strategy_module
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow
 from sadgs_ns.method.schedule import Windows
-from sadgs_ns.method.statistics import empty_statistics
+from sadgs_ns.method.statistics import STATISTICS, Statistic, empty_statistics
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 
@@ -100,6 +100,19 @@ def test_over_a_run_no_gaussian_has_more_observations_than_iterations_of_life():
         assert not state["eta_max"][state["n_total"] == 0].any()
         newborn, observed = newborn + int((age == 0).sum()), observed + int((state["n_total"] > 0).sum())
     assert newborn > 100 and observed > 1000
+
+
+def test_a_statistic_is_added_in_one_entry_and_stays_with_its_gaussians(monkeypatch: pytest.MonkeyPatch):
+    """The sum of η, which clones, splits, a structure step and pruning keep in step with the Gaussians."""
+    monkeypatch.setitem(STATISTICS, "eta_sum", Statistic((3,), lambda values, eta: values.add_(eta.nansum(0))))
+    growing = {"clone_grad2d": 1e-3, "split_absgrad2d": 2e-3, "min_opacity": 0.1, "refine_stop_iter": 30}
+    _, state, counts = train(short(max_gaussians=3000, **growing), 24)
+    assert counts[9] > 5 * counts[8] and counts[23] < counts[22], "split in a structure step, and pruned in another"
+    eta_sum, eta_max, n_total = (state[name] for name in ("eta_sum", "eta_max", "n_total"))
+    assert (n_total > 1).any() and (n_total == 0).any(), "clones and children of the last step"
+    assert (eta_max * (1 - 1e-5) <= eta_sum).all() and (eta_sum <= eta_max * n_total[:, None] * (1 + 1e-5)).all()
+    _, state, _ = train(short(), 26)
+    assert "eta_sum" not in state, "it ends with densification, like the others"
 
 
 @pytest.mark.parametrize("cap", [60, 61, 150, 400])
