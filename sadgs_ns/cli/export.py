@@ -118,20 +118,13 @@ def export(options: Export) -> int:
             problem = f"{folder} holds no {TRANSFORMS_NAME}, where nerfstudio notes how it moved the data"
             raise InputError(f"{problem}: give the run where it was made, or export in nerfstudio's frame.")
         similarity = from_data(folder / TRANSFORMS_NAME).inverse()
-    checkpoint, params, drawing = read_checkpoint(options.run)
-    if params["features_rest"].shape[1] == 0:  # then training holds colours' logits
-        params["features_dc"] = (params["features_dc"].sigmoid() - 0.5) / DEGREE_0
-    cameras = None
+    params, drawing = read_checkpoint(options.run)
+    cameras = start = None
     if is_page or is_mesh or cleaning.needs_views:
         from sadgs_ns.data.run_cameras import read_cameras
 
         cameras = read_cameras(folder, options.data)
-    try:
-        of_parameters(_arrays(params))
-    except ValueError as error:
-        told = f"{checkpoint} holds no Gaussians that can be exported ({error}): {_REMEDY}."
-        raise InputError(told) from error
-    params, start = _cleaned(params, cleaning, cameras, drawing), None
+    params = _cleaned(params, cleaning, cameras, drawing)
     if is_mesh and cameras is not None:
         from sadgs_ns.cli.meshing import write_mesh
 
@@ -194,11 +187,11 @@ def _checkpoint_of(run: Path) -> Path:
     return max(found, key=lambda path: int(path.stem[5:]))
 
 
-def read_checkpoint(run: Path) -> tuple[Path, dict[str, Tensor], RenderOptions]:
-    """Read a run's checkpoint, its parameters as `of_parameters` takes them, and the options with which it drew them.
+def read_checkpoint(run: Path) -> tuple[dict[str, Tensor], RenderOptions]:
+    """Read a run's parameters, as `of_parameters` takes them, and the options with which it drew them.
 
-    The tensors are mapped from the file, so that they take no memory before they are read. Raise InputError if there is
-    no checkpoint of this method or of splatfacto.
+    The tensors are mapped from the file, so that what is not read takes no memory. Raise InputError if there is no
+    checkpoint of this method or of splatfacto, or its Gaussians cannot be exported.
     """
     # These import torch, which takes seconds, and `--help` and a wrong path need not wait for it.
     from torch import Tensor
@@ -219,10 +212,17 @@ def read_checkpoint(run: Path) -> tuple[Path, dict[str, Tensor], RenderOptions]:
         if not isinstance(value, Tensor) or value.dim() < 2:
             raise InputError(f"{checkpoint} holds no {name} of Gaussians, so another method made it: {_REMEDY}.")
         params[name] = value
+    if params["features_rest"].shape[1] == 0:  # then training holds colours' logits
+        params["features_dc"] = (params["features_dc"].sigmoid() - 0.5) / DEGREE_0
+    try:
+        of_parameters(_arrays(params))
+    except ValueError as error:
+        problem = f"{checkpoint} holds no Gaussians that can be exported ({error})"
+        raise InputError(f"{problem}: {_REMEDY}.") from error
     state = loaded.get("_extra_state")
     plan = state.get("plan", {}) if isinstance(state, dict) else {}
     options = {"near_plane": NEAR_PLANE, "max_off_axis": _MAX_OFF_AXIS}
-    return checkpoint, params, RenderOptions(**{name: plan.get(name, value) for name, value in options.items()})
+    return params, RenderOptions(**{name: plan.get(name, value) for name, value in options.items()})
 
 
 def main(argv: Sequence[str] | None = None) -> int:

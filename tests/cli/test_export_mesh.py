@@ -117,7 +117,7 @@ def test_the_mesh_lies_on_the_room_s_surfaces_in_both_frames(
 def test_without_a_size_voxels_are_two_pixels_wide_or_as_many_as_fit(
     run: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    _, params, _ = export.read_checkpoint(run[1])
+    params, _ = export.read_checkpoint(run[1])
     cameras = read_cameras(run[1], run[0])
     views = list(meshing.render_depths(params, cameras, range(3), RenderOptions(max_off_axis=4.0)))
     depths = np.median([np.median(view.depth[view.depth > 0]) for view in views])
@@ -189,7 +189,7 @@ def test_what_gives_no_mesh_is_one_sentence_and_leaves_nothing(
 @pytest.mark.hard_case("a mesh without views, or of faint Gaussians alone", "refused: there is no surface")
 @pytest.mark.usefixtures("open3d")
 def test_no_views_and_gaussians_that_are_all_faint_have_no_surface(run: tuple[Path, Path], tmp_path: Path):
-    _, params, _ = export.read_checkpoint(run[1])
+    params, _ = export.read_checkpoint(run[1])
     nowhere = meshing.RunCameras(torch.zeros(0, 3, 4), torch.zeros(0, 3, 3), [], [])
     with pytest.raises(InputError, match=r"^The capture has no training views to fuse .* give another with --data\.$"):
         meshing.write_mesh(tmp_path / "a.mesh.ply", params, nowhere)

@@ -88,7 +88,7 @@ def test_the_plan_is_written_beside_config_yml_and_kept_in_the_checkpoint(config
     kept = torch.load(file, weights_only=True)["pipeline"]["_extra_state"]["plan"]
     assert written == kept == dataclasses.asdict(plan_of(trainer))
     assert RunPlan.of(kept) == plan_of(trainer)
-    _, _, drawing = export.read_checkpoint(file)
+    _, drawing = export.read_checkpoint(file)
     assert drawing == RenderOptions(near_plane=trainer.pipeline.model.near_plane, max_off_axis=2.5)
     assert [path.name for path in trainer.base_dir.iterdir() if ".partial" in path.name] == []
 
