@@ -42,7 +42,7 @@ def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> T
     from nerfstudio.engine.trainer import TrainerConfig
 
     from sadgs_ns.data.parsers import PARSERS
-    from sadgs_ns.plugin.trainer import SadgsTrainerConfig
+    from sadgs_ns.plugin.config import SadgsTrainerConfig
 
     config = copy.deepcopy(all_methods.get(row.method))
     if not isinstance(config, TrainerConfig):

@@ -23,9 +23,10 @@ from scenes import HEIGHT, POINTS, VIEWS, WIDTH
 
 from examples.drawn_scene.drawing import render
 from examples.drawn_scene.scene import arc_views, room_surfaces
+from sadgs_ns.plugin.config import SadgsTrainerConfig
 from sadgs_ns.plugin.model import SadgsModel
 from sadgs_ns.plugin.presets import sadgs
-from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
+from sadgs_ns.plugin.trainer import SadgsTrainer
 
 TRAIN_VIEWS = 8
 """Of 10, the parser holds out the first and the ninth."""

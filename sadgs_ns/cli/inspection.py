@@ -22,10 +22,10 @@ from sadgs_ns.method.split import grid_split, num_children
 from sadgs_ns.method.strategy import SMALL_SCALE
 from sadgs_ns.plugin import checkpoints, color_scales, gaussian_maps, texture
 from sadgs_ns.plugin.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
+from sadgs_ns.plugin.config import SadgsTrainerConfig
 from sadgs_ns.plugin.model import SadgsModel
 from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.plugin.structure_cache import observe_training_views
-from sadgs_ns.plugin.trainer import SadgsTrainerConfig
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.render.types import Cameras as Pinholes
 

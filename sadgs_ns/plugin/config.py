@@ -1,32 +1,242 @@
-"""The options of `ns-train sadgs` besides data and model, and the checks of all of them before a run starts."""
+"""The options of `ns-train sadgs`, and the checks of their ranges. Those of optimizers are in optimizers.py."""
 
 from __future__ import annotations
 
-import errno
 import math
-import os
-import socket
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
-import yaml
-from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
+from nerfstudio.configs.base_config import (
+    InstantiateConfig,
+    LocalWriterConfig,
+    LoggingConfig,
+    MachineConfig,
+    ViewerConfig,
+)
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.engine.trainer import TrainerConfig
-from nerfstudio.utils.rich_utils import CONSOLE
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from tyro.conf import Suppress
 
-from sadgs_ns.data.parsers import check_capture, keep_findings
+from sadgs_ns.data.parsers import AnyParserConfig, AutomaticDataParserConfig
 from sadgs_ns.errors import InputError, reason
-from sadgs_ns.files import atomic_path
 from sadgs_ns.kernels import SWITCH, switched_off
-from sadgs_ns.plugin import checkpoints, processes
+from sadgs_ns.method.initialization import POINT_OPACITY
+from sadgs_ns.method.quantization import HIGHEST_FREQUENCY
+from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.method.structure_tensor import ENERGY_BLUR, FREQUENCY_CONSTANT
+from sadgs_ns.plugin import processes
 from sadgs_ns.plugin.optimizers import FusedAdam, RunLengthDecaySchedulerConfig
 from sadgs_ns.plugin.options import check_ranges, hide
-from sadgs_ns.plugin.pipeline import SadgsPipelineConfig
 from sadgs_ns.plugin.progress import ProgressTable
+from sadgs_ns.plugin.run_folder import begin
 from sadgs_ns.render.rasterization import choose_backend
+from sadgs_ns.render.types import BackendName
+
+_MOST_RANDOM = 10_000_000
+"""Largest number of random points to start from; they take the host's memory before the cap thins them out."""
+_MOST_EFFORT = 100
+"""Largest `effort`, which is a million iterations of four views for a capture of 760 views."""
+_WIDEST_BLUR = 100
+"""Largest window of `energy_blur`, which makes kernels of thousands of pixels."""
+
+
+def _class(module: str, name: str) -> type:
+    """Import a class when options are made: its module imports this one."""
+    return getattr(import_module(f"sadgs_ns.plugin.{module}"), name)
+
+
+@hide("trans_l2_penalty", "rot_l2_penalty")  # Others than nerfstudio's are refused below.
+@dataclass
+class PoseOptimizerConfig(CameraOptimizerConfig):
+    """nerfstudio's options of learned camera poses, with its own penalties, which hold them near the given ones."""
+
+    mode: Literal["off", "SO3xR3", "SE3"] = "off"
+    """Whether and how the cameras' poses are refined; SO3xR3 turns and moves each camera."""
+
+
+@hide("rasterize_mode")  # Files of the result look right with the default alone.
+@dataclass
+class SadgsModelConfig(InstantiateConfig):
+    """Options of the Gaussians, their loss and their densification.
+
+    The model is a splatfacto model, because nerfstudio's viewer and exporter ask for one; its configuration is not one
+    of splatfacto's, most of whose options concern a densification that this method replaces.
+    """
+
+    _target: type = field(default_factory=lambda: _class("model", "SadgsModel"))
+    strategy: StructureAwareStrategy = field(default_factory=StructureAwareStrategy)
+    """When and how Gaussians are split, cloned and pruned."""
+    camera_optimizer: PoseOptimizerConfig = field(default_factory=PoseOptimizerConfig)
+    """Whether and how the cameras' poses are refined in training."""
+    backend: BackendName = "auto"
+    """What draws: auto takes Triton's kernels where they work, gsplat's on other CUDA devices, and torch elsewhere.
+    gsplat trains on one GPU, without CUDA graphs."""
+    background_color: Literal["black", "white"] = "black"
+    """Colour behind the Gaussians."""
+    random_init: bool = False
+    """Start from random points even where the data has SfM points."""
+    num_random: int = 50000
+    """Number of random points to start from, where there are no SfM points or they are not wanted."""
+    random_scale: float = 10.0
+    """Side of the cube around the origin in which random points are drawn, in the run's units."""
+    bounding_box_points: bool = True
+    """Also start from points on the faces of the SfM points' bounding box, which become sky and far background."""
+    stereo_points: int | None = None
+    """Points to start from beside the SfM points, at most, drawn from stereo depth of the training photos (CUDA).
+    None is 150,000 where there are 3 to 60 training views, and otherwise none."""
+    clear_paths: bool | None = None
+    """Let each densification step prune what floats near the cameras' paths, which viewers of files show as haze.
+    None does so where there are at most 60 training views."""
+    initial_opacity: float = POINT_OPACITY
+    """Opacity at which SfM points start, in (0, 1); random ones start at 0.1.
+    Half opaque ones mostly have a lower LPIPS and make more Gaussians (docs/results.md)."""
+    sh_degree: int = 3
+    """Degree of the spherical harmonics that make colours depend on the direction of view, 0 to 3."""
+    rasterize_mode: Literal["classic", "antialiased"] = "classic"
+    """How Gaussians smaller than a pixel are drawn: "classic" as in 3DGS, "antialiased" fades them by their size.
+    Viewers of PLY files expect "classic"."""
+    ssim_lambda: float = 0.6
+    """Weight of SSIM against L1 in the loss, in [0, 1]. The paper's 0.2 resolves less detail for as many Gaussians."""
+    opacity_reg: float = 0.01
+    """Weight of the mean opacity in the loss while densification runs: what no image needs fades until it is pruned.
+    Larger leaves fewer Gaussians; 0 is off, as in the paper."""
+    averaged_share: float = 0.05
+    """Share of the run, at its end, over which the Gaussians' parameters are averaged, in [0, 0.3].
+    The finished run has the mean; 0 leaves it the last iteration's."""
+    max_off_axis: float = 4.0
+    """Gaussians whose centre is projected further from the image's centre, in half images along x or y, are not drawn.
+    Far off the axis a Gaussian's image is wrong, and can be haze over the view; 0 draws all."""
+    near_plane: float | None = None
+    """Depth from which Gaussians are drawn, in the run's units; nothing nearer is, in training or later.
+    None is half the depth at which a training camera's fifth SfM point lies, of the camera that comes nearest."""
+    max_angular_scale: float = 0.3
+    """Longest standard deviation of a Gaussian as a share of its distance from the nearest training camera.
+    A longer one can cover a view beside which it lies with haze; 0 sets no limit."""
+    color_model: Literal["none", "affine"] = "none"
+    """What is learned of each training photo's exposure and white balance, which held-out views are rendered without.
+    "affine" is a colour matrix."""
+    color_corrected_metrics: bool = False
+    """Also report metrics after fitting the colours of each rendering to its photo, as suits changing exposure."""
+
+    def check(self) -> None:
+        """Raise InputError if an option is out of its range."""
+        near, stereo, off_axis, angle = self.near_plane, self.stereo_points, self.max_off_axis, self.max_angular_scale
+        ranges = [
+            ("ssim_lambda", 0 <= self.ssim_lambda <= 1, "in [0, 1]"),
+            ("background_color", self.background_color in ("black", "white"), "black or white"),
+            ("initial_opacity", 0 < self.initial_opacity < 1, "in (0, 1)"),
+            ("opacity_reg", 0 <= self.opacity_reg <= 100, "in [0, 100]"),
+            ("averaged_share", 0 <= self.averaged_share <= 0.3, "in [0, 0.3]"),
+            ("max_off_axis", 0 <= off_axis < math.inf, "finite and not negative"),
+            ("max_angular_scale", 0 <= angle < math.inf, "finite and not negative"),
+            ("max_off_axis", off_axis == 0 or off_axis >= 1, "0, or at least 1, the image's border"),
+            ("near_plane", near is None or 0 < near < math.inf, "positive and finite"),
+            ("sh_degree", 0 <= self.sh_degree <= 3, "in [0, 3]"),
+            ("num_random", 1 <= self.num_random <= _MOST_RANDOM, f"in [1, {_MOST_RANDOM:,}]"),
+            ("stereo_points", stereo is None or 0 <= stereo <= _MOST_RANDOM, f"in [0, {_MOST_RANDOM:,}]"),
+            ("random_scale", 0 < self.random_scale < math.inf, "positive and finite"),
+        ]
+        check_ranges("pipeline.model.", self, ranges)
+        for name in ("trans_l2_penalty", "rot_l2_penalty"):
+            if (penalty := getattr(self.camera_optimizer, name)) != getattr(PoseOptimizerConfig, name):
+                told = f"cannot be set, got {penalty:g}: leave it out."
+                raise InputError(f"pipeline.model.camera_optimizer.{name} {told}")
+        try:
+            self.strategy.check()
+        except ValueError as error:
+            raise InputError(f"pipeline.model.{error}") from error
+
+
+@hide("data", "train_cameras_sampling_seed")  # `--data` and `--machine.seed` set them.
+@hide("masks_on_gpu", "images_on_gpu", "max_thread_workers", "train_cameras_sampling_strategy", "fps_reset_every")
+@hide("eval_num_images_to_sample_from", "eval_num_times_to_repeat_images", "eval_image_indices")
+@dataclass
+class SadgsDatamanagerConfig(FullImageDatamanagerConfig):
+    """nerfstudio's options, without those on the command line that its loader of whole images does not read."""
+
+    _target: type = field(default_factory=lambda: _class("datamanager", "SadgsDatamanager"))
+    dataparser: AnyParserConfig = field(default_factory=AutomaticDataParserConfig)
+    """How the folder is read: by default with the parser that fits what it holds."""
+    camera_res_scale_factor: float = 1.0
+    """Factor by which images and cameras are scaled when they are loaded; 0.5 trains at half the resolution."""
+    cache_images: Literal["gpu", "cpu", "compressed"] = "gpu"  # type: ignore[assignment]
+    """Where the images are kept: "gpu" is the device of training, as long as that leaves enough of its memory free.
+    Otherwise it is "cpu", decoded in the host's memory, or "compressed", files that are decoded ahead of their step."""
+    cache_images_type: Suppress[Literal["uint8", "float32"]] = "uint8"
+    """Images are kept as bytes, as they are in files; another type is refused."""
+
+
+def check_options(config: FullImageDatamanagerConfig) -> None:
+    """Raise InputError if an option of a datamanager, or of its parser of data, is out of its range."""
+    parser: Any = config.dataparser
+    ranges = {
+        "scale_factor": (lambda value: 0 < value < math.inf, "positive and finite"),
+        "train_split_fraction": (lambda value: 0 < value <= 1, "in (0, 1]"),
+        "eval_interval": (lambda value: value >= 2, "at least 2"),
+    }
+    for name, (fits, allowed) in ranges.items():
+        if hasattr(parser, name) and not fits(value := getattr(parser, name)):
+            raise InputError(f"{name}, an option of the data's parser, must be {allowed}, got {value:g}.")
+    if config.cache_images_type != "uint8":
+        raise InputError(
+            f"pipeline.datamanager.cache_images_type is {config.cache_images_type}, and sadgs keeps images as bytes, "
+            "which is what their files hold: leave it out."
+        )
+    if config.train_cameras_sampling_strategy != "random":
+        raise InputError(
+            f"pipeline.datamanager.train_cameras_sampling_strategy is {config.train_cameras_sampling_strategy}, and "
+            "sadgs takes each view once a round: leave it out."
+        )
+    scale = config.camera_res_scale_factor
+    check_ranges("pipeline.datamanager.", config, [("camera_res_scale_factor", 0 < scale <= 1, "in (0, 1]")])
+
+
+@dataclass
+class SadgsPipelineConfig(VanillaPipelineConfig):
+    """Options of the data, the model and the structure tensors of the images."""
+
+    _target: type = field(default_factory=lambda: _class("pipeline", "SadgsPipeline"))
+    datamanager: SadgsDatamanagerConfig = field(default_factory=SadgsDatamanagerConfig)
+    """How images are loaded and drawn."""
+    model: SadgsModelConfig = field(default_factory=SadgsModelConfig)
+    """The Gaussians and their densification."""
+    effort: float = 1.0
+    """How much training the capture is given, relative to what its number of views asks for.
+    0.5 is a draft of half as many renderings. 2 adds more Gaussians; 2 and 4 render more where views are many."""
+    views_per_iteration: int | None = None
+    """Training views rendered for one optimizer step, at most as many as there are; the loss is their mean.
+    None takes one more for every 2,000 renderings of the run, up to 4. The paper uses 1 outdoors, 2 indoors."""
+    memory_budget_gb: float | None = None
+    """Memory of the GPU, in 10⁹ bytes, that training may take; the cap of Gaussians is lowered to it at the start.
+    None is 80 % of what is free, unless `max_gaussians` was changed, which then stays."""
+    frequency_constant: float = FREQUENCY_CONSTANT
+    """c of ω_l = c / σ_l in 1/px, at most 4: the larger, the shorter every wavelength and the more is split."""
+    energy_blur: float = ENERGY_BLUR
+    """Window, in multiples of σ_l, over which the energy of a scale is averaged; 0 measures it per pixel (eq. 4)."""
+    epsilon: float | None = None
+    """ε of the structure tensor (eq. 3 and 5), for images in [0, 1].
+    None makes it relative to an image's contrast, so that the exposure of a photo does not decide what is split."""
+
+    def check(self) -> None:
+        """Raise InputError if an option is out of its range."""
+        views, epsilon, budget = self.views_per_iteration, self.epsilon, self.memory_budget_gb
+        ranges = [
+            ("effort", 0 < self.effort <= _MOST_EFFORT, f"in (0, {_MOST_EFFORT}]"),
+            ("views_per_iteration", views is None or views >= 1, "at least 1"),
+            ("energy_blur", 0 <= self.energy_blur <= _WIDEST_BLUR, f"in [0, {_WIDEST_BLUR}]"),
+            ("epsilon", epsilon is None or 0 < epsilon < math.inf, "positive and finite"),
+            ("memory_budget_gb", budget is None or 0 < budget < math.inf, "positive and finite"),
+        ]
+        check_ranges("pipeline.", self, ranges)
+        if not 0 < (constant := self.frequency_constant) <= HIGHEST_FREQUENCY:
+            raise InputError(f"pipeline.frequency_constant must be in (0, {HIGHEST_FREQUENCY:g}], got {constant}.")
+        check_options(self.datamanager)
+        self.model.check()
 
 
 @hide("num_machines", "machine_rank", "dist_url")
@@ -66,9 +276,10 @@ class SadgsViewerConfig(ViewerConfig):
 @hide("method_name", "prompt", "relative_model_dir", "load_scheduler", "log_gradients")
 @hide("mixed_precision", "use_grad_scaler", "gradient_accumulation_steps")  # The check below refuses them.
 @dataclass
-class CheckedTrainerConfig(TrainerConfig):
-    """nerfstudio's options of a trainer with this method's defaults, checked before a run starts."""
+class SadgsTrainerConfig(TrainerConfig):
+    """Options of `ns-train sadgs`, checked before a run starts."""
 
+    _target: type = field(default_factory=lambda: _class("trainer", "SadgsTrainer"))
     output_dir: Path = Path("outputs")
     """Folder in which each run gets a folder of its own."""
     experiment_name: str | None = None
@@ -236,65 +447,7 @@ class CheckedTrainerConfig(TrainerConfig):
                             f"makes {rate * factor:g} of {rate:g}."
                         )
 
-    def _check_folder(self) -> None:
-        """Raise InputError if the run would delete checkpoints of an earlier run in the same folder."""
-        folder = self.get_checkpoint_dir()
-        there = sorted(folder.glob("step-*.ckpt")) if os.path.isdir(folder) else []
-        start = self.load_dir if self.load_checkpoint is None else self.load_checkpoint.parent
-        if there and (start is None or start.resolve() not in (folder.resolve(), folder.parent.resolve())):
-            raise InputError(
-                f"{folder} holds {there[-1].name} of an earlier run, which this run would delete: go on from it with "
-                f"--load-dir {folder.parent} (load_dir in a config.yml), give another --timestamp, or remove it."
-            )
-
-    def _check_address(self) -> None:
-        """Raise InputError if the viewer cannot listen where it is told to.
-
-        viser would take the next free port, of which nerfstudio knows nothing, or look for one for ever.
-        """
-        host, port = self.viewer.websocket_host, self.viewer.websocket_port
-        try:
-            places = socket.getaddrinfo(host, port or 0, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        except OSError as error:
-            raise InputError(
-                f"viewer.websocket_host {host!r} is unknown ({reason(error)}): 127.0.0.1 opens the viewer to this "
-                "machine only, 0.0.0.0 to the network."
-            ) from error
-        try:
-            for family, _, _, _, address in places:
-                socket.create_server(address, family=family).close()
-        except OSError as error:
-            what = reason(error).partition(" (while")[0]
-            if error.errno == errno.EADDRINUSE:
-                told = (
-                    f"viewer.websocket_port {port} is taken on {host} ({what}): give another, or none for a free one."
-                )
-            else:
-                told = f"The viewer cannot listen on {host}{f':{port}' if port else ''} ({what}): give another "
-                told += "viewer.websocket_host or viewer.websocket_port."
-            raise InputError(told) from error
-
     def save_config(self) -> None:
-        """Write `config.yml`, the first file of a run, once options, checkpoint and data have been found good.
-
-        Raises:
-            InputError: If they are not; nothing is written then.
-            WriteError: If the folder cannot be written.
-        """
+        """Write `config.yml` if the run can begin; raises InputError as `check`, and as `run_folder.begin`."""
         self.check()
-        checkpoints.check_chosen(self.load_dir, self.load_step, self.load_checkpoint)
-        self._check_folder()
-        if not processes.is_first():
-            return  # torchrun's other processes leave the files to the first.
-        if self.is_viewer_enabled() or self.is_viewer_legacy_enabled():
-            self._check_address()
-        findings = check_capture(self.pipeline.datamanager)
-        CONSOLE.log(f"Saving config to: {self.write()}")
-        keep_findings(self.pipeline.datamanager, findings)  # After writing, so that `config.yml` holds none.
-
-    def write(self) -> Path:
-        """Write `config.yml` and return its path. Raise WriteError if that is not possible."""
-        path = self.get_base_dir() / "config.yml"
-        with atomic_path(path) as partial:
-            partial.write_text(yaml.dump(self), "utf8")
-        return path
+        begin(self)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,65 +16,18 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, Colm
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from rich.progress import track
 from torch import Tensor
-from tyro.conf import Suppress
 
 from sadgs_ns.data import colmap
 from sadgs_ns.data.checks import splits
-from sadgs_ns.data.parsers import OWN, AnyParserConfig, AutomaticDataParserConfig, choose_parser, points_in_the_run
+from sadgs_ns.data.parsers import OWN, choose_parser, points_in_the_run
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.memory import available_host_bytes
 from sadgs_ns.plugin.images import LazyImages, thread_count
-from sadgs_ns.plugin.options import check_ranges, hide
 from sadgs_ns.plugin.processes import processes_on_this_machine
-
-
-@hide("data", "train_cameras_sampling_seed")  # `--data` and `--machine.seed` set them.
-@hide("masks_on_gpu", "images_on_gpu", "max_thread_workers", "train_cameras_sampling_strategy", "fps_reset_every")
-@hide("eval_num_images_to_sample_from", "eval_num_times_to_repeat_images", "eval_image_indices")
-@dataclass
-class SadgsDatamanagerConfig(FullImageDatamanagerConfig):
-    """nerfstudio's options, without those on the command line that its loader of whole images does not read."""
-
-    _target: type = field(default_factory=lambda: SadgsDatamanager)
-    dataparser: AnyParserConfig = field(default_factory=AutomaticDataParserConfig)
-    """How the folder is read: by default with the parser that fits what it holds."""
-    camera_res_scale_factor: float = 1.0
-    """Factor by which images and cameras are scaled when they are loaded; 0.5 trains at half the resolution."""
-    cache_images: Literal["gpu", "cpu", "compressed"] = "gpu"  # type: ignore[assignment]
-    """Where the images are kept: "gpu" is the device of training, as long as that leaves enough of its memory free.
-    Otherwise it is "cpu", decoded in the host's memory, or "compressed", files that are decoded ahead of their step."""
-    cache_images_type: Suppress[Literal["uint8", "float32"]] = "uint8"
-    """Images are kept as bytes, as they are in files; another type is refused."""
-
 
 KEPT_FILES_SHARE = 0.25
 """Share of the host's free memory up to which the files of compressed images are kept in it, by all processes of the
 machine together; each may keep all of them in the course of a run."""
-
-
-def check_options(config: FullImageDatamanagerConfig) -> None:
-    """Raise InputError if an option of a datamanager, or of its parser of data, is out of its range."""
-    parser: Any = config.dataparser
-    ranges = {
-        "scale_factor": (lambda value: 0 < value < math.inf, "positive and finite"),
-        "train_split_fraction": (lambda value: 0 < value <= 1, "in (0, 1]"),
-        "eval_interval": (lambda value: value >= 2, "at least 2"),
-    }
-    for name, (fits, allowed) in ranges.items():
-        if hasattr(parser, name) and not fits(value := getattr(parser, name)):
-            raise InputError(f"{name}, an option of the data's parser, must be {allowed}, got {value:g}.")
-    if config.cache_images_type != "uint8":
-        raise InputError(
-            f"pipeline.datamanager.cache_images_type is {config.cache_images_type}, and sadgs keeps images as bytes, "
-            "which is what their files hold: leave it out."
-        )
-    if config.train_cameras_sampling_strategy != "random":
-        raise InputError(
-            f"pipeline.datamanager.train_cameras_sampling_strategy is {config.train_cameras_sampling_strategy}, and "
-            "sadgs takes each view once a round: leave it out."
-        )
-    scale = config.camera_res_scale_factor
-    check_ranges("pipeline.datamanager.", config, [("camera_res_scale_factor", 0 < scale <= 1, "in (0, 1]")])
 
 
 class SadgsDatamanager(FullImageDatamanager[InputDataset]):

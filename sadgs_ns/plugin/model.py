@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Any
 
 import torch
-from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.configs.base_config import InstantiateConfig
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.splatfacto import RGB2SH, SplatfactoModel, num_sh_bases, random_quat_tensor
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -29,7 +26,6 @@ from sadgs_ns.method.camera_paths import MOST_VIEWS, CameraPaths
 from sadgs_ns.method.clearance import clear_of_cameras, limit_scales
 from sadgs_ns.method.color_matrices import identities
 from sadgs_ns.method.initialization import (
-    POINT_OPACITY,
     camera_extent,
     neighbour_scales,
     plausible_points,
@@ -40,14 +36,14 @@ from sadgs_ns.method.near_plane import nearest_depths, scene_near_plane
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.outliers import POINT_SHARE, REACH
 from sadgs_ns.plugin import gaussian_maps
-from sadgs_ns.plugin.options import check_ranges, hide
+from sadgs_ns.plugin.config import SadgsModelConfig
 from sadgs_ns.plugin.outputs import LazyOutputs
 from sadgs_ns.plugin.run_plan import RunPlan
 from sadgs_ns.render.activations import activate
 from sadgs_ns.render.rasterization import choose_backend, rasterize, viewmats_from_camera_to_world
 from sadgs_ns.render.tile_forecast import TileForecast
-from sadgs_ns.render.types import BackendName, Gaussians, RenderOptions
 from sadgs_ns.render.types import Cameras as Pinholes
+from sadgs_ns.render.types import Gaussians, RenderOptions
 
 CAMERA_CLEARANCE = 2.0
 """Initial Gaussians nearer to a camera than this many of their standard deviations are dropped. The paper keeps them;
@@ -58,108 +54,6 @@ LIMIT_EVERY = 25
 """Iterations between two times that scales are limited; at the presets' rates an axis grows threefold until then."""
 _MOST_RANDOM = 10_000_000
 """Largest number of random points to start from; they take the host's memory before the cap thins them out."""
-
-
-@hide("trans_l2_penalty", "rot_l2_penalty")  # Others than nerfstudio's are refused below.
-@dataclass
-class PoseOptimizerConfig(CameraOptimizerConfig):
-    """nerfstudio's options of learned camera poses, with its own penalties, which hold them near the given ones."""
-
-    mode: Literal["off", "SO3xR3", "SE3"] = "off"
-    """Whether and how the cameras' poses are refined; SO3xR3 turns and moves each camera."""
-
-
-@hide("rasterize_mode")  # Files of the result look right with the default alone.
-@dataclass
-class SadgsModelConfig(InstantiateConfig):
-    """Options of the Gaussians, their loss and their densification.
-
-    The model is a splatfacto model, because nerfstudio's viewer and exporter ask for one; its configuration is not one
-    of splatfacto's, most of whose options concern a densification that this method replaces.
-    """
-
-    _target: type = field(default_factory=lambda: SadgsModel)
-    strategy: StructureAwareStrategy = field(default_factory=StructureAwareStrategy)
-    """When and how Gaussians are split, cloned and pruned."""
-    camera_optimizer: PoseOptimizerConfig = field(default_factory=PoseOptimizerConfig)
-    """Whether and how the cameras' poses are refined in training."""
-    backend: BackendName = "auto"
-    """What draws: auto takes Triton's kernels where they work, gsplat's on other CUDA devices, and torch elsewhere.
-    gsplat trains on one GPU, without CUDA graphs."""
-    background_color: Literal["black", "white"] = "black"
-    """Colour behind the Gaussians."""
-    random_init: bool = False
-    """Start from random points even where the data has SfM points."""
-    num_random: int = 50000
-    """Number of random points to start from, where there are no SfM points or they are not wanted."""
-    random_scale: float = 10.0
-    """Side of the cube around the origin in which random points are drawn, in the run's units."""
-    bounding_box_points: bool = True
-    """Also start from points on the faces of the SfM points' bounding box, which become sky and far background."""
-    stereo_points: int | None = None
-    """Points to start from beside the SfM points, at most, drawn from stereo depth of the training photos (CUDA).
-    None is 150,000 where there are 3 to 60 training views, and otherwise none."""
-    clear_paths: bool | None = None
-    """Let each densification step prune what floats near the cameras' paths, which viewers of files show as haze.
-    None does so where there are at most 60 training views."""
-    initial_opacity: float = POINT_OPACITY
-    """Opacity at which SfM points start, in (0, 1); random ones start at 0.1.
-    Half opaque ones mostly have a lower LPIPS and make more Gaussians (docs/results.md)."""
-    sh_degree: int = 3
-    """Degree of the spherical harmonics that make colours depend on the direction of view, 0 to 3."""
-    rasterize_mode: Literal["classic", "antialiased"] = "classic"
-    """How Gaussians smaller than a pixel are drawn: "classic" as in 3DGS, "antialiased" fades them by their size.
-    Viewers of PLY files expect "classic"."""
-    ssim_lambda: float = 0.6
-    """Weight of SSIM against L1 in the loss, in [0, 1]. The paper's 0.2 resolves less detail for as many Gaussians."""
-    opacity_reg: float = 0.01
-    """Weight of the mean opacity in the loss while densification runs: what no image needs fades until it is pruned.
-    Larger leaves fewer Gaussians; 0 is off, as in the paper."""
-    averaged_share: float = 0.05
-    """Share of the run, at its end, over which the Gaussians' parameters are averaged, in [0, 0.3].
-    The finished run has the mean; 0 leaves it the last iteration's."""
-    max_off_axis: float = 4.0
-    """Gaussians whose centre is projected further from the image's centre, in half images along x or y, are not drawn.
-    Far off the axis a Gaussian's image is wrong, and can be haze over the view; 0 draws all."""
-    near_plane: float | None = None
-    """Depth from which Gaussians are drawn, in the run's units; nothing nearer is, in training or later.
-    None is half the depth at which a training camera's fifth SfM point lies, of the camera that comes nearest."""
-    max_angular_scale: float = 0.3
-    """Longest standard deviation of a Gaussian as a share of its distance from the nearest training camera.
-    A longer one can cover a view beside which it lies with haze; 0 sets no limit."""
-    color_model: Literal["none", "affine"] = "none"
-    """What is learned of each training photo's exposure and white balance, which held-out views are rendered without.
-    "affine" is a colour matrix."""
-    color_corrected_metrics: bool = False
-    """Also report metrics after fitting the colours of each rendering to its photo, as suits changing exposure."""
-
-    def check(self) -> None:
-        """Raise InputError if an option is out of its range."""
-        near, stereo, off_axis, angle = self.near_plane, self.stereo_points, self.max_off_axis, self.max_angular_scale
-        ranges = [
-            ("ssim_lambda", 0 <= self.ssim_lambda <= 1, "in [0, 1]"),
-            ("background_color", self.background_color in ("black", "white"), "black or white"),
-            ("initial_opacity", 0 < self.initial_opacity < 1, "in (0, 1)"),
-            ("opacity_reg", 0 <= self.opacity_reg <= 100, "in [0, 100]"),
-            ("averaged_share", 0 <= self.averaged_share <= 0.3, "in [0, 0.3]"),
-            ("max_off_axis", 0 <= off_axis < math.inf, "finite and not negative"),
-            ("max_angular_scale", 0 <= angle < math.inf, "finite and not negative"),
-            ("max_off_axis", off_axis == 0 or off_axis >= 1, "0, or at least 1, the image's border"),
-            ("near_plane", near is None or 0 < near < math.inf, "positive and finite"),
-            ("sh_degree", 0 <= self.sh_degree <= 3, "in [0, 3]"),
-            ("num_random", 1 <= self.num_random <= _MOST_RANDOM, f"in [1, {_MOST_RANDOM:,}]"),
-            ("stereo_points", stereo is None or 0 <= stereo <= _MOST_RANDOM, f"in [0, {_MOST_RANDOM:,}]"),
-            ("random_scale", 0 < self.random_scale < math.inf, "positive and finite"),
-        ]
-        check_ranges("pipeline.model.", self, ranges)
-        for name in ("trans_l2_penalty", "rot_l2_penalty"):
-            if (penalty := getattr(self.camera_optimizer, name)) != getattr(PoseOptimizerConfig, name):
-                told = f"cannot be set, got {penalty:g}: leave it out."
-                raise InputError(f"pipeline.model.camera_optimizer.{name} {told}")
-        try:
-            self.strategy.check()
-        except ValueError as error:
-            raise InputError(f"pipeline.model.{error}") from error
 
 
 class SadgsModel(SplatfactoModel):

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
-from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 from torch import Tensor
@@ -21,15 +20,13 @@ from sadgs_ns.data.parsers import findings_of
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
 from sadgs_ns.gsplat_compat import FAR_PLANE
-from sadgs_ns.method.quantization import HIGHEST_FREQUENCY
-from sadgs_ns.method.structure_tensor import ENERGY_BLUR, FREQUENCY_CONSTANT
 from sadgs_ns.plugin import nonfinite
 from sadgs_ns.plugin.cleaning_panel import CleaningPanel
-from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig, check_options
+from sadgs_ns.plugin.config import SadgsPipelineConfig
+from sadgs_ns.plugin.datamanager import SadgsDatamanager
 from sadgs_ns.plugin.memory_plan import place_images
-from sadgs_ns.plugin.model import NORMALS, SadgsModel, SadgsModelConfig, in_viewer
+from sadgs_ns.plugin.model import NORMALS, SadgsModel, in_viewer
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
-from sadgs_ns.plugin.options import check_ranges
 from sadgs_ns.plugin.panel import StructurePanel
 from sadgs_ns.plugin.run_plan import RunPlan
 from sadgs_ns.plugin.structure_cache import StructureCache
@@ -47,49 +44,6 @@ _WIDEST_BLUR = 100
 """Largest window of `energy_blur`, which makes kernels of thousands of pixels."""
 _SAMPLED = 1000
 """About so many cameras, and Gaussians, are enough to find out whether training can see anything."""
-
-
-@dataclass
-class SadgsPipelineConfig(VanillaPipelineConfig):
-    """Options of the data, the model and the structure tensors of the images."""
-
-    _target: type = field(default_factory=lambda: SadgsPipeline)
-    datamanager: SadgsDatamanagerConfig = field(default_factory=SadgsDatamanagerConfig)
-    """How images are loaded and drawn."""
-    model: SadgsModelConfig = field(default_factory=SadgsModelConfig)
-    """The Gaussians and their densification."""
-    effort: float = 1.0
-    """How much training the capture is given, relative to what its number of views asks for.
-    0.5 is a draft of half as many renderings. 2 adds more Gaussians; 2 and 4 render more where views are many."""
-    views_per_iteration: int | None = None
-    """Training views rendered for one optimizer step, at most as many as there are; the loss is their mean.
-    None takes one more for every 2,000 renderings of the run, up to 4. The paper uses 1 outdoors, 2 indoors."""
-    memory_budget_gb: float | None = None
-    """Memory of the GPU, in 10⁹ bytes, that training may take; the cap of Gaussians is lowered to it at the start.
-    None is 80 % of what is free, unless `max_gaussians` was changed, which then stays."""
-    frequency_constant: float = FREQUENCY_CONSTANT
-    """c of ω_l = c / σ_l in 1/px, at most 4: the larger, the shorter every wavelength and the more is split."""
-    energy_blur: float = ENERGY_BLUR
-    """Window, in multiples of σ_l, over which the energy of a scale is averaged; 0 measures it per pixel (eq. 4)."""
-    epsilon: float | None = None
-    """ε of the structure tensor (eq. 3 and 5), for images in [0, 1].
-    None makes it relative to an image's contrast, so that the exposure of a photo does not decide what is split."""
-
-    def check(self) -> None:
-        """Raise InputError if an option is out of its range."""
-        views, epsilon, budget = self.views_per_iteration, self.epsilon, self.memory_budget_gb
-        ranges = [
-            ("effort", 0 < self.effort <= _MOST_EFFORT, f"in (0, {_MOST_EFFORT}]"),
-            ("views_per_iteration", views is None or views >= 1, "at least 1"),
-            ("energy_blur", 0 <= self.energy_blur <= _WIDEST_BLUR, f"in [0, {_WIDEST_BLUR}]"),
-            ("epsilon", epsilon is None or 0 < epsilon < math.inf, "positive and finite"),
-            ("memory_budget_gb", budget is None or 0 < budget < math.inf, "positive and finite"),
-        ]
-        check_ranges("pipeline.", self, ranges)
-        if not 0 < (constant := self.frequency_constant) <= HIGHEST_FREQUENCY:
-            raise InputError(f"pipeline.frequency_constant must be in (0, {HIGHEST_FREQUENCY:g}], got {constant}.")
-        check_options(self.datamanager)
-        self.model.check()
 
 
 class SadgsPipeline(VanillaPipeline):

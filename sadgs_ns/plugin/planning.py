@@ -11,9 +11,9 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 
 from sadgs_ns.method.schedule import Schedule, growth_threshold, schedule
-from sadgs_ns.plugin.config import CheckedTrainerConfig
+from sadgs_ns.plugin.config import SadgsPipelineConfig, SadgsTrainerConfig
 from sadgs_ns.plugin.memory_plan import fit_to_memory, training_size
-from sadgs_ns.plugin.pipeline import SadgsPipeline, SadgsPipelineConfig
+from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.plugin.progress import about_cpu
 from sadgs_ns.plugin.run_plan import RunPlan, plan_rates
 
@@ -28,7 +28,7 @@ _OF_THE_CAP = ("memory_budget_gb", "model.strategy.max_gaussians")
 """Options that decide the cap of Gaussians."""
 
 
-def plan_length(config: CheckedTrainerConfig, views: int, before: RunPlan | None) -> Schedule:
+def plan_length(config: SadgsTrainerConfig, views: int, before: RunPlan | None) -> Schedule:
     """Decide the length of a run of so many training views, and the views of a step.
 
     By hand, or as in the checkpoint's run, whose plan is `before`, if the effort is the same, or by rule.
@@ -61,7 +61,7 @@ def _pixels(cameras: Cameras) -> float:
 
 
 def plan_run(
-    config: CheckedTrainerConfig,
+    config: SadgsTrainerConfig,
     pipeline: SadgsPipeline,
     length: Schedule,
     *,
@@ -132,7 +132,7 @@ def _tell_changes(now: dict[str, Any], before: dict[str, Any]) -> None:
         )
 
 
-def _tell_length(config: CheckedTrainerConfig, pipeline: SadgsPipeline, length: Schedule, done: int) -> None:
+def _tell_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: Schedule, done: int) -> None:
     """Print how long the run is, and what decided it."""
     cameras, options, taken = pipeline.datamanager.train_dataset.cameras, config.pipeline, length.views_per_iteration
     views, asked, iterations = len(cameras), options.views_per_iteration, length.iterations

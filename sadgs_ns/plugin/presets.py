@@ -8,15 +8,13 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from sadgs_ns.method.schedule import DENSIFICATION_SHARE
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.plugin.model import SadgsModelConfig
+from sadgs_ns.plugin.config import SadgsModelConfig, SadgsPipelineConfig, SadgsTrainerConfig
 from sadgs_ns.plugin.optimizers import (
     FusedAdamOptimizerConfig,
     RunLengthDecaySchedulerConfig,
     UnlistedAdamOptimizerConfig,
     UnlistedDecaySchedulerConfig,
 )
-from sadgs_ns.plugin.pipeline import SadgsPipelineConfig
-from sadgs_ns.plugin.trainer import SadgsTrainerConfig
 
 RATES: dict[str, tuple[float, float, float]] = {
     "means": (1.6e-4, 1.0, 0.01),

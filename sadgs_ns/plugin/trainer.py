@@ -8,7 +8,6 @@ import os
 import shlex
 import signal
 import time
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ from sadgs_ns.errors import InputError, RunError, WriteError, reason
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.plugin import checkpoints, processes
 from sadgs_ns.plugin.compilation import compile_kernels
-from sadgs_ns.plugin.config import CheckedTrainerConfig
+from sadgs_ns.plugin.config import SadgsTrainerConfig
 from sadgs_ns.plugin.cuda_graphs import GraphedSteps
 from sadgs_ns.plugin.interrupts import HANG_UP, SIGNALS, Interrupted, Interrupts
 from sadgs_ns.plugin.lost_output import drop_lost_output, print_elsewhere_once_unread
@@ -34,6 +33,7 @@ from sadgs_ns.plugin.pipeline import SadgsPipeline
 from sadgs_ns.plugin.planning import one_device_is_quicker, plan_length, plan_run
 from sadgs_ns.plugin.progress import remove_tables, what_next
 from sadgs_ns.plugin.resume import Resumption
+from sadgs_ns.plugin.run_folder import write_config
 from sadgs_ns.plugin.stereo_start import start_from_stereo
 from sadgs_ns.plugin.train_step import training_step
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
@@ -50,13 +50,6 @@ _SAVING_SHARE = 0.01
 def _memory(error: torch.cuda.OutOfMemoryError) -> str:
     """Return the first two of torch's many sentences, which say how much memory was asked for, and of whom."""
     return ". ".join(reason(error).split(". ")[:2]).rstrip(".")
-
-
-@dataclass
-class SadgsTrainerConfig(CheckedTrainerConfig):
-    """Options of `ns-train sadgs`."""
-
-    _target: type = field(default_factory=lambda: SadgsTrainer)
 
 
 class SadgsTrainer(Trainer):
@@ -369,7 +362,7 @@ class SadgsTrainer(Trainer):
             config.max_num_iterations = total
             config.load_dir, config.load_step, config.load_checkpoint = self.checkpoint_dir, None, None
             config.vis = self._vis
-            file = config.write() if processes.is_first() else self.base_dir / "config.yml"
+            file = write_config(config) if processes.is_first() else self.base_dir / "config.yml"
             command = shlex.join(["ns-train", str(config.method_name), "--load-config", str(file)])
             text = f"{interrupted}: stopped and saved after {done} of {total} iterations; resume with: {command}"
         if interrupted.number == HANG_UP:  # Some systems send it before they take the terminal away.

@@ -31,6 +31,7 @@ from sadgs_ns.data.coordinates import Similarity, from_data, spherical_harmonics
 from sadgs_ns.data.run_cameras import find_capture, read_cameras
 from sadgs_ns.errors import InputError
 from sadgs_ns.formats import FORMATS, html
+from sadgs_ns.plugin.run_folder import write_config
 from sadgs_ns.plugin.trainer import SadgsTrainer
 
 WIDTH, HEIGHT, VIEWS = 48, 36, 10
@@ -93,7 +94,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SadgsTraine
     params["features_rest"].data = 0.3 * torch.randn(params["features_rest"].shape, generator=generator)
     params["opacities"].data = torch.randn(params["opacities"].shape, generator=generator)
     trainer.save_checkpoint(11)
-    trainer.config.write()
+    write_config(trainer.config)
     return folder / "scene", trainer
 
 
@@ -316,7 +317,7 @@ def test_the_cameras_of_a_run_are_those_of_training_however_it_moved_the_capture
     assert held_out and not held_out & {path.name for path in found.photos}
 
 
-def write_config(run: Path, parser: Any) -> None:
+def write_parser_config(run: Path, parser: Any) -> None:
     """What nerfstudio writes of a run, as far as its cameras need it."""
     run.mkdir()
     manager = FullImageDatamanagerConfig(data=None, dataparser=parser)
@@ -335,7 +336,7 @@ def test_the_cameras_are_read_as_the_run_read_them(tmp_path: Path):
     parser = parser_of(tmp_path / "scene")
     parser.colmap_path, parser.eval_interval = Path("sparse/1"), 3
     expected = parser.setup().get_dataparser_outputs("train").cameras
-    write_config(tmp_path / "run", parser)
+    write_parser_config(tmp_path / "run", parser)
     found = read_cameras(tmp_path / "run")
     assert len(found.photos) == len(expected) == VIEWS - len(range(0, VIEWS, 3))
     np.testing.assert_array_equal(found.camera_to_worlds, expected.camera_to_worlds)
@@ -360,7 +361,7 @@ def test_the_cameras_of_a_moved_capture_are_the_run_s(options: dict, tmp_path: P
     (tmp_path / "scene/images").rename(tmp_path / "scene" / parser.images_path)
     (tmp_path / "scene" / f"{parser.images_path}_2").mkdir()
     expected = parser.setup().get_dataparser_outputs("train")
-    write_config(tmp_path / "run", parser)
+    write_parser_config(tmp_path / "run", parser)
     (tmp_path / "scene" / f"{parser.images_path}_2").rmdir()
     (tmp_path / "scene").rename(tmp_path / "moved")
     monkeypatch.setattr("rich.prompt.Confirm.ask", None)
@@ -378,7 +379,7 @@ def test_data_may_be_a_copy_of_another_layout(tmp_path: Path):
     parser = nerfstudio_data(tmp_path / "data")
     parser.data = (tmp_path / "data/transforms.json").rename(tmp_path / "data/other.json")
     parser.eval_mode, parser.eval_interval = "interval", 3
-    write_config(tmp_path / "run", parser)
+    write_parser_config(tmp_path / "run", parser)
     expected = parser.setup().get_dataparser_outputs("train").cameras.camera_to_worlds
     np.testing.assert_array_equal(read_cameras(tmp_path / "run").camera_to_worlds, expected)
     with pytest.raises(InputError, match=r"data cannot be read as a capture \(.*: give another with --data\.$"):
@@ -401,7 +402,7 @@ def test_cameras_are_read_without_their_points(ply: bool, tmp_path: Path, monkey
     (tmp_path / "data/transforms.json").write_text(json.dumps(meta | ({"ply_file_path": "points.ply"} if ply else {})))
     (tmp_path / "data/colmap/sparse/0").mkdir(parents=True)
     parser.load_3D_points = True
-    write_config(tmp_path / "run", parser)
+    write_parser_config(tmp_path / "run", parser)
     before = sorted((path, path.stat().st_mtime_ns) for path in (tmp_path / "data").rglob("*"))
     monkeypatch.setitem(sys.modules, "open3d", None)  # type: ignore[arg-type]  # Importing it raises ImportError.
     monkeypatch.setattr("rich.prompt.Confirm.ask", None)

@@ -37,8 +37,8 @@ from benchmarks import protocol, run
 from benchmarks.protocol import Row, Scene
 from examples.drawn_scene.scene import SPARSE_FOLDER
 from sadgs_ns.plugin import presets
-from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
-from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
+from sadgs_ns.plugin.config import SadgsDatamanagerConfig, SadgsTrainerConfig
+from sadgs_ns.plugin.trainer import SadgsTrainer
 
 
 class Payload:

@@ -20,7 +20,8 @@ from sadgs_ns.gsplat_compat import RADII_PER_AXIS
 from sadgs_ns.plugin import compilation
 from sadgs_ns.plugin import config as config_module
 from sadgs_ns.plugin import model as model_module
-from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
+from sadgs_ns.plugin.config import SadgsTrainerConfig
+from sadgs_ns.plugin.trainer import SadgsTrainer
 from sadgs_ns.render import rasterization
 
 ON_GPU = torch.cuda.is_available()

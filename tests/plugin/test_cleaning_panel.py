@@ -14,8 +14,8 @@ from runs import in_the_viewer
 
 from sadgs_ns.method.cleaning import Cleaning, find, see
 from sadgs_ns.plugin.cleaning_panel import GOES, OUTPUT, STAYS, CleaningPanel, command_line_options
+from sadgs_ns.plugin.config import SadgsTrainerConfig
 from sadgs_ns.plugin.pipeline import SadgsPipeline
-from sadgs_ns.plugin.trainer import SadgsTrainerConfig
 
 
 @pytest.fixture

@@ -16,7 +16,8 @@ from benchmarks import exposures
 from benchmarks.evaluate import quality
 from examples.drawn_scene.scene import write_scene
 from sadgs_ns.method.color_matrices import anchored
-from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
+from sadgs_ns.plugin.config import SadgsTrainerConfig
+from sadgs_ns.plugin.trainer import SadgsTrainer
 
 WIDTH, HEIGHT, VIEWS, POINTS = 64, 48, 14, 1500
 """Of the room; fewer points, or smaller photos, tell too little of their exposure."""

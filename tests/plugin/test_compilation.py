@@ -12,7 +12,8 @@ from triton_compiler import run_with_the_compiler
 
 from sadgs_ns import kernels
 from sadgs_ns.plugin import compilation
-from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
+from sadgs_ns.plugin.config import SadgsTrainerConfig
+from sadgs_ns.plugin.trainer import SadgsTrainer
 
 FIRST_RUN = """
 import sys

@@ -27,12 +27,17 @@ import sadgs_ns.plugin.model
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin import presets, stereo_start
-from sadgs_ns.plugin.config import CheckedTrainerConfig, SadgsMachineConfig, SadgsViewerConfig
-from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
-from sadgs_ns.plugin.model import PoseOptimizerConfig, SadgsModel, SadgsModelConfig
+from sadgs_ns.plugin.config import (
+    PoseOptimizerConfig,
+    SadgsDatamanagerConfig,
+    SadgsMachineConfig,
+    SadgsModelConfig,
+    SadgsPipelineConfig,
+    SadgsTrainerConfig,
+    SadgsViewerConfig,
+)
+from sadgs_ns.plugin.model import SadgsModel
 from sadgs_ns.plugin.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
-from sadgs_ns.plugin.pipeline import SadgsPipelineConfig
-from sadgs_ns.plugin.trainer import SadgsTrainerConfig
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -44,7 +49,7 @@ NO_OPTIONS = {"_fitted", "world"}
 """Attributes of the strategy that are decided in each run."""
 METHODS = ("sadgs", "sadgs-paper", "sadgs-paper-indoor")
 CONFIG_CLASSES = (
-    CheckedTrainerConfig,
+    SadgsTrainerConfig,
     SadgsMachineConfig,
     SadgsViewerConfig,
     SadgsPipelineConfig,

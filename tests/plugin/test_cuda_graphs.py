@@ -19,8 +19,9 @@ from torch import Tensor
 
 from sadgs_ns import kernels
 from sadgs_ns.plugin import cuda_graphs, optimizers
+from sadgs_ns.plugin.config import SadgsTrainerConfig
 from sadgs_ns.plugin.cuda_graphs import Results
-from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
+from sadgs_ns.plugin.trainer import SadgsTrainer
 
 adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
 

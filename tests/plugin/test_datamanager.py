@@ -28,7 +28,8 @@ from sadgs_ns.data import ply
 from sadgs_ns.data.checks.geometry import check_ply
 from sadgs_ns.data.parsers import check_capture
 from sadgs_ns.errors import InputError
-from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig
+from sadgs_ns.plugin.config import SadgsDatamanagerConfig
+from sadgs_ns.plugin.datamanager import SadgsDatamanager
 
 READ = ("points3D_xyz", "points3D_rgb")
 

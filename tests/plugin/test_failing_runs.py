@@ -32,8 +32,10 @@ from scenes import HEIGHT, WIDTH
 from sadgs_ns.cli.export import write_gaussians
 from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.plugin import checkpoints, nonfinite
+from sadgs_ns.plugin.config import SadgsTrainerConfig
 from sadgs_ns.plugin.presets import sadgs
-from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
+from sadgs_ns.plugin.run_folder import write_config
+from sadgs_ns.plugin.trainer import SadgsTrainer
 
 ITERATIONS = 6
 
@@ -241,7 +243,7 @@ def test_a_viewer_that_cannot_listen_where_it_is_told_to_is_refused(config: Sadg
 def test_options_beside_a_config_that_nerfstudio_would_not_read_are_refused(
     config: SadgsTrainerConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    preset, file = sadgs.config, config.write()
+    preset, file = sadgs.config, write_config(config)
     dataclasses.replace(preset, load_config=file).print_to_terminal()
     assert capsys.readouterr().out == ""
     with pytest.raises(InputError) as refused:

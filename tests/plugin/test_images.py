@@ -25,7 +25,8 @@ from sadgs_ns.cli.inspection import get_view
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.plugin import structure_cache
-from sadgs_ns.plugin.datamanager import SadgsDatamanager, SadgsDatamanagerConfig
+from sadgs_ns.plugin.config import SadgsDatamanagerConfig
+from sadgs_ns.plugin.datamanager import SadgsDatamanager
 from sadgs_ns.plugin.prefetch import ImagePrefetcher
 from sadgs_ns.plugin.structure_cache import StructureCache, observe_training_views
 from sadgs_ns.plugin.trainer import SadgsTrainer

@@ -38,11 +38,12 @@ from examples.drawn_scene.scene import SPARSE_FOLDER
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.near_plane import NEAR_SHARE
 from sadgs_ns.method.quantization import dequantize
+from sadgs_ns.plugin.config import SadgsTrainerConfig
 from sadgs_ns.plugin.model import SadgsModel, _load_lpips
 from sadgs_ns.plugin.optimizers import AdamUpdate, FusedAdam
 from sadgs_ns.plugin.presets import RATES
 from sadgs_ns.plugin.train_step import training_step
-from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
+from sadgs_ns.plugin.trainer import SadgsTrainer
 from sadgs_ns.plugin.views import ViewSampler
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world, visible
 from sadgs_ns.render.types import Cameras as Pinholes

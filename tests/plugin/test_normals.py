@@ -18,11 +18,13 @@ from PIL import Image
 from runs import in_the_viewer
 from scenes import HEIGHT, WIDTH, camera
 
+from sadgs_ns.plugin.config import SadgsTrainerConfig
 from sadgs_ns.plugin.gaussian_maps import normals_map
 from sadgs_ns.plugin.model import NORMALS, SadgsModel
 from sadgs_ns.plugin.outputs import LazyOutputs
 from sadgs_ns.plugin.pipeline import SadgsPipeline
-from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
+from sadgs_ns.plugin.run_folder import write_config
+from sadgs_ns.plugin.trainer import SadgsTrainer
 from sadgs_ns.plugin.viewer import shows_output
 
 
@@ -158,7 +160,7 @@ def test_the_viewer_renders_normals_only_where_it_shows_them(trainer: SadgsTrain
 
 def test_ns_render_writes_depth_and_normals(trainer: SadgsTrainer, tmp_path: Path, counted: Callable[[], int]):
     trainer.save_checkpoint(0)
-    config, output = trainer.config.write(), tmp_path / "renders"
+    config, output = write_config(trainer.config), tmp_path / "renders"
     command = DatasetRender(config, output_path=output, image_format="png")
     command.rendered_output_names = ["rgb", "depth"]
     command.main()

@@ -26,6 +26,7 @@ from runs import train
 from sadgs_ns import errors
 from sadgs_ns.errors import InputError
 from sadgs_ns.plugin.model import SadgsModel
+from sadgs_ns.plugin.run_folder import write_config
 
 HELD_OUT = {0: 1.0, 1: 0.9}
 """Number of held-out views, and the share of the drawn scene's 10 views that is then trained on."""
@@ -39,7 +40,7 @@ def run(request: pytest.FixtureRequest, scene: Path, tmp_path_factory: pytest.Te
     config.pipeline.datamanager.dataparser = dataclasses.replace(
         parser, eval_mode="fraction", train_split_fraction=HELD_OUT[request.param]
     )
-    return request.param, train(config).config.write()
+    return request.param, write_config(train(config).config)
 
 
 @pytest.fixture(autouse=True)

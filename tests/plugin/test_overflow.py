@@ -20,8 +20,8 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from runs import TRAIN_VIEWS, configure
 from torch import Tensor
 
+from sadgs_ns.plugin.config import SadgsTrainerConfig
 from sadgs_ns.plugin.model import SadgsModel
-from sadgs_ns.plugin.trainer import SadgsTrainerConfig
 from sadgs_ns.render.tile_forecast import TileForecast
 
 pytestmark = pytest.mark.skipif(torch.cuda.is_available(), reason="on the CPU Triton is interpreted")

@@ -9,9 +9,9 @@ from kill_and_resume import set_up
 
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin import panel as panel_module
+from sadgs_ns.plugin.config import SadgsTrainerConfig
 from sadgs_ns.plugin.panel import ROWS, StructurePanel, describe
 from sadgs_ns.plugin.pipeline import SadgsPipeline
-from sadgs_ns.plugin.trainer import SadgsTrainerConfig
 
 
 def structure_step(iteration: int, before: int, after: int) -> dict[str, int]:

@@ -23,8 +23,8 @@ from scenes import ITERATIONS
 
 from sadgs_ns.cli import export
 from sadgs_ns.plugin import progress
+from sadgs_ns.plugin.config import SadgsTrainerConfig
 from sadgs_ns.plugin.progress import ProgressTable, about_cpu, duration, remove_tables
-from sadgs_ns.plugin.trainer import SadgsTrainerConfig
 
 
 @pytest.fixture

@@ -46,10 +46,11 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.method.schedule import Schedule, schedule
 from sadgs_ns.plugin import planning
 from sadgs_ns.plugin.checkpoints import checkpoint_paths
+from sadgs_ns.plugin.config import SadgsTrainerConfig
 from sadgs_ns.plugin.interrupts import SIGNALS
 from sadgs_ns.plugin.pipeline import camera_positions
 from sadgs_ns.plugin.resume import refuse_other_capture
-from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
+from sadgs_ns.plugin.trainer import SadgsTrainer
 
 
 def after(trainer: SadgsTrainer, at: int, act: Callable[[], None]) -> None:

@@ -18,8 +18,9 @@ import sadgs_ns
 from examples.drawn_scene.scene import write_scene
 from sadgs_ns.cli import export
 from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.plugin.config import SadgsTrainerConfig
 from sadgs_ns.plugin.run_plan import Rate, RunPlan
-from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
+from sadgs_ns.plugin.trainer import SadgsTrainer
 from sadgs_ns.render.types import RenderOptions
 
 OPTIONS, RATES = ({field.name for field in dataclasses.fields(cls)} for cls in (StructureAwareStrategy, Rate))

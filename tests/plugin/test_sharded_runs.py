@@ -29,9 +29,10 @@ from torch.multiprocessing.spawn import ProcessExitedException, ProcessRaisedExc
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.plugin import trainer as trainer_module
+from sadgs_ns.plugin.config import SadgsTrainerConfig
 from sadgs_ns.plugin.presets import sadgs
 from sadgs_ns.plugin.processes import Peers
-from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
+from sadgs_ns.plugin.trainer import SadgsTrainer
 
 
 @pytest.mark.parametrize(("ranks", "views"), [(2, 2), (3, 2)])

@@ -11,7 +11,8 @@ import pytest
 from kill_and_resume import set_up
 from scenes import HEIGHT, ITERATIONS, WIDTH
 
-from sadgs_ns.plugin.trainer import SadgsTrainer, SadgsTrainerConfig
+from sadgs_ns.plugin.config import SadgsTrainerConfig
+from sadgs_ns.plugin.trainer import SadgsTrainer
 
 LATER = (
     "sadgs_ns.cli", "benchmarks", "examples.drawn_scene", "pycolmap", "torchmetrics", "matplotlib.figure", "open3d",

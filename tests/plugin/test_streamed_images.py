@@ -20,12 +20,11 @@ from sharded_runs import STRUCTURE_EVERY, few_steps, record, set_up_together
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.method import memory
-from sadgs_ns.plugin.datamanager import SadgsDatamanagerConfig
+from sadgs_ns.plugin.config import SadgsDatamanagerConfig, SadgsTrainerConfig
 from sadgs_ns.plugin.images import LazyImages, thread_count
 from sadgs_ns.plugin.memory_plan import image_bytes, place_images
 from sadgs_ns.plugin.prefetch import ImagePrefetcher
 from sadgs_ns.plugin.structure_cache import StructureCache
-from sadgs_ns.plugin.trainer import SadgsTrainerConfig
 from sadgs_ns.plugin.views import TrainingViews
 
 TRAINING = VIEWS - 1
