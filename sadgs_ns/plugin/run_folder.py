@@ -6,6 +6,7 @@ import errno
 import os
 import socket
 from pathlib import Path
+from typing import Any
 
 import yaml
 from nerfstudio.configs.base_config import ViewerConfig
@@ -31,9 +32,10 @@ def begin(config: TrainerConfig) -> None:
         return  # torchrun's other processes leave the files to the first.
     if config.is_viewer_enabled() or config.is_viewer_legacy_enabled():
         _check_address(config.viewer)
-    findings = check_capture(config.pipeline.datamanager)
+    data: Any = config.pipeline.datamanager
+    findings = check_capture(data)
     CONSOLE.log(f"Saving config to: {write_config(config)}")
-    keep_findings(config.pipeline.datamanager, findings)  # After writing, so that `config.yml` holds none.
+    keep_findings(data, findings)  # After writing, so that `config.yml` holds none.
 
 
 def write_config(config: TrainerConfig) -> Path:
