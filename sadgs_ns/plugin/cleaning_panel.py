@@ -17,7 +17,8 @@ from torch import Tensor
 
 from sadgs_ns.errors import reason
 from sadgs_ns.method.cleaning import Cleaning, Seen, find, see
-from sadgs_ns.plugin.model import SadgsModel, in_viewer
+from sadgs_ns.plugin.model import SadgsModel
+from sadgs_ns.plugin.outputs import in_viewer
 from sadgs_ns.plugin.viewer import ViewerMarkdown, show_output
 from sadgs_ns.plugin.views import TrainingViews
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from dataclasses import asdict, replace
 from functools import lru_cache
@@ -11,10 +10,7 @@ from typing import Any
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
-from nerfstudio.models.splatfacto import RGB2SH, SplatfactoModel, num_sh_bases, random_quat_tensor
-from nerfstudio.utils.rich_utils import CONSOLE
-from pytorch_msssim import SSIM
-from rich.markup import escape
+from nerfstudio.models.splatfacto import SplatfactoModel
 from torch import Tensor
 
 from sadgs_ns.data.cameras import check_camera_types
@@ -23,21 +19,19 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.method.averaging import RunningMean
 from sadgs_ns.method.camera_paths import MOST_VIEWS, CameraPaths
-from sadgs_ns.method.clearance import clear_of_cameras, limit_scales
+from sadgs_ns.method.clearance import limit_scales
 from sadgs_ns.method.color_matrices import identities
 from sadgs_ns.method.initialization import (
     camera_extent,
-    neighbour_scales,
-    plausible_points,
-    starting_points,
 )
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.near_plane import nearest_depths, scene_near_plane
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.outliers import POINT_SHARE, REACH
 from sadgs_ns.plugin import gaussian_maps
 from sadgs_ns.plugin.config import SadgsModelConfig
-from sadgs_ns.plugin.outputs import LazyOutputs
+from sadgs_ns.plugin.initial_gaussians import beside, initial_gaussians, outside_cameras
+from sadgs_ns.plugin.metrics import MeasuredModel
+from sadgs_ns.plugin.outputs import LazyOutputs, in_viewer, say_once
 from sadgs_ns.plugin.run_plan import RunPlan
 from sadgs_ns.render.activations import activate
 from sadgs_ns.render.rasterization import choose_backend, rasterize, viewmats_from_camera_to_world
@@ -45,9 +39,6 @@ from sadgs_ns.render.tile_forecast import TileForecast
 from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.render.types import Gaussians, RenderOptions
 
-CAMERA_CLEARANCE = 2.0
-"""Initial Gaussians nearer to a camera than this many of their standard deviations are dropped. The paper keeps them;
-on the scene `south` dropping them brought 1.7 dB, elsewhere nothing (docs/results.md#other-constants)."""
 NORMALS = "normals"
 """Name of the output that only its readers pay for."""
 LIMIT_EVERY = 25
@@ -56,7 +47,7 @@ _MOST_RANDOM = 10_000_000
 """Largest number of random points to start from; they take the host's memory before the cap thins them out."""
 
 
-class SadgsModel(SplatfactoModel):
+class SadgsModel(MeasuredModel):
     """The Gaussians, how they are rendered, and the loss of a rendering.
 
     nerfstudio's viewer, evaluation and exporter treat it as a splatfacto model.
@@ -81,12 +72,11 @@ class SadgsModel(SplatfactoModel):
         config.check()
         self.strategy = config.strategy
         self.strategy_state = self.strategy.initialize_state()
-        self.gauss_params = torch.nn.ParameterDict(
-            {name: torch.nn.Parameter(value) for name, value in self._initial_gaussians().items()}
-        )
+        params, self.synthetic = initial_gaussians(config, self.seed_points)
+        """Which of the initial Gaussians stand for no SfM point, but are random or on their bounding box. bool [N]"""
+        self.gauss_params = torch.nn.ParameterDict({name: torch.nn.Parameter(p) for name, p in params.items()})
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
-        self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
-        self._lpips: list[torch.nn.Module | None] = []  # In a list its weights stay out of the checkpoint.
+        self.make_metrics()
         self.step = 0
         self.average = RunningMean()
         self.camera_positions: Tensor | None = None  # [C, 3]
@@ -102,57 +92,6 @@ class SadgsModel(SplatfactoModel):
         if config.color_model == "affine":
             self.learn_color_matrices()
 
-    def _initial_gaussians(self) -> dict[str, Tensor]:
-        """Return the initial parameters by name.
-
-        They are means [N, 3], log scales [N, 3], quats [N, 4], logit opacities [N, 1] and coefficients of harmonics,
-        features_dc [N, 3] and features_rest [N, K, 3].
-        """
-        config = self.config
-        if self.seed_points is None or config.random_init:
-            if not config.random_init:
-                CONSOLE.print(
-                    f"[yellow]The data has no SfM points: starting from {config.num_random} random ones in a cube of "
-                    f"side {config.random_scale}. A sparse reconstruction (ns-process-data) gives a better splat.[/]"
-                )
-            points = (torch.rand((config.num_random, 3)) - 0.5) * config.random_scale  # [P, 3]
-            means, colors, scales, opacities = starting_points(points, torch.rand((len(points), 3)), faces=False)
-            sfm = 0
-        else:
-            points, colors = self.seed_points[0].float(), self.seed_points[1].float() / 255.0
-            plausible = plausible_points(points)  # [P]
-            if not plausible.all():
-                CONSOLE.print(
-                    f"[yellow]Leaving out {int((~plausible).sum())} of {len(points)} SfM points, which are not finite "
-                    f"or more than {REACH:g} times as far out as {POINT_SHARE:.0%} of them.[/]"
-                )
-                points, colors = points[plausible], colors[plausible]
-            means, colors, scales, opacities = starting_points(
-                points, colors, faces=config.bounding_box_points, opacity=config.initial_opacity
-            )
-            sfm = len(points)
-        cap, guessed = self.strategy.max_gaussians, torch.arange(len(means)) >= sfm
-        if len(means) > cap:
-            CONSOLE.print(f"[yellow]Keeping a random {cap} of {len(means)} initial points: max_gaussians is {cap}.[/]")
-            keep = torch.randperm(len(means))[:cap]
-            means, colors, scales, opacities = means[keep], colors[keep], scales[keep], opacities[keep]
-            guessed = guessed[keep]
-        self.guessed = guessed
-        """Which of the initial Gaussians stand for no SfM point, but are random or on their bounding box. bool [N]"""
-        return self._spheres(means, colors, scales, opacities)
-
-    def _spheres(self, means: Tensor, colors: Tensor, scales: Tensor, opacities: Tensor | float) -> dict[str, Tensor]:
-        """Make parameters by name of spheres: centres [P, 3], colours in [0, 1] [P, 3], scales [P], opacities [P]."""
-        sh_degree, number = self.config.sh_degree, len(means)
-        return {
-            "means": means,
-            "scales": scales.log()[:, None].repeat(1, 3),
-            "quats": random_quat_tensor(number),
-            "features_dc": RGB2SH(colors) if sh_degree > 0 else torch.logit(colors, eps=1e-4),
-            "features_rest": torch.zeros((number, num_sh_bases(sh_degree) - 1, 3)),
-            "opacities": torch.logit(torch.as_tensor(opacities).expand(number))[:, None],
-        }
-
     def set_cameras(self, positions: Tensor) -> None:
         """Fit the initial Gaussians and the strategy to the training cameras; call before optimizers are made.
 
@@ -163,12 +102,10 @@ class SadgsModel(SplatfactoModel):
         """
         self.strategy_state["scene_scale"] = camera_extent(positions)
         self.camera_positions = positions.to(self.means)
-        radii = CAMERA_CLEARANCE * self.scales.detach().exp().amax(dim=1)  # [N]
-        keep = clear_of_cameras(self.means.detach(), radii, self.camera_positions)  # [N]
-        if keep.any():
-            for parameter in self.gauss_params.values():
-                parameter.data = parameter.data[keep]
-            self.guessed = self.guessed[keep.cpu()]
+        keep = outside_cameras(dict(self.gauss_params.items()), self.camera_positions)  # [N]
+        for parameter in self.gauss_params.values():
+            parameter.data = parameter.data[keep]
+        self.synthetic = self.synthetic[keep.cpu()]
 
     def set_near_plane(self, viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> None:
         """Derive the near plane from the SfM points before the training cameras; call `set_cameras` before.
@@ -197,12 +134,11 @@ class SadgsModel(SplatfactoModel):
         means, colors, scales = means[:room], colors[:room], scales[:room]
         if not room:
             return 0
-        known = self.means.detach()[~self.guessed.to(self.means.device)]
-        spacing = neighbour_scales(torch.cat([known, means.to(known)]))[len(known) :]
-        added = self._spheres(means, colors, torch.minimum(scales, spacing.to(scales)), self.config.initial_opacity)
+        known = self.means.detach()[~self.synthetic.to(self.means.device)]
+        added = beside(known, means, colors, scales, self.config)
         for name, parameter in self.gauss_params.items():
             parameter.data = torch.cat([parameter.data, added[name].to(parameter)])
-        self.guessed = torch.cat([self.guessed, torch.zeros(room, dtype=torch.bool)])
+        self.synthetic = torch.cat([self.synthetic, torch.zeros(room, dtype=torch.bool)])
         return room
 
     def clear_paths(self, viewmats: Tensor) -> None:
@@ -212,7 +148,7 @@ class SadgsModel(SplatfactoModel):
         """
         asked = self.config.clear_paths
         if len(viewmats) <= MOST_VIEWS if asked is None else asked:
-            surfaces = self.means.detach()[~self.guessed.to(self.device)]
+            surfaces = self.means.detach()[~self.synthetic.to(self.device)]
             self.strategy_state["camera_paths"] = CameraPaths.of(viewmats, self.near_plane, surfaces)
 
     def learn_color_matrices(self) -> None:
@@ -417,7 +353,7 @@ class SadgsModel(SplatfactoModel):
         except InputError as error:
             if not in_viewer():
                 raise
-            _say_once(str(error))
+            say_once(str(error))
             width, height = int(camera.width.item()), int(camera.height.item())
             outputs = self.get_empty_outputs(width, height, self.background)
         if self.viewer_outputs is not None:
@@ -481,30 +417,6 @@ class SadgsModel(SplatfactoModel):
             target, rgb = target * mask, rgb * mask
         return rgb, target
 
-    def psnr(self, predicted: Tensor, target: Tensor) -> Tensor:
-        """Return PSNR in dB of images in [0, 1], [1, 3, H, W] or [H, W, 3]."""
-        # The import takes a second, and training does not need it.
-        from torchmetrics.functional.image import peak_signal_noise_ratio
-
-        return peak_signal_noise_ratio(predicted, target, data_range=1.0)
-
-    def lpips(self, predicted: Tensor, target: Tensor) -> Tensor:
-        """Return LPIPS (AlexNet) of images [1, 3, H, W] in [0, 1], or NaN where its weights cannot be loaded.
-
-        The weights are loaded at the first call, so that neither training nor rendering needs them.
-        """
-        if not self._lpips:
-            self._lpips = [_load_lpips(self.device)]
-        metric = self._lpips[0]
-        return predicted.new_tensor(float("nan")) if metric is None else metric(predicted, target)
-
-    def get_image_metrics_and_images(
-        self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
-    ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Return PSNR, SSIM and, where its weights can be loaded, LPIPS of one held-out view."""
-        metrics, images = super().get_image_metrics_and_images(outputs, batch)
-        return {name: value for name, value in metrics.items() if "lpips" not in name or value == value}, images
-
     def get_extra_state(self) -> dict[str, Any]:
         """Return what a checkpoint needs besides parameters: the step, the strategy's state and the mean so far."""
         return {
@@ -541,29 +453,6 @@ class SadgsModel(SplatfactoModel):
         return super(SplatfactoModel, self).load_state_dict(dict, **kwargs)
 
 
-def in_viewer() -> bool:
-    """Tell whether this is a thread in which nerfstudio's viewer draws."""
-    from nerfstudio.viewer.render_state_machine import RenderStateMachine
-
-    return isinstance(threading.current_thread(), RenderStateMachine)
-
-
-@lru_cache(maxsize=8)
-def _say_once(text: str) -> None:
-    CONSOLE.print(f"[yellow]{escape(text)}[/]")
-
-
 @lru_cache(maxsize=8)
 def _constant_color(grey: float, device: torch.device) -> Tensor:
     return torch.full((3,), grey, device=device)
-
-
-def _load_lpips(device: torch.device) -> torch.nn.Module | None:
-    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
-
-    try:
-        with torch.random.fork_rng(devices=[]):  # Drawing weights must not change training's random state.
-            return LearnedPerceptualImagePatchSimilarity(normalize=True).to(device)
-    except Exception as error:
-        CONSOLE.print(f"[yellow]LPIPS is not reported: its AlexNet weights could not be loaded ({error}).[/]")
-        return None

@@ -1,10 +1,14 @@
-"""The outputs of a rendering, of which some are computed only for those who read them."""
+"""The outputs of a rendering, some of which are computed only for those who read them, and who these are."""
 
 from __future__ import annotations
 
+import threading
 from collections import UserDict
+from functools import lru_cache
 from typing import Any
 
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
 from torch import Tensor
 
 
@@ -20,3 +24,16 @@ class LazyOutputs(UserDict[str, Any]):
         if callable(value):
             value = self.data[name] = value()
         return value
+
+
+def in_viewer() -> bool:
+    """Tell whether this is a thread in which nerfstudio's viewer draws."""
+    from nerfstudio.viewer.render_state_machine import RenderStateMachine
+
+    return isinstance(threading.current_thread(), RenderStateMachine)
+
+
+@lru_cache(maxsize=8)
+def say_once(text: str) -> None:
+    """Print a warning, unless it was printed before."""
+    CONSOLE.print(f"[yellow]{escape(text)}[/]")

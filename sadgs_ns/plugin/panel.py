@@ -32,7 +32,8 @@ from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin import color_scales, gaussian_maps, texture
 from sadgs_ns.plugin.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
-from sadgs_ns.plugin.model import SadgsModel, in_viewer
+from sadgs_ns.plugin.model import SadgsModel
+from sadgs_ns.plugin.outputs import in_viewer
 from sadgs_ns.plugin.run_plan import RunPlan
 from sadgs_ns.plugin.structure_cache import StructureCache, observe_training_views
 from sadgs_ns.plugin.viewer import ViewerMarkdown, show_output

@@ -25,8 +25,9 @@ from sadgs_ns.plugin.cleaning_panel import CleaningPanel
 from sadgs_ns.plugin.config import SadgsPipelineConfig
 from sadgs_ns.plugin.datamanager import SadgsDatamanager
 from sadgs_ns.plugin.memory_plan import place_images
-from sadgs_ns.plugin.model import NORMALS, SadgsModel, in_viewer
+from sadgs_ns.plugin.model import NORMALS, SadgsModel
 from sadgs_ns.plugin.nonfinite import NonFiniteLog
+from sadgs_ns.plugin.outputs import in_viewer
 from sadgs_ns.plugin.panel import StructurePanel
 from sadgs_ns.plugin.run_plan import RunPlan
 from sadgs_ns.plugin.structure_cache import StructureCache

@@ -39,7 +39,8 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.method.near_plane import NEAR_SHARE
 from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.plugin.config import SadgsTrainerConfig
-from sadgs_ns.plugin.model import SadgsModel, _load_lpips
+from sadgs_ns.plugin.metrics import load_lpips
+from sadgs_ns.plugin.model import SadgsModel
 from sadgs_ns.plugin.optimizers import AdamUpdate, FusedAdam
 from sadgs_ns.plugin.presets import RATES
 from sadgs_ns.plugin.train_step import training_step
@@ -94,7 +95,7 @@ def test_making_lpips_draws_no_number_that_training_would(monkeypatch: pytest.Mo
 
     monkeypatch.setattr("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", weights)
     before = torch.random.get_rng_state()
-    assert _load_lpips(torch.device("cpu")) is not None
+    assert load_lpips(torch.device("cpu")) is not None
     assert torch.equal(torch.random.get_rng_state(), before)
 
 

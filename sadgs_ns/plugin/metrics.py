@@ -1,0 +1,53 @@
+"""How held-out views are measured: PSNR, SSIM, and LPIPS where its weights can be loaded."""
+
+from __future__ import annotations
+
+import torch
+from nerfstudio.models.splatfacto import SplatfactoModel
+from nerfstudio.utils.rich_utils import CONSOLE
+from pytorch_msssim import SSIM
+from torch import Tensor
+
+
+class MeasuredModel(SplatfactoModel):
+    """A splatfacto model that loads what metrics need when they are first asked for."""
+
+    def make_metrics(self) -> None:
+        """Make the metrics that splatfacto would make with its Gaussians, with LPIPS' weights."""
+        self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
+        self._lpips: list[torch.nn.Module | None] = []  # In a list its weights stay out of the checkpoint.
+
+    def psnr(self, predicted: Tensor, target: Tensor) -> Tensor:
+        """Return PSNR in dB of images in [0, 1], [1, 3, H, W] or [H, W, 3]."""
+        # The import takes a second, and training does not need it.
+        from torchmetrics.functional.image import peak_signal_noise_ratio
+
+        return peak_signal_noise_ratio(predicted, target, data_range=1.0)
+
+    def lpips(self, predicted: Tensor, target: Tensor) -> Tensor:
+        """Return LPIPS (AlexNet) of images [1, 3, H, W] in [0, 1], or NaN where its weights cannot be loaded.
+
+        The weights are loaded at the first call, so that neither training nor rendering needs them.
+        """
+        if not self._lpips:
+            self._lpips = [load_lpips(self.device)]
+        metric = self._lpips[0]
+        return predicted.new_tensor(float("nan")) if metric is None else metric(predicted, target)
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Return PSNR, SSIM and, where its weights can be loaded, LPIPS of one held-out view."""
+        metrics, images = super().get_image_metrics_and_images(outputs, batch)
+        return {name: value for name, value in metrics.items() if "lpips" not in name or value == value}, images
+
+
+def load_lpips(device: torch.device) -> torch.nn.Module | None:
+    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+    try:
+        with torch.random.fork_rng(devices=[]):  # Drawing weights must not change training's random state.
+            return LearnedPerceptualImagePatchSimilarity(normalize=True).to(device)
+    except Exception as error:
+        CONSOLE.print(f"[yellow]LPIPS is not reported: its AlexNet weights could not be loaded ({error}).[/]")
+        return None
