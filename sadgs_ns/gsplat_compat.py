@@ -59,23 +59,21 @@ def project(
     Ks: Tensor,
     width: int,
     height: int,
-    calc_compensations: bool,
     near_plane: float = NEAR_PLANE,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Project Gaussians into pinhole cameras (render/types.py) differentiably, as `gsplat.rasterization` does.
 
     This is gsplat's `fully_fused_projection`. A new gsplat may pass it more arguments than this does. The opacities
-    bound the radii of gsplat 1.5, and the compensations say how much the blur must lower them.
+    bound the radii of gsplat 1.5.
 
     Returns:
-        radii, means2d, depths and conics as `render.types.Projected` has them; and compensations in [0, 1] [C, N], or
-        None where they were not asked for. What is not drawn has radius zero, and its other values are not written.
+        radii, means2d, depths and conics as `render.types.Projected` has them. What is not drawn has radius zero, and
+        its other values are not written.
     """
     bound: dict[str, Any] = {"opacities": opacities} if RADII_PER_AXIS else {}
     return gsplat.fully_fused_projection(  # type: ignore[return-value]
-        means, None, quats, scales, viewmats, Ks, width, height,
-        near_plane=near_plane, calc_compensations=calc_compensations, **bound,
-    )  # fmt: skip
+        means, None, quats, scales, viewmats, Ks, width, height, near_plane=near_plane, **bound
+    )[:4]
 
 
 def try_kernels() -> None:

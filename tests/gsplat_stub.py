@@ -20,20 +20,18 @@ def stub_gsplat(monkeypatch: pytest.MonkeyPatch, per_axis_radii: bool) -> None:
 
     def fully_fused_projection(
         means: Tensor, covars: None, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor,
-        width: int, height: int, *, near_plane: float, calc_compensations: bool, **bound: Tensor,
+        width: int, height: int, *, near_plane: float, **bound: Tensor,
     ) -> tuple[Tensor | None, ...]:  # fmt: skip
         assert bound.keys() == ({"opacities"} if per_axis_radii else set())
-        means2d, depths, conics, compensations, covars2d, valid = backend_torch._project(
+        means2d, depths, conics, covars2d, valid = backend_torch._project(
             means, quats, scales, viewmats, Ks, width, height, near_plane
         )
         opacities = bound.get("opacities", means.new_ones(len(means))).expand(depths.shape)
-        if calc_compensations:
-            opacities = opacities * compensations
         radii = backend_torch._radii(means2d, covars2d, opacities, valid, width, height)
         drawn = gsplat_compat.drawn(radii, means2d)[..., None]
         # The kernel does not write what it culls.
         conics = torch.where(drawn, conics, torch.nan)
-        return radii, means2d, depths, conics, compensations if calc_compensations else None
+        return radii, means2d, depths, conics, None
 
     def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor) -> Tensor:
         assert dirs.shape[:-1] == coeffs.shape[:-2] == masks.shape

@@ -26,21 +26,12 @@ def project(
     Ks: Tensor,  # [C, 3, 3]
     width: int,
     height: int,
-    calc_compensations: bool,
     near_plane: float = 0.01,
 ) -> tuple[Tensor, ...]:
     """`gsplat_compat.project` in torch."""
     covariances = _quat_scale_to_covar_preci(quats, scales, True, False)[0]
-    return _fully_fused_projection(
-        means,
-        covariances,  # type: ignore[arg-type]
-        viewmats,
-        Ks,
-        width,
-        height,
-        calc_compensations=calc_compensations,
-        near_plane=near_plane,
-    )
+    assert covariances is not None
+    return _fully_fused_projection(means, covariances, viewmats, Ks, width, height, near_plane=near_plane)[:4]
 
 
 def composite(

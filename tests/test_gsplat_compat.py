@@ -88,8 +88,7 @@ def test_the_starts_of_tile_lists_take_four_arguments_by_their_places():
     assert len(parameters) == 4 and parameters[0] == "isect_ids" and parameters[2:] == ["tile_width", "tile_height"]
 
 
-@pytest.mark.parametrize("mode", ["classic", "antialiased"])
-def test_the_projection_gets_what_gsplats_rasterization_gives_it(monkeypatch: pytest.MonkeyPatch, mode: Any):
+def test_the_projection_gets_what_gsplats_rasterization_gives_it(monkeypatch: pytest.MonkeyPatch):
     """In a gsplat that passes more, `project` would draw something else than `gsplat.rasterization` does."""
     signature = inspect.signature(gsplat.fully_fused_projection)
     viewmats, Ks = cameras()
@@ -99,9 +98,9 @@ def test_the_projection_gets_what_gsplats_rasterization_gives_it(monkeypatch: py
         first_call(monkeypatch, signature, call)
         for call in (
             lambda: gsplat.rasterization(
-                *geometry, torch.ones(N, 3), viewmats, Ks, 40, 30, near_plane=0.7, packed=False, rasterize_mode=mode
+                *geometry, torch.ones(N, 3), viewmats, Ks, 40, 30, near_plane=0.7, packed=False
             ),
-            lambda: gsplat_compat.project(*geometry, viewmats, Ks, 40, 30, mode == "antialiased", 0.7),
+            lambda: gsplat_compat.project(*geometry, viewmats, Ks, 40, 30, 0.7),
         )
     )
     assert found.keys() == expected.keys()

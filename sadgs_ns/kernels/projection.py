@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sadgs_ns import gsplat_compat
-from sadgs_ns.gsplat_compat import NEAR_PLANE, SCREEN_BLUR
+from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.visibility import drawn
 
@@ -81,11 +81,10 @@ def _by_row(ratio, slope, inverse, scale, by_first, by_last):
     do_not_specialize_on_alignment=["Ks", "v_means2d", "v_conics"],
 )
 def _project_backward(
-    means, quats, scales, viewmats, Ks, radii, conics, compensations,
-    v_means2d, v_conics, v_depths, v_compensations, v_passed, v_means, v_quats, v_scales,
+    means, quats, scales, viewmats, Ks, radii, conics,
+    v_means2d, v_conics, v_depths, v_passed, v_means, v_quats, v_scales,
     n, num_views, width, height, row2d, row_conic,
-    DEPTHS: tl.constexpr, COMPENSATIONS: tl.constexpr, PASSED: tl.constexpr, PER_GAUSSIAN: tl.constexpr,
-    BLUR: tl.constexpr, LANES: tl.constexpr,
+    DEPTHS: tl.constexpr, PASSED: tl.constexpr, PER_GAUSSIAN: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
     """Write the gradients by centres, quaternions and standard deviations, summed over the views.
 
@@ -126,13 +125,6 @@ def _project_backward(
         h_b = 0.5 * h_b
         top, right, left, bottom = a * h_a + b * h_b, a * h_b + b * h_c, b * h_a + c * h_b, b * h_b + c * h_c
         h00, h01, h11 = -(top * a + right * b), -(top * b + right * c), -(left * b + bottom * c)
-        if COMPENSATIONS:
-            compensation = tl.load(compensations + at, seen, 0.0)
-            by_square = 0.5 * tl.load(v_compensations + at, seen, 0.0) / (compensation + 1e-6)
-            rest, blurred = 1 - compensation * compensation, BLUR * (a * c - b * b)
-            h00 += by_square * (rest * a - blurred)
-            h01 += by_square * rest * b
-            h11 += by_square * (rest * c - blurred)
 
         # Σ2D = T Σ Tᵀ with T = J W, where W is the camera's rotation and J the Jacobian [2, 3] of the projection.
         slope_x, slope_y = _clamped(x * inverse, fx, cx, width), _clamped(y * inverse, fy, cy, height)
@@ -241,18 +233,17 @@ class _Project(torch.autograd.Function):
         Ks: Tensor,  # [C, 3, 3]
         width: int,
         height: int,
-        calc_compensations: bool,
         near_plane: float,
     ) -> tuple[Tensor | None, ...]:
-        radii, means2d, depths, conics, compensations = gsplat_compat.project(
-            means, quats, scales, opacities, viewmats, Ks, width, height, calc_compensations, near_plane
+        radii, means2d, depths, conics = gsplat_compat.project(
+            means, quats, scales, opacities, viewmats, Ks, width, height, near_plane
         )
         radii = radii.contiguous()
         ctx.mark_non_differentiable(radii)
         ctx.set_materialize_grads(False)  # torch would fill gradients with zeros where nothing depends on an output
-        ctx.save_for_backward(means, quats, scales, viewmats, Ks, radii, means2d, conics, compensations)
+        ctx.save_for_backward(means, quats, scales, viewmats, Ks, radii, means2d, conics)
         ctx.size = width, height
-        return radii, means2d, depths, conics, compensations, means
+        return radii, means2d, depths, conics, means
 
     @staticmethod
     @once_differentiable
@@ -262,25 +253,21 @@ class _Project(torch.autograd.Function):
         v_means2d: Tensor | None,
         v_depths: Tensor | None,
         v_conics: Tensor | None,
-        v_compensations: Tensor | None,
         v_passed: Tensor | None,
     ) -> tuple[Tensor | None, ...]:
-        means, quats, scales, viewmats, Ks, radii, means2d, conics, compensations = ctx.saved_tensors
+        means, quats, scales, viewmats, Ks, radii, means2d, conics = ctx.saved_tensors
         v_means, v_quats, v_scales = torch.empty_like(means), torch.empty_like(quats), torch.empty_like(scales)
         (v_means2d, row2d), (v_conics, row_conic) = _rows(v_means2d, means2d), _rows(v_conics, conics)
         # The kernel reads no tensor that stands in for one that is None.
-        depths, by_compensation, passed = (
-            conics if value is None else value.contiguous() for value in (v_depths, v_compensations, v_passed)
-        )
+        depths, passed = (conics if value is None else value.contiguous() for value in (v_depths, v_passed))
         n = len(means)
         _project_backward[cdiv(n, _LANES),](
-            means, quats, scales, viewmats, Ks, radii, conics, conics if compensations is None else compensations,
-            v_means2d, v_conics, depths, by_compensation, passed, v_means, v_quats, v_scales,
+            means, quats, scales, viewmats, Ks, radii, conics,
+            v_means2d, v_conics, depths, passed, v_means, v_quats, v_scales,
             n, len(viewmats), *ctx.size, row2d, row_conic,
-            v_depths is not None, v_compensations is not None, v_passed is not None, radii.dim() - 1,
-            SCREEN_BLUR, _LANES,
+            v_depths is not None, v_passed is not None, radii.dim() - 1, _LANES,
         )  # fmt: skip
-        return v_means, v_quats, v_scales, *[None] * 7
+        return v_means, v_quats, v_scales, *[None] * 6
 
 
 def project(
@@ -292,9 +279,8 @@ def project(
     Ks: Tensor,  # [C, 3, 3]
     width: int,
     height: int,
-    calc_compensations: bool,
     near_plane: float = NEAR_PLANE,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Compute `gsplat_compat.project`, but differentiate it with one kernel.
 
     Returns:
@@ -302,4 +288,4 @@ def project(
         `means`. If what else depends on the centres takes this tensor, the backward kernel adds its gradient to theirs.
     """
     tensors = (value.contiguous() for value in (means, quats, scales, opacities, viewmats, Ks))
-    return _Project.apply(*tensors, width, height, calc_compensations, near_plane)  # type: ignore[return-value]
+    return _Project.apply(*tensors, width, height, near_plane)  # type: ignore[return-value]

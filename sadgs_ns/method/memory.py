@@ -34,7 +34,7 @@ ACTIVATION_GRADIENT_BYTES = 28
 the projection and the harmonics each have one."""
 PROJECTION_BYTES = 52
 """Bytes of a Gaussian and view from the projection to the end of the step: radii 4, means2d 8, depths 4, conics 12,
-opacities 4, colours 12; with antialiasing also compensations 4, and their products with the opacities 4."""
+opacities 4, colours 12."""
 DEPTH_SORT_BYTES = 40
 """Bytes of a Gaussian and view besides, while Gaussians are sorted by depth: numbers of tiles 8, indices before 8 and
 after 8 the sort, sorted depths 4, the sort's buffers 12."""

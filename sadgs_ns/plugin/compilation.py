@@ -145,10 +145,8 @@ class _Stages:
 
         config = self.model.config
         means, quats, scales = (value.clone().requires_grad_() for value in self.gaussians[:3])
-        radii, means2d, _, conics, compensations, centres = project(
-            means, quats, scales, self.opacities, *self.cameras, self.drawing.antialiased
-        )
-        results = [means2d, conics] if compensations is None else [means2d, conics, compensations]
+        radii, means2d, _, conics, centres = project(means, quats, scales, self.opacities, *self.cameras)
+        results = [means2d, conics]
         if config.sh_degree > 0:
             coefficients = self.blank("features_dc"), self.blank("features_rest")
             viewmats = self.cameras.viewmats

@@ -59,7 +59,6 @@ class PoseOptimizerConfig(CameraOptimizerConfig):
     """Whether and how the cameras' poses are refined; SO3xR3 turns and moves each camera."""
 
 
-@hide("rasterize_mode")  # Files of the result look right with the default alone.
 @dataclass
 class SadgsModelConfig(InstantiateConfig):
     """Options of the Gaussians, their loss and their densification.
@@ -97,9 +96,6 @@ class SadgsModelConfig(InstantiateConfig):
     Half opaque ones mostly have a lower LPIPS and make more Gaussians (docs/results.md)."""
     sh_degree: int = 3
     """Degree of the spherical harmonics that make colours depend on the direction of view, 0 to 3."""
-    rasterize_mode: Literal["classic", "antialiased"] = "classic"
-    """How Gaussians smaller than a pixel are drawn: "classic" as in 3DGS, "antialiased" fades them by their size.
-    Viewers of PLY files expect "classic"."""
     ssim_lambda: float = 0.6
     """Weight of SSIM against L1 in the loss, in [0, 1]. The paper's 0.2 resolves less detail for as many Gaussians."""
     opacity_reg: float = 0.01

@@ -236,12 +236,7 @@ class SadgsModel(MeasuredModel):
     def drawing(self) -> RenderOptions:
         """The options that every picture of these Gaussians shares; colours are drawn with `color_options`."""
         config = self.config
-        return RenderOptions(
-            near_plane=self.near_plane,
-            max_off_axis=config.max_off_axis,
-            rasterize_mode=config.rasterize_mode,
-            backend=config.backend,
-        )
+        return RenderOptions(near_plane=self.near_plane, max_off_axis=config.max_off_axis, backend=config.backend)
 
     def color_options(self, **changes: Any) -> RenderOptions:
         """Return the options with which colours are drawn at this step, and others of their fields."""

@@ -19,20 +19,16 @@ TILE_SIZE = 16
 def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions, begin_tiles: bool = True) -> Projected:
     """Do what `rasterization.project` says."""
     viewmats, _, width, height = cameras
-    radii, means2d, depths, conics, compensations = gsplat_compat.project(
-        *gaussians[:4], *cameras, options.antialiased, options.near_plane
-    )
+    radii, means2d, depths, conics = gsplat_compat.project(*gaussians[:4], *cameras, options.near_plane)
     if options.max_off_axis > 0:
         radii = cull_off_axis(radii, means2d, width, height, options.max_off_axis)
-    opacities = opacities_in_views(gaussians.opacities, compensations, len(viewmats))
+    opacities = opacities_in_views(gaussians.opacities, len(viewmats))
     colors = colors_in_views(gaussians, viewmats, radii, means2d, options.sh_degree)
     return Projected(radii, means2d, depths, conics, opacities, colors, width, height)
 
 
-def opacities_in_views(opacities: Tensor, compensations: Tensor | None, num_views: int) -> Tensor:
-    """Return opacities [N] as cameras see them, after compensation [C, N] for the blur if there is one. [C, N]"""
-    if compensations is not None:
-        return opacities * compensations
+def opacities_in_views(opacities: Tensor, num_views: int) -> Tensor:
+    """Return opacities [N] once for each view. [C, N]"""
     # One copy serves the tiles and compositing. `expand` would be slower: torch reduces its gradient over the views ten
     # times as slowly as it adds.
     return opacities[None] if num_views == 1 else torch.stack([opacities] * num_views)

@@ -70,12 +70,10 @@ def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions, begi
     _check_shapes(gaussians, cameras, colors, options.sh_degree)
     viewmats, Ks, width, height = cameras
     C, N = len(viewmats), len(means)
-    means2d, depths, conics, compensations, covars2d, valid = _project(
+    means2d, depths, conics, covars2d, valid = _project(
         means, quats, scales, viewmats, Ks, width, height, options.near_plane
     )
     opacities = opacities.expand(C, N)
-    if options.antialiased:
-        opacities = opacities * compensations
     radii = _radii(means2d, covars2d, opacities, valid, width, height)
     if options.max_off_axis > 0:
         radii = cull_off_axis(radii, means2d, width, height, options.max_off_axis)
@@ -118,11 +116,11 @@ def composite(projected: Projected, options: RenderOptions) -> tuple[Tensor, Ten
 
 def _project(
     means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int, near: float
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Project the Gaussians as EWA splatting does.
 
     Returns:
-        means2d [C, N, 2], depths [C, N], conics [C, N, 3], compensations [C, N], covars2d [C, N, 2, 2], valid [C, N].
+        means2d [C, N, 2], depths [C, N], conics [C, N, 3], covars2d [C, N, 2, 2], valid [C, N].
     """
     means_c, covars_c = world_to_camera(means, covariances(quats, scales), viewmats)  # [C, N, 3], [C, N, 3, 3]
     depths = means_c[..., 2]
@@ -134,15 +132,12 @@ def _project(
     valid = valid & _determinant(covars2d.detach()).isfinite()
     covars2d = torch.where(valid[..., None, None], covars2d, torch.eye(2, dtype=means.dtype, device=means.device))
 
-    det_sharp = _determinant(covars2d)
     covars2d = covars2d + SCREEN_BLUR * torch.eye(2, dtype=means.dtype, device=means.device)
     det = _determinant(covars2d)
     valid = valid & (det > 0)
     det = torch.where(valid, det, 1.0)
     conics = torch.stack([covars2d[..., 1, 1], -covars2d[..., 0, 1], covars2d[..., 0, 0]], dim=-1) / det[..., None]
-    # The floor keeps the square root's gradient finite for flat Gaussians seen edge-on; it is itself invisible.
-    compensations = (det_sharp / det).clamp_min(1e-12).sqrt()
-    return means2d, depths, conics, compensations, covars2d, valid
+    return means2d, depths, conics, covars2d, valid
 
 
 def _determinant(matrices: Tensor) -> Tensor:

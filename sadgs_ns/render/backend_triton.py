@@ -27,17 +27,13 @@ def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions, begi
         check_pixels(len(viewmats), height, width)
     differentiates_cameras = viewmats.requires_grad  # as for learned poses; our kernels do not
     if differentiates_cameras:
-        radii, means2d, depths, conics, compensations = gsplat_compat.project(
-            *gaussians[:4], *cameras, options.antialiased, options.near_plane
-        )
+        radii, means2d, depths, conics = gsplat_compat.project(*gaussians[:4], *cameras, options.near_plane)
     else:
         # Colours take these centres, so that their gradient is added in the projection's backward kernel.
-        radii, means2d, depths, conics, compensations, means = kernels_projection.project(
-            *gaussians[:4], *cameras, options.antialiased, options.near_plane
-        )
+        radii, means2d, depths, conics, means = kernels_projection.project(*gaussians[:4], *cameras, options.near_plane)
         gaussians = gaussians._replace(means=means)
     radii = radii.contiguous()  # Culling, and tile lists that are too short, set these very radii to 0.
-    opacities = opacities_in_views(gaussians.opacities, compensations, len(viewmats))
+    opacities = opacities_in_views(gaussians.opacities, len(viewmats))
     tiles = None
     if begin_tiles:
         # Without a capacity the host waits for the lists' length: the colours are computed meanwhile.

@@ -55,8 +55,6 @@ class RenderOptions:
     max_off_axis: float = 0.0
     """Gaussians whose centre is projected further from the image's centre, in half images along x or y, are not drawn
     (off_axis.py); 0 draws all."""
-    rasterize_mode: Literal["classic", "antialiased"] = "classic"
-    """"antialiased" compensates opacities for the blur of the screen."""
     expected_depth: bool = False
     """Whether the expected depth is rendered as one more channel."""
     absgrad: bool = False
@@ -67,11 +65,6 @@ class RenderOptions:
     None the host waits. The other backends need no such number."""
     backend: BackendName = "auto"
     """What draws (`rasterization.choose_backend`)."""
-
-    @property
-    def antialiased(self) -> bool:
-        """Whether opacities are compensated for the blur of the screen."""
-        return self.rasterize_mode == "antialiased"
 
 
 DEFAULTS = RenderOptions()
@@ -91,7 +84,7 @@ class Projected(NamedTuple):
     conics: Tensor
     """(a, b, c) of the inverse of the blurred Σ2D, in 1/px². [C, N, 3]"""
     opacities: Tensor
-    """In [0, 1], compensated for the blur where that was asked for. [C, N]"""
+    """In [0, 1]. [C, N]"""
     colors: Tensor
     """[C, N, D]"""
     width: int

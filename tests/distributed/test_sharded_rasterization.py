@@ -19,7 +19,7 @@ from sadgs_ns.render.rasterization import visible
 from sadgs_ns.render.types import RenderOptions
 
 
-def draw_together(world: World, views: int, mode: Any, uneven: bool, fused: bool) -> dict[str, Any]:
+def draw_together(world: World, views: int, uneven: bool, fused: bool) -> dict[str, Any]:
     if fused:
         from interpreted import use_our_rasterizer
 
@@ -30,7 +30,7 @@ def draw_together(world: World, views: int, mode: Any, uneven: bool, fused: bool
         start = sum(world.sizes[: world.rank])
         part = slice(start, start + world.sizes[world.rank])
     leaves = inputs(part)
-    options = RenderOptions(sh_degree=1, absgrad=True, rasterize_mode=mode, max_off_axis=1.5)
+    options = RenderOptions(sh_degree=1, absgrad=True, max_off_axis=1.5)
     world.flags_out = 1 << world.rank
     rendered, info = rasterize(world, *splats(leaves, views), options)
     loss = info["anchor"]
@@ -53,16 +53,11 @@ def draw_together(world: World, views: int, mode: Any, uneven: bool, fused: bool
 
 
 @pytest.mark.parametrize(
-    ("ranks", "views", "mode", "uneven", "fused"),
-    [
-        (2, 2, "classic", False, False),
-        (3, 4, "antialiased", False, False),
-        (3, 1, "classic", True, False),
-        (2, 3, "classic", False, True),
-    ],
+    ("ranks", "views", "uneven", "fused"),
+    [(2, 2, False, False), (3, 4, False, False), (3, 1, True, False), (2, 3, False, True)],
 )
 def test_processes_draw_and_differentiate_what_one_does(
-    ranks: int, views: int, mode: Any, uneven: bool, fused: bool, tmp_path: Path
+    ranks: int, views: int, uneven: bool, fused: bool, tmp_path: Path
 ):
     """With `fused`, the processes draw with our kernels in Triton's interpreter."""
     if fused:
@@ -70,7 +65,7 @@ def test_processes_draw_and_differentiate_what_one_does(
             pytest.skip("Triton is interpreted where there is no GPU")
         pytest.importorskip("interpreted", reason="Triton is not installed", exc_type=ImportError)
     leaves = inputs()
-    options = RenderOptions(sh_degree=1, absgrad=True, rasterize_mode=mode, max_off_axis=1.5)
+    options = RenderOptions(sh_degree=1, absgrad=True, max_off_axis=1.5)
     colors, alphas, info = rasterize_alone(*splats(leaves, views), options)
     info["means2d"].retain_grad()
     expected = torch.cat([colors, alphas], dim=-1)
@@ -78,7 +73,7 @@ def test_processes_draw_and_differentiate_what_one_does(
     loss.backward()
     assert not visible(info).all(), "some Gaussians should be out of sight"
 
-    results = run_ranks(draw_together, ranks, tmp_path, views, mode, uneven, fused)
+    results = run_ranks(draw_together, ranks, tmp_path, views, uneven, fused)
 
     covered = torch.zeros(views, HEIGHT)
     for result in results:

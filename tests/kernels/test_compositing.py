@@ -326,27 +326,15 @@ def test_autograd_gets_what_the_kernel_returns(through):
 @pytest.mark.skipif(
     torch.cuda.is_available(), reason="with CUDA, tests/render/test_rasterization.py takes gsplat's own kernels"
 )
-@pytest.mark.parametrize(
-    ("mode", "max_off_axis", "capacity"),
-    [("classic", 0.0, None), ("antialiased", 0.0, None), ("classic", 0.5, None), ("classic", 0.0, 3000)],
-)
-def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatch, mode, max_off_axis, capacity):
+@pytest.mark.parametrize(("max_off_axis", "capacity"), [(0.0, None), (0.5, None), (0.0, 3000)])
+def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatch, max_off_axis, capacity):
     """All of it for two views; torch code stands in for gsplat's projection."""
     width, height = 22, 18
 
-    def project(means, quats, scales, opacities, viewmats, Ks, width, height, calc_compensations, near_plane):
+    def project(means, quats, scales, opacities, viewmats, Ks, width, height, near_plane):
         covariances = _quat_scale_to_covar_preci(quats, scales, True, False)[0]
         assert covariances is not None
-        return _fully_fused_projection(
-            means,
-            covariances,
-            viewmats,
-            Ks,
-            width,
-            height,
-            near_plane=near_plane,
-            calc_compensations=calc_compensations,
-        )
+        return _fully_fused_projection(means, covariances, viewmats, Ks, width, height, near_plane=near_plane)[:4]
 
     monkeypatch.setattr(gsplat_compat, "project", project)
     generator = torch.Generator().manual_seed(0)
@@ -366,7 +354,7 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
         with triton_switched(backend == "triton"):
             renders, _, info = rasterization(
                 *geometry, colors, viewmats.to(dtype), Ks.to(dtype), width, height, **options, backend=backend,
-                sh_degree=3, absgrad=True, rasterize_mode=mode, max_off_axis=max_off_axis,
+                sh_degree=3, absgrad=True, max_off_axis=max_off_axis,
             )  # fmt: skip
         if options:
             needed = sum(info["pair_counts"].wait())

@@ -737,8 +737,7 @@ def test_rasterization_equals_gsplats_own(monkeypatch, render_mode, max_off_axis
     monkeypatch.setattr(backend_gsplat, "TILE_SIZE", kernels.TILE_SIZE)  # gsplat 1.4 cuts off at borders of tiles
     scene = {name: value.float().cuda() for name, value in random_scene(3000, 128, seed=0).items()}
     del scene["weights"]
-    shared = {"width": 128, "height": 128, "sh_degree": 3, "render_mode": render_mode}
-    shared |= {"rasterize_mode": "antialiased", "absgrad": False}
+    shared = {"width": 128, "height": 128, "sh_degree": 3, "render_mode": render_mode, "absgrad": False}
     images = [rasterization(**scene, **shared, max_off_axis=max_off_axis, backend="triton")]
     images.append(rasterization(**scene, **shared, max_off_axis=max_off_axis, backend="gsplat"))
     if max_off_axis == 0:

@@ -18,7 +18,7 @@ projection = pytest.importorskip("sadgs_ns.kernels.projection", reason="Triton i
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 WIDTH, HEIGHT = 40, 30
 N = 150
-OUTPUTS = ("means2d", "depths", "conics", "compensations", "passed")
+OUTPUTS = ("means2d", "depths", "conics", "passed")
 
 
 def scene(num_views: int) -> dict[str, Any]:
@@ -48,14 +48,12 @@ def scene(num_views: int) -> dict[str, Any]:
 
 def project_in_torch(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor,
-    width: int, height: int, calc_compensations: bool, near_plane: float = 0.01, per_axis_radii: bool = False,
+    width: int, height: int, near_plane: float = 0.01, per_axis_radii: bool = False,
 ) -> tuple[Any, ...]:  # fmt: skip
     """Do what `gsplat_compat.project` does, with radii in either layout."""
     covariances, _ = _quat_scale_to_covar_preci(quats, scales, True, False)
     assert covariances is not None
-    radii, *others = _fully_fused_projection(
-        means, covariances, viewmats, Ks, width, height, near_plane=near_plane, calc_compensations=calc_compensations
-    )
+    radii, *others, _ = _fully_fused_projection(means, covariances, viewmats, Ks, width, height, near_plane=near_plane)
     assert others[0] is not None
     seen = gsplat_compat.drawn(radii, others[0])
     radii = seen.int() * 3
@@ -81,7 +79,6 @@ def upstream_of(seen: Tensor, names: tuple[str, ...]) -> dict[str, Tensor]:
         "means2d": rows[..., :2],
         "conics": rows[..., 2:5],
         "depths": rows[..., 5],
-        "compensations": rows[..., 6],
         "passed": passed,
     }
     return {name: every[name] for name in names}
@@ -90,15 +87,15 @@ def upstream_of(seen: Tensor, names: tuple[str, ...]) -> dict[str, Tensor]:
 @pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
 @pytest.mark.parametrize(
     ("num_views", "names"),
-    [(1, ("means2d", "conics", "passed")), (3, OUTPUTS), (2, ("means2d", "conics", "compensations")), (1, ("conics",))],
+    [(1, ("means2d", "conics", "passed")), (3, OUTPUTS), (2, ("means2d", "conics")), (1, ("conics",))],
     ids=lambda value: "-".join(value) if isinstance(value, tuple) else str(value),
 )
 def test_gradients_equal_float64_autograd(monkeypatch, num_views, names, per_axis_radii):
     if DEVICE.type == "cuda" and per_axis_radii is not gsplat_compat.RADII_PER_AXIS:
         pytest.skip("gsplat's kernel makes radii in one of the layouts")
-    values, antialiased = scene(num_views), "compensations" in names
+    values = scene(num_views)
     inputs: dict[str, Any] = {name: value.clone().requires_grad_() for name, value in values.items()}
-    radii, *others = project_in_torch(**inputs, width=WIDTH, height=HEIGHT, calc_compensations=antialiased)
+    radii, *others = project_in_torch(**inputs, width=WIDTH, height=HEIGHT)
     seen = radii > 0
     assert 0.3 < seen.float().mean() < 0.9
     ratios = others[0][seen] / torch.tensor([WIDTH, HEIGHT])
@@ -114,7 +111,7 @@ def test_gradients_equal_float64_autograd(monkeypatch, num_views, names, per_axi
     inputs = {name: value.float().to(DEVICE) for name, value in values.items()}
     for name in ("means", "quats", "scales"):
         inputs[name].requires_grad_()
-    radii, *others = projection.project(**inputs, width=WIDTH, height=HEIGHT, calc_compensations=antialiased)
+    radii, *others = projection.project(**inputs, width=WIDTH, height=HEIGHT)
     assert not radii.requires_grad and torch.equal(gsplat_compat.drawn(radii, others[0]).cpu(), seen)
     found = gradients_of(dict(zip(OUTPUTS, others, strict=True)), inputs, upstream)
     for name, value in expected.items():
@@ -136,7 +133,7 @@ def test_what_no_view_draws_has_gradients_of_zero_whatever_its_numbers_are(monke
             if broken:
                 inputs[name][:50] = torch.tensor([torch.nan, torch.inf, 0.0, -1.0, 1e30]).repeat(10)[:, None]
             inputs[name].requires_grad_()
-        radii, *others = projection.project(**inputs, width=WIDTH, height=HEIGHT, calc_compensations=False)
+        radii, *others = projection.project(**inputs, width=WIDTH, height=HEIGHT)
         radii.data[:, :50] = 0  # as kernels do, of whose changes autograd does not know
         upstream = upstream_of(gsplat_compat.drawn(radii, others[0]).cpu(), ("means2d", "conics"))
         with np.errstate(all="ignore"):  # Triton's interpreter computes with numpy
@@ -150,15 +147,15 @@ def test_what_no_view_draws_has_gradients_of_zero_whatever_its_numbers_are(monke
 def test_gradients_are_as_close_to_float64_as_gsplats():
     values = scene(3)
     inputs = {name: value.clone().requires_grad_() for name, value in values.items()}
-    radii, *others = project_in_torch(**inputs, width=WIDTH, height=HEIGHT, calc_compensations=True)
-    upstream = upstream_of(radii > 0, OUTPUTS[:4])
+    radii, *others = project_in_torch(**inputs, width=WIDTH, height=HEIGHT)
+    upstream = upstream_of(radii > 0, OUTPUTS[:3])
     expected = gradients_of(dict(zip(OUTPUTS, others, strict=False)), inputs, upstream)
     errors = []
     for function in (projection.project, gsplat_compat.project):
         inputs = {name: value.float().to(DEVICE) for name, value in values.items()}
         for name in ("means", "quats", "scales"):
             inputs[name].requires_grad_()
-        others = function(**inputs, width=WIDTH, height=HEIGHT, calc_compensations=True)[1:5]
+        others = function(**inputs, width=WIDTH, height=HEIGHT)[1:4]
         found = gradients_of(dict(zip(OUTPUTS, others, strict=False)), inputs, upstream)
         errors.append({name: float((found[name] - v).norm() / v.norm()) for name, v in expected.items()})
     for name, error in errors[0].items():

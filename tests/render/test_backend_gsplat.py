@@ -19,7 +19,7 @@ from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
 CASES = {
     "harmonics": (RenderOptions(sh_degree=3, absgrad=True), 1),
     "two views": (RenderOptions(sh_degree=2, absgrad=True), 2),
-    "antialiased with depth": (RenderOptions(sh_degree=1, rasterize_mode="antialiased", expected_depth=True), 2),
+    "depth": (RenderOptions(sh_degree=1, expected_depth=True), 2),
     "off the axis": (RenderOptions(sh_degree=3, max_off_axis=0.7, absgrad=True), 2),
     "near plane": (RenderOptions(sh_degree=3, near_plane=2.9, absgrad=True), 1),
     "features": (RenderOptions(absgrad=True), 2),

@@ -60,7 +60,7 @@ def render(scene: dict[str, Any], **changes: Any) -> tuple[Tensor, Tensor, dict[
     return splatted(**{**scene, **changes})
 
 
-def reference_gaussian(scene: dict[str, Any], index: int, per_axis: bool, antialiased: bool) -> dict[str, Any] | None:
+def reference_gaussian(scene: dict[str, Any], index: int, per_axis: bool) -> dict[str, Any] | None:
     """Projection of one Gaussian by the first camera, or None if it is culled."""
     quat, scale = scene["quats"][index].numpy(), scene["scales"][index].numpy()
     viewmat, K = scene["viewmats"][0].numpy(), scene["Ks"][0].numpy()
@@ -82,11 +82,8 @@ def reference_gaussian(scene: dict[str, Any], index: int, per_axis: bool, antial
     clamped = np.clip(slopes, -principal / focal - margin, (size - principal) / focal + margin)
     jacobian = np.concatenate([np.diag(focal), -(focal * clamped)[:, None]], axis=1) / center[2]
     axes = jacobian @ viewmat[:3, :3] @ rotation @ np.diag(scale)
-    sharp = axes @ axes.T
-    blurred = sharp + 0.3 * np.eye(2)
+    blurred = axes @ axes.T + 0.3 * np.eye(2)
     opacity = scene["opacities"][index].item()
-    if antialiased:
-        opacity *= math.sqrt(np.linalg.det(sharp) / np.linalg.det(blurred))
     if per_axis:
         if opacity < 1 / 255:
             return None
@@ -108,11 +105,9 @@ def reference_gaussian(scene: dict[str, Any], index: int, per_axis: bool, antial
     }
 
 
-def reference_render(
-    scene: dict[str, Any], *, per_axis: bool, antialiased: bool = False, tile_size: int = 16
-) -> tuple[np.ndarray, np.ndarray]:
+def reference_render(scene: dict[str, Any], *, per_axis: bool, tile_size: int = 16) -> tuple[np.ndarray, np.ndarray]:
     """Colour and depth [H, W, 4], and alpha [H, W, 1]."""
-    projected = [reference_gaussian(scene, index, per_axis, antialiased) for index in range(len(scene["means"]))]
+    projected = [reference_gaussian(scene, index, per_axis) for index in range(len(scene["means"]))]
     gaussians = sorted([one for one in projected if one is not None], key=lambda one: one["depth"])
     image = np.zeros((scene["height"], scene["width"], 4))
     alphas = np.zeros((scene["height"], scene["width"], 1))
@@ -143,17 +138,16 @@ def segment(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.usefixtures("segment")
 @pytest.mark.parametrize("per_axis", [False, True])
-@pytest.mark.parametrize("mode", ["classic", "antialiased"])
-def test_agrees_with_the_reference(mode: str, per_axis: bool) -> None:
+def test_agrees_with_the_reference(per_axis: bool) -> None:
     scene = small_scene()
-    colors, alphas, info = render(scene, render_mode="RGB+ED", rasterize_mode=mode, per_axis_radii=per_axis)
-    expected_colors, expected_alphas = reference_render(scene, per_axis=per_axis, antialiased=mode == "antialiased")
+    colors, alphas, info = render(scene, render_mode="RGB+ED", per_axis_radii=per_axis)
+    expected_colors, expected_alphas = reference_render(scene, per_axis=per_axis)
     expected_colors[..., 3:] /= np.maximum(expected_alphas, 1e-10)
     assert colors.dtype == torch.float64
     np.testing.assert_allclose(colors[0].numpy(), expected_colors, rtol=0, atol=1e-12)
     np.testing.assert_allclose(alphas[0].numpy(), expected_alphas, rtol=0, atol=1e-12)
     for index in range(len(scene["means"])):
-        one = reference_gaussian(scene, index, per_axis, mode == "antialiased")
+        one = reference_gaussian(scene, index, per_axis)
         radii = np.zeros(2) if one is None else one["radii"]
         assert info["radii"][0, index].tolist() == (radii.tolist() if per_axis else radii[0])
     # The scene reaches the cut-offs: pixels that are done, and Gaussians that are culled.
@@ -186,8 +180,7 @@ def test_spherical_harmonics() -> None:
 
 
 @pytest.mark.usefixtures("segment")
-@pytest.mark.parametrize("mode", ["classic", "antialiased"])
-def test_gradients_agree_with_finite_differences(mode: str) -> None:
+def test_gradients_agree_with_finite_differences() -> None:
     scene = small_scene(gaussians=6, seed=3)
     # Keep away from the cut-offs, at which the image jumps.
     scene["means"] *= 0.3
@@ -200,9 +193,7 @@ def test_gradients_agree_with_finite_differences(mode: str) -> None:
 
     def images(*values: Tensor) -> tuple[Tensor, Tensor]:
         arguments: dict[str, Any] = dict(zip(names, values, strict=True))
-        colors, alphas, _ = render(
-            scene | arguments, sh_degree=1, render_mode="RGB+ED", rasterize_mode=mode, tile_size=4
-        )
+        colors, alphas, _ = render(scene | arguments, sh_degree=1, render_mode="RGB+ED", tile_size=4)
         return colors, alphas
 
     inputs = [scene[name].clone().requires_grad_() for name in names]
