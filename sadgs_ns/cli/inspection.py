@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -16,10 +16,10 @@ from rich.progress import track
 from torch import Tensor
 
 from sadgs_ns.errors import InputError, reason
-from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow, keep_gradient
+from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, keep_gradient
+from sadgs_ns.method.growth import absgs, apply
 from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.method.split import grid_split, num_children
-from sadgs_ns.method.strategy import SMALL_SCALE
 from sadgs_ns.plugin import checkpoints, color_scales, gaussian_maps, texture
 from sadgs_ns.plugin.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
 from sadgs_ns.plugin.config import SadgsTrainerConfig
@@ -168,14 +168,12 @@ def structure_step(model: SadgsModel, statistics: dict[str, Tensor]) -> dict[str
 
 def conventional_step(model: SadgsModel, gradients: dict[str, Tensor]) -> dict[str, Tensor]:
     """Return the Gaussians after a step of AbsGS, clones and splits in two, without its pruning, as `_try`."""
-    strategy, size = model.strategy, SMALL_SCALE * float(model.strategy_state["scene_scale"])
-    densify = partial(
-        grow, clone_threshold=strategy.clone_grad2d, split_threshold=strategy.split_absgrad2d, size_threshold=size,
-        budget=strategy.max_gaussians - model.num_points, world=strategy.world,
-    )  # fmt: skip
+    strategy = replace(model.strategy, absgs_long_axis=False)
+    state = {**gradients, "scene_scale": model.strategy_state["scene_scale"]}
+    densify = partial(apply, *strategy.growth_now(absgs, model.gauss_params, state))
     with torch.random.fork_rng(devices=[model.device] if model.device.type == "cuda" else []):
         torch.manual_seed(SEED)  # gsplat draws the children's places at random.
-        return _try(model, dict(gradients), densify)
+        return _try(model, state, densify)
 
 
 def view_panels(pipeline: SadgsPipeline, view: View, statistics: dict[str, Tensor]) -> dict[str, Panel]:

@@ -1,25 +1,15 @@
-"""AbsGS densification: clone on the mean gradient, split on the absolute one (paper, section 3.6; AbsGS)."""
+"""Sums of screen gradients, by which AbsGS lets Gaussians grow (paper, section 3.6; AbsGS)."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, MutableMapping
 from typing import Any
 
 import torch
-import torch.nn.functional as F
-from gsplat.strategy.ops import duplicate, split
 from torch import Tensor
 
-from sadgs_ns.distributed.ranking import limit_growth
-from sadgs_ns.distributed.world import World
 from sadgs_ns.kernels import use_triton
-from sadgs_ns.method.ops import Params
-from sadgs_ns.method.split import grid_split
 from sadgs_ns.render.rasterization import visible
-
-_OTHER_AXES = 0.8
-"""Of a Gaussian whose longest axis is halved: how long the others stay (docs/results.md#splits-and-rates)."""
 
 
 def empty_gradients(num_gaussians: int, device: torch.device) -> dict[str, Tensor]:
@@ -70,65 +60,3 @@ def accumulate_gradients(gradients: MutableMapping[str, Tensor], info: Mapping[s
         norm = torch.hypot(value[..., 0] * scale_x, value[..., 1] * scale_y)  # [C, N]
         gradients[key] += torch.where(seen, norm, 0.0).nansum(0)
     gradients["grad_count"] += seen.sum(0)
-
-
-@torch.no_grad()
-def grow(
-    params: Params,
-    optimizers: MutableMapping[str, torch.optim.Optimizer],
-    state: MutableMapping[str, Any],
-    *,
-    clone_threshold: float,
-    split_threshold: float,
-    size_threshold: float,
-    budget: float,
-    long_axis: bool = False,
-    world: World,
-) -> tuple[int, int]:
-    """Clone small Gaussians by their mean gradient, split large ones in two by their absolute gradient.
-
-    Args:
-        params: gsplat's parameters.
-        optimizers: One per parameter.
-        state: The strategy's state with the sums of `empty_gradients`.
-        clone_threshold: Normalised mean gradient at which a small Gaussian is cloned; AbsGS uses 2e-4.
-        split_threshold: Normalised mean absolute gradient at which a large one is split; AbsGS uses 4e-4.
-        size_threshold: Largest scale in world units at which a Gaussian counts as small.
-        budget: Gaussians that may be added in all, the steepest gradients first.
-        long_axis: Halve the longest axis of a large one as `grid_split` does, and take a fifth off the others, instead
-            of drawing the places of two that are 1.6 times as small on all axes, as 3DGS does.
-        world: The processes that share the budget.
-
-    Returns:
-        Numbers of clones and of splits.
-    """
-    count = state["grad_count"].clamp_min(1)
-    is_small = params["scales"].exp().amax(dim=-1) <= size_threshold
-    clone_ratio = state["grad2d"] / count / clone_threshold
-    split_ratio = state["absgrad2d"] / count / split_threshold
-    steepness = torch.where(is_small, clone_ratio, split_ratio)  # ≥ 1 grows
-    grows = (steepness >= 1) & steepness.isfinite()  # a sum that overflowed says nothing
-    chosen = limit_growth(world, grows.long(), steepness, budget)
-    is_clone, is_split = chosen & is_small, chosen & ~is_small
-    n_clone, n_split = int(is_clone.sum()), int(is_split.sum())
-    if n_clone > 0:
-        duplicate(params, optimizers, state, is_clone)  # type: ignore[arg-type]
-        _forget_last(state, n_clone)
-    if n_split > 0:
-        is_split = torch.cat([is_split, is_split.new_zeros(n_clone)])  # clones are not split
-        if long_axis:
-            halved = F.one_hot(params["scales"].argmax(dim=-1), 3) * is_split[:, None]  # [N, 3]
-            # The other axes are shortened on the parents, which the next line replaces by their children.
-            params["scales"].data += math.log(_OTHER_AXES) * (is_split[:, None].long() - halved)
-            grid_split(params, optimizers, state, 1 + halved)
-        else:
-            split(params, optimizers, state, is_split)  # type: ignore[arg-type]
-            _forget_last(state, 2 * n_split)
-    return n_clone, n_split
-
-
-def _forget_last(state: MutableMapping[str, Any], num_children: int) -> None:
-    """Empty the rows of the newest Gaussians, which gsplat's operations append as copies of their parents' rows."""
-    for value in state.values():
-        if isinstance(value, Tensor):
-            value[-num_children:] = 0

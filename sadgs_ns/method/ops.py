@@ -11,6 +11,11 @@ Params = MutableMapping[str, torch.nn.Parameter] | torch.nn.ParameterDict
 """gsplat's parameters by name, each with leading dimension N."""
 
 
+def opacities(params: Params) -> Tensor:
+    """Return the opacities, without gradient. [N]"""
+    return torch.sigmoid(params["opacities"].detach().flatten())
+
+
 @torch.no_grad()
 def update_param_with_optimizer(
     param_fn: Callable[[str, Tensor], torch.nn.Parameter],

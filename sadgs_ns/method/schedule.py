@@ -118,6 +118,16 @@ def windows(iterations: int, **given: int | None) -> Windows:
     return replace(chosen, refine_stop_iter=stop if stop >= chosen.refine_start_iter else 0)
 
 
+def due(iteration: int, every: int) -> bool:
+    """Whether what comes every so many iterations comes at this one; 0 is never."""
+    return every > 0 and iteration % every == 0
+
+
+def next_due(iteration: int, every: int) -> float:
+    """The first iteration from this one on at which it is `due`; infinity if never."""
+    return -(-iteration // every) * every if every > 0 else math.inf
+
+
 def growth_threshold(effort: float) -> float:
     """Factor on the gradients at which AbsGS adds Gaussians.
 

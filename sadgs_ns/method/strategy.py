@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Mapping, MutableMapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
@@ -15,11 +14,11 @@ from torch import Tensor
 
 from sadgs_ns.distributed.ranking import limit_growth
 from sadgs_ns.distributed.world import World
-from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow, keep_gradient
+from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, keep_gradient
+from sadgs_ns.method.growth import RULES, Proposal, Propose, Rule, apply, due_rule, structure_aware
 from sadgs_ns.method.memory import StepSize, affordable_growth, free_bytes
-from sadgs_ns.method.ops import Params, update_param_with_optimizer
-from sadgs_ns.method.schedule import Windows, windows
-from sadgs_ns.method.split import children_per_axis, grid_split, num_children
+from sadgs_ns.method.ops import Params, opacities, update_param_with_optimizer
+from sadgs_ns.method.schedule import Windows, due, next_due, windows
 from sadgs_ns.method.statistics import consistent, empty_statistics, observe
 
 Info = Mapping[str, Any]
@@ -30,8 +29,6 @@ TAU_PRUNE = 0.8
 section 3.4)."""
 PRUNE_OPACITY = 0.1
 """τ_α: opacity under which a Gaussian with consistently low η is pruned (paper, section 3.4)."""
-SMALL_SCALE = 0.001
-"""Largest scale, relative to the scene's extent, at which AbsGS counts a Gaussian as small (3DGS)."""
 CLAMP_OPACITY = 0.8
 """Structure steps lower opacities to at most this, so that what lies behind gets gradients again (released code)."""
 RESET_FACTOR = 0.1
@@ -163,9 +160,10 @@ class StructureAwareStrategy(Strategy):
     def observes(self, step: int) -> bool:
         """Whether `step_pre_backward` will measure η at this step, and so needs structure tensors."""
         windows = self.windows
-        # Beyond the last structure step nobody would read it.
+        periods = [rule.every(windows) for rule in RULES.values() if rule.reads == "statistics"]
+        # Beyond the last step that would read it nobody does.
         return step % windows.eta_every == 0 and (
-            _next_due(step + 1, windows.structure_every) <= windows.refine_stop_iter
+            min(next_due(step + 1, every) for every in periods) <= windows.refine_stop_iter
         )
 
     def densifies(self, step: int) -> bool:
@@ -173,8 +171,8 @@ class StructureAwareStrategy(Strategy):
         iteration, windows = step + 1, self.windows
         if not windows.refine_start_iter <= iteration <= windows.refine_stop_iter:
             return False
-        periods = windows.structure_every, windows.absgs_every, windows.reset_every
-        return iteration == windows.refine_stop_iter or any(_due(iteration, every) for every in periods)
+        ends, resets = iteration == windows.refine_stop_iter, due(iteration, windows.reset_every)
+        return ends or resets or due_rule(iteration, windows) is not None
 
     def needs_absgrad(self, step: int) -> bool:
         """Whether the rasterizer must provide absolute screen gradients: an AbsGS step will read this step's.
@@ -183,8 +181,10 @@ class StructureAwareStrategy(Strategy):
         """
         windows = self.windows
         first = max(step + 1, windows.refine_start_iter)
-        read = _next_due(first, windows.absgs_every)
-        return read <= windows.refine_stop_iter and read < _next_due(first, windows.structure_every)
+        readers = [rule for rule in RULES.values() if rule.reads is not None]
+        # Of rules that are due at once, `min` takes the first, as a step does.
+        read, reads = min(((next_due(first, r.every(windows)), r.reads) for r in readers), key=lambda reader: reader[0])
+        return read <= windows.refine_stop_iter and reads == "gradients"
 
     def step_pre_backward(
         self,
@@ -243,103 +243,66 @@ class StructureAwareStrategy(Strategy):
     ) -> None:
         """Split, clone, prune and reset what is due after this step."""
         iteration, windows, views = step + 1, self.windows, _views(info)
-        if iteration > windows.refine_stop_iter:
+        if not windows.refine_start_iter <= iteration <= windows.refine_stop_iter:
             return
-        if iteration >= windows.refine_start_iter:
-            if _due(iteration, windows.structure_every):
-                self._structure_step(params, optimizers, state, iteration, views)
-            elif _due(iteration, windows.absgs_every):
-                self._absgs_step(params, optimizers, state, iteration, views)
-            if iteration == windows.refine_stop_iter:
-                self._end(params, optimizers, state, iteration)
-            # A reset just before the final prune would leave nothing that had time to recover.
-            elif _due(iteration, windows.reset_every) and (
-                iteration <= windows.refine_stop_iter - windows.reset_every // 4
-            ):
-                self._map_opacities(params, optimizers, lambda opacities: opacities * RESET_FACTOR)
-            if not self.world.alone and self.densifies(step):
-                self._even_out(params, optimizers, state)
-
-    def _end(self, params: Any, optimizers: Any, state: Any, iteration: int) -> None:
-        """Prune what stays faint at the last iteration, and forget what densification alone reads."""
-        if not _due(iteration, self.windows.structure_every):  # whose step has pruned
-            gone = (self._opacities(params) < FINAL_PRUNE_OPACITY) | self._haze(params, state)
-            self._prune(params, optimizers, state, gone)
-        for key in (*self._empty_state(0, torch.device("cpu")), "camera_paths"):
-            state.pop(key, None)  # Neither memory nor checkpoints should hold them.
+        if (rule := due_rule(iteration, windows)) is not None:
+            self._grow(rule, params, optimizers, state, iteration, views)
+        if iteration == windows.refine_stop_iter:
+            if rule is None or rule.reads != "statistics":  # whose step has pruned
+                self._prune_faint(params, optimizers, state, FINAL_PRUNE_OPACITY)
+            for key in (*self._empty_state(0, torch.device("cpu")), "camera_paths"):
+                state.pop(key, None)  # Neither memory nor checkpoints should hold them.
+        # A reset just before the final prune would leave nothing that had time to recover.
+        elif due(iteration, windows.reset_every) and iteration <= windows.refine_stop_iter - windows.reset_every // 4:
+            self._map_opacities(params, optimizers, lambda alpha: alpha * RESET_FACTOR)
+        if not self.world.alone and self.densifies(step):
+            self._even_out(params, optimizers, state)
 
     def consistently_low(self, statistics: Mapping[str, Tensor]) -> Tensor:
         """Gaussians that answered low on all three axes in more than τ_prune of their observations. bool [N]"""
         n_low, n_total = statistics["n_low"], statistics["n_total"]
         return consistent(n_low, n_total, TAU_PRUNE, self.min_observations).all(dim=1)
 
-    def split_plan(self, params: Params, statistics: Mapping[str, Tensor], budget: float) -> tuple[Tensor, Tensor]:
-        """What a structure step makes of the statistics.
-
-        Args:
-            params: gsplat's parameters.
-            statistics: As made by `empty_statistics`.
-            budget: Gaussians that may be added.
-
-        Returns:
-            n per axis that η asks for, int64 [N, 3]; and the Gaussians whose children fit the budget, bool [N].
-        """
-        n_high, n_total = statistics["n_high"], statistics["n_total"]
-        violates = consistent(n_high, n_total, self.tau_split, self.min_observations)
-        violates &= (self._opacities(params) >= self.split_min_opacity)[:, None]
-        counts = children_per_axis(statistics["eta_max"], violates)  # [N, 3]
-        worst = torch.where(violates, statistics["eta_max"], 0.0).amax(dim=1)  # [N]
-        return counts, limit_growth(self.world, num_children(counts) - 1, worst, budget)
-
     def children_now(self, params: Params, statistics: Mapping[str, Tensor]) -> Tensor:
         """n per axis that a structure step would split by now, 1 where whole or over the cap. int64 [N, 3]"""
-        counts, fits = self.split_plan(params, statistics, self.max_gaussians - len(statistics["n_total"]))
-        return torch.where(fits[:, None], counts, 1)
+        proposal, fits = self.growth_now(structure_aware, params, statistics)
+        return torch.where(fits[:, None], proposal.children, 1)
 
-    def _structure_step(
-        self, params: Any, optimizers: Any, state: Any, iteration: int, views: Sequence[Info] = ()
+    def growth_now(self, propose: Propose, params: Params, state: Mapping[str, Any]) -> tuple[Proposal, Tensor]:
+        """What a rule would propose by now, and the Gaussians that the cap lets grow, bool [N]."""
+        proposal = propose(self, params, state)
+        room = self.max_gaussians - len(params["means"])
+        return proposal, limit_growth(self.world, proposal.growth, proposal.priority, room)
+
+    def _grow(
+        self, rule: Rule, params: Any, optimizers: Any, state: Any, iteration: int, views: Sequence[Info]
     ) -> None:
-        opacities = self._opacities(params)
-        is_low = self.consistently_low(state)
-        n_before, n_low = len(is_low), int(is_low.sum())
-        # The final prune, before children are made: those are fainter, and would go with what they replace.
-        faint = max(self.min_opacity, FINAL_PRUNE_OPACITY if iteration == self.windows.refine_stop_iter else 0.0)
-        gone = (opacities < faint) | (is_low & (opacities < PRUNE_OPACITY)) | self._haze(params, state)
-        n_pruned = self._prune(params, optimizers, state, gone)
-        self._map_opacities(params, optimizers, lambda alpha: alpha.clamp_max(CLAMP_OPACITY))
-        under_cap, in_memory = self._room(params, state, views)
-        counts, allowed = self.split_plan(params, state, min(under_cap, in_memory))
-        n_parents, n_wanted = int(allowed.sum()), int((counts > 1).any(dim=1).sum())
-        if in_memory < min(self.world.sums(int((num_children(counts) - 1).sum()))[0], under_cap):
+        """Prune, let what a rule proposes grow as far as there is room, and forget what it has read."""
+        n_before, n_low, n_pruned, by_eta = len(params["means"]), 0, 0, rule.reads == "statistics"
+        if by_eta:
+            is_low = self.consistently_low(state)
+            n_low = int(is_low.sum())
+            # The final prune, before children are made: those are fainter, and would go with what they replace.
+            faint = max(self.min_opacity, FINAL_PRUNE_OPACITY if iteration == self.windows.refine_stop_iter else 0.0)
+            n_pruned = self._prune_faint(params, optimizers, state, faint, is_low & (opacities(params) < PRUNE_OPACITY))
+            self._map_opacities(params, optimizers, lambda alpha: alpha.clamp_max(CLAMP_OPACITY))
+        proposal = rule.propose(self, params, state)
+        growth, (under_cap, in_memory) = proposal.growth, self._room(params, state, views)
+        allowed = limit_growth(self.world, growth, proposal.priority, min(under_cap, in_memory))
+        if in_memory < min(self.world.sums(int(growth.sum()))[0], under_cap):
             _warn_of_memory(iteration, in_memory)
-        if n_parents > 0:
-            grid_split(params, optimizers, state, torch.where(allowed[:, None], counts, 1), self.child_scale)
-        # What was learned about parents says nothing about their children.
-        self._clear_statistics(params, state)
-        names = ("before", "violating", "low", "split", "pruned", "after")
-        numbers = self.world.sums(n_before, n_wanted, n_low, n_parents, n_pruned, len(params["means"]))
-        state.setdefault("structure_steps", []).append(
-            {"iteration": iteration, **dict(zip(names, numbers, strict=True))}
-        )
-
-    def _absgs_step(self, params: Any, optimizers: Any, state: Any, iteration: int, views: Sequence[Info] = ()) -> None:
-        under_cap, in_memory = self._room(params, state, views)
-        n_clone, n_split = grow(
-            params,
-            optimizers,
-            state,
-            clone_threshold=self.clone_grad2d,
-            split_threshold=self.split_absgrad2d,
-            size_threshold=SMALL_SCALE * state["scene_scale"],
-            budget=min(under_cap, in_memory),
-            long_axis=self.absgs_long_axis,
-            world=self.world,
-        )
-        if in_memory <= self.world.sums(n_clone + n_split)[0] < under_cap:
-            _warn_of_memory(iteration, in_memory)
-        gone = (self._opacities(params) < self.min_opacity) | self._haze(params, state)
-        self._prune(params, optimizers, state, gone)
-        state.update(empty_gradients(len(params["means"]), params["means"].device))
+        apply(proposal, allowed, params, optimizers, state)
+        if by_eta:
+            # What was learned about parents says nothing about their children.
+            self._clear_statistics(params, state)
+            names = ("before", "violating", "low", "split", "pruned", "after")
+            of_this = (n_before, int((growth > 0).sum()), n_low, int(allowed.sum()), n_pruned, len(params["means"]))
+            numbers = dict(zip(names, self.world.sums(*of_this), strict=True))
+            state.setdefault("structure_steps", []).append({"iteration": iteration, **numbers})
+            return
+        self._prune_faint(params, optimizers, state, self.min_opacity)
+        if rule.reads == "gradients":
+            state.update(empty_gradients(len(params["means"]), params["means"].device))
 
     def _room(self, params: Params, state: Mapping[str, Any], views: Sequence[Info]) -> tuple[int, float]:
         """How many Gaussians may be added under the cap, and how many fit in the devices' memory beside such views."""
@@ -373,9 +336,10 @@ class StructureAwareStrategy(Strategy):
             return torch.zeros(len(means), dtype=torch.bool, device=means.device)
         return paths.haze(means, params["scales"].detach().exp())
 
-    @staticmethod
-    def _opacities(params: Params) -> Tensor:
-        return torch.sigmoid(params["opacities"].detach().flatten())  # [N]
+    def _prune_faint(self, params: Any, optimizers: Any, state: Any, opacity: float, also: Tensor | None = None) -> int:
+        """Remove haze, Gaussians less opaque than this, and others; return how many these were."""
+        gone = (opacities(params) < opacity) | self._haze(params, state)
+        return self._prune(params, optimizers, state, gone if also is None else gone | also)
 
     def _prune(self, params: Any, optimizers: Any, state: Any, mask: Tensor) -> int:
         """Remove Gaussians, unless fewer than one for each process would be left to train.
@@ -420,12 +384,3 @@ def _warn_of_memory(iteration: int, in_memory: float) -> None:
         "Lower max_gaussians, use smaller images, or end other programs on the device.",
         stacklevel=2,
     )
-
-
-def _due(iteration: int, every: int) -> bool:
-    return every > 0 and iteration % every == 0
-
-
-def _next_due(iteration: int, every: int) -> float:
-    """The first iteration from this one on at which `_due`."""
-    return -(-iteration // every) * every if every > 0 else math.inf

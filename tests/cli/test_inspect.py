@@ -27,6 +27,7 @@ from runs import in_the_viewer
 from examples.drawn_scene.scene import write_scene
 from sadgs_ns.cli import inspect, inspection
 from sadgs_ns.errors import InputError
+from sadgs_ns.method.growth import structure_aware
 from sadgs_ns.method.quantization import INVALID
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.plugin import color_scales, gaussian_maps, texture
@@ -240,10 +241,7 @@ def test_observing_leaves_the_run_as_it_was(early: SadgsPipeline):
 
 def test_the_structure_step_makes_the_children_of_the_plan(early: SadgsPipeline):
     model, statistics = early.model, observe_training_views(early.structure_cache)
-    counts, fits = model.strategy.split_plan(
-        model.gauss_params, statistics, model.strategy.max_gaussians - model.num_points
-    )
-    children = torch.where(fits, counts.prod(dim=1), 1)
+    children = model.strategy.children_now(model.gauss_params, statistics).prod(dim=1)
     step = inspection.structure_step(model, statistics)
     assert int(children.max()) > 1
     assert torch.equal(torch.bincount(step["origins"], minlength=model.num_points), children)
@@ -414,7 +412,7 @@ def test_sliders_reach_the_strategy_and_the_plan(panel: StructurePanel):
         panel.set_tau_split.cb_hook(panel.set_tau_split)
         strategy = pipeline.model.strategy
         assert strategy.tau_split == tau
-        counts, _ = strategy.split_plan(pipeline.model.gauss_params, statistics, math.inf)
+        counts = structure_aware(strategy, pipeline.model.gauss_params, statistics).children
         split.append(int((counts > 1).any(dim=1).sum()))
     assert split[0] == 0 < split[1] < split[2]
     panel.set_max_gaussians.value = 777

@@ -32,7 +32,8 @@ from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import RunError
 from sadgs_ns.method import memory
 from sadgs_ns.method import strategy as strategy_module
-from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow
+from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients
+from sadgs_ns.method.growth import absgs
 from sadgs_ns.method.initialization import bounding_box_points, neighbour_scales
 from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.split import children_per_axis
@@ -108,7 +109,7 @@ def no_final_prune(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_all_violate_beyond_measure_and_fill_the_cap(eta_max: float):
     params, state = random_params(50), observed(50, eta_max)
     before = {name: p.detach().clone() for name, p in params.items()}
-    short(max_gaussians=50 + 3 * 511 + 100)._structure_step(params, adam(params, lr=0.0), state, 10)
+    short(max_gaussians=50 + 3 * 511 + 100).densify(params, adam(params, lr=0.0), state, 9, [])
     assert len(params["means"]) == 50 + 3 * 511, "three parents of 8³ children fit, a fourth does not"
     assert all(p.isfinite().all() for p in params.values())
     torch.testing.assert_close(params["scales"][47:].amin(), before["scales"][:3].amin() - math.log(8 / 1.5))
@@ -120,7 +121,7 @@ def test_all_violate_beyond_measure_and_fill_the_cap(eta_max: float):
 def test_where_none_violates_nothing_is_split(eta_max: float):
     params, state = random_params(50), observed(50, eta_max)
     before = params["means"].detach().clone()
-    short()._structure_step(params, adam(params, lr=0.0), state, 10)
+    short().densify(params, adam(params, lr=0.0), state, 9, [])
     assert torch.equal(params["means"], before)
 
 
@@ -232,7 +233,7 @@ def test_what_is_kept_of_each_new_gaussian_is_counted():
         return sum(tensor.numel() * tensor.element_size() for tensor in tensors)
 
     before = bytes_kept()
-    short()._structure_step(params, optimizers, state, 10)
+    short().densify(params, optimizers, state, 9, [])
     grown = len(params["means"]) - 50
     assert grown == 50 * 7
     size = StepSize(views=1)
@@ -307,7 +308,7 @@ def test_pruning_may_leave_one():
     params, state = random_params(5), observed(5, 0.01)
     params["opacities"].data = torch.logit(torch.tensor([0.01, 0.02, 0.9, 0.03, 0.04]))
     kept = params["means"].detach()[2:3].clone()
-    short()._structure_step(params, adam(params, lr=0.0), state, 10)
+    short().densify(params, adam(params, lr=0.0), state, 9, [])
     assert torch.equal(params["means"], kept)
 
 
@@ -466,17 +467,9 @@ def test_absgs_sums_skip_what_is_no_number_and_ignore_what_overflowed():
     assert gradients["grad2d"].isfinite().tolist() == [True, True, False, True]
     torch.testing.assert_close(gradients["grad2d"][1], gradients["grad2d"][0] / 2)
     params = random_params(4)
-    n_clone, n_split = grow(
-        params,
-        adam(params),
-        gradients,  # type: ignore[arg-type]
-        clone_threshold=1e-6,
-        split_threshold=1e-6,
-        size_threshold=10.0,
-        budget=100,
-        world=World(),
-    )
-    assert (n_clone, n_split) == (3, 0)
+    state = {**gradients, "scene_scale": 1e4}  # all are small
+    proposal = absgs(StructureAwareStrategy(clone_grad2d=1e-6, split_absgrad2d=1e-6), params, state)
+    assert proposal.growth.tolist() == [1, 1, 0, 1] and (proposal.children == 1).all()
 
 
 class HostWaits(TorchDispatchMode):

@@ -6,11 +6,12 @@ from typing import Any
 
 import pytest
 import torch
+import torch.nn.functional as F
 from scenes import adam, camera, random_params, training_step
 
-from sadgs_ns.distributed.world import World
 from sadgs_ns.method import strategy as strategy_module
-from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, grow
+from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients
+from sadgs_ns.method.growth import RULES, Proposal, Rule, absgs, apply
 from sadgs_ns.method.schedule import Windows
 from sadgs_ns.method.statistics import STATISTICS, Statistic, empty_statistics
 from sadgs_ns.method.strategy import StructureAwareStrategy
@@ -113,6 +114,21 @@ def test_a_statistic_is_added_in_one_entry_and_stays_with_its_gaussians(monkeypa
     assert (eta_max * (1 - 1e-5) <= eta_sum).all() and (eta_sum <= eta_max * n_total[:, None] * (1 + 1e-5)).all()
     _, state, _ = train(short(), 26)
     assert "eta_sum" not in state, "it ends with densification, like the others"
+
+
+def test_a_rule_of_growth_is_added_in_one_entry_and_keeps_to_the_cap(monkeypatch: pytest.MonkeyPatch):
+    """It halves the longest axis of all, the longest first, and leaves gradients to AbsGS."""
+
+    def longest(options: Any, params: Any, state: Any) -> Proposal:
+        scales = params["scales"].detach()
+        return Proposal(1 + F.one_hot(scales.argmax(dim=1), 3), scales.exp().amax(dim=1))
+
+    monkeypatch.setitem(RULES, "longest", Rule(lambda windows: 3, longest))
+    strategy = short(max_gaussians=200, structure_every=0, clone_grad2d=1e9, split_absgrad2d=1e9)
+    assert strategy.densifies(2) and strategy.densifies(3) and not strategy.densifies(4)
+    _, state, counts = train(strategy, 11)
+    assert counts == [60, 60, 120, 120, 120, *[200] * 6]
+    assert state["grad_count"].any() and strategy.needs_absgrad(9), "AbsGS will read them at iteration 12"
 
 
 @pytest.mark.parametrize("cap", [60, 61, 150, 400])
@@ -248,7 +264,7 @@ def test_low_eta_and_low_opacity_together_prune(monkeypatch: pytest.MonkeyPatch)
     state["n_low"][3] = torch.tensor([10.0, 10.0, 0.0])  # 3: faint, but one axis is not low
     optimizers = adam(params, lr=0.0)
     keep = params["means"].detach()[1:].clone()
-    short()._structure_step(params, optimizers, state, 10)
+    short().densify(params, optimizers, state, 9, [])
     torch.testing.assert_close(params["means"].detach(), keep)
 
 
@@ -258,22 +274,19 @@ def test_pruning_never_leaves_nothing():
     assert n == 0 and len(params["means"]) == 5
 
 
-def gradient_state(grad: list[float], absgrad: list[float]) -> dict[str, torch.Tensor]:
+def gradient_state(grad: list[float], absgrad: list[float]) -> dict[str, Any]:
     return {"grad2d": torch.tensor(grad), "absgrad2d": torch.tensor(absgrad), "grad_count": torch.ones(len(grad))}
 
 
-def grow_with(params, state, budget: int = 1000, **options: Any) -> tuple[int, int]:
-    return grow(
-        params,
-        adam(params, lr=0.0),
-        state,
-        clone_threshold=2e-4,
-        split_threshold=4e-4,
-        size_threshold=0.1,
-        budget=budget,
-        world=World(),
-        **options,
-    )
+def grow_with(params, state, budget: int = 1000, long_axis: bool = False) -> tuple[int, int]:
+    """Numbers of clones and splits of an AbsGS step; Gaussians are small up to a scale of .1."""
+    options = {"clone_grad2d": 2e-4, "split_absgrad2d": 4e-4, "absgs_long_axis": long_axis}
+    strategy = StructureAwareStrategy(max_gaussians=len(params["means"]) + budget, **options)
+    state["scene_scale"] = 100.0
+    proposal, allowed = strategy.growth_now(absgs, params, state)
+    apply(proposal, allowed, params, adam(params, lr=0.0), state)
+    assert proposal.clone is not None
+    return int((allowed & proposal.clone).sum()), int((allowed & ~proposal.clone).sum())
 
 
 def test_absgs_clones_on_the_mean_and_splits_on_the_absolute_gradient():

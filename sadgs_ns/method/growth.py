@@ -1,0 +1,144 @@
+"""What may grow: rules that propose splits and clones, and what becomes of a proposal under one budget."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, MutableMapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+import torch
+import torch.nn.functional as F
+from gsplat.strategy.ops import duplicate, split
+from torch import Tensor
+
+from sadgs_ns.method.ops import Params, opacities
+from sadgs_ns.method.schedule import Windows, due
+from sadgs_ns.method.split import children_per_axis, grid_split, num_children
+from sadgs_ns.method.statistics import consistent
+
+SMALL_SCALE = 0.001
+"""Largest scale, relative to the scene's extent, at which AbsGS counts a Gaussian as small (3DGS)."""
+_OTHER_AXES = 0.8
+"""Of a Gaussian whose longest axis is halved: how long the others stay (docs/results.md#splits-and-rates)."""
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """How N Gaussians would grow, each of which does so as a whole or not at all."""
+
+    children: Tensor
+    """Into how many a Gaussian is split along each of its axes; 1, 1, 1 leaves it whole. int64 [N, 3]"""
+    priority: Tensor
+    """Those of the largest grow first, ≥ 0. [N]"""
+    split: Callable[[Any, Any, Any, Tensor], None] = grid_split
+    """Puts children in the place of parents, in place, given parameters, optimizers, state and `children`."""
+    clone: Tensor | None = None
+    """Gaussians that stay whole and get a copy in the same place. bool [N]"""
+
+    @property
+    def growth(self) -> Tensor:
+        """Gaussians that each one would add. int64 [N]"""
+        growth = num_children(self.children) - 1
+        return growth if self.clone is None else growth + self.clone
+
+
+Propose = Callable[[Any, Params, Mapping[str, Any]], Proposal]
+"""Takes a `StructureAwareStrategy`, for its options, the parameters and the strategy's state."""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A way to grow, and when it is asked."""
+
+    every: Callable[[Windows], int]
+    """Iterations between its steps inside the densification window; 0 turns it off."""
+    propose: Propose
+    reads: Literal["statistics", "gradients"] | None = None
+    """What its steps read of the state, which begins anew after each. A rule that reads η's statistics prunes by them
+    before it grows, and gradients begin anew after it, too; others prune the faint after they grew."""
+
+
+def structure_aware(options: Any, params: Params, state: Mapping[str, Any]) -> Proposal:
+    """Split the axes on which η violated consistently, those of the largest η first (paper, section 3.5)."""
+    violates = consistent(state["n_high"], state["n_total"], options.tau_split, options.min_observations)
+    violates &= (opacities(params) >= options.split_min_opacity)[:, None]
+    worst = torch.where(violates, state["eta_max"], 0.0).amax(dim=1)  # [N]
+    counts = children_per_axis(state["eta_max"], violates)
+    return Proposal(counts, worst, partial(grid_split, child_scale=options.child_scale))
+
+
+def absgs(options: Any, params: Params, state: Mapping[str, Any]) -> Proposal:
+    """Clone small Gaussians by their mean gradient, split large ones in two by their absolute gradient.
+
+    The steepest come first. A large one's longest axis is halved in its place; without `absgs_long_axis`, the places of
+    two that are 1.6 times as small on all axes are drawn at random, as 3DGS does.
+    """
+    scales, count = params["scales"].detach(), state["grad_count"].clamp_min(1)
+    is_small = scales.exp().amax(dim=-1) <= SMALL_SCALE * state["scene_scale"]
+    clone_ratio = state["grad2d"] / count / options.clone_grad2d
+    split_ratio = state["absgrad2d"] / count / options.split_absgrad2d
+    steepness = torch.where(is_small, clone_ratio, split_ratio)  # ≥ 1 grows
+    grows = (steepness >= 1) & steepness.isfinite()  # a sum that overflowed says nothing
+    halved = F.one_hot(scales.argmax(dim=-1), 3) * (grows & ~is_small)[:, None]  # [N, 3]
+    how = _halve if options.absgs_long_axis else _split_at_random
+    return Proposal(1 + halved, steepness, how, clone=grows & is_small)
+
+
+RULES: dict[str, Rule] = {
+    "structure": Rule(lambda windows: windows.structure_every, structure_aware, reads="statistics"),
+    "absgs": Rule(lambda windows: windows.absgs_every, absgs, reads="gradients"),
+}
+"""The rules by their names. Where several are due, the first of them takes the place of the others."""
+
+
+def due_rule(iteration: int, windows: Windows) -> Rule | None:
+    """Return the rule whose step ends an iteration inside the densification window."""
+    return next((rule for rule in RULES.values() if due(iteration, rule.every(windows))), None)
+
+
+@torch.no_grad()
+def apply(
+    proposal: Proposal,
+    allowed: Tensor,
+    params: Params,
+    optimizers: MutableMapping[str, torch.optim.Optimizer],
+    state: MutableMapping[str, Any],
+) -> None:
+    """Let Gaussians grow as proposed, in place; what is new starts with empty rows of every tensor in `state`.
+
+    Args:
+        proposal: For the N Gaussians of `params`.
+        allowed: Those that grow. bool [N]
+        params: gsplat's parameters.
+        optimizers: One per parameter.
+        state: The strategy's state.
+    """
+    counts = torch.where(allowed[:, None], proposal.children, 1)
+    if proposal.clone is not None and (num_clones := int((is_clone := allowed & proposal.clone).sum())) > 0:
+        duplicate(params, optimizers, state, is_clone)  # type: ignore[arg-type]
+        _forget_last(state, num_clones)
+        counts = F.pad(counts, (0, 0, 0, num_clones), value=1)  # clones are not split
+    if (counts > 1).any():
+        proposal.split(params, optimizers, state, counts)
+
+
+def _halve(params: Any, optimizers: Any, state: Any, counts: Tensor) -> None:
+    # The other axes are shortened on the parents, which the next line replaces by their children.
+    others = (counts > 1).any(dim=1, keepdim=True) & (counts == 1)
+    params["scales"].data += math.log(_OTHER_AXES) * others
+    grid_split(params, optimizers, state, counts)
+
+
+def _split_at_random(params: Any, optimizers: Any, state: Any, counts: Tensor) -> None:
+    is_split = (counts > 1).any(dim=1)
+    split(params, optimizers, state, is_split)
+    _forget_last(state, 2 * int(is_split.sum()))
+
+
+def _forget_last(state: MutableMapping[str, Any], num_children: int) -> None:
+    """Empty the rows of the newest Gaussians, which gsplat's operations append as copies of their parents' rows."""
+    for value in state.values():
+        if isinstance(value, Tensor):
+            value[-num_children:] = 0
