@@ -42,7 +42,7 @@ def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> T
     from nerfstudio.engine.trainer import TrainerConfig
 
     from sadgs_ns.data.parsers import PARSERS
-    from sadgs_ns.plugin.config import SadgsTrainerConfig
+    from sadgs_ns.training.config import SadgsTrainerConfig
 
     config = copy.deepcopy(all_methods.get(row.method))
     if not isinstance(config, TrainerConfig):
@@ -117,7 +117,7 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
 
     from benchmarks import evaluate
     from benchmarks.curve import Curve, LoopTimer, point
-    from sadgs_ns.plugin import processes
+    from sadgs_ns.training import processes
 
     devices = processes.number_of_processes()
     seconds["import_seconds"] = time.perf_counter() - start

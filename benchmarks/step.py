@@ -21,9 +21,9 @@ from sadgs_ns import kernels
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, keep_gradient
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.statistics import empty_statistics, observe
-from sadgs_ns.plugin.optimizers import AdamUpdate, FusedAdam
 from sadgs_ns.render.rasterization import rasterize
 from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
+from sadgs_ns.training.optimizers import AdamUpdate, FusedAdam
 
 REPEATS = 20
 """Calls in a row that are timed together."""

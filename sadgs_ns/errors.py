@@ -98,7 +98,7 @@ def check_working_directory() -> None:
 def print_uncaught_errors_as_sentences() -> None:
     """Have Python print our errors, and some of nerfstudio's, that nobody catches as a sentence without a traceback.
 
-    nerfstudio's commands run none of our code around their work, but all import the package's `plugin` folder, which
+    nerfstudio's commands run none of our code around their work, but all import the package's `training` folder, which
     calls this. The exit code stays 1, and other errors are shown as before.
     """
     show = sys.excepthook

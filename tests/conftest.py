@@ -50,7 +50,7 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 if TYPE_CHECKING:  # imported by the fixtures alone: nerfstudio takes seconds
     from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 
-    from sadgs_ns.plugin.config import SadgsTrainerConfig
+    from sadgs_ns.training.config import SadgsTrainerConfig
 
 THIRD_PARTY_WARNINGS = (
     # nerfstudio's activations still use torch.cuda.amp's decorators.

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-IMPORTED = ["sadgs_ns.plugin.presets", "sadgs_ns.plugin.model"]
+IMPORTED = ["sadgs_ns.training.presets", "sadgs_ns.training.model"]
 """What nerfstudio imports for this package's methods."""
 NS_TRAIN = "import sys; from nerfstudio.scripts.train import entrypoint; sys.argv[:] = {}; entrypoint()"
 """The program `ns-train`, to be completed with its name and arguments."""

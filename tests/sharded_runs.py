@@ -11,8 +11,8 @@ from kill_and_resume import configure
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from sadgs_ns.distributed.world import World
-from sadgs_ns.plugin.config import SadgsTrainerConfig
-from sadgs_ns.plugin.trainer import SadgsTrainer
+from sadgs_ns.training.config import SadgsTrainerConfig
+from sadgs_ns.training.trainer import SadgsTrainer
 
 STRUCTURE_EVERY = 6
 

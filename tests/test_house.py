@@ -12,8 +12,10 @@ import sadgs_ns
 ROOT = Path(sadgs_ns.__file__).parent
 USES = {
     # folder: the other folders that its modules may import; all may import the modules that lie flat in the package
-    "cli": {"plugin", "formats", "data", "method", "render", "kernels"},
-    "plugin": {"data", "method", "distributed", "render", "kernels"},
+    "cli": {"training", "viewer", "formats", "data", "method", "render", "kernels"},
+    # The pipeline makes the panels that show its model; the test below keeps modules from importing in a circle.
+    "training": {"viewer", "data", "method", "distributed", "render", "kernels"},
+    "viewer": {"training", "method", "render"},
     "formats": {"data"},
     "data": set(),
     "method": {"distributed", "render", "kernels"},
@@ -28,7 +30,7 @@ LINES = 20_650
 something, and who makes the package smaller lowers them."""
 LINES_OF_A_FILE = 500
 LINES_OF_LARGE_FILES = {
-    "plugin/model.py": 810,
+    "training/model.py": 810,
 }
 
 

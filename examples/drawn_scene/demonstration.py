@@ -23,12 +23,13 @@ from examples.drawn_scene.scene import EVAL_INTERVAL, SPARSE_FOLDER, SceneDescri
 from sadgs_ns.cli.export import write_gaussians
 from sadgs_ns.cli.inspection import get_view
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.plugin import color_scales, gaussian_maps, presets, texture
-from sadgs_ns.plugin.color_scales import ETA, PERIOD, Panel, to_picture
-from sadgs_ns.plugin.config import SadgsTrainerConfig
-from sadgs_ns.plugin.pipeline import SadgsPipeline
-from sadgs_ns.plugin.structure_cache import observe_training_views
-from sadgs_ns.plugin.trainer import SadgsTrainer
+from sadgs_ns.training import presets
+from sadgs_ns.training.config import SadgsTrainerConfig
+from sadgs_ns.training.pipeline import SadgsPipeline
+from sadgs_ns.training.structure_cache import observe_training_views
+from sadgs_ns.training.trainer import SadgsTrainer
+from sadgs_ns.viewer import color_scales, gaussian_maps, texture
+from sadgs_ns.viewer.color_scales import ETA, PERIOD, Panel, to_picture
 
 ABSGS_THRESHOLD_FACTOR = 16.0
 """Factor on AbsGS's gradient thresholds. Gradients are normalised by the image's size and grow with a

@@ -197,8 +197,8 @@ def read_checkpoint(run: Path) -> tuple[dict[str, Tensor], RenderOptions]:
     from torch import Tensor
 
     from sadgs_ns.gsplat_compat import NEAR_PLANE
-    from sadgs_ns.plugin import checkpoints
     from sadgs_ns.render.types import RenderOptions
+    from sadgs_ns.training import checkpoints
 
     checkpoint = _checkpoint_of(run)
     folder, single = (None, checkpoint) if checkpoint == run else (checkpoint.parent, None)

@@ -20,14 +20,15 @@ from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, keep_gr
 from sadgs_ns.method.growth import absgs, apply
 from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.method.split import grid_split, num_children
-from sadgs_ns.plugin import checkpoints, color_scales, gaussian_maps, texture
-from sadgs_ns.plugin.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
-from sadgs_ns.plugin.config import SadgsTrainerConfig
-from sadgs_ns.plugin.model import SadgsModel
-from sadgs_ns.plugin.pipeline import SadgsPipeline
-from sadgs_ns.plugin.structure_cache import observe_training_views
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.render.types import Cameras as Pinholes
+from sadgs_ns.training import checkpoints
+from sadgs_ns.training.config import SadgsTrainerConfig
+from sadgs_ns.training.model import SadgsModel
+from sadgs_ns.training.pipeline import SadgsPipeline
+from sadgs_ns.training.structure_cache import observe_training_views
+from sadgs_ns.viewer import color_scales, gaussian_maps, texture
+from sadgs_ns.viewer.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
 
 Split = Literal["train", "eval"]
 SEED = 0

@@ -43,8 +43,8 @@ from sadgs_ns.data.coordinates import FRAME_KEYS, TRANSFORMS_NAME
 from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.formats import FORMATS, MESH
 from sadgs_ns.formats.mesh import load_open3d
-from sadgs_ns.plugin.interrupts import Interrupts
-from sadgs_ns.plugin.lost_output import print_elsewhere_once_unread
+from sadgs_ns.training.interrupts import Interrupts
+from sadgs_ns.training.lost_output import print_elsewhere_once_unread
 
 _OURS = ("data", "output-dir", "experiment-name", "timestamp", "vis", "load-dir", "load-checkpoint", "load-config")
 """Options of ns-train that this command sets."""

@@ -26,8 +26,8 @@ def update_param_with_optimizer(
 ) -> None:
     """Put others in the place of parameters and of their optimizers' moments, as gsplat's `duplicate` and `split` do.
 
-    While a parameter is changed, its optimizer has no state, by which plugin/trainer.py recognizes that memory ran out
-    meanwhile.
+    While a parameter is changed, its optimizer has no state, by which training/trainer.py recognizes that memory ran
+    out meanwhile.
 
     Args:
         param_fn: Makes a parameter of its name and what it was.

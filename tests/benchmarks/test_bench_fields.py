@@ -213,7 +213,7 @@ INITIALIZATION_SECONDS = 0.5
 @pytest.fixture(scope="module")
 def written(root: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """What `benchmarks.run` writes for the command that python -m benchmarks starts."""
-    from sadgs_ns.plugin.model import SadgsModel
+    from sadgs_ns.training.model import SadgsModel
 
     folder = tmp_path_factory.mktemp("run")
     commands: list[list[str]] = []

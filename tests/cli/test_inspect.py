@@ -30,14 +30,14 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.method.growth import structure_aware
 from sadgs_ns.method.quantization import INVALID
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.plugin import color_scales, gaussian_maps, texture
-from sadgs_ns.plugin.model import _say_once
-from sadgs_ns.plugin.panel import CHOICES, OFF, OUTPUT, StructurePanel, changed, describe, nearest_view
-from sadgs_ns.plugin.pipeline import SadgsPipeline
-from sadgs_ns.plugin.structure_cache import observe_training_views
 from sadgs_ns.render import rasterization
 from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.render.types import Gaussians
+from sadgs_ns.training.model import _say_once
+from sadgs_ns.training.pipeline import SadgsPipeline
+from sadgs_ns.training.structure_cache import observe_training_views
+from sadgs_ns.viewer import color_scales, gaussian_maps, texture
+from sadgs_ns.viewer.structure_panel import CHOICES, OFF, OUTPUT, StructurePanel, changed, describe, nearest_view
 
 WIDTH, HEIGHT, TRAIN_VIEWS, EVAL_VIEWS = 48, 36, 8, 2
 ITERATIONS = 60

@@ -50,7 +50,7 @@ from sadgs_ns.cli.cameras.video import sharpest_frames, video_frames
 from sadgs_ns.data.checks.layouts import ParserOptions
 from sadgs_ns.data.checks.transforms import check_nerfstudio
 from sadgs_ns.errors import InputError, RunError
-from sadgs_ns.plugin.config import SadgsDatamanagerConfig
+from sadgs_ns.training.config import SadgsDatamanagerConfig
 
 
 @pytest.fixture(scope="module")

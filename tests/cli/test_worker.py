@@ -17,7 +17,7 @@ from processes import HANGS
 
 from sadgs_ns.cli.worker import Worker, WorkerError
 from sadgs_ns.errors import InputError
-from sadgs_ns.plugin.interrupts import Interrupted, Interrupts
+from sadgs_ns.training.interrupts import Interrupted, Interrupts
 
 
 @pytest.fixture

@@ -30,7 +30,7 @@ from examples.drawn_scene.scene import SPARSE_FOLDER
 from sadgs_ns.data.checks import check_data
 from sadgs_ns.data.parsers import AutomaticDataParserConfig, check_capture, choose_parser
 from sadgs_ns.errors import InputError
-from sadgs_ns.plugin.config import SadgsDatamanagerConfig
+from sadgs_ns.training.config import SadgsDatamanagerConfig
 
 
 def colmap_in(folder: str) -> Callable[[Path, Path], None]:

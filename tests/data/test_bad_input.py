@@ -1385,11 +1385,13 @@ def test_of_two_hundred_photographs_one_is_decoded(tmp_path: Path, monkeypatch: 
 )
 def test_uncaught_errors_print_one_sentence_and_exit_with_1():
     for kind, ordinary in ((InputError, ValueError), (RunError, RuntimeError)):
-        code = f"import sadgs_ns.plugin; from sadgs_ns.errors import *; raise {kind.__name__}('Nothing: do something.')"
+        code = (
+            f"import sadgs_ns.training; from sadgs_ns.errors import *; raise {kind.__name__}('Nothing: do something.')"
+        )
         result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=HANGS)
         assert (result.returncode, result.stderr) == (1, "error: Nothing: do something.\n")
         assert kind.__bases__ == (ordinary,)
-    code = "import sadgs_ns.plugin; raise ValueError('somebody else')"
+    code = "import sadgs_ns.training; raise ValueError('somebody else')"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=HANGS)
     assert result.returncode == 1 and result.stderr.startswith("Traceback") and "somebody else" in result.stderr
 

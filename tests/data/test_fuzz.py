@@ -22,7 +22,7 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
 from sadgs_ns.data.parsers import check_capture
 from sadgs_ns.errors import InputError
-from sadgs_ns.plugin.config import SadgsDatamanagerConfig
+from sadgs_ns.training.config import SadgsDatamanagerConfig
 
 FEW = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 MEMORY = 1 << 30

@@ -36,9 +36,9 @@ from tyro import cli
 from benchmarks import protocol, run
 from benchmarks.protocol import Row, Scene
 from examples.drawn_scene.scene import SPARSE_FOLDER
-from sadgs_ns.plugin import presets
-from sadgs_ns.plugin.config import SadgsDatamanagerConfig, SadgsTrainerConfig
-from sadgs_ns.plugin.trainer import SadgsTrainer
+from sadgs_ns.training import presets
+from sadgs_ns.training.config import SadgsDatamanagerConfig, SadgsTrainerConfig
+from sadgs_ns.training.trainer import SadgsTrainer
 
 
 class Payload:

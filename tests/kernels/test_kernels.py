@@ -27,10 +27,10 @@ from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients
 from sadgs_ns.method.quantization import quantize
 from sadgs_ns.method.statistics import STATISTICS, Statistic, empty_statistics, observe, observed_eta
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
-from sadgs_ns.plugin.optimizers import AdamUpdate, FusedAdam
 from sadgs_ns.render import backend_gsplat
 from sadgs_ns.render.activations import activate
 from sadgs_ns.render.off_axis import cull_off_axis
+from sadgs_ns.training.optimizers import AdamUpdate, FusedAdam
 
 triton = pytest.importorskip("triton", reason="Triton is not installed")
 activations = pytest.importorskip("sadgs_ns.kernels.activations", reason="Triton is not installed")

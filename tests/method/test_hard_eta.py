@@ -33,12 +33,12 @@ from sadgs_ns.kernels import triton_switched
 from sadgs_ns.method import losses
 from sadgs_ns.method.eta import eta, projected_axes, sample_footprint
 from sadgs_ns.method.statistics import empty_statistics, observe
-from sadgs_ns.plugin.config import SadgsDatamanagerConfig, SadgsPipelineConfig
-from sadgs_ns.plugin.datamanager import SadgsDatamanager
-from sadgs_ns.plugin.model import SadgsModel
-from sadgs_ns.plugin.pipeline import SadgsPipeline
-from sadgs_ns.plugin.views import TrainingViews
 from sadgs_ns.render.rasterization import visible
+from sadgs_ns.training.config import SadgsDatamanagerConfig, SadgsPipelineConfig
+from sadgs_ns.training.datamanager import SadgsDatamanager
+from sadgs_ns.training.model import SadgsModel
+from sadgs_ns.training.pipeline import SadgsPipeline
+from sadgs_ns.training.views import TrainingViews
 
 harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")
 photometric = pytest.importorskip("sadgs_ns.kernels.losses", reason="Triton is not installed")

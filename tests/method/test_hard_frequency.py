@@ -18,7 +18,7 @@ from torch import Tensor
 
 from sadgs_ns.method.eta import principal_eigenvalue, wavelength
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
-from sadgs_ns.plugin.model import SadgsModel
+from sadgs_ns.training.model import SadgsModel
 
 unit_tensor = partial(multiscale_structure_tensor, frequency_constant=1.0)
 """S̄ in units of c²: its trace is at most 1."""

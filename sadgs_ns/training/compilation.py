@@ -1,0 +1,216 @@
+"""Compiles a run's Triton kernels side by side before training starts, instead of one by one on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
+from torch import Tensor
+
+from sadgs_ns.errors import reason
+from sadgs_ns.gsplat_compat import NEAR_PLANE
+from sadgs_ns.kernels import use_triton
+from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients
+from sadgs_ns.method.color_matrices import correct_colors, identities
+from sadgs_ns.method.losses import photometric_loss
+from sadgs_ns.method.quantization import quantize
+from sadgs_ns.method.statistics import empty_statistics, observe
+from sadgs_ns.render.activations import activate
+from sadgs_ns.render.rasterization import rasterize
+from sadgs_ns.render.types import Cameras, Gaussians
+from sadgs_ns.training.optimizers import AdamUpdate, FusedAdam
+from sadgs_ns.training.pipeline import SadgsPipeline
+
+_GAUSSIANS, _SIZE = 64, 64
+"""Number of Gaussians, and width and height in px, of the picture on which the kernels are tried."""
+_PATIENCE = 2.0
+"""Seconds after which the user is told what the run is waiting for."""
+
+
+class _Stages:
+    """The stages of a training step on a few Gaussians. Each method launches the kernels of one.
+
+    Args:
+        pipeline: As for `compile_kernels`, like what follows.
+    """
+
+    def __init__(self, pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
+        self.pipeline, self.optimizers = pipeline, optimizers
+        self.model, self.device, self.views = pipeline.model, pipeline.device, pipeline.views_per_iteration
+        n, device = _GAUSSIANS, pipeline.device
+        ramp = torch.linspace(-0.5, 0.5, n, device=device)
+        self.means = torch.stack([ramp, ramp.flip(0), torch.full_like(ramp, 2.0)], dim=-1)
+        quats = self.means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
+        self.scales, self.opacities = torch.full_like(self.means, 0.05), torch.full_like(ramp, 0.5)
+        self.gaussians = Gaussians(self.means, quats, self.scales, self.opacities, self.means)
+        viewmats = torch.eye(4, device=device).repeat(self.views, 1, 1)
+        intrinsics = [[_SIZE, 0.0, _SIZE / 2], [0.0, _SIZE, _SIZE / 2], [0.0, 0.0, 1.0]]
+        Ks = self.means.new_tensor(intrinsics).repeat(self.views, 1, 1)
+        self.image = torch.linspace(0.0, 1.0, 3 * _SIZE * _SIZE, device=device).view(1, _SIZE, _SIZE, 3)
+        self.cameras = Cameras(viewmats, Ks, _SIZE, _SIZE)
+        # The run's own near plane may lie behind these Gaussians, and what nobody sees launches no compositing.
+        self.drawing = replace(self.model.drawing, near_plane=NEAR_PLANE)
+        self.info: dict[str, Any] = {}
+        """What `rasterize` says of the projection, once `project` was called."""
+
+    def alone(self) -> dict[str, Callable[[], None]]:
+        """Return the stages that need no projection, by what a user calls them."""
+        stages = {
+            "the loss": partial(self.loss, torch.uint8),
+            "S̄": self.structure,
+            "Adam": self.update,
+            "the loss of masked images": partial(self.loss, torch.float32),
+            "activations": self.activations,
+        }
+        return stages if self.model.color_matrices is None else stages | {"colour matrices": self.colors}
+
+    def after_projection(self) -> dict[str, Callable[[], None]]:
+        """Return the stages that read what `project` has computed."""
+        stages = {"η": self.observation, "compositing with AbsGS": partial(self.composite, True)}
+        if self.model.backend == "triton":
+            stages |= {
+                "projection and spherical harmonics": self.projection,
+                "tile lists": self.tile_lists,
+                "compositing": partial(self.composite, False),
+            }
+        return stages if self.pipeline.world.alone else stages | {"what travels between devices": self.exchange}
+
+    def project(self) -> None:
+        _, _, self.info = rasterize(self.gaussians, self.cameras, self.drawing)
+
+    def tile_lists(self) -> None:
+        # The size is the run's: whether tiles are numbered in 16 or in 32 bits depends on how many there are, and lists
+        # of a given length have one more row of them.
+        sizes = self.pipeline.datamanager.train_dataset.cameras
+        cameras = self.cameras._replace(width=int(sizes.width.max()), height=int(sizes.height.max()))
+        for capacity in (None, 2**20):
+            rasterize(self.gaussians, cameras, replace(self.drawing, tile_capacity=capacity))
+
+    def blank(self, name: str) -> Tensor:
+        return self.means.new_zeros((_GAUSSIANS, *self.model.gauss_params[name].shape[1:]))
+
+    def structure(self) -> None:
+        quantize(self.pipeline.structure_cache.of_images(self.image))
+
+    def loss(self, dtype: torch.dtype) -> None:  # Images are bytes; a mask or transparency makes them floats.
+        predicted = self.image.repeat(self.views, 1, 1, 1).requires_grad_()
+        photometric_loss(predicted, torch.zeros_like(predicted, dtype=dtype))[0].backward()
+
+    def colors(self) -> None:
+        shape = self.views, _SIZE, _SIZE
+        renders, alphas = (torch.zeros((*shape, k), device=self.device, requires_grad=True) for k in (3, 1))
+        matrices = identities(self.views).to(self.device).requires_grad_()
+        correct_colors(renders, alphas, matrices).sum().backward()
+
+    def update(self) -> None:
+        twins: dict[str, FusedAdam] = {}
+        for name, optimizer in self.optimizers.items():
+            if name in self.model.trained_params:
+                # Matrices of colours are fewer than the Gaussians, and so updated in a launch of their own.
+                of_gaussians = name in self.model.gauss_params
+                value = self.blank(name) if of_gaussians else torch.zeros((1, 3, 4), device=self.device)
+                options = {key: optimizer.defaults[key] for key in ("betas", "eps")}
+                twins[name] = FusedAdam([torch.nn.Parameter(value)], **options)
+        update = AdamUpdate({name: twin for name, twin in twins.items() if twin.param_groups[0]["params"][0].numel()})
+        gradients = {name: torch.zeros_like(parameter) for name, parameter in update.parameters.items()}
+        # Several processes wait for the exact lengths of tile lists, which then cannot overflow.
+        flags = (torch.zeros(1, dtype=torch.int64, device=self.device),) if self.pipeline.world.alone else ()
+        update.launch(gradients, update.factors().to(self.device), torch.zeros(1, device=self.device), flags)
+
+    def composite(self, absgrad: bool) -> None:
+        gaussians = self.gaussians._replace(means=self.means.clone().requires_grad_())
+        renders, alphas, info = rasterize(gaussians, self.cameras, replace(self.drawing, absgrad=absgrad))
+        black = self.model.config.background_color == "black" and self.model.color_matrices is None
+        result = renders.sum() if black else renders.sum() + alphas.sum()
+        # The projection is differentiated elsewhere.
+        (info["means2d"].grad2d,) = torch.autograd.grad(result, info["means2d"])
+        if absgrad:
+            accumulate_gradients(empty_gradients(_GAUSSIANS, self.device), info, self.views)
+
+    def activations(self) -> None:
+        for weight in (0.0, 1.0):  # The loss has a part with the mean opacity, but not to the end.
+            parameters = self.scales.clone().requires_grad_(), self.opacities[:, None].clone().requires_grad_()
+            some = activate(*parameters, weight)
+            torch.autograd.backward([value.sum() for value in some if value is not None])
+
+    def projection(self) -> None:
+        from sadgs_ns.kernels.harmonics import colors_from_harmonics
+        from sadgs_ns.kernels.projection import project
+
+        config = self.model.config
+        means, quats, scales = (value.clone().requires_grad_() for value in self.gaussians[:3])
+        radii, means2d, _, conics, centres = project(means, quats, scales, self.opacities, *self.cameras)
+        results = [means2d, conics]
+        if config.sh_degree > 0:
+            coefficients = self.blank("features_dc"), self.blank("features_rest")
+            viewmats = self.cameras.viewmats
+            results.append(colors_from_harmonics(config.sh_degree, centres, *coefficients, viewmats, radii))
+        torch.autograd.backward([value.sum() for value in results])
+
+    def observation(self) -> None:
+        params = {"means": self.means, "quats": self.gaussians.quats, "scales": self.scales.log()}
+        tensors = self.image.byte().repeat(self.views, 1, 1, 1)
+        observe(
+            empty_statistics(_GAUSSIANS, self.device),
+            params,  # type: ignore[arg-type]
+            self.info | {"structure_tensors": tensors, "viewmats": self.cameras.viewmats, "Ks": self.cameras.Ks},
+            generator=torch.Generator(self.device).manual_seed(0),
+        )
+
+    def exchange(self) -> None:
+        from sadgs_ns.kernels.exchange import pack, unpack
+
+        seen = [self.info[name].detach() for name in ("radii", "means2d", "depths", "conics", "opacities")]
+        places = torch.arange(self.views * _GAUSSIANS, device=self.device)
+        colors = self.means.expand(self.views, _GAUSSIANS, 3)
+        unpack(pack(*(value.contiguous() for value in (*seen, colors)), places=places), 0)
+
+
+def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
+    """Launch the kernels of training once, on a few Gaussians and in threads, whose compilations then overlap.
+
+    Triton keeps what it compiled on the disk: a machine's first run takes seconds here, a later one none. The run
+    itself is left as it was, random numbers included.
+
+    A kernel that fails here does not stop the run, which may never need it: the user is told which ones failed and why,
+    in one sentence, and training tries them again where it needs them.
+
+    Args:
+        pipeline: A pipeline whose model and data are set up.
+        optimizers: The run's optimizers, by the names of their parameters.
+    """
+    device = pipeline.device
+    if not use_triton(device):
+        return
+    stages = _Stages(pipeline, optimizers)
+    failures: dict[str, BaseException] = {}
+    pending: dict[str, Future[None]] = {}
+
+    def take_device() -> None:
+        if device.type == "cuda":  # A new thread has the first device, and Triton launches on a thread's own.
+            torch.cuda.set_device(device)
+
+    with ThreadPoolExecutor(initializer=take_device) as pool:  # which waits for its threads, whatever happens
+        pending |= {name: pool.submit(stage) for name, stage in stages.alone().items()}
+        try:
+            stages.project()
+        except Exception as error:
+            failures["rasterization"] = error
+        else:
+            pending |= {name: pool.submit(stage) for name, stage in stages.after_projection().items()}
+        if wait(pending.values(), timeout=_PATIENCE).not_done:
+            CONSOLE.print("Compiling kernels for this GPU, once …")
+    failures |= {name: error for name, future in pending.items() if (error := future.exception()) is not None}
+    if failures:
+        why = escape(reason(next(iter(failures.values()))))
+        CONSOLE.print(
+            f"[yellow]The kernels of {', '.join(failures)} could not be compiled and tried before training ({why}): "
+            "training tries them again, and stops with an error of its own if it cannot do without them.[/]",
+            soft_wrap=True,
+        )

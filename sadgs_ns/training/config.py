@@ -1,0 +1,449 @@
+"""The options of `ns-train sadgs`, and the checks of their ranges. Those of optimizers are in optimizers.py."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
+from nerfstudio.configs.base_config import (
+    InstantiateConfig,
+    LocalWriterConfig,
+    LoggingConfig,
+    MachineConfig,
+    ViewerConfig,
+)
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+from tyro.conf import Suppress
+
+from sadgs_ns.data.parsers import AnyParserConfig, AutomaticDataParserConfig
+from sadgs_ns.errors import InputError, reason
+from sadgs_ns.kernels import SWITCH, switched_off
+from sadgs_ns.method.initialization import POINT_OPACITY
+from sadgs_ns.method.quantization import HIGHEST_FREQUENCY
+from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.method.structure_tensor import ENERGY_BLUR, FREQUENCY_CONSTANT
+from sadgs_ns.render.rasterization import choose_backend
+from sadgs_ns.render.types import BackendName
+from sadgs_ns.training import processes
+from sadgs_ns.training.optimizers import FusedAdam, RunLengthDecaySchedulerConfig
+from sadgs_ns.training.options import check_ranges, hide
+from sadgs_ns.training.progress import ProgressTable
+from sadgs_ns.training.run_folder import begin
+
+_MOST_RANDOM = 10_000_000
+"""Largest number of random points to start from; they take the host's memory before the cap thins them out."""
+_MOST_EFFORT = 100
+"""Largest `effort`, which is a million iterations of four views for a capture of 760 views."""
+_WIDEST_BLUR = 100
+"""Largest window of `energy_blur`, which makes kernels of thousands of pixels."""
+
+
+def _class(module: str, name: str) -> type:
+    """Import a class when options are made: its module imports this one."""
+    return getattr(import_module(f"sadgs_ns.training.{module}"), name)
+
+
+@hide("trans_l2_penalty", "rot_l2_penalty")  # Others than nerfstudio's are refused below.
+@dataclass
+class PoseOptimizerConfig(CameraOptimizerConfig):
+    """nerfstudio's options of learned camera poses, with its own penalties, which hold them near the given ones."""
+
+    mode: Literal["off", "SO3xR3", "SE3"] = "off"
+    """Whether and how the cameras' poses are refined; SO3xR3 turns and moves each camera."""
+
+
+@dataclass
+class SadgsModelConfig(InstantiateConfig):
+    """Options of the Gaussians, their loss and their densification.
+
+    The model is a splatfacto model, because nerfstudio's viewer and exporter ask for one; its configuration is not one
+    of splatfacto's, most of whose options concern a densification that this method replaces.
+    """
+
+    _target: type = field(default_factory=lambda: _class("model", "SadgsModel"))
+    strategy: StructureAwareStrategy = field(default_factory=StructureAwareStrategy)
+    """When and how Gaussians are split, cloned and pruned."""
+    camera_optimizer: PoseOptimizerConfig = field(default_factory=PoseOptimizerConfig)
+    """Whether and how the cameras' poses are refined in training."""
+    backend: BackendName = "auto"
+    """What draws: auto takes Triton's kernels where they work, gsplat's on other CUDA devices, and torch elsewhere.
+    gsplat trains on one GPU, without CUDA graphs."""
+    background_color: Literal["black", "white"] = "black"
+    """Colour behind the Gaussians."""
+    random_init: bool = False
+    """Start from random points even where the data has SfM points."""
+    num_random: int = 50000
+    """Number of random points to start from, where there are no SfM points or they are not wanted."""
+    random_scale: float = 10.0
+    """Side of the cube around the origin in which random points are drawn, in the run's units."""
+    bounding_box_points: bool = True
+    """Also start from points on the faces of the SfM points' bounding box, which become sky and far background."""
+    stereo_points: int | None = None
+    """Points to start from beside the SfM points, at most, drawn from stereo depth of the training photos (CUDA).
+    None is 150,000 where there are 3 to 60 training views, and otherwise none."""
+    clear_paths: bool | None = None
+    """Let each densification step prune what floats near the cameras' paths, which viewers of files show as haze.
+    None does so where there are at most 60 training views."""
+    initial_opacity: float = POINT_OPACITY
+    """Opacity at which SfM points start, in (0, 1); random ones start at 0.1.
+    Half opaque ones mostly have a lower LPIPS and make more Gaussians (docs/results.md)."""
+    sh_degree: int = 3
+    """Degree of the spherical harmonics that make colours depend on the direction of view, 0 to 3."""
+    ssim_lambda: float = 0.6
+    """Weight of SSIM against L1 in the loss, in [0, 1]. The paper's 0.2 resolves less detail for as many Gaussians."""
+    opacity_reg: float = 0.01
+    """Weight of the mean opacity in the loss while densification runs: what no image needs fades until it is pruned.
+    Larger leaves fewer Gaussians; 0 is off, as in the paper."""
+    averaged_share: float = 0.05
+    """Share of the run, at its end, over which the Gaussians' parameters are averaged, in [0, 0.3].
+    The finished run has the mean; 0 leaves it the last iteration's."""
+    max_off_axis: float = 4.0
+    """Gaussians whose centre is projected further from the image's centre, in half images along x or y, are not drawn.
+    Far off the axis a Gaussian's image is wrong, and can be haze over the view; 0 draws all."""
+    near_plane: float | None = None
+    """Depth from which Gaussians are drawn, in the run's units; nothing nearer is, in training or later.
+    None is half the depth at which a training camera's fifth SfM point lies, of the camera that comes nearest."""
+    max_angular_scale: float = 0.3
+    """Longest standard deviation of a Gaussian as a share of its distance from the nearest training camera.
+    A longer one can cover a view beside which it lies with haze; 0 sets no limit."""
+    color_model: Literal["none", "affine"] = "none"
+    """What is learned of each training photo's exposure and white balance, which held-out views are rendered without.
+    "affine" is a colour matrix."""
+    color_corrected_metrics: bool = False
+    """Also report metrics after fitting the colours of each rendering to its photo, as suits changing exposure."""
+
+    def check(self) -> None:
+        """Raise InputError if an option is out of its range."""
+        near, stereo, off_axis, angle = self.near_plane, self.stereo_points, self.max_off_axis, self.max_angular_scale
+        ranges = [
+            ("ssim_lambda", 0 <= self.ssim_lambda <= 1, "in [0, 1]"),
+            ("background_color", self.background_color in ("black", "white"), "black or white"),
+            ("initial_opacity", 0 < self.initial_opacity < 1, "in (0, 1)"),
+            ("opacity_reg", 0 <= self.opacity_reg <= 100, "in [0, 100]"),
+            ("averaged_share", 0 <= self.averaged_share <= 0.3, "in [0, 0.3]"),
+            ("max_off_axis", 0 <= off_axis < math.inf, "finite and not negative"),
+            ("max_angular_scale", 0 <= angle < math.inf, "finite and not negative"),
+            ("max_off_axis", off_axis == 0 or off_axis >= 1, "0, or at least 1, the image's border"),
+            ("near_plane", near is None or 0 < near < math.inf, "positive and finite"),
+            ("sh_degree", 0 <= self.sh_degree <= 3, "in [0, 3]"),
+            ("num_random", 1 <= self.num_random <= _MOST_RANDOM, f"in [1, {_MOST_RANDOM:,}]"),
+            ("stereo_points", stereo is None or 0 <= stereo <= _MOST_RANDOM, f"in [0, {_MOST_RANDOM:,}]"),
+            ("random_scale", 0 < self.random_scale < math.inf, "positive and finite"),
+        ]
+        check_ranges("pipeline.model.", self, ranges)
+        for name in ("trans_l2_penalty", "rot_l2_penalty"):
+            if (penalty := getattr(self.camera_optimizer, name)) != getattr(PoseOptimizerConfig, name):
+                told = f"cannot be set, got {penalty:g}: leave it out."
+                raise InputError(f"pipeline.model.camera_optimizer.{name} {told}")
+        try:
+            self.strategy.check()
+        except ValueError as error:
+            raise InputError(f"pipeline.model.{error}") from error
+
+
+@hide("data", "train_cameras_sampling_seed")  # `--data` and `--machine.seed` set them.
+@hide("masks_on_gpu", "images_on_gpu", "max_thread_workers", "train_cameras_sampling_strategy", "fps_reset_every")
+@hide("eval_num_images_to_sample_from", "eval_num_times_to_repeat_images", "eval_image_indices")
+@dataclass
+class SadgsDatamanagerConfig(FullImageDatamanagerConfig):
+    """nerfstudio's options, without those on the command line that its loader of whole images does not read."""
+
+    _target: type = field(default_factory=lambda: _class("datamanager", "SadgsDatamanager"))
+    dataparser: AnyParserConfig = field(default_factory=AutomaticDataParserConfig)
+    """How the folder is read: by default with the parser that fits what it holds."""
+    camera_res_scale_factor: float = 1.0
+    """Factor by which images and cameras are scaled when they are loaded; 0.5 trains at half the resolution."""
+    cache_images: Literal["gpu", "cpu", "compressed"] = "gpu"  # type: ignore[assignment]
+    """Where the images are kept: "gpu" is the device of training, as long as that leaves enough of its memory free.
+    Otherwise it is "cpu", decoded in the host's memory, or "compressed", files that are decoded ahead of their step."""
+    cache_images_type: Suppress[Literal["uint8", "float32"]] = "uint8"
+    """Images are kept as bytes, as they are in files; another type is refused."""
+
+
+def check_options(config: FullImageDatamanagerConfig) -> None:
+    """Raise InputError if an option of a datamanager, or of its parser of data, is out of its range."""
+    parser: Any = config.dataparser
+    ranges = {
+        "scale_factor": (lambda value: 0 < value < math.inf, "positive and finite"),
+        "train_split_fraction": (lambda value: 0 < value <= 1, "in (0, 1]"),
+        "eval_interval": (lambda value: value >= 2, "at least 2"),
+    }
+    for name, (fits, allowed) in ranges.items():
+        if hasattr(parser, name) and not fits(value := getattr(parser, name)):
+            raise InputError(f"{name}, an option of the data's parser, must be {allowed}, got {value:g}.")
+    if config.cache_images_type != "uint8":
+        raise InputError(
+            f"pipeline.datamanager.cache_images_type is {config.cache_images_type}, and sadgs keeps images as bytes, "
+            "which is what their files hold: leave it out."
+        )
+    if config.train_cameras_sampling_strategy != "random":
+        raise InputError(
+            f"pipeline.datamanager.train_cameras_sampling_strategy is {config.train_cameras_sampling_strategy}, and "
+            "sadgs takes each view once a round: leave it out."
+        )
+    scale = config.camera_res_scale_factor
+    check_ranges("pipeline.datamanager.", config, [("camera_res_scale_factor", 0 < scale <= 1, "in (0, 1]")])
+
+
+@dataclass
+class SadgsPipelineConfig(VanillaPipelineConfig):
+    """Options of the data, the model and the structure tensors of the images."""
+
+    _target: type = field(default_factory=lambda: _class("pipeline", "SadgsPipeline"))
+    datamanager: SadgsDatamanagerConfig = field(default_factory=SadgsDatamanagerConfig)
+    """How images are loaded and drawn."""
+    model: SadgsModelConfig = field(default_factory=SadgsModelConfig)
+    """The Gaussians and their densification."""
+    effort: float = 1.0
+    """How much training the capture is given, relative to what its number of views asks for.
+    0.5 is a draft of half as many renderings. 2 adds more Gaussians; 2 and 4 render more where views are many."""
+    views_per_iteration: int | None = None
+    """Training views rendered for one optimizer step, at most as many as there are; the loss is their mean.
+    None takes one more for every 2,000 renderings of the run, up to 4. The paper uses 1 outdoors, 2 indoors."""
+    memory_budget_gb: float | None = None
+    """Memory of the GPU, in 10⁹ bytes, that training may take; the cap of Gaussians is lowered to it at the start.
+    None is 80 % of what is free, unless `max_gaussians` was changed, which then stays."""
+    frequency_constant: float = FREQUENCY_CONSTANT
+    """c of ω_l = c / σ_l in 1/px, at most 4: the larger, the shorter every wavelength and the more is split."""
+    energy_blur: float = ENERGY_BLUR
+    """Window, in multiples of σ_l, over which the energy of a scale is averaged; 0 measures it per pixel (eq. 4)."""
+    epsilon: float | None = None
+    """ε of the structure tensor (eq. 3 and 5), for images in [0, 1].
+    None makes it relative to an image's contrast, so that the exposure of a photo does not decide what is split."""
+
+    def check(self) -> None:
+        """Raise InputError if an option is out of its range."""
+        views, epsilon, budget = self.views_per_iteration, self.epsilon, self.memory_budget_gb
+        ranges = [
+            ("effort", 0 < self.effort <= _MOST_EFFORT, f"in (0, {_MOST_EFFORT}]"),
+            ("views_per_iteration", views is None or views >= 1, "at least 1"),
+            ("energy_blur", 0 <= self.energy_blur <= _WIDEST_BLUR, f"in [0, {_WIDEST_BLUR}]"),
+            ("epsilon", epsilon is None or 0 < epsilon < math.inf, "positive and finite"),
+            ("memory_budget_gb", budget is None or 0 < budget < math.inf, "positive and finite"),
+        ]
+        check_ranges("pipeline.", self, ranges)
+        if not 0 < (constant := self.frequency_constant) <= HIGHEST_FREQUENCY:
+            raise InputError(f"pipeline.frequency_constant must be in (0, {HIGHEST_FREQUENCY:g}], got {constant}.")
+        check_options(self.datamanager)
+        self.model.check()
+
+
+@hide("num_machines", "machine_rank", "dist_url")
+@dataclass
+class SadgsMachineConfig(MachineConfig):
+    """nerfstudio's options of the machine; those of several machines are not shown, since torchrun starts these."""
+
+    seed: int = 42
+    """Seed of everything that is drawn at random, the order of the training views too."""
+    num_devices: int = 1
+    """Number of CUDA devices of this machine to train on, among which the Gaussians are shared out.
+    torchrun can start the processes instead, on several machines, too; this is then 1."""
+    device_type: Literal["cpu", "cuda", "mps"] = field(
+        default_factory=lambda: "cuda" if torch.cuda.is_available() else "cpu"
+    )
+    """Kind of device to train on; CUDA where there is one."""
+
+
+@hide("websocket_port_default", "relative_log_filename", "num_rays_per_chunk")
+@hide("camera_frustum_scale", "default_composite_depth")
+@dataclass
+class SadgsViewerConfig(ViewerConfig):
+    """nerfstudio's options of the viewer, which here listens on this machine only."""
+
+    websocket_host: str = "127.0.0.1"
+    """Address at which the viewer listens: this machine only; 0.0.0.0 opens it to the network."""
+    websocket_port: int | None = None
+    """Port at which the viewer listens; None is 7007, or a free one where that is taken."""
+    quit_on_train_completion: bool = False
+    """End the command when training is done, instead of keeping the viewer open."""
+    max_num_display_images: int = 512
+    """Number of training images shown as cameras in the viewer, -1 for all; training takes all images anyway."""
+    make_share_url: bool = False
+    """Print an address at which others can open the viewer, through a server of viser's makers."""
+
+
+@hide("method_name", "prompt", "relative_model_dir", "load_scheduler", "log_gradients")
+@hide("mixed_precision", "use_grad_scaler", "gradient_accumulation_steps")  # The check below refuses them.
+@dataclass
+class SadgsTrainerConfig(TrainerConfig):
+    """Options of `ns-train sadgs`, checked before a run starts."""
+
+    _target: type = field(default_factory=lambda: _class("trainer", "SadgsTrainer"))
+    output_dir: Path = Path("outputs")
+    """Folder in which each run gets a folder of its own."""
+    experiment_name: str | None = None
+    """Name of the run's folder; None takes that of the data."""
+    timestamp: str = "{timestamp}"
+    """Name of the folder inside the experiment's and the method's; by default it is the time of the start."""
+    machine: SadgsMachineConfig = field(default_factory=SadgsMachineConfig)
+    """Device and seed."""
+    pipeline: SadgsPipelineConfig = field(default_factory=SadgsPipelineConfig)
+    """Data and model."""
+    viewer: SadgsViewerConfig = field(default_factory=SadgsViewerConfig)
+    """The viewer in the browser."""
+    max_num_iterations: int | None = None  # type: ignore[assignment]
+    """Length of the run in optimizer steps; None derives it from the number of views and `pipeline.effort`.
+    Densification and the learning rates' schedules stretch to it."""
+    rates_follow_views: bool = True
+    """Whether the rates of positions, opacities, scales and rotations, set for one view a step, change with more views.
+    The mean over more views is less noisy, so that they may be higher, and fall further."""
+    cuda_graphs: bool = True
+    """Whether the host launches steps of few Gaussians at once, as CUDA graphs, instead of kernel by kernel.
+    Only where there is CUDA, and up to a million Gaussians, counted in each view (docs/results.md)."""
+    share_always: bool = False
+    """Share the Gaussians out over all devices, also where steps are so short that one device alone is quicker.
+    There, several devices help only if one does not hold the Gaussians."""
+    steps_per_save: int = 0
+    """Steps between checkpoints; 0 leaves them to the clock. One is always made at the end."""
+    seconds_per_save: float = 60.0
+    """Seconds from one checkpoint to the next where steps_per_save is 0; 0 makes none before the end.
+    If 100 times what the last one took is longer, that is waited."""
+    steps_per_eval_batch: Suppress[int] = 0
+    """Steps between losses on a held-out view; 0 is never."""
+    steps_per_eval_image: int = 500
+    """Steps between metrics of one held-out view, where a logger such as tensorboard is on."""
+    steps_per_eval_all_images: int = 0
+    """Steps between metrics of all held-out views; 0 is never. `ns-eval` measures them after training."""
+    data: Path | None = None
+    """Folder of the data."""
+    project_name: str | None = "nerfstudio-project"
+    """Name of the project in wandb and comet."""
+    vis: Literal[
+        "viewer", "wandb", "tensorboard", "comet", "viewer+wandb", "viewer+tensorboard", "viewer+comet", "viewer_legacy"
+    ] = "viewer"
+    """Where the run can be watched. With a viewer the command waits at the end, until Ctrl+C."""
+    save_only_latest_checkpoint: bool = True
+    """Keep the latest checkpoint only, instead of all."""
+    load_dir: Path | None = None
+    """Folder of a run, or of its checkpoints, from which the run goes on."""
+    load_step: int | None = None
+    """Step of the checkpoint in `load_dir`; None takes the latest."""
+    load_checkpoint: Path | None = None
+    """Checkpoint from which the run goes on."""
+    load_config: Path | None = None
+    """The config.yml of a run whose options are taken, instead of all others; nerfstudio executes what it says."""
+    start_paused: bool = False
+    """Wait for a click in the viewer before training starts."""
+    logging: Suppress[LoggingConfig] = field(
+        default_factory=lambda: LoggingConfig(
+            local_writer=LocalWriterConfig(_target=ProgressTable, enable=True), profiler="none"
+        )
+    )
+    """What is printed during training, and how often."""
+
+    def __post_init__(self) -> None:
+        """Raise InputError if `load_config` is no config.yml, or if options are given that nerfstudio then forgets."""
+        if self.load_config is None:
+            return
+        try:
+            with self.load_config.open(encoding="utf8") as file:
+                problem = None if file.readline().startswith("!!python/object:") else "it is no config.yml of a run"
+        except (OSError, UnicodeDecodeError) as error:
+            problem = reason(error)
+        if problem is not None:
+            raise InputError(f"{self.load_config} cannot be used ({problem}): give --load-config the file of a run.")
+        from nerfstudio.configs.method_configs import all_methods  # It imports this module.
+
+        preset = all_methods.get(self.method_name or "", self)
+        if lost := [
+            name for name, value in vars(preset).items() if vars(self)[name] != value and name != "load_config"
+        ]:
+            raise InputError(
+                f"With --load-config all options come from its file, and others are not read, here of "
+                f"{', '.join(lost)}: leave them out, change them in the file, or give --load-dir with the run's folder "
+                "and all options instead of --load-config."
+            )
+
+    def print_to_terminal(self) -> None:
+        """Print nothing. nerfstudio prints all options, which `config.yml` holds, before a run is known to start."""
+
+    def check(self) -> None:
+        """Raise InputError if training cannot work with these options, or if the device is not there."""
+        length, periods = self.max_num_iterations, ("save", "eval_batch", "eval_image", "eval_all_images")
+        check_ranges("", self, [("max_num_iterations", length is None or length >= 1, "at least 1")])
+        check_ranges("logging.", self.logging, [("steps_per_log", self.logging.steps_per_log >= 1, "at least 1")])
+        for name in (*(f"steps_per_{what}" for what in periods), "seconds_per_save"):
+            if not (value := getattr(self, name)) >= 0:
+                raise InputError(f"{name} must not be negative, got {value:g}.")
+        if self.load_step is not None and self.load_dir is None:
+            raise InputError(
+                f"load_step is {self.load_step}, but load_dir is not set: add --load-dir with the folder of a run."
+            )
+        port = self.viewer.websocket_port
+        if port is not None and not 1 <= port <= 65535:
+            raise InputError(f"viewer.websocket_port must be in [1, 65535], got {port}.")
+        self._check_machine()
+        self._check_rates()
+        if self.mixed_precision or self.use_grad_scaler or self.log_gradients:
+            raise InputError(
+                "sadgs trains in float32, and its densification reads gradients as they are: leave mixed_precision, "
+                "use_grad_scaler and log_gradients off."
+            )
+        if any(steps != 1 for steps in self.gradient_accumulation_steps.values()):
+            raise InputError(
+                "sadgs updates every parameter in every iteration, and densification would lose gradients that were "
+                "kept for later: leave gradient_accumulation_steps out, and set pipeline.views_per_iteration instead."
+            )
+        self.pipeline.check()
+
+    def _check_machine(self) -> None:
+        """Raise InputError if a device is not there, or several cannot work with these options."""
+        device = self.machine.device_type
+        available = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+        if not available[device]:
+            name = device.upper()
+            raise InputError(
+                f"machine.device_type is {device}, but torch finds no {name} device: set it to cpu, or install torch "
+                f"for {name}."
+            )
+        if not 0 <= self.machine.seed < 2**32:
+            raise InputError(f"machine.seed must be in [0, 2³²), got {self.machine.seed}.")
+        model, several = self.pipeline.model, processes.check_devices(self.machine)
+        if model.backend != "auto":  # That is decided in the process that trains, where Triton tries a kernel.
+            choose_backend(model.backend, torch.device(device), not several)
+        if not several:
+            return
+        for name, given, remedy in (
+            ("pipeline.model.color_model", model.color_model != "none", "set it to none"),
+            ("pipeline.model.camera_optimizer.mode", model.camera_optimizer.mode != "off", "set it to off"),
+            ("start_paused", self.start_paused, "leave it off, since the viewer is off, too"),
+            (f"{SWITCH}=0", switched_off() and device == "cuda", "unset it"),
+        ):
+            if given:
+                raise InputError(f"{name} works on one device only, and this run takes several: {remedy}.")
+
+    def _check_rates(self) -> None:
+        """Raise InputError if a learning rate ever leaves [0, 1], or a factor is not positive and finite."""
+        for group, configs in self.optimizers.items():
+            adam, rate, scheduler = configs["optimizer"], configs["optimizer"].lr, configs.get("scheduler")
+            # One launch updates all parameters.
+            if adam._target is not FusedAdam or adam.max_norm is not None or adam.weight_decay:
+                raise InputError(
+                    f"optimizers.{group}.optimizer must be sadgs's Adam without max_norm and weight_decay: leave out "
+                    "all but its lr."
+                )
+            if not 0 <= rate <= 1:
+                raise InputError(f"optimizers.{group}.optimizer.lr must be in [0, 1], got {rate:g}.")
+            if isinstance(scheduler, RunLengthDecaySchedulerConfig):
+                for name in ("initial_factor", "final_factor"):
+                    if not 0 < (factor := getattr(scheduler, name)) < math.inf:
+                        raise InputError(
+                            f"optimizers.{group}.scheduler.{name} must be positive and finite, got {factor:g}."
+                        )
+                    if rate * factor > 1:
+                        raise InputError(
+                            f"optimizers.{group}.scheduler.{name} must leave the rate in [0, 1], got {factor:g}, which "
+                            f"makes {rate * factor:g} of {rate:g}."
+                        )
+
+    def save_config(self) -> None:
+        """Write `config.yml` if the run can begin; raises InputError as `check`, and as `run_folder.begin`."""
+        self.check()
+        begin(self)

@@ -1,0 +1,267 @@
+"""Training steps of few Gaussians as CUDA graphs, which the host launches in one call instead of one by one.
+
+On a small scene the host takes longer to launch a step than the GPU to run it. A graph repeats launches with the very
+arguments with which they were captured. What changes from step to step is therefore written, beforehand, into tensors
+that stay where they are: cameras, images and Adam's rates. What else the launches depend on is a graph's key, and where
+parameters are replaced, as densification does, all graphs are dropped.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
+from torch import Tensor
+
+from sadgs_ns.errors import reason
+from sadgs_ns.render.types import Cameras
+from sadgs_ns.training.model import SadgsModel
+from sadgs_ns.training.optimizers import AdamUpdate
+from sadgs_ns.training.train_step import StepResult, ViewGroup, training_step
+
+MOST_GAUSSIANS = 2**20
+"""Steps of more Gaussians, counted once for each view, keep the GPU busy without a graph, which would only take memory
+from them."""
+MOST_GRAPHS = 16
+"""Largest number of graphs at a time. Images of many sizes, or views that see very different numbers of Gaussians,
+would otherwise be captured more often than they are replayed."""
+
+
+class Results(NamedTuple):
+    """What a graph leaves on the device; its next replay overwrites it."""
+
+    values: Tensor
+    """Loss, PSNR in dB, two numbers that mean nothing, and NaN if a gradient was left out, else 0. [5]"""
+    pair_counts: Tensor
+    """Pairs of a Gaussian and a tile of each view. int64 [V]"""
+    means_gradient: Tensor
+    """Gradient of the loss by the centres. [N, 3]"""
+
+
+class Graph(Protocol):
+    """Launches that were captured."""
+
+    def replay(self) -> Results:
+        """Launch them all, and return what they write."""
+        ...
+
+
+@dataclass(frozen=True)
+class _CudaGraph:
+    graph: torch.cuda.CUDAGraph
+    results: Any
+
+    def replay(self) -> Results:
+        self.graph.replay()
+        return self.results
+
+
+class CudaGraphs:
+    """Captures functions as CUDA graphs, which share memory, since only one of them runs at a time.
+
+    Args:
+        device: Device of training.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._stream = torch.cuda.Stream(device)
+        self._pool = torch.cuda.graph_pool_handle()
+        # The shared memory lives as long as one of its graphs, so one that does nothing else is kept.
+        self._first = self.capture(lambda: torch.zeros((), device=device))
+
+    def capture(self, function: Callable[[], Any]) -> Graph:
+        """Capture what a function launches, which is not run by that.
+
+        torch's context manager would wait for the device, and give its unused memory back, at each capture.
+
+        Args:
+            function: It may launch only what was launched before, so that nothing is compiled or loaded meanwhile. The
+                tensors that it returns stay where they are.
+
+        Raises:
+            Exception: What the function raises, or RuntimeError, if it did what cannot be captured.
+        """
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.stream(self._stream):
+            # Other threads load images and draw for the viewer meanwhile.
+            graph.capture_begin(pool=self._pool, capture_error_mode="relaxed")
+            try:
+                results = function()
+            except BaseException:
+                with contextlib.suppress(RuntimeError):  # The function's own error says more.
+                    graph.capture_end()
+                self._repair_generator()
+                raise
+            try:
+                graph.capture_end()
+            except RuntimeError:
+                self._repair_generator()
+                raise
+        return _CudaGraph(graph, results)
+
+    def wait(self) -> None:
+        """Wait until no graph is running, before which none may be dropped."""
+        torch.cuda.synchronize(self._device)
+
+    def _repair_generator(self) -> None:
+        """Let random numbers be drawn again, which torch refuses after a capture that did not end well."""
+        generator = torch.cuda.default_generators[torch.cuda.current_device()]
+        generator.graphsafe_set_state(generator.clone_state())
+
+
+def has_room(device: torch.device) -> bool:
+    """Tell whether the memory for a graph's step is free, which is at most what the process has reserved."""
+    return device.type != "cuda" or torch.cuda.mem_get_info(device)[0] >= torch.cuda.memory_reserved(device)
+
+
+@dataclass(frozen=True)
+class _Inputs:
+    """What a graph reads that changes from step to step."""
+
+    group: ViewGroup
+    """Cameras, images and numbers of the views."""
+    factors: Tensor
+    """Of Adam. [2, P]"""
+
+    @staticmethod
+    def like(group: ViewGroup, factors: Tensor) -> _Inputs:
+        """Make tensors for steps like one."""
+        images = torch.stack([data["image"] for data in group.data])
+        viewmats, Ks, *size = group.cameras
+        cameras = Cameras(viewmats.clone(), Ks.clone(), *size)
+        numbers = None if group.view_numbers is None else group.view_numbers.clone()
+        copied = replace(group, cameras=cameras, view_numbers=numbers, data=[{}] * len(images), images=images)
+        return _Inputs(copied, factors.to(images.device))
+
+    def write(self, group: ViewGroup, factors: Tensor) -> None:
+        """Put a step's values in the place of those before, without waiting for the device."""
+        self.group.cameras.viewmats.copy_(group.cameras.viewmats)
+        self.group.cameras.Ks.copy_(group.cameras.Ks)
+        if self.group.view_numbers is not None and group.view_numbers is not None:
+            self.group.view_numbers.copy_(group.view_numbers)
+        torch.stack([data["image"] for data in group.data], out=self.group.images)
+        self.factors.copy_(factors, non_blocking=True)
+
+
+class GraphedSteps:
+    """Replays training steps as graphs, which it captures where that pays.
+
+    The first step of a kind after parameters were replaced is launched one by one, which compiles and loads what is
+    missing. The second one is captured, and those after it are replayed.
+
+    Attributes:
+        replayed: Number of steps that were trained by a graph.
+        failure: Why all steps are launched one by one from now on; empty where they are not.
+
+    Args:
+        model: The model, of which this process holds all Gaussians.
+    """
+
+    def __init__(self, model: SadgsModel) -> None:
+        self._model = model
+        self._recorder: CudaGraphs | None = None
+        self._addresses: tuple[int, ...] = ()
+        self._launched: set[Any] = set()  # These are keys of steps that were launched one by one at these addresses.
+        self._graphs: dict[Any, tuple[Graph, _Inputs]] = {}
+        self.replayed = 0
+        self.failure = ""
+
+    def prepare(self, num_views: int) -> bool:
+        """Tell whether steps of so many views may be replayed by now. If not, give back what graphs take."""
+        if not self.failure and num_views * self._model.num_points <= MOST_GAUSSIANS:
+            return True
+        self._drop()
+        self._recorder = None
+        return False
+
+    def replay(
+        self, groups: Sequence[ViewGroup], opacity_reg: float, update: AdamUpdate, factors: Tensor, noted: Tensor
+    ) -> StepResult | None:
+        """Do what `training_step` does with these arguments; `factors` are on the host.
+
+        Returns:
+            None if the step must be launched one by one.
+        """
+        from sadgs_ns.kernels.tiles import PairCounts
+
+        strategy, state = self._model.strategy, self._model.strategy_state
+        group, step = groups[0], self._model.step
+        # An image with transparency, or with a mask, takes launches of its own.
+        plain = all("mask" not in data and data["image"].shape[-1] == 3 for data in group.data)
+        known = group.options.tile_capacity is not None and (not group.options.absgrad or "grad2d" in state)
+        observes = group.structure_tensors is not None
+        if self.failure or len(groups) > 1 or not plain or not known or observes or strategy.densifies(step):
+            return None
+        found = self._graph(group, opacity_reg, update, factors)
+        if found is None:
+            return None
+        graph, inputs = found
+        inputs.write(group, factors)
+        results = graph.replay()
+        self.replayed += 1
+        values = results.values.clone()
+        noted.copy_(values[4:])
+        counts = PairCounts.sent(results.pair_counts)
+        return StepResult(values[0], values[1], results.means_gradient, [{"pair_counts": counts}])
+
+    def _graph(
+        self, group: ViewGroup, opacity_reg: float, update: AdamUpdate, factors: Tensor
+    ) -> tuple[Graph, _Inputs] | None:
+        """Return the graph of such a step; None if there is none.
+
+        One is captured if such a step was launched one by one before, and memory is not short.
+        """
+        sums = [value for value in self._model.strategy_state.values() if isinstance(value, Tensor)]
+        changed = (*update.parameters.values(), *update.exp_avgs, *update.exp_avg_sqs, *sums)
+        # Tensors of other lengths may lie where those before did.
+        addresses = (len(update.parameters["means"]), *[tensor.data_ptr() for tensor in changed])
+        if addresses != self._addresses:
+            self._drop()
+            self._addresses = addresses
+        key = group.cameras[2:], group.options, opacity_reg, group.data[0]["image"].dtype, len(group.indices)
+        wanted = key in self._launched and key not in self._graphs and len(self._graphs) < MOST_GRAPHS
+        if wanted and has_room(update.device):
+            try:
+                inputs = _Inputs.like(group, factors)
+                self._recorder = self._recorder or CudaGraphs(update.device)
+                step = partial(_captured_step, self._model, inputs, opacity_reg, update)
+                self._graphs[key] = self._recorder.capture(step), inputs
+            except Exception as error:  # CUDA, torch and Triton each raise their own.
+                self._give_up(error)
+        self._launched.add(key)
+        return self._graphs.get(key)
+
+    def _drop(self) -> None:
+        if self._graphs and self._recorder is not None:
+            self._recorder.wait()
+        self._graphs.clear()
+        self._launched.clear()
+
+    def _give_up(self, error: Exception) -> None:
+        """Launch all steps one by one from now on, and say so."""
+        self.failure = reason(error)
+        self._drop()
+        self._recorder = None
+        CONSOLE.print(
+            f"[yellow]A training step could not be captured as a CUDA graph ({escape(self.failure)}): the kernels of "
+            "this run are launched one by one, which takes longer where Gaussians are few.[/]",
+            soft_wrap=True,
+        )
+
+
+def _captured_step(model: SadgsModel, inputs: _Inputs, opacity_reg: float, update: AdamUpdate) -> Results:
+    """Launch a training step, and keep what the host reads of it."""
+    # What notes gradients begins at 16 bytes, because Triton would compile Adam anew for what is less aligned.
+    values = torch.zeros(5, device=update.device)
+    result = training_step(model, [inputs.group], opacity_reg, update, inputs.factors, values[4:])
+    # These are copies of memory. A kernel that no step has launched before would be loaded while it is captured.
+    values[0].copy_(result.loss)
+    values[1].copy_(result.psnr)
+    return Results(values, result.infos[0]["pair_counts"].counts.clone(), result.means_gradient)

@@ -1,0 +1,157 @@
+"""A data manager: nerfstudio's loader of whole images, with checks of their names and a faster reader of points."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, ColmapDataParserConfig
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from rich.progress import track
+from torch import Tensor
+
+from sadgs_ns.data import colmap
+from sadgs_ns.data.checks import splits
+from sadgs_ns.data.parsers import OWN, choose_parser, points_in_the_run
+from sadgs_ns.errors import InputError
+from sadgs_ns.method.memory import available_host_bytes
+from sadgs_ns.training.images import LazyImages, thread_count
+from sadgs_ns.training.processes import processes_on_this_machine
+
+KEPT_FILES_SHARE = 0.25
+"""Share of the host's free memory up to which the files of compressed images are kept in it, by all processes of the
+machine together; each may keep all of them in the course of a run."""
+
+
+class SadgsDatamanager(FullImageDatamanager[InputDataset]):
+    """A loader that checks the images' names and places, decodes them in more threads, or only when they are needed,
+    and reads SfM points once, faster and without open3d.
+
+    The checks are here rather than in the pipeline, because `ns-render dataset` makes a datamanager of its own. Raises
+    InputError if an image is too small; as `colmap.read_poses`, `ply.read_points`, `splits.check_names` and
+    `splits.check_paths`.
+    """
+
+    def __init__(self, config: FullImageDatamanagerConfig, *args: Any, **kwargs: Any) -> None:
+        config = copy.copy(config)  # It is changed below, and the one that was given belongs to the run's config.yml.
+        choose_parser(config)
+        parser = copy.copy(config.dataparser)
+        self._points: Path | None = None
+        """COLMAP's points, where nerfstudio does not read them itself."""
+        if isinstance(parser, ColmapDataParserConfig):  # These checks precede the making of smaller images.
+            model = (config.data or parser.data) / parser.colmap_path
+            if (source := model / f"images.{colmap.model_kind(model)}").is_file():
+                splits.check_names((name for name, _, _ in colmap.read_poses(source)), source)
+            plain = parser._target is ColmapDataParser and parser.max_2D_matches_per_3D_point == 0
+            if plain and parser.load_3D_points:
+                self._points = colmap.points_file(model)
+                parser.load_3D_points = self._points is None
+        parser._target = OWN.get(parser._target, parser._target)
+        config.dataparser = parser
+        # nerfstudio would keep more than 500 images on the host, whatever their size, and say so in a line.
+        asked, config.cache_images = config.cache_images, "cpu"
+        super().__init__(config, *args, **kwargs)  # type: ignore[arg-type]
+        self.config.cache_images = asked
+        for dataset in (self.train_dataset, self.eval_dataset):
+            splits.check_paths(dataset.image_filenames)
+            dataset.cameras.metadata = dataset.cameras.metadata or {}  # `ns-export cameras` needs one.
+            _check_sizes(dataset)
+
+    def create_train_dataset(self) -> InputDataset:
+        """Add COLMAP's points to what nerfstudio makes; it would read the same ones in ten times the time."""
+        if self._points is not None:
+            outputs = self.train_dataparser_outputs
+            points = colmap.read_points(self._points)
+            outputs.metadata |= points_in_the_run(*points, outputs.dataparser_transform, outputs.dataparser_scale)
+        return super().create_train_dataset()
+
+    def create_eval_dataset(self) -> InputDataset:
+        """Make the dataset without reading the points a second time: nothing looks for them here."""
+        parser: Any = self.config.dataparser
+        if hasattr(parser, "load_3D_points"):
+            parser.load_3D_points = False
+        return super().create_eval_dataset()
+
+    def _load_images(self, split: Literal["train", "eval"], cache_images_device: str) -> Any:
+        """Load and undistort the images of a split as nerfstudio does, or make a sequence that does so at each access.
+
+        Returns:
+            `image` [H, W, 3 or 4] and, where there is one, boolean `mask` [H, W, 1] of each view, on the device of
+            training with `cache_images` "gpu", else on the host, and pinned there if training is on CUDA.
+
+        Raises:
+            InputError: As `LazyImages.__getitem__`, unless images stay compressed.
+        """
+        device, dataset = torch.device(self.device), self.train_dataset if split == "train" else self.eval_dataset
+        on_demand = cache_images_device == "compressed"
+        # Of several processes each would come to hold all files, which the system's cache of files holds once.
+        keep = on_demand and processes_on_this_machine() == 1
+        if keep:
+            size = sum(path.stat().st_size for path in dataset.image_filenames)
+            keep = size <= KEPT_FILES_SHARE * available_host_bytes()
+        images = LazyImages(dataset, keep)
+        self.train_cameras = self.train_dataset.cameras
+        if on_demand:
+            return images
+
+        def place(tensor: Tensor) -> Tensor:
+            if cache_images_device == "gpu":
+                return tensor.to(device)
+            return tensor.pin_memory() if device.type == "cuda" else tensor
+
+        loaded = []
+        with ThreadPoolExecutor(thread_count(self.config.max_thread_workers)) as pool:
+            decoded = pool.map(images.__getitem__, range(len(images)))
+            try:
+                for data in track(decoded, f"Loading the {split} images", total=len(images), transient=True):
+                    loaded.append(data | {name: place(data[name]) for name in ("image", "mask") if name in data})
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+        if cache_images_device == "gpu":
+            self.train_cameras = self.train_cameras.to(device)
+        return loaded
+
+    @property
+    def fixed_indices_eval_dataloader(self) -> Any:
+        """Cameras [1] and data of the held-out views, on the device; nerfstudio would copy all there at once."""
+        return _HeldOutViews(self)
+
+    def get_train_rays_per_batch(self) -> int:
+        """Return the number of pixels of the first training image, which nerfstudio's trainer asks for in each step."""
+        cameras = self.train_dataset.cameras
+        return int(cameras.height[0]) * int(cameras.width[0])
+
+
+@dataclass
+class _HeldOutViews(Sequence[tuple[Cameras, dict[str, Any]]]):
+    """Cameras and data of the held-out views, each of which is brought to the device when it is asked for."""
+
+    datamanager: SadgsDatamanager
+
+    def __len__(self) -> int:
+        return len(self.datamanager.eval_dataset)
+
+    def __getitem__(self, index: Any) -> Any:
+        device, data = self.datamanager.device, self.datamanager.cached_eval[index]
+        camera = self.datamanager.eval_dataset.cameras[index : index + 1].to(device)
+        return camera, {**data, "image": data["image"].to(device)}
+
+
+def _check_sizes(dataset: InputDataset) -> None:
+    """Raise InputError if an image is less than 2 px high or wide, which is too small for the loss."""
+    sizes = torch.cat([dataset.cameras.width, dataset.cameras.height], dim=-1)  # [C, 2] px
+    for index in (sizes < 2).any(dim=-1).nonzero().flatten().tolist():
+        width, height = sizes[index].tolist()
+        raise InputError(
+            f"{dataset.image_filenames[index]} would be trained on with {width} × {height} px, and at least 2 × 2 are "
+            "needed: take a larger image, or scale it down less with pipeline.datamanager.camera-res-scale-factor or "
+            "the parser's downscale-factor."
+        )

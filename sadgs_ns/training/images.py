@@ -1,0 +1,172 @@
+"""Images that are decoded whenever they are asked for."""
+
+from __future__ import annotations
+
+import copy
+import io
+import os
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sadgs_ns.errors import InputError, reason
+from sadgs_ns.training.processes import processes_on_this_machine
+
+_MOST_THREADS = 16
+"""Threads that decode images on a machine of at least as many cores."""
+_Undistort = Callable[[dict[str, Any], NDArray[Any]], tuple[NDArray[np.float32], NDArray[Any], Tensor | None]]
+"""Takes the data and the image [H, W] or [H, W, C] of a camera; returns its intrinsics in px [3, 3], image and mask
+[H, W, 1], where there is one, without distortion."""
+
+
+def thread_count(asked: int | None) -> int:
+    """Return the number of threads that decode images in this process.
+
+    It is what was asked for, or one for each core, up to 16; several processes of a machine share its cores.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return asked or min(max(cores // processes_on_this_machine(), 1), _MOST_THREADS)
+
+
+class LazyImages(Sequence[dict[str, Any]]):
+    """Images of a dataset as nerfstudio's FullImageDatamanager loads and undistorts them, decoded at each access.
+
+    The dataset's cameras become those of the undistorted images at once, for which no image is opened. Several threads
+    may ask for images at the same time.
+
+    Args:
+        dataset: The images, with their cameras and masks. It must be given to one such object only.
+        keep_files: Whether to keep the bytes of files in memory once they have been read. Otherwise a file is read at
+            each access, from the operating system's cache of files where that has room.
+    """
+
+    def __init__(self, dataset: InputDataset, keep_files: bool = False) -> None:
+        self._names = dataset.image_filenames
+        self._sizes = torch.cat([dataset.cameras.width, dataset.cameras.height], dim=-1).tolist()  # [C][2] px
+        self._undistort = _undistort_cameras(dataset.cameras)
+        read = cache(Path.read_bytes) if keep_files else Path.read_bytes
+        outputs = copy.copy(dataset._dataparser_outputs)
+        outputs.image_filenames = _Files(outputs.image_filenames, read)  # type: ignore[assignment]
+        if outputs.mask_filenames is not None:
+            outputs.mask_filenames = _Files(outputs.mask_filenames, read)  # type: ignore[assignment]
+        self._dataset = copy.copy(dataset)
+        self._dataset._dataparser_outputs = outputs
+        self._opencv_agrees: bool | None = None  # It is known once a JPEG has been decoded.
+        if dataset.scale_factor == 1 and type(dataset).get_numpy_image is InputDataset.get_numpy_image:
+            self._dataset.get_numpy_image = self._decode
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def __getitem__(self, index: Any) -> Any:
+        """Decode an image and undistort it.
+
+        Returns:
+            `image` uint8 [H, W, 3 or 4], contiguous and on the CPU, boolean `mask` [H, W, 1] if the image has one, and
+            what else the dataset adds.
+
+        Raises:
+            InputError: If the image or its mask cannot be read any more, or has another size than its camera.
+        """
+        name, size, undistort = self._names[index], tuple(self._sizes[index]), self._undistort[index]
+        try:
+            data = self._dataset.get_data(index, image_type="uint8")
+        except MemoryError:
+            raise
+        except Exception as error:  # Decoders raise OSError, SyntaxError, struct.error, …
+            masks = self._dataset._dataparser_outputs.mask_filenames is not None
+            raise InputError(
+                f"{name}{' or its mask' if masks else ''} cannot be read as an image ({reason(error)}): copy it again, "
+                "or leave it out of the reconstruction."
+            ) from error
+        image: Tensor = data["image"]
+        if (width_and_height := (image.shape[1], image.shape[0])) != size:
+            sizes = "{} × {} px, but its camera {} × {}".format(*width_and_height, *size)
+            raise InputError(f"{name} has {sizes}: use the images that the poses were computed from.")
+        if undistort is not None:
+            _, undistorted, mask = undistort(data, image.numpy())
+            # nerfstudio's crop is a view of the larger image.
+            image = torch.from_numpy(np.ascontiguousarray(undistorted))
+            if mask is not None:
+                data["mask"] = mask.contiguous()
+        return {**data, "image": image}
+
+    def _decode(self, image_idx: int) -> NDArray[np.uint8]:
+        """Decode an image as nerfstudio's `get_numpy_image`, a whole JPEG with OpenCV instead of Pillow.
+
+        Of 2 megapixels Pillow keeps other threads from running Python for 5 ms in all, and the training loop is such
+        a thread. Both libraries decode with libjpeg-turbo, but with versions of their own: the first JPEG is decoded
+        with both, and OpenCV is used only if their pixels are equal.
+
+        Returns:
+            [H, W, 3 or 4]
+        """
+        content = self._dataset.image_filenames[image_idx].getbuffer()  # type: ignore[attr-defined]
+        image = None
+        if self._opencv_agrees is not False and content[:2] == b"\xff\xd8" and content[-2:] == b"\xff\xd9":
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        if image is not None:
+            image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+            if self._opencv_agrees:
+                return image  # type: ignore[return-value]
+        expected = InputDataset.get_numpy_image(self._dataset, image_idx)
+        if image is not None:
+            self._opencv_agrees = np.array_equal(image, expected)
+        return expected
+
+
+def _undistort_cameras(cameras: Cameras) -> list[_Undistort | None]:
+    """Give C cameras the intrinsics and sizes that they have once nerfstudio has undistorted their images.
+
+    Cameras that are alike, which most are, are computed once. Returns what undistorts an image of each; None where that
+    changes nothing.
+    """
+    undistorts: list[_Undistort | None] = [None] * len(cameras)
+    distortion = cameras.distortion_params  # [C, D]
+    if distortion is None or not distortion.any():
+        return undistorts
+    fields = [cameras.camera_type, cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height]
+    rows = torch.cat([field.double() for field in (*fields, distortion)], dim=-1).numpy()  # [C, 7 + D]
+    _, firsts, numbers = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    for number, first in enumerate(firsts.tolist()):
+        if not distortion[first].any():
+            continue
+        undistort = _undistort_as(cameras[first].reshape(()))
+        # The new intrinsics do not depend on the pixels.
+        K, image, _ = undistort({}, np.zeros((int(cameras.height[first]), int(cameras.width[first])), np.uint8))
+        for index in np.flatnonzero(numbers.reshape(-1) == number).tolist():
+            undistorts[index] = undistort
+            cameras.fx[index], cameras.fy[index] = float(K[0, 0]), float(K[1, 1])
+            cameras.cx[index], cameras.cy[index] = float(K[0, 2]), float(K[1, 2])
+            cameras.width[index], cameras.height[index] = image.shape[1], image.shape[0]
+    return undistorts
+
+
+def _undistort_as(camera: Cameras) -> _Undistort:
+    """Return what undistorts images of a camera, without batch dimension, as it is now."""
+    camera = copy.deepcopy(camera)
+    K, distortion = camera.get_intrinsics_matrices().numpy(), camera.distortion_params.numpy()  # type: ignore[union-attr]
+    return lambda data, image: _undistort_image(camera, distortion, data, image, K.copy())
+
+
+class _Files(Sequence[io.BytesIO]):
+    """The content of files in the place of their paths, since Pillow opens both."""
+
+    def __init__(self, paths: Sequence[Path], read: Callable[[Path], bytes]) -> None:
+        self._paths, self._read = paths, read
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    def __getitem__(self, index: Any) -> Any:
+        return io.BytesIO(self._read(self._paths[index]))

@@ -1,0 +1,112 @@
+"""The Gaussians that a run starts from: of SfM points, on their bounding box, random ones, and those of stereo depth.
+
+Parameters are by name: means [N, 3], log scales [N, 3], quats [N, 4], logit opacities [N, 1] and coefficients of
+harmonics, features_dc [N, 3] and features_rest [N, K, 3].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from nerfstudio.models.splatfacto import RGB2SH, num_sh_bases, random_quat_tensor
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from sadgs_ns.method.clearance import clear_of_cameras
+from sadgs_ns.method.initialization import neighbour_scales, plausible_points, starting_points
+from sadgs_ns.outliers import POINT_SHARE, REACH
+from sadgs_ns.training.config import SadgsModelConfig
+
+CAMERA_CLEARANCE = 2.0
+"""Initial Gaussians nearer to a camera than this many of their standard deviations are dropped. The paper keeps them;
+on the scene `south` dropping them brought 1.7 dB, elsewhere nothing (docs/results.md#other-constants)."""
+
+
+def initial_gaussians(
+    config: SadgsModelConfig, seed_points: tuple[Tensor, Tensor] | None
+) -> tuple[dict[str, Tensor], Tensor]:
+    """Make Gaussians of the SfM points, or random ones where there are none or they are not wanted.
+
+    Args:
+        config: Options of the model.
+        seed_points: SfM points [P, 3] and their colours in 0 … 255 [P, 3].
+
+    Returns:
+        The parameters; and which of the Gaussians are synthetic, random or on the points' bounding box. bool [N]
+    """
+    if seed_points is None or config.random_init:
+        if not config.random_init:
+            CONSOLE.print(
+                f"[yellow]The data has no SfM points: starting from {config.num_random} random ones in a cube of "
+                f"side {config.random_scale}. A sparse reconstruction (ns-process-data) gives a better splat.[/]"
+            )
+        points = (torch.rand((config.num_random, 3)) - 0.5) * config.random_scale  # [P, 3]
+        start = starting_points(points, torch.rand((len(points), 3)), faces=False)
+        sfm = 0
+    else:
+        points, colors = seed_points[0].float(), seed_points[1].float() / 255.0
+        plausible = plausible_points(points)  # [P]
+        if not plausible.all():
+            CONSOLE.print(
+                f"[yellow]Leaving out {int((~plausible).sum())} of {len(points)} SfM points, which are not finite "
+                f"or more than {REACH:g} times as far out as {POINT_SHARE:.0%} of them.[/]"
+            )
+            points, colors = points[plausible], colors[plausible]
+        start = starting_points(points, colors, faces=config.bounding_box_points, opacity=config.initial_opacity)
+        sfm = len(points)
+    means, cap = start[0], config.strategy.max_gaussians
+    synthetic = torch.arange(len(means)) >= sfm
+    if len(means) > cap:
+        CONSOLE.print(f"[yellow]Keeping a random {cap} of {len(means)} initial points: max_gaussians is {cap}.[/]")
+        keep = torch.randperm(len(means))[:cap]
+        start, synthetic = tuple(values[keep] for values in start), synthetic[keep]
+    return spheres(*start, sh_degree=config.sh_degree), synthetic
+
+
+def spheres(
+    means: Tensor,  # [P, 3]
+    colors: Tensor,  # [P, 3] in [0, 1]
+    scales: Tensor,  # [P] standard deviations in world units
+    opacities: Tensor | float,  # [P] in (0, 1)
+    *,
+    sh_degree: int,
+) -> dict[str, Tensor]:
+    """Return the parameters of spheres, turned at random."""
+    number = len(means)
+    return {
+        "means": means,
+        "scales": scales.log()[:, None].repeat(1, 3),
+        "quats": random_quat_tensor(number),
+        "features_dc": RGB2SH(colors) if sh_degree > 0 else torch.logit(colors, eps=1e-4),
+        "features_rest": torch.zeros((number, num_sh_bases(sh_degree) - 1, 3)),
+        "opacities": torch.logit(torch.as_tensor(opacities).expand(number))[:, None],
+    }
+
+
+def outside_cameras(params: Mapping[str, Tensor], positions: Tensor) -> Tensor:
+    """Tell which Gaussians contain no camera; the others could only become haze before it.
+
+    Args:
+        params: `means` and `scales`.
+        positions: The cameras' centres in world units. [C, 3]
+
+    Returns:
+        bool [N], all True where otherwise none would be.
+    """
+    radii = CAMERA_CLEARANCE * params["scales"].detach().exp().amax(dim=1)  # [N]
+    keep = clear_of_cameras(params["means"].detach(), radii, positions)  # [N]
+    return keep if bool(keep.any()) else torch.ones_like(keep)
+
+
+def beside(
+    known: Tensor,  # [K, 3]
+    means: Tensor,  # [P, 3]
+    colors: Tensor,  # [P, 3] in [0, 1]
+    scales: Tensor,  # [P]
+    config: SadgsModelConfig,
+) -> dict[str, Tensor]:
+    """Return the parameters of spheres no larger than these scales, or than the way to neighbours and known points."""
+    spacing = neighbour_scales(torch.cat([known, means.to(known)]))[len(known) :]  # [P]
+    scales = torch.minimum(scales, spacing.to(scales))
+    return spheres(means, colors, scales, config.initial_opacity, sh_degree=config.sh_degree)

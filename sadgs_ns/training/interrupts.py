@@ -1,0 +1,92 @@
+"""SIGINT, SIGTERM and SIGHUP stop a run, but only when a training step is whole."""
+
+from __future__ import annotations
+
+import errno
+import signal
+import threading
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any
+
+from sadgs_ns.training.lost_output import drop_lost_output
+
+HANG_UP: int | None = getattr(signal, "SIGHUP", None)
+"""The signal that says that the terminal is gone, as of an ssh that was cut off; Windows has none."""
+_HANG_UP_SECONDS = 2.0
+"""Longest time from a write that fails because the terminal is gone to the signal that says so."""
+SIGNALS = (signal.SIGINT, signal.SIGTERM, *([] if HANG_UP is None else [HANG_UP]))
+"""Signals that ask a run to stop."""
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal asked the run to stop, and no step is half done."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+class Interrupts:
+    """A context in which the first of `SIGNALS` makes `poll` raise, and a second SIGINT or SIGTERM acts as usual.
+
+    Signals are left alone outside the main thread, since other threads cannot handle them. A signal for which the
+    program has a handler of its own, or which it ignores, as SIGHUP under nohup, is left alone, too.
+
+    Args:
+        waiting: Returns whether the program only waits for somebody, so that nobody polls. The signal then raises at
+            once.
+        started: Whether another process started this one. It sends SIGTERM where it is interrupted itself, as from the
+            keyboard, so that SIGTERM after another signal is left alone.
+    """
+
+    def __init__(self, waiting: Callable[[], bool], started: bool = False) -> None:
+        self._waiting = waiting
+        self._repeated = {HANG_UP, signal.SIGTERM} if started else {HANG_UP}
+        self._previous: dict[int, Any] = {}
+        self.received: int | None = None
+        """The first signal that has come, None where none has."""
+
+    def __enter__(self) -> Interrupts:
+        self.received = None
+        if threading.current_thread() is threading.main_thread():
+            default = (signal.SIG_DFL, signal.default_int_handler)
+            self._previous = {s: old for s in SIGNALS if (old := signal.getsignal(s)) in default}
+            for number in self._previous:
+                signal.signal(number, self._handle)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        for number, previous in self._previous.items():
+            signal.signal(number, previous)
+        self._previous = {}
+
+    def poll(self) -> None:
+        """Raise Interrupted if a signal has come."""
+        if self.received is not None:
+            raise Interrupted(self.received)
+
+    def behind(self, error: OSError) -> Interrupted | None:
+        """Return the interruption that made a write fail, or None if the error has another cause.
+
+        The kernel takes a terminal away before it sends SIGHUP, so that what is printed between fails.
+        """
+        if error.errno == errno.EIO and HANG_UP in self._previous:
+            end = time.monotonic() + _HANG_UP_SECONDS
+            while self.received is None and time.monotonic() < end:
+                time.sleep(0.01)
+        return None if self.received is None or self.received != HANG_UP else Interrupted(self.received)
+
+    def _handle(self, number: int, frame: object) -> None:
+        if self.received is not None:
+            return  # Where a connection drops, the shell sends one SIGHUP and the kernel another.
+        self.received = number
+        for another in self._previous.keys() - self._repeated:
+            signal.signal(another, self._previous[another])
+        if number == HANG_UP:
+            drop_lost_output()
+        if self._waiting():
+            self.poll()

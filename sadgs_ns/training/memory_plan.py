@@ -1,0 +1,251 @@
+"""The memory plan before the first step: how many Gaussians the device holds beside the images and a step's views."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
+from torch import Tensor
+
+from sadgs_ns.distributed.bands import views_of_rank
+from sadgs_ns.errors import InputError
+from sadgs_ns.gsplat_compat import NEAR_PLANE, SCREEN_BLUR
+from sadgs_ns.kernels import TILE_SIZE
+from sadgs_ns.method import memory
+from sadgs_ns.method.absgs import empty_gradients
+from sadgs_ns.method.memory import StepSize
+from sadgs_ns.method.ops import Params
+from sadgs_ns.method.statistics import empty_statistics
+from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
+from sadgs_ns.training.processes import least, number_of_processes, processes_on_this_machine
+from sadgs_ns.training.structure_cache import PIXELS_PER_BATCH
+
+PLANNED_SHARE = 0.8
+"""Share of the available memory that is planned with; the rest is for fragments and other programs."""
+QUANTIZED_BYTES = 3
+"""Bytes that S̄ takes for each pixel of the training images (`method.quantization`)."""
+STRUCTURE_PIXEL_BYTES = 300
+"""Bytes that a pixel takes at most while S̄ is computed."""
+SAMPLED_CAMERAS = 8
+"""Training cameras in which the pairs of the initial Gaussians are counted."""
+MANY_IMAGES = 500
+"""Number of training images up to which nerfstudio would keep them on the device, whatever their size."""
+IMAGE_SHARE = 0.25
+"""Share of the device's free memory up to which more images than these are kept on it."""
+FEW_IMAGES_SHARE = 0.5
+"""The same share where there are no more than these."""
+HOST_SHARE = 0.5
+"""Share of the host's available memory up to which decoded images are kept in it. torch takes up to twice as much for
+pinned memory as is asked for, since it rounds up to powers of two."""
+_REACH = 3.0
+"""Standard deviations of a Gaussian that gsplat draws."""
+
+
+@dataclass(frozen=True)
+class TrainingSize:
+    """What a run keeps and renders besides its Gaussians."""
+
+    image_bytes: float
+    """Bytes of images and their S̄ on the training device."""
+    step: StepSize
+    """The largest step of the run, with the pairs of the initial Gaussians."""
+    structure_bytes: float = 0.0
+    """Bytes that S̄ of a step's images takes while it is computed, before they are rendered; 0 where that is done once,
+    with the initial Gaussians."""
+
+
+def training_size(
+    datamanager: FullImageDatamanager, params: Params, views: int, processes: int = 1, near_plane: float = NEAR_PLANE
+) -> TrainingSize:
+    """Measure a run before its first step; no image is opened for it.
+
+    Args:
+        datamanager: Holds the cameras of the training and of the held-out images.
+        params: The initial Gaussians of this process.
+        views: Views rendered in a step.
+        processes: Number of processes among which the step is shared out.
+        near_plane: Depth in world units from which Gaussians are drawn.
+    """
+    cameras = datamanager.train_dataset.cameras
+    largest = int((cameras.height * cameras.width).max())
+    structure = 0.0
+    if datamanager.config.cache_images == "gpu":
+        kept = image_bytes(datamanager)
+    else:  # The images of the next step are there, too; a process has those that it composites, and S̄ of all.
+        sizes = torch.cat([cameras.height, cameras.width], dim=-1).unique(dim=0).tolist()
+        here = views  # Views of several sizes are shared out size by size, and a process may have a part of each.
+        if len(sizes) == 1:
+            here = max(len(views_of_rank((*map(tuple, sizes),) * views, processes, r)) for r in range(processes))
+        kept = float((3 * here + QUANTIZED_BYTES * views) * largest)
+        structure = float(STRUCTURE_PIXEL_BYTES * max(largest, min(PIXELS_PER_BATCH, here * largest)))
+    # A process composites its share of the pixels, and as many pairs as its share of the Gaussians has in all views.
+    pixels, pairs = -(-views * largest // processes), views * estimate_pairs(params, cameras, near_plane)
+    return TrainingSize(kept, StepSize(views, pixels, pairs, processes > 1), structure)
+
+
+def image_bytes(datamanager: FullImageDatamanager) -> float:
+    """Bytes of all images, held-out ones too, and of S̄ of the training images."""
+    train, held_out = (
+        float((cameras.height * cameras.width).sum())
+        for cameras in (datamanager.train_dataset.cameras, datamanager.eval_dataset.cameras)
+    )  # px
+    return 3 * (train + held_out) + QUANTIZED_BYTES * train
+
+
+def place_images(datamanager: FullImageDatamanager, device: torch.device) -> str | None:
+    """Decide where the images are kept, from the memory that is there: alike in all processes of the run.
+
+    Images that are asked for on the host stay compressed where each of several processes would decode all of them, and
+    there is no room for that.
+
+    Args:
+        datamanager: Its images have not been loaded yet; its configuration is changed.
+        device: The device of training.
+
+    Returns:
+        A line for the user; None where they are kept on the device, or where the user asked for.
+    """
+    config, size, sharing = datamanager.config, image_bytes(datamanager), processes_on_this_machine()
+    host = least(memory.available_host_bytes() / sharing, device)
+    if config.cache_images == "cpu":
+        if number_of_processes() == 1 or size <= HOST_SHARE * host:
+            return None
+        config.cache_images = "compressed"  # type: ignore[assignment]
+        return (
+            f"The images stay compressed and are decoded ahead of the steps: decoded they take {size / 1e9:.2g} GB in "
+            f"each process, and the host has {host / 1e9:.2g} GB free for each of its {sharing}."
+        )
+    many = len(datamanager.train_dataset) > MANY_IMAGES
+    free, share, name = host, HOST_SHARE, "the host"
+    if device.type == "cuda":
+        share, name = IMAGE_SHARE if many else FEW_IMAGES_SHARE, "the GPU"
+        free = least(memory.available_bytes(device)[0], device)
+    if size <= share * free:
+        config.cache_images = "gpu"
+        return None
+    needs = f"decoded images and their structure take {size / 1e9:.2g} GB, and {name} has {free / 1e9:.2g} GB free"
+    if device.type == "cuda" and size <= HOST_SHARE * host:
+        config.cache_images = "cpu"
+        return f"The images stay in the host's memory and are copied ahead of the steps: {needs}."
+    config.cache_images = "compressed"  # type: ignore[assignment]
+    return f"The images stay compressed and are decoded ahead of the steps: {needs}."
+
+
+@torch.no_grad()
+def estimate_pairs(params: Params, cameras: Cameras, near_plane: float = NEAR_PLANE) -> int:
+    """Pairs of a Gaussian and a tile in the view that has most of them, of a few training cameras.
+
+    Each Gaussian counts as a sphere of its largest scale and in all tiles of the square around its projection: the
+    initial Gaussians are spheres, and where they are large, which is where memory runs out, the square is the image.
+
+    Args:
+        params: `means` [N, 3], log `scales` [N, 3], logit `opacities` [N] or [N, 1].
+        cameras: Training cameras. [C]
+        near_plane: Depth in world units from which Gaussians are drawn.
+    """
+    means, device = params["means"], params["means"].device
+    chosen = torch.linspace(0, len(cameras) - 1, min(SAMPLED_CAMERAS, len(cameras))).round().long()
+    chosen = chosen.to(cameras.camera_to_worlds.device)
+    viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds[chosen]).to(device)
+    Ks = cameras.get_intrinsics_matrices()[chosen].to(device)
+    sizes = torch.cat([cameras.width[chosen], cameras.height[chosen]], dim=-1)  # [C, 2]
+    scales = params["scales"].exp().amax(dim=-1)  # [N]
+    level = 2 * (255 * torch.sigmoid(params["opacities"].flatten())).clamp_min(1).log()
+    reach = level.sqrt().clamp_max(_REACH)  # [N] standard deviations at which a Gaussian is 1/255 opaque
+    return max(
+        _count_pairs(means, scales, reach, viewmat, K, size.to(means), near_plane)
+        for viewmat, K, size in zip(viewmats, Ks, sizes, strict=True)
+    )
+
+
+def _count_pairs(
+    means: Tensor,  # [N, 3]
+    scales: Tensor,  # [N]
+    reach: Tensor,  # [N]
+    viewmat: Tensor,  # [4, 4]
+    K: Tensor,  # [3, 3]
+    size: Tensor,  # [2] width and height in px
+    near_plane: float,
+) -> int:
+    points = means @ viewmat[:3, :3].T + viewmat[:3, 3]  # [N, 3]
+    depths = points[:, 2:]  # [N, 1]
+    focals, center = K.diagonal()[:2], K[:2, 2]  # [2], [2]
+    means2d = focals * points[:, :2] / depths + center  # [N, 2]
+    radii = reach[:, None] * ((focals * scales[:, None] / depths).square() + SCREEN_BLUR).sqrt()  # [N, 2]
+    tiles = (size / TILE_SIZE).ceil()
+    first = ((means2d - radii) / TILE_SIZE).floor().clamp_min(0).minimum(tiles)
+    last = ((means2d + radii) / TILE_SIZE).ceil().clamp_min(0).minimum(tiles)
+    counts = (last - first).prod(dim=-1)  # [N]
+    drawn = (depths[:, 0] >= near_plane) & (reach > 0) & counts.isfinite()
+    return int(torch.where(drawn, counts, 0.0).double().sum())
+
+
+def fit_to_memory(
+    cap: int, params: Params, size: TrainingSize, budget_gb: float | None = None, processes: int = 1
+) -> tuple[int, str, str | None]:
+    """Lower the cap of Gaussians to what the budget, or the device's free memory, holds; call before the first step.
+
+    A cap under the present number of Gaussians adds none and takes none away. Without a budget, a cap that is not the
+    default of `max_gaussians` stays as it is, as all do without CUDA. Raises InputError if the budget leaves no room.
+
+    Args:
+        cap: The strategy's `max_gaussians`.
+        params: The initial Gaussians of this process, on the device of training.
+        size: What the run keeps and renders besides.
+        budget_gb: Memory that the run may take on each device, in 10⁹ bytes; None is `PLANNED_SHARE` of what is free.
+        processes: Number of processes, each of which holds an equal part of the Gaussians on a device of its own.
+
+    Returns:
+        The cap, a line for the user, and a warning if the first step will probably not fit.
+    """
+    device, n = params["means"].device, len(params["means"])
+    free, total = memory.available_bytes(device)
+    if math.isinf(free):
+        told = f"At most {cap:,} Gaussians: this device's memory is not planned with, so this is max_gaussians."
+        return cap, told, None
+    state = empty_statistics(0, device) | empty_gradients(0, device)
+    each = memory.kept_bytes(params, state) + memory.widest_bytes(params)
+
+    def need(num_gaussians: int, step: StepSize) -> float:
+        working = max(size.structure_bytes, *memory.step_bytes(num_gaussians, step, device).values())
+        return size.image_bytes + each * num_gaussians + working
+
+    why = ""
+    if budget_gb is not None or cap == StructureAwareStrategy.max_gaussians:
+        budget = PLANNED_SHARE * free if budget_gb is None else min(1e9 * budget_gb, free)
+        none = {name: value[:0] for name, value in params.items()}
+        left = budget - size.image_bytes
+        affordable = memory.affordable_growth(none, state, left, replace(size.step, pairs=0))  # type: ignore[arg-type]
+        affordable = processes * min(affordable, (left - size.structure_bytes) / each)
+        if budget_gb is not None and affordable < 1:
+            fixed = need(0, replace(size.step, pairs=0))
+            raise InputError(
+                f"pipeline.memory_budget_gb is {budget_gb:g} and leaves no room for Gaussians: images and rendering "
+                f"take {fixed / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; raise it, take fewer or "
+                "smaller images, or lower pipeline.views-per-iteration."
+            )
+        if affordable < cap:
+            cap = max(int(affordable), 1)
+            why = f"; {free / 1e9:.1f} GB are free" if budget_gb is None else f"; memory_budget_gb is {budget_gb:g}"
+            if cap < n * processes:
+                why += f", which holds no more than the {n * processes:,} at the start: none will be added"
+    most = max(-(-cap // processes), n)
+    at_most = need(most, replace(size.step, pairs=memory.PAIRS_PER_GAUSSIAN * size.step.views * most))
+    line = (
+        f"At most {cap:,} Gaussians: {at_most / 1e9:.1f} GB of "
+        f"{'the card' if processes == 1 else 'each card'}'s {total / 1e9:.1f} GB{why}."
+    )
+    first = need(n, size.step)
+    if first <= free:
+        return cap, line, None
+    fewer_views = "lower --pipeline.views-per-iteration, or " if size.step.views > 1 else ""
+    warning = (
+        f"The first step will probably not fit the GPU's memory: {n:,} Gaussians, which reach "
+        f"{size.step.pairs / 1e6:,.0f} million tiles of {size.step.views} views, take {first / 1e9:.1f} GB with the "
+        f"images, and {free / 1e9:.1f} GB are free; {fewer_views}take smaller images."
+    )
+    return cap, line, warning

@@ -1,0 +1,453 @@
+"""The model that nerfstudio trains: splatfacto's with the structure-aware strategy and this package's rasterizer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, MutableMapping, Sequence
+from dataclasses import asdict, replace
+from functools import lru_cache
+from typing import Any
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.models.splatfacto import SplatfactoModel
+from torch import Tensor
+
+from sadgs_ns.data.cameras import check_camera_types
+from sadgs_ns.distributed.world import World
+from sadgs_ns.errors import InputError
+from sadgs_ns.gsplat_compat import NEAR_PLANE
+from sadgs_ns.method.averaging import RunningMean
+from sadgs_ns.method.camera_paths import MOST_VIEWS, CameraPaths
+from sadgs_ns.method.clearance import limit_scales
+from sadgs_ns.method.color_matrices import identities
+from sadgs_ns.method.initialization import (
+    camera_extent,
+)
+from sadgs_ns.method.losses import photometric_loss
+from sadgs_ns.method.near_plane import nearest_depths, scene_near_plane
+from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.render.activations import activate
+from sadgs_ns.render.rasterization import choose_backend, rasterize, viewmats_from_camera_to_world
+from sadgs_ns.render.tile_forecast import TileForecast
+from sadgs_ns.render.types import Cameras as Pinholes
+from sadgs_ns.render.types import Gaussians, RenderOptions
+from sadgs_ns.training.config import SadgsModelConfig
+from sadgs_ns.training.initial_gaussians import beside, initial_gaussians, outside_cameras
+from sadgs_ns.training.metrics import MeasuredModel
+from sadgs_ns.training.outputs import LazyOutputs, in_viewer, say_once
+from sadgs_ns.training.run_plan import RunPlan
+from sadgs_ns.viewer import gaussian_maps
+
+NORMALS = "normals"
+"""Name of the output that only its readers pay for."""
+LIMIT_EVERY = 25
+"""Iterations between two times that scales are limited; at the presets' rates an axis grows threefold until then."""
+_MOST_RANDOM = 10_000_000
+"""Largest number of random points to start from; they take the host's memory before the cap thins them out."""
+
+
+class SadgsModel(MeasuredModel):
+    """The Gaussians, how they are rendered, and the loss of a rendering.
+
+    nerfstudio's viewer, evaluation and exporter treat it as a splatfacto model.
+
+    Args:
+        config: The model's configuration.
+        seed_points: SfM points [P, 3] and their colours in 0 … 255 [P, 3], or None for random points.
+    """
+
+    config: SadgsModelConfig
+    strategy: StructureAwareStrategy
+    view_numbers: Tensor
+    near_plane: float
+    plan: RunPlan
+
+    def populate_modules(self) -> None:
+        """Make parameters, metrics and the strategy, or raise InputError as `SadgsModelConfig.check`.
+
+        splatfacto's method needs CUDA and the weights of LPIPS, which are loaded here when they are first needed.
+        """
+        config = self.config
+        config.check()
+        self.strategy = config.strategy
+        self.strategy_state = self.strategy.initialize_state()
+        params, self.synthetic = initial_gaussians(config, self.seed_points)
+        """Which of the initial Gaussians stand for no SfM point, but are random or on their bounding box. bool [N]"""
+        self.gauss_params = torch.nn.ParameterDict({name: torch.nn.Parameter(p) for name, p in params.items()})
+        self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
+        self.make_metrics()
+        self.step = 0
+        self.average = RunningMean()
+        self.camera_positions: Tensor | None = None  # [C, 3]
+        self.near_plane = NEAR_PLANE if config.near_plane is None else config.near_plane
+        """Depth in world units from which Gaussians are drawn."""
+        self.infos: list[dict[str, Any]] = []
+        self.tile_forecast: TileForecast | None = TileForecast()
+        self.color_matrices: torch.nn.Parameter | None = None  # [V, 3, 4]
+        self.crop_box: OrientedBox | None = None
+        self.viewer_outputs: Callable[[Cameras, dict[str, Tensor]], dict[str, Tensor]] | None = None
+        self.world = World()
+        """The processes among which the Gaussians are shared out."""
+        if config.color_model == "affine":
+            self.learn_color_matrices()
+
+    def set_cameras(self, positions: Tensor) -> None:
+        """Fit the initial Gaussians and the strategy to the training cameras; call before optimizers are made.
+
+        Initial Gaussians that contain a camera are dropped: they could only become haze in front of it.
+
+        Args:
+            positions: Camera centres in world units. [C, 3]
+        """
+        self.strategy_state["scene_scale"] = camera_extent(positions)
+        self.camera_positions = positions.to(self.means)
+        keep = outside_cameras(dict(self.gauss_params.items()), self.camera_positions)  # [N]
+        for parameter in self.gauss_params.values():
+            parameter.data = parameter.data[keep]
+        self.synthetic = self.synthetic[keep.cpu()]
+
+    def set_near_plane(self, viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> None:
+        """Derive the near plane from the SfM points before the training cameras; call `set_cameras` before.
+
+        Args:
+            viewmats, Ks: As `render.types.Cameras` has them, of C views.
+            sizes: Width and height in px. [C, 2]
+        """
+        points = self.means.new_zeros((0, 3)) if self.seed_points is None else self.seed_points[0].to(self.means)
+        depths = nearest_depths(points, viewmats, Ks, sizes)
+        if self.config.near_plane is None:
+            self.near_plane = scene_near_plane(depths, float(self.strategy_state["scene_scale"]))
+
+    def add_points(self, means: Tensor, colors: Tensor, scales: Tensor) -> int:
+        """Start from more points, as many as the cap has room for; call before optimizers are made.
+
+        Args:
+            means: World units. [P, 3]
+            colors: In [0, 1]. [P, 3]
+            scales: Largest standard deviations, world units; they are no longer than the way to neighbours. [P]
+
+        Returns:
+            Number of points that were added.
+        """
+        room = max(min(len(means), self.strategy.max_gaussians - self.num_points), 0)
+        means, colors, scales = means[:room], colors[:room], scales[:room]
+        if not room:
+            return 0
+        known = self.means.detach()[~self.synthetic.to(self.means.device)]
+        added = beside(known, means, colors, scales, self.config)
+        for name, parameter in self.gauss_params.items():
+            parameter.data = torch.cat([parameter.data, added[name].to(parameter)])
+        self.synthetic = torch.cat([self.synthetic, torch.zeros(room, dtype=torch.bool)])
+        return room
+
+    def clear_paths(self, viewmats: Tensor) -> None:
+        """Let densification prune the haze near the cameras' paths, unless the run is told not to.
+
+        Call it once all initial Gaussians are there, with the training views' world-to-camera matrices. [C, 4, 4]
+        """
+        asked = self.config.clear_paths
+        if len(viewmats) <= MOST_VIEWS if asked is None else asked:
+            surfaces = self.means.detach()[~self.synthetic.to(self.device)]
+            self.strategy_state["camera_paths"] = CameraPaths.of(viewmats, self.near_plane, surfaces)
+
+    def learn_color_matrices(self) -> None:
+        """Learn a matrix of colours for each training view; call before optimizers are made."""
+        matrices = identities(self.num_train_data).to(self.means.device)
+        self.color_matrices = torch.nn.Parameter(matrices)
+        # An index that is made in a step would have to be copied to the device there.
+        numbers = torch.arange(len(matrices), device=matrices.device)  # [V]
+        self.register_buffer("view_numbers", numbers, persistent=False)
+
+    def share_out(self, world: World) -> None:
+        """Keep this process's part of the Gaussians, all of which it has until now; call before optimizers are made.
+
+        Raises InputError if the backend draws in one process alone.
+        """
+        choose_backend(self.config.backend, world.device, world.alone)
+        part = world.take_even_part(self.num_points)
+        for parameter in self.gauss_params.values():
+            parameter.data = parameter.data[part].clone()
+        self.world = world
+        self.tile_forecast = None  # How many pairs a view has depends on the Gaussians of all.
+
+    @property
+    def num_gaussians(self) -> int:
+        """Number of Gaussians of all processes."""
+        return self.num_points if self.world.alone else self.world.total
+
+    def follow(self, plan: RunPlan) -> None:
+        """Densify, average and draw as a plan says from now on."""
+        self.plan, self.near_plane = plan, plan.near_plane
+        self.strategy = plan.strategy.for_run(plan.iterations, self.world)
+
+    def step_post_backward(self, step: int) -> None:
+        """Densify where that is due, limit scales, and average the parameters at the run's end."""
+        self.strategy.densify(self.gauss_params, self.optimizers, self.strategy_state, self.step, self.infos)
+        self.infos = []
+        iterations, done = self.plan.iterations, self.step + 1
+        if done <= iterations - round(self.config.averaged_share * iterations):
+            self.average.clear()  # A run that was to end here, and is trained on, may have begun to average.
+        else:
+            self.average.add(self.gauss_params)
+            if done >= iterations:
+                self.average.move_to(self.gauss_params)
+        share, positions = self.config.max_angular_scale, self.camera_positions
+        if share > 0 and positions is not None and (done % LIMIT_EVERY == 0 or done >= iterations):
+            limit_scales(self.scales, self.means, positions, share)
+
+    @property
+    def trained_params(self) -> dict[str, Tensor]:
+        """Parameters by name that a training step reads: the Gaussians', and matrices of colours where there are."""
+        learned = {} if self.color_matrices is None else {"color_matrices": self.color_matrices}
+        return {**dict(self.gauss_params.items()), **learned}
+
+    def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
+        """Return what is optimized, by the names of the optimizers."""
+        groups = {name: [parameter] for name, parameter in self.trained_params.items()}
+        self.camera_optimizer.get_param_groups(param_groups=groups)  # type: ignore[arg-type]
+        return groups  # type: ignore[return-value]
+
+    def numbers_of(self, cam_indices: Sequence[int]) -> Tensor | None:
+        """Return indices of C views as int64 [C] on the device, without waiting; None without matrices of colours."""
+        if self.color_matrices is None:
+            return None
+        return torch.cat([self.view_numbers[index : index + 1] for index in cam_indices])
+
+    def cropped(self, values: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+        """Return the rows of tensors [N, …] of Gaussians in the viewer's crop box; in training, all rows."""
+        if self.crop_box is None or self.training:
+            return values
+        inside = self.crop_box.within(self.means)
+        return {name: value[inside] for name, value in values.items()}
+
+    @property
+    def sh_degree_now(self) -> int | None:
+        """Degree of the harmonics that are drawn at this step; None where colours do not depend on the direction."""
+        # Each iteration adds a degree: 3DGS's 1,000 iterations between them leave too few of so short a run.
+        return min(self.step, self.config.sh_degree) if self.config.sh_degree > 0 else None
+
+    @property
+    def backend(self) -> str:
+        """Name of what draws; raises InputError if the backend that is wanted cannot."""
+        return choose_backend(self.config.backend, self.device)
+
+    @property
+    def drawing(self) -> RenderOptions:
+        """The options that every picture of these Gaussians shares; colours are drawn with `color_options`."""
+        config = self.config
+        return RenderOptions(near_plane=self.near_plane, max_off_axis=config.max_off_axis, backend=config.backend)
+
+    def color_options(self, **changes: Any) -> RenderOptions:
+        """Return the options with which colours are drawn at this step, and others of their fields."""
+        return replace(self.drawing, sh_degree=self.sh_degree_now, **changes)
+
+    def render(self, cameras: Pinholes, options: RenderOptions) -> tuple[Tensor, Tensor, dict[str, Any]]:
+        """Rasterize the Gaussians, in the viewer those inside its crop box, in their colours.
+
+        Args:
+            cameras: Views of one size.
+            options: As `color_options` makes them.
+
+        Returns:
+            Colours, not clamped, and depth if it was asked for [C, H, W, 3 or 4]; accumulated opacity [C, H, W, 1]; the
+            rasterizer's info.
+        """
+        return rasterize(self.gaussians()[0], cameras, options)
+
+    def gaussians(
+        self, params: Mapping[str, Tensor] | None = None, opacity_reg: float = 0.0
+    ) -> tuple[Gaussians, Tensor | None]:
+        """Return what the rasterizer takes of the Gaussians; in the viewer, of those inside its crop box.
+
+        Args:
+            params: Parameters by name; None is the model's own.
+            opacity_reg: Factor on the mean opacity.
+
+        Returns:
+            The Gaussians; and numbers [P] whose sum is the mean opacity times `opacity_reg`, or None where that is 0.
+        """
+        params = self.cropped(dict(self.gauss_params.items()) if params is None else params)
+        colors: Tensor | tuple[Tensor, Tensor] = (params["features_dc"], params["features_rest"])
+        if self.config.sh_degree == 0:
+            colors = torch.sigmoid(params["features_dc"])  # [N, 3]
+        scales, opacities, penalty = activate(params["scales"], params["opacities"], opacity_reg)
+        return Gaussians(params["means"], params["quats"], scales, opacities, colors), penalty
+
+    def step_options(self, cameras: Pinholes, indices: Sequence[int]) -> RenderOptions:
+        """Return how training views, by their indices, are drawn at this step.
+
+        With our kernels the host does not wait for the length of the tile lists, but foresees it.
+        """
+        forecast, capacity = self.tile_forecast, None
+        if forecast is not None:
+            capacity = forecast.capacity(indices, cameras[2:], self.num_points)
+        return self.color_options(absgrad=self.strategy.needs_absgrad(self.step), tile_capacity=capacity)
+
+    @property
+    def opacity_reg_now(self) -> float:
+        """Factor on the mean opacity in this step's loss."""
+        return self.config.opacity_reg if self.step < self.strategy.windows.refine_stop_iter else 0.0
+
+    def before_background(self, render: Tensor, alpha: Tensor, background: Tensor) -> Tensor:
+        """Put renderings [C, H, W, ≥ 3] of accumulated opacity [C, H, W, 1] before a background [3]. → [C, H, W, 3]"""
+        if self.config.background_color == "black":
+            return render[..., :3]
+        return render[..., :3] + (1 - alpha) * background
+
+    def get_outputs(self, camera: Cameras) -> dict[str, Any]:
+        """Render one camera, shape [1], for the viewer, evaluation and rendering. Raise InputError if it is no pinhole.
+
+        Returns:
+            `rgb` [H, W, 3] in [0, 1]; `depth` [H, W, 1], the mean of the drawn Gaussians' depths along the viewing axis
+            in the run's units, and the largest one where nothing is; `accumulation` [H, W, 1]; `background` [H, W, 3].
+        """
+        check_camera_types(camera)
+        width, height = int(camera.width.item()), int(camera.height.item())
+        background = self.background
+        if self.crop_box is not None and not self.crop_box.within(self.means).any():
+            return self.get_empty_outputs(width, height, background)
+        viewmats = viewmats_from_camera_to_world(camera.camera_to_worlds)
+        Ks = camera.get_intrinsics_matrices().to(self.device)
+        cameras = Pinholes(viewmats, Ks, width, height)
+        render, alpha, _ = self.render(cameras, self.color_options(expected_depth=True))
+        depth = render[..., 3:4]
+        return {
+            "rgb": (render[..., :3] + (1 - alpha) * background).clamp(0.0, 1.0)[0],
+            "depth": torch.where(alpha > 0, depth, depth.detach().max())[0],
+            "accumulation": alpha[0],
+            "background": background.expand(height, width, 3),
+        }
+
+    @torch.no_grad()
+    def get_normals(self, camera: Cameras, params: Mapping[str, Tensor] | None = None) -> Tensor:
+        """Render the normals of one camera, shape [1], which takes about as long as its colours. [H, W, 3]
+
+        They are 0.5 + 0.5 n, n being what `gaussian_maps.normals_map` returns, in the axes of the run's world, and
+        black where nothing is. `params` are by name; None is the model's own, inside the viewer's crop box.
+        """
+        params = self.cropped(dict(self.gauss_params.items())) if params is None else params
+        width, height = int(camera.width.item()), int(camera.height.item())
+        if not len(params["means"]):
+            return torch.zeros((height, width, 3), device=self.device)
+        viewmat = viewmats_from_camera_to_world(camera.camera_to_worlds)[0].to(self.device)
+        K = camera.get_intrinsics_matrices()[0].to(self.device)
+        normals = gaussian_maps.normals_map(params, viewmat, K, width, height, self.drawing)
+        return torch.where((normals != 0).any(dim=-1, keepdim=True), 0.5 + 0.5 * normals, 0.0)
+
+    def get_outputs_for_camera(  # type: ignore[override]
+        self, camera: Cameras, obb_box: OrientedBox | None = None
+    ) -> MutableMapping[str, Tensor]:
+        """Render one camera, shape [1], as `get_outputs` does, inside a crop box, and add the pictures of the panels.
+
+        Outside the viewer, `get_normals` is added as `normals`, and computed when it is first read. A camera that is no
+        pinhole raises InputError; the viewer, whose thread would end, is shown nothing instead.
+        """
+        try:
+            outputs: dict[str, Any] = super().get_outputs_for_camera(camera, obb_box)
+        except InputError as error:
+            if not in_viewer():
+                raise
+            say_once(str(error))
+            width, height = int(camera.width.item()), int(camera.height.item())
+            outputs = self.get_empty_outputs(width, height, self.background)
+        if self.viewer_outputs is not None:
+            outputs = outputs | self.viewer_outputs(camera, outputs)
+        if in_viewer():
+            return outputs
+        params = self.cropped(dict(self.gauss_params.items()))
+        return LazyOutputs({**outputs, NORMALS: lambda: self.get_normals(camera, params)})
+
+    def get_gt_img(self, image: Tensor) -> Tensor:
+        """Return an image, uint8 or floats in [0, 1] [H, W, 3 or 4], on the model's device and in [0, 1].
+
+        splatfacto converts and divides bytes in two launches; this takes one.
+        """
+        image = image.to(self.device)
+        return image / 255.0 if image.dtype == torch.uint8 else image
+
+    @property
+    def background(self) -> Tensor:
+        """Colour behind the Gaussians, which is not made anew in each step. [3]"""
+        return _constant_color(float(self.config.background_color == "white"), self.device)
+
+    def composite_with_background(self, image: Tensor, background: Tensor) -> Tensor:
+        """Put images in [0, 1] [..., H, W, 3 or 4] before the background, [3] or [H, W, 3], if they have alpha."""
+        if image.shape[-1] == 4:
+            alpha = image[..., 3:]
+            return alpha * image[..., :3] + (1 - alpha) * background
+        return image
+
+    def training_metrics(self, psnr: Tensor) -> dict[str, Any]:
+        """Return what is logged of a step whose views have this PSNR in dB, a scalar."""
+        metrics: dict[str, Any] = {"psnr": psnr, "gaussian_count": self.num_gaussians}
+        self.camera_optimizer.get_metrics_dict(metrics)
+        return metrics
+
+    def get_loss_dict(
+        self, outputs: Mapping[str, Any], batch: Mapping[str, Any], metrics_dict: Mapping[str, Any] | None = None
+    ) -> dict[str, Tensor]:
+        """Return the photometric loss of renderings, `rgb` […, H, W, 3]; training has its own (train_step.py)."""
+        pair = self.masked_pair(outputs["rgb"], batch, outputs["background"])
+        views = [image.reshape(-1, *image.shape[-3:]) for image in pair]
+        return {"main_loss": photometric_loss(views[0], views[1], ssim_lambda=self.config.ssim_lambda)[0]}
+
+    def masked_pair(self, rgb: Tensor, batch: Mapping[str, Any], background: Tensor) -> tuple[Tensor, Tensor]:
+        """Return a rendering and its photo as the loss compares them: within the mask, before the same background.
+
+        Args:
+            rgb: Not clamped. […, H, W, 3]
+            batch: `image` of the same leading shape, uint8 or floats in [0, 1] […, H, W, 3 or 4], and perhaps a boolean
+                `mask` […, H, W, 1].
+            background: [3] or [H, W, 3]
+
+        Returns:
+            Both on the model's device, the photo as floats in [0, 1] or as bytes. […, H, W, 3]
+        """
+        target = batch["image"].to(self.device)
+        if "mask" in batch or target.shape[-1] == 4:  # Otherwise the loss reads bytes as they are.
+            target = self.composite_with_background(self.get_gt_img(target), background)
+        if "mask" in batch:
+            mask = batch["mask"].to(self.device)
+            target, rgb = target * mask, rgb * mask
+        return rgb, target
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return what a checkpoint needs besides parameters: the step, the strategy's state and the mean so far."""
+        return {
+            "step": self.step,
+            "strategy_state": {
+                key: asdict(value) if isinstance(value, CameraPaths) else value
+                for key, value in self.strategy_state.items()
+            },
+            "average": self.average.state_dict(),
+        }
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_extra_state` saved."""
+        self.step = state["step"]
+        self.strategy_state = {
+            key: value.to(self.device) if isinstance(value, Tensor) else value
+            for key, value in state["strategy_state"].items()
+        }
+        if "camera_paths" in state["strategy_state"]:
+            paths = CameraPaths(**state["strategy_state"]["camera_paths"])
+            self.strategy_state["camera_paths"] = paths.to(self.device)
+        self.average.load_state_dict(state["average"], self.device)
+
+    def load_state_dict(self, dict: dict[str, Any], **kwargs: Any) -> Any:  # type: ignore[override]
+        """Load a checkpoint of any number of Gaussians.
+
+        The parameters are resized in place: the optimizers were built on these very tensors. Where no matrices of
+        colours are learned, those of the checkpoint are left out, since nothing else reads them.
+        """
+        if self.color_matrices is None:
+            dict = {name: value for name, value in dict.items() if name != "color_matrices"}
+        for name, parameter in self.gauss_params.items():
+            parameter.data = torch.empty_like(dict[f"gauss_params.{name}"], device=self.device)
+        return super(SplatfactoModel, self).load_state_dict(dict, **kwargs)
+
+
+@lru_cache(maxsize=8)
+def _constant_color(grey: float, device: torch.device) -> Tensor:
+    return torch.full((3,), grey, device=device)

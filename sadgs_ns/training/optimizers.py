@@ -1,0 +1,194 @@
+"""The optimizers: Adam in one launch for all parameters, and learning rates that decay over the run's own length."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
+from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
+from torch import Tensor
+from torch.optim import Adam, Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+from tyro.conf import Suppress
+
+from sadgs_ns.kernels import use_triton
+from sadgs_ns.training.nonfinite import MAX_GRADIENT, leave_out_nonfinite
+from sadgs_ns.training.options import hide
+
+_ONE = torch.tensor(1.0, device="cpu")
+"""Adding it to the count of steps costs the host a third of adding Python's 1."""
+
+
+class FusedAdam(Adam):
+    """torch's fused Adam, or the state of it that our kernel updates, of one parameter."""
+
+    def __init__(self, params: Iterable[Tensor], **options: Any) -> None:
+        (parameter,) = params
+        # torch's fused Adam keeps the step count on the device, and our kernel would make the host wait for it.
+        super().__init__([parameter], fused=not use_triton(parameter.device), **options)
+
+
+class AdamUpdate:
+    """One update of parameters, by our kernel where that runs, else by torch's fused Adam.
+
+    At 300k Gaussians the GPU would wait for the host, which took a quarter of a step for six optimizers. One launch
+    updates all parameters that are equally many and have equal betas and eps.
+
+    Gradients that are NaN, infinite or beyond `nonfinite.MAX_GRADIENT` count as 0: parameters and moments stay finite.
+
+    Attributes:
+        parameters: What is updated, by name, as it is now.
+        exp_avgs: Their first moments.
+        exp_avg_sqs: Their second moments.
+
+    Args:
+        optimizers: By name, all on one device.
+    """
+
+    def __init__(self, optimizers: Mapping[str, Adam]) -> None:
+        alike: dict[Any, dict[str, Adam]] = {}
+        for name, optimizer in optimizers.items():
+            group = optimizer.param_groups[0]
+            alike.setdefault((len(group["params"][0]), group["betas"], group["eps"]), {})[name] = optimizer
+        self._launches: list[tuple[Any, list[str]]] = [(key, list(chosen)) for key, chosen in alike.items()]
+        self._optimizers = {name: optimizer for chosen in alike.values() for name, optimizer in chosen.items()}
+        self._groups = [optimizer.param_groups[0] for optimizer in self._optimizers.values()]
+        self.parameters: dict[str, Tensor] = {
+            name: group["params"][0] for name, group in zip(self._optimizers, self._groups, strict=True)
+        }
+        self.device = next(iter(self.parameters.values())).device
+        self._triton = use_triton(self.device)
+        self._states = [
+            optimizer.state[parameter]
+            for optimizer, parameter in zip(self._optimizers.values(), self.parameters.values(), strict=True)
+        ]
+        for state, parameter in zip(self._states, self.parameters.values(), strict=True):
+            if self._triton and not state:
+                state["step"] = torch.tensor(0.0)
+                state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+        self.exp_avgs, self.exp_avg_sqs = (
+            tuple(state[key] for state in self._states if state) for key in ("exp_avg", "exp_avg_sq")
+        )
+
+    def factors(self) -> Tensor:
+        """Count an update of each parameter; return what the kernel multiplies with, on the host. float32 [2, P]
+
+        It is in pinned memory where there is CUDA. torch's Adam counts by itself and reads nothing of it.
+        """
+        if not self._triton:
+            return torch.empty((2, 0))
+        from sadgs_ns.kernels.adam import rate_and_scale
+
+        columns = []
+        for state, group in zip(self._states, self._groups, strict=True):
+            state["step"] = state["step"].cpu() + _ONE
+            columns.append(rate_and_scale(int(state["step"]), group["lr"], group["betas"]))
+        return torch.tensor(list(zip(*columns, strict=True)), pin_memory=self.device.type == "cuda")
+
+    @torch.no_grad()
+    def launch(
+        self, gradients: Mapping[str, Tensor], factors: Tensor, noted: Tensor, overflowed: tuple[Tensor, ...] = ()
+    ) -> None:
+        """Update the parameters.
+
+        Args:
+            gradients: By the parameters' names, of their shapes.
+            factors: What `factors` returned, on the parameters' device. [2, P]
+            noted: Becomes NaN if a gradient was not finite. float32 [1]
+            overflowed: As for `kernels.adam.adam_step`; torch's Adam takes none.
+        """
+        if not self._triton:
+            for name, optimizer in self._optimizers.items():
+                leave_out_nonfinite(gradients[name], noted)
+                self.parameters[name].grad = gradients[name]
+                optimizer.step()
+                self.parameters[name].grad = None
+            return
+        from sadgs_ns.kernels.adam import adam_step
+
+        begin = 0
+        for (_, betas, eps), names in self._launches:
+            these, begin = slice(begin, begin + len(names)), begin + len(names)
+            parameters = tuple(self.parameters[name] for name in names)
+            in_order = tuple(gradients[name].contiguous() for name in names)
+            adam_step(
+                parameters, in_order, self.exp_avgs[these], self.exp_avg_sqs[these], factors[:, these], noted,
+                overflowed, betas=betas, eps=eps, max_gradient=MAX_GRADIENT,
+            )  # fmt: skip
+
+
+class SadgsOptimizers(Optimizers):
+    """nerfstudio's set of optimizers, each a `FusedAdam`, whose parameters are updated together."""
+
+    def __init__(self, config: dict[str, Any], param_groups: dict[str, list[torch.nn.Parameter]]) -> None:
+        super().__init__(config, param_groups)
+        # nerfstudio would keep the parameters of the start, which densification replaces, to clip their gradients.
+        self.parameters.clear()
+
+    def update(self) -> AdamUpdate:
+        """Return an update of all parameters that hold numbers, as they are now."""
+        adams: Any = self.optimizers.items()
+        for _, adam in adams:
+            adam._opt_called = True  # torch's schedulers look for it.
+        return AdamUpdate({name: adam for name, adam in adams if adam.param_groups[0]["params"][0].numel()})
+
+
+@hide("max_norm", "weight_decay")
+@dataclass
+class FusedAdamOptimizerConfig(AdamOptimizerConfig):
+    """Adam; only its rate is an option of the command line."""
+
+    _target: type = FusedAdam
+    lr: float = 1e-3
+    """Learning rate; where there is a schedule, its factors multiply it."""
+    eps: Suppress[float] = 1e-15
+    """What Adam adds to the root of the second moment; as in 3DGS."""
+
+
+@dataclass
+class RunLengthDecaySchedulerConfig(SchedulerConfig):
+    """Exponential decay over the length of the run, or over its last part, whatever `--max-num-iterations` is."""
+
+    _target: type = field(default_factory=lambda: RunLengthDecayScheduler)
+    initial_factor: Suppress[float] = 1.0
+    """Learning rate at the first iteration, relative to the optimizer's."""
+    final_factor: float = 1.0
+    """Learning rate at the last iteration, relative to the optimizer's."""
+    hold_share: Suppress[float] = 0.0
+    """Share of the run in [0, 1) in which the learning rate stays as at the first iteration."""
+    max_steps: Suppress[int | None] = None
+    """Iterations until `final_factor`; None is the length of the run."""
+
+
+@hide("lr")
+@dataclass
+class UnlistedAdamOptimizerConfig(FusedAdamOptimizerConfig):
+    """Adam whose rate `--help` does not list; a config.yml, or a benchmark's protocol, can set it."""
+
+
+@hide("final_factor")
+@dataclass
+class UnlistedDecaySchedulerConfig(RunLengthDecaySchedulerConfig):
+    """Exponential decay as above, whose factors `--help` does not list."""
+
+
+class RunLengthDecayScheduler(Scheduler):
+    """lr(t) = lr · initial^(1−t) · final^t with t the fraction that has passed of the run after `hold_share`."""
+
+    config: RunLengthDecaySchedulerConfig
+
+    def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LambdaLR:
+        """Make torch's scheduler. Its state holds Python numbers only, which torch's safe loader loads."""
+        max_steps = self.config.max_steps
+        if max_steps is None:
+            raise ValueError("max_steps is unset: SadgsTrainer sets it to the length of the run.")
+        initial, final, hold = self.config.initial_factor, self.config.final_factor, self.config.hold_share
+
+        def factor(step: int) -> float:
+            t = min(max((step / max(max_steps, 1) - hold) / (1 - hold), 0.0), 1.0)
+            return float(initial ** (1 - t) * final**t)
+
+        return LambdaLR(optimizer, factor)

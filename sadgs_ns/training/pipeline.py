@@ -1,0 +1,310 @@
+"""nerfstudio's pipeline for this method: several views in an iteration, with the structure tensors of their images."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
+from torch import Tensor
+
+from sadgs_ns.data.cameras import check_camera_types
+from sadgs_ns.data.parsers import findings_of
+from sadgs_ns.distributed.world import World
+from sadgs_ns.errors import InputError
+from sadgs_ns.gsplat_compat import FAR_PLANE
+from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
+from sadgs_ns.render.types import Cameras as Pinholes
+from sadgs_ns.training import nonfinite
+from sadgs_ns.training.config import SadgsPipelineConfig
+from sadgs_ns.training.datamanager import SadgsDatamanager
+from sadgs_ns.training.memory_plan import place_images
+from sadgs_ns.training.model import NORMALS, SadgsModel
+from sadgs_ns.training.nonfinite import NonFiniteLog
+from sadgs_ns.training.outputs import in_viewer
+from sadgs_ns.training.run_plan import RunPlan
+from sadgs_ns.training.structure_cache import StructureCache
+from sadgs_ns.training.train_step import StepResult, ViewGroup, stack
+from sadgs_ns.training.views import TrainingViews
+from sadgs_ns.viewer.cleaning_panel import CleaningPanel
+from sadgs_ns.viewer.elements import shows_output
+from sadgs_ns.viewer.structure_panel import StructurePanel
+
+_MOST_EFFORT = 100
+"""Largest `effort`, which is a million iterations of four views for a capture of 760 views."""
+_NAMED_STEPS = 5
+"""Number of iterations of which a report of what was not finite names the images."""
+_WIDEST_BLUR = 100
+"""Largest window of `energy_blur`, which makes kernels of thousands of pixels."""
+_SAMPLED = 1000
+"""About so many cameras, and Gaussians, are enough to find out whether training can see anything."""
+
+
+class SadgsPipeline(VanillaPipeline):
+    """Draws views, renders those of one size together, and feeds the model their structure tensors.
+
+    Raises:
+        InputError: As `SadgsPipelineConfig.check`, or if the data cannot be trained on.
+    """
+
+    config: SadgsPipelineConfig
+    datamanager: SadgsDatamanager
+
+    def __init__(self, config: SadgsPipelineConfig, *args: Any, **kwargs: Any) -> None:
+        config.check()
+        # Rendering new views ("inference") opens no image.
+        for finding in findings_of(config.datamanager, open_images=kwargs.get("test_mode") != "inference"):
+            if finding.severity == "warning":
+                CONSOLE.print(f"[yellow]{escape(finding.sentence)}[/]")
+        super().__init__(config, *args, **kwargs)
+        backend = self.model.backend  # It may be refused.
+        for dataset in (self.datamanager.train_dataset, self.datamanager.eval_dataset):
+            check_camera_types(dataset.cameras)
+        if config.datamanager.cache_images != "compressed" and kwargs.get("test_mode") != "inference":
+            line = place_images(self.datamanager, self.device)
+            if line is not None:
+                CONSOLE.print(line, highlight=False, soft_wrap=True)
+        parsed_on = getattr(self.datamanager.dataparser.config, "alpha_color", None)
+        if parsed_on is not None and parsed_on != config.model.background_color:
+            CONSOLE.print(
+                f"[yellow]The images were put on {parsed_on}, the Gaussians lie on {config.model.background_color}: "
+                f"consider --pipeline.model.background-color {parsed_on}.[/]"
+            )
+        if config.model.backend == "auto" and backend == "gsplat":
+            CONSOLE.print("[yellow]Triton's kernels are not used: training takes about twice as long without them.[/]")
+        cameras = self.datamanager.train_dataset.cameras
+        self.model.set_cameras(camera_positions(cameras))
+        self.model.set_near_plane(
+            viewmats_from_camera_to_world(cameras.camera_to_worlds),
+            cameras.get_intrinsics_matrices(),
+            torch.cat([cameras.width, cameras.height], dim=-1),
+        )
+        self.views = TrainingViews(self.datamanager, self.model)
+        self.structure_cache = StructureCache(
+            self.views, config.frequency_constant, energy_blur=config.energy_blur, epsilon=config.epsilon
+        )
+        self.log = NonFiniteLog(self.device)
+        self.world = World()
+        """The processes among which the Gaussians are shared out."""
+        self._means_gradient: Tensor | None = None  # [N, 3], of the last step
+        self.stuck = ""  # It says why, where nothing is learned any more.
+        self.structure = StructurePanel(self.structure_cache)
+        self.cleaning = CleaningPanel(self.views)
+        self.model.viewer_outputs = self._viewer_outputs
+
+    def _viewer_outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return what the viewer may show besides the model's own outputs; what it does not show is `rgb`.
+
+        Normals cannot wait until they are read, because the viewer reads them when training goes on.
+        """
+        if not in_viewer():
+            return {}
+        shown = shows_output(self.structure.viewer, NORMALS)
+        normals = {NORMALS: self.model.get_normals(camera) if shown else rendered["rgb"]}
+        return normals | self.structure.outputs(camera, rendered) | self.cleaning.outputs(camera, rendered)
+
+    @property
+    def model(self) -> SadgsModel:
+        """The model, which is never wrapped for several devices."""
+        return self._model  # type: ignore[return-value]
+
+    def follow(self, plan: RunPlan) -> None:
+        """Train, and draw, as a plan says from now on."""
+        self.model.follow(plan)
+        self.structure.set_max_gaussians.value = plan.strategy.max_gaussians
+        self.structure.set_tau_split.value = plan.strategy.tau_split
+
+    def share_out(self, world: World) -> None:
+        """Keep this process's part of the Gaussians, all of which it has until now; call before optimizers are made."""
+        self.world = self.views.world = world
+        self.model.share_out(world)
+
+    def train(self, mode: bool = True) -> SadgsPipeline:
+        """Set the mode of all modules, unless they have it: nerfstudio asks before every step, and torch visits all."""
+        return self if mode == self.training == self.model.training else super().train(mode)
+
+    @property
+    def views_per_iteration(self) -> int:
+        """Number of views in a step, at most as many as there are: a view that is rendered twice would count twice."""
+        return self.model.plan.views_per_iteration
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Return the callbacks of data and model, and two that read what was not finite."""
+        after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN]
+        counts = TrainingCallback(after, lambda step: self.structure.refresh())
+        after_step = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+        read = TrainingCallback(after_step, lambda step: self._report_nonfinite() if self.log.full else None)
+        last = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self._report_at_the_end())
+        # The log is read before densification makes new parameters, which have no gradients.
+        return [read, *super().get_training_callbacks(training_callback_attributes), counts, last]
+
+    def refuse_empty_views(self) -> None:
+        """Raise InputError if fewer than 1 % of the Gaussians lie between the near and the far plane of any camera."""
+        cameras = self.datamanager.train_dataset.cameras
+        viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds[:: -(-len(cameras) // _SAMPLED)])
+        means = self.model.means.detach()
+        means = means[:: -(-len(means) // _SAMPLED)].to(viewmats)  # [N, 3]
+        depths = means @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]  # [N, C]
+        near = self.model.near_plane
+        drawn = ((depths > near) & (depths < FAR_PLANE)).any(dim=1)
+        share = self.world.sum(drawn.float().mean().to(self.world.device)) / self.world.num_ranks
+        if share < 0.01:
+            extent = float(self.model.strategy_state["scene_scale"])
+            raise InputError(
+                f"The renderings would be empty, since a camera sees from {near:.2g} to {FAR_PLANE:g} units and the "
+                f"cameras lie within {extent:.2g}: set the parser's scale-factor so that they lie within about 1, or "
+                "leave its auto-scale-poses on."
+            )
+
+    def _report_nonfinite(self, last: bool = False) -> None:
+        """Say in which of the last iterations, and with which images, a loss or gradient was not finite.
+
+        Where that lasts, and the present gradients move nothing, `stuck` becomes the sentence that says so. The last of
+        all reports, at the run's end, may be of too few iterations for `nonfinite.HOPELESS_STEPS`.
+        """
+        wrong = self.log.read()
+        files = self.datamanager.train_dataset.image_filenames
+        for step, views, what in wrong[:_NAMED_STEPS]:
+            names = escape(" and ".join(files[view].name for view in views))
+            CONSOLE.print(
+                f"[yellow]Iteration {step + 1}, {names}: {what}; such gradients counted as 0, training goes on.[/]"
+            )
+        if len(wrong) > _NAMED_STEPS:
+            CONSOLE.print(f"[yellow]The same in {len(wrong) - _NAMED_STEPS} more of the last iterations.[/]")
+        enough = nonfinite.HOPELESS_STEPS if not last else min(nonfinite.HOPELESS_STEPS, self.log.steps)
+        gradient = self._means_gradient
+        stuck = bool(wrong) and self.log.streak >= enough and gradient is not None and nonfinite.is_useless(gradient)
+        if self.world.all(stuck):
+            step, _, what = wrong[-1]
+            names = [files[view].name for view in dict.fromkeys(view for _, views, _ in wrong for view in views)]
+            more = f" and {len(names) - _NAMED_STEPS} more" if len(names) > _NAMED_STEPS else ""
+            self.stuck = (
+                f"Nothing was learned in the last {self.log.streak} iterations, up to iteration {step + 1}: {what} "
+                f"(images {', '.join(names[:_NAMED_STEPS])}{more})"
+            )
+
+    def _repeat_overflowed(self, *, wait: bool = False) -> None:
+        """Put back the views that were not drawn, because their tile lists were longer than foreseen."""
+        forecast = self.model.tile_forecast
+        if forecast is not None and (lost := forecast.overflowed(wait=wait)):
+            self.views.sampler.requeue(lost)
+
+    def _report_at_the_end(self) -> None:
+        """Say what was not finite in the last iterations, and how often nothing was drawn."""
+        self._report_nonfinite(last=True)
+        self._repeat_overflowed(wait=True)
+        forecast = self.model.tile_forecast
+        if forecast is not None and (times := forecast.times_overflowed) > 0:
+            CONSOLE.print(
+                f"In {times:,} iteration{'s' * (times > 1)} nothing was drawn, since the Gaussians reached more tiles "
+                "than foreseen; these views were drawn again later.",
+                highlight=False,
+                soft_wrap=True,
+            )
+
+    def next_views(self, step: int) -> list[ViewGroup]:
+        """Draw the views of a step, bring their images to the device, and group them by their sizes."""
+        self._repeat_overflowed()
+        model = self.model
+        groups: dict[tuple[int, ...], list[tuple[int, dict[str, Any]]]] = defaultdict(list)
+        for index, data in self.views.draw(self.views_per_iteration):
+            # One of several processes does not have the images that only others composite.
+            groups[data["image"].shape if self.world.alone else self.views.sizes[index]].append((index, data))
+        result = []
+        for (height, width, *_), views in groups.items():
+            indices, data = [index for index, _ in views], [data for _, data in views]
+            quantized = stack(self.structure_cache.get(views)) if model.strategy.observes(step) else None
+            cameras = Pinholes(*self.views.stacked_cameras(indices), width, height)
+            options = model.step_options(cameras, indices)
+            result.append(ViewGroup(indices, cameras, options, data, model.numbers_of(indices), quantized))
+        return result
+
+    def finish_step(self, step: int, groups: list[ViewGroup], result: StepResult) -> None:
+        """Keep what later steps and reports ask for; nothing of it is waited for."""
+        self.model.infos, self._means_gradient = result.infos, result.means_gradient
+        self.log.record(step, [index for group in groups for index in group.indices], result.loss)
+        forecast = self.model.tile_forecast
+        for group, info in zip(groups, result.infos, strict=True):
+            if forecast is not None and "pair_counts" in info:  # Only our kernels count pairs.
+                size, capacity = group.cameras[2:], group.options.tile_capacity
+                forecast.rendered(group.indices, size, capacity, info["pair_counts"])
+
+    def get_average_eval_image_metrics(
+        self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
+    ) -> dict[str, float]:
+        """Return the mean of each metric over the held-out views, and with `get_std` its standard deviation, too.
+
+        A single view has no deviation (nerfstudio would return NaN, which is no JSON). Raises InputError without views.
+        """
+        views = len(self.datamanager.eval_dataset)
+        if views == 0:
+            raise InputError(
+                "The run holds out no view, so that there is nothing to measure: train with one of the parser's "
+                "--eval-mode that holds out some."
+            )
+        return super().get_average_eval_image_metrics(step, output_path, get_std and views > 1)
+
+    def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
+        """Load a checkpoint, or raise InputError if it is of another method or of other settings of the model.
+
+        nerfstudio would pass over missing parameters: another method's checkpoint would go on from a mixture.
+        """
+        loaded = {key.removeprefix("module."): value for key, value in loaded_state.items()}
+        for name, parameter in self.model.gauss_params.items():
+            value = loaded.get(f"_model.gauss_params.{name}")
+            if value is None:
+                raise InputError(f"The checkpoint has no {name} of Gaussians, so another method made it.")
+            if value.shape[1:] != parameter.shape[1:]:
+                raise InputError(
+                    f"The checkpoint's {name} have the shape {list(value.shape[1:])}, the model's "
+                    f"{list(parameter.shape[1:])}: set pipeline.model.sh-degree as it was."
+                )
+        if not {"_extra_state", "_model._extra_state"} <= loaded.keys():
+            raise InputError("The checkpoint lacks the state of structure-aware densification, so splatfacto made it.")
+        for name, parameter in self.named_parameters():
+            value = loaded.get(name)
+            if ".gauss_params." not in name and value is not None and value.shape != parameter.shape:
+                raise InputError(
+                    f"The checkpoint's {name} is for {len(value)} training views, and there are {len(parameter)}: set "
+                    "the parser's options that choose them as they were."
+                )
+        super().load_pipeline(loaded_state, step)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return what lets a resumed run go on as if it had never been stopped, and tells of which data it is.
+
+        This is random states, the order of the views, the plan, and the names and cameras of the images.
+        """
+        self._repeat_overflowed(wait=True)  # The sampler's state holds the views that are put back.
+        state: dict[str, Any] = {
+            "torch": torch.get_rng_state(),
+            "views": self.views.sampler.state_dict(),
+            "plan": asdict(self.model.plan),
+            "images": [path.name for path in self.datamanager.train_dataset.image_filenames],
+            "camera_positions": camera_positions(self.datamanager.train_dataset.cameras),
+        }
+        if self.device.type == "cuda":
+            state["cuda"] = torch.cuda.get_rng_state(self.device)
+        return state
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_extra_state` saved; the order of the views only where the data still has that many."""
+        self.follow(RunPlan.of(state["plan"]))
+        torch.set_rng_state(state["torch"].cpu())
+        self.views.sampler.load_state_dict(state["views"])
+        if "cuda" in state and self.device.type == "cuda":
+            torch.cuda.set_rng_state(state["cuda"].cpu(), self.device)
+
+
+def camera_positions(cameras: Cameras) -> Tensor:
+    """Return the centres of cameras in world units. [C, 3]"""
+    return cameras.camera_to_worlds[:, :3, 3].cpu()

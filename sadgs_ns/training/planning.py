@@ -1,0 +1,184 @@
+"""Planning a run from its options, its data, the machine's memory and the checkpoint that it goes on from."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from typing import Any
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
+
+from sadgs_ns.method.schedule import Schedule, growth_threshold, schedule
+from sadgs_ns.training.config import SadgsPipelineConfig, SadgsTrainerConfig
+from sadgs_ns.training.memory_plan import fit_to_memory, training_size
+from sadgs_ns.training.pipeline import SadgsPipeline
+from sadgs_ns.training.progress import about_cpu
+from sadgs_ns.training.run_plan import RunPlan, plan_rates
+
+DENSE_THRESHOLDS = 1.25
+"""Factor on AbsGS's thresholds in a run that starts from stereo depth. It takes back the Gaussians that such a start
+adds, with a higher SSIM than without the factor on all of four scenes (docs/results.md#dense-start)."""
+LEAST_PIXELS = 1.5e6
+"""Pixels that a step must draw on each of several devices. Runs whose steps drew 1.9 and 3 million pixels on each of
+two took 1/1.1 of the time on one (one run of the latter 1/1.3), and a run of .7 million took 2.3 times as long
+(docs/results.md#several-devices)."""
+_OF_THE_CAP = ("memory_budget_gb", "model.strategy.max_gaussians")
+"""Options that decide the cap of Gaussians."""
+
+
+def plan_length(config: SadgsTrainerConfig, views: int, before: RunPlan | None) -> Schedule:
+    """Decide the length of a run of so many training views, and the views of a step.
+
+    By hand, or as in the checkpoint's run, whose plan is `before`, if the effort is the same, or by rule.
+    """
+    effort, iterations, in_step = config.pipeline.effort, config.max_num_iterations, config.pipeline.views_per_iteration
+    if before is not None and before.asked["effort"] == effort:
+        iterations = before.iterations if iterations is None else iterations
+        in_step = before.views_per_iteration if in_step is None else in_step
+    return schedule(views, effort=effort, iterations=iterations, views_per_iteration=in_step)
+
+
+def one_device_is_quicker(cameras: Cameras, views: int, devices: int) -> bool:
+    """Tell whether steps of so many of these views have too few pixels for several devices, and say so."""
+    pixels = views * _pixels(cameras)
+    if pixels >= LEAST_PIXELS * devices:
+        return False
+    CONSOLE.print(
+        f"Training on one device: a step draws {pixels / 1e6:.2f} megapixels, and {devices} devices are expected to be "
+        f"quicker from {LEAST_PIXELS * devices / 1e6:.1f} on (docs/results.md). If one device does not hold the "
+        "Gaussians, set --share-always True.",
+        highlight=False,
+        soft_wrap=True,
+    )
+    return True
+
+
+def _pixels(cameras: Cameras) -> float:
+    """Return the mean number of pixels of a view."""
+    return float((cameras.height * cameras.width).double().mean())
+
+
+def plan_run(
+    config: SadgsTrainerConfig,
+    pipeline: SadgsPipeline,
+    length: Schedule,
+    *,
+    dense: bool,
+    before: RunPlan | None,
+    done: int,
+) -> RunPlan:
+    """Decide what a run's options leave open, and print what a user should know of that.
+
+    Raises InputError if `memory_budget_gb` leaves no room for Gaussians.
+
+    Args:
+        config, pipeline: Of the run, each process with the Gaussians from which it starts.
+        length, before: As for `plan_length`.
+        dense: Whether the run starts, or started, from stereo depth.
+        done: Iterations that are done already.
+    """
+    options, model, asked = config.pipeline, pipeline.model, _asked(config.pipeline)
+    if before is not None:
+        _tell_changes(asked, before.asked)
+    strategy, growth = options.model.strategy, growth_threshold(options.effort)
+    clone, split = growth * strategy.clone_grad2d, growth * strategy.split_absgrad2d
+    if dense:
+        clone, split = clone * DENSE_THRESHOLDS, split * DENSE_THRESHOLDS
+    cap = strategy.max_gaussians
+    if strategy.refine_stop_iter != 0:
+        cap = _cap_in_memory(options, pipeline, length.views_per_iteration)
+        if before is not None and all(asked[name] == before.asked[name] for name in _OF_THE_CAP):
+            cap = _kept_cap(cap, before.strategy.max_gaussians)
+    planned = replace(strategy, max_gaussians=cap, clone_grad2d=clone, split_absgrad2d=split)
+    planned = planned.for_run(length.iterations)
+    windows = planned.windows
+    if windows.refine_stop_iter < windows.structure_every and strategy.refine_stop_iter != 0:
+        CONSOLE.print(
+            f"[yellow]{length.iterations} iterations are too few for a structure-aware split: densification ends at "
+            f"{windows.refine_stop_iter}, the first split would come at {windows.structure_every}. "
+            "Train longer or lower pipeline.model.strategy.structure-every.[/]"
+        )
+    _tell_length(config, pipeline, length, done)
+    extent, groups = float(model.strategy_state["scene_scale"]), pipeline.get_param_groups()
+    optimizers = {name: group for name, group in config.optimizers.items() if name in groups}
+    return RunPlan(
+        **vars(length),
+        devices=pipeline.world.num_ranks,
+        images=pipeline.datamanager.config.cache_images,
+        near_plane=model.near_plane if options.model.near_plane is None else options.model.near_plane,
+        max_off_axis=options.model.max_off_axis,
+        strategy=planned,
+        rates=plan_rates(optimizers, length, extent, config.rates_follow_views),
+        asked=asked,
+    )
+
+
+def _asked(options: SadgsPipelineConfig) -> dict[str, Any]:
+    """Return the options that decide how training goes on from a checkpoint, by their names."""
+    own = {name: getattr(options, name) for name in ("effort", "views_per_iteration", "memory_budget_gb")}
+    return own | {f"model.strategy.{name}": value for name, value in asdict(options.model.strategy).items()}
+
+
+def _tell_changes(now: dict[str, Any], before: dict[str, Any]) -> None:
+    """Say which options are others than the checkpoint's run had."""
+    changed = [name for name in before if name in now and now[name] != before[name]]
+    if changed:
+        listed = ", ".join(f"pipeline.{name} was {before[name]} and is {now[name]}" for name in changed)
+        CONSOLE.print(
+            f"[yellow]The checkpoint's run had other settings; this one goes on with its own: {escape(listed)}.[/]",
+            soft_wrap=True,
+        )
+
+
+def _tell_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: Schedule, done: int) -> None:
+    """Print how long the run is, and what decided it."""
+    cameras, options, taken = pipeline.datamanager.train_dataset.cameras, config.pipeline, length.views_per_iteration
+    views, asked, iterations = len(cameras), options.views_per_iteration, length.iterations
+    times = round(iterations * taken / views)
+    lines = [
+        f"{config.method_name} on {views:,} training views of {_pixels(cameras) / 1e6:.2g} megapixels: "
+        f"{iterations:,} iterations of {taken} view{'s' * (taken > 1)}{f', of which {done:,} are done' if done else ''}"
+        f", so that each view is rendered about {times:,} time{'s' * (times != 1)}."
+    ]
+    if config.max_num_iterations is None:
+        lines.append(
+            f"The number of views and --pipeline.effort {options.effort:g} decide this: 0.5 is a draft of half as many "
+            "renderings, 2 resolves more, with more Gaussians and, where views are many, renderings."
+        )
+    if asked is not None and asked > taken:
+        lines.append(
+            f"[yellow]pipeline.views_per_iteration is {asked}, but there are {views} training views: all are taken "
+            "each time.[/]"
+        )
+    if pipeline.device.type == "cpu":
+        lines.append(f"[yellow]{about_cpu(torch.get_num_threads())}[/]")
+    CONSOLE.print("\n".join(lines), highlight=False, soft_wrap=True)
+
+
+def _cap_in_memory(options: SadgsPipelineConfig, pipeline: SadgsPipeline, views: int) -> int:
+    """Return the cap of Gaussians that all devices hold, and say what decided it."""
+    model, processes, cap = pipeline.model, pipeline.world.num_ranks, options.model.strategy.max_gaussians
+    gaussians: Any = model.gauss_params
+    size = training_size(pipeline.datamanager, gaussians, views, processes, model.near_plane)
+    cap, line, warning = fit_to_memory(cap, gaussians, size, options.memory_budget_gb, processes)
+    CONSOLE.print(line, highlight=False, soft_wrap=True)
+    if warning is not None:
+        CONSOLE.print(f"[yellow]{escape(warning)}[/]", soft_wrap=True)
+    return int(pipeline.world.least(cap))
+
+
+def _kept_cap(now: int, before: int) -> int:
+    """Return the cap with which a run goes on from a checkpoint, and say so if memory now allows more, or less."""
+    if now > before:
+        text = f"At most {before:,} Gaussians, as in the checkpoint's run."
+    else:
+        text = (
+            f"[yellow]The checkpoint's run had room for {before:,} Gaussians, the GPU's free memory now has for "
+            f"{now:,}, which is the cap from here on: stop this run and end other programs on the GPU to keep "
+            f"{before:,}.[/]"
+        )
+    if now != before:
+        CONSOLE.print(text, highlight=False, soft_wrap=True)
+    return min(now, before)

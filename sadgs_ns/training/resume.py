@@ -1,0 +1,117 @@
+"""The checkpoint that a run goes on from, and whether it fits the run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
+from scipy.spatial import KDTree
+from torch import Tensor
+from torch.cuda.amp.grad_scaler import GradScaler
+
+from sadgs_ns.distributed.world import World
+from sadgs_ns.errors import InputError, reason
+from sadgs_ns.method.initialization import camera_extent
+from sadgs_ns.training import checkpoints
+from sadgs_ns.training.pipeline import SadgsPipeline, camera_positions
+from sadgs_ns.training.run_plan import RunPlan
+
+_SAME_PLACE = 1e-3
+"""Share of the cameras' extent up to which two cameras are taken for one."""
+
+
+@dataclass
+class Resumption:
+    """A checkpoint between its reading and its loading.
+
+    Each method raises InputError, which names the file and a remedy, if the checkpoint does not fit.
+    """
+
+    path: Path
+    state: dict[str, Any]
+    """As nerfstudio's trainer writes it."""
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        try:
+            yield
+        except torch.cuda.OutOfMemoryError:
+            raise
+        except InputError as error:
+            told = f"{self.path} cannot be continued: {str(error).rstrip('.')}; {checkpoints.REMEDY}."
+            raise InputError(told) from error
+        except Exception as error:  # The parts of a foreign file may raise anything.
+            what = f"{type(error).__name__}: {reason(error)}"
+            raise InputError(
+                f"{self.path} is not a checkpoint of this version of sadgs ({what}): {checkpoints.REMEDY}."
+            ) from error
+
+    @property
+    def plan(self) -> RunPlan | None:
+        """The plan of the run that wrote it; None in one of another method, which `load_gaussians` refuses."""
+        with self._told():
+            pipeline = self.state["pipeline"]
+            state = pipeline.get("_extra_state") if isinstance(pipeline, dict) else None
+            return RunPlan.of(state["plan"]) if isinstance(state, dict) and "plan" in state else None
+
+    def load_gaussians(self, pipeline: SadgsPipeline, world: World) -> None:
+        """Load what the pipeline holds, of the Gaussians this process's part; call before optimizers are made."""
+        with self._told():
+            if not world.alone:
+                part = world.take_even_part(len(self.state["pipeline"]["_model.gauss_params.means"]))
+                self.state = checkpoints.of_gaussians(self.state, lambda rows: rows[part].clone())
+            pipeline.load_pipeline(self.state["pipeline"], self.state["step"])
+            extra = self.state["pipeline"]["_extra_state"]
+            refuse_other_capture(pipeline, extra["images"], extra["camera_positions"])
+            if more := sorted(self.state["optimizers"].keys() - pipeline.get_param_groups().keys()):
+                raise InputError(
+                    f"It optimized {' and '.join(more)}, too: set pipeline.model.color-model and "
+                    "pipeline.model.camera-optimizer.mode as they were."
+                )
+
+    def load_optimizers(self, optimizers: Optimizers, scaler: GradScaler, schedulers: bool) -> None:
+        """Load the optimizers and, if they are wanted, their schedulers, and say so."""
+        with self._told():
+            optimizers.load_optimizers(self.state["optimizers"])
+            if "schedulers" in self.state and schedulers:
+                optimizers.load_schedulers(self.state["schedulers"])
+            scaler.load_state_dict(self.state["scalers"])
+        CONSOLE.print(f"Resuming after step {self.state['step']} of {self.path}", markup=False, soft_wrap=True)
+
+
+def refuse_other_capture(pipeline: SadgsPipeline, before: Sequence[str], positions_before: Tensor) -> None:
+    """Check whether a checkpoint is of the data that training is about to go on with.
+
+    Images may have been added or taken away since, if the others' poses stayed where they were. A warning is
+    printed where the cameras are the same and no image has its old name. Raises InputError if more than half of the
+    cameras of either are where the other has none.
+
+    Args:
+        pipeline: The pipeline, with the data.
+        before: Names of the images that the checkpoint's run was trained on.
+        positions_before: Centres of their cameras in world units. [C, 3]
+    """
+    dataset = pipeline.datamanager.train_dataset
+    now, positions = [path.name for path in dataset.image_filenames], camera_positions(dataset.cameras)
+    distances, _ = KDTree(positions).query(positions_before)  # [C]
+    same = int((distances < _SAME_PLACE * camera_extent(positions)).sum())
+    if 2 * same < min(len(before), len(now)):
+        raise InputError(
+            "It was trained on other data, or with other options of the parser: of its "
+            f"{len(before)} cameras ({before[0]}, …) {same or 'none'} stand where one of these {len(now)} "
+            f"({now[0]}, …) does."
+        )
+    if not {Path(name).stem for name in before} & {Path(name).stem for name in now}:
+        CONSOLE.print(
+            "[yellow]The checkpoint's run had the same cameras, but none of its images had the name of one of "
+            f"these ({escape(before[0])} and {escape(now[0])} are the first): the Gaussians fit only if the images "
+            "were renamed.[/]",
+            soft_wrap=True,
+        )

@@ -1,0 +1,88 @@
+"""The dense start of a run: stereo depth of its training photos, and points drawn from it."""
+
+from __future__ import annotations
+
+import time
+
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from sadgs_ns.method.dense_start import NUMBER, dense_points
+from sadgs_ns.method.eta import wavelength
+from sadgs_ns.method.initialization import plausible_points
+from sadgs_ns.method.quantization import dequantize
+from sadgs_ns.method.stereo import depth_maps
+from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
+from sadgs_ns.training.pipeline import SadgsPipeline
+
+FEWEST_VIEWS, MOST_VIEWS = 3, 60
+"""Numbers of training views between which a run starts from stereo depth, where nobody says. More views make up for
+sparse points, and end with more Gaussians at equal quality (docs/results.md#dense-start)."""
+
+
+def number_of_points(pipeline: SadgsPipeline) -> int:
+    """Return how many points of stereo depth a run starts from at most, with a line where CUDA lacks for them."""
+    model, views = pipeline.model, len(pipeline.datamanager.train_dataset)
+    asked = model.config.stereo_points
+    if model.seed_points is None or model.config.random_init:
+        return 0
+    if asked is not None:
+        return asked
+    if not FEWEST_VIEWS <= views <= MOST_VIEWS:
+        return 0
+    if pipeline.device.type != "cuda":
+        CONSOLE.print("The start has no points of stereo depth, which takes minutes on the CPU.", highlight=False)
+        return 0
+    return NUMBER
+
+
+def start_from_stereo(pipeline: SadgsPipeline, resumed: bool) -> bool:
+    """Start from points of stereo depth, too, where the run is to and is not resumed.
+
+    Call it before optimizers are made. The images are loaded, where they are not yet.
+
+    Returns:
+        Whether the run starts, or a resumed one started, from such points.
+    """
+    number = number_of_points(pipeline)
+    if number and not resumed:
+        _add_points(pipeline, number)
+    return number > 0
+
+
+def _add_points(pipeline: SadgsPipeline, number: int) -> None:
+    """Compute depth maps of the training views, and add points of them to the initial Gaussians."""
+    model, cache = pipeline.model, pipeline.structure_cache
+    data, started = pipeline.datamanager.cached_train, time.perf_counter()  # Undistorting images changes cameras.
+    cameras = pipeline.datamanager.train_dataset.cameras
+    viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
+    assert model.seed_points is not None
+    points = model.seed_points[0]
+    masks = [d["mask"][..., 0].bool() if "mask" in d else None for d in data]
+    depths = depth_maps(
+        lambda view: data[view]["image"],
+        viewmats,
+        cameras.get_intrinsics_matrices(),
+        points[plausible_points(points)].to(model.device),
+        masks=masks,
+        device=model.device,
+    )
+
+    def image(view: int) -> Tensor:
+        return cache.photo(data[view])[..., :3]
+
+    def wavelengths(view: int) -> Tensor:
+        return wavelength(dequantize(cache[view]))
+
+    points = dense_points(depths, viewmats, image, wavelengths, number)
+    added = model.add_points(*points)
+    if model.device.type == "cuda":
+        torch.cuda.synchronize()
+    known = sum(float((d.confidence > 0).float().mean()) for d in depths) / len(depths)
+    CONSOLE.print(
+        f"The start has {added:,} points of stereo depth, known in {known:.0%} of the pixels, beside the SfM points "
+        f"({time.perf_counter() - started:.1f} s).",
+        highlight=False,
+        soft_wrap=True,
+    )

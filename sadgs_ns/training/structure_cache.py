@@ -1,0 +1,145 @@
+"""The structure tensors of a run's images, and η's statistics in all training views."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cached_property, partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sadgs_ns.distributed.bands import first_ranks, share_out
+from sadgs_ns.method.quantization import quantize
+from sadgs_ns.method.statistics import empty_statistics, observe
+from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
+from sadgs_ns.render.types import Cameras
+from sadgs_ns.training.views import TrainingViews
+
+PIXELS_PER_BATCH = 4_000_000
+"""Structure tensors are computed for as many images at once as have this many pixels; each pixel takes at most about
+300 bytes meanwhile."""
+
+
+class StructureCache:
+    """Computes S̄ of images with a run's settings, and keeps that of the training images, quantized to bytes.
+
+    It is kept beside decoded images: on the device, where S̄ of all images is computed at once, or on the host, where
+    that of a view is computed when a step first needs it. Beside images that stay compressed it would take more memory
+    than they do, and is computed anew.
+
+    Args:
+        views: The training views, and the model that decides how transparent images look.
+        frequency_constant: c of ω_l = c / σ_l in 1/px.
+        options: Other arguments of `multiscale_structure_tensor`.
+
+    Attributes:
+        of_images: `multiscale_structure_tensor` with these arguments.
+        filled: Whether `fill` has been called.
+    """
+
+    def __init__(self, views: TrainingViews, frequency_constant: float, **options: float | None) -> None:
+        self.views = views
+        self.frequency_constant = frequency_constant
+        self.of_images = partial(multiscale_structure_tensor, frequency_constant=frequency_constant, **options)  # type: ignore[arg-type]
+        self.filled = False
+        self._kept: dict[int, Tensor] = {}
+
+    def fill(self) -> None:
+        """Load the training images, and compute S̄ of all of them if they are on the device; once is enough."""
+        if self.filled:
+            return
+        images = self.views.datamanager.cached_train
+        if self.views.prefetcher is None:
+            by_size = defaultdict(list)
+            for index, data in enumerate(images):
+                by_size[data["image"].shape[:2]].append(index)
+            for indices in by_size.values():
+                self._kept.update(zip(indices, self.quantized([images[index] for index in indices]), strict=True))
+        self.filled = True
+
+    def __getitem__(self, index: int) -> Tensor:
+        """Quantized S̄ of a training image, on the device. uint8 [H, W, 3]"""
+        self.fill()
+        if index in self._kept:
+            return self._kept[index].to(self.views.model.device, non_blocking=True)
+        return next(self.quantized([self.views.datamanager.cached_train[index]]))
+
+    def get(self, views: Sequence[tuple[int, Mapping[str, Any]]]) -> list[Tensor]:
+        """Quantized S̄ of a step's views, on the device. uint8 [H, W, 3] each
+
+        All of several processes observe η, and the one that composites a view's first rows computes S̄ for the others.
+
+        Args:
+            views: Index and data of each, as drawn; all have one size, and all processes pass the same ones.
+        """
+        self.fill()
+        world, data, (height, width) = self.views.world, dict(views), self.views.sizes[views[0][0]]
+        found = {index: self[index] for index in data if index in self._kept}
+        ranks = first_ranks(share_out(len(views), height, world.num_ranks))
+        missing = {index: ranks[place] for place, (index, _) in enumerate(views) if index not in found}
+        own = [index for index, rank in missing.items() if rank == world.rank]
+        found.update(zip(own, self.quantized([data[index] for index in own]), strict=True))
+        for index, rank in missing.items():
+            if rank != world.rank:
+                found[index] = torch.empty((height, width, 3), dtype=torch.uint8, device=world.device)
+            world.broadcast(found[index], rank)
+            if self._room:
+                self._kept[index] = self._room[index].copy_(found[index], non_blocking=True)
+        return [found[index] for index, _ in views]
+
+    @cached_property
+    def _room(self) -> list[Tensor]:
+        """Memory of the host for S̄ of all images, uint8 [H, W, 3] each; nothing if they are not there decoded.
+
+        It is made at once, because the host waits for the device whenever pinned memory is new.
+        """
+        prefetcher = self.views.prefetcher
+        if prefetcher is None or not prefetcher.decoded:
+            return []
+        pinned = self.views.model.device.type == "cuda"
+        return [torch.empty((*size, 3), dtype=torch.uint8, pin_memory=pinned) for size in self.views.sizes]
+
+    def photo(self, data: Mapping[str, Any]) -> Tensor:
+        """An image of the datamanager as the loss sees it: on the training device and on the background. [H, W, 3]"""
+        model = self.views.model
+        return model.composite_with_background(model.get_gt_img(data["image"]), model.background)
+
+    def quantized(self, data: Sequence[Mapping[str, Any]]) -> Iterator[Tensor]:
+        """Yield quantized S̄ of images of one size, within their masks, on the device. uint8 [H, W, 3] each
+
+        Several are computed at once. `data` are the datamanager's.
+        """
+        at_once = max(PIXELS_PER_BATCH // math.prod(data[0]["image"].shape[:2]), 1) if data else 1
+        for start in range(0, len(data), at_once):
+            batch = data[start : start + at_once]
+            images, masks = torch.stack([self.photo(d) for d in batch]), None
+            if any("mask" in d for d in batch):
+                everything = torch.ones(images.shape[1:3], dtype=torch.bool, device=images.device)
+                masks = torch.stack([d["mask"][..., 0].to(images.device) if "mask" in d else everything for d in batch])
+            yield from quantize(self.of_images(images, masks, known_finite=True))
+
+
+@torch.no_grad()
+def observe_training_views(
+    cache: StructureCache, progress: Callable[[range], Iterable[int]] = iter
+) -> dict[str, Tensor]:
+    """η's statistics of the Gaussians as they are, in one look at each training view, as `statistics.empty_statistics`.
+
+    The samples are drawn from a generator of their own: a run that is watched goes on as if it were not. `progress`
+    wraps the numbers of the views, to show how far the work is.
+    """
+    views, model = cache.views, cache.views.model
+    model.set_crop(None)  # the viewer sets its crop box anew whenever it renders
+    params = model.gauss_params
+    generator = torch.Generator(model.device).manual_seed(0)
+    statistics = empty_statistics(model.num_points, model.device)
+    for index in progress(range(len(views))):
+        tensors, (viewmats, Ks) = cache[index][None], views.stacked_cameras([index])
+        cameras = Cameras(viewmats, Ks, tensors.shape[2], tensors.shape[1])
+        _, _, info = model.render(cameras, model.color_options())
+        info |= {"viewmats": viewmats, "Ks": Ks, "structure_tensors": tensors}
+        observe(statistics, params, info, generator=generator)
+    return statistics

@@ -1,0 +1,161 @@
+"""A training step: render views, compare them with their photos, differentiate, and update all parameters.
+
+One function serves every run. Processes come in where it asks `distributed.rasterization.rasterize` for pictures, and
+CUDA graphs where the trainer has it repeated instead of called (cuda_graphs.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sadgs_ns.distributed.bands import Band
+from sadgs_ns.distributed.rasterization import rasterize
+from sadgs_ns.method.color_matrices import anchored, correct_colors
+from sadgs_ns.method.losses import photometric_loss, photometric_part
+from sadgs_ns.render.types import Cameras, RenderOptions
+from sadgs_ns.training.model import SadgsModel
+from sadgs_ns.training.optimizers import AdamUpdate
+
+
+@dataclass(frozen=True)
+class ViewGroup:
+    """Views of a step that have one size, on the training device."""
+
+    indices: list[int]
+    """Which of the training views they are, V of them."""
+    cameras: Cameras
+    """All of the views."""
+    options: RenderOptions
+    """How they are drawn."""
+    data: Sequence[Mapping[str, Tensor]]
+    """Of each view its `image`, uint8 or floats in [0, 1] [H, W, 3 or 4], and perhaps its `mask`, bool [H, W, 1]. With
+    several processes, views that only others composite have none."""
+    view_numbers: Tensor | None = None
+    """`indices` on the device, where views have matrices of colours. int64 [V]"""
+    structure_tensors: Tensor | None = None
+    """Quantized S̄, where η is observed. uint8 [V, H, W, 3]"""
+    images: Tensor | None = None
+    """The images, where they lie in one tensor already. [V, H, W, 3]"""
+
+    def batch(self, band: Band | None) -> dict[str, Tensor]:
+        """Return `image` and, where one view has a mask, `mask` of all views [V, H, W, ·], or of a band's rows."""
+        if band is not None:
+            rows, data = slice(band.top, band.bottom), self.data[band.view]
+            return {name: data[name][None, rows] for name in ("image", "mask") if name in data}
+        batch = {"image": stack([data["image"] for data in self.data]) if self.images is None else self.images}
+        if any("mask" in data for data in self.data):
+            device = self.cameras.viewmats.device
+            everything = torch.ones((*batch["image"].shape[1:3], 1), dtype=torch.bool, device=device)
+            masks = [data.get("mask", everything).to(device, non_blocking=True) for data in self.data]
+            batch["mask"] = stack(masks)
+        return batch
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What a step leaves on the device."""
+
+    loss: Tensor
+    """The loss of all processes, without gradient."""
+    psnr: Tensor
+    """Of the views, in dB."""
+    means_gradient: Tensor
+    """Gradient of the loss by the centres. [N, 3]"""
+    infos: list[dict[str, Any]]
+    """What the rasterizer tells of each group of views."""
+
+
+def training_step(
+    model: SadgsModel,
+    groups: Sequence[ViewGroup],
+    opacity_reg: float,
+    update: AdamUpdate,
+    factors: Tensor,
+    noted: Tensor,
+) -> StepResult:
+    """Train on the views of a step. This enqueues work and waits for none of it, and changes nothing but tensors.
+
+    Where the tile lists of a group were too short, nothing of it was drawn, and no gradient comes from it. Where that
+    holds for all groups, neither parameters nor moments change.
+
+    Args:
+        model: The model, in training, whose strategy sees the views.
+        groups: The views; the loss is the mean over all of them.
+        opacity_reg: Factor on the mean opacity in the loss.
+        update: Of all parameters.
+        factors: What `AdamUpdate.factors` returned, on the device.
+        noted: Becomes NaN if a gradient was not finite. float32 [1]
+    """
+    strategy, state, world, step = model.strategy, model.strategy_state, model.strategy.world, model.step
+    # Gradients of the parameters themselves would be added up on the stream on which these were first used, which is
+    # not the one on which a graph is captured.
+    leaves = {name: parameter.detach().requires_grad_() for name, parameter in model.trained_params.items()}
+    for name in update.parameters.keys() - leaves.keys():  # learned poses, which moved the groups' cameras
+        update.parameters[name].grad = None
+    share = 1.0 if world.alone else len(leaves["means"]) / world.total
+    gaussians, penalty = model.gaussians(leaves, opacity_reg * share)
+    num_views, background = sum(len(group.indices) for group in groups), model.background
+    losses: list[Tensor] = []
+    qualities: list[Tensor] = []  # PSNR of groups; with several processes, mean square errors of bands
+    infos: list[dict[str, Any]] = []
+    # Several processes have the same groups, and autograd goes back through them in the reverse order in each.
+    for group in groups:
+        pictures, info = rasterize(world, gaussians, group.cameras, group.options)
+        info |= {"viewmats": group.cameras.viewmats.detach(), "Ks": group.cameras.Ks}
+        info["structure_tensors"] = group.structure_tensors
+        strategy.step_pre_backward(model.gauss_params, {}, state, step, info)
+        infos.append(info)
+        for band, colors, alphas in pictures:
+            if group.view_numbers is not None:
+                colors = correct_colors(colors, alphas, anchored(leaves["color_matrices"], group.view_numbers))
+            rgb = model.before_background(colors, alphas, background)
+            predicted, target = model.masked_pair(rgb, group.batch(band), background)
+            if band is None:
+                # The kernel adds up the loss of a single group and the penalty.
+                parts, penalty = (penalty, None) if len(groups) == 1 else (None, penalty)
+                loss, quality = photometric_loss(predicted, target, ssim_lambda=model.config.ssim_lambda, parts=parts)
+                weight = len(group.indices) / num_views
+            else:
+                loss, quality = photometric_part(
+                    predicted, target, rows=(band.first, band.last), top=band.top, height=group.cameras.height,
+                    ssim_lambda=model.config.ssim_lambda,
+                )  # fmt: skip
+                weight = 1 / num_views
+            losses.append(loss if weight == 1 else weight * loss)
+            qualities.append(quality if weight == 1 else weight * quality)
+        if (anchor := info.pop("anchor", None)) is not None:
+            losses.append(anchor)
+    if penalty is not None:
+        losses.append(penalty.sum())
+    pose_penalties: dict[str, Tensor] = {}
+    model.camera_optimizer.get_loss_dict(pose_penalties)
+    losses += pose_penalties.values()
+    loss = reduce(torch.add, losses)
+    loss.backward()
+    gradients = {name: _gradient(leaves.get(name, parameter)) for name, parameter in update.parameters.items()}
+    overflowed = tuple(info["overflowed"] for info in infos if "overflowed" in info)
+    update.launch(gradients, factors, noted, overflowed)
+    strategy.accumulate(state, step, infos)
+    loss = loss.detach()
+    if world.alone:
+        psnr = reduce(torch.add, qualities)
+    else:
+        loss, error = world.sum(torch.stack([loss, sum(qualities, torch.zeros_like(loss))]))
+        psnr = -10 * error.log10()
+    return StepResult(loss, psnr, gradients["means"], infos)
+
+
+def _gradient(leaf: Tensor) -> Tensor:
+    """Return the gradient that a leaf got, zeros where it got none."""
+    return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
+
+
+def stack(tensors: Sequence[Tensor]) -> Tensor:
+    """Stack tensors as `torch.stack` does, but do not copy a single one."""
+    return tensors[0][None] if len(tensors) == 1 else torch.stack(list(tensors))

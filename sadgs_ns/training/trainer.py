@@ -1,0 +1,410 @@
+"""The trainer of `ns-train sadgs`: it plans, saves, resumes, and ends a run in one sentence."""
+
+from __future__ import annotations
+
+import copy
+import math
+import os
+import shlex
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils import writer
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from sadgs_ns import events
+from sadgs_ns.distributed.world import World
+from sadgs_ns.errors import InputError, RunError, WriteError, reason
+from sadgs_ns.kernels import use_triton
+from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
+from sadgs_ns.training import checkpoints, processes
+from sadgs_ns.training.compilation import compile_kernels
+from sadgs_ns.training.config import SadgsTrainerConfig
+from sadgs_ns.training.cuda_graphs import GraphedSteps
+from sadgs_ns.training.interrupts import HANG_UP, SIGNALS, Interrupted, Interrupts
+from sadgs_ns.training.lost_output import drop_lost_output, print_elsewhere_once_unread
+from sadgs_ns.training.optimizers import SadgsOptimizers
+from sadgs_ns.training.pipeline import SadgsPipeline
+from sadgs_ns.training.planning import one_device_is_quicker, plan_length, plan_run
+from sadgs_ns.training.progress import remove_tables, what_next
+from sadgs_ns.training.resume import Resumption
+from sadgs_ns.training.run_folder import write_config
+from sadgs_ns.training.stereo_start import start_from_stereo
+from sadgs_ns.training.train_step import training_step
+
+_LESS_MEMORY = (
+    "lower --pipeline.model.strategy.max-gaussians or --pipeline.views-per-iteration, or take smaller images "
+    "(`--downscale-factor 2` after `nerfstudio-data` or `colmap`), or several devices (`--share-always True`)"
+)
+_NOTHING_DONE = "stopped before an iteration was done; the same command starts again."
+_SAVING_SHARE = 0.01
+"""Largest share of the time between two checkpoints by the clock that saving may take."""
+
+
+def _memory(error: torch.cuda.OutOfMemoryError) -> str:
+    """Return the first two of torch's many sentences, which say how much memory was asked for, and of whom."""
+    return ". ".join(reason(error).split(". ")[:2]).rstrip(".")
+
+
+class SadgsTrainer(Trainer):
+    """A trainer for one model on one device, or on several, each with a process and a part of the Gaussians.
+
+    Where there are several, all processes call the same methods, and the first one alone prints and writes files.
+    """
+
+    config: SadgsTrainerConfig
+    pipeline: SadgsPipeline
+    optimizers: SadgsOptimizers
+
+    def __init__(self, config: SadgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
+        print_elsewhere_once_unread(CONSOLE)
+        config.check()
+        config = copy.copy(config)  # Where there are several processes, they agree on what the file does not say.
+        self.world, local_rank = processes.join(config, local_rank)
+        """What this process knows of the others; None where it is alone."""
+        self._peers = None if self.world.alone else processes.Peers(self.world)
+        if not self.world.alone:
+            with processes.first_of_each_machine_before_others(self.world, local_rank):
+                use_triton(self.world.device)  # This compiles a kernel, and is asked for again below.
+        config.pipeline.datamanager.train_cameras_sampling_seed = config.machine.seed
+        self._vis: Any = config.vis
+        # nerfstudio would wrap the pipeline for several devices in its own way.
+        super().__init__(config, local_rank, world_size=1)
+        self._stepping = False
+        self.graphed: GraphedSteps | None = None
+        """What trains steps by CUDA graphs; None where all are launched one by one."""
+        self._resumed: Resumption | None = None
+        self._completed_step = self._saved_step = -1
+        self._save_due = math.inf
+        # A run that is paused or done polls no signal, because nerfstudio waits for the viewer's user.
+        self._interrupts = Interrupts(
+            waiting=lambda: self.training_state != "training" and not self._stepping, started=not self.world.alone
+        )
+
+    def setup(self, *args: Any, **kwargs: Any) -> None:
+        """Load data, model and checkpoint, and compile what the machine has not compiled yet.
+
+        Raises:
+            InputError: If one of them cannot be used.
+            RunError: If they do not fit the GPU's memory, or another process ended.
+            SystemExit: If SIGINT came; nerfstudio would print a traceback.
+        """
+        try:
+            super().setup(*args, **kwargs)
+            plan = self.pipeline.model.plan
+            if processes.is_first():
+                plan.write(self.base_dir)
+            events.report("training begins", iterations=plan.iterations, on_cpu=self.device == "cpu")
+            last = [TrainingCallbackLocation.AFTER_TRAIN]
+            self.callbacks.append(TrainingCallback(last, lambda step: self._say_what_is_next()))
+            with processes.first_of_each_machine_before_others(self.world, self.local_rank):
+                compile_kernels(self.pipeline, self.optimizers.optimizers)
+            self.graphed = GraphedSteps(self.pipeline.model) if self._may_graph_steps() else None
+        except torch.cuda.OutOfMemoryError as error:
+            raise RunError(f"The GPU's memory is too small to start ({_memory(error)}): {_LESS_MEMORY}.") from error
+        except RunError:
+            raise
+        except RuntimeError as error:
+            if (ended := self._ended()) is None:
+                raise
+            raise RunError(f"{ended}: {_NOTHING_DONE}") from error
+        except KeyboardInterrupt:
+            CONSOLE.print(f"SIGINT: {_NOTHING_DONE}", soft_wrap=True)
+            raise SystemExit(128 + signal.SIGINT) from None
+
+    def _may_graph_steps(self) -> bool:
+        """Tell whether steps of this run can be CUDA graphs.
+
+        The host must not wait in a step, as it does for lists of an exact length, and for the numbers of Gaussians that
+        several processes send each other. A camera optimizer computes what is not in the graphs.
+        """
+        model = self.pipeline.model
+        known = model.backend == "triton" and model.tile_forecast is not None
+        return self.config.cuda_graphs and self.world.alone and known and model.camera_optimizer.config.mode == "off"
+
+    def _say_what_is_next(self) -> None:
+        """Print the commands for a run that is done, below nerfstudio's box; not where the run ends with an error."""
+        if not self.pipeline.stuck:
+            text = what_next(self.base_dir / "config.yml", self.pipeline.model.num_gaussians)
+            CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
+            events.report("training ends", gaussians=self.pipeline.model.num_gaussians)
+
+    def _load_checkpoint(self) -> None:
+        """Load the optimizers of the checkpoint, whose Gaussians are there since they were made."""
+        if self._resumed is None:
+            return super()._load_checkpoint()
+        self._resumed.load_optimizers(self.optimizers, self.grad_scaler, self.config.load_scheduler)
+        self._resumed = None
+
+    def _turn_viewer_off(self) -> None:
+        """Keep nerfstudio from starting a viewer, and say so where one was asked for."""
+        if self.config.is_viewer_enabled() or self.config.is_viewer_legacy_enabled():
+            CONSOLE.print("The viewer is off, since no device holds all Gaussians; `ns-viewer` shows the finished run.")
+            others = self._vis.removeprefix("viewer_legacy").removeprefix("viewer").removeprefix("+")
+            self.config.vis = others or "none"  # type: ignore[assignment]
+
+    def setup_optimizers(self) -> SadgsOptimizers:
+        """Load the checkpoint's Gaussians, if there is one, plan the run, and build optimizers with the planned rates.
+
+        Raises InputError if checkpoint, data or options cannot be used, or do not fit each other.
+        """
+        config, pipeline = self.config, self.pipeline
+        chosen = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
+        self._resumed = resumed = None if chosen is None else Resumption(*chosen)
+        before = None if resumed is None else resumed.plan
+        dense = start_from_stereo(pipeline, resumed=resumed is not None)
+        cameras = pipeline.datamanager.train_dataset.cameras
+        if resumed is None:
+            pipeline.model.clear_paths(viewmats_from_camera_to_world(cameras.camera_to_worlds))
+        length = plan_length(config, len(cameras), before)
+        peers, views = None if config.share_always else self._peers, length.views_per_iteration
+        if peers is not None and peers.all_here() and one_device_is_quicker(cameras, views, self.world.num_ranks):
+            # The other processes end with SystemExit, once this one, the first, has ended.
+            processes.leave_the_rest_to_the_first(self.world, peers)
+            self.world, self._peers = World(), None
+        if not self.world.alone:
+            self._turn_viewer_off()
+            pipeline.share_out(self.world)
+        if resumed is not None:
+            resumed.load_gaussians(pipeline, self.world)
+            self._start_step = resumed.state["step"] + 1
+        pipeline.refuse_empty_views()
+        plan = plan_run(config, pipeline, length, dense=dense, before=before, done=self._start_step)
+        pipeline.follow(plan)
+        config.max_num_iterations = plan.iterations  # nerfstudio's loop and table read it.
+        return SadgsOptimizers(plan.optimizers(config.optimizers), pipeline.get_param_groups())
+
+    def train(self) -> None:
+        """Train up to `max_num_iterations` in all, where nerfstudio 1.1.5 would train that many more after resuming.
+
+        Raises:
+            RunError: If the GPU's memory is full, nothing is learned any more, or an image cannot be decoded any more.
+            WriteError: If a checkpoint or log could not be written.
+            SystemExit: If SIGINT, SIGTERM or SIGHUP came. A checkpoint is saved then, a line says how to go on, and the
+                exit code is the one that shells give these signals.
+        """
+        total = self.pipeline.model.plan.iterations
+        self.step: int = max(self._start_step - 1, 0)  # It names the checkpoint where nothing is left to do.
+        self._completed_step = self._saved_step = self._start_step - 1
+        self.config.max_num_iterations = max(total - self._start_step, 0)
+        if self._start_step >= total:
+            writer.GLOBAL_BUFFER["step"] = self.step  # nerfstudio's table reads what only an iteration sets.
+            CONSOLE.print(
+                f"This run is finished after {self._start_step} iterations: --max-num-iterations of more than "
+                f"{self._start_step} trains on.",
+                highlight=False,
+                soft_wrap=True,
+            )
+        out_of_memory = ""
+        self._set_clock(0.0)
+        try:
+            self._train_until_interrupted(total)
+        except InputError as error:
+            if self._completed_step == self._saved_step or not self.world.alone:
+                raise
+            # An image that is decoded ahead of its step is gone or damaged, and no step is half done.
+            self.save_checkpoint(self._completed_step)
+            raise RunError(
+                f"{error} What was trained is saved and goes on with --load-dir {self.checkpoint_dir}."
+            ) from error
+        except RunError:
+            raise
+        except torch.cuda.OutOfMemoryError as error:
+            out_of_memory = _memory(error)  # The RunError is raised below, when the failed step's tensors are gone.
+        except OSError as error:
+            if error.errno is None:  # It is a WriteError, or it does not come from the disk.
+                raise
+            # A logger, such as tensorboard's, could not write; its file may be on another disk, or its folder is gone.
+            if not self._stepping and self._completed_step > self._saved_step and self.world.alone:
+                self.save_checkpoint(self._completed_step)
+            raise WriteError(Path(os.fsdecode(error.filename or self.base_dir)), error) from error
+        except RuntimeError as error:
+            if (ended := self._ended()) is None:
+                raise
+            resume = f"what the last checkpoint holds goes on with --load-dir {self.checkpoint_dir}"
+            raise RunError(f"{ended}: {resume}.") from error
+        finally:
+            self.config.max_num_iterations = total
+            self.pipeline.views.close()
+            remove_tables()
+        if out_of_memory:
+            raise RunError(self._rescue(out_of_memory))
+        processes.leave()
+
+    def _train_until_interrupted(self, total: int) -> None:
+        """Train as nerfstudio does, until the last iteration of all or a signal, which raises SystemExit once saved."""
+        with self._interrupts:
+            try:
+                if not self.world.alone:  # nerfstudio's way to make it fails where another process is as fast.
+                    self.base_dir.mkdir(parents=True, exist_ok=True)
+                super().train()
+                self._stop_if_stuck()
+            except Interrupted as interrupted:
+                self._stop(interrupted, total)
+            except OSError as error:
+                interruption = self._interrupts.behind(error)
+                if interruption is None or self._stepping:
+                    raise
+                self._stop(interruption, total)
+
+    def _ended(self) -> str | None:
+        """Say which other processes ended by themselves, and with them this one; None where none did."""
+        ended = [] if self._peers is None else self._peers.ended()
+        if not ended:
+            return None
+        number = processes.number_of_processes()
+        return f"Process {' and '.join(map(str, ended))} of {number} ended (counted from 0), and the others with it"
+
+    def _rescue(self, out_of_memory: str) -> str:
+        """Save the state before the present step if it is whole, and return what to tell the user.
+
+        If memory ran out while Gaussians were split, the saved state holds the step's update already, and the resumed
+        run makes it a second time.
+        """
+        torch.cuda.empty_cache()
+        model = self.pipeline.model
+        lengths = {len(parameter) for parameter in model.gauss_params.values()}
+        for name, parameter in model.gauss_params.items():
+            states = self.optimizers.optimizers[name].state
+            if not states and parameter.numel() > 0:
+                lengths.add(-1)  # gsplat takes the state out while it rewrites it.
+            for state in states.values():
+                lengths |= {len(value) for value in state.values() if isinstance(value, torch.Tensor) and value.dim()}
+        lengths |= {len(v) for v in model.strategy_state.values() if isinstance(v, torch.Tensor) and v.dim()}
+        if len(lengths) > 1 or self.step <= self._start_step or not self.world.alone:
+            kept = "nothing newer than the last checkpoint could be saved"
+        else:
+            try:
+                self.save_checkpoint(max(self.step - 1, self._completed_step))
+                kept = f"what was trained is saved and goes on with --load-dir {self.checkpoint_dir}"
+            except WriteError as error:
+                kept = f"what was trained is lost, since {error}"
+        return (
+            f"The GPU's memory was full at iteration {self.step} with {model.num_points} Gaussians ({out_of_memory}): "
+            f"{_LESS_MEMORY}; {kept}."
+        )
+
+    def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
+        """Train on the views of a step, in the place of nerfstudio's iteration, and return its loss and metrics.
+
+        No signal may stop the run from here to `_update_viewer_state`.
+        """
+        self._stepping = True
+        # Several processes agree on what to do after a step in the step itself. A signal has the bit of its number.
+        self.world.flags_in, signalled = 0, self._interrupts.received
+        bit = 0 if signalled is None else 1 << signalled
+        self.world.flags_out = int(time.monotonic() >= self._save_due) | bit
+        pipeline, model, graphed = self.pipeline, self.pipeline.model, self.graphed
+        if graphed is not None and model.tile_forecast is not None:
+            model.tile_forecast.coarse = graphed.prepare(pipeline.views_per_iteration)
+        groups, update = pipeline.next_views(step), self.optimizers.update()
+        inputs = groups, model.opacity_reg_now, update
+        factors, slot = update.factors(), pipeline.log.slot
+        result = None if graphed is None else graphed.replay(*inputs, factors, slot)
+        if result is None:
+            result = training_step(model, *inputs, factors.to(update.device, non_blocking=True), slot)
+        pipeline.finish_step(step, groups, result)
+        self.optimizers.scheduler_step_all(step)
+        return result.loss, {"main_loss": result.loss}, model.training_metrics(result.psnr)
+
+    def _update_viewer_state(self, step: int) -> None:
+        """Stop or save where that is due; nerfstudio calls this after every step, when densification is done."""
+        self._completed_step, self._stepping = step, False
+        if self.world.alone:
+            self._interrupts.poll()
+            due = time.monotonic() >= self._save_due
+        else:
+            due = bool(self.world.flags_in & 1)
+            for number in SIGNALS:
+                if self.world.flags_in >> number & 1:
+                    raise Interrupted(number)
+        self._stop_if_stuck()
+        if due:
+            self.save_checkpoint(step)
+        super()._update_viewer_state(step)
+
+    def eval_iteration(self, step: int) -> None:
+        """Measure held-out views as nerfstudio does, unless no device holds all Gaussians."""
+        if self.world.alone:
+            super().eval_iteration(step)
+
+    def _train_complete_viewer(self) -> None:
+        """Wait for the viewer's user, as nerfstudio does for ever, unless the run must stop."""
+        self._interrupts.poll()
+        self._stop_if_stuck()
+        super()._train_complete_viewer()
+
+    def _set_clock(self, took: float) -> None:
+        """Set when the next checkpoint is due, after one that took `took` seconds to save."""
+        config = self.config
+        by_clock = config.steps_per_save == 0 and config.seconds_per_save > 0
+        wait = max(config.seconds_per_save, took / _SAVING_SHARE) if by_clock else math.inf
+        self._save_due = time.monotonic() + wait
+
+    def _stop(self, interrupted: Interrupted, total: int) -> None:
+        """Save a checkpoint, and in `config.yml` that the run goes on from it; a run that was done just ends."""
+        if self._completed_step > self._saved_step:
+            self.save_checkpoint(self._completed_step)
+        done = self._completed_step + 1
+        if done >= total:
+            return
+        if done == self._start_step:
+            text = f"{interrupted}: {_NOTHING_DONE}"
+        else:
+            # With --load-config nerfstudio takes all options from the file, so the file must name the checkpoints, too.
+            config = copy.copy(self.config)
+            config.max_num_iterations = total
+            config.load_dir, config.load_step, config.load_checkpoint = self.checkpoint_dir, None, None
+            config.vis = self._vis
+            file = write_config(config) if processes.is_first() else self.base_dir / "config.yml"
+            command = shlex.join(["ns-train", str(config.method_name), "--load-config", str(file)])
+            text = f"{interrupted}: stopped and saved after {done} of {total} iterations; resume with: {command}"
+        if interrupted.number == HANG_UP:  # Some systems send it before they take the terminal away.
+            drop_lost_output()
+        CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
+        self.world.all(True)  # What starts the processes ends all as soon as one has ended.
+        raise SystemExit(128 + interrupted.number)
+
+    def _stop_if_stuck(self) -> None:
+        """Save the Gaussians and raise RunError if they learn nothing any more because gradients are not finite."""
+        if not self.pipeline.stuck:
+            return
+        kept = "the Gaussians themselves are not finite: train anew, or from a checkpoint in which they are"
+        finite = all(bool(parameter.isfinite().all()) for parameter in self.pipeline.model.gauss_params.values())
+        if self.world.all(finite):
+            if self._completed_step > self._saved_step:
+                self.save_checkpoint(self._completed_step)
+            kept = f"the Gaussians as they are now are saved and go on with --load-dir {self.checkpoint_dir}"
+        raise RunError(
+            f"{self.pipeline.stuck}; look at them with sadgs-doctor, and lower the learning rates if you raised them; "
+            f"{kept}."
+        )
+
+    def save_checkpoint(self, step: int) -> None:
+        """Save as `checkpoints.write` does. Where several processes train, the first writes what all of them hold."""
+        start = time.monotonic()
+        state = self._state(step)
+        if processes.is_first():
+            # An earlier checkpoint may be better where nothing is learned any more.
+            keep = not self.config.save_only_latest_checkpoint or bool(self.pipeline.stuck)
+            checkpoints.write(self.checkpoint_dir, step, state, keep)
+        self.world.all(True)
+        self._saved_step = step
+        self._set_clock(time.monotonic() - start)
+
+    def _state(self, step: int) -> dict[str, Any]:
+        """Return what a checkpoint holds; the Gaussians of other processes are gathered by the first."""
+        state = {
+            "step": step,
+            "pipeline": self.pipeline.state_dict(),
+            "optimizers": {name: o.state_dict() for name, o in self.optimizers.optimizers.items()},
+            "schedulers": {name: s.state_dict() for name, s in self.optimizers.schedulers.items()},
+            "scalers": self.grad_scaler.state_dict(),
+        }
+        return state if self.world.alone else checkpoints.of_gaussians(state, self.world.gather_rows)

@@ -1,0 +1,1 @@
+"""What the viewer, sadgs-inspect and the demo show of Gaussians, wavelengths and planned splits."""

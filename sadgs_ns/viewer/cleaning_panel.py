@@ -1,0 +1,143 @@
+"""The viewer's panel for cleaning: sliders, how many Gaussians they would take away, and what that looks like.
+
+It takes nothing away: `sadgs-export` does, with the options that the panel prints.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.utils.rich_utils import CONSOLE
+from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerDropdown, ViewerSlider, ViewerVec3
+from rich.markup import escape
+from torch import Tensor
+
+from sadgs_ns.errors import reason
+from sadgs_ns.method.cleaning import Cleaning, Seen, find, see
+from sadgs_ns.training.model import SadgsModel
+from sadgs_ns.training.outputs import in_viewer
+from sadgs_ns.training.views import TrainingViews
+from sadgs_ns.viewer.elements import ViewerMarkdown, show_output
+
+OUTPUT = "cleaned"
+"""Name of the panel's picture among the viewer's output types."""
+OFF, STAYS, GOES = "off", "what stays", "what goes"
+NEAREST, FURTHEST = (-100.0, -100.0, -100.0), (100.0, 100.0, 100.0)
+"""Corners of the box at first, in world units: a box of these takes nothing away."""
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Stands in for a crop box, as far as the model asks it: which Gaussians are drawn."""
+
+    drawn: Tensor
+    """bool [N]"""
+
+    def within(self, means: Tensor) -> Tensor:
+        """Return which are drawn. [N, 3] → [N]"""
+        return self.drawn
+
+
+class CleaningPanel(torch.nn.Module):
+    """Elements of the viewer, and the picture that they choose, of a run's model.
+
+    It is a module because the viewer looks for elements in modules only; it has neither parameters nor state.
+    """
+
+    def __init__(self, views: TrainingViews) -> None:
+        super().__init__()
+        self._views = views
+        self._seen: tuple[tuple[int, int], Seen] | None = None
+        self._stays = torch.ones(0, dtype=torch.bool)
+        self._shown, self._text = OFF, ""
+        self.choice = ViewerDropdown(
+            "Preview", OFF, [OFF, STAYS, GOES], cb_hook=self._changed, hint="What the output type “cleaned” shows"
+        )
+        self.crop_from = ViewerVec3("crop from", NEAREST, cb_hook=self._changed, hint="Lowest x, y and z that stay")
+        self.crop_to = ViewerVec3("crop to", FURTHEST, cb_hook=self._changed, hint="Highest x, y and z that stay")
+        self.dust = self._slider("dust", 20.0, 0.1, "Pixels that a Gaussian must make up in some training view")
+        self.max_extent = self._slider("max extent", 2.0, 0.01, "Longest standard deviation that stays; 0 is no limit")
+        self.min_views = self._slider("min views", len(views), 1, "Training views that must see a Gaussian")
+        self.text = ViewerMarkdown("taken away", lambda: self._text)
+        self.viewer = ViewerControl()
+
+    def _slider(self, name: str, most: float, step: float, hint: str) -> ViewerSlider[Any]:
+        return ViewerSlider(name, type(most)(0), type(most)(0), most, step, cb_hook=self._changed, hint=hint)
+
+    @property
+    def _model(self) -> SadgsModel:
+        """The model; the name is private, lest the viewer walk from here into it again."""
+        return self._views.model
+
+    @property
+    def cleaning(self) -> Cleaning:
+        """What the elements ask for; raises InputError if the box is reversed."""
+        low, high = self.crop_from.value, self.crop_to.value
+        crop = None
+        if (tuple(low), tuple(high)) != (NEAREST, FURTHEST):
+            crop = (low[0], low[1], low[2], high[0], high[1], high[2])
+        return Cleaning(int(self.min_views.value), self.max_extent.value or None, crop, self.dust.value)
+
+    def _changed(self, _: Any) -> None:
+        """Find what stays, and say how many go, or what went wrong: the viewer's threads keep errors to themselves."""
+        try:
+            self.refresh()
+        except (RuntimeError, ValueError) as error:  # Memory is full, the box is reversed, or photos went away.
+            self._say(f"The picture stays as it was: {reason(error)}.")
+            CONSOLE.print(f"[yellow]{escape(self._text)}[/]")
+            return
+        show_output(self.viewer, "rgb" if self._shown == OFF else OUTPUT)
+
+    def refresh(self) -> None:
+        """Find what stays of the present Gaussians; raises InputError if the box is reversed."""
+        cleaning, model = self.cleaning, self._model
+        params = dict(model.gauss_params.items())
+        now = (model.num_points, model.step)  # While a run trains, what was seen becomes untrue.
+        if cleaning.needs_views and (self._seen is None or self._seen[0] != now):
+            self._say("Looking from all training views …")
+            self._seen = now, see(params, self._cameras(), model.drawing)
+        stays, sentences = find(params, cleaning, None if self._seen is None else self._seen[1])
+        self._stays, self._shown = stays, self.choice.value
+        left = f"{int(stays.sum()):,} of {len(stays):,} Gaussians would stay."
+        options = command_line_options(cleaning)
+        how = f"\n\n`sadgs-export RUN --output splat.ply {options}` does this." if options else ""
+        self._say("\n\n".join([*sentences, left]) + how)
+
+    def _cameras(self) -> list[tuple[Tensor, Tensor, int, int]]:
+        cameras = self._views.datamanager.train_dataset.cameras
+        sizes = torch.cat([cameras.width, cameras.height], dim=1).tolist()
+        views = (self._views.stacked_cameras([index]) for index in range(len(sizes)))
+        return [(viewmats[0].detach(), Ks[0], *size) for (viewmats, Ks), size in zip(views, sizes, strict=True)]
+
+    def _say(self, text: str) -> None:
+        self._text = text
+        self.text.refresh()
+
+    def outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return `cleaned` [H, W, 3] in [0, 1], which the viewer may show; evaluation and `ns-render` get nothing.
+
+        It is `rgb` of the model's outputs where densification has changed the Gaussians.
+        """
+        if not in_viewer():
+            return {}
+        model, stays = self._model, self._stays
+        if self._shown == OFF or len(stays) != model.num_points:
+            return {OUTPUT: rendered["rgb"]}
+        box, drawn = model.crop_box, stays if self._shown == STAYS else ~stays
+        model.crop_box = _Rows(drawn if box is None else drawn & box.within(model.means))  # type: ignore[assignment]
+        try:
+            return {OUTPUT: model.get_outputs(camera)["rgb"]}
+        finally:
+            model.crop_box = box
+
+
+def command_line_options(cleaning: Cleaning) -> str:
+    """Return the options of `sadgs-export` that ask for the same, or "" for nothing."""
+    options = [f"--min-views {cleaning.min_views}"] if cleaning.min_views else []
+    options += [] if cleaning.max_extent is None else [f"--max-extent {cleaning.max_extent:g}"]
+    options += [] if cleaning.crop is None else ["--crop " + " ".join(f"{value:g}" for value in cleaning.crop)]
+    options += [f"--dust {cleaning.dust:g}"] if cleaning.dust else []
+    return " ".join(options)

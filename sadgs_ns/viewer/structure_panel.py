@@ -1,0 +1,326 @@
+"""The viewer's panel, which shows what the method does and changes some of its settings while a run trains.
+
+The viewer finds the elements by walking the pipeline, and shows them in alphabetical order of their attributes.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.utils.rich_utils import CONSOLE
+from nerfstudio.viewer.viewer_elements import (
+    ViewerButton,
+    ViewerControl,
+    ViewerDropdown,
+    ViewerNumber,
+    ViewerParameter,
+    ViewerSlider,
+)
+from rich.markup import escape
+from torch import Tensor
+
+from sadgs_ns.errors import reason
+from sadgs_ns.method.quantization import dequantize
+from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
+from sadgs_ns.training.model import SadgsModel
+from sadgs_ns.training.outputs import in_viewer
+from sadgs_ns.training.run_plan import RunPlan
+from sadgs_ns.training.structure_cache import StructureCache, observe_training_views
+from sadgs_ns.viewer import color_scales, gaussian_maps, texture
+from sadgs_ns.viewer.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
+from sadgs_ns.viewer.elements import ViewerMarkdown, show_output
+
+OUTPUT = "structure"
+"""Name of the panel's picture among the viewer's output types."""
+OFF, ETA_OF, CHILDREN_OF, LOW_OF = "off", "η", "children", "low"
+PERIOD_HERE, ELLIPSES_HERE = "wavelength of this rendering", "ellipses of this rendering"
+PERIOD_NEAR, ELLIPSES_NEAR = "wavelength of the nearest photo", "ellipses of the nearest photo"
+CHOICES = [OFF, ETA_OF, CHILDREN_OF, LOW_OF, PERIOD_HERE, ELLIPSES_HERE, PERIOD_NEAR, ELLIPSES_NEAR]
+OF_PHOTOS = (PERIOD_NEAR, ELLIPSES_NEAR)
+"""Choices that need the training photos."""
+OF_STATISTICS = (ETA_OF, CHILDREN_OF, LOW_OF)
+"""Choices that need observations of the training views."""
+RANGES = {"tau_split": (0.0, 1.0), "max_gaussians": (1, 100_000_000)}
+"""Fields of the strategy that may be changed while a run trains, each with its smallest and largest value."""
+ROWS = 8
+"""Number of structure steps in the table, which shows the last ones."""
+
+
+def changed(plan: RunPlan, name: str, value: float) -> RunPlan:
+    """Return a plan with another value of one of `RANGES`' fields; raise ValueError if it is out of range."""
+    low, high = RANGES[name]
+    if not (isinstance(value, int | float) and math.isfinite(value) and low <= value <= high):
+        raise ValueError(f"{name} must be in {low} … {high}, got {value}; it stays {getattr(plan.strategy, name)}.")
+    option: dict[str, Any] = {name: int(value) if isinstance(low, int) else float(value)}
+    return replace(plan, strategy=replace(plan.strategy, **option))
+
+
+def describe(strategy: StructureAwareStrategy, num_points: int, state: dict[str, Any]) -> str:
+    """Return the number of Gaussians now, and a table of how the last structure steps changed it, as Markdown.
+
+    What AbsGS and pruning changed between the structure steps, which `state` lists, has rows of its own: each row
+    begins where the one above ends, and the last one ends with the number of now.
+    """
+    lines = [f"**{num_points:,} Gaussians** (cap {strategy.max_gaussians:,})", ""]
+    steps = state.get("structure_steps", [])[-ROWS:]
+    if not steps:
+        return "\n".join([*lines, "No structure step yet."])
+    lines += ["| iteration | step | violate | low | Gaussians |", "| --- | --- | --- | --- | --- |"]
+    number, last = steps[0]["before"], ""
+    for step in steps:
+        if step["before"] != number:
+            lines.append(_between(f"to {step['iteration']}", number, step["before"]))
+        change = f"{step['before']:,} → {step['after']:,}"
+        lines.append(f"| {step['iteration']} | structure | {step['violating']:,} | {step['low']:,} | {change} |")
+        number, last = step["after"], f"since {step['iteration']}"
+    if number != num_points:
+        lines.append(_between(last, number, num_points))
+    return "\n".join(lines)
+
+
+def _between(when: str, before: int, after: int) -> str:
+    return f"| {when} | AbsGS, pruning | | | {before:,} → {after:,} |"
+
+
+def nearest_view(cameras: Tensor, camera: Tensor, extent: float) -> int:
+    """Return the index of the training view that is most like a camera's: near it, and looking in the same direction.
+
+    The camera-to-world poses are [C, 3, 4] and [3, 4]; the extent is the distance that counts as much as 1 rad.
+    """
+    distance = (cameras[:, :, 3] - camera[:, 3]).norm(dim=-1) / max(extent, 1e-12)
+    angle = (cameras[:, :, 2] @ camera[:, 2]).clamp(-1, 1).acos()
+    return int((distance + angle).argmin())
+
+
+class StructurePanel(torch.nn.Module):
+    """Elements of the viewer, and the picture that they choose, of a run's structure tensors and its model.
+
+    It is a module because the viewer looks for elements in modules only; it has neither parameters nor state.
+    """
+
+    def __init__(self, cache: StructureCache) -> None:
+        super().__init__()
+        self._cache = cache
+        self._observed: dict[str, Tensor] = {}
+        self._refreshed = 0.0
+        self._status = ""
+        self._shown = OFF
+        self._legend = ""
+        strategy = self._model.strategy
+        self.choice = ViewerDropdown(
+            "Show",
+            OFF,
+            CHOICES,
+            cb_hook=lambda _: self._told(self.choose),
+            hint="What the output type “structure” shows",
+        )
+        self.legend = ViewerMarkdown("legend", lambda: self._legend)
+        self.observe = ViewerButton("Observe all training views", cb_hook=lambda _: self._told(self.observe_now))
+        self.set_max_gaussians = ViewerNumber(
+            "max_gaussians",
+            strategy.max_gaussians,
+            cb_hook=lambda element: self._change("max_gaussians", element),
+            hint="Hard cap, from the next densification on",
+        )
+        low, high = RANGES["tau_split"]
+        self.set_tau_split = ViewerSlider(
+            "tau_split",
+            strategy.tau_split,
+            min(low, strategy.tau_split),  # The run's own options may lie beyond the range.
+            max(high, strategy.tau_split),
+            0.05,
+            cb_hook=lambda element: self._change("tau_split", element),
+            hint="Share of observations that must violate, at the next structure step",
+        )
+        self.table = ViewerMarkdown("counts", self._describe)
+        self.viewer = ViewerControl()
+
+    @property
+    def _model(self) -> SadgsModel:
+        """The model; the name is private, lest the viewer walk from here into it again."""
+        return self._cache.views.model
+
+    def _describe(self) -> str:
+        model = self._model
+        text = describe(model.strategy, model.num_points, model.strategy_state)
+        return f"{self._status}\n\n{text}" if self._status else text
+
+    def _say(self, status: str) -> None:
+        """Show above the table what the panel is doing or has done."""
+        self._status = status
+        self.table.refresh()
+
+    def _change(self, name: str, element: ViewerParameter) -> None:
+        plan = self._model.plan
+        try:
+            if element.value != getattr(plan.strategy, name):
+                self._model.follow(changed(plan, name, element.value))
+        except ValueError as error:
+            CONSOLE.print(f"[yellow]{error}[/]")
+            element.value = getattr(plan.strategy, name)
+        self.table.refresh()
+
+    def _told(self, act: Callable[[], None]) -> None:
+        """Call `act`, and say what went wrong: the viewer's threads keep their errors to themselves."""
+        self._say("")
+        try:
+            act()
+        except (RuntimeError, ValueError) as error:  # Memory is full, or data went away.
+            text = f"The viewer's panel stays as it was: {reason(error)}"
+            CONSOLE.print(f"[yellow]{escape(text)}[/]")
+            self._say(text)
+
+    def refresh(self) -> None:
+        """Show the present numbers in the table, at most once a second; without a viewer this costs nothing."""
+        now = time.monotonic()
+        if self.table.gui_handle is not None and now - self._refreshed > 1.0:
+            self._refreshed = now
+            self.table.refresh()
+
+    def statistics(self) -> dict[str, Tensor] | None:
+        """Return observations as `empty_statistics`: the run's since its last structure step, or else `observe_now`'s.
+
+        They are None where neither is of the present Gaussians.
+        """
+        model = self._model
+        live, n = model.strategy_state, model.num_points
+        if "n_total" in live and len(live["n_total"]) == n and bool((live["n_total"] > 0).any()):
+            return live
+        return self._observed if len(self._observed.get("n_total", ())) == n else None
+
+    def observe_now(self) -> None:
+        """Observe all training views with the present Gaussians, and say above the table how far that is."""
+        number = len(self._cache.views)
+        self._set_busy(True)
+        try:
+            self._read_photos()
+            self._observed = observe_training_views(self._cache, self._told_of)
+        finally:
+            self._set_busy(False)
+        seen = int((self._observed["n_total"] > 0).sum())
+        self._say(
+            f"Observed {number:,} training views, which see {seen:,} Gaussians: “{ETA_OF}”, “{CHILDREN_OF}” and "
+            f"“{LOW_OF}” show what was found."
+        )
+
+    def _told_of(self, views: range) -> Iterator[int]:
+        """Yield the views, and say at most twice a second which of them is looked at."""
+        due = 0.0
+        for view in views:
+            if time.monotonic() >= due:
+                self._say(f"Observing training view {view + 1:,} of {len(views):,} …")
+                due = time.monotonic() + 0.5
+            yield view
+
+    def _read_photos(self) -> None:
+        """Compute the structure tensors of the training photos, which are then kept."""
+        if not self._cache.filled:
+            self._say("Reading the training photos and their texture …")
+            self._cache.fill()
+
+    def _set_busy(self, busy: bool) -> None:
+        """Let the button be pressed only while nothing is observed."""
+        if self.observe.gui_handle is not None:
+            self.observe.set_disabled(busy)
+
+    def choose(self) -> None:
+        """Make what the present choice needs, and have the viewer show it.
+
+        This does not happen when the picture is drawn, because the viewer breaks off drawing at any line when its
+        camera moves, and photos that were then undistorted a second time would be wrong.
+        """
+        chosen = self.choice.value
+        if chosen in OF_STATISTICS and self.statistics() is None:
+            self.observe_now()
+        elif chosen in OF_PHOTOS:
+            self._read_photos()
+            self._say("")
+        self._shown = chosen
+        if chosen == OFF:
+            self._say_of_picture("")
+        show_output(self.viewer, "rgb" if chosen == OFF else OUTPUT)
+
+    def outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return `structure` [H, W, 3] in [0, 1], which the viewer may show; evaluation and `ns-render` get nothing.
+
+        The output exists whatever is chosen, because the viewer's thread fails where one goes missing.
+        """
+        if not in_viewer():
+            return {}
+        if self._shown == OFF:
+            return {OUTPUT: rendered["rgb"]}
+        drawn = self.picture(self._shown, camera, rendered["rgb"])
+        self._say_of_picture(color_scales.legend(drawn.title, drawn.scale))
+        return {OUTPUT: torch.from_numpy(drawn.picture).to(rendered["rgb"]) / 255}
+
+    def _say_of_picture(self, legend: str) -> None:
+        """Show a legend beside the picture, which the viewer would shrink with the picture if it were in it."""
+        self._legend = legend
+        self.legend.refresh()
+
+    @torch.no_grad()
+    def picture(self, choice: str, camera: Cameras, rgb: Tensor) -> Panel:
+        """Draw one of `CHOICES`, but not "off", as a camera, shape [1], that sees `rgb` [H, W, 3] in [0, 1] sees it."""
+        cache, datamanager, (height, width) = self._cache, self._cache.views.datamanager, rgb.shape[:2]
+        constant = cache.frequency_constant
+        if choice in OF_STATISTICS:
+            return self._of_gaussians(choice, camera, width, height)
+        if choice in (PERIOD_HERE, ELLIPSES_HERE):
+            photo, tensor, name = to_picture(rgb), cache.of_images(rgb[None])[0], "this rendering"
+        else:
+            cameras = datamanager.train_dataset.cameras.camera_to_worlds
+            extent = float(self._model.strategy_state["scene_scale"])
+            index = nearest_view(cameras, camera.camera_to_worlds[0].to(cameras), extent)
+            photo = to_picture(cache.photo(datamanager.cached_train[index]))
+            tensor = dequantize(cache[index])
+            name = f"the nearest training view, `{datamanager.train_dataset.image_filenames[index].name}`"
+        scale = min(height / photo.shape[0], width / photo.shape[1])
+        size = max(round(scale * photo.shape[0]), 1), max(round(scale * photo.shape[1]), 1)
+        if choice in (ELLIPSES_HERE, ELLIPSES_NEAR):
+            drawn = texture.draw_ellipses(photo, tensor, constant, size)
+            what = "S̄⁻¹ as ellipses, coloured by period,"
+        else:
+            drawn = cv2.resize(PERIOD(texture.texture_period(tensor, constant)), size[::-1])
+            what = "Period of the texture, px,"
+        top, left = (height - size[0]) // 2, (width - size[1]) // 2
+        whole = np.zeros((height, width, 3), np.uint8)
+        whole[top : top + size[0], left : left + size[1]] = drawn
+        return Panel(f"{what} of {name}", whole, PERIOD)
+
+    def _of_gaussians(self, choice: str, camera: Cameras, width: int, height: int) -> Panel:
+        model, statistics = self._model, self.statistics()
+        if statistics is None:
+            text = "No observations yet: press “Observe all training views”, or wait for some iterations."
+            return Panel(text, np.zeros((height, width, 3), np.uint8))
+        strategy = model.strategy
+        kept = {name: statistics[name] for name in ("eta_max", "n_total")}
+        kept |= {
+            "children": strategy.children_now(model.gauss_params, statistics),
+            "low": strategy.consistently_low(statistics),
+        }
+        rows = model.cropped({**model.gauss_params, **kept})
+        if len(rows["means"]) == 0:
+            return Panel("No Gaussians in the crop box.", np.zeros((height, width, 3), np.uint8))
+        viewmat = viewmats_from_camera_to_world(camera.camera_to_worlds)[0].to(model.device)
+        view = viewmat, camera.get_intrinsics_matrices()[0].to(model.device), width, height
+        seen = f"{int((statistics['n_total'] > 0).sum()):,} of {model.num_points:,} Gaussians observed"
+        if choice == ETA_OF:
+            drawn, scale = gaussian_maps.eta_map(rows, rows, *view, model.drawing), ETA
+            text = f"largest η: over 1 violates, under 0.1 is low ({seen})"
+        elif choice == CHILDREN_OF:
+            drawn, scale = gaussian_maps.children_map(rows, rows["children"], *view, model.drawing), CHILDREN
+            split = int((kept["children"] > 1).any(dim=1).sum())
+            text = f"children at a structure step now: {split:,} Gaussians would split ({seen})"
+        else:
+            drawn, scale = gaussian_maps.share_map(rows, rows["low"], *view, model.drawing), LOW
+            text = f"share of consistently low Gaussians, {int(kept['low'].sum()):,} in all ({seen})"
+        return Panel(text, scale(drawn), scale)
