@@ -17,8 +17,8 @@ from sadgs_ns import formats
 from sadgs_ns.cli.program import parse
 from sadgs_ns.data.coordinates import TRANSFORMS_NAME, Similarity, from_data
 from sadgs_ns.errors import InputError, RunError, WriteError
-from sadgs_ns.formats import FORMATS, MESH, Frame, format_of, html
-from sadgs_ns.formats.gaussians import DEGREE_0, of_parameters
+from sadgs_ns.formats import FORMATS, MESH, format_of, html
+from sadgs_ns.formats.gaussians import DEFAULTS, DEGREE_0, Context, Frame, of_parameters
 from sadgs_ns.formats.mesh import load_open3d
 
 if TYPE_CHECKING:  # torch takes seconds, which `--help` and a wrong path need not wait for
@@ -73,9 +73,8 @@ class Export:
 def write_gaussians(
     path: Path,
     params: Mapping[str, Tensor],
-    frame: Frame = "nerfstudio",
+    context: Context = DEFAULTS,
     similarity: Similarity | None = None,
-    start: html.Start | None = None,
 ) -> int:
     """Write a model's parameters as `formats.write` does, and return the number of Gaussians.
 
@@ -84,7 +83,7 @@ def write_gaussians(
     """
     gaussians = of_parameters(_arrays(params))
     sound = (gaussians if similarity is None else gaussians.moved(similarity)).finite()
-    formats.write(path, sound, frame, start)
+    formats.write(path, sound, context)
     if len(sound) < len(gaussians):
         print(f"{path}: dropped {len(gaussians) - len(sound)} of {len(gaussians)} Gaussians that are not finite")
     return len(sound)
@@ -132,7 +131,7 @@ def export(options: Export) -> int:
     if is_page and cameras is not None:
         pose, focal = cameras.camera_to_worlds[0].double().numpy(), float(cameras.Ks[0, 0, 0])
         start = html.start_at(pose, max(cameras.sizes[0]), focal, params["means"].numpy())
-    return write_gaussians(options.output, params, options.frame, similarity, start)
+    return write_gaussians(options.output, params, Context(options.frame, start), similarity)
 
 
 def _check(options: Export) -> None:

@@ -12,7 +12,7 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from sadgs_ns.formats.gaussians import DEGREE_0, Gaussians
+from sadgs_ns.formats.gaussians import DEGREE_0, Context, Gaussians
 from sadgs_ns.formats.packing import morton_order, sigmoid, smallest_three
 
 _CHUNK = 256
@@ -21,7 +21,7 @@ _HARMONICS_SPAN = 8.0
 """The higher harmonics lie between −4 and 4."""
 
 
-def write(file: IO[bytes], gaussians: Gaussians) -> None:
+def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:
     """Write at least one Gaussian as compressed PLY, in an order that keeps neighbours in one chunk."""
     gaussians = gaussians[morton_order(gaussians.means)]
     count, bands = gaussians.features_rest.shape[:2]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,32 @@ _ROWS = 1 << 16
 """Number of Gaussians that are converted at a time, so that float64 takes little memory."""
 
 Array = NDArray[np.float32]
+Frame = Literal["nerfstudio", "colmap"]
+"""Coordinates: nerfstudio's, in which z is up, or those of the COLMAP model, in which y mostly is down."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """The camera with which a page opens, in the Gaussians' frame; it stands upright."""
+
+    position: tuple[float, float, float]
+    target: tuple[float, float, float]
+    """A point that it looks at, around which the mouse turns it."""
+    degrees: float
+    """Angle of view along the longer side of the window."""
+
+
+@dataclass(frozen=True)
+class Context:
+    """What a writer may need beside the Gaussians."""
+
+    frame: Frame = "nerfstudio"
+    """That of the Gaussians."""
+    start: Start | None = None
+    """There if the file is a page."""
+
+
+DEFAULTS = Context()
 
 
 @dataclass(frozen=True)

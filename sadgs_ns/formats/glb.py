@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sadgs_ns.errors import InputError
-from sadgs_ns.formats.gaussians import DEGREE_0, Gaussians
+from sadgs_ns.formats.gaussians import DEGREE_0, Context, Gaussians
 from sadgs_ns.formats.packing import sigmoid, to_bytes
 
 _EXTENSION = "KHR_gaussian_splatting"
@@ -18,12 +18,14 @@ _FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
 """glTF's numbers for types of values, the purpose of a buffer, and the kind of primitives."""
 _MOST_BYTES = (1 << 32) - 1
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+_TO_Y_UP = {"nerfstudio": (-(0.5**0.5), 0.0, 0.0, 0.5**0.5), "colmap": (1.0, 0.0, 0.0, 0.0)}
+"""Rotations, xyzw, of the frames to one in which y is up."""
 
 
-def write(file: IO[bytes], gaussians: Gaussians, rotation: tuple[float, float, float, float]) -> None:
+def write(file: IO[bytes], gaussians: Gaussians, context: Context) -> None:
     """Write at least one Gaussian as the points of a mesh; raise InputError beyond the 4 GB that the format can hold.
 
-    Viewers that do not know the extension show coloured points. The node's rotation, xyzw, turns y up, as in glTF.
+    Viewers that do not know the extension show coloured points. The node turns y up, as in glTF.
     """
     attributes = _attributes(gaussians)
     arrays = list(attributes.values())
@@ -45,7 +47,7 @@ def write(file: IO[bytes], gaussians: Gaussians, rotation: tuple[float, float, f
         "extensionsUsed": [_EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": list(rotation)}],
+        "nodes": [{"mesh": 0, "rotation": _TO_Y_UP[context.frame]}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": [

@@ -15,7 +15,6 @@ import re
 import shutil
 import subprocess
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -25,7 +24,7 @@ from numpy.typing import NDArray
 from sadgs_ns.data.coordinates import Similarity
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.formats import ply, sog
-from sadgs_ns.formats.gaussians import Gaussians
+from sadgs_ns.formats.gaussians import DEFAULTS, Context, Gaussians, Start
 
 VIEWER = "@playcanvas/splat-transform@3.7.0"
 _SECONDS = 300
@@ -38,30 +37,19 @@ _TO_CONTENT = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
 """From z up to the content's frame, which the viewer turns half round its z."""
 
 
-@dataclass(frozen=True)
-class Start:
-    """The camera with which the page opens, in the Gaussians' frame; it stands upright."""
-
-    position: tuple[float, float, float]
-    target: tuple[float, float, float]
-    """A point that it looks at, around which the mouse turns it."""
-    degrees: float
-    """Angle of view along the longer side of the window."""
-
-
-def write(file: IO[bytes], gaussians: Gaussians, start: Start | None) -> None:
-    """Write a page of at least one Gaussian, in a frame in which z is up; it opens at the start, not None.
+def write(file: IO[bytes], gaussians: Gaussians, context: Context) -> None:
+    """Write a page of at least one Gaussian, in a frame in which z is up; it opens at the context's start.
 
     Raise InputError if Node.js or its package cannot be run, or there are more Gaussians than SOG can hold.
     """
-    assert start is not None
-    page, content = _page(), io.BytesIO()
-    sog.write(content, gaussians.moved(Similarity(1.0, _TO_CONTENT, np.zeros(3))))
+    assert context.start is not None
+    page, content, settings = _page(), io.BytesIO(), _settings(context.start)
+    sog.write(content, gaussians.moved(Similarity(1.0, _TO_CONTENT, np.zeros(3))), context)
     encoded = base64.b64encode(content.getvalue()).decode()
 
     def fill(found: re.Match[bytes]) -> bytes:
         bootstrap = json.loads(found[2])
-        bootstrap["settings"] |= _settings(start)
+        bootstrap["settings"] |= settings
         bootstrap["contentUrl"] = f"data:application/octet-stream;base64,{encoded}"
         return found[1] + json.dumps(bootstrap).encode() + found[3]
 
@@ -96,7 +84,7 @@ def _page() -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "point.ply"
         with path.open("wb") as file:
-            ply.write(file, point)
+            ply.write(file, point, DEFAULTS)
         command = [npx, "--yes", VIEWER, "--quiet", "--gpu", "cpu", str(path), str(path.with_suffix(".html"))]
         try:
             subprocess.run(command, check=True, capture_output=True, text=True, timeout=_SECONDS, cwd=folder)

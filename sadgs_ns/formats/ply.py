@@ -6,13 +6,13 @@ from typing import IO
 
 import numpy as np
 
-from sadgs_ns.formats.gaussians import Gaussians
+from sadgs_ns.formats.gaussians import Context, Gaussians
 
 _ROWS = 1 << 16
 """Number of Gaussians that are converted at a time, so that writing takes little memory beyond their own."""
 
 
-def write(file: IO[bytes], gaussians: Gaussians) -> None:
+def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:
     """Write Gaussians as binary little-endian PLY.
 
     The columns are x y z, nx ny nz (zero), f_dc_*, f_rest_* (all of red, then green, then blue), opacity, scale_* and

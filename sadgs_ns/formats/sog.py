@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sadgs_ns.errors import InputError
-from sadgs_ns.formats.gaussians import Gaussians
+from sadgs_ns.formats.gaussians import Context, Gaussians
 from sadgs_ns.formats.packing import codebook, morton_order, nearest_level, sigmoid, smallest_three, to_bytes
 
 _MOST_PIXELS = 16383
@@ -32,7 +32,7 @@ _SAMPLE, _ROUNDS = 1 << 16, 8
 """Sets from which the coarse clusters are made, and rounds of k-means."""
 
 
-def write(file: IO[bytes], gaussians: Gaussians) -> None:
+def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:
     """Write at least one Gaussian as SOG, neighbours together; raise InputError if more than fit into an image."""
     gaussians = gaussians[morton_order(gaussians.means)]
     count = len(gaussians)

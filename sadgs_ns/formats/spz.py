@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sadgs_ns.errors import InputError
-from sadgs_ns.formats.gaussians import Gaussians
+from sadgs_ns.formats.gaussians import Context, Gaussians
 from sadgs_ns.formats.packing import sigmoid, smallest_three, to_bytes
 
 _MAGIC, _VERSION = 0x5053474E, 3
@@ -39,7 +39,7 @@ _STEP = 4
 """Steps of the higher harmonics, in 128ths; gzip makes use of the bits that are always zero."""
 
 
-def write(file: IO[bytes], gaussians: Gaussians) -> None:
+def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:
     """Write at least one Gaussian as SPZ; raise InputError if positions would be coarser than 1/256 of a unit."""
     bits = _fractional_bits(float(np.abs(gaussians.means).max()))
     fixed = np.rint(gaussians.means * np.float64(1 << bits)).clip(1 - _RANGE, _RANGE - 1).astype("<i4")

@@ -31,9 +31,9 @@ from sadgs_ns import formats
 from sadgs_ns.data.coordinates import Similarity
 from sadgs_ns.errors import InputError
 from sadgs_ns.formats import glb, html, packing, sog
-from sadgs_ns.formats.gaussians import Gaussians, of_parameters
+from sadgs_ns.formats.gaussians import Context, Gaussians, Start, of_parameters
 
-START = html.Start((0.0, -2.0, 1.0), (0.0, 0.0, 0.5), 60.0)
+START = Start((0.0, -2.0, 1.0), (0.0, 0.0, 0.5), 60.0)
 
 
 def of_gsply(read: Any) -> Gaussians:
@@ -242,7 +242,7 @@ def test_values_beyond_a_format_s_range_are_cut_and_not_wrapped(tmp_path: Path):
 
 @pytest.mark.parametrize(("frame", "up"), [("nerfstudio", [0, 0, 1]), ("colmap", [0, -1, 0])])
 def test_the_node_of_a_glb_turns_up_to_y(frame: Any, up: list[int], tmp_path: Path):
-    formats.write(tmp_path / "splat.glb", random_gaussians(5), frame)
+    formats.write(tmp_path / "splat.glb", random_gaussians(5), Context(frame))
     _, document = of_glb(tmp_path / "splat.glb")
     turned = Rotation.from_quat(document["nodes"][0]["rotation"]).apply(up)
     np.testing.assert_allclose(turned, [0, 1, 0], atol=1e-12)
@@ -268,7 +268,7 @@ def test_a_page_holds_the_gaussians_turned_for_the_viewer_and_the_start(
 ):
     monkeypatch.setattr(html, "_page", lambda: PAGE)
     written = random_gaussians(300)
-    formats.write(tmp_path / "splat.html", written, start=START)
+    formats.write(tmp_path / "splat.html", written, Context(start=START))
     bootstrap = json.loads(re.findall(rb">(\{.*\})<", (tmp_path / "splat.html").read_bytes())[0])
     assert bootstrap["settings"]["a"] == 1, "what else is set stays"
     (tmp_path / "splat.sog").write_bytes(base64.b64decode(bootstrap["contentUrl"].partition(",")[2]))
@@ -307,7 +307,7 @@ def _raise(error: Exception) -> Callable[..., Any]:
 def test_what_goes_wrong_with_node_is_one_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     def fails(message: str) -> None:
         with pytest.raises(InputError, match=message):
-            formats.write(tmp_path / "splat.html", random_gaussians(5), start=START)
+            formats.write(tmp_path / "splat.html", random_gaussians(5), Context(start=START))
         assert list(tmp_path.iterdir()) == []
 
     remedy = r": install Node\.js 22 or newer, be online the first time, or choose another format\.$"
@@ -344,6 +344,6 @@ def test_the_same_gaussians_make_the_same_bytes():
     gaussians = random_gaussians(300)
     for suffix in READ_BACK:
         first, second = io.BytesIO(), io.BytesIO()
-        formats.FORMATS[suffix](first, gaussians, "nerfstudio", None)
-        formats.FORMATS[suffix](second, gaussians, "nerfstudio", None)
+        formats.FORMATS[suffix](first, gaussians, Context())
+        formats.FORMATS[suffix](second, gaussians, Context())
         assert first.getvalue() == second.getvalue()

@@ -16,10 +16,9 @@ from PIL import Image
 
 from sadgs_ns import formats
 from sadgs_ns.errors import InputError
-from sadgs_ns.formats import html
-from sadgs_ns.formats.gaussians import Gaussians
+from sadgs_ns.formats.gaussians import Context, Gaussians, Start
 
-START = html.Start((1.0, -8.0, 2.0), (0.5, 0.5, 0.5), 60.0)
+START = Start((1.0, -8.0, 2.0), (0.5, 0.5, 0.5), 60.0)
 
 
 def render(gaussians: Gaussians, width: int, height: int) -> np.ndarray:
@@ -55,7 +54,7 @@ def test_a_page_shows_from_the_disk_what_we_render(tmp_path: Path):
     gaussians = random_gaussians(3000)
     gaussians.scales[:] += 1.0
     try:
-        formats.write(tmp_path / "splat.html", gaussians, start=START)
+        formats.write(tmp_path / "splat.html", gaussians, Context(start=START))
     except InputError as error:
         pytest.skip(str(error))
     found = 0.0
