@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
+
+from sadgs_ns.distributed.world import World
 
 Params = MutableMapping[str, torch.nn.Parameter] | torch.nn.ParameterDict
 """gsplat's parameters by name, each with leading dimension N."""
@@ -45,3 +48,43 @@ def update_param_with_optimizer(
         params[name] = new = param_fn(name, old)
         if optimizer is not None:
             optimizer.param_groups[0]["params"], optimizer.state[new] = [new], state
+
+
+def map_opacities(
+    function: Callable[[Tensor], Tensor], params: Params, optimizers: Mapping[str, torch.optim.Optimizer]
+) -> None:
+    """Change the opacities (not their logits) and forget their optimizer moments, as gsplat's reset does."""
+
+    def param_fn(name: str, p: Tensor) -> torch.nn.Parameter:
+        changed = torch.logit(function(torch.sigmoid(p)).clamp(1e-6, 1 - 1e-6))
+        return torch.nn.Parameter(changed, requires_grad=p.requires_grad)
+
+    update_param_with_optimizer(param_fn, lambda key, v: torch.zeros_like(v), params, optimizers, names=["opacities"])
+
+
+def even_out(
+    world: World,
+    params: Params,
+    optimizers: Mapping[str, torch.optim.Optimizer],
+    state: MutableMapping[str, Any],
+) -> None:
+    """Count the Gaussians of the processes, and give each equally many where they differ by more than a tenth.
+
+    Args:
+        world: The processes, which must all call this.
+        params: The parameters of this process's Gaussians.
+        optimizers: One per parameter.
+        state: The strategy's state, whose tensors have leading dimension N.
+    """
+    world.count(len(params["means"]))
+    if not world.is_uneven():
+        return
+
+    def param_fn(name: str, p: Tensor) -> torch.nn.Parameter:
+        return torch.nn.Parameter(world.rebalance(p.detach()), requires_grad=p.requires_grad)
+
+    update_param_with_optimizer(param_fn, lambda key, v: world.rebalance(v), params, optimizers)
+    for key, value in state.items():
+        if isinstance(value, Tensor):
+            state[key] = world.rebalance(value)
+    world.count(len(params["means"]))

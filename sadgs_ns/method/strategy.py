@@ -17,7 +17,7 @@ from sadgs_ns.distributed.world import World
 from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, keep_gradient
 from sadgs_ns.method.growth import RULES, Proposal, Propose, Rule, apply, due_rule, structure_aware
 from sadgs_ns.method.memory import StepSize, affordable_growth, free_bytes
-from sadgs_ns.method.ops import Params, opacities, update_param_with_optimizer
+from sadgs_ns.method.ops import Params, even_out, map_opacities, opacities
 from sadgs_ns.method.schedule import Windows, due, next_due, windows
 from sadgs_ns.method.statistics import consistent, empty_statistics, observe
 
@@ -254,9 +254,9 @@ class StructureAwareStrategy(Strategy):
                 state.pop(key, None)  # Neither memory nor checkpoints should hold them.
         # A reset just before the final prune would leave nothing that had time to recover.
         elif due(iteration, windows.reset_every) and iteration <= windows.refine_stop_iter - windows.reset_every // 4:
-            self._map_opacities(params, optimizers, lambda alpha: alpha * RESET_FACTOR)
+            map_opacities(lambda alpha: alpha * RESET_FACTOR, params, optimizers)
         if not self.world.alone and self.densifies(step):
-            self._even_out(params, optimizers, state)
+            even_out(self.world, params, optimizers, state)
 
     def consistently_low(self, statistics: Mapping[str, Tensor]) -> Tensor:
         """Gaussians that answered low on all three axes in more than τ_prune of their observations. bool [N]"""
@@ -285,7 +285,7 @@ class StructureAwareStrategy(Strategy):
             # The final prune, before children are made: those are fainter, and would go with what they replace.
             faint = max(self.min_opacity, FINAL_PRUNE_OPACITY if iteration == self.windows.refine_stop_iter else 0.0)
             n_pruned = self._prune_faint(params, optimizers, state, faint, is_low & (opacities(params) < PRUNE_OPACITY))
-            self._map_opacities(params, optimizers, lambda alpha: alpha.clamp_max(CLAMP_OPACITY))
+            map_opacities(lambda alpha: alpha.clamp_max(CLAMP_OPACITY), params, optimizers)
         proposal = rule.propose(self, params, state)
         growth, (under_cap, in_memory) = proposal.growth, self._room(params, state, views)
         allowed = limit_growth(self.world, growth, proposal.priority, min(under_cap, in_memory))
@@ -312,22 +312,6 @@ class StructureAwareStrategy(Strategy):
         in_memory = self.world.num_ranks * self.world.least(in_memory)
         return self.max_gaussians - self.world.sums(len(params["means"]))[0], in_memory
 
-    def _even_out(self, params: Any, optimizers: Any, state: Any) -> None:
-        """Count the Gaussians of the processes, and give each equally many where they differ by more than a tenth."""
-        world = self.world
-        world.count(len(params["means"]))
-        if not world.is_uneven():
-            return
-
-        def param_fn(name: str, p: Tensor) -> torch.nn.Parameter:
-            return torch.nn.Parameter(world.rebalance(p.detach()), requires_grad=p.requires_grad)
-
-        update_param_with_optimizer(param_fn, lambda key, v: world.rebalance(v), params, optimizers)
-        for key, value in state.items():
-            if isinstance(value, Tensor):
-                state[key] = world.rebalance(value)
-        world.count(len(params["means"]))
-
     @staticmethod
     def _haze(params: Params, state: Mapping[str, Any]) -> Tensor:
         """Gaussians that are haze near the cameras' paths, none where the state has no paths. bool [N]"""
@@ -353,18 +337,6 @@ class StructureAwareStrategy(Strategy):
         if n_prune > 0:
             remove(params, optimizers, state, mask)
         return n_prune
-
-    @staticmethod
-    def _map_opacities(params: Any, optimizers: Any, function: Any) -> None:
-        """Change the opacities (not their logits) and forget their optimizer moments, as gsplat's reset does."""
-
-        def param_fn(name: str, p: Tensor) -> torch.nn.Parameter:
-            changed = torch.logit(function(torch.sigmoid(p)).clamp(1e-6, 1 - 1e-6))
-            return torch.nn.Parameter(changed, requires_grad=p.requires_grad)
-
-        update_param_with_optimizer(
-            param_fn, lambda key, v: torch.zeros_like(v), params, optimizers, names=["opacities"]
-        )
 
     def _clear_statistics(self, params: Any, state: MutableMapping[str, Any]) -> None:
         state.update(self._empty_state(len(params["means"]), params["means"].device))
