@@ -18,9 +18,10 @@ from torch import Tensor
 from benchmarks.evaluate import now
 from benchmarks.table import grid
 from sadgs_ns import kernels
-from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, keep_gradient
+from sadgs_ns.method.absgs import accumulate_gradients, keep_gradient
 from sadgs_ns.method.losses import photometric_loss
-from sadgs_ns.method.statistics import empty_statistics, observe
+from sadgs_ns.method.statistics import observe
+from sadgs_ns.method.strategy import empty_state
 from sadgs_ns.render.rasterization import rasterize
 from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
 from sadgs_ns.training.optimizers import AdamUpdate, FusedAdam
@@ -70,7 +71,7 @@ class Step:
         self.params = {name: torch.nn.Parameter(value) for name, value in values.items()}
         self.optimizers = {name: FusedAdam([p], lr=1e-6, eps=1e-15) for name, p in self.params.items()}
         self.noted = torch.zeros(1, device=device)
-        self.state: dict[str, Any] = empty_statistics(gaussians, device) | empty_gradients(gaussians, device)
+        self.state: dict[str, Any] = empty_state(gaussians, device)
         angles = torch.arange(views, device=device) * (2 * math.pi / views)
         self.viewmats = torch.eye(4, device=device).repeat(views, 1, 1)
         self.viewmats[:, 0, 0] = self.viewmats[:, 2, 2] = angles.cos()

@@ -250,7 +250,7 @@ class StructureAwareStrategy(Strategy):
         if iteration == windows.refine_stop_iter:
             if rule is None or rule.reads != "statistics":  # whose step has pruned
                 self._prune_faint(params, optimizers, state, FINAL_PRUNE_OPACITY)
-            for key in (*self._empty_state(0, torch.device("cpu")), "camera_paths"):
+            for key in (*empty_state(0, torch.device("cpu")), "camera_paths"):
                 state.pop(key, None)  # Neither memory nor checkpoints should hold them.
         # A reset just before the final prune would leave nothing that had time to recover.
         elif due(iteration, windows.reset_every) and iteration <= windows.refine_stop_iter - windows.reset_every // 4:
@@ -312,17 +312,11 @@ class StructureAwareStrategy(Strategy):
         in_memory = self.world.num_ranks * self.world.least(in_memory)
         return self.max_gaussians - self.world.sums(len(params["means"]))[0], in_memory
 
-    @staticmethod
-    def _haze(params: Params, state: Mapping[str, Any]) -> Tensor:
-        """Gaussians that are haze near the cameras' paths, none where the state has no paths. bool [N]"""
-        means, paths = params["means"].detach(), state.get("camera_paths")
-        if paths is None:
-            return torch.zeros(len(means), dtype=torch.bool, device=means.device)
-        return paths.haze(means, params["scales"].detach().exp())
-
     def _prune_faint(self, params: Any, optimizers: Any, state: Any, opacity: float, also: Tensor | None = None) -> int:
         """Remove haze, Gaussians less opaque than this, and others; return how many these were."""
-        gone = (opacities(params) < opacity) | self._haze(params, state)
+        gone = opacities(params) < opacity
+        if (paths := state.get("camera_paths")) is not None:
+            gone |= paths.haze(params["means"].detach(), params["scales"].detach().exp())
         return self._prune(params, optimizers, state, gone if also is None else gone | also)
 
     def _prune(self, params: Any, optimizers: Any, state: Any, mask: Tensor) -> int:
@@ -339,11 +333,12 @@ class StructureAwareStrategy(Strategy):
         return n_prune
 
     def _clear_statistics(self, params: Any, state: MutableMapping[str, Any]) -> None:
-        state.update(self._empty_state(len(params["means"]), params["means"].device))
+        state.update(empty_state(len(params["means"]), params["means"].device))
 
-    @staticmethod
-    def _empty_state(n: int, device: torch.device) -> dict[str, Tensor]:
-        return empty_statistics(n, device) | empty_gradients(n, device)
+
+def empty_state(num_gaussians: int, device: torch.device) -> dict[str, Tensor]:
+    """Return what densification keeps of Gaussians of which nothing is known: statistics of η, and screen gradients."""
+    return empty_statistics(num_gaussians, device) | empty_gradients(num_gaussians, device)
 
 
 def _views(info: Info | Sequence[Info]) -> Sequence[Info]:

@@ -15,11 +15,9 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.gsplat_compat import NEAR_PLANE, SCREEN_BLUR
 from sadgs_ns.kernels import TILE_SIZE
 from sadgs_ns.method import memory
-from sadgs_ns.method.absgs import empty_gradients
 from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.ops import Params
-from sadgs_ns.method.statistics import empty_statistics
-from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.method.strategy import StructureAwareStrategy, empty_state
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training.processes import least, number_of_processes, processes_on_this_machine
 from sadgs_ns.training.structure_cache import PIXELS_PER_BATCH
@@ -207,7 +205,7 @@ def fit_to_memory(
     if math.isinf(free):
         told = f"At most {cap:,} Gaussians: this device's memory is not planned with, so this is max_gaussians."
         return cap, told, None
-    state = empty_statistics(0, device) | empty_gradients(0, device)
+    state = empty_state(0, device)
     each = memory.kept_bytes(params, state) + memory.widest_bytes(params)
 
     def need(num_gaussians: int, step: StepSize) -> float:

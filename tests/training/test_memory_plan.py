@@ -31,7 +31,7 @@ from sadgs_ns.kernels import TILE_SIZE, triton_switched
 from sadgs_ns.method import memory
 from sadgs_ns.method import strategy as strategy_module
 from sadgs_ns.method.memory import StepSize
-from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.method.strategy import StructureAwareStrategy, empty_state
 from sadgs_ns.training.memory_plan import (
     TrainingSize,
     estimate_pairs,
@@ -94,7 +94,7 @@ def fit(
 def test_what_a_gaussian_takes_is_what_a_split_asks_for():
     size = StepSize(views=2, pixels=1000, pairs=5000)
     lists = 10 * (16 + 2 * 92 + WIDEST) + 5000 * 40
-    state = StructureAwareStrategy._empty_state(0, torch.device("cpu"))
+    state = empty_state(0, torch.device("cpu"))
     assert memory.kept_bytes(params(), state) == KEPT  # type: ignore[arg-type]
     for grown in (0, 1, 7):
         free = lists + grown * each(2)
