@@ -10,7 +10,6 @@ frame, with the same views held out. The earlier run is removed when the new spl
 from __future__ import annotations
 
 import contextlib
-import functools
 import json
 import math
 import os
@@ -158,16 +157,11 @@ class PhotosToSplat:
             self._note()
             # Importing nerfstudio takes some 12 s, in which cameras can be found.
             needs_training = not self._trained() or (not self._camera_file and photos_added(self.source, self._scene))
-            self._trainer = self._worker("training", _TRAINING) if needs_training else None
-            stages: tuple[tuple[str, Callable[[StatusLine], str]], ...] = (
-                ("cameras", self._find_cameras),
-                ("training", self._train),
-                *(("export", functools.partial(self._export, name)) for name in self._formats),
-            )
-            for name, stage in stages:
+            self._trainer = self.worker("training", _TRAINING) if needs_training else None
+            for name, stage in STAGES.items():
                 with StatusLine(name, self.console) as line:
                     try:
-                        line.update(stage(line))
+                        line.update(stage(self, line))
                     except KeyboardInterrupt:
                         line.update("stopping")
                         raise
@@ -217,13 +211,14 @@ class PhotosToSplat:
             described |= {"train_filenames": trained, "val_filenames": held_out, "test_filenames": held_out}
         write_json(file, described)
 
-    def _worker(self, stage: str, function: str) -> Worker:
+    def worker(self, stage: str, function: str) -> Worker:
+        """Start a process that imports `function`, as `module:name`, and prints into the log of the stage."""
         worker = Worker(function, self.folder / "log" / f"{stage}.txt", [self._lock], saves=True)
         return self._workers.enter_context(worker)
 
-    def _call(
-        self, worker: Worker, line: StatusLine, on_event: OnEvent, command: Sequence[str], *arguments: Any
-    ) -> Any:
+    def call(self, worker: Worker, line: StatusLine, on_event: OnEvent, command: Sequence[str], *arguments: Any) -> Any:
+        """Call a worker's function as `Worker.run` does, and name the log where it fails."""
+
         def listen(event: str, **fields: Any) -> None:
             line.update(event) if event == "stopping" else on_event(event, **fields)
 
@@ -260,11 +255,11 @@ class PhotosToSplat:
             elif event == "progress":
                 line.update(f"{added}{fields['stage']} {fields['done']} of {fields['total']}{duration}")
 
-        worker = self._worker("cameras", "sadgs_ns.cli.cameras.command:process")
+        worker = self.worker("cameras", "sadgs_ns.cli.cameras.command:process")
         source = Path(os.path.abspath(self.source))
         command = ["sadgs-process", str(source), str(self._scene), "--max-size", str(self.options.max_size)]
         options = Process(source, self._scene, max_size=self.options.max_size)
-        summary = Summary(**self._call(worker, line, on_event, command, options))
+        summary = Summary(**self.call(worker, line, on_event, command, options))
         again = " after a second attempt" if summary.attempts else ""
         found = f"{added}{summary.registered} of {summary.photos} photos registered{again}"
         self._settings.pop("few", None)
@@ -312,25 +307,40 @@ class PhotosToSplat:
         command += ["--timestamp", self._run.name, "--vis", "tensorboard"]
         command += ["--steps-per-eval-image", "0", "--pipeline.effort", f"{self.options.effort:g}"]
         command += ["--load-dir", str(self._run.absolute())] if begun else []
-        worker = self._trainer or self._worker("training", _TRAINING)
-        self._call(worker, line, on_event, [*command, *self.train_options])
+        worker = self._trainer or self.worker("training", _TRAINING)
+        self.call(worker, line, on_event, [*command, *self.train_options])
         if not self._checkpoint():
             raise RunError(f"training ended without a checkpoint; all that it printed is in {self.folder}/log.")
         told = f"{total} iterations, {count} Gaussians"
         self._note(trained=told)
         return told
 
-    def _export(self, name: str, line: StatusLine) -> str:
+    def _export(self, line: StatusLine) -> str:
+        *others, last = self._formats
+        for name in others:
+            line.finish(self._export_as(name, line))
+        return self._export_as(last, line)
+
+    def _export_as(self, name: str, line: StatusLine) -> str:
         output, checkpoint = self.folder / f"splat.{name}", self._checkpoint()
         if checkpoint and output.is_file() and output.stat().st_mtime >= checkpoint.stat().st_mtime:
             return f"{output}; done before"
         line.update(str(output))
-        worker = self._worker("export", "sadgs_ns.cli.export:export")
+        worker = self.worker("export", "sadgs_ns.cli.export:export")
         # The folder may have been renamed since the run's config.yml noted where the scene is.
         options = Export(self._run, output, data=self._data)
         command = ["sadgs-export", str(self._run), "--output", str(output), "--data", str(self._data)]
-        self._call(worker, line, lambda event, **fields: None, command, options)
+        self.call(worker, line, lambda event, **fields: None, command, options)
         return f"{output}, {output.stat().st_size / 1e6:,.1f} MB"
+
+
+STAGES: dict[str, Callable[[PhotosToSplat, StatusLine], str]] = {
+    "cameras": PhotosToSplat._find_cameras,
+    "training": PhotosToSplat._train,
+    "export": PhotosToSplat._export,
+}
+"""The stages in their order, by the names of their lines. A stage sees by what lies in `folder` whether it was done
+before, updates its line, and returns the line's last sentence. It may raise InputError and RunError."""
 
 
 def _cameras_of(options: Sadgs) -> Path | None:

@@ -31,6 +31,12 @@ class StatusLine:
         """Show how far the stage is."""
         self._status = status
 
+    def finish(self, status: str) -> None:
+        """Leave the line as it is with this status, and begin another one of its name."""
+        self._status = status
+        self._console.print(self._text(), soft_wrap=True)
+        self._status, self._start = "", time.monotonic()
+
     def print(self, sentence: str) -> None:
         """Print a sentence above the line."""
         self._console.print(Text(sentence), soft_wrap=True)

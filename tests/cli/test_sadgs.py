@@ -354,8 +354,8 @@ def commands(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         else:
             Path(command[command.index("--output") + 1]).touch()
 
-    monkeypatch.setattr(PhotosToSplat, "_call", call)
-    monkeypatch.setattr(PhotosToSplat, "_worker", lambda *others: None)
+    monkeypatch.setattr(PhotosToSplat, "call", call)
+    monkeypatch.setattr(PhotosToSplat, "worker", lambda *others: None)
     return called
 
 

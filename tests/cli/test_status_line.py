@@ -24,5 +24,17 @@ def test_the_last_status_stays_below_what_was_printed(is_terminal: bool):
     assert is_terminal or text == "There is no GPU.\ncameras      0:00  done\n"
 
 
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_a_stage_of_several_parts_leaves_a_line_of_each(is_terminal: bool):
+    printed = io.StringIO()
+    console = Console(file=printed, force_terminal=is_terminal, highlight=False, width=80)
+    with StatusLine("export", console) as line:
+        line.finish("splat.ply")
+        line.update("splat.html")
+    text = re.sub(r"\x1b\[[?\d;]*[a-zA-Z]", "", printed.getvalue())
+    lines = [line.rstrip() for line in re.split(r"[\r\n]+", text)]
+    assert lines.index("export       0:00  splat.ply") < lines.index("export       0:00  splat.html")
+
+
 def test_hours_are_shown_from_one_hour_on():
     assert [clock(seconds) for seconds in (0.4, 61.6, 3599.6)] == ["0:00", "1:02", "1:00:00"]
