@@ -174,7 +174,7 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
     if not timer.finished:
         raise RuntimeError("the training loop stopped before its last iteration.")
     if devices > 1:
-        if not processes.is_first():
+        if not processes.is_rank_zero():
             return {}
         trainer = alone(job, root, work, trainer.checkpoint_dir)
         pipeline, datamanager, model = trainer.pipeline, trainer.pipeline.datamanager, trainer.pipeline.model

@@ -42,8 +42,8 @@ from sadgs_ns.data.coordinates import FRAME_KEYS, TRANSFORMS_NAME
 from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.formats import FORMATS, MESH
 from sadgs_ns.formats.mesh import load_open3d
+from sadgs_ns.training.broken_pipe import redirect_on_broken_pipe
 from sadgs_ns.training.interrupts import Interrupts
-from sadgs_ns.training.lost_output import print_elsewhere_once_unread
 
 _OURS = ("data", "output-dir", "experiment-name", "timestamp", "vis", "load-dir", "load-checkpoint", "load-config")
 """Options of ns-train that this command sets."""
@@ -383,7 +383,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words, console, start = list(sys.argv[1:] if argv is None else argv), Console(highlight=False), time.monotonic()
     end = words.index("--") if "--" in words else len(words)
     options, train_options = parse(Sadgs, "sadgs", words[:end]), words[end + 1 :]
-    print_elsewhere_once_unread(console)
+    redirect_on_broken_pipe(console)
 
     def run() -> int:
         with Interrupts(waiting=lambda: True):

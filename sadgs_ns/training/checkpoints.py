@@ -109,7 +109,7 @@ def _checkpoints_in(load_dir: Path) -> dict[int, Path]:
     return steps
 
 
-def of_gaussians(state: dict[str, Any], change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
+def map_rows(state: dict[str, Any], change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
     """Return a checkpoint with changed tensors that have a row for each Gaussian; the rest is shared, not copied.
 
     These are the parameters, Adam's moments, the statistics and the mean of the parameters. `change` is called with

@@ -136,16 +136,16 @@ class _Inputs:
         images = torch.stack([data["image"] for data in group.data])
         viewmats, Ks, *size = group.cameras
         cameras = Cameras(viewmats.clone(), Ks.clone(), *size)
-        numbers = None if group.view_numbers is None else group.view_numbers.clone()
-        copied = replace(group, cameras=cameras, view_numbers=numbers, data=[{}] * len(images), images=images)
+        numbers = None if group.view_ids is None else group.view_ids.clone()
+        copied = replace(group, cameras=cameras, view_ids=numbers, data=[{}] * len(images), images=images)
         return _Inputs(copied, factors.to(images.device))
 
     def write(self, group: ViewGroup, factors: Tensor) -> None:
         """Put a step's values in the place of those before, without waiting for the device."""
         self.group.cameras.viewmats.copy_(group.cameras.viewmats)
         self.group.cameras.Ks.copy_(group.cameras.Ks)
-        if self.group.view_numbers is not None and group.view_numbers is not None:
-            self.group.view_numbers.copy_(group.view_numbers)
+        if self.group.view_ids is not None and group.view_ids is not None:
+            self.group.view_ids.copy_(group.view_ids)
         torch.stack([data["image"] for data in group.data], out=self.group.images)
         self.factors.copy_(factors, non_blocking=True)
 
@@ -182,7 +182,12 @@ class GraphedSteps:
         return False
 
     def replay(
-        self, groups: Sequence[ViewGroup], opacity_reg: float, update: AdamUpdate, factors: Tensor, noted: Tensor
+        self,
+        groups: Sequence[ViewGroup],
+        opacity_reg: float,
+        update: AdamUpdate,
+        factors: Tensor,
+        nonfinite_flag: Tensor,
     ) -> StepResult | None:
         """Do what `training_step` does with these arguments; `factors` are on the host.
 
@@ -207,7 +212,7 @@ class GraphedSteps:
         results = graph.replay()
         self.replayed += 1
         values = results.values.clone()
-        noted.copy_(values[4:])
+        nonfinite_flag.copy_(values[4:])
         counts = PairCounts.sent(results.pair_counts)
         return StepResult(values[0], values[1], results.means_gradient, [{"pair_counts": counts}])
 

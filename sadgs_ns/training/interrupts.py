@@ -10,7 +10,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Any
 
-from sadgs_ns.training.lost_output import drop_lost_output
+from sadgs_ns.training.broken_pipe import discard_broken_output
 
 HANG_UP: int | None = getattr(signal, "SIGHUP", None)
 """The signal that says that the terminal is gone, as of an ssh that was cut off; Windows has none."""
@@ -69,7 +69,7 @@ class Interrupts:
         if self.received is not None:
             raise Interrupted(self.received)
 
-    def behind(self, error: OSError) -> Interrupted | None:
+    def cause_of(self, error: OSError) -> Interrupted | None:
         """Return the interruption that made a write fail, or None if the error has another cause.
 
         The kernel takes a terminal away before it sends SIGHUP, so that what is printed between fails.
@@ -87,6 +87,6 @@ class Interrupts:
         for another in self._previous.keys() - self._repeated:
             signal.signal(another, self._previous[another])
         if number == HANG_UP:
-            drop_lost_output()
+            discard_broken_output()
         if self._waiting():
             self.poll()

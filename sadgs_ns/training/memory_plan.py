@@ -94,7 +94,7 @@ def image_bytes(datamanager: FullImageDatamanager) -> float:
     return 3 * (train + held_out) + QUANTIZED_BYTES * train
 
 
-def place_images(datamanager: FullImageDatamanager, device: torch.device) -> str | None:
+def choose_image_storage(datamanager: FullImageDatamanager, device: torch.device) -> str | None:
     """Decide where the images are kept, from the memory that is there: alike in all processes of the run.
 
     Images that are asked for on the host stay compressed where each of several processes would decode all of them, and

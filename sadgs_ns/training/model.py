@@ -35,7 +35,7 @@ from sadgs_ns.render.types import Gaussians, RenderOptions
 from sadgs_ns.training.config import SadgsModelConfig
 from sadgs_ns.training.initial_gaussians import beside, initial_gaussians, outside_cameras
 from sadgs_ns.training.metrics import MeasuredModel
-from sadgs_ns.training.outputs import LazyOutputs, in_viewer, say_once
+from sadgs_ns.training.outputs import LazyOutputs, in_viewer, warn_once
 from sadgs_ns.training.run_plan import RunPlan
 from sadgs_ns.viewer import gaussian_maps
 
@@ -59,7 +59,7 @@ class SadgsModel(MeasuredModel):
 
     config: SadgsModelConfig
     strategy: StructureAwareStrategy
-    view_numbers: Tensor
+    every_view_id: Tensor
     near_plane: float
     plan: RunPlan
 
@@ -157,9 +157,9 @@ class SadgsModel(MeasuredModel):
         self.color_matrices = torch.nn.Parameter(matrices)
         # An index that is made in a step would have to be copied to the device there.
         numbers = torch.arange(len(matrices), device=matrices.device)  # [V]
-        self.register_buffer("view_numbers", numbers, persistent=False)
+        self.register_buffer("every_view_id", numbers, persistent=False)
 
-    def share_out(self, world: World) -> None:
+    def shard(self, world: World) -> None:
         """Keep this process's part of the Gaussians, all of which it has until now; call before optimizers are made.
 
         Raises InputError if the backend draws in one process alone.
@@ -208,11 +208,11 @@ class SadgsModel(MeasuredModel):
         self.camera_optimizer.get_param_groups(param_groups=groups)  # type: ignore[arg-type]
         return groups  # type: ignore[return-value]
 
-    def numbers_of(self, cam_indices: Sequence[int]) -> Tensor | None:
+    def view_ids(self, cam_indices: Sequence[int]) -> Tensor | None:
         """Return indices of C views as int64 [C] on the device, without waiting; None without matrices of colours."""
         if self.color_matrices is None:
             return None
-        return torch.cat([self.view_numbers[index : index + 1] for index in cam_indices])
+        return torch.cat([self.every_view_id[index : index + 1] for index in cam_indices])
 
     def cropped(self, values: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
         """Return the rows of tensors [N, …] of Gaussians in the viewer's crop box; in training, all rows."""
@@ -348,7 +348,7 @@ class SadgsModel(MeasuredModel):
         except InputError as error:
             if not in_viewer():
                 raise
-            say_once(str(error))
+            warn_once(str(error))
             width, height = int(camera.width.item()), int(camera.height.item())
             outputs = self.get_empty_outputs(width, height, self.background)
         if self.viewer_outputs is not None:

@@ -1,6 +1,6 @@
 """Losses and gradients that are not finite.
 
-They are noted on the device in each step and read now and then, so that no step waits for the device.
+They are flagged on the device in each step and read now and then, so that no step waits for the device.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from torch import Tensor
 MAX_GRADIENT = 1e18
 """A gradient at least this large counts as not finite, because from 1.8e19 its square overflows for good in Adam."""
 
-HOPELESS_STEPS = 100
+DIVERGED_STEPS = 100
 """Number of steps in a row with something not finite after which a run stops, if its gradients are useless, too."""
 
 
@@ -78,17 +78,17 @@ class NonFiniteLog:
 
 
 @torch.no_grad()
-def leave_out_nonfinite(gradient: Tensor, noted: Tensor) -> None:
+def leave_out_nonfinite(gradient: Tensor, nonfinite_flag: Tensor) -> None:
     """Set gradients from which Adam could not recover to 0, in place, without waiting for the device.
 
-    `noted`, float32 [1], becomes NaN if there was such a gradient.
+    `nonfinite_flag`, float32 [1], becomes NaN if there was such a gradient.
     """
     wrong = ~(gradient.abs() < MAX_GRADIENT)  # Comparing NaN gives False.
     gradient.masked_fill_(wrong, 0.0)
-    noted.masked_fill_(wrong.any(), torch.nan)
+    nonfinite_flag.masked_fill_(wrong.any(), torch.nan)
 
 
-def is_useless(gradient: Tensor) -> bool:
+def has_no_update(gradient: Tensor) -> bool:
     """Return whether no element of a gradient changes its parameter; this waits for the device."""
     size = gradient.abs()
     return not bool(((size > 0) & (size < MAX_GRADIENT)).any())

@@ -90,19 +90,23 @@ class AdamUpdate:
 
     @torch.no_grad()
     def launch(
-        self, gradients: Mapping[str, Tensor], factors: Tensor, noted: Tensor, overflowed: tuple[Tensor, ...] = ()
+        self,
+        gradients: Mapping[str, Tensor],
+        factors: Tensor,
+        nonfinite_flag: Tensor,
+        overflowed: tuple[Tensor, ...] = (),
     ) -> None:
         """Update the parameters.
 
         Args:
             gradients: By the parameters' names, of their shapes.
             factors: What `factors` returned, on the parameters' device. [2, P]
-            noted: Becomes NaN if a gradient was not finite. float32 [1]
+            nonfinite_flag: Becomes NaN if a gradient was not finite. float32 [1]
             overflowed: As for `kernels.adam.adam_step`; torch's Adam takes none.
         """
         if not self._triton:
             for name, optimizer in self._optimizers.items():
-                leave_out_nonfinite(gradients[name], noted)
+                leave_out_nonfinite(gradients[name], nonfinite_flag)
                 self.parameters[name].grad = gradients[name]
                 optimizer.step()
                 self.parameters[name].grad = None
@@ -115,7 +119,7 @@ class AdamUpdate:
             parameters = tuple(self.parameters[name] for name in names)
             in_order = tuple(gradients[name].contiguous() for name in names)
             adam_step(
-                parameters, in_order, self.exp_avgs[these], self.exp_avg_sqs[these], factors[:, these], noted,
+                parameters, in_order, self.exp_avgs[these], self.exp_avg_sqs[these], factors[:, these], nonfinite_flag,
                 overflowed, betas=betas, eps=eps, max_gradient=MAX_GRADIENT,
             )  # fmt: skip
 

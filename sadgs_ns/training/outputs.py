@@ -34,6 +34,6 @@ def in_viewer() -> bool:
 
 
 @lru_cache(maxsize=8)
-def say_once(text: str) -> None:
+def warn_once(text: str) -> None:
     """Print a warning, unless it was printed before."""
     CONSOLE.print(f"[yellow]{escape(text)}[/]")

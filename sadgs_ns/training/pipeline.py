@@ -25,7 +25,7 @@ from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.training import nonfinite
 from sadgs_ns.training.config import SadgsPipelineConfig
 from sadgs_ns.training.datamanager import SadgsDatamanager
-from sadgs_ns.training.memory_plan import place_images
+from sadgs_ns.training.memory_plan import choose_image_storage
 from sadgs_ns.training.model import NORMALS, SadgsModel
 from sadgs_ns.training.nonfinite import NonFiniteLog
 from sadgs_ns.training.outputs import in_viewer
@@ -68,7 +68,7 @@ class SadgsPipeline(VanillaPipeline):
         for dataset in (self.datamanager.train_dataset, self.datamanager.eval_dataset):
             check_camera_types(dataset.cameras)
         if config.datamanager.cache_images != "compressed" and kwargs.get("test_mode") != "inference":
-            line = place_images(self.datamanager, self.device)
+            line = choose_image_storage(self.datamanager, self.device)
             if line is not None:
                 CONSOLE.print(line, highlight=False, soft_wrap=True)
         parsed_on = getattr(self.datamanager.dataparser.config, "alpha_color", None)
@@ -94,7 +94,7 @@ class SadgsPipeline(VanillaPipeline):
         self.world = World()
         """The processes among which the Gaussians are shared out."""
         self._means_gradient: Tensor | None = None  # [N, 3], of the last step
-        self.stuck = ""  # It says why, where nothing is learned any more.
+        self.diverged = ""  # It says why, where nothing is learned any more.
         self.structure = StructurePanel(self.structure_cache)
         self.cleaning = CleaningPanel(self.views)
         self.model.viewer_outputs = self._viewer_outputs
@@ -121,10 +121,10 @@ class SadgsPipeline(VanillaPipeline):
         self.structure.set_max_gaussians.value = plan.strategy.max_gaussians
         self.structure.set_tau_split.value = plan.strategy.tau_split
 
-    def share_out(self, world: World) -> None:
+    def shard(self, world: World) -> None:
         """Keep this process's part of the Gaussians, all of which it has until now; call before optimizers are made."""
         self.world = self.views.world = world
-        self.model.share_out(world)
+        self.model.shard(world)
 
     def train(self, mode: bool = True) -> SadgsPipeline:
         """Set the mode of all modules, unless they have it: nerfstudio asks before every step, and torch visits all."""
@@ -147,7 +147,7 @@ class SadgsPipeline(VanillaPipeline):
         # The log is read before densification makes new parameters, which have no gradients.
         return [read, *super().get_training_callbacks(training_callback_attributes), counts, last]
 
-    def refuse_empty_views(self) -> None:
+    def check_visibility(self) -> None:
         """Raise InputError if fewer than 1 % of the Gaussians lie between the near and the far plane of any camera."""
         cameras = self.datamanager.train_dataset.cameras
         viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds[:: -(-len(cameras) // _SAMPLED)])
@@ -168,8 +168,8 @@ class SadgsPipeline(VanillaPipeline):
     def _report_nonfinite(self, last: bool = False) -> None:
         """Say in which of the last iterations, and with which images, a loss or gradient was not finite.
 
-        Where that lasts, and the present gradients move nothing, `stuck` becomes the sentence that says so. The last of
-        all reports, at the run's end, may be of too few iterations for `nonfinite.HOPELESS_STEPS`.
+        If that lasts, and the present gradients move nothing, `diverged` becomes the sentence that says so. The report
+        at the run's end may cover fewer iterations than `nonfinite.DIVERGED_STEPS`.
         """
         wrong = self.log.read()
         files = self.datamanager.train_dataset.image_filenames
@@ -180,14 +180,13 @@ class SadgsPipeline(VanillaPipeline):
             )
         if len(wrong) > _NAMED_STEPS:
             CONSOLE.print(f"[yellow]The same in {len(wrong) - _NAMED_STEPS} more of the last iterations.[/]")
-        enough = nonfinite.HOPELESS_STEPS if not last else min(nonfinite.HOPELESS_STEPS, self.log.steps)
-        gradient = self._means_gradient
-        stuck = bool(wrong) and self.log.streak >= enough and gradient is not None and nonfinite.is_useless(gradient)
-        if self.world.all(stuck):
+        enough = nonfinite.DIVERGED_STEPS if not last else min(nonfinite.DIVERGED_STEPS, self.log.steps)
+        lasts, gradient = bool(wrong) and self.log.streak >= enough, self._means_gradient
+        if self.world.all(lasts and gradient is not None and nonfinite.has_no_update(gradient)):
             step, _, what = wrong[-1]
             names = [files[view].name for view in dict.fromkeys(view for _, views, _ in wrong for view in views)]
             more = f" and {len(names) - _NAMED_STEPS} more" if len(names) > _NAMED_STEPS else ""
-            self.stuck = (
+            self.diverged = (
                 f"Nothing was learned in the last {self.log.streak} iterations, up to iteration {step + 1}: {what} "
                 f"(images {', '.join(names[:_NAMED_STEPS])}{more})"
             )
@@ -225,7 +224,7 @@ class SadgsPipeline(VanillaPipeline):
             quantized = stack(self.structure_cache.get(views)) if model.strategy.observes(step) else None
             cameras = Pinholes(*self.views.stacked_cameras(indices), width, height)
             options = model.step_options(cameras, indices)
-            result.append(ViewGroup(indices, cameras, options, data, model.numbers_of(indices), quantized))
+            result.append(ViewGroup(indices, cameras, options, data, model.view_ids(indices), quantized))
         return result
 
     def finish_step(self, step: int, groups: list[ViewGroup], result: StepResult) -> None:

@@ -14,7 +14,7 @@ from sadgs_ns.method.schedule import Schedule, growth_threshold, schedule
 from sadgs_ns.training.config import SadgsPipelineConfig, SadgsTrainerConfig
 from sadgs_ns.training.memory_plan import fit_to_memory, training_size
 from sadgs_ns.training.pipeline import SadgsPipeline
-from sadgs_ns.training.progress import about_cpu
+from sadgs_ns.training.progress import cpu_notice
 from sadgs_ns.training.run_plan import RunPlan, plan_rates
 
 DENSE_THRESHOLDS = 1.25
@@ -81,7 +81,7 @@ def plan_run(
     """
     options, model, asked = config.pipeline, pipeline.model, _asked(config.pipeline)
     if before is not None:
-        _tell_changes(asked, before.asked)
+        _warn_of_changes(asked, before.asked)
     strategy, growth = options.model.strategy, growth_threshold(options.effort)
     clone, split = growth * strategy.clone_grad2d, growth * strategy.split_absgrad2d
     if dense:
@@ -100,7 +100,7 @@ def plan_run(
             f"{windows.refine_stop_iter}, the first split would come at {windows.structure_every}. "
             "Train longer or lower pipeline.model.strategy.structure-every.[/]"
         )
-    _tell_length(config, pipeline, length, done)
+    _print_length(config, pipeline, length, done)
     extent, groups = float(model.strategy_state["scene_scale"]), pipeline.get_param_groups()
     optimizers = {name: group for name, group in config.optimizers.items() if name in groups}
     return RunPlan(
@@ -121,7 +121,7 @@ def _asked(options: SadgsPipelineConfig) -> dict[str, Any]:
     return own | {f"model.strategy.{name}": value for name, value in asdict(options.model.strategy).items()}
 
 
-def _tell_changes(now: dict[str, Any], before: dict[str, Any]) -> None:
+def _warn_of_changes(now: dict[str, Any], before: dict[str, Any]) -> None:
     """Say which options are others than the checkpoint's run had."""
     changed = [name for name in before if name in now and now[name] != before[name]]
     if changed:
@@ -132,7 +132,7 @@ def _tell_changes(now: dict[str, Any], before: dict[str, Any]) -> None:
         )
 
 
-def _tell_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: Schedule, done: int) -> None:
+def _print_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: Schedule, done: int) -> None:
     """Print how long the run is, and what decided it."""
     cameras, options, taken = pipeline.datamanager.train_dataset.cameras, config.pipeline, length.views_per_iteration
     views, asked, iterations = len(cameras), options.views_per_iteration, length.iterations
@@ -153,7 +153,7 @@ def _tell_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: Sc
             "each time.[/]"
         )
     if pipeline.device.type == "cpu":
-        lines.append(f"[yellow]{about_cpu(torch.get_num_threads())}[/]")
+        lines.append(f"[yellow]{cpu_notice(torch.get_num_threads())}[/]")
     CONSOLE.print("\n".join(lines), highlight=False, soft_wrap=True)
 
 

@@ -34,7 +34,7 @@ def number_of_processes() -> int:
     return dist.get_world_size() if dist.is_initialized() else int(os.environ.get("WORLD_SIZE", "1"))
 
 
-def is_first() -> bool:
+def is_rank_zero() -> bool:
     """Tell whether this process is the one that prints and writes files."""
     return (dist.get_rank() if dist.is_initialized() else int(os.environ.get("RANK", "0"))) == 0
 
@@ -102,7 +102,7 @@ class Peers:
         """Tell whether all processes run on this machine."""
         return len({host for host, _, _ in self._places}) == 1
 
-    def wait_for_the_first(self) -> NoReturn:
+    def exit_after_rank_zero(self) -> NoReturn:
         """Wait until the first process, of this machine, has ended; then end this process with exit code 0.
 
         What starts the processes would take the end of one for the end of all.
@@ -169,7 +169,7 @@ def join(config: TrainerConfig, local_rank: int) -> tuple[World, int]:
     random.seed(config.machine.seed)
     np.random.seed(config.machine.seed)
     torch.manual_seed(config.machine.seed)
-    CONSOLE.quiet = not is_first()
+    CONSOLE.quiet = not is_rank_zero()
     shared = [config.timestamp]
     dist.broadcast_object_list(shared, 0)
     config.timestamp = shared[0]
@@ -177,7 +177,7 @@ def join(config: TrainerConfig, local_rank: int) -> tuple[World, int]:
 
 
 @contextmanager
-def first_of_each_machine_before_others(world: World, local_rank: int) -> Iterator[None]:
+def local_rank_zero_first(world: World, local_rank: int) -> Iterator[None]:
     """Let the first process of each machine do something, such as compiling, before its others; all call this.
 
     Triton keeps what it compiles on the disk, where the others find it. Of 24 processes that compiled the same kernels
@@ -190,7 +190,7 @@ def first_of_each_machine_before_others(world: World, local_rank: int) -> Iterat
         world.all(True)
 
 
-def leave_the_rest_to_the_first(world: World, peers: Peers) -> None:
+def continue_on_rank_zero(world: World, peers: Peers) -> None:
     """Let the run go on in the first process, as if it were alone; the others wait for its end, and end with code 0.
 
     All processes run on this machine, and nobody may use their `World` any more.
@@ -198,7 +198,7 @@ def leave_the_rest_to_the_first(world: World, peers: Peers) -> None:
     world.all(True)
     dist.destroy_process_group()
     if world.rank > 0:
-        peers.wait_for_the_first()
+        peers.exit_after_rank_zero()
     os.environ.pop("LOCAL_WORLD_SIZE", None)  # torchrun's; nobody shares the host's memory any more.
     # nerfstudio takes leave of the others at the end, and a group of one process has none.
     store = dist.HashStore()  # pyright: ignore[reportPrivateImportUsage]

@@ -37,7 +37,7 @@ def duration(seconds: float) -> str:
     return f"{minutes // 60} h {minutes % 60} min"
 
 
-def about_cpu(threads: int) -> str:
+def cpu_notice(threads: int) -> str:
     """Return what somebody should know who trains without a GPU, with so many threads of torch."""
     text = (
         "This run trains on the CPU, which is for small scenes and tests: a GPU with CUDA is about a hundred times as "
@@ -51,7 +51,7 @@ def about_cpu(threads: int) -> str:
     return text
 
 
-def what_next(config: Path, gaussians: int) -> str:
+def next_commands(config: Path, gaussians: int) -> str:
     """Return the commands for a finished run: its `config.yml`, and the number of Gaussians that it ended with."""
     commands = {
         ("ns-viewer", "--load-config", str(config)): "shows the Gaussians in a browser",

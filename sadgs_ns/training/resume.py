@@ -66,10 +66,10 @@ class Resumption:
         with self._told():
             if not world.alone:
                 part = world.take_even_part(len(self.state["pipeline"]["_model.gauss_params.means"]))
-                self.state = checkpoints.of_gaussians(self.state, lambda rows: rows[part].clone())
+                self.state = checkpoints.map_rows(self.state, lambda rows: rows[part].clone())
             pipeline.load_pipeline(self.state["pipeline"], self.state["step"])
             extra = self.state["pipeline"]["_extra_state"]
-            refuse_other_capture(pipeline, extra["images"], extra["camera_positions"])
+            check_same_capture(pipeline, extra["images"], extra["camera_positions"])
             if more := sorted(self.state["optimizers"].keys() - pipeline.get_param_groups().keys()):
                 raise InputError(
                     f"It optimized {' and '.join(more)}, too: set pipeline.model.color-model and "
@@ -86,7 +86,7 @@ class Resumption:
         CONSOLE.print(f"Resuming after step {self.state['step']} of {self.path}", markup=False, soft_wrap=True)
 
 
-def refuse_other_capture(pipeline: SadgsPipeline, before: Sequence[str], positions_before: Tensor) -> None:
+def check_same_capture(pipeline: SadgsPipeline, before: Sequence[str], positions_before: Tensor) -> None:
     """Check whether a checkpoint is of the data that training is about to go on with.
 
     Images may have been added or taken away since, if the others' poses stayed where they were. A warning is

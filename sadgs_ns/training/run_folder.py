@@ -28,7 +28,7 @@ def begin(config: TrainerConfig) -> None:
     """
     checkpoints.check_chosen(config.load_dir, config.load_step, config.load_checkpoint)
     _check_folder(config)
-    if not processes.is_first():
+    if not processes.is_rank_zero():
         return  # torchrun's other processes leave the files to the first.
     if config.is_viewer_enabled() or config.is_viewer_legacy_enabled():
         _check_address(config.viewer)

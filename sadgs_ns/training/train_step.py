@@ -36,7 +36,7 @@ class ViewGroup:
     data: Sequence[Mapping[str, Tensor]]
     """Of each view its `image`, uint8 or floats in [0, 1] [H, W, 3 or 4], and perhaps its `mask`, bool [H, W, 1]. With
     several processes, views that only others composite have none."""
-    view_numbers: Tensor | None = None
+    view_ids: Tensor | None = None
     """`indices` on the device, where views have matrices of colours. int64 [V]"""
     structure_tensors: Tensor | None = None
     """Quantized S̄, where η is observed. uint8 [V, H, W, 3]"""
@@ -77,7 +77,7 @@ def training_step(
     opacity_reg: float,
     update: AdamUpdate,
     factors: Tensor,
-    noted: Tensor,
+    nonfinite_flag: Tensor,
 ) -> StepResult:
     """Train on the views of a step. This enqueues work and waits for none of it, and changes nothing but tensors.
 
@@ -90,7 +90,7 @@ def training_step(
         opacity_reg: Factor on the mean opacity in the loss.
         update: Of all parameters.
         factors: What `AdamUpdate.factors` returned, on the device.
-        noted: Becomes NaN if a gradient was not finite. float32 [1]
+        nonfinite_flag: Becomes NaN if a gradient was not finite. float32 [1]
     """
     strategy, state, world, step = model.strategy, model.strategy_state, model.strategy.world, model.step
     # Gradients of the parameters themselves would be added up on the stream on which these were first used, which is
@@ -112,8 +112,8 @@ def training_step(
         strategy.step_pre_backward(model.gauss_params, {}, state, step, info)
         infos.append(info)
         for band, colors, alphas in pictures:
-            if group.view_numbers is not None:
-                colors = correct_colors(colors, alphas, anchored(leaves["color_matrices"], group.view_numbers))
+            if group.view_ids is not None:
+                colors = correct_colors(colors, alphas, anchored(leaves["color_matrices"], group.view_ids))
             rgb = model.before_background(colors, alphas, background)
             predicted, target = model.masked_pair(rgb, group.batch(band), background)
             if band is None:
@@ -140,7 +140,7 @@ def training_step(
     loss.backward()
     gradients = {name: _gradient(leaves.get(name, parameter)) for name, parameter in update.parameters.items()}
     overflowed = tuple(info["overflowed"] for info in infos if "overflowed" in info)
-    update.launch(gradients, factors, noted, overflowed)
+    update.launch(gradients, factors, nonfinite_flag, overflowed)
     strategy.accumulate(state, step, infos)
     loss = loss.detach()
     if world.alone:

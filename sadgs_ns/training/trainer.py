@@ -24,15 +24,15 @@ from sadgs_ns.errors import InputError, RunError, WriteError, reason
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training import checkpoints, processes
+from sadgs_ns.training.broken_pipe import discard_broken_output, redirect_on_broken_pipe
 from sadgs_ns.training.compilation import compile_kernels
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.cuda_graphs import GraphedSteps
 from sadgs_ns.training.interrupts import HANG_UP, SIGNALS, Interrupted, Interrupts
-from sadgs_ns.training.lost_output import drop_lost_output, print_elsewhere_once_unread
 from sadgs_ns.training.optimizers import SadgsOptimizers
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.planning import one_device_is_quicker, plan_length, plan_run
-from sadgs_ns.training.progress import remove_tables, what_next
+from sadgs_ns.training.progress import next_commands, remove_tables
 from sadgs_ns.training.resume import Resumption
 from sadgs_ns.training.run_folder import write_config
 from sadgs_ns.training.stereo_start import start_from_stereo
@@ -63,14 +63,14 @@ class SadgsTrainer(Trainer):
     optimizers: SadgsOptimizers
 
     def __init__(self, config: SadgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
-        print_elsewhere_once_unread(CONSOLE)
+        redirect_on_broken_pipe(CONSOLE)
         config.check()
         config = copy.copy(config)  # Where there are several processes, they agree on what the file does not say.
         self.world, local_rank = processes.join(config, local_rank)
         """What this process knows of the others; None where it is alone."""
         self._peers = None if self.world.alone else processes.Peers(self.world)
         if not self.world.alone:
-            with processes.first_of_each_machine_before_others(self.world, local_rank):
+            with processes.local_rank_zero_first(self.world, local_rank):
                 use_triton(self.world.device)  # This compiles a kernel, and is asked for again below.
         config.pipeline.datamanager.train_cameras_sampling_seed = config.machine.seed
         self._vis: Any = config.vis
@@ -98,12 +98,12 @@ class SadgsTrainer(Trainer):
         try:
             super().setup(*args, **kwargs)
             plan = self.pipeline.model.plan
-            if processes.is_first():
+            if processes.is_rank_zero():
                 plan.write(self.base_dir)
             events.report("training begins", iterations=plan.iterations, on_cpu=self.device == "cpu")
             last = [TrainingCallbackLocation.AFTER_TRAIN]
-            self.callbacks.append(TrainingCallback(last, lambda step: self._say_what_is_next()))
-            with processes.first_of_each_machine_before_others(self.world, self.local_rank):
+            self.callbacks.append(TrainingCallback(last, lambda step: self._print_next_commands()))
+            with processes.local_rank_zero_first(self.world, self.local_rank):
                 compile_kernels(self.pipeline, self.optimizers.optimizers)
             self.graphed = GraphedSteps(self.pipeline.model) if self._may_graph_steps() else None
         except torch.cuda.OutOfMemoryError as error:
@@ -128,10 +128,10 @@ class SadgsTrainer(Trainer):
         known = model.backend == "triton" and model.tile_forecast is not None
         return self.config.cuda_graphs and self.world.alone and known and model.camera_optimizer.config.mode == "off"
 
-    def _say_what_is_next(self) -> None:
+    def _print_next_commands(self) -> None:
         """Print the commands for a run that is done, below nerfstudio's box; not where the run ends with an error."""
-        if not self.pipeline.stuck:
-            text = what_next(self.base_dir / "config.yml", self.pipeline.model.num_gaussians)
+        if not self.pipeline.diverged:
+            text = next_commands(self.base_dir / "config.yml", self.pipeline.model.num_gaussians)
             CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
             events.report("training ends", gaussians=self.pipeline.model.num_gaussians)
 
@@ -166,15 +166,15 @@ class SadgsTrainer(Trainer):
         peers, views = None if config.share_always else self._peers, length.views_per_iteration
         if peers is not None and peers.all_here() and one_device_is_quicker(cameras, views, self.world.num_ranks):
             # The other processes end with SystemExit, once this one, the first, has ended.
-            processes.leave_the_rest_to_the_first(self.world, peers)
+            processes.continue_on_rank_zero(self.world, peers)
             self.world, self._peers = World(), None
         if not self.world.alone:
             self._turn_viewer_off()
-            pipeline.share_out(self.world)
+            pipeline.shard(self.world)
         if resumed is not None:
             resumed.load_gaussians(pipeline, self.world)
             self._start_step = resumed.state["step"] + 1
-        pipeline.refuse_empty_views()
+        pipeline.check_visibility()
         plan = plan_run(config, pipeline, length, dense=dense, before=before, done=self._start_step)
         pipeline.follow(plan)
         config.max_num_iterations = plan.iterations  # nerfstudio's loop and table read it.
@@ -244,11 +244,11 @@ class SadgsTrainer(Trainer):
                 if not self.world.alone:  # nerfstudio's way to make it fails where another process is as fast.
                     self.base_dir.mkdir(parents=True, exist_ok=True)
                 super().train()
-                self._stop_if_stuck()
+                self._stop_if_diverged()
             except Interrupted as interrupted:
                 self._stop(interrupted, total)
             except OSError as error:
-                interruption = self._interrupts.behind(error)
+                interruption = self._interrupts.cause_of(error)
                 if interruption is None or self._stepping:
                     raise
                 self._stop(interruption, total)
@@ -324,7 +324,7 @@ class SadgsTrainer(Trainer):
             for number in SIGNALS:
                 if self.world.flags_in >> number & 1:
                     raise Interrupted(number)
-        self._stop_if_stuck()
+        self._stop_if_diverged()
         if due:
             self.save_checkpoint(step)
         super()._update_viewer_state(step)
@@ -337,7 +337,7 @@ class SadgsTrainer(Trainer):
     def _train_complete_viewer(self) -> None:
         """Wait for the viewer's user, as nerfstudio does for ever, unless the run must stop."""
         self._interrupts.poll()
-        self._stop_if_stuck()
+        self._stop_if_diverged()
         super()._train_complete_viewer()
 
     def _set_clock(self, took: float) -> None:
@@ -362,18 +362,18 @@ class SadgsTrainer(Trainer):
             config.max_num_iterations = total
             config.load_dir, config.load_step, config.load_checkpoint = self.checkpoint_dir, None, None
             config.vis = self._vis
-            file = write_config(config) if processes.is_first() else self.base_dir / "config.yml"
+            file = write_config(config) if processes.is_rank_zero() else self.base_dir / "config.yml"
             command = shlex.join(["ns-train", str(config.method_name), "--load-config", str(file)])
             text = f"{interrupted}: stopped and saved after {done} of {total} iterations; resume with: {command}"
         if interrupted.number == HANG_UP:  # Some systems send it before they take the terminal away.
-            drop_lost_output()
+            discard_broken_output()
         CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
         self.world.all(True)  # What starts the processes ends all as soon as one has ended.
         raise SystemExit(128 + interrupted.number)
 
-    def _stop_if_stuck(self) -> None:
+    def _stop_if_diverged(self) -> None:
         """Save the Gaussians and raise RunError if they learn nothing any more because gradients are not finite."""
-        if not self.pipeline.stuck:
+        if not self.pipeline.diverged:
             return
         kept = "the Gaussians themselves are not finite: train anew, or from a checkpoint in which they are"
         finite = all(bool(parameter.isfinite().all()) for parameter in self.pipeline.model.gauss_params.values())
@@ -382,17 +382,17 @@ class SadgsTrainer(Trainer):
                 self.save_checkpoint(self._completed_step)
             kept = f"the Gaussians as they are now are saved and go on with --load-dir {self.checkpoint_dir}"
         raise RunError(
-            f"{self.pipeline.stuck}; look at them with sadgs-doctor, and lower the learning rates if you raised them; "
-            f"{kept}."
+            f"{self.pipeline.diverged}; look at them with sadgs-doctor, and lower the learning rates if you raised "
+            f"them; {kept}."
         )
 
     def save_checkpoint(self, step: int) -> None:
         """Save as `checkpoints.write` does. Where several processes train, the first writes what all of them hold."""
         start = time.monotonic()
         state = self._state(step)
-        if processes.is_first():
+        if processes.is_rank_zero():
             # An earlier checkpoint may be better where nothing is learned any more.
-            keep = not self.config.save_only_latest_checkpoint or bool(self.pipeline.stuck)
+            keep = not self.config.save_only_latest_checkpoint or bool(self.pipeline.diverged)
             checkpoints.write(self.checkpoint_dir, step, state, keep)
         self.world.all(True)
         self._saved_step = step
@@ -407,4 +407,4 @@ class SadgsTrainer(Trainer):
             "schedulers": {name: s.state_dict() for name, s in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),
         }
-        return state if self.world.alone else checkpoints.of_gaussians(state, self.world.gather_rows)
+        return state if self.world.alone else checkpoints.map_rows(state, self.world.gather_rows)

@@ -122,5 +122,5 @@ def test_where_it_cannot_draw_it_is_refused(config: SadgsTrainerConfig, monkeypa
     model, world = set_up(config).pipeline.model, World()
     asked: list[Any] = []
     monkeypatch.setattr(model_module, "choose_backend", lambda *args: asked.append(args))
-    model.share_out(world)
+    model.shard(world)
     assert asked == [("auto", world.device, True)]

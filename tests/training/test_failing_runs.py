@@ -558,7 +558,7 @@ def poison(trainer: SadgsTrainer, what: str) -> None:
 def test_a_run_that_learns_nothing_stops_with_one_sentence_and_a_finite_checkpoint(
     what: str, config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
-    monkeypatch.setattr(nonfinite, "HOPELESS_STEPS", 8)
+    monkeypatch.setattr(nonfinite, "DIVERGED_STEPS", 8)
     config.max_num_iterations, config.steps_per_save = 24, 3
     config.pipeline.model.strategy.refine_stop_iter = 0
     trainer = set_up(config)

@@ -34,10 +34,10 @@ from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.strategy import StructureAwareStrategy, empty_state
 from sadgs_ns.training.memory_plan import (
     TrainingSize,
+    choose_image_storage,
     estimate_pairs,
     fit_to_memory,
     image_bytes,
-    place_images,
     training_size,
 )
 
@@ -351,10 +351,10 @@ def test_images_are_kept_where_there_is_room(number: int, card: Any, monkeypatch
     monkeypatch.setattr(memory, "available_host_bytes", lambda: 1e15)
 
     card(1.01 * size / share / 1e9, 80)
-    assert place_images(small, gpu) is None
+    assert choose_image_storage(small, gpu) is None
     assert small.config.cache_images == "gpu"
     card(0.99 * size / share / 1e9, 80)
-    assert (place_images(small, gpu) or "").startswith(
+    assert (choose_image_storage(small, gpu) or "").startswith(
         "The images stay in the host's memory and are copied ahead of the steps: decoded images and their structure "
         f"take {size / 1e9:.2g} GB, and the GPU has 0."
     )
@@ -363,12 +363,12 @@ def test_images_are_kept_where_there_is_room(number: int, card: Any, monkeypatch
     card(80, 80)
     monkeypatch.setattr(memory, "available_host_bytes", lambda: 1.99 * image_bytes(large))
     for device, name in ((gpu, "GPU"), (torch.device("cpu"), "host")):
-        line = place_images(large, device) or ""
+        line = choose_image_storage(large, device) or ""
         assert line.startswith("The images stay compressed and are decoded ahead of the steps: decoded images and ")
         assert f" take {image_bytes(large) / 1e9:.2g} GB, and the {name} has " in line
         assert large.config.cache_images == "compressed"
     monkeypatch.setattr(memory, "available_host_bytes", lambda: 2.01 * image_bytes(large))
-    assert place_images(large, torch.device("cpu")) is None
+    assert choose_image_storage(large, torch.device("cpu")) is None
     assert large.config.cache_images == "gpu"  # the training device
 
 

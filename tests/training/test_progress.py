@@ -24,7 +24,7 @@ from scenes import ITERATIONS
 from sadgs_ns.cli import export
 from sadgs_ns.training import progress
 from sadgs_ns.training.config import SadgsTrainerConfig
-from sadgs_ns.training.progress import ProgressTable, about_cpu, duration, remove_tables
+from sadgs_ns.training.progress import ProgressTable, cpu_notice, duration, remove_tables
 
 
 @pytest.fixture
@@ -207,5 +207,5 @@ def test_a_run_on_the_cpu_says_that_it_is_slow_and_what_to_do_beside_other_work(
 ):
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     set_up(config)
-    assert f"{about_cpu(2)}\n" in capsys.readouterr().out
-    assert "put OMP_NUM_THREADS=1 before the command" in about_cpu(2) and "OMP_NUM_THREADS" not in about_cpu(1)
+    assert f"{cpu_notice(2)}\n" in capsys.readouterr().out
+    assert "put OMP_NUM_THREADS=1 before the command" in cpu_notice(2) and "OMP_NUM_THREADS" not in cpu_notice(1)

@@ -49,7 +49,7 @@ from sadgs_ns.training.checkpoints import checkpoint_paths
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.interrupts import SIGNALS
 from sadgs_ns.training.pipeline import camera_positions
-from sadgs_ns.training.resume import refuse_other_capture
+from sadgs_ns.training.resume import check_same_capture
 from sadgs_ns.training.trainer import SadgsTrainer
 
 
@@ -717,13 +717,13 @@ def test_images_with_other_names_at_the_same_cameras_are_told_of(
     assert "same cameras" not in capsys.readouterr().out
     files: Any = trainer.pipeline.datamanager.train_dataset.image_filenames
     files[:] = [path.with_name(f"of_another_{path.name}") for path in files]
-    refuse_other_capture(pipeline, known, positions)
+    check_same_capture(pipeline, known, positions)
     line = one_line(capsys.readouterr().out, "The checkpoint's run")
     assert line.endswith(
         "(001.png and of_another_001.png are the first): the Gaussians fit only if the images were renamed."
     )
     files[:] = [path.with_name(path.name.removeprefix("of_another_")).with_suffix(".jpg") for path in files]
-    refuse_other_capture(pipeline, known, positions)
+    check_same_capture(pipeline, known, positions)
     assert "same cameras" not in capsys.readouterr().out
 
 

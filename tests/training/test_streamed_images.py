@@ -22,7 +22,7 @@ from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.method import memory
 from sadgs_ns.training.config import SadgsDatamanagerConfig, SadgsTrainerConfig
 from sadgs_ns.training.images import LazyImages, thread_count
-from sadgs_ns.training.memory_plan import image_bytes, place_images
+from sadgs_ns.training.memory_plan import choose_image_storage, image_bytes
 from sadgs_ns.training.prefetch import ImagePrefetcher
 from sadgs_ns.training.structure_cache import StructureCache
 from sadgs_ns.training.views import TrainingViews
@@ -155,7 +155,7 @@ def test_an_image_that_one_process_cannot_read_any_more_ends_all(tmp_path: Path)
 
 
 def sizes_of(number: int, side: int) -> Any:
-    """What `place_images` reads of a datamanager with square images."""
+    """What `choose_image_storage` reads of a datamanager with square images."""
     cameras = SimpleNamespace(height=torch.full((number, 1), side), width=torch.full((number, 1), side))
     dataset = type("Dataset", (), {"cameras": cameras, "__len__": lambda _: number})()
     return SimpleNamespace(
@@ -171,7 +171,7 @@ def place_together(world: World, asked: str) -> tuple[str, str | None]:
     datamanager.config.cache_images = asked
     free = 4.1 * image_bytes(datamanager) if world.rank == 0 else 3.9 * image_bytes(datamanager)
     pytest.MonkeyPatch().setattr(memory, "available_host_bytes", lambda: free)
-    line = place_images(datamanager, torch.device("cpu"))
+    line = choose_image_storage(datamanager, torch.device("cpu"))
     return datamanager.config.cache_images, line
 
 
@@ -194,10 +194,10 @@ def test_decoded_images_stay_on_the_host_where_all_processes_have_room(monkeypat
     datamanager.config.cache_images = "cpu"
     monkeypatch.setattr(memory, "available_host_bytes", lambda: 4.1 * image_bytes(datamanager))
     monkeypatch.setenv("WORLD_SIZE", "2")
-    assert place_images(datamanager, torch.device("cpu")) is None and datamanager.config.cache_images == "cpu"
+    assert choose_image_storage(datamanager, torch.device("cpu")) is None and datamanager.config.cache_images == "cpu"
     monkeypatch.setattr(memory, "available_host_bytes", lambda: 0.0)
     monkeypatch.setenv("WORLD_SIZE", "1")  # One process keeps them where it is told to.
-    assert place_images(datamanager, torch.device("cpu")) is None and datamanager.config.cache_images == "cpu"
+    assert choose_image_storage(datamanager, torch.device("cpu")) is None and datamanager.config.cache_images == "cpu"
 
 
 def test_processes_of_a_machine_share_what_keeps_files_and_the_cores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -9,14 +9,14 @@ import sys
 from rich.console import Console
 
 
-def drop_lost_output() -> None:
+def discard_broken_output() -> None:
     """Discard output to a terminal or pipe that is gone, since printing there would raise before the run is saved."""
     for descriptor in (1, 2):
         if not os.isatty(descriptor) and not stat.S_ISREG(os.fstat(descriptor).st_mode):
             _discard(descriptor)
 
 
-def print_elsewhere_once_unread(console: Console) -> None:
+def redirect_on_broken_pipe(console: Console) -> None:
     """Have standard output's console print where errors go, or else nowhere, as soon as what read its output has ended.
 
     `head` ends when it has read enough, and `tee` ends by the same Ctrl-C as the program whose output it copies. rich
