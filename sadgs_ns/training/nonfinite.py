@@ -1,7 +1,4 @@
-"""Losses and gradients that are not finite.
-
-They are flagged on the device in each step and read now and then, so that no step waits for the device.
-"""
+"""Losses and gradients that are not finite: flagged on the device, and read now and then, so that no step waits."""
 
 from __future__ import annotations
 
@@ -11,27 +8,23 @@ import torch
 from torch import Tensor
 
 MAX_GRADIENT = 1e18
-"""A gradient at least this large counts as not finite, because from 1.8e19 its square overflows for good in Adam."""
-
+"""Gradients this large count as not finite, because from 1.8e19 their square overflows for good in Adam."""
 DIVERGED_STEPS = 100
-"""Number of steps in a row with something not finite after which a run stops, if its gradients are useless, too."""
+"""Number of steps in a row that were not finite after which a run stops, if its gradients move nothing, too."""
 
 
 class NonFiniteLog:
-    """A log of the losses, and of gradients that were left out, in the training steps since it was last read.
+    """The losses of the steps since the log was last read, and whether gradients were left out.
 
-    Attributes:
-        capacity: Number of steps that the log holds.
-        steps: Number of all steps that have been read.
-        streak: Number of the latest of these in a row in which something was not finite.
+    It holds `capacity` steps. `steps` have been read so far, and the last `streak` of them were not finite.
     """
 
     def __init__(self, device: torch.device | str, capacity: int = 100) -> None:
-        self._losses: list[Tensor] = []  # They are scalars, which stay where they are until the log is read.
-        # The first column is NaN where a gradient was left out. Rows have 16 bytes, because Triton would compile Adam
-        # anew for rows that are less aligned.
+        self._losses: list[Tensor] = []  # scalars on the device
+        # The first column is NaN if a gradient was left out. Triton would compile Adam anew for rows not aligned to 16
+        # bytes.
         self._gradients = torch.zeros((capacity, 4), device=device)
-        self._slots = self._gradients[:, :1].unbind()  # They are made once, because slicing takes the host long.
+        self._slots = self._gradients[:, :1].unbind()  # once, because slicing takes the host long
         self._steps: list[tuple[int, list[int]]] = []
         self.capacity, self.steps, self.streak = capacity, 0, 0
 
@@ -42,19 +35,18 @@ class NonFiniteLog:
 
     @property
     def slot(self) -> Tensor:
-        """Where the present step, before it is recorded, notes with NaN that a gradient was not finite, float32 [1]."""
+        """The `nonfinite_flag` of the present step, which is not recorded yet. float32 [1]"""
         return self._slots[len(self._steps)]
 
     def record(self, step: int, views: list[int], loss: Tensor) -> None:
-        """Note the loss of a step of these views, a scalar that nobody changes in place; the device has no work."""
+        """Add a step with its views and its loss, a scalar that must not change in place."""
         self._losses.append(loss)
         self._steps.append((step, views))
 
     def read(self) -> list[tuple[int, list[int], str]]:
-        """Return the steps in which something was not finite, and empty the log; this waits for the device.
+        """Return number, views and problem of each step that was not finite, and empty the log; waits for the device.
 
-        Returns:
-            For each such step its number, its views, and "the loss was nan" (or inf) or "gradients were not finite".
+        The problem is "the loss was nan" (or inf) or "gradients were not finite".
         """
         if not self._steps:
             return []
@@ -79,16 +71,13 @@ class NonFiniteLog:
 
 @torch.no_grad()
 def leave_out_nonfinite(gradient: Tensor, nonfinite_flag: Tensor) -> None:
-    """Set gradients from which Adam could not recover to 0, in place, without waiting for the device.
-
-    `nonfinite_flag`, float32 [1], becomes NaN if there was such a gradient.
-    """
+    """Set gradients that are not finite to 0, in place, and `nonfinite_flag` [1] to NaN if there were some."""
     wrong = ~(gradient.abs() < MAX_GRADIENT)  # Comparing NaN gives False.
     gradient.masked_fill_(wrong, 0.0)
     nonfinite_flag.masked_fill_(wrong.any(), torch.nan)
 
 
 def has_no_update(gradient: Tensor) -> bool:
-    """Return whether no element of a gradient changes its parameter; this waits for the device."""
+    """Tell whether a gradient changes no parameter; this waits for the device."""
     size = gradient.abs()
     return not bool(((size > 0) & (size < MAX_GRADIENT)).any())

@@ -1,4 +1,4 @@
-"""The processes of a run on several devices: how they find each other, and what a run on several devices cannot do."""
+"""The processes of a run on several devices: how they start, and how they end together."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
 
 _REAPED_SECONDS = 5.0
-"""Longest time from a message that fails because its process has ended to the operating system's forgetting that."""
+"""Longest time from a message that fails because its receiver has ended until the system forgets the receiver."""
 _TIMEOUT = timedelta(minutes=30)
 """Longest time that one process waits for another, as in nerfstudio: rank 0 may write a large checkpoint meanwhile."""
 
 
 def number_of_processes() -> int:
-    """Return how many processes train together, as torchrun or nerfstudio started them; 1 outside of both."""
+    """Return how many processes train together; 1 if neither torchrun nor nerfstudio started several."""
     return dist.get_world_size() if dist.is_initialized() else int(os.environ.get("WORLD_SIZE", "1"))
 
 
@@ -45,15 +45,14 @@ def processes_on_this_machine() -> int:
 
 
 def least(number: float, device: torch.device) -> float:
-    """Return the least of the numbers, which may be infinite, that all processes of the run pass: they decide alike."""
+    """Return the least number, perhaps infinite, that any process of the run passes, so that all decide alike."""
     return World(device if dist.is_initialized() else None).least(number)
 
 
 def check_devices(machine: MachineConfig) -> bool:
-    """Return whether the devices that a run is to take are several.
+    """Return whether a run takes several devices.
 
-    Raises:
-        InputError: If one is not there, or the processes cannot be started in this way.
+    Raises InputError if a device is missing, or if the processes cannot be started with these options.
     """
     if machine.num_machines != 1:
         raise InputError(
@@ -69,17 +68,17 @@ def check_devices(machine: MachineConfig) -> bool:
         )
     if machine.num_devices == 1 and number_of_processes() == 1:
         return False
-    here = torch.cuda.device_count()
-    if machine.device_type == "cuda" and max(machine.num_devices, processes_on_this_machine()) > here:
+    wanted, found = max(machine.num_devices, processes_on_this_machine()), torch.cuda.device_count()
+    if machine.device_type == "cuda" and wanted > found:
         raise InputError(
-            f"The run is to take {max(machine.num_devices, processes_on_this_machine())} CUDA devices of this machine, "
-            f"and torch finds {here}: lower machine.num_devices, or torchrun's --nproc-per-node."
+            f"The run is to take {wanted} CUDA devices of this machine, and torch finds {found}: lower "
+            "machine.num_devices, or torchrun's --nproc-per-node."
         )
     return True
 
 
 class Peers:
-    """The processes of a run, as the operating system of this machine knows them."""
+    """The processes of a run by their hosts and ids, to find out which of them ended."""
 
     def __init__(self, world: World) -> None:
         self._rank, number = world.rank, world.num_ranks
@@ -91,21 +90,20 @@ class Peers:
             dist.all_gather_object(self._places, mine)
             shared = next(path for host, _, path in self._places if host == mine[0])
             try:
-                # The first process's file is memory that all processes of this machine share, with a byte for each.
+                # This file is memory that all processes of the machine share. The byte of a process becomes 1 if it
+                # ends because another has ended.
                 self._followed = torch.from_file(shared, shared=True, size=number, dtype=torch.uint8)
-                """1 for each process that ends because another has ended. uint8 [number of processes]"""
             except RuntimeError:  # This process has another folder of temporary files.
                 self._followed = torch.zeros(number, dtype=torch.uint8)
             world.all(True)  # The files go, and the memory stays as long as a process has it.
 
-    def all_here(self) -> bool:
-        """Tell whether all processes run on this machine."""
+    def on_one_machine(self) -> bool:
         return len({host for host, _, _ in self._places}) == 1
 
     def exit_after_rank_zero(self) -> NoReturn:
-        """Wait until the first process, of this machine, has ended; then end this process with exit code 0.
+        """Wait until rank 0, which runs on this machine, has ended; then exit with code 0.
 
-        What starts the processes would take the end of one for the end of all.
+        Whoever started the processes takes the end of one for the end of all.
         """
         for number in (signal.SIGINT, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)  # The first process saves, and ends.
@@ -115,17 +113,14 @@ class Peers:
         raise SystemExit(0)
 
     def ended(self) -> list[int]:
-        """Return the ranks of this machine's processes that ended by themselves, after waiting some seconds for one.
+        """Wait some seconds until a process of this machine has ended; return the ranks that ended by themselves.
 
-        Those that end because this method named others to them are none of these.
+        A process to which this method returned others ends because of them, and is not counted.
         """
         end, here = time.monotonic() + _REAPED_SECONDS, socket.gethostname()
         while True:
-            ranks = [
-                rank
-                for rank, (host, pid, _) in enumerate(self._places)
-                if host == here and not _exists(pid) and not self._followed[rank]
-            ]
+            gone = (rank for rank, (host, pid, _) in enumerate(self._places) if host == here and not _exists(pid))
+            ranks = [rank for rank in gone if not self._followed[rank]]
             if ranks:
                 self._followed[self._rank] = 1
             if ranks or time.monotonic() > end:
@@ -134,28 +129,19 @@ class Peers:
 
 
 def _exists(pid: int) -> bool:
-    """Tell whether there is a process of this user, or one that ended and of which its parent has not learned yet."""
+    """Tell whether a process of this user exists, or has ended but was not reaped by its parent yet."""
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:  # The number is another user's process's by now.
+    except (ProcessLookupError, PermissionError):  # Another user's process may have the number by now.
         return False
     return True
 
 
 def join(config: TrainerConfig, local_rank: int) -> tuple[World, int]:
-    """Join the other processes of the run, where there are others.
+    """Join the other processes of the run, if there are others; return them and this process's local rank.
 
-    All processes draw the same random numbers, where nerfstudio seeds each in its own way. Those after the first print
-    nothing.
-
-    Args:
-        config: Its time stamp becomes that of the first process.
-        local_rank: Number of this process on its machine, as nerfstudio counts it.
-
-    Returns:
-        The processes of the run, and the number of this one on its machine.
+    All processes are seeded alike, while nerfstudio seeds each in its own way. The time stamp of `config` becomes that
+    of rank 0. Only rank 0 prints.
     """
     if number_of_processes() == 1:
         return World(), local_rank
@@ -178,10 +164,10 @@ def join(config: TrainerConfig, local_rank: int) -> tuple[World, int]:
 
 @contextmanager
 def local_rank_zero_first(world: World, local_rank: int) -> Iterator[None]:
-    """Let the first process of each machine do something, such as compiling, before its others; all call this.
+    """Run the body, such as compiling, on the first process of each machine before the others; all call this.
 
-    Triton keeps what it compiles on the disk, where the others find it. Of 24 processes that compiled the same kernels
-    at once two ended with a TypeError (docs/results.md#several-devices).
+    The others then find Triton's kernels on the disk. When 24 processes compiled the same kernels at once, two ended
+    with a TypeError (docs/results.md#several-devices).
     """
     if local_rank > 0:
         world.all(True)
@@ -191,21 +177,21 @@ def local_rank_zero_first(world: World, local_rank: int) -> Iterator[None]:
 
 
 def continue_on_rank_zero(world: World, peers: Peers) -> None:
-    """Let the run go on in the first process, as if it were alone; the others wait for its end, and end with code 0.
+    """Continue the run in rank 0 alone; the other processes, of the same machine, wait for its end and exit with 0.
 
-    All processes run on this machine, and nobody may use their `World` any more.
+    `world` must not be used afterwards.
     """
     world.all(True)
     dist.destroy_process_group()
     if world.rank > 0:
         peers.exit_after_rank_zero()
-    os.environ.pop("LOCAL_WORLD_SIZE", None)  # torchrun's; nobody shares the host's memory any more.
-    # nerfstudio takes leave of the others at the end, and a group of one process has none.
+    os.environ.pop("LOCAL_WORLD_SIZE", None)  # torchrun set it; nobody shares the host's memory any more.
+    # nerfstudio leaves a process group at the end, so there must be one.
     store = dist.HashStore()  # pyright: ignore[reportPrivateImportUsage]
     dist.init_process_group("gloo", store=store, rank=0, world_size=1)
 
 
 def leave() -> None:
-    """End what `join` began, where torchrun started the processes; nerfstudio does so for those that it starts."""
+    """Leave the process group if torchrun started the processes; nerfstudio does so for those that it starts."""
     if "WORLD_SIZE" in os.environ and dist.is_initialized():
         dist.destroy_process_group()

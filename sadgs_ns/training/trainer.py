@@ -164,7 +164,7 @@ class SadgsTrainer(Trainer):
             pipeline.model.clear_paths(viewmats_from_camera_to_world(cameras.camera_to_worlds))
         length = plan_length(config, len(cameras), before)
         peers, views = None if config.share_always else self._peers, length.views_per_iteration
-        if peers is not None and peers.all_here() and one_device_is_quicker(cameras, views, self.world.num_ranks):
+        if peers is not None and peers.on_one_machine() and one_device_is_quicker(cameras, views, self.world.num_ranks):
             # The other processes end with SystemExit, once this one, the first, has ended.
             processes.continue_on_rank_zero(self.world, peers)
             self.world, self._peers = World(), None
