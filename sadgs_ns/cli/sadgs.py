@@ -42,8 +42,7 @@ from sadgs_ns.data.coordinates import FRAME_KEYS, TRANSFORMS_NAME
 from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.formats import FORMATS, MESH
 from sadgs_ns.formats.mesh import load_open3d
-from sadgs_ns.training.broken_pipe import redirect_on_broken_pipe
-from sadgs_ns.training.interrupts import Interrupts
+from sadgs_ns.training.interrupts import Interrupts, redirect_on_broken_pipe
 
 _OURS = ("data", "output-dir", "experiment-name", "timestamp", "vis", "load-dir", "load-checkpoint", "load-config")
 """Options of ns-train that this command sets."""

@@ -1,16 +1,19 @@
-"""SIGINT, SIGTERM and SIGHUP stop a run, but only when a training step is whole."""
+"""How SIGINT, SIGTERM and SIGHUP stop a run between two steps, and where it prints once its output is gone."""
 
 from __future__ import annotations
 
 import errno
+import os
 import signal
+import stat
+import sys
 import threading
 import time
 from collections.abc import Callable
 from types import TracebackType
 from typing import Any
 
-from sadgs_ns.training.broken_pipe import discard_broken_output
+from rich.console import Console
 
 HANG_UP: int | None = getattr(signal, "SIGHUP", None)
 """The signal that says that the terminal is gone, as of an ssh that was cut off; Windows has none."""
@@ -90,3 +93,36 @@ class Interrupts:
             discard_broken_output()
         if self._waiting():
             self.poll()
+
+
+def discard_broken_output() -> None:
+    """Discard output to a terminal or pipe that is gone, since printing there would raise before the run is saved."""
+    for descriptor in (1, 2):
+        if not os.isatty(descriptor) and not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            _discard(descriptor)
+
+
+def redirect_on_broken_pipe(console: Console) -> None:
+    """Have standard output's console print where errors go, or else nowhere, as soon as what read its output has ended.
+
+    `head` ends when it has read enough, and `tee` ends by the same Ctrl-C as the program whose output it copies. rich
+    would end the program then, wherever it is, with exit code 1 and without a word.
+    """
+
+    def print_elsewhere() -> None:
+        descriptor = console.file.fileno()
+        errors_are_elsewhere = sys.stderr is not None and not os.path.sameopenfile(descriptor, 2)
+        _discard(descriptor)
+        console.file.flush()  # rich has kept what could not be written, and so has the file.
+        if errors_are_elsewhere:
+            os.dup2(2, descriptor)
+        with console:  # Its end prints what rich has kept, and calls this function again if that fails.
+            pass
+
+    console.on_broken_pipe = print_elsewhere
+
+
+def _discard(descriptor: int) -> None:
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, descriptor)
+    os.close(nowhere)

@@ -35,9 +35,9 @@ from sadgs_ns.render.types import Gaussians, RenderOptions
 from sadgs_ns.training.config import SadgsModelConfig
 from sadgs_ns.training.initial_gaussians import beside, initial_gaussians, outside_cameras
 from sadgs_ns.training.metrics import MeasuredModel
-from sadgs_ns.training.outputs import LazyOutputs, in_viewer, warn_once
 from sadgs_ns.training.run_plan import RunPlan
 from sadgs_ns.viewer import gaussian_maps
+from sadgs_ns.viewer.elements import LazyOutputs, in_viewer, warn_once
 
 NORMALS = "normals"
 """Name of the output that only its readers pay for."""

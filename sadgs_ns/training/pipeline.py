@@ -28,13 +28,12 @@ from sadgs_ns.training.datamanager import SadgsDatamanager
 from sadgs_ns.training.memory_plan import choose_image_storage
 from sadgs_ns.training.model import NORMALS, SadgsModel
 from sadgs_ns.training.nonfinite import NonFiniteLog
-from sadgs_ns.training.outputs import in_viewer
 from sadgs_ns.training.run_plan import RunPlan
 from sadgs_ns.training.structure_cache import StructureCache
 from sadgs_ns.training.train_step import StepResult, ViewGroup, stack
 from sadgs_ns.training.views import TrainingViews
 from sadgs_ns.viewer.cleaning_panel import CleaningPanel
-from sadgs_ns.viewer.elements import shows_output
+from sadgs_ns.viewer.elements import in_viewer, shows_output
 from sadgs_ns.viewer.structure_panel import StructurePanel
 
 _MOST_EFFORT = 100

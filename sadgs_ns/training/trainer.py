@@ -24,11 +24,17 @@ from sadgs_ns.errors import InputError, RunError, WriteError, reason
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training import checkpoints, processes
-from sadgs_ns.training.broken_pipe import discard_broken_output, redirect_on_broken_pipe
 from sadgs_ns.training.compilation import compile_kernels
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.cuda_graphs import GraphedSteps
-from sadgs_ns.training.interrupts import HANG_UP, SIGNALS, Interrupted, Interrupts
+from sadgs_ns.training.interrupts import (
+    HANG_UP,
+    SIGNALS,
+    Interrupted,
+    Interrupts,
+    discard_broken_output,
+    redirect_on_broken_pipe,
+)
 from sadgs_ns.training.optimizers import SadgsOptimizers
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.planning import one_device_is_quicker, plan_length, plan_run

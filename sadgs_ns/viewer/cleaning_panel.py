@@ -18,9 +18,8 @@ from torch import Tensor
 from sadgs_ns.errors import reason
 from sadgs_ns.method.cleaning import Cleaning, Seen, find, see
 from sadgs_ns.training.model import SadgsModel
-from sadgs_ns.training.outputs import in_viewer
 from sadgs_ns.training.views import TrainingViews
-from sadgs_ns.viewer.elements import ViewerMarkdown, show_output
+from sadgs_ns.viewer.elements import ViewerMarkdown, in_viewer, show_output
 
 OUTPUT = "cleaned"
 """Name of the panel's picture among the viewer's output types."""

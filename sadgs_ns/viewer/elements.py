@@ -1,12 +1,18 @@
-"""What the viewer's panels share: a text, and switching what the viewer shows."""
+"""What the model and the viewer's panels share: lazy outputs, a text, and which output the viewer shows."""
 
 from __future__ import annotations
 
+import threading
+from collections import UserDict
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
+from rich.markup import escape
+from torch import Tensor
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -50,3 +56,30 @@ def shows_output(control: ViewerControl, name: str) -> bool:
         return False
     panel = viewer.control_panel
     return name == panel.output_render or (panel.split and name == panel.split_output_render)
+
+
+class LazyOutputs(UserDict[str, Any]):
+    """Tensors by name, as nerfstudio reads them: a function that stands in for a tensor is called at the first read.
+
+    nerfstudio does not tell a model which of its outputs are wanted, so that each of them would cost `ns-eval` and
+    `ns-render` time, also where nobody looks at it.
+    """
+
+    def __getitem__(self, name: str) -> Tensor:
+        value: Any = self.data[name]
+        if callable(value):
+            value = self.data[name] = value()
+        return value
+
+
+def in_viewer() -> bool:
+    """Tell whether this is a thread in which nerfstudio's viewer draws."""
+    from nerfstudio.viewer.render_state_machine import RenderStateMachine
+
+    return isinstance(threading.current_thread(), RenderStateMachine)
+
+
+@lru_cache(maxsize=8)
+def warn_once(text: str) -> None:
+    """Print a warning, unless it was printed before."""
+    CONSOLE.print(f"[yellow]{escape(text)}[/]")

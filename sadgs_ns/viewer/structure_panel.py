@@ -32,12 +32,11 @@ from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training.model import SadgsModel
-from sadgs_ns.training.outputs import in_viewer
 from sadgs_ns.training.run_plan import RunPlan
 from sadgs_ns.training.structure_cache import StructureCache, observe_training_views
 from sadgs_ns.viewer import color_scales, gaussian_maps, texture
 from sadgs_ns.viewer.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
-from sadgs_ns.viewer.elements import ViewerMarkdown, show_output
+from sadgs_ns.viewer.elements import ViewerMarkdown, in_viewer, show_output
 
 OUTPUT = "structure"
 """Name of the panel's picture among the viewer's output types."""

@@ -20,11 +20,10 @@ from scenes import HEIGHT, WIDTH, camera
 
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.model import NORMALS, SadgsModel
-from sadgs_ns.training.outputs import LazyOutputs
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.run_folder import write_config
 from sadgs_ns.training.trainer import SadgsTrainer
-from sadgs_ns.viewer.elements import shows_output
+from sadgs_ns.viewer.elements import LazyOutputs, shows_output
 from sadgs_ns.viewer.gaussian_maps import normals_map
 
 
