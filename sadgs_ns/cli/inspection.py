@@ -16,9 +16,9 @@ from rich.progress import track
 from torch import Tensor
 
 from sadgs_ns.errors import InputError, reason
-from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, keep_gradient
 from sadgs_ns.method.growth import absgs, apply
 from sadgs_ns.method.quantization import dequantize
+from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients, keep_gradient
 from sadgs_ns.method.split import grid_split, num_children
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.render.types import Cameras as Pinholes
@@ -124,7 +124,7 @@ def get_view(pipeline: SadgsPipeline, index: int, split: Split = "train") -> Vie
 
 
 def screen_gradients(pipeline: SadgsPipeline, progress: Callable[[range], Iterable[int]] = iter) -> dict[str, Tensor]:
-    """Add up the loss's screen gradients of all training views, by which AbsGS decides, as `absgs.empty_gradients`.
+    """Add up the loss's screen gradients of all training views, by which AbsGS decides, as `empty_gradients`.
 
     `progress` wraps the numbers of the views.
     """

@@ -12,7 +12,8 @@ between, have 32. What remains limited, with C views in one step, N Gaussians an
 | C, and images times channels of one batch | MAX_BLOCKS | CUDA launches no more blocks along an axis |
 | H | MAX_HEIGHT | the same: two rows of an image are a block of `structure_tensor` |
 
-N alone is limited by C · N; `absgs`, `adam`, `quantization` and `statistics` have no limit of their own.
+N alone is limited by C · N; `adam`, `quantization`, `screen_gradients` and `statistics` have no limit of their
+own.
 """
 
 from __future__ import annotations

@@ -16,10 +16,10 @@ from torch import Tensor
 from sadgs_ns.errors import reason
 from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.kernels import use_triton
-from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients
 from sadgs_ns.method.color_matrices import correct_colors, identities
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.quantization import quantize
+from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.render.activations import activate
 from sadgs_ns.render.rasterization import rasterize

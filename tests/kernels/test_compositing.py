@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sadgs_ns import gsplat_compat
 from sadgs_ns.kernels import triton_switched
-from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients, keep_gradient
+from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients, keep_gradient
 from sadgs_ns.render.rasterization import visible
 
 compositing = pytest.importorskip("sadgs_ns.kernels.compositing", reason="Triton is not installed")

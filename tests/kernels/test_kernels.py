@@ -23,8 +23,8 @@ from torch import Tensor
 
 from sadgs_ns import kernels
 from sadgs_ns.method import losses
-from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients
 from sadgs_ns.method.quantization import quantize
+from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients
 from sadgs_ns.method.statistics import STATISTICS, Statistic, empty_statistics, observe, observed_eta
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.render import backend_gsplat
@@ -40,7 +40,7 @@ structure = pytest.importorskip("sadgs_ns.kernels.structure_tensor", reason="Tri
 harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")
 observation = pytest.importorskip("sadgs_ns.kernels.statistics", reason="Triton is not installed")
 photometric = pytest.importorskip("sadgs_ns.kernels.losses", reason="Triton is not installed")
-screen_gradients = pytest.importorskip("sadgs_ns.kernels.absgs", reason="Triton is not installed")
+screen_gradients = pytest.importorskip("sadgs_ns.kernels.screen_gradients", reason="Triton is not installed")
 tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not installed")
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")

@@ -10,9 +10,9 @@ import torch.nn.functional as F
 from scenes import adam, camera, random_params, training_step
 
 from sadgs_ns.method import strategy as strategy_module
-from sadgs_ns.method.absgs import accumulate_gradients, empty_gradients
 from sadgs_ns.method.growth import RULES, Proposal, Rule, absgs, apply
 from sadgs_ns.method.schedule import Windows
+from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients
 from sadgs_ns.method.statistics import STATISTICS, Statistic, empty_statistics
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor

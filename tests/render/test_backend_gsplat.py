@@ -11,7 +11,7 @@ from random_scene import random_scene
 from torch import Tensor
 
 from sadgs_ns import kernels
-from sadgs_ns.method.absgs import keep_gradient
+from sadgs_ns.method.screen_gradients import keep_gradient
 from sadgs_ns.render import backend_gsplat, backend_torch, rasterization
 from sadgs_ns.render.rasterization import visible
 from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions

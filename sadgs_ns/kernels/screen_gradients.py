@@ -1,4 +1,4 @@
-"""`method.absgs.accumulate_gradients` in one kernel."""
+"""`method.screen_gradients.accumulate_gradients` in one kernel."""
 
 # pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
 # (Triton's launch syntax, kernel[grid](...), is not in its types.)
@@ -53,7 +53,7 @@ def accumulate_gradients(
     absolute: Tensor,
     scales: tuple[float, float],
 ) -> None:
-    """Compute `method.absgs.accumulate_gradients`; a gradient longer than 1e19 counts as infinite.
+    """Compute `method.screen_gradients.accumulate_gradients`; a gradient longer than 1e19 counts as infinite.
 
     Args:
         sums: grad2d, absgrad2d and grad_count, contiguous float32, updated in place. Each [N]

@@ -50,7 +50,7 @@ def accumulate_gradients(gradients: MutableMapping[str, Tensor], info: Mapping[s
     # Python numbers: a tensor made of them here would make the host wait for its copy to the device.
     scale_x, scale_y = info["width"] / 2.0 * num_views, info["height"] / 2.0 * num_views
     if use_triton(means2d):
-        from sadgs_ns.kernels import absgs as kernel
+        from sadgs_ns.kernels import screen_gradients as kernel
 
         sums = gradients["grad2d"], gradients["absgrad2d"], gradients["grad_count"]
         kernel.accumulate_gradients(sums, info["radii"], gradient, means2d.absgrad, (scale_x, scale_y))
