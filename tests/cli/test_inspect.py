@@ -33,10 +33,10 @@ from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.render import rasterization
 from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.render.types import Gaussians
-from sadgs_ns.training.model import _say_once
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.structure_cache import observe_training_views
 from sadgs_ns.viewer import color_scales, gaussian_maps, texture
+from sadgs_ns.viewer.elements import warn_once
 from sadgs_ns.viewer.structure_panel import CHOICES, OFF, OUTPUT, StructurePanel, changed, describe, nearest_view
 
 WIDTH, HEIGHT, TRAIN_VIEWS, EVAL_VIEWS = 48, 36, 8, 2
@@ -367,7 +367,7 @@ def test_the_viewer_is_told_of_a_camera_that_is_no_pinhole_and_goes_on(choice: s
     panel.choose()
     camera = copy.deepcopy(a_camera(pipeline))
     camera.camera_type = torch.full_like(camera.camera_type, CameraType.EQUIRECTANGULAR.value)
-    _say_once.cache_clear()
+    warn_once.cache_clear()
     for _ in range(2):
         outputs = in_the_viewer(lambda: pipeline.model.get_outputs_for_camera(camera))
         assert outputs[OUTPUT].shape == outputs["rgb"].shape == (HEIGHT, WIDTH, 3)
