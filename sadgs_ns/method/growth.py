@@ -106,14 +106,9 @@ def apply(
     optimizers: MutableMapping[str, torch.optim.Optimizer],
     state: MutableMapping[str, Any],
 ) -> None:
-    """Let Gaussians grow as proposed, in place; what is new starts with empty rows of every tensor in `state`.
+    """Let the `allowed` Gaussians, bool [N], grow as proposed, in place.
 
-    Args:
-        proposal: For the N Gaussians of `params`.
-        allowed: Those that grow. bool [N]
-        params: gsplat's parameters.
-        optimizers: One per parameter.
-        state: The strategy's state.
+    What is new starts with empty rows of every tensor in the strategy's state.
     """
     counts = torch.where(allowed[:, None], proposal.children, 1)
     if proposal.clone is not None and (num_clones := int((is_clone := allowed & proposal.clone).sum())) > 0:

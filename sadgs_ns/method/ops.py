@@ -63,19 +63,9 @@ def map_opacities(
 
 
 def even_out(
-    world: World,
-    params: Params,
-    optimizers: Mapping[str, torch.optim.Optimizer],
-    state: MutableMapping[str, Any],
+    world: World, params: Params, optimizers: Mapping[str, torch.optim.Optimizer], state: MutableMapping[str, Any]
 ) -> None:
-    """Count the Gaussians of the processes, and give each equally many where they differ by more than a tenth.
-
-    Args:
-        world: The processes, which must all call this.
-        params: The parameters of this process's Gaussians.
-        optimizers: One per parameter.
-        state: The strategy's state, whose tensors have leading dimension N.
-    """
+    """Count the Gaussians of all processes, and give each equally many where they differ by more than a tenth."""
     world.count(len(params["means"]))
     if not world.is_uneven():
         return

@@ -102,13 +102,9 @@ def observed_eta(params: Params, info: Mapping[str, Any], jitter: Tensor) -> Ten
 
         return kernel.observed_eta(
             (params["means"], params["quats"], params["scales"]),
-            info["radii"],
-            info["means2d"],
-            info["conics"],
+            *(info[name] for name in ("radii", "means2d", "conics")),
             jitter,
-            info["structure_tensors"],
-            info["viewmats"],
-            info["Ks"],
+            *(info[name] for name in ("structure_tensors", "viewmats", "Ks")),
             constants=(SCREEN_BLUR, FRUSTUM_MARGIN, WAVELENGTH_EPSILON),
             quantization=(HIGHEST_FREQUENCY, OCTAVES, INVALID),
         )
