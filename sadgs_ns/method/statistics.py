@@ -102,9 +102,8 @@ def observed_eta(params: Params, info: Mapping[str, Any], jitter: Tensor) -> Ten
 
         return kernel.observed_eta(
             (params["means"], params["quats"], params["scales"]),
-            *(info[name] for name in ("radii", "means2d", "conics")),
-            jitter,
-            *(info[name] for name in ("structure_tensors", "viewmats", "Ks")),
+            **{name: info[name] for name in ("radii", "means2d", "conics", "structure_tensors", "viewmats", "Ks")},
+            jitter=jitter,
             constants=(SCREEN_BLUR, FRUSTUM_MARGIN, WAVELENGTH_EPSILON),
             quantization=(HIGHEST_FREQUENCY, OCTAVES, INVALID),
         )
