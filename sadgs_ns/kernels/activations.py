@@ -3,9 +3,6 @@
 The torch functions and the mean opacity take five launches forward and six backward, for which small scenes wait.
 """
 
-# pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportIndexIssue=false
-# (Triton's launch syntax, kernel[grid](...), is not in its types.)
-
 from __future__ import annotations
 
 from typing import Any
@@ -90,11 +87,9 @@ class _Activate(torch.autograd.Function):
 
 
 def activate(log_scales: Tensor, logits: Tensor, penalty: float) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Compute `render.activations.activate`, in float32, for N > 0.
+    """Do what `render.activations.activate` does, for N > 0 in float32.
 
-    Returns:
-        Standard deviations [N, 3], opacities [N], and the penalty in parts [P], which are to be summed, or None if the
-        factor on the mean opacity is 0. The gradient of the first part is taken for that of all.
+    The gradient of the penalty's first part is taken for that of all parts.
     """
     scales, opacities, sums = _Activate.apply(log_scales.contiguous(), logits.contiguous(), penalty / len(logits))  # type: ignore[misc]
     return scales, opacities, sums if penalty > 0 else None

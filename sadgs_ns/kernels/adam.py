@@ -3,9 +3,6 @@
 On parameters of Gaussians torch's fused Adam reaches a third of the memory's bandwidth.
 """
 
-# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false
-# (Triton's launch syntax, kernel[grid](...), and its functions are not in its types.)
-
 from __future__ import annotations
 
 import triton
@@ -73,48 +70,29 @@ def _update(
 
 
 def rate_and_scale(step: int, lr: float, betas: tuple[float, float]) -> tuple[float, float]:
-    """Return what an update does with the corrections of Adam's running means, which begin at 0.
+    """Return Adam's factors on the mean of the gradients, and on the root of the mean of their squares.
 
-    Args:
-        step: Which update this is of the parameter, from 1.
-        lr: Its learning rate.
-        betas: Decay of the two running means, in [0, 1).
-
-    Returns:
-        Factors on the running mean of the gradients, and on the root of that of their squares.
+    They correct the running means, which begin at 0. `step` counts the updates of the parameter from 1.
     """
     return lr / (1 - betas[0] ** step), (1 - betas[1] ** step) ** -0.5
 
 
 def adam_step(
-    parameters: tuple[Tensor, ...],
-    gradients: tuple[Tensor, ...],
-    exp_avgs: tuple[Tensor, ...],
-    exp_avg_sqs: tuple[Tensor, ...],
-    factors: Tensor,
-    noted: Tensor,
-    overflowed: tuple[Tensor, ...] = (),
-    *,
-    betas: tuple[float, float],
-    eps: float,
-    max_gradient: float,
-) -> None:
-    """Update parameters and their moments in place, in one launch, as torch's Adam without weight decay.
+    parameters: tuple[Tensor, ...], gradients: tuple[Tensor, ...],
+    exp_avgs: tuple[Tensor, ...], exp_avg_sqs: tuple[Tensor, ...],
+    factors: Tensor, noted: Tensor, overflowed: tuple[Tensor, ...] = (),
+    *, betas: tuple[float, float], eps: float, max_gradient: float,
+) -> None:  # fmt: skip
+    """Update P parameters and their moments in place, in one launch, as torch's Adam without weight decay.
 
-    A gradient that is NaN, or not below `max_gradient`, counts as 0.
+    A gradient that is NaN, or whose absolute value is not below `max_gradient`, counts as 0.
 
     Args:
-        parameters: P of them, contiguous float32, all of the same length. [N, ...] each
-        gradients: Contiguous, each of its parameter's shape; so are the moments.
-        exp_avgs: Running means of the gradients.
-        exp_avg_sqs: Running means of their squares.
-        factors: What `rate_and_scale` returns for each, on the device, so that a CUDA graph can repeat the launch.
+        parameters: Contiguous float32; so are the gradients and both moments, of the same shapes. [N, ...] each
+        factors: The results of `rate_and_scale`, on the device, so that a CUDA graph can repeat the launch.
             Contiguous float32 [2, P]
         noted: Becomes NaN if there was such a gradient. float32 [1]
         overflowed: Flags; if there are some and none is 0, nothing is changed. int64 [1] each
-        betas: Decay of the two running means, in [0, 1).
-        eps: Added to the denominator.
-        max_gradient: Absolute value from which a gradient is left out.
     """
     rows = parameters[0].shape[:1].numel()  # 1 without dimensions
     widths = tuple(parameter.shape[1:].numel() for parameter in parameters)

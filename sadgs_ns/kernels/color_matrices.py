@@ -4,9 +4,6 @@ Matrix products of three columns reach a small part of the memory's bandwidth, a
 matrices, which is a sum over all pixels.
 """
 
-# pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportIndexIssue=false
-# (Triton's launch syntax, kernel[grid](...), is not in its types.)
-
 from __future__ import annotations
 
 from typing import Any
@@ -97,11 +94,7 @@ class _CorrectColors(torch.autograd.Function):
         return v_render, v_alpha, sums.sum(dim=1)
 
 
-def correct_colors(
-    render: Tensor,  # [C, H, W, 3] float32
-    alpha: Tensor,  # [C, H, W, 1] float32
-    matrices: Tensor,  # [C, 3, 4] float32
-) -> Tensor:
-    """Compute `method.color_matrices.correct_colors`, and raise the same."""
+def correct_colors(render: Tensor, alpha: Tensor, matrices: Tensor) -> Tensor:
+    """Do what `method.color_matrices.correct_colors` does, in float32."""
     check_pixels(*render.shape[:3])
     return _CorrectColors.apply(render.contiguous(), alpha.contiguous(), matrices.contiguous())  # type: ignore[return-value]

@@ -12,9 +12,6 @@ Gaussians of 0.05 px, which only other projections make. A pixel's share of the 
 an error of 5e-4 at most and 2e-4 on average, which shrinks as a Gaussian covers more pixels: 1e-4 from 0.55 px.
 """
 
-# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false
-# (Triton's launch syntax, kernel[grid](...), and its functions are not in its types.)
-
 from __future__ import annotations
 
 from typing import Any
@@ -177,23 +174,14 @@ def _composite_backward(
 
 
 def composite_backward(
-    means2d: Tensor,  # [C, N, 2] px
-    conics: Tensor,  # [C, N, 3] in 1/px²
-    colors: Tensor,  # [C, N, 3]
-    opacities: Tensor,  # [C, N] in [0, 1]
-    isect_offsets: Tensor,  # int32 [C, tile rows, tile columns]
-    flatten_ids: Tensor,  # int32 [number of pairs]
-    alphas: Tensor,  # [C, height, width, 1]
-    last_ids: Tensor,  # int32 [C, height, width]
-    v_renders: Tensor,  # [C, height, width, 3]
-    v_alphas: Tensor | None,  # [C, height, width, 1]
-    absgrad: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]:
-    """Differentiate `composite_forward`, whose arguments and results these are; all tensors are contiguous.
+    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, isect_offsets: Tensor, flatten_ids: Tensor,
+    alphas: Tensor, last_ids: Tensor, v_renders: Tensor, v_alphas: Tensor | None, absgrad: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]:  # fmt: skip
+    """Differentiate `composite_forward`, given its arguments and results; all tensors are contiguous.
 
-    `v_renders` and `v_alphas` are the gradients of its colours and alphas, the latter None where nothing depends on
-    them. A pixel whose gradient is not finite, or at least 1e18, makes the gradients of the Gaussians that it sees NaN,
-    and of no others.
+    `v_renders` and `v_alphas` are the gradients of its colours and alphas; the latter is None where nothing depends on
+    alphas. A pixel whose gradient is not finite, or at least 1e18, makes the gradients of the Gaussians that it sees
+    NaN, and of no others.
 
     Returns:
         Gradients of means2d, conics, colors and opacities, in their shapes, and with `absgrad` the sum of the absolute
@@ -214,21 +202,11 @@ def composite_backward(
 
 
 class _RasterizeToPixels(torch.autograd.Function):
-    """`composite_forward` and `composite_backward`."""
-
     @staticmethod
     def forward(  # type: ignore[override]
-        ctx: Any,
-        means2d: Tensor,  # [C, N, 2]
-        conics: Tensor,  # [C, N, 3]
-        colors: Tensor,  # [C, N, 3]
-        opacities: Tensor,  # [C, N]
-        width: int,
-        height: int,
-        isect_offsets: Tensor,  # [C, tile rows, tile columns]
-        flatten_ids: Tensor,  # [number of pairs]
-        absgrad: bool,
-    ) -> tuple[Tensor, Tensor]:
+        ctx: Any, means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, width: int, height: int,
+        isect_offsets: Tensor, flatten_ids: Tensor, absgrad: bool,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
         ctx.set_materialize_grads(False)  # torch would fill an image with zeros where nothing depends on alphas
         renders, alphas, last_ids = composite_forward(
             means2d, conics, colors, opacities, width, height, isect_offsets, flatten_ids
@@ -255,23 +233,13 @@ class _RasterizeToPixels(torch.autograd.Function):
 
 
 def rasterize_to_pixels(
-    means2d: Tensor,  # [C, N, 2] px
-    conics: Tensor,  # [C, N, 3] in 1/px²
-    colors: Tensor,  # [C, N, 3]
-    opacities: Tensor,  # [C, N] in [0, 1]
-    width: int,
-    height: int,
-    isect_offsets: Tensor,  # int32 [C, tile rows, tile columns]
-    flatten_ids: Tensor,  # int32 [number of pairs]
-    absgrad: bool,
-) -> tuple[Tensor, Tensor]:
-    """Compute `composite_forward`, whose arguments these are, differentiably.
+    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, width: int, height: int,
+    isect_offsets: Tensor, flatten_ids: Tensor, absgrad: bool,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Call `composite_forward` differentiably, and return its colours and alphas.
 
     With `absgrad`, `backward` sets two attributes of `means2d`: `absgrad`, the sum of its absolute gradients, and
     `grad2d`, its gradient, which is None until then: `retain_grad` would copy the gradient.
-
-    Returns:
-        Colours [C, height, width, 3] and alphas [C, height, width, 1].
     """
     means2d = means2d.contiguous()
     if absgrad:

@@ -3,9 +3,6 @@
 A block is [Gaussians, pixels]. With one warp a thread holds all Gaussians of its two pixels.
 """
 
-# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false
-# (Triton's functions are not in its types.)
-
 from __future__ import annotations
 
 import triton

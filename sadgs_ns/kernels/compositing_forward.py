@@ -5,9 +5,6 @@ batches of Gaussians of two pixels, as in the backward pass (compositing.py), so
 wait for one another. The image is the same but for rounding: a weight errs by some 1e-7 of itself.
 """
 
-# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false
-# (Triton's launch syntax, kernel[grid](...), and its functions are not in its types.)
-
 from __future__ import annotations
 
 import triton
@@ -101,20 +98,14 @@ def _composite_forward(
 
 
 def composite_forward(
-    means2d: Tensor,  # [C, N, 2] px
-    conics: Tensor,  # [C, N, 3] in 1/px²
-    colors: Tensor,  # [C, N, 3]
-    opacities: Tensor,  # [C, N] in [0, 1]
-    width: int,
-    height: int,
-    isect_offsets: Tensor,  # int32 [C, tile rows, tile columns]
-    flatten_ids: Tensor,  # int32 [number of pairs]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute gsplat's `rasterize_to_pixels` for three channels in tiles of TILE_SIZE.
+    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, width: int, height: int,
+    isect_offsets: Tensor, flatten_ids: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Do what gsplat's `rasterize_to_pixels` does, for three channels and tiles of TILE_SIZE.
 
-    All tensors must be contiguous. `isect_offsets` tells where each tile's list starts; lists of tiles below the image
-    are passed over. `flatten_ids` are the lists: indices in C·N, from front to back. A colour that is not finite makes
-    the pixels that see it NaN, and no others.
+    All tensors are contiguous, with shapes as in `render.types.Projected`. `isect_offsets` and `flatten_ids` are the
+    `starts` and `ids` of `tiles.TileLists`; lists of tiles below the image are passed over. A colour that is not finite
+    makes the pixels that see it NaN, and no others.
 
     Returns:
         Colours [C, height, width, 3]; alphas [C, height, width, 1]; and the place in the lists of the last Gaussian

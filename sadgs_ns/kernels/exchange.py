@@ -1,11 +1,7 @@
-"""The rows in which projected Gaussians travel between processes, written and read in one launch each.
+"""`pack` and `unpack` of `distributed.exchange` in one launch each.
 
-`distributed.exchange` has both functions in torch, which take a launch for each tensor and read every row once for each
-of its columns.
+In torch they take a launch for each tensor, and read every row once for each of its columns.
 """
-
-# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false
-# (Triton's launch syntax, kernel[grid](...), and its functions are not in its types.)
 
 from __future__ import annotations
 
@@ -65,15 +61,9 @@ def _unpack(
 
 
 def pack(
-    radii: Tensor,  # [V, N] or [V, N, 2]
-    means2d: Tensor,  # [V, N, 2]
-    depths: Tensor,  # [V, N]
-    conics: Tensor,  # [V, N, 3]
-    opacities: Tensor,  # [V, N]
-    colors: Tensor,  # [V, N, 3]
-    places: Tensor,  # [M]
+    radii: Tensor, means2d: Tensor, depths: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, places: Tensor
 ) -> Tensor:
-    """Compute `distributed.exchange.pack` for colours of three channels; all tensors are contiguous."""
+    """Do what `distributed.exchange.pack` does, for colours of three channels and contiguous tensors."""
     per_gaussian = radii.dim() - 1
     rows = means2d.new_empty((len(places), 10 + per_gaussian))
     if len(places):
@@ -85,10 +75,7 @@ def pack(
 
 
 def unpack(rows: Tensor, top: int) -> tuple[Tensor, ...]:
-    """Compute `distributed.exchange.unpack` for colours of three channels.
-
-    `rows` [M, 11 or 12] are contiguous. Return the arguments of `pack` for one view, without `places`.
-    """
+    """Do what `distributed.exchange.unpack` does, for colours of three channels and contiguous rows."""
     n, per_gaussian = len(rows), rows.shape[1] - 10
     radii = rows.new_empty((1, n, 2) if per_gaussian == 2 else (1, n), dtype=torch.int32)
     means2d, conics, colors = (rows.new_empty((1, n, width)) for width in (2, 3, 3))

@@ -4,9 +4,6 @@ gsplat takes all coefficients in one tensor, once per view, while the parameters
 Here nothing is concatenated or expanded, and the gradients arrive summed over the views.
 """
 
-# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false
-# (Triton's launch syntax, kernel[grid](...), and its functions are not in its types.)
-
 from __future__ import annotations
 
 from typing import Any
@@ -52,22 +49,13 @@ def _basis(x, y, z):
     planar, mixed = x * x - y * y, 2 * x * y
     ring = -2.285228997322329 * z * z + 0.4570457994644658
     return (
-        -0.48860251190292 * y,
-        0.48860251190292 * z,
-        -0.48860251190292 * x,
-        0.5462742152960395 * mixed,
-        -1.092548430592079 * y * z,
-        0.9461746957575601 * z * z - 0.3153915652525201,
-        -1.092548430592079 * x * z,
-        0.5462742152960395 * planar,
-        -0.5900435899266435 * (x * mixed + y * planar),
-        1.445305721320277 * z * mixed,
-        ring * y,
-        z * (1.865881662950577 * z * z - 1.119528997770346),
-        ring * x,
-        1.445305721320277 * z * planar,
+        -0.48860251190292 * y, 0.48860251190292 * z, -0.48860251190292 * x,
+        0.5462742152960395 * mixed, -1.092548430592079 * y * z, 0.9461746957575601 * z * z - 0.3153915652525201,
+        -1.092548430592079 * x * z, 0.5462742152960395 * planar,
+        -0.5900435899266435 * (x * mixed + y * planar), 1.445305721320277 * z * mixed, ring * y,
+        z * (1.865881662950577 * z * z - 1.119528997770346), ring * x, 1.445305721320277 * z * planar,
         -0.5900435899266435 * (x * planar - y * mixed),
-    )
+    )  # fmt: skip
 
 
 @triton.jit
@@ -77,56 +65,23 @@ def _slopes(x, y, z):
     planar, mixed = x * x - y * y, 2 * x * y
     ring = -2.285228997322329 * z * z + 0.4570457994644658
     by_x = (
-        zero,
-        zero,
-        zero - 0.48860251190292,
-        1.092548430592079 * y,
-        zero,
-        zero,
-        -1.092548430592079 * z,
-        1.092548430592079 * x,
-        -1.7701307697799304 * mixed,
-        2.890611442640554 * y * z,
-        zero,
-        zero,
-        ring,
-        2.890611442640554 * x * z,
+        zero, zero, zero - 0.48860251190292,
+        1.092548430592079 * y, zero, zero, -1.092548430592079 * z, 1.092548430592079 * x,
+        -1.7701307697799304 * mixed, 2.890611442640554 * y * z, zero, zero, ring, 2.890611442640554 * x * z,
         -1.7701307697799304 * planar,
-    )
+    )  # fmt: skip
     by_y = (
-        zero - 0.48860251190292,
-        zero,
-        zero,
-        1.092548430592079 * x,
-        -1.092548430592079 * z,
-        zero,
-        zero,
-        -1.092548430592079 * y,
-        -1.7701307697799304 * planar,
-        2.890611442640554 * x * z,
-        ring,
-        zero,
-        zero,
-        -2.890611442640554 * y * z,
+        zero - 0.48860251190292, zero, zero,
+        1.092548430592079 * x, -1.092548430592079 * z, zero, zero, -1.092548430592079 * y,
+        -1.7701307697799304 * planar, 2.890611442640554 * x * z, ring, zero, zero, -2.890611442640554 * y * z,
         1.7701307697799304 * mixed,
-    )
+    )  # fmt: skip
     by_z = (
-        zero,
-        zero + 0.48860251190292,
-        zero,
-        zero,
-        -1.092548430592079 * y,
-        1.8923493915151202 * z,
-        -1.092548430592079 * x,
-        zero,
-        zero,
-        1.445305721320277 * mixed,
-        -4.570457994644658 * z * y,
-        5.597644988851731 * z * z - 1.119528997770346,
-        -4.570457994644658 * z * x,
-        1.445305721320277 * planar,
-        zero,
-    )
+        zero, zero + 0.48860251190292, zero,
+        zero, -1.092548430592079 * y, 1.8923493915151202 * z, -1.092548430592079 * x, zero,
+        zero, 1.445305721320277 * mixed, -4.570457994644658 * z * y, 5.597644988851731 * z * z - 1.119528997770346,
+        -4.570457994644658 * z * x, 1.445305721320277 * planar, zero,
+    )  # fmt: skip
     return by_x, by_y, by_z
 
 
@@ -160,22 +115,12 @@ def _forward(
 def _add(sums, basis, v):
     """Sums of the coefficients' gradients [LANES, 4] with one view's added."""
     return (
-        sums[0] + basis[0][:, None] * v,
-        sums[1] + basis[1][:, None] * v,
-        sums[2] + basis[2][:, None] * v,
-        sums[3] + basis[3][:, None] * v,
-        sums[4] + basis[4][:, None] * v,
-        sums[5] + basis[5][:, None] * v,
-        sums[6] + basis[6][:, None] * v,
-        sums[7] + basis[7][:, None] * v,
-        sums[8] + basis[8][:, None] * v,
-        sums[9] + basis[9][:, None] * v,
-        sums[10] + basis[10][:, None] * v,
-        sums[11] + basis[11][:, None] * v,
-        sums[12] + basis[12][:, None] * v,
-        sums[13] + basis[13][:, None] * v,
-        sums[14] + basis[14][:, None] * v,
-    )
+        sums[0] + basis[0][:, None] * v, sums[1] + basis[1][:, None] * v, sums[2] + basis[2][:, None] * v,
+        sums[3] + basis[3][:, None] * v, sums[4] + basis[4][:, None] * v, sums[5] + basis[5][:, None] * v,
+        sums[6] + basis[6][:, None] * v, sums[7] + basis[7][:, None] * v, sums[8] + basis[8][:, None] * v,
+        sums[9] + basis[9][:, None] * v, sums[10] + basis[10][:, None] * v, sums[11] + basis[11][:, None] * v,
+        sums[12] + basis[12][:, None] * v, sums[13] + basis[13][:, None] * v, sums[14] + basis[14][:, None] * v,
+    )  # fmt: skip
 
 
 # The colours' gradients may be parts of rows that begin at no multiple of 16 bytes: Triton would compile a new kernel.
@@ -271,17 +216,12 @@ class _Colors(torch.autograd.Function):
 
 
 def colors_from_harmonics(
-    degree: int,
-    means: Tensor,  # [N, 3] float32
-    first: Tensor,  # [N, 3]
-    rest: Tensor,  # [N, K − 1, 3]
-    viewmats: Tensor,  # [C, 4, 4], without gradient
-    radii: Tensor,  # int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5
+    degree: int, means: Tensor, first: Tensor, rest: Tensor, viewmats: Tensor, radii: Tensor
 ) -> Tensor:
     """Colours that 3DGS gives Gaussians seen from cameras: max(Σ_k Y_k(direction) · coefficient_k + 0.5, 0). [C, N, 3]
 
-    `first` are the coefficients of degree 0, `rest` those of the higher degrees, at least up to `degree`, which is at
-    most 3. Where a radius is not positive, the colour means nothing.
+    `first` and `rest` are the pair of `render.types.Gaussians.colors`, float32, with coefficients at least up to
+    `degree` ≤ MAX_DEGREE. `viewmats` get no gradient. Where a radius is not positive, the colour means nothing.
     """
     tensors = (value.contiguous() for value in (means, first, rest, viewmats, radii))
     return _Colors.apply(*tensors, (degree + 1) ** 2 - 1)  # type: ignore[return-value]

@@ -5,9 +5,6 @@ so that the adjoint of a blur is the same blur of the zero-padded map. Sizes are
 compile the kernels anew for other images.
 """
 
-# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
-# (Triton's launch syntax, kernel[grid](...), is not in its types.)
-
 from __future__ import annotations
 
 import math
@@ -197,14 +194,9 @@ def _gradient(
 class _PhotometricLoss(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
-        x: Tensor,  # [C, H, W, 3]
-        y: Tensor,  # [C, H, W, 3]
-        window: tuple[float, ...],
-        ssim_lambda: float,
-        l2_lambda: float,
-        parts: Tensor | None,  # [P]
-    ) -> tuple[Tensor, Tensor]:
+        ctx: Any, x: Tensor, y: Tensor, window: tuple[float, ...], ssim_lambda: float, l2_lambda: float,
+        parts: Tensor | None,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
         views, height, width, _ = x.shape
         n, row = x.numel(), 3 * width
         blurred, slopes = x.new_empty((5, n)), x.new_empty((3, n))
@@ -242,18 +234,13 @@ class _PhotometricLoss(torch.autograd.Function):
 
 
 def photometric_loss(
-    predicted: Tensor,  # [C, H, W, 3] float32
-    target: Tensor,  # [C, H, W, 3] float32 in [0, 1] or uint8
-    window: tuple[float, ...],
-    *,
-    ssim_lambda: float,
-    l2_lambda: float,
-    parts: Tensor | None = None,  # [P] contiguous float32
-) -> tuple[Tensor, Tensor]:
-    """Compute `method.losses.photometric_loss` for views at least as large as SSIM's window.
+    predicted: Tensor, target: Tensor, window: tuple[float, ...],
+    *, ssim_lambda: float, l2_lambda: float, parts: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Do what `method.losses.photometric_loss` does, for views at least as large as SSIM's window.
 
-    `window` has the weights of that window along one axis, and is symmetric. Raises InputError if the views have more
-    pixels than the kernels can address (limits.py).
+    `window` holds the window's weights along one axis, and is symmetric. `predicted` and `parts` are float32, and
+    `parts` is contiguous.
     """
     check_pixels(*predicted.shape[:3])
     return _PhotometricLoss.apply(  # type: ignore[return-value]

@@ -6,9 +6,6 @@ fills and copies it is eight launches. Here each Gaussian's gradients are summed
 once, and what else depends on the centres is added on the way. The formulas are those of gsplat 1.4.0 and 1.5.3.
 """
 
-# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false
-# (Triton's launch syntax, kernel[grid](...), and its functions are not in its types.)
-
 from __future__ import annotations
 
 from typing import Any
@@ -220,21 +217,11 @@ def _rows(gradient: Tensor | None, like: Tensor) -> tuple[Tensor, int]:
 
 
 class _Project(torch.autograd.Function):
-    """gsplat's forward pass and `_project_backward`."""
-
     @staticmethod
     def forward(  # type: ignore[override]
-        ctx: Any,
-        means: Tensor,  # [N, 3]
-        quats: Tensor,  # [N, 4]
-        scales: Tensor,  # [N, 3]
-        opacities: Tensor,  # [N]
-        viewmats: Tensor,  # [C, 4, 4]
-        Ks: Tensor,  # [C, 3, 3]
-        width: int,
-        height: int,
-        near_plane: float,
-    ) -> tuple[Tensor | None, ...]:
+        ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor,
+        width: int, height: int, near_plane: float,
+    ) -> tuple[Tensor | None, ...]:  # fmt: skip
         radii, means2d, depths, conics = gsplat_compat.project(
             means, quats, scales, opacities, viewmats, Ks, width, height, near_plane
         )
@@ -248,13 +235,9 @@ class _Project(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(  # type: ignore[override]
-        ctx: Any,
-        _: None,
-        v_means2d: Tensor | None,
-        v_depths: Tensor | None,
-        v_conics: Tensor | None,
+        ctx: Any, _: None, v_means2d: Tensor | None, v_depths: Tensor | None, v_conics: Tensor | None,
         v_passed: Tensor | None,
-    ) -> tuple[Tensor | None, ...]:
+    ) -> tuple[Tensor | None, ...]:  # fmt: skip
         means, quats, scales, viewmats, Ks, radii, means2d, conics = ctx.saved_tensors
         v_means, v_quats, v_scales = torch.empty_like(means), torch.empty_like(quats), torch.empty_like(scales)
         (v_means2d, row2d), (v_conics, row_conic) = _rows(v_means2d, means2d), _rows(v_conics, conics)
@@ -271,21 +254,15 @@ class _Project(torch.autograd.Function):
 
 
 def project(
-    means: Tensor,  # [N, 3] float32
-    quats: Tensor,  # [N, 4]
-    scales: Tensor,  # [N, 3]
-    opacities: Tensor,  # [N], without gradient, as the cameras
-    viewmats: Tensor,  # [C, 4, 4]
-    Ks: Tensor,  # [C, 3, 3]
-    width: int,
-    height: int,
-    near_plane: float = NEAR_PLANE,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Compute `gsplat_compat.project`, but differentiate it with one kernel.
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor,
+    width: int, height: int, near_plane: float = NEAR_PLANE,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    """Do what `gsplat_compat.project` does, but with one kernel backward. Opacities and cameras get no gradient.
 
     Returns:
-        What `gsplat_compat.project` returns, whose radii may be set to 0 in place until the backward pass; and
-        `means`. If what else depends on the centres takes this tensor, the backward kernel adds its gradient to theirs.
+        The results of `gsplat_compat.project`, whose radii may be set to 0 in place until the backward pass; and
+        `means`. Let everything else that depends on the centres take this tensor: the backward kernel then adds its
+        gradient on the way.
     """
     tensors = (value.contiguous() for value in (means, quats, scales, opacities, viewmats, Ks))
     return _Project.apply(*tensors, width, height, near_plane)  # type: ignore[return-value]

@@ -1,8 +1,5 @@
 """`method.quantization.quantize` in one kernel."""
 
-# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
-# (Triton's launch syntax, kernel[grid](...), is not in its types.)
-
 from __future__ import annotations
 
 import torch
@@ -48,15 +45,7 @@ def _quantize(
 
 
 def quantize(tensor: Tensor, highest_frequency: float, octaves: float, invalid: int) -> Tensor:
-    """Compute `method.quantization.quantize`; a byte may be its neighbour if rounding decides.
-
-    Args:
-        tensor: S̄ as (xx, xy, yy) in 1/px², finite or NaN, float32. [..., 3]
-        highest_frequency, octaves, invalid: The constants of `method.quantization`.
-
-    Returns:
-        uint8 [..., 3]
-    """
+    """Do what `method.quantization.quantize` does in float32, with its constants; rounding may change a byte by 1."""
     tensor = tensor.contiguous()
     quantized = torch.empty_like(tensor, dtype=torch.uint8)
     n = tensor.numel() // 3

@@ -1,8 +1,5 @@
 """`method.screen_gradients.accumulate_gradients` in one kernel."""
 
-# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
-# (Triton's launch syntax, kernel[grid](...), is not in its types.)
-
 from __future__ import annotations
 
 import triton
@@ -47,20 +44,12 @@ def _accumulate_gradients(
 
 
 def accumulate_gradients(
-    sums: tuple[Tensor, Tensor, Tensor],
-    radii: Tensor,
-    gradient: Tensor,
-    absolute: Tensor,
-    scales: tuple[float, float],
+    sums: tuple[Tensor, Tensor, Tensor], radii: Tensor, gradient: Tensor, absolute: Tensor, scales: tuple[float, float]
 ) -> None:
-    """Compute `method.screen_gradients.accumulate_gradients`; a gradient longer than 1e19 counts as infinite.
+    """Do what `method.screen_gradients.accumulate_gradients` does, except that a gradient longer than 1e19 counts as infinite.
 
-    Args:
-        sums: grad2d, absgrad2d and grad_count, contiguous float32, updated in place. Each [N]
-        radii: px, int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5; not positive if a Gaussian was culled.
-        gradient, absolute: The loss's gradient by the centres in px, and the sum of its absolute values over the
-            pixels, float32; they may be parts of the rows of larger tensors. [C, N, 2]
-        scales: Factors of the x and y components of both.
+    `sums` are grad2d, absgrad2d and grad_count, contiguous float32. The gradient of the centres and its absolute sum
+    over the pixels, float32 [C, N, 2], may be parts of the rows of larger tensors; `scales` multiply their x and y.
     """
     num_views, n = radii.shape[:2]
     # The kernel reads parts of rows where they lie, but expects x and y side by side: other layouts are copied.

@@ -1,8 +1,5 @@
 """`method.statistics.observed_eta` in one kernel: project the axes, and sample S̄ in the footprint."""
 
-# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false
-# (Triton's launch syntax, kernel[grid](...), and its functions are not in its types.)
-
 from __future__ import annotations
 
 import triton
@@ -147,21 +144,14 @@ def _observe(
 
 
 def observed_eta(
-    params: tuple[Tensor, Tensor, Tensor],  # means [N, 3], quats [N, 4] and log scales [N, 3]; float32
-    radii: Tensor,  # int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5, px; not positive where nothing was drawn
-    means2d: Tensor,  # [C, N, 2] px
-    conics: Tensor,  # [C, N, 3] in 1/px²
-    jitter: Tensor,  # [C, N, 2] in [0, 1)
-    structure_tensors: Tensor,  # [C, H, W, 3] in 1/px², or quantized
-    viewmats: Tensor,  # [C, 4, 4]
-    Ks: Tensor,  # [C, 3, 3] px
-    *,
-    constants: tuple[float, float, float],
-    quantization: tuple[float, float, int],
-) -> Tensor:
-    """Compute `method.statistics.observed_eta`. [C, N, 3]
+    params: tuple[Tensor, Tensor, Tensor], radii: Tensor, means2d: Tensor, conics: Tensor, jitter: Tensor,
+    structure_tensors: Tensor, viewmats: Tensor, Ks: Tensor,
+    *, constants: tuple[float, float, float], quantization: tuple[float, float, int],
+) -> Tensor:  # fmt: skip
+    """Do what `method.statistics.observed_eta` does, given the tensors of `info`. [C, N, 3]
 
     Args:
+        params: means, quats and log scales, float32.
         constants: gsplat's blur in px², its margin of the frustum, and ε of the wavelength in 1/px.
         quantization: HIGHEST_FREQUENCY, OCTAVES and INVALID of `method.quantization`.
     """

@@ -5,9 +5,6 @@ cuDNN's depthwise convolutions take several times as long for these long kernels
 rest of a level.
 """
 
-# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
-# (Triton's launch syntax, kernel[grid](...), is not in its types.)
-
 from __future__ import annotations
 
 import torch
@@ -103,13 +100,7 @@ def _aggregate(
 
 
 def correlate(image: Tensor, kernel: Tensor, axis: int) -> Tensor:
-    """Compute `_correlate` of `method.structure_tensor` in float32.
-
-    Args:
-        image: float32 [B, C, H, W]
-        kernel: K is odd, float32. [K]
-        axis: 2 for rows (y), 3 for columns (x).
-    """
+    """Do what `method.structure_tensor._correlate` does, in float32."""
     image = image.contiguous()
     batch, channels, height, width = image.shape
     result = torch.empty_like(image)
@@ -122,7 +113,7 @@ def correlate(image: Tensor, kernel: Tensor, axis: int) -> Tensor:
 def differentiate(
     blurs: tuple[Tensor, Tensor, Tensor], totals: tuple[Tensor, Tensor, Tensor], weight: Tensor, previous: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute `_differentiate` of `method.structure_tensor` in float32; the first of `blurs` is overwritten."""
+    """Do what `method.structure_tensor._differentiate` does, in float32; the first of `blurs` is overwritten."""
     batch, channels, height, width = blurs[0].shape
     products, energy = (blurs[0].new_empty((batch, planes, height, width)) for planes in (3, 1))
     n = height * width
@@ -134,15 +125,10 @@ def differentiate(
 
 
 def aggregate(
-    tensor: tuple[Tensor, Tensor],
-    energy: tuple[Tensor, Tensor],
-    trace_floor: Tensor,
-    numerator: Tensor,
-    denominator: Tensor,
-    exponent: float,
-    frequency: float,
-) -> None:
-    """Compute `_aggregate` of `method.structure_tensor` in float32."""
+    tensor: tuple[Tensor, Tensor], energy: tuple[Tensor, Tensor], trace_floor: Tensor,
+    numerator: Tensor, denominator: Tensor, exponent: float, frequency: float,
+) -> None:  # fmt: skip
+    """Do what `method.structure_tensor._aggregate` does, in float32."""
     n = tensor[0].shape[2] * tensor[0].shape[3]
     _aggregate[cdiv(n, _PIXELS), len(tensor[0])](
         *tensor, *energy, trace_floor, numerator, denominator,

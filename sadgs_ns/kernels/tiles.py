@@ -6,9 +6,6 @@ by pixel, forward and backward. Here a tile is listed only if the ellipse meets 
 is drawn stays the same.
 """
 
-# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false
-# (Triton's launch syntax, kernel[grid](...), and its functions are not in its types.)
-
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -274,11 +271,7 @@ class PairCounts:
 
     @staticmethod
     def sent(counts: Tensor) -> PairCounts:
-        """Start to copy the numbers to the host.
-
-        Args:
-            counts: On any device; they may change after this call. int64 [C]
-        """
+        """Start to copy numbers, int64 [C], from any device to the host; they may change after this call."""
         if counts.device.type != "cuda":
             return PairCounts(counts.clone(), None)
         on_host = torch.empty(counts.shape, dtype=torch.int64, pin_memory=True).copy_(counts, non_blocking=True)
@@ -375,27 +368,14 @@ class PendingTiles:
 
 @torch.no_grad()
 def intersect_tiles(
-    means2d: Tensor,  # [C, N, 2] px
-    radii: Tensor,  # int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5, px; not positive where a Gaussian was culled
-    depths: Tensor,  # [C, N] along the viewing axis
-    conics: Tensor,  # [C, N, 3] in 1/px²
-    opacities: Tensor,  # [C, N] in [0, 1]
-    width: int,
-    height: int,
-    tile_size: int,
-    max_off_axis: float = 0.0,
-) -> PendingTiles:
-    """Begin to list the Gaussians of each tile; in place of gsplat's `isect_tiles` and `isect_offset_encode`.
+    means2d: Tensor, radii: Tensor, depths: Tensor, conics: Tensor, opacities: Tensor,
+    width: int, height: int, tile_size: int, max_off_axis: float = 0.0,
+) -> PendingTiles:  # fmt: skip
+    """Begin to list the Gaussians of each tile, in place of gsplat's `isect_tiles` and `isect_offset_encode`.
 
-    Args:
-        radii: They should be contiguous: they are set to 0 where a Gaussian is culled here, and by `lists` where its
-            capacity is too small, which would happen to a copy of others.
-        tile_size: Side of a tile in px, a power of two.
-        max_off_axis: Gaussians whose centre is further from the image's centre, in halves of its width and height along
-            x and y, are culled, as `render.off_axis.cull_off_axis` does; 0 culls none.
-
-    Returns:
-        An object that makes the lists when it is asked for them; by then the host should have given the device work.
+    The tensors are those of `render.types.Projected`. The radii should be contiguous: they are set to 0 in place where
+    a Gaussian is culled here, as `render.off_axis.cull_off_axis` does, and by `lists` where its capacity is too small.
+    `tile_size`, in px, is a power of two. Give the device other work before asking the result for its lists.
     """
     num_views, num_gaussians = means2d.shape[:2]
     tile_width, tile_height = cdiv(width, tile_size), cdiv(height, tile_size)

@@ -1,8 +1,5 @@
 """The smallest kernel, which shows whether Triton works on a device."""
 
-# pyright: reportArgumentType=false, reportIndexIssue=false
-# (Triton's launch syntax, kernel[grid](...), is not in its types.)
-
 from __future__ import annotations
 
 import torch
