@@ -109,29 +109,29 @@ class Exchange:
 
 
 class _Exchanged(torch.autograd.Function):
-    """Forward: `Exchange.forth`; backward: `Exchange.back`, with the absolute gradients beside the gradients."""
+    """Send forward with `Exchange.forth`, and gradients back with `Exchange.back`, the absolute ones beside them."""
 
     @staticmethod
-    def forward(  # type: ignore[override]
-        ctx: Any,
-        exchange: Exchange,
-        absgrad: bool,
-        radii: Tensor,  # [V, N] or [V, N, 2]
-        means2d: Tensor,  # [V, N, 2]
-        depths: Tensor,  # [V, N]
-        conics: Tensor,  # [V, N, 3]
-        opacities: Tensor,  # [V, N]
-        colors: Tensor,  # [V, N, D]
-    ) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, exchange: Exchange, absgrad: bool, *projected: Tensor) -> tuple[Tensor, ...]:  # type: ignore[override]
+        _, means2d, _, _, opacities, colors = projected
         ctx.set_materialize_grads(False)
         ctx.exchange, ctx.absgrad, ctx.shape = exchange, absgrad, opacities.shape
         ctx.save_for_backward(means2d)
         ctx.num_colors = colors.shape[-1]
-        rows, outputs = _rows_of((radii, means2d, depths, conics, opacities, colors), exchange), []
+        if exchange.fused:
+            from sadgs_ns.kernels import exchange as kernel  # Triton need not be installed.
+
+            rows = kernel.pack(*(value.detach().contiguous() for value in projected), places=exchange.places)
+        else:
+            kernel, rows = None, pack([value.detach() for value in projected], exchange.places)
+        outputs = []
         for band, received in zip(exchange.bands, exchange.forth(rows), strict=True):
             if not len(received):
                 received = received.new_zeros((1, received.shape[1]))  # A Gaussian whose radius is 0 is not drawn.
-            part = _splats_of(received, ctx.num_colors, band.top, exchange)
+            if kernel is None:
+                part = unpack(received, ctx.num_colors, band.top)
+            else:
+                part = kernel.unpack(received.contiguous(), band.top)
             ctx.mark_non_differentiable(part[0])
             outputs += part
         return means2d.new_zeros(()), *outputs
@@ -186,25 +186,6 @@ def unpack(rows: Tensor, num_colors: int, top: int) -> tuple[Tensor, ...]:
     return radii, means2d, depths[..., 0], conics, opacities[..., 0], colors
 
 
-def _rows_of(projected: Sequence[Tensor], exchange: Exchange) -> Tensor:
-    """Call `pack`, or its kernel."""
-    projected = [value.detach() for value in projected]
-    if not exchange.fused:
-        return pack(projected, exchange.places)
-    from sadgs_ns.kernels.exchange import pack as pack_fused  # Triton need not be installed.
-
-    return pack_fused(*(value.contiguous() for value in projected), places=exchange.places)
-
-
-def _splats_of(rows: Tensor, num_colors: int, top: int, exchange: Exchange) -> tuple[Tensor, ...]:
-    """Call `unpack`, or its kernel."""
-    if not exchange.fused:
-        return unpack(rows, num_colors, top)
-    from sadgs_ns.kernels.exchange import unpack as unpack_fused
-
-    return unpack_fused(rows.contiguous(), top)
-
-
 def _gradient_rows(columns: Sequence[Tensor | None], widths: Sequence[int], number: int, like: Tensor) -> Tensor:
     """Put gradients of one view, or zeros for None, into M rows, unless they are parts of such rows already.
 
@@ -230,15 +211,10 @@ def _reached(projected: Projected, bands: Sequence[Band]) -> Tensor:
     visible = drawn(radii, means2d)  # [V, N]
     if all(band.view == index for index, band in enumerate(bands)) and len(bands) == len(visible):
         return visible
-    reach = radii[..., 1] if radii.dim() == 3 else radii  # [V, N]
-    y = means2d[..., 1]
+    y, reach = means2d[..., 1], radii[..., 1] if radii.dim() == 3 else radii  # [V, N]
+    below, above = y + reach, y - reach
     return torch.stack(
-        [
-            visible[band.view]
-            & (y[band.view] + reach[band.view] > band.top)
-            & (y[band.view] - reach[band.view] < band.bottom)
-            for band in bands
-        ]
+        [visible[band.view] & (below[band.view] > band.top) & (above[band.view] < band.bottom) for band in bands]
     )
 
 

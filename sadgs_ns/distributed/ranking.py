@@ -25,13 +25,12 @@ def limit_growth(world: World, growth: Tensor, priority: Tensor, budget: float) 
     130 to 160).
 
     Args:
-        world: The processes.
-        growth: Gaussians that each one would add, ≥ 0. int64 [N]
+        growth: Gaussians that each one of this process would add, ≥ 0. int64 [N]
         priority: Larger comes first, ≥ 0. [N]
         budget: Gaussians that may be added in all, the same in all processes; ≤ 0 allows none.
 
     Returns:
-        The chosen ones of this process, among them none that does not grow. bool [N]
+        The chosen ones of this process; those that would add none are never chosen. bool [N]
     """
     # The bits of floats that are not negative have the order of the floats.
     bits = priority.float().contiguous().view(torch.int32)

@@ -15,7 +15,7 @@ from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
 
 
 class Picture(NamedTuple):
-    """What this process composited of some views, or of one."""
+    """Rows of one view, or all views, that this process composited."""
 
     band: Band | None
     """Which rows of one view they are, from `band.top` to `band.bottom`, and which of them count. None is all rows of
@@ -29,22 +29,17 @@ class Picture(NamedTuple):
 def rasterize(
     world: World, gaussians: Gaussians, cameras: Cameras, options: RenderOptions
 ) -> tuple[list[Picture], dict[str, Any]]:
-    """Render the Gaussians of all processes into V cameras, of which each process composites its share.
+    """Render the Gaussians of all processes into V cameras; each process composites its share of the rows.
 
-    Every process must call this, and `backward` of something to which the anchor was added, in the same order. Raises
-    InputError as `render.rasterization.rasterize`.
-
-    Args:
-        world: The processes, whose `sizes` are right.
-        gaussians: Those of this process.
-        cameras: The same in all processes; with several, `viewmats` gets no gradient.
-        options: The same in all processes. Several wait for the exact lengths of tile lists.
+    Every process must call this with the same cameras and options, and then `backward`, in the same order. `gaussians`
+    are those of this process, and `world.sizes` must be right. Several processes wait for the exact lengths of tile
+    lists, and give `viewmats` no gradient. Raises InputError as `render.rasterization.rasterize`.
 
     Returns:
-        What this process composited, one picture of everything where it is alone; and the `info` of this process's
-        Gaussians in all views. With several processes, `info` has `anchor`, a zero that must be added to the loss;
-        `num_pairs` and `num_pixels` of what this process composited; and, after `backward`, `absgrad` and `grad2d` of
-        `means2d` where `absgrad` was asked for.
+        The pictures that this process composited, a single one of everything where it is alone; and the `info` of this
+        process's Gaussians in all views. With several processes, `info` has `anchor`, a zero that must be added to the
+        loss; `num_pairs` and `num_pixels` that this process composited; and, after `backward` with `absgrad`, `absgrad`
+        and `grad2d` of `means2d`.
     """
     if world.alone:
         colors, alphas, info = render.rasterize(gaussians, cameras, options)

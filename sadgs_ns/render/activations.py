@@ -1,4 +1,4 @@
-"""What the rasterizer takes of the parameters that are optimized: standard deviations and opacities."""
+"""From the parameters that are optimized to standard deviations and opacities."""
 
 from __future__ import annotations
 
@@ -8,21 +8,11 @@ from torch import Tensor
 from sadgs_ns.kernels import use_triton
 
 
-def activate(
-    log_scales: Tensor,  # [N, 3]
-    logits: Tensor,  # [N, 1]
-    penalty: float = 0.0,
-) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Compute standard deviations and opacities, and a penalty on the opacities.
+def activate(log_scales: Tensor, logits: Tensor, penalty: float = 0.0) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Compute the `scales` [N, 3] and `opacities` [N] of `Gaussians` from their logarithms [N, 3] and logits [N, 1].
 
-    Args:
-        log_scales: Logarithms of the standard deviations along the Gaussians' axes, in world units. [N, 3]
-        logits: Logits of the opacities. [N, 1]
-        penalty: Factor on the mean opacity, at least 0.
-
-    Returns:
-        Standard deviations in world units [N, 3]; opacities in [0, 1] [N]; and numbers [P] whose sum is their mean
-        times `penalty`, and of which nothing but the sum may be differentiated, or None where `penalty` is 0.
+    Also return numbers [P] whose sum is the mean opacity times `penalty` ≥ 0, or None where `penalty` is 0.
+    Differentiate their sum only.
     """
     if use_triton(logits):
         from sadgs_ns.kernels.activations import activate as fused_activate

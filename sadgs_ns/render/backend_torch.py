@@ -1,7 +1,6 @@
-"""Gaussian splatting in plain torch, for machines without a CUDA device.
+"""Gaussian splatting in plain torch, to train and test on a CPU.
 
-It draws what gsplat draws, with the same cut-offs and tile lists, in float32 or float64, on any device, so that models
-and densification strategies can be trained and tested on a CPU; on a GPU gsplat is much faster.
+It draws as gsplat does, with the same cut-offs and tile lists, in float32 or float64, on any device.
 
 Compositing is an autograd function which handles bounded chunks of (pixel, Gaussian) pairs and evaluates them again in
 the backward pass, so that the peak memory does not grow with the number of pairs.
@@ -164,14 +163,8 @@ def _radii(means2d: Tensor, covars2d: Tensor, opacities: Tensor, valid: Tensor, 
 
 
 @torch.no_grad()
-def _bin_into_tiles(
-    means2d: Tensor,  # [C, N, 2]
-    depths: Tensor,  # [C, N]
-    extents: Tensor,  # [C, N, 2]
-    width: int,
-    height: int,
-) -> _Tiles:
-    """Make the tiles' lists, as gsplat's `isect_tiles` and `isect_offset_encode` do."""
+def _bin_into_tiles(means2d: Tensor, depths: Tensor, extents: Tensor, width: int, height: int) -> _Tiles:
+    """Make the tiles' lists, as gsplat's `isect_tiles` and `isect_offset_encode` do. `extents` are radii [C, N, 2]."""
     C, N = depths.shape
     device, tile_size = means2d.device, TILE_SIZE
     tile_width, tile_height = math.ceil(width / tile_size), math.ceil(height / tile_size)
@@ -210,13 +203,7 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,
-        means2d: Tensor,  # [C, N, 2]
-        conics: Tensor,  # [C, N, 3]
-        colors: Tensor,  # [C, N, D]
-        opacities: Tensor,  # [C, N]
-        tiles: _Tiles,
-        absgrad: bool,
+        ctx: Any, means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, tiles: _Tiles, absgrad: bool
     ) -> Tensor:
         # Alpha is the image of Gaussians of colour one.
         values = torch.cat([colors, torch.ones_like(colors[..., :1])], dim=-1).flatten(0, 1)  # [C * N, D + 1]
@@ -277,16 +264,13 @@ def _chunks(tiles: _Tiles) -> Iterator[tuple[Tensor, int]]:
 
 
 def _segment(
-    means2d: Tensor,  # [C, N, 2]
-    conics: Tensor,  # [C, N, 3]
-    opacities: Tensor,  # [C, N]
-    tiles: _Tiles,
-    chunk: Tensor,  # [B]
-    begin: int,
-    length: int,
-    start: Tensor,  # [B, S, S] transmittance before the segment
-) -> _Segment:
-    """Alpha, transmittance and weight of each (pixel, Gaussian) pair of the lists' entries from `begin`."""
+    means2d: Tensor, conics: Tensor, opacities: Tensor, tiles: _Tiles, chunk: Tensor, begin: int, length: int,
+    start: Tensor,
+) -> _Segment:  # fmt: skip
+    """Composite the entries from `begin` of the lists of a chunk of tiles [B], before which `start` is left [B, S, S].
+
+    `length` is that of the longest list.
+    """
     positions = torch.arange(begin, min(begin + _SEGMENT, length), device=means2d.device)
     counts = tiles.counts[chunk, None]  # [B, 1]
     # The padding repeats a tile's own last Gaussian, with opacity zero.
@@ -311,13 +295,13 @@ def _segment(
 
 
 def _segment_gradients(
-    segment: _Segment,
-    colors: Tensor,  # [B, L, D]
-    v_colors: Tensor,  # [B, S * S, D]
-    behind: Tensor,  # [B, S * S, 1] what is behind the segment, dotted with v_colors
-    absgrad: bool,
+    segment: _Segment, colors: Tensor, v_colors: Tensor, behind: Tensor, absgrad: bool
 ) -> tuple[Tensor, Tensor]:
-    """Gradients [B * L, 6 + D (+ 2)] of means2d, conics, opacity, colours (and absgrad), and what is behind `begin`."""
+    """Gradients [B * L, 6 + D (+ 2)] of means2d, conics, opacity, colours (and absgrad), and the new `behind`.
+
+    `colors` are [B, L, D], their pixels' gradients [B, S * S, D]. `behind` is the colour behind the segment, dotted
+    with these gradients [B, S * S, 1].
+    """
     dx, dy, alphas, weights = segment.dx, segment.dy, segment.alphas, segment.weights
     a, b, c = segment.conics
     dots = v_colors @ colors.mT  # [B, S * S, L]

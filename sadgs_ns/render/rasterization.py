@@ -99,27 +99,14 @@ def _backend(wanted: BackendName, device: torch.device) -> Any:
 
 
 def visible(info: Mapping[str, Any]) -> Tensor:
-    """Tell which Gaussians were drawn, from an `info` of gsplat 1.4 (one radius) or 1.5 (a radius for each axis).
-
-    Args:
-        info: Third value of `rasterize`, or gsplat's.
-
-    Returns:
-        bool [C, N]
-    """
+    """Tell which Gaussians were drawn, from the `info` of `rasterize` or of gsplat 1.4 or 1.5. bool [C, N]"""
     return gsplat_compat.drawn(info["radii"], info["means2d"])
 
 
-def viewmats_from_camera_to_world(
-    camera_to_worlds: Tensor,  # [C, 3, 4]
-) -> Tensor:
-    """Make world-to-camera transforms for `rasterize` from camera poses as nerfstudio has them.
+def viewmats_from_camera_to_world(camera_to_worlds: Tensor) -> Tensor:
+    """Make `Cameras.viewmats` [C, 4, 4] from nerfstudio's poses [C, 3, 4].
 
-    Args:
-        camera_to_worlds: Camera-to-world poses, OpenGL axes (x right, y up, z backward), orthonormal. [C, 3, 4]
-
-    Returns:
-        World-to-camera, OpenCV axes (x right, y down, z forward). [C, 4, 4]
+    Those are orthonormal, from camera to world, in OpenGL's axes (x right, y up, z backward).
     """
     flip = camera_to_worlds.new_tensor([1.0, -1.0, -1.0])
     rotations = (camera_to_worlds[:, :, :3] * flip).mT  # [C, 3, 3], the inverse of an orthonormal matrix

@@ -1,4 +1,4 @@
-"""Foresees how long the tile lists of a training step will be, so that the host need not wait for their length.
+"""Predicts how long the tile lists of a training step will be, so that the host need not wait for their length.
 
 The number of pairs of a Gaussian and a tile changes little between two visits of a view, except where densification
 lies between them. Views that were visited since then tell by how much it changed.
@@ -25,15 +25,10 @@ _LEAST_STEP = 4096
 
 
 class Counts(Protocol):
-    """Numbers of pairs of views that were rendered together, on their way to the host (`kernels.tiles.PairCounts`)."""
+    """As `kernels.tiles.PairCounts`, for which Triton must be installed."""
 
-    def ready(self) -> bool:
-        """Tell whether they have arrived, without waiting."""
-        ...
-
-    def wait(self) -> list[int]:
-        """Wait until they have arrived, and return one for each view."""
-        ...
+    def ready(self) -> bool: ...
+    def wait(self) -> list[int]: ...
 
 
 class _Visit(NamedTuple):
@@ -50,10 +45,11 @@ class _Call(NamedTuple):
 
 
 class TileForecast:
-    """What is known of the numbers of pairs of the training views, and the capacities that follow from them.
+    """Remembers how many pairs the training views had, and derives the capacity of tile lists from it.
 
     For each call of the rasterizer, `capacity` says how many places its tile lists should have, and `rendered` takes
-    the exact numbers, which arrive later. `overflowed` reads those that have arrived.
+    the exact numbers, which arrive later. `overflowed` reads those that have arrived. Views are the indices of training
+    views, and `size` the width and height in px in which they were rendered.
 
     Attributes:
         coarse: Whether capacities are rounded up to powers of two and one and a half times these, so that only few
@@ -70,18 +66,12 @@ class TileForecast:
         self.times_overflowed = 0
 
     def capacity(self, views: Sequence[int], size: tuple[int, int], num_gaussians: int) -> int | None:
-        """Foresee how many places the tile lists of a call should have.
+        """Predict how many places the tile lists of a call should have.
 
-        Args:
-            views: Indices of the training views that the call renders.
-            size: Width and height in px of its images; nothing is known of a view in a size that it never had.
-            num_gaussians: Number of Gaussians.
-
-        Returns:
-            The sum over the views of the number at the last visit, times the largest recent change of any view (if that
-            is a growth), times MARGIN, rounded up so that few different numbers occur. None where a view was not
-            visited yet, where its last visit was before a densification and no view has shown yet what changed since,
-            or where there are more than MOST_PAIRS: then the host must wait for the exact number.
+        It is the sum over the views of the number at the last visit in this size, times the largest recent growth of
+        any view, times MARGIN, rounded up so that few different numbers occur. None means that the host must wait for
+        the exact number: a view was not visited yet, or not since a densification and neither was any other, or there
+        are more than MOST_PAIRS.
         """
         if num_gaussians != self._num_gaussians:
             self._epoch, self._num_gaussians = self._epoch + 1, num_gaussians
@@ -99,24 +89,16 @@ class TileForecast:
         return rounded if rounded <= MOST_PAIRS else None
 
     def rendered(self, views: Sequence[int], size: tuple[int, int], capacity: int | None, counts: Counts) -> None:
-        """Take the exact numbers of a call, which may not have arrived yet.
+        """Take the exact numbers of the call for which `capacity` was asked last; they may not have arrived yet.
 
-        Args:
-            views: As passed to `capacity` for this call, which must have been the latest one; so is `size`.
-            size: Width and height in px.
-            capacity: What the tile lists had place for; None if they had the exact length.
-            counts: The numbers of pairs of the views.
+        `capacity` is None if the tile lists had the exact length.
         """
         self._calls.append(_Call(views, size, self._epoch, capacity, counts))
 
     def overflowed(self, *, wait: bool = False) -> list[int]:
-        """Learn from the numbers that have arrived.
+        """Learn from the numbers that have arrived, or wait for all, and return the views of calls that overflowed.
 
-        Args:
-            wait: Whether to wait for those of all calls.
-
-        Returns:
-            The views of calls that needed more places than they had, and therefore drew nothing.
+        Such calls needed more places than they had, and therefore drew nothing.
         """
         lost: list[int] = []
         while self._calls and (wait or self._calls[0].counts.ready()):
