@@ -28,11 +28,7 @@ class RunningMean:
 
     @torch.no_grad()
     def add(self, params: Params) -> None:
-        """Take an iteration's parameters into the mean.
-
-        Args:
-            params: Parameters by name, of the same shapes each time. [N, …]
-        """
+        """Take an iteration's parameters into the mean, of the same shapes each time."""
         self.count += 1
         if self.count == 1:
             self.means = {name: parameter.detach().clone() for name, parameter in params.items()}
@@ -42,11 +38,7 @@ class RunningMean:
 
     @torch.no_grad()
     def move_to(self, params: Params) -> None:
-        """Write the mean into the parameters and forget it.
-
-        Args:
-            params: Parameters by name, as `add` saw them. [N, …]
-        """
+        """Write the mean into the parameters and forget it."""
         for name, mean in self.means.items():
             params[name].copy_(mean)
         self.clear()

@@ -17,16 +17,7 @@ _LEAST_LIMIT = 1e-7
 
 
 def clear_of_cameras(means: Tensor, radii: Tensor, positions: Tensor) -> Tensor:
-    """Which points have no camera nearer than their radius.
-
-    Args:
-        means: World units. [N, 3]
-        radii: World units. [N]
-        positions: Camera centres in world units. [C, 3]
-
-    Returns:
-        bool [N]
-    """
+    """Which points [N, 3] have no camera [C, 3] nearer than their radius [N], all in world units. bool [N]"""
     return _distances(means, positions) >= radii
 
 
@@ -37,8 +28,7 @@ def limit_scales(scales: Tensor, means: Tensor, positions: Tensor, angular_scale
     The host does not wait for the device.
 
     Args:
-        scales: Logarithms of the standard deviations along the Gaussians' axes, in world units. [N, 3]
-        means: World units. [N, 3]
+        scales: Parameters: logarithms of the standard deviations. [N, 3]
         positions: Camera centres in world units, C > 0. [C, 3]
         angular_scale: Largest standard deviation, as a share of that distance, > 0.
     """

@@ -15,13 +15,9 @@ and statistics, with the line that tells how much of that are files that the sys
 
 
 def available_host_bytes(root: Path = Path("/")) -> float:
-    """Bytes of the host's memory that this process may take, as Linux and a container's limit tell.
+    """Bytes of the host's memory that this process may take, as Linux and a container's limit tell; else infinity.
 
-    Args:
-        root: Folder in which the folders `proc` and `sys` lie.
-
-    Returns:
-        Infinity where nothing tells, as on other systems.
+    The folders `proc` and `sys` lie in `root`.
     """
     available = math.inf
     with contextlib.suppress(OSError):

@@ -19,11 +19,7 @@ FACE_GREY = 0.5
 
 
 def bounding_box_points(points: Tensor, grid: int = FACE_GRID) -> tuple[Tensor, float]:
-    """Make regular grids on the six faces of the axis-aligned bounding box.
-
-    Args:
-        points: SfM points in world units. [P, 3]
-        grid: Points along each side of a face.
+    """Make regular grids on the six faces of the axis-aligned bounding box of points [P, 3].
 
     Returns:
         6·grid² points [6·grid², 3], and the spacing that their scale starts from, mean box extent / grid, world units.
@@ -47,16 +43,10 @@ def bounding_box_points(points: Tensor, grid: int = FACE_GRID) -> tuple[Tensor, 
 
 
 def neighbour_scales(points: Tensor) -> Tensor:
-    """The initial scale of each point, which is the mean distance to its 3 nearest neighbours (3DGS, splatfacto).
+    """The initial scale, > 0, of points [P, 3]: the mean distance to the 3 nearest neighbours (3DGS, splatfacto). [P]
 
     Duplicates have distance 0; the scale is then a millionth of the cloud's extent, so that its logarithm is finite.
     Raises ValueError if there is no point.
-
-    Args:
-        points: World units. [P, 3]
-
-    Returns:
-        World units, > 0. [P]
     """
     if len(points) == 0:
         raise ValueError("There are no points to start from: give SfM points, or set pipeline.model.random-init True.")
@@ -70,15 +60,9 @@ def neighbour_scales(points: Tensor) -> Tensor:
 
 
 def plausible_points(points: Tensor) -> Tensor:
-    """Which SfM points to start from: all but those that are not finite or lie absurdly far out.
+    """Which SfM points [P, 3] to start from: all but those that are not finite or lie absurdly far out. bool [P]
 
     A single wild point would otherwise decide the size of the bounding box and of the points on its faces.
-
-    Args:
-        points: World units. [P, 3]
-
-    Returns:
-        bool [P]
     """
     return ~_far_outliers(points, POINT_SHARE)
 
@@ -93,11 +77,7 @@ def starting_points(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The points that training starts from, with the scale and opacity of each; raises ValueError if there is no point.
 
-    Args:
-        points: World units. [P, 3]
-        colors: In [0, 1]. [P, 3]
-        faces: Whether to add `bounding_box_points`.
-        opacity: Opacity of the points that are given, in [0, 1].
+    `faces` adds `bounding_box_points` to the given points [P, 3] with their colours in [0, 1] [P, 3].
 
     Returns:
         Points in world units, [N, 3]; colours in [0, 1], [N, 3]; scales in world units, > 0, [N]; opacities, [N].
@@ -115,15 +95,10 @@ def starting_points(
 
 
 def camera_extent(positions: Tensor) -> float:
-    """The extent of the cameras, which is 1.1 times the largest distance from their centre (3DGS).
+    """The extent of cameras at positions [C, 3]: 1.1 times the largest distance from their centre (3DGS).
 
-    Cameras that lie absurdly far from the others (`outliers.far_outliers`) do not count.
-
-    Args:
-        positions: Camera centres in world units. [C, 3]
-
-    Returns:
-        World units; 1 for a single camera or coinciding ones, which have no extent.
+    Cameras that lie absurdly far from the others (`outliers.far_outliers`) do not count. It is 1 for a single camera or
+    coinciding ones, which have no extent.
     """
     positions = positions[~_far_outliers(positions, CAMERA_SHARE)]
     extent = 1.1 * float((positions - positions.mean(0)).norm(dim=-1).max())

@@ -91,11 +91,9 @@ class StepSize:
 
 
 def available_bytes(device: torch.device) -> tuple[float, float]:
-    """Bytes of the device's memory that this process may have in all, with what it has already, and bytes of all of it.
+    """Bytes of the device's memory that this process may have, with those it has already, and bytes of all of it.
 
-    Args:
-        device: Any device; without CUDA both numbers are infinite, because an operating system's memory is nothing to
-            plan with.
+    Without CUDA both are infinite, because an operating system's memory is nothing to plan with.
     """
     if device.type != "cuda":
         return math.inf, math.inf
@@ -104,62 +102,41 @@ def available_bytes(device: torch.device) -> tuple[float, float]:
 
 
 def free_bytes(device: torch.device) -> float:
-    """Bytes that new tensors may take: what the driver has left and what torch's allocator keeps unused.
+    """Bytes that new tensors may take: those that the driver has left and that torch's allocator keeps unused.
 
-    Args:
-        device: Any device; infinitely many are free without CUDA.
+    They are infinite without CUDA.
     """
     available, _ = available_bytes(device)
     return available - torch.cuda.memory_allocated(device) if device.type == "cuda" else available
 
 
 def kept_bytes(params: Params, state: Mapping[str, Any]) -> int:
-    """Bytes that one Gaussian keeps: its parameters, their gradients and moments, and its statistics.
-
-    Args:
-        params: Parameters, each with leading dimension N.
-        state: The strategy's state; its tensors have leading dimension N, or 0 before the first step.
-    """
+    """Bytes that one Gaussian keeps: its parameters, their gradients and moments, and its statistics in `state`."""
     tensors = [value for value in state.values() if isinstance(value, Tensor)]
     return COPIES * sum(map(_row_bytes, params.values())) + sum(map(_row_bytes, tensors))
 
 
 def widest_bytes(params: Params) -> int:
-    """Bytes of a Gaussian's widest parameter, which is there twice while a split copies it to its new length.
-
-    Args:
-        params: Parameters, each with leading dimension N.
-    """
+    """Bytes of a Gaussian's widest parameter, which is there twice while a split copies it to its new length."""
     return max(map(_row_bytes, params.values()))
 
 
 def step_bytes(num_gaussians: int, size: StepSize, device: torch.device) -> dict[str, float]:
-    """Bytes that a step takes at its peak in each phase, besides what is kept between steps.
+    """Bytes that a step takes at its peak in each phase ("tile lists", "loss", "backward"), besides `kept_bytes`.
 
-    Args:
-        num_gaussians: Number of Gaussians, visible or not.
-        size: What the step renders.
-        device: Where it is trained.
-
-    Returns:
-        Bytes by the names of the phases: "tile lists", "loss" and "backward".
+    All Gaussians count, visible or not.
     """
     return {name: a * num_gaussians + b + p * size.pairs for name, (a, b, p) in _phases(size, device).items()}
 
 
 def affordable_growth(params: Params, state: Mapping[str, Any], free: float, size: StepSize) -> float:
-    """How many Gaussians may be added so that adding them and the next training step fit.
+    """How many Gaussians may be added so that adding them and the next training step fit; ≥ 0, or infinity.
 
     Added Gaussians bring `PAIRS_PER_GAUSSIAN` pairs each in every view.
 
     Args:
-        params: Parameters, each with leading dimension N.
-        state: The strategy's state; its tensors have leading dimension N, or 0 before the first step.
-        free: Bytes left, as `free_bytes` counts them; infinity allows infinitely many.
-        size: What the next step renders, with the pairs of the N Gaussians.
-
-    Returns:
-        ≥ 0, a whole number or infinity.
+        free: Bytes left, as `free_bytes` counts them.
+        size: What the next step renders, with the pairs of the present Gaussians.
     """
     if math.isinf(free):
         return free

@@ -27,30 +27,18 @@ _PAIRS = 2**24
 """Pairs of a pose and a point that are computed at a time, in arrays of 64 MB."""
 
 
-def nearest_depths(
-    points: Tensor,  # [P, 3]
-    viewmats: Tensor,  # [C, 4, 4]
-    Ks: Tensor,  # [C, 3, 3]
-    sizes: Tensor,  # [C, 2]
-) -> Tensor:
-    """Measure the depth of the nearest SfM points before each view, of which a few may be wrong.
+def nearest_depths(points: Tensor, viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> Tensor:
+    """Measure the depth of the `NEAREST_POINTS`-th SfM point before each view; a few nearer ones may be wrong.
 
-    Args:
-        points: SfM points in world units. [P, 3]
-        viewmats: World to camera, OpenCV axes. [C, 4, 4]
-        Ks: Intrinsics in px. [C, 3, 3]
-        sizes: Width and height of the images in px. [C, 2]
-
-    Returns:
-        Depth of the `NEAREST_POINTS`-th point along the viewing axis, in world units, > 0; infinite in views that see
-        fewer. [C]
+    It is along the viewing axis, in world units, > 0, and infinite in views that see fewer points. The arguments are
+    those of `depths_in_views`. [C]
     """
     points = points[plausible_points(points)]
     points = points[:: -(-len(points) // _MOST_POINTS) or 1]  # [P, 3]
     nearest = [points.new_full((0,), torch.inf)]
     step = max(_PAIRS // max(len(points), 1), 1)
     for part in (slice(start, start + step) for start in range(0, len(viewmats), step)):
-        depths = _depths_in_frusta(points, viewmats[part], Ks[part], sizes[part])  # [c, P]
+        depths = depths_in_views(points, viewmats[part], Ks[part], sizes[part])  # [c, P]
         if len(points) < NEAREST_POINTS:
             nearest.append(points.new_full((len(depths),), torch.inf))
         else:
@@ -59,28 +47,20 @@ def nearest_depths(
 
 
 def scene_near_plane(depths: Tensor, extent: float) -> float:
-    """Derive the near plane of a scene from what its training cameras come nearest to.
+    """Derive the near plane of a scene, > 0, from the `nearest_depths` of its training cameras.
 
-    It follows the camera that comes nearest to anything: an object close to a single camera is drawn, too.
-
-    Args:
-        depths: What `nearest_depths` returned for the training cameras. [C]
-        extent: Of the cameras in world units, as `initialization.camera_extent` defines it.
-
-    Returns:
-        Depth along the viewing axis in world units, > 0.
+    It follows the camera that comes nearest to anything: an object close to a single camera is drawn, too. `extent` is
+    `initialization.camera_extent`.
     """
     nearest = float(depths.min())
     return NEAR_SHARE * nearest if nearest < math.inf else UNKNOWN_SHARE * extent
 
 
-def _depths_in_frusta(
-    points: Tensor,  # [P, 3]
-    viewmats: Tensor,  # [C, 4, 4]
-    Ks: Tensor,  # [C, 3, 3]
-    sizes: Tensor,  # [C, 2]
-) -> Tensor:
-    """Depths of points in views, infinite outside the image. [C, P]"""
+def depths_in_views(points: Tensor, viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> Tensor:
+    """Depths of points [P, 3] along the viewing axes of cameras (`render.types.Cameras`), infinite outside the image.
+
+    `sizes` are the images' widths and heights in px [C, 2]. [C, P]
+    """
     viewmats, Ks, sizes = viewmats.to(points), Ks.to(points), sizes.to(points)
     projected = (Ks @ viewmats[:, :3, :3]) @ points.T + Ks @ viewmats[:, :3, 3:]  # [C, 3, P]
     x, y, depths = projected.unbind(dim=1)

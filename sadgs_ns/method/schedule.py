@@ -64,24 +64,14 @@ class Windows:
 
 
 def schedule(
-    num_views: int,
-    *,
-    effort: float = 1.0,
-    iterations: int | None = None,
-    views_per_iteration: int | None = None,
+    num_views: int, *, effort: float = 1.0, iterations: int | None = None, views_per_iteration: int | None = None
 ) -> Schedule:
-    """Derive the length of a run from the number of its training views.
+    """Derive the length of a run from the number of its training views, at least 1; given numbers stay.
 
-    With effort 1 the run visits views 2,000 + 50 · num_views times. Less effort multiplies that; more effort multiplies
-    it where views are many, and adds nothing where they are few (`MORE_VISITS_FROM`). A step takes one view more for
-    every 2,000 visits, up to four: more views in a step spare the GPU work and the gradients noise, but a run needs its
-    steps.
-
-    Args:
-        num_views: Training views, at least 1.
-        effort: How much training, relative to what the number of views asks for, > 0.
-        iterations: Optimizer steps, if they are given; else they are as many as the visits take.
-        views_per_iteration: Views of a step, if they are given; never more than there are.
+    With effort 1 the run visits views 2,000 + 50 · num_views times. Less effort, > 0, multiplies that; more effort
+    multiplies it where views are many, and adds nothing where they are few (`MORE_VISITS_FROM`). A step takes one view
+    more for every 2,000 visits, up to four and never more than there are: more views in a step spare the GPU work and
+    the gradients noise, but a run needs its steps.
     """
     few, many = MORE_VISITS_FROM
     power = 1.0 if effort <= 1 else min(max((num_views - few) / (many - few), 0.0), 1.0)
@@ -96,7 +86,7 @@ def schedule(
 
 @lru_cache(maxsize=64)
 def windows(iterations: int, **given: int | None) -> Windows:
-    """Derive when densification does what from the length of the run; what is given stays.
+    """Derive when densification does what from the number of iterations; fields that are given and not None stay.
 
     In the proportions of the released code: of thirty parts of the run, an AbsGS step ends each from the first to the
     sixteenth, a structure step takes the place of every fifth, and opacities are reset once after twelve, but not in
@@ -104,10 +94,6 @@ def windows(iterations: int, **given: int | None) -> Windows:
 
     Densification ends after at most 19/30 of the run (released code). Where that is before `refine_start_iter`, there
     is none, and nothing that prepares it. Raises TypeError if another name is given.
-
-    Args:
-        iterations: Length of the run.
-        **given: Fields of `Windows`; None derives one.
     """
     part = max(round(iterations / _PARTS), 1)
     derived = {name: max(round(parts * part), 1) for name, parts in _WINDOWS.items()}

@@ -20,6 +20,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from sadgs_ns.method.near_plane import depths_in_views
+
 WORKING_SIDE = 800
 """Longest side in px at which depth is computed. Larger images are reduced, since time grows with the area."""
 LEVELS = 3
@@ -60,17 +62,14 @@ _TINY = 1e-6
 
 @dataclass(frozen=True)
 class DepthMap:
-    """Depth of one view.
-
-    Attributes:
-        depth: Along the viewing axis, in world units; 0 where it is unknown. [h, w]
-        confidence: In [0, 1]; 0 where the depth is unknown. [h, w]
-        K: Intrinsics in px at this size; the centre of the first pixel is (0.5, 0.5). [3, 3]
-    """
+    """Depth of one view."""
 
     depth: Tensor
+    """Along the viewing axis, in world units; 0 where it is unknown. [h, w]"""
     confidence: Tensor
+    """In [0, 1]; 0 where the depth is unknown. [h, w]"""
     K: Tensor
+    """Intrinsics in px at this size; the centre of the first pixel is (0.5, 0.5). [3, 3]"""
 
 
 @dataclass(frozen=True)
@@ -109,10 +108,9 @@ def depth_maps(
         images: Of all views, or a function that returns a view's. They may lie anywhere and differ in size. uint8, or
             floating point in [0, 1]. RGB is multiplied by alpha; pixels with an alpha under 0.5 are masked.
             Each [H, W, 3 or 4]
-        viewmats: World → camera, rigid; x right, y down, z forward. [V, 4, 4]
-        Ks: Pinhole intrinsics in px of the images; the centre of the first pixel is (0.5, 0.5). [V, 3, 3]
-        points: World units. Points on surfaces, as from structure from motion. They only tell which views see the same
-            things, and how far away things are. [P, 3]
+        viewmats, Ks: As `render.types.Cameras`, of the images; the centre of the first pixel is (0.5, 0.5).
+        points: Points on surfaces, as from structure from motion, in world units. They only tell which views see the
+            same things, and how far away things are. [P, 3]
         masks: Valid pixels of each view, or None for all. Others get no depth, and nothing is compared with them.
             Each bool [H, W]
         device: Where to compute. The results lie there.
@@ -144,28 +142,22 @@ def depth_maps(
 
 @torch.no_grad()
 def choose_neighbours(viewmats: Tensor, Ks: Tensor, sizes: Tensor, points: Tensor, count: int = NEIGHBOURS) -> Tensor:
-    """Choose the views with which each view is compared.
+    """Choose the views with which each view is compared, given the arguments of `depths_in_views`.
 
     Two views gain from every point that both see: less if the angle between their rays is too small or too wide, and
     less if one of them sees it larger. Occlusion is not known. A view counts less if one that is chosen already lies in
     the same direction, so that not all of them miss the same places.
-
-    Args:
-        viewmats: World → camera, rigid; x right, y down, z forward. [V, 4, 4]
-        Ks: Pinhole intrinsics in px. [V, 3, 3]
-        sizes: Width and height in px. [V, 2]
-        points: World units. [P, 3]
-        count: Neighbours per view, > 0.
 
     Returns:
         Indices of views, the best first, and −1 where there are fewer; on the device of the points. int64 [V, count]
     """
     points = points[:: math.ceil(max(len(points), 1) / _POINTS)]
     viewmats, Ks, sizes, points = (tensor.to(points.device, torch.float64) for tensor in (viewmats, Ks, sizes, points))
-    depths, seen = _visible(viewmats, Ks, sizes, points)
+    depths = depths_in_views(points, viewmats, Ks, sizes)
+    seen = depths.isfinite()
     centres = viewmats.inverse()[:, :3, 3]  # [V, 3]
     rays = F.normalize(points - centres[:, None], dim=2)  # [V, P, 3]
-    scales = Ks[:, :1, 0] / depths.clamp_min(_TINY)  # px per world unit. [V, P]
+    scales = Ks[:, :1, 0] / torch.where(seen, depths, 1.0)  # px per world unit. [V, P]
     weights = []
     for part in torch.arange(len(seen), device=seen.device).split(max(_TRIPLES // max(seen.numel(), 1), 1)):
         angles = (rays[part, None] * rays).sum(dim=3).clamp(-1, 1).acos().rad2deg()  # [v, V, P]
@@ -184,14 +176,6 @@ def choose_neighbours(viewmats: Tensor, Ks: Tensor, sizes: Tensor, points: Tenso
         weight = weight * (1 - 0.5 * (directions * direction).sum(dim=2).clamp_min(0))
         weight.scatter_(1, best[:, None], 0)
     return chosen
-
-
-def _visible(viewmats: Tensor, Ks: Tensor, sizes: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Depths of points, and whether they lie in the pictures. Arguments as `choose_neighbours`. Each [V, P]"""
-    local = points @ viewmats[:, :3, :3].transpose(1, 2) + viewmats[:, None, :3, 3]  # [V, P, 3]
-    depths, places = local[..., 2], local @ Ks.transpose(1, 2)
-    pixels = places[..., :2] / depths[..., None].clamp_min(_TINY)  # [V, P, 2]
-    return depths, (depths > _TINY) & ((pixels > 0) & (pixels < sizes[:, None])).all(dim=2)
 
 
 def _pyramid(image: Tensor, mask: Tensor | None, device: torch.device) -> list[Tensor]:
@@ -233,8 +217,9 @@ def _views(pyramids: list[list[Tensor]], viewmats: Tensor, Ks: Tensor, sizes: Te
     points = points[:: math.ceil(max(len(points), 1) / _POINTS)].to(torch.float64)
     placed = viewmats.to(points.device), Ks.to(points.device), sizes.to(points.device)
     neighbours = choose_neighbours(*placed, points).tolist()
-    depths, seen = _visible(*placed, points)
-    depths = F.pad(torch.where(seen, depths, torch.nan), (0, 1), value=torch.nan)  # No quantile is known of nothing.
+    depths = depths_in_views(points, *placed)
+    # No quantile is known of nothing.
+    depths = F.pad(torch.where(depths.isfinite(), depths, torch.nan), (0, 1), value=torch.nan)
     ranges = depths.nanquantile(depths.new_tensor([0.005, 0.99]), dim=1).T.tolist()
     cameras = torch.eye(4, dtype=torch.float64).repeat(len(Ks), 1, 1)  # In a camera's axes → [−1, 1]². [V, 4, 4]
     cameras[:, :2, :3] = Ks[:, :2] * (2 / sizes[:, :, None])

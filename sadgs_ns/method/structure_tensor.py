@@ -43,16 +43,12 @@ _ROUNDING_FLOOR = 1e-5
 def gaussian_kernel(
     sigma: float, order: int = 0, dtype: torch.dtype = torch.float32, truncation: float = TRUNCATION
 ) -> Tensor:
-    """Sample a 1-D Gaussian, or its derivative, for cross-correlation.
+    """Sample a 1-D Gaussian, or its derivative, for cross-correlation; it is computed in float64. [K]
 
     Args:
         sigma: Standard deviation in px, > 0.
         order: 0 for the Gaussian (sums to 1), 1 for its first derivative (a unit ramp gives exactly 1).
-        dtype: Type of the result, which is computed in float64.
-        truncation: Radius in standard deviations, > 0.
-
-    Returns:
-        Kernel of odd length 2·⌈truncation · σ⌉ + 1. [K]
+        truncation: Radius in standard deviations, > 0: K is 2·⌈truncation · σ⌉ + 1.
     """
     radius = math.ceil(truncation * sigma)
     x = torch.arange(-radius, radius + 1, dtype=torch.float64)  # [K]
@@ -154,11 +150,6 @@ def multiscale_structure_tensor(
 def _normalised(images: Tensor, masks: Tensor | None, known_finite: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Check the images, and scale and centre their valid pixels; raises ValueError as `multiscale_structure_tensor`.
 
-    Args:
-        images: [B, H, W, C]
-        masks: bool [B, H, W] or None.
-        known_finite: Do not check whether valid pixels are finite.
-
     Returns:
         The images in [−1, 1] around a mean of 0, 0 where masked [B, C, H, W]; 1 at valid pixels and 0 at masked ones
         [B, 1, H, W]; the largest absolute value, by which they were divided [B, 1, 1, 1]; and their contrast after
@@ -256,13 +247,7 @@ def _operations(image: Tensor) -> _Operations:
 
 
 def _correlate(image: Tensor, kernel: Tensor, axis: int) -> Tensor:
-    """Correlate along one image axis with zeros outside.
-
-    Args:
-        image: [B, C, H, W]
-        kernel: K is odd. [K]
-        axis: 2 for rows (y), 3 for columns (x).
-    """
+    """Correlate images [B, C, H, W] along axis 2 (y) or 3 (x) with a kernel of odd length; outside there are zeros."""
     channels, size, radius = image.shape[1], image.shape[axis], kernel.numel() // 2
     if radius >= size:  # taps that can only ever meet zeros
         kernel = kernel[radius - size + 1 : radius + size]
@@ -301,14 +286,9 @@ def _differentiate(
 
 
 def _aggregate(
-    tensor: tuple[Tensor, Tensor],
-    energy: tuple[Tensor, Tensor],
-    trace_floor: Tensor,
-    numerator: Tensor,
-    denominator: Tensor,
-    exponent: float,
-    frequency: float,
-) -> None:
+    tensor: tuple[Tensor, Tensor], energy: tuple[Tensor, Tensor], trace_floor: Tensor,
+    numerator: Tensor, denominator: Tensor, exponent: float, frequency: float,
+) -> None:  # fmt: skip
     """Add a level to the sums of eq. 5, in place.
 
     Args:
