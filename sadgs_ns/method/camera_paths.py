@@ -56,13 +56,7 @@ class CameraPaths:
 
     @staticmethod
     def of(viewmats: Tensor, near_plane: float, points: Tensor) -> CameraPaths:
-        """Connect neighbouring cameras.
-
-        Args:
-            viewmats: World to camera. [C, 4, 4]
-            near_plane: Of the scene, in world units, > 0.
-            points: Points on surfaces, those that a run starts from. [P, 3]
-        """
+        """Connect neighbouring cameras, given the scene's near plane > 0 and the points that a run starts from."""
         rotations = viewmats[:, :3, :3].double().cpu()
         centres = -(rotations.mT @ viewmats[:, :3, 3:].double().cpu())[..., 0]  # [C, 3]
         distances = torch.cdist(centres, centres)
@@ -94,15 +88,7 @@ class CameraPaths:
 
     @torch.no_grad()
     def haze(self, means: Tensor, scales: Tensor) -> Tensor:
-        """Tell which Gaussians are haze near a path.
-
-        Args:
-            means: Centres in world units. [N, 3]
-            scales: Standard deviations in world units. [N, 3]
-
-        Returns:
-            bool [N], False where a centre is not finite.
-        """
+        """Tell which Gaussians are haze near a path; those whose centre is not finite are none. bool [N]"""
         cells = ((means - self.corner) / self.cell).nan_to_num(-1.0).clamp(-1, _CELLS).floor().long()  # [N, 3]
         inside = ((cells >= 0) & (cells < _CELLS)).all(dim=1)
         x, y, z = cells.clamp(0, _CELLS - 1).unbind(dim=1)

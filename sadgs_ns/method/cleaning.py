@@ -34,11 +34,7 @@ class Cleaning:
     """Take away Gaussians that make up less than this, in pixels, of the image of every training view; 0 takes none."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be meant.
-
-        Raises:
-            InputError: If a number is negative or not finite, an extent is 0, or the box has a corner that is reversed.
-        """
+        """Raise InputError if a number is negative or not finite, an extent is 0, or the box's corners are reversed."""
         for name, value in (("--min-views", self.min_views), ("--dust", self.dust)):
             if not 0 <= value < math.inf:
                 raise InputError(f"{name} {value:g} must be 0, which takes nothing away, or more.")
@@ -78,7 +74,7 @@ def see(
     """Measure how many pixels Gaussians make up in training views: opacity × area, less what is hidden by others.
 
     Args:
-        params: `means` [N, 3], `quats` [N, 4], log `scales` [N, 3], logit `opacities` [N] or [N, 1].
+        params: `means`, `quats`, log `scales`, logit `opacities`.
         cameras: World-to-camera matrix [4, 4], intrinsics in px [3, 3], width and height in px of each view.
         drawing: How Gaussians are drawn, of whatever colour.
     """
@@ -104,16 +100,11 @@ def see(
 
 @torch.no_grad()
 def find(params: Mapping[str, Tensor], cleaning: Cleaning, seen: Seen | None = None) -> tuple[Tensor, list[str]]:
-    """Find which Gaussians stay.
-
-    Args:
-        params: `means` [N, 3] and log `scales` [N, 3].
-        cleaning: What is taken away.
-        seen: Of these Gaussians, where `cleaning.needs_views`.
+    """Find which Gaussians stay. `seen` is needed where `cleaning.needs_views`.
 
     Returns:
-        Which stay, bool [N]; and a sentence for each of the options that are set, with the number that it takes away of
-        those that the ones before it left.
+        Which stay, bool [N]; and a sentence for each option that is set, with the number of Gaussians that it takes
+        away after the options before it.
     """
     means, extents = params["means"].detach(), params["scales"].detach().amax(dim=1).exp()
     goes: list[tuple[Tensor, str]] = []

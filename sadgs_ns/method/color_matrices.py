@@ -17,40 +17,23 @@ def identities(views: int) -> Tensor:
     return torch.eye(3, 4).repeat(views, 1, 1)
 
 
-def anchored(
-    matrices: Tensor,  # [V, 3, 4]
-    views: Tensor,  # [C]
-) -> Tensor:
-    """Return the matrices of some views, moved so that the mean over all views is the identity.
+def anchored(matrices: Tensor, views: Tensor) -> Tensor:
+    """Return the matrices of views, int64 [C], moved so that the mean over all views [V, 3, 4] is the identity.
 
     Otherwise the Gaussians and all matrices could change together, and held-out views, which have no matrix, would be
     rendered in colours that no photo has. No gradient flows through the mean, so that a view moves its own matrix only.
-
-    Args:
-        matrices: The parameters, of all training views. [V, 3, 4]
-        views: Indices of the views that are wanted, on the matrices' device. int64 [C]
-
-    Returns:
-        [C, 3, 4]
     """
     with torch.no_grad():
         shift = torch.eye(3, 4, dtype=matrices.dtype, device=matrices.device) - matrices.mean(dim=0)
     return matrices.index_select(0, views) + shift
 
 
-def correct_colors(
-    render: Tensor,  # [C, H, W, 3]
-    alpha: Tensor,  # [C, H, W, 1]
-    matrices: Tensor,  # [C, 3, 4]
-) -> Tensor:
-    """Apply an affine map (M | b) to the colours of the Gaussians that a rendering shows: M c + α b.
+def correct_colors(render: Tensor, alpha: Tensor, matrices: Tensor) -> Tensor:
+    """Apply affine maps (M | b) [C, 3, 4] to the colours [C, H, W, 3] and alphas that `composite` returned: M c + α b.
 
-    The offset b counts as much as the Gaussians cover, as if each Gaussian's own colour had been changed. What nothing
-    covers stays black, and teaches the matrices nothing. `render` is before a black background and not clamped, `alpha`
-    in [0, 1]. Raises InputError if the views have more pixels than the Triton kernels can address (kernels/limits.py).
-
-    Returns:
-        [C, H, W, 3]
+    The offset b counts as much as the Gaussians cover, as if each Gaussian's own colour had been changed. Pixels that
+    nothing covers stay black, and teach the matrices nothing. Raises InputError if the views have more pixels than the
+    Triton kernels can address (kernels/limits.py).
     """
     if use_triton(render):
         from sadgs_ns.kernels.color_matrices import correct_colors as fused_correct_colors

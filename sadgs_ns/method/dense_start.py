@@ -51,7 +51,7 @@ def dense_points(
     number: int = NUMBER,
     seed: int = 0,
 ) -> DensePoints:
-    """Draw points from the depth maps of V views.
+    """Draw at most `number` points from the depth maps of views, in random order; none if no depth is confident.
 
     The same arguments give the same points, whatever the state of torch's generators.
 
@@ -60,11 +60,6 @@ def dense_points(
         viewmats: World to camera. [V, 4, 4]
         image: Returns the image of a view in [0, 1], of any size. [H, W, 3]
         wavelength: Returns Λ of a view's image in px of that image; NaN where it is unknown. [H, W]
-        number: Points to draw at most, > 0.
-        seed: Of the drawing.
-
-    Returns:
-        At most `number` points, in random order; none where no depth is confident.
     """
     device = maps[0].depth.device
     viewmats = viewmats.to(device)

@@ -20,15 +20,9 @@ WAVELENGTH_EPSILON = 1e-5
 
 
 def principal_eigenvalue(structure_tensor: Tensor) -> Tensor:
-    """Larger eigenvalue λ_1 of symmetric 2×2 tensors, in closed form.
+    """Larger eigenvalue λ_1 [...] of symmetric 2×2 tensors (xx, xy, yy) [..., 3], in closed form.
 
     Both terms are non-negative, so that nothing cancels, however close to isotropic the tensor is.
-
-    Args:
-        structure_tensor: (xx, xy, yy). [..., 3]
-
-    Returns:
-        λ_1 in the tensor's units. [...]
     """
     xx, xy, yy = structure_tensor.unbind(-1)
     return 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)
@@ -37,26 +31,17 @@ def principal_eigenvalue(structure_tensor: Tensor) -> Tensor:
 def wavelength(structure_tensor: Tensor) -> Tensor:
     """Smallest local wavelength Λ_min = 1 / (√λ_1 + ε) (paper, section 3.3).
 
-    Args:
-        structure_tensor: S̄ as (xx, xy, yy) in 1/px². [..., 3]
-
-    Returns:
-        Λ_min in px, in (0, 1/ε]. [...]
+    It is in px, in (0, 1/ε] [...], and S̄ is (xx, xy, yy) in 1/px² [..., 3].
     """
     return 1.0 / (principal_eigenvalue(structure_tensor).clamp_min(0).sqrt() + WAVELENGTH_EPSILON)
 
 
 def projected_axes(
-    means: Tensor,  # [M, 3] world units, in front of the camera
-    quats: Tensor,  # [M, 4] wxyz, of any length
-    scales: Tensor,  # [M, 3] standard deviations in world units, > 0
-    viewmats: Tensor,  # [M, 4, 4] world to camera, one for each observation
-    Ks: Tensor,  # [M, 3, 3] px
-    width: int,
-    height: int,
+    means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int
 ) -> Tensor:
     """Screen-space vectors of the three principal axes, v_k = J W R S_k (paper, eq. 1).
 
+    Each observation has a Gaussian in front of a camera (`render.types`): [M, 3], [M, 4], [M, 3], [M, 4, 4], [M, 3, 3].
     J is the Jacobian that gsplat's forward pass uses for a pinhole camera, with its clamp near the frustum's border.
 
     Returns:
@@ -74,17 +59,13 @@ def projected_axes(
     return (jacobian @ rotation @ axes).transpose(1, 2)
 
 
-def sample_footprint(
-    means2d: Tensor,  # [M, 2] px
-    conics: Tensor,  # [M, 3] (a, b, c) of the inverse of Σ2D + SCREEN_BLUR·I, in 1/px²
-    jitter: Tensor,  # [M, 2] in [0, 1)
-) -> Tensor:
-    """Draw one point in each Gaussian's footprint, uniformly if the jitter is uniform.
+def sample_footprint(means2d: Tensor, conics: Tensor, jitter: Tensor) -> Tensor:
+    """Draw one point in each Gaussian's footprint, uniformly if the jitter [M, 2] is uniform in [0, 1).
 
-    The footprint is the 2σ ellipse of Σ2D: a uniform point in it has mean μ_2D and covariance Σ2D. gsplat's conic
-    contains its screen-space blur, which is taken out again; what rounding makes negative is set to 0. Rounded to
-    float32, a conic tells its determinant from 0 only above ε a c: footprints longer than that (thousands of px) are
-    cut to it.
+    `means2d` [M, 2] and `conics` [M, 3] are those of `render.types.Projected`. The footprint is the 2σ ellipse of Σ2D:
+    a uniform point in it has mean μ_2D and covariance Σ2D. gsplat's conic contains its screen-space blur, which is
+    taken out again; what rounding makes negative is set to 0. Rounded to float32, a conic tells its determinant from 0
+    only above ε a c: footprints longer than that (thousands of px) are cut to it.
 
     Returns:
         Points in px, pixel centres at half-integers; NaN where the conic is NaN or infinite. [M, 2]
@@ -108,12 +89,9 @@ def sample_footprint(
 
 
 def sample_map(structure_tensors: Tensor, camera_ids: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Read S̄ at the pixel under each point.
+    """Read S̄ of images, of any floating dtype or quantized [C, H, W, 3], at the pixel under each point.
 
-    Args:
-        structure_tensors: S̄ of each camera's image, of any floating dtype or quantized. [C, H, W, 3]
-        camera_ids: Index of the image of each point. int64 [M]
-        points: In px, pixel centres at half-integers. [M, 2]
+    `camera_ids` are the points' images, int64 [M]. Points are in px, pixel centres at half-integers [M, 2].
 
     Returns:
         S̄ in float32 or wider [M, 3], and whether it is known [M]: the point lies inside the image, on a pixel whose S̄
@@ -132,13 +110,9 @@ def sample_map(structure_tensors: Tensor, camera_ids: Tensor, points: Tensor) ->
 
 
 def eta(axes: Tensor, structure_tensor: Tensor) -> Tensor:
-    """Frequency violation of each axis: η_k = ‖v_k‖ / Λ_min (paper, eq. 6).
+    """Frequency violation of each axis: η_k = ‖v_k‖ / Λ_min (paper, eq. 6). [M, 3]
 
-    Args:
-        axes: v_k in px. [M, 3, 2]
-        structure_tensor: S̄ at the footprint's sample, (xx, xy, yy) in 1/px². [M, 3]
-
-    Returns:
-        η ≥ 0; above 1 the axis is longer than the local wavelength. [M, 3]
+    It is above 1 where an axis is longer than the local wavelength. The arguments are what `projected_axes` and
+    `sample_map` return.
     """
     return torch.hypot(axes[..., 0], axes[..., 1]) / wavelength(structure_tensor)[:, None]

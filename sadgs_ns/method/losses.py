@@ -24,13 +24,9 @@ def _window(device: torch.device, dtype: torch.dtype) -> Tensor:
 
 
 def photometric_loss(
-    predicted: Tensor,  # [C, H, W, 3]
-    target: Tensor,  # [C, H, W, 3]
-    *,
-    ssim_lambda: float = 0.2,
-    l2_lambda: float = L2_LAMBDA,
-    parts: Tensor | None = None,  # [P]
-) -> tuple[Tensor, Tensor]:
+    predicted: Tensor, target: Tensor, *, ssim_lambda: float = 0.2, l2_lambda: float = L2_LAMBDA,
+    parts: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
     """(1 − λ) L1 + λ (1 − SSIM) + λ_2 ℓ2, each a mean over views, pixels and channels.
 
     The paper gives no weights; these defaults are the released code's.
@@ -73,13 +69,7 @@ def photometric_loss(
 
 
 def photometric_part(
-    predicted: Tensor,  # [1, H', W, 3]
-    target: Tensor,  # [1, H', W, 3]
-    *,
-    rows: tuple[int, int],
-    top: int,
-    height: int,
-    ssim_lambda: float = 0.2,
+    predicted: Tensor, target: Tensor, *, rows: tuple[int, int], top: int, height: int, ssim_lambda: float = 0.2
 ) -> tuple[Tensor, Tensor]:
     """What some rows of a view add to its `photometric_loss`: over rows that cover the view, these parts sum to it.
 
@@ -87,11 +77,11 @@ def photometric_part(
 
     Args:
         predicted: Rendered rows, from `top` on. Unless the image's border is there, 5 more than `rows` on either side.
+            [1, H', W, 3]
         target: The same rows of the training view.
         rows: First row that counts and one past the last.
         top: Which row of the view is the first of `predicted`.
         height: Of the view in px, at least 11 unless all rows count.
-        ssim_lambda: As for `photometric_loss`.
 
     Returns:
         The part of the loss, and that of the mean square error, without gradient; both are scalars.

@@ -27,17 +27,16 @@ def update_param_with_optimizer(
     optimizers: Mapping[str, torch.optim.Optimizer],
     names: Sequence[str] | None = None,
 ) -> None:
-    """Put others in the place of parameters and of their optimizers' moments, as gsplat's `duplicate` and `split` do.
+    """Replace parameters and their optimizers' moments, as gsplat's `duplicate` and `split` do.
 
     While a parameter is changed, its optimizer has no state, by which training/trainer.py recognizes that memory ran
     out meanwhile.
 
     Args:
-        param_fn: Makes a parameter of its name and what it was.
-        optimizer_fn: Makes a moment of its key and what it was; `step` stays.
-        params: The parameters.
+        param_fn: Makes the new parameter from its name and the old one.
+        optimizer_fn: Makes a new moment from its key and the old one; `step` stays.
         optimizers: One per parameter; a parameter that is not trained may have none.
-        names: Which parameters are changed; None changes all.
+        names: The parameters to change; None changes all.
     """
     for name in list(params) if names is None else names:
         old, optimizer = params[name], optimizers.get(name)

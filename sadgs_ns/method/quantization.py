@@ -1,4 +1,4 @@
-"""S̄ in three bytes a pixel, which is as much as the image takes that it was computed from."""
+"""S̄ in three bytes a pixel, as many as its image takes."""
 
 from __future__ import annotations
 
@@ -19,14 +19,8 @@ def quantize(tensor: Tensor) -> Tensor:
     """Round √xx and √yy on a logarithmic scale, and the correlation xy / √(xx yy) on a linear one, to a byte each.
 
     A logarithm keeps the relative error of every wavelength the same (at most 1.7 %), and a correlation within ±1 keeps
-    S̄ positive semidefinite. A pixel of which any number is NaN, as `multiscale_structure_tensor` gives masked ones,
-    becomes (0, INVALID, 0).
-
-    Args:
-        tensor: S̄ as (xx, xy, yy) in 1/px², finite or NaN. [..., 3]
-
-    Returns:
-        uint8 [..., 3]
+    S̄ positive semidefinite. S̄ is (xx, xy, yy) in 1/px², finite or NaN; a pixel with a NaN, such as a masked one,
+    becomes (0, INVALID, 0). [..., 3] → uint8 [..., 3]
     """
     if use_triton(tensor):
         from sadgs_ns.kernels import quantization as kernel
@@ -45,11 +39,7 @@ def quantize(tensor: Tensor) -> Tensor:
 
 
 def dequantize(quantized: Tensor) -> Tensor:
-    """Read S̄ back from what `quantize` made of it, uint8 [..., 3].
-
-    Returns:
-        S̄ as (xx, xy, yy) in 1/px², float32; NaN at masked pixels. [..., 3]
-    """
+    """Read S̄ back from what `quantize` made of it, in float32; NaN at masked pixels. uint8 [..., 3] → [..., 3]"""
     x, correlation, y = quantized.float().unbind(-1)
 
     def frequency(byte: Tensor) -> Tensor:

@@ -19,12 +19,9 @@ def empty_gradients(num_gaussians: int, device: torch.device) -> dict[str, Tenso
 
 
 def keep_gradient(means2d: Tensor) -> None:
-    """Have the backward pass keep the gradient of projected centres for `accumulate_gradients`.
+    """Have the backward pass keep the gradient of projected centres, from a call with `absgrad`.
 
     Our compositing keeps it by itself, without the copy that torch makes.
-
-    Args:
-        means2d: Of gsplat's meta, from a call with `absgrad`. [C, N, 2]
     """
     if not hasattr(means2d, "grad2d"):
         means2d.retain_grad()
@@ -32,16 +29,11 @@ def keep_gradient(means2d: Tensor) -> None:
 
 @torch.no_grad()
 def accumulate_gradients(gradients: MutableMapping[str, Tensor], info: Mapping[str, Any], num_views: int) -> None:
-    """Add the screen-space gradients of one backward pass, in place.
+    """Add the screen-space gradients of one backward pass to those of `empty_gradients`, in place.
 
     Gradients are normalised as in 3DGS: by half the image size, so that 1 is the gradient per half image, and by the
-    number of views, since the loss is a mean over views. One that is NaN adds nothing.
-
-    Args:
-        gradients: As made by `empty_gradients`.
-        info: gsplat's meta, unpacked, whose `means2d` [C, N, 2] kept its `absgrad`, and its gradient as `keep_gradient`
-            made it or in `grad`.
-        num_views: Views that the loss is a mean of.
+    number of views, since the loss is their mean. One that is NaN adds nothing. `info` is gsplat's unpacked meta, whose
+    `means2d` has its `absgrad` and what `keep_gradient` kept.
     """
     means2d = info["means2d"]
     gradient = getattr(means2d, "grad2d", None)

@@ -43,11 +43,7 @@ def num_children(counts: Tensor) -> Tensor:
 
 
 def grid_offsets(counts: Tensor, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:
-    """Place the cell centres of regular grids of n_x × n_y × n_z cells, centred on their parents.
-
-    Args:
-        counts: n of each parent. int64 [P, 3]
-        dtype: Of the coordinates.
+    """Place the cell centres of regular grids of n_x × n_y × n_z cells, int64 [P, 3], centred on their parents.
 
     Returns:
         Index of each child's parent, int64 [Q], and the grid coordinate g in parent standard deviations [Q, 3],
@@ -81,8 +77,7 @@ def grid_split(
     so that the integral of opacity stays.
 
     Args:
-        params: gsplat's parameters: `means`, log `scales`, `quats` and any others with leading dimension N.
-        optimizers: One per parameter.
+        params: `means`, log `scales`, `quats` and any others with leading dimension N.
         state: The strategy's state; its tensors have leading dimension N.
         counts: n per axis. int64 [N, 3]
         child_scale: k in [1, 2).

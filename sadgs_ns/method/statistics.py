@@ -70,17 +70,14 @@ def observe(
     info: Mapping[str, Any],
     *,
     generator: torch.Generator | None = None,
-    jitter: Tensor | None = None,  # [C, N, 2]
+    jitter: Tensor | None = None,
 ) -> None:
-    """Add one forward pass: one jittered sample per visible Gaussian and view, in place.
+    """Add one forward pass to `STATISTICS`, in place: one jittered sample per visible Gaussian and view.
 
     Args:
-        statistics: As made by `empty_statistics`.
-        params: `means` [N, 3], `quats` [N, 4] and log `scales` [N, 3].
         info: gsplat's meta, unpacked, of C views of one size, plus `structure_tensors` [C, H, W, 3] (S̄,
             which may be quantized), `viewmats` [C, 4, 4] and `Ks` [C, 3, 3].
-        generator: Source of the jitter.
-        jitter: In [0, 1), where it is not to be drawn here. [C, N, 2]
+        jitter: In [0, 1) [C, N, 2]; None draws it here, with the generator.
     """
     if jitter is None:
         means2d = info["means2d"]
@@ -139,13 +136,7 @@ def observed_eta(params: Params, info: Mapping[str, Any], jitter: Tensor) -> Ten
 def consistent(counts: Tensor, n_total: Tensor, threshold: float, min_observations: int = 1) -> Tensor:
     """Whether a response was seen in more than a fraction of the observations: N / N_total > τ (paper, section 3.4).
 
-    Args:
-        counts: `n_high` or `n_low`. [N, 3]
-        n_total: [N]
-        threshold: τ_split or τ_prune in [0, 1].
-        min_observations: Fewer observations than these say nothing: one of one would be all of them.
-
-    Returns:
-        Per axis; False for a Gaussian with too few observations. bool [N, 3]
+    `counts` are `n_high` or `n_low`, and the threshold τ_split or τ_prune. Fewer than `min_observations` say nothing:
+    one of one would be all of them. bool [N, 3]
     """
     return (counts > threshold * n_total[:, None]) & (n_total >= min_observations)[:, None]
