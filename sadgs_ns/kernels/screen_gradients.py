@@ -46,7 +46,7 @@ def _accumulate_gradients(
 def accumulate_gradients(
     sums: tuple[Tensor, Tensor, Tensor], radii: Tensor, gradient: Tensor, absolute: Tensor, scales: tuple[float, float]
 ) -> None:
-    """Do what `method.screen_gradients.accumulate_gradients` does, except that a gradient longer than 1e19 counts as infinite.
+    """Do what `method.screen_gradients.accumulate_gradients` does; a gradient longer than 1e19 is infinite.
 
     `sums` are grad2d, absgrad2d and grad_count, contiguous float32. The gradient of the centres and its absolute sum
     over the pixels, float32 [C, N, 2], may be parts of the rows of larger tensors; `scales` multiply their x and y.
