@@ -71,10 +71,7 @@ class Export:
 
 
 def write_gaussians(
-    path: Path,
-    params: Mapping[str, Tensor],
-    context: Context = DEFAULTS,
-    similarity: Similarity | None = None,
+    path: Path, params: Mapping[str, Tensor], context: Context = DEFAULTS, similarity: Similarity | None = None
 ) -> int:
     """Write a model's parameters as `formats.write` does, and return the number of Gaussians.
 

@@ -29,13 +29,9 @@ _SAMPLED = 16
 
 
 def write_mesh(
-    path: Path,
-    params: Mapping[str, Tensor],
-    cameras: RunCameras,
-    similarity: Similarity | None = None,
-    voxel_size: float | None = None,
-    drawing: RenderOptions = DEFAULTS,
-) -> int:
+    path: Path, params: Mapping[str, Tensor], cameras: RunCameras, similarity: Similarity | None = None,
+    voxel_size: float | None = None, drawing: RenderOptions = DEFAULTS,
+) -> int:  # fmt: skip
     """Fuse what the training views see into a mesh, write it as `atomic_path` does, and return its number of triangles.
 
     Args:
@@ -43,7 +39,6 @@ def write_mesh(
         cameras: The training views, in the parameters' frame.
         similarity: From the parameters' frame to the file's; None leaves the mesh as it is.
         voxel_size: Edge of a voxel in the parameters' frame; None derives it from the median depth.
-        drawing: How Gaussians are drawn.
 
     Raises:
         InputError: If no view shows a surface, voxels do not fit in memory, or open3d cannot be imported.
@@ -88,10 +83,7 @@ def derive_voxel_size(views: Sequence[DepthView]) -> float:
 
 @torch.no_grad()
 def render_depths(
-    params: Mapping[str, Tensor],
-    cameras: RunCameras,
-    indices: Sequence[int],
-    drawing: RenderOptions = DEFAULTS,
+    params: Mapping[str, Tensor], cameras: RunCameras, indices: Sequence[int], drawing: RenderOptions = DEFAULTS
 ) -> Iterator[DepthView]:
     """Render colours and expected depth in some of the views; the parameters are finite, on the device that renders."""
     device = params["means"].device

@@ -45,12 +45,9 @@ def switched_off() -> bool:
 def use_triton(place: torch.device | Tensor) -> bool:
     """Return whether to use the kernels of this package; torch and gsplat compute the same, more slowly.
 
-    What projects and composites is chosen by `render.rasterization.choose_backend`, which asks this function where the
-    backend is "auto". With another backend than Triton's, everything else stays with these kernels: activations, loss,
-    matrices of colours, Adam, limits of scales, S̄, and the statistics of η and AbsGS.
-
-    Args:
-        place: The device that computes, or a tensor that a kernel would read, which must be float32.
+    `place` is the device that computes, or a tensor that a kernel would read, which must be float32. With another
+    backend than Triton's (`render.rasterization.choose_backend`), everything but projection and compositing still uses
+    these kernels.
     """
     if isinstance(place, Tensor):
         if place.dtype != torch.float32:
@@ -78,8 +75,8 @@ def available(device: torch.device) -> bool:
 
     It must be CUDA's current device, on which Triton launches any tensors, and Triton must compile for it, which needs
     a C compiler, Python's headers and a GPU that Triton knows. One small kernel is tried, and success is remembered. A
-    failure may pass, such as a full memory, so the kernel is tried again at the 2nd, 4th, 8th, … question; a warning
-    tells of the first failure.
+    failure may pass, such as a full memory, so the kernel is tried again at the 2nd, 4th, 8th, … question. Only the
+    first failure warns.
     """
     if device.type != "cuda" or device.index not in (None, torch.cuda.current_device()):
         return False

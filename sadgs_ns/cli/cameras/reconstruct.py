@@ -38,11 +38,9 @@ _PAIRS, _PAIRS_ON_GPU = 50, 400
 """Pairs of photos that are matched, saved and reported together; for each lot COLMAP starts its threads anew, and the
 descriptors travel to the GPU."""
 _ADJUSTMENT = {
-    "ba_global_frames_ratio": 2.0,
-    "ba_global_points_ratio": 2.0,
-    "ba_local_function_tolerance": 1e-4,
-    "ba_global_function_tolerance": 1e-5,
-}
+    "ba_global_frames_ratio": 2.0, "ba_global_points_ratio": 2.0,
+    "ba_local_function_tolerance": 1e-4, "ba_global_function_tolerance": 1e-5,
+}  # fmt: skip
 """Growth of a model until all of it is adjusted again, and the relative change of the cost at which an adjustment
 ends. COLMAP's own are 1.1 and 0 (docs/results.md#finding-cameras)."""
 _ADJUSTED_PHOTOS = 2
@@ -167,12 +165,9 @@ def sequential_pairs(names: Sequence[str], overlap: int = 10) -> list[tuple[str,
 
 
 def match(
-    names: Sequence[str],
-    database: Path,
-    matching: Matching,
-    gpu: torch.device | None,
+    names: Sequence[str], database: Path, matching: Matching, gpu: torch.device | None,
     rigs: Sequence[Sequence[str]] = (),
-) -> None:
+) -> None:  # fmt: skip
     """Match the features in COLMAP's database between photos; pairs that an earlier run matched are skipped.
 
     The GPU compares features unless COLMAP chooses the pairs; None leaves all to COLMAP. A file `pairs.txt` is written

@@ -21,19 +21,16 @@ _SHELL = set('"$`\\')
 
 
 def check_splits(
-    names: Sequence[str],
-    lists: Mapping[str, Any],
-    called: Callable[[str], str],
-    locate: Callable[[str], Path],
+    names: Sequence[str], lists: Mapping[str, Any], called: Callable[[str], str], locate: Callable[[str], Path],
     options: ParserOptions,
-) -> Generator[Finding, None, int]:
+) -> Generator[Finding, None, int]:  # fmt: skip
     """Check how the images with poses are divided, and return how many are trained on.
 
     Args:
         names: The names of all images that have poses.
         lists: The list of each split that has one; if any has, nerfstudio divides the images by nothing else.
-        called: The start of a sentence about a split's list.
-        locate: The file that a name stands for.
+        called: Returns the start of a sentence about a split's list.
+        locate: Returns the file that a name stands for.
         options: How the images are divided without lists.
 
     Raises:
