@@ -1,0 +1,31 @@
+"""The questions of newcomers in questions.yaml have their answers where the file says."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+
+CHECKOUT = Path(__file__).parents[1]
+QUESTIONS = yaml.safe_load((CHECKOUT / "tests/questions.yaml").read_text("utf8"))
+
+
+def defined(nodes: list[ast.stmt]) -> Iterator[str]:
+    """Names of functions, classes, methods and values of a module's statements."""
+    for node in nodes:
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+            yield node.name
+        if isinstance(node, ast.ClassDef):
+            yield from (part.name for part in node.body if isinstance(part, ast.FunctionDef))
+        targets = getattr(node, "targets", [getattr(node, "target", None)])
+        yield from (target.id for target in targets if isinstance(target, ast.Name))
+
+
+@pytest.mark.parametrize("asked", QUESTIONS, ids=lambda asked: asked["name"])
+def test_what_answers_a_question_is_where_it_is_expected(asked: dict[str, str]):
+    path = CHECKOUT / asked["file"]
+    assert path.is_file(), asked["question"]
+    assert asked["name"] in set(defined(ast.parse(path.read_text("utf8")).body)), asked["question"]
