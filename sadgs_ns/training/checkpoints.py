@@ -1,4 +1,4 @@
-"""Choosing the checkpoint that a run resumes from, and reading it so that nothing in the file is executed."""
+"""Choosing, reading and writing checkpoints; nothing in a file that is read is executed."""
 
 from __future__ import annotations
 
@@ -17,23 +17,17 @@ from sadgs_ns.errors import InputError, reason
 from sadgs_ns.files import atomic_path
 
 REMEDY = "give --load-dir the folder of a run of sadgs, or train from scratch"
-"""What errors advise about a checkpoint that cannot be used."""
 _FOLDER = "nerfstudio_models"
 """Name of the folder of checkpoints in a run's folder."""
 _PARTS = ("step", "pipeline", "optimizers", "scalers")
-"""What nerfstudio's trainer writes into every checkpoint."""
+"""Keys of every checkpoint of nerfstudio's trainer."""
 
 
 def read(path: Path, remedy: str = REMEDY, mmap: bool = False) -> dict[str, Any]:
-    """Read one checkpoint into the CPU's memory, with torch's safe loader whatever its version and environment say.
+    """Read one checkpoint into the CPU's memory with torch's safe loader, whatever torch's version and environment.
 
-    Args:
-        path: The file.
-        remedy: What errors advise.
-        mmap: Whether tensors stay in the file until they are used, which is quicker if only a part of them is.
-
-    Raises:
-        InputError: If it is cut off or damaged, or holds anything but a checkpoint's tensors and plain values.
+    With `mmap`, tensors stay in the file until they are used. Raises InputError, which ends with `remedy`, if the file
+    is damaged, or holds anything but a checkpoint's tensors and plain values.
     """
     try:
         with zipfile.ZipFile(path) as file:  # torch itself does not check the checksums.
@@ -41,7 +35,7 @@ def read(path: Path, remedy: str = REMEDY, mmap: bool = False) -> dict[str, Any]
                 raise zipfile.BadZipFile(f"wrong checksum of {damaged}")
         state = torch.load(path, map_location="cpu", weights_only=True, mmap=mmap or None)
     except Exception as error:  # Damaged archives, pickles and tensors each raise their own.
-        # torch's message goes on with the advice to load the file unsafely, which is cut off here.
+        # torch's message goes on with advice to load the file unsafely.
         what = re.split(r"(?<=[a-z])[.:]\s", reason(error), maxsplit=1)[0]
         raise InputError(
             f"{path} is cut off, damaged or not of tensors and plain values alone ({what}): {remedy}."
@@ -54,18 +48,24 @@ def read(path: Path, remedy: str = REMEDY, mmap: bool = False) -> dict[str, Any]
 
 
 def checkpoint_paths(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> list[Path]:
-    """Return the checkpoints that nerfstudio's options for resuming name, in the order in which they are to be tried.
+    """Return the checkpoints that nerfstudio's options for resuming name, in the order to try them.
 
     Args:
-        load_dir: A folder of checkpoints, or the folder of a run, which holds one.
-        load_step: Step of the only checkpoint of `load_dir` to take; None takes all, the latest first.
+        load_dir: The folder of a run, or its folder of checkpoints.
+        load_step: Step of the checkpoint of `load_dir` to take; None takes all, the latest first.
         load_checkpoint: A file. If it and `load_dir` are None, no checkpoint is named.
 
     Raises:
-        InputError: If both are given, what is named does not exist, or the folder does not hold checkpoints alone.
+        InputError: If both are given, one does not exist, or the folder does not hold checkpoints alone.
     """
     if load_dir is None:
-        return [] if load_checkpoint is None else [_file(load_checkpoint)]
+        if load_checkpoint is None:
+            return []
+        if load_checkpoint.is_dir():
+            raise InputError(f"{load_checkpoint} is a folder: give it to --load-dir instead of --load-checkpoint.")
+        if not load_checkpoint.is_file():
+            raise InputError(f"{load_checkpoint} does not exist: give --load-checkpoint a file step-*.ckpt of a run.")
+        return [load_checkpoint]
     if load_checkpoint is not None:
         raise InputError("load_dir and load_checkpoint both name where the run goes on: give one of them.")
     steps = _checkpoints_in(load_dir)
@@ -77,17 +77,8 @@ def checkpoint_paths(load_dir: Path | None, load_step: int | None, load_checkpoi
     return [steps[load_step]]
 
 
-def _file(path: Path) -> Path:
-    """Return the path of a checkpoint, which must be a file."""
-    if path.is_dir():
-        raise InputError(f"{path} is a folder: give it to --load-dir instead of --load-checkpoint.")
-    if not path.is_file():
-        raise InputError(f"{path} does not exist: give --load-checkpoint a file step-*.ckpt of a run.")
-    return path
-
-
 def _checkpoints_in(load_dir: Path) -> dict[int, Path]:
-    """Return the checkpoints of a folder of them, or of a run's, by their steps."""
+    """Return the checkpoints of a run's folder, or of its folder of checkpoints, by their steps."""
     if load_dir.is_file():
         raise InputError(f"{load_dir} is a file: give it to --load-checkpoint instead of --load-dir.")
     if (load_dir / _FOLDER).is_dir():
@@ -110,10 +101,9 @@ def _checkpoints_in(load_dir: Path) -> dict[int, Path]:
 
 
 def map_rows(state: dict[str, Any], change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
-    """Return a checkpoint with changed tensors that have a row for each Gaussian; the rest is shared, not copied.
+    """Return a checkpoint in which `change` was called on all tensors [N, …] of Gaussians; the rest is not copied.
 
-    These are the parameters, Adam's moments, the statistics and the mean of the parameters. `change` is called with
-    each of them [N, …], always in the same order.
+    These are the parameters, Adam's moments, the statistics and the mean of the parameters, always in the same order.
     """
     pipeline, optimizers = dict(state["pipeline"]), dict(state["optimizers"])
     names = sorted(name for name in pipeline if ".gauss_params." in name)
@@ -137,24 +127,23 @@ def map_rows(state: dict[str, Any], change: Callable[[Tensor], Tensor]) -> dict[
 
 
 def _changed(value: Any, change: Callable[[Tensor], Tensor]) -> Any:
-    """Change a tensor that has rows; Adam's number of steps is one without."""
+    """Change a tensor that has rows; Adam's number of steps has none."""
     return change(value) if isinstance(value, Tensor) and value.dim() > 0 else value
 
 
 def write(folder: Path, step: int, state: dict[str, Any], keep: bool) -> None:
-    """Save under a temporary name and rename, so that a killed save leaves the previous checkpoint as it was.
+    """Save a checkpoint whole or not at all and, unless they are to be kept, delete the others. Raises WriteError.
 
-    The temporary file lies beside the folder of checkpoints, because nerfstudio takes every file inside for one. Unless
-    they are to be kept, other checkpoints are deleted then. Raises WriteError.
+    The temporary file lies beside the folder, because nerfstudio takes every file inside for a checkpoint.
     """
     path = folder / f"step-{step:09d}.ckpt"
     others = [other for other in folder.glob("*.ckpt") if other != path]
     with atomic_path(path, beside=folder) as partial:
         try:
             torch.save(state, partial)
-        except RuntimeError as error:  # torch's writer reports a full disk in this way.
+        except RuntimeError as error:  # This is how torch's writer reports a full disk.
             raise OSError(reason(error)) from error
-        if others:  # These are about to be deleted, so the new one must survive a power cut first.
+        if others:  # The new checkpoint must survive a power cut before these are deleted.
             with partial.open("rb+") as file:
                 os.fsync(file.fileno())
     for other in [] if keep else others:
@@ -162,23 +151,19 @@ def write(folder: Path, step: int, state: dict[str, Any], keep: bool) -> None:
 
 
 def check_chosen(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> None:
-    """Raise InputError, without reading the files' content, if none of those for `read_chosen` is whole."""
+    """Raise InputError if none of the files for `read_chosen` is whole; their content is not read."""
     tried = checkpoint_paths(load_dir, load_step, load_checkpoint)
     if tried and not any(map(zipfile.is_zipfile, tried)):  # A zip file's table of contents is at its end.
-        read(tried[0])  # It raises the error that says what is wrong.
+        read(tried[0])  # raises the error that says what is wrong
 
 
 def read_chosen(
     load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None, remedy: str = REMEDY, mmap: bool = False
 ) -> tuple[Path, dict[str, Any]] | None:
-    """Read the checkpoint that these options name, or the one before it if it is damaged and no step was asked for.
+    """Return path and content of the checkpoint that these options name; None if they name none.
 
-    Args:
-        load_dir, load_step, load_checkpoint: As for `checkpoint_paths`.
-        remedy, mmap: As for `read`.
-
-    Returns:
-        Its path and content, or None if the options name none. Raises as `checkpoint_paths` and `read`.
+    A damaged one is skipped for the one before it, unless a step was asked for. Arguments and errors are those of
+    `checkpoint_paths` and `read`.
     """
     errors = []
     for path in checkpoint_paths(load_dir, load_step, load_checkpoint):
@@ -188,8 +173,7 @@ def read_chosen(
             errors.append(error)
             continue
         for error in errors:
-            text = f"{error} Going on from {path} instead."
-            CONSOLE.print(text, style="yellow", markup=False, soft_wrap=True)
+            CONSOLE.print(f"{error} Going on from {path} instead.", style="yellow", markup=False, soft_wrap=True)
         return path, state
     if errors:
         raise errors[0]

@@ -1,4 +1,4 @@
-"""Compiles a run's Triton kernels side by side before training starts, instead of one by one on the way."""
+"""Compiles a run's Triton kernels in parallel before training starts."""
 
 from __future__ import annotations
 
@@ -28,17 +28,13 @@ from sadgs_ns.training.optimizers import AdamUpdate, FusedAdam
 from sadgs_ns.training.pipeline import SadgsPipeline
 
 _GAUSSIANS, _SIZE = 64, 64
-"""Number of Gaussians, and width and height in px, of the picture on which the kernels are tried."""
+"""Number of Gaussians, and width and height in px, with which the kernels are tried."""
 _PATIENCE = 2.0
 """Seconds after which the user is told what the run is waiting for."""
 
 
 class _Stages:
-    """The stages of a training step on a few Gaussians. Each method launches the kernels of one.
-
-    Args:
-        pipeline: As for `compile_kernels`, like what follows.
-    """
+    """The stages of a training step on a few Gaussians, each a method that launches its kernels."""
 
     def __init__(self, pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
         self.pipeline, self.optimizers = pipeline, optimizers
@@ -54,13 +50,13 @@ class _Stages:
         Ks = self.means.new_tensor(intrinsics).repeat(self.views, 1, 1)
         self.image = torch.linspace(0.0, 1.0, 3 * _SIZE * _SIZE, device=device).view(1, _SIZE, _SIZE, 3)
         self.cameras = Cameras(viewmats, Ks, _SIZE, _SIZE)
-        # The run's own near plane may lie behind these Gaussians, and what nobody sees launches no compositing.
+        # The run's own near plane may lie behind these Gaussians, which would launch no compositing.
         self.drawing = replace(self.model.drawing, near_plane=NEAR_PLANE)
         self.info: dict[str, Any] = {}
-        """What `rasterize` says of the projection, once `project` was called."""
+        """The rasterizer's info, once `project` was called."""
 
     def alone(self) -> dict[str, Callable[[], None]]:
-        """Return the stages that need no projection, by what a user calls them."""
+        """Return the stages that need no projection, by their names for users."""
         stages = {
             "the loss": partial(self.loss, torch.uint8),
             "S̄": self.structure,
@@ -85,8 +81,8 @@ class _Stages:
         _, _, self.info = rasterize(self.gaussians, self.cameras, self.drawing)
 
     def tile_lists(self) -> None:
-        # The size is the run's: whether tiles are numbered in 16 or in 32 bits depends on how many there are, and lists
-        # of a given length have one more row of them.
+        # The run's image size decides between tile numbers of 16 and 32 bits; lists of a given length have one more row
+        # of tiles.
         sizes = self.pipeline.datamanager.train_dataset.cameras
         cameras = self.cameras._replace(width=int(sizes.width.max()), height=int(sizes.height.max()))
         for capacity in (None, 2**20):
@@ -112,14 +108,14 @@ class _Stages:
         twins: dict[str, FusedAdam] = {}
         for name, optimizer in self.optimizers.items():
             if name in self.model.trained_params:
-                # Matrices of colours are fewer than the Gaussians, and so updated in a launch of their own.
-                of_gaussians = name in self.model.gauss_params
-                value = self.blank(name) if of_gaussians else torch.zeros((1, 3, 4), device=self.device)
+                # There are fewer colour matrices than Gaussians, so that they take another launch.
+                known = name in self.model.gauss_params
+                value = self.blank(name) if known else torch.zeros((1, 3, 4), device=self.device)
                 options = {key: optimizer.defaults[key] for key in ("betas", "eps")}
                 twins[name] = FusedAdam([torch.nn.Parameter(value)], **options)
         update = AdamUpdate({name: twin for name, twin in twins.items() if twin.param_groups[0]["params"][0].numel()})
         gradients = {name: torch.zeros_like(parameter) for name, parameter in update.parameters.items()}
-        # Several processes wait for the exact lengths of tile lists, which then cannot overflow.
+        # Several processes wait for the lengths of tile lists, which then cannot overflow.
         flags = (torch.zeros(1, dtype=torch.int64, device=self.device),) if self.pipeline.world.alone else ()
         update.launch(gradients, update.factors().to(self.device), torch.zeros(1, device=self.device), flags)
 
@@ -134,7 +130,7 @@ class _Stages:
             accumulate_gradients(empty_gradients(_GAUSSIANS, self.device), info, self.views)
 
     def activations(self) -> None:
-        for weight in (0.0, 1.0):  # The loss has a part with the mean opacity, but not to the end.
+        for weight in (0.0, 1.0):  # The loss has its opacity term only while densification runs.
             parameters = self.scales.clone().requires_grad_(), self.opacities[:, None].clone().requires_grad_()
             some = activate(*parameters, weight)
             torch.autograd.backward([value.sum() for value in some if value is not None])
@@ -173,13 +169,11 @@ class _Stages:
 
 
 def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
-    """Launch the kernels of training once, on a few Gaussians and in threads, whose compilations then overlap.
+    """Launch the kernels of training once, on a few Gaussians and in threads, so that their compilations overlap.
 
-    Triton keeps what it compiled on the disk: a machine's first run takes seconds here, a later one none. The run
-    itself is left as it was, random numbers included.
-
-    A kernel that fails here does not stop the run, which may never need it: the user is told which ones failed and why,
-    in one sentence, and training tries them again where it needs them.
+    Triton keeps kernels on the disk, so only a machine's first run takes seconds here. The run's state, random numbers
+    included, does not change. If kernels fail, a sentence names them and the reason, and the run goes on: it may never
+    need them.
 
     Args:
         pipeline: A pipeline whose model and data are set up.
@@ -193,10 +187,10 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
     pending: dict[str, Future[None]] = {}
 
     def take_device() -> None:
-        if device.type == "cuda":  # A new thread has the first device, and Triton launches on a thread's own.
+        if device.type == "cuda":  # Triton launches on the thread's device, which is the first one by default.
             torch.cuda.set_device(device)
 
-    with ThreadPoolExecutor(initializer=take_device) as pool:  # which waits for its threads, whatever happens
+    with ThreadPoolExecutor(initializer=take_device) as pool:
         pending |= {name: pool.submit(stage) for name, stage in stages.alone().items()}
         try:
             stages.project()

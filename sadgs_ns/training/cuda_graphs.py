@@ -1,9 +1,9 @@
-"""Training steps of few Gaussians as CUDA graphs, which the host launches in one call instead of one by one.
+"""Training steps of few Gaussians as CUDA graphs: one call of the host launches all kernels of a step.
 
-On a small scene the host takes longer to launch a step than the GPU to run it. A graph repeats launches with the very
-arguments with which they were captured. What changes from step to step is therefore written, beforehand, into tensors
-that stay where they are: cameras, images and Adam's rates. What else the launches depend on is a graph's key, and where
-parameters are replaced, as densification does, all graphs are dropped.
+On a small scene the host takes longer to launch a step than the GPU to run it. A graph repeats launches with the
+arguments with which they were captured. So cameras, images and Adam's rates are copied, before each step, into tensors
+that keep their addresses. Everything else that a step depends on is part of its graph's key. When densification
+replaces parameters, all graphs are dropped.
 """
 
 from __future__ import annotations
@@ -26,18 +26,17 @@ from sadgs_ns.training.optimizers import AdamUpdate
 from sadgs_ns.training.train_step import StepResult, ViewGroup, training_step
 
 MOST_GAUSSIANS = 2**20
-"""Steps of more Gaussians, counted once for each view, keep the GPU busy without a graph, which would only take memory
-from them."""
+"""Steps of more Gaussians × views keep the GPU busy without a graph, which would only take memory."""
 MOST_GRAPHS = 16
-"""Largest number of graphs at a time. Images of many sizes, or views that see very different numbers of Gaussians,
-would otherwise be captured more often than they are replayed."""
+"""Largest number of graphs. With images of many sizes, or views of very different numbers of Gaussians, steps would
+otherwise be captured more often than they are replayed."""
 
 
 class Results(NamedTuple):
     """What a graph leaves on the device; its next replay overwrites it."""
 
     values: Tensor
-    """Loss, PSNR in dB, two numbers that mean nothing, and NaN if a gradient was left out, else 0. [5]"""
+    """Loss, PSNR in dB, two unused numbers, and NaN if a gradient was left out, else 0. [5]"""
     pair_counts: Tensor
     """Pairs of a Gaussian and a tile of each view. int64 [V]"""
     means_gradient: Tensor
@@ -45,11 +44,9 @@ class Results(NamedTuple):
 
 
 class Graph(Protocol):
-    """Launches that were captured."""
+    """Captured launches; `replay` launches them all, and returns what they write."""
 
-    def replay(self) -> Results:
-        """Launch them all, and return what they write."""
-        ...
+    def replay(self) -> Results: ...
 
 
 @dataclass(frozen=True)
@@ -63,30 +60,25 @@ class _CudaGraph:
 
 
 class CudaGraphs:
-    """Captures functions as CUDA graphs, which share memory, since only one of them runs at a time.
-
-    Args:
-        device: Device of training.
-    """
+    """Captures functions as CUDA graphs on a device. They share memory, since only one runs at a time."""
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
         self._stream = torch.cuda.Stream(device)
         self._pool = torch.cuda.graph_pool_handle()
-        # The shared memory lives as long as one of its graphs, so one that does nothing else is kept.
+        # The shared memory lives as long as one of its graphs, so this one is kept.
         self._first = self.capture(lambda: torch.zeros((), device=device))
 
     def capture(self, function: Callable[[], Any]) -> Graph:
-        """Capture what a function launches, which is not run by that.
+        """Capture what a function launches, without running it; its results keep their addresses.
 
-        torch's context manager would wait for the device, and give its unused memory back, at each capture.
+        torch's context manager would wait for the device, and free its unused memory, at each capture.
 
         Args:
-            function: It may launch only what was launched before, so that nothing is compiled or loaded meanwhile. The
-                tensors that it returns stay where they are.
+            function: It may launch only kernels that were launched before: none may be compiled or loaded meanwhile.
 
         Raises:
-            Exception: What the function raises, or RuntimeError, if it did what cannot be captured.
+            Exception: As `function`, or RuntimeError if it did something that cannot be captured.
         """
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.stream(self._stream):
@@ -111,28 +103,26 @@ class CudaGraphs:
         torch.cuda.synchronize(self._device)
 
     def _repair_generator(self) -> None:
-        """Let random numbers be drawn again, which torch refuses after a capture that did not end well."""
+        """Let torch draw random numbers again, which it refuses after a failed capture."""
         generator = torch.cuda.default_generators[torch.cuda.current_device()]
         generator.graphsafe_set_state(generator.clone_state())
 
 
 def has_room(device: torch.device) -> bool:
-    """Tell whether the memory for a graph's step is free, which is at most what the process has reserved."""
+    """Tell whether there is free memory for a graph, which takes at most what the process has reserved."""
     return device.type != "cuda" or torch.cuda.mem_get_info(device)[0] >= torch.cuda.memory_reserved(device)
 
 
 @dataclass(frozen=True)
 class _Inputs:
-    """What a graph reads that changes from step to step."""
+    """What changes from step to step, in tensors that a graph reads."""
 
     group: ViewGroup
-    """Cameras, images and numbers of the views."""
-    factors: Tensor
-    """Of Adam. [2, P]"""
+    factors: Tensor  # of Adam, [2, P]
 
     @staticmethod
     def like(group: ViewGroup, factors: Tensor) -> _Inputs:
-        """Make tensors for steps like one."""
+        """Make tensors for steps like this one."""
         images = torch.stack([data["image"] for data in group.data])
         viewmats, Ks, *size = group.cameras
         cameras = Cameras(viewmats.clone(), Ks.clone(), *size)
@@ -141,7 +131,7 @@ class _Inputs:
         return _Inputs(copied, factors.to(images.device))
 
     def write(self, group: ViewGroup, factors: Tensor) -> None:
-        """Put a step's values in the place of those before, without waiting for the device."""
+        """Copy a step's values into the tensors, without waiting for the device."""
         self.group.cameras.viewmats.copy_(group.cameras.viewmats)
         self.group.cameras.Ks.copy_(group.cameras.Ks)
         if self.group.view_ids is not None and group.view_ids is not None:
@@ -151,30 +141,27 @@ class _Inputs:
 
 
 class GraphedSteps:
-    """Replays training steps as graphs, which it captures where that pays.
+    """Captures and replays training steps of a model that this process holds alone.
 
-    The first step of a kind after parameters were replaced is launched one by one, which compiles and loads what is
-    missing. The second one is captured, and those after it are replayed.
+    The first step of a key after parameters were replaced is launched kernel by kernel, which compiles and loads what
+    is missing. The second one is captured, and all later ones are replayed.
 
     Attributes:
-        replayed: Number of steps that were trained by a graph.
-        failure: Why all steps are launched one by one from now on; empty where they are not.
-
-    Args:
-        model: The model, of which this process holds all Gaussians.
+        replayed: Number of steps that were replayed.
+        failure: Why no step is captured from now on, or "".
     """
 
     def __init__(self, model: SadgsModel) -> None:
         self._model = model
         self._recorder: CudaGraphs | None = None
         self._addresses: tuple[int, ...] = ()
-        self._launched: set[Any] = set()  # These are keys of steps that were launched one by one at these addresses.
+        self._launched: set[Any] = set()  # keys of steps that were launched at these addresses
         self._graphs: dict[Any, tuple[Graph, _Inputs]] = {}
         self.replayed = 0
         self.failure = ""
 
     def prepare(self, num_views: int) -> bool:
-        """Tell whether steps of so many views may be replayed by now. If not, give back what graphs take."""
+        """Tell whether steps of so many views may be replayed now. If not, free the graphs' memory."""
         if not self.failure and num_views * self._model.num_points <= MOST_GAUSSIANS:
             return True
         self._drop()
@@ -189,16 +176,12 @@ class GraphedSteps:
         factors: Tensor,
         nonfinite_flag: Tensor,
     ) -> StepResult | None:
-        """Do what `training_step` does with these arguments; `factors` are on the host.
-
-        Returns:
-            None if the step must be launched one by one.
-        """
+        """Do `training_step` with `factors` on the host by a graph; return None if the step cannot be one."""
         from sadgs_ns.kernels.tiles import PairCounts
 
         strategy, state = self._model.strategy, self._model.strategy_state
         group, step = groups[0], self._model.step
-        # An image with transparency, or with a mask, takes launches of its own.
+        # Transparency and masks take more launches.
         plain = all("mask" not in data and data["image"].shape[-1] == 3 for data in group.data)
         known = group.options.tile_capacity is not None and (not group.options.absgrad or "grad2d" in state)
         observes = group.structure_tensors is not None
@@ -219,13 +202,10 @@ class GraphedSteps:
     def _graph(
         self, group: ViewGroup, opacity_reg: float, update: AdamUpdate, factors: Tensor
     ) -> tuple[Graph, _Inputs] | None:
-        """Return the graph of such a step; None if there is none.
-
-        One is captured if such a step was launched one by one before, and memory is not short.
-        """
+        """Return the graph of such a step. Capture it at the second step of its key, unless memory is short."""
         sums = [value for value in self._model.strategy_state.values() if isinstance(value, Tensor)]
         changed = (*update.parameters.values(), *update.exp_avgs, *update.exp_avg_sqs, *sums)
-        # Tensors of other lengths may lie where those before did.
+        # New tensors of another length may have the old addresses.
         addresses = (len(update.parameters["means"]), *[tensor.data_ptr() for tensor in changed])
         if addresses != self._addresses:
             self._drop()
@@ -250,7 +230,7 @@ class GraphedSteps:
         self._launched.clear()
 
     def _give_up(self, error: Exception) -> None:
-        """Launch all steps one by one from now on, and say so."""
+        """Capture no step from now on, and print why."""
         self.failure = reason(error)
         self._drop()
         self._recorder = None
@@ -263,10 +243,10 @@ class GraphedSteps:
 
 def _captured_step(model: SadgsModel, inputs: _Inputs, opacity_reg: float, update: AdamUpdate) -> Results:
     """Launch a training step, and keep what the host reads of it."""
-    # What notes gradients begins at 16 bytes, because Triton would compile Adam anew for what is less aligned.
+    # The flag begins at 16 bytes, because Triton would compile Adam anew for a lesser alignment.
     values = torch.zeros(5, device=update.device)
     result = training_step(model, [inputs.group], opacity_reg, update, inputs.factors, values[4:])
-    # These are copies of memory. A kernel that no step has launched before would be loaded while it is captured.
+    # `copy_` copies memory; a kernel that no step has launched before would be loaded during the capture.
     values[0].copy_(result.loss)
     values[1].copy_(result.psnr)
     return Results(values, result.infos[0]["pair_counts"].counts.clone(), result.means_gradient)

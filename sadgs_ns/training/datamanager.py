@@ -1,4 +1,4 @@
-"""A data manager: nerfstudio's loader of whole images, with checks of their names and a faster reader of points."""
+"""nerfstudio's loader of whole images, with checks of their names, more threads, and a faster reader of points."""
 
 from __future__ import annotations
 
@@ -26,25 +26,21 @@ from sadgs_ns.training.images import LazyImages, thread_count
 from sadgs_ns.training.processes import processes_on_this_machine
 
 KEPT_FILES_SHARE = 0.25
-"""Share of the host's free memory up to which the files of compressed images are kept in it, by all processes of the
-machine together; each may keep all of them in the course of a run."""
+"""Largest share of the host's free memory in which the files of compressed images are kept."""
 
 
 class SadgsDatamanager(FullImageDatamanager[InputDataset]):
-    """A loader that checks the images' names and places, decodes them in more threads, or only when they are needed,
-    and reads SfM points once, faster and without open3d.
+    """Loads images in several threads or only when they are needed, and SfM points faster and without open3d.
 
-    The checks are here rather than in the pipeline, because `ns-render dataset` makes a datamanager of its own. Raises
-    InputError if an image is too small; as `colmap.read_poses`, `ply.read_points`, `splits.check_names` and
-    `splits.check_paths`.
+    It checks names and sizes of images, and raises InputError, here rather than in the pipeline, because `ns-render
+    dataset` makes its own datamanager.
     """
 
     def __init__(self, config: FullImageDatamanagerConfig, *args: Any, **kwargs: Any) -> None:
-        config = copy.copy(config)  # It is changed below, and the one that was given belongs to the run's config.yml.
+        config = copy.copy(config)  # The original is written to config.yml.
         choose_parser(config)
         parser = copy.copy(config.dataparser)
-        self._points: Path | None = None
-        """COLMAP's points, where nerfstudio does not read them itself."""
+        self._points: Path | None = None  # COLMAP's points, if nerfstudio does not read them itself
         if isinstance(parser, ColmapDataParserConfig):  # These checks precede the making of smaller images.
             model = (config.data or parser.data) / parser.colmap_path
             if (source := model / f"images.{colmap.model_kind(model)}").is_file():
@@ -55,7 +51,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
                 parser.load_3D_points = self._points is None
         parser._target = OWN.get(parser._target, parser._target)
         config.dataparser = parser
-        # nerfstudio would keep more than 500 images on the host, whatever their size, and say so in a line.
+        # nerfstudio would keep more than 500 images on the host, whatever their size.
         asked, config.cache_images = config.cache_images, "cpu"
         super().__init__(config, *args, **kwargs)  # type: ignore[arg-type]
         self.config.cache_images = asked
@@ -65,7 +61,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
             _check_sizes(dataset)
 
     def create_train_dataset(self) -> InputDataset:
-        """Add COLMAP's points to what nerfstudio makes; it would read the same ones in ten times the time."""
+        """Make the dataset with COLMAP's points, which nerfstudio would read in ten times the time."""
         if self._points is not None:
             outputs = self.train_dataparser_outputs
             points = colmap.read_points(self._points)
@@ -73,25 +69,20 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         return super().create_train_dataset()
 
     def create_eval_dataset(self) -> InputDataset:
-        """Make the dataset without reading the points a second time: nothing looks for them here."""
+        """Make the dataset without reading the points a second time; nobody uses them."""
         parser: Any = self.config.dataparser
         if hasattr(parser, "load_3D_points"):
             parser.load_3D_points = False
         return super().create_eval_dataset()
 
     def _load_images(self, split: Literal["train", "eval"], cache_images_device: str) -> Any:
-        """Load and undistort the images of a split as nerfstudio does, or make a sequence that does so at each access.
+        """Load and undistort the images of a split as nerfstudio does, or make `LazyImages` if they stay compressed.
 
-        Returns:
-            `image` [H, W, 3 or 4] and, where there is one, boolean `mask` [H, W, 1] of each view, on the device of
-            training with `cache_images` "gpu", else on the host, and pinned there if training is on CUDA.
-
-        Raises:
-            InputError: As `LazyImages.__getitem__`, unless images stay compressed.
+        Loaded, they are as in `LazyImages`, on the training device or in the host's memory, pinned with CUDA.
         """
         device, dataset = torch.device(self.device), self.train_dataset if split == "train" else self.eval_dataset
         on_demand = cache_images_device == "compressed"
-        # Of several processes each would come to hold all files, which the system's cache of files holds once.
+        # Each of several processes would keep all files, while the system's cache of files keeps them once.
         keep = on_demand and processes_on_this_machine() == 1
         if keep:
             size = sum(path.stat().st_size for path in dataset.image_filenames)
@@ -121,19 +112,17 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
 
     @property
     def fixed_indices_eval_dataloader(self) -> Any:
-        """Cameras [1] and data of the held-out views, on the device; nerfstudio would copy all there at once."""
+        """Cameras [1] and data of the held-out views, copied to the device one by one."""
         return _HeldOutViews(self)
 
     def get_train_rays_per_batch(self) -> int:
-        """Return the number of pixels of the first training image, which nerfstudio's trainer asks for in each step."""
+        """Return the number of pixels of the first training image; nerfstudio's trainer asks in each step."""
         cameras = self.train_dataset.cameras
         return int(cameras.height[0]) * int(cameras.width[0])
 
 
 @dataclass
 class _HeldOutViews(Sequence[tuple[Cameras, dict[str, Any]]]):
-    """Cameras and data of the held-out views, each of which is brought to the device when it is asked for."""
-
     datamanager: SadgsDatamanager
 
     def __len__(self) -> int:
@@ -146,7 +135,7 @@ class _HeldOutViews(Sequence[tuple[Cameras, dict[str, Any]]]):
 
 
 def _check_sizes(dataset: InputDataset) -> None:
-    """Raise InputError if an image is less than 2 px high or wide, which is too small for the loss."""
+    """Raise InputError if an image is less than 2 px high or wide, too small for the loss."""
     sizes = torch.cat([dataset.cameras.width, dataset.cameras.height], dim=-1)  # [C, 2] px
     for index in (sizes < 2).any(dim=-1).nonzero().flatten().tolist():
         width, height = sizes[index].tolist()

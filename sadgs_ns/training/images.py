@@ -1,4 +1,4 @@
-"""Images that are decoded whenever they are asked for."""
+"""Images that are decoded and undistorted at each access."""
 
 from __future__ import annotations
 
@@ -22,32 +22,26 @@ from torch import Tensor
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.training.processes import processes_on_this_machine
 
-_MOST_THREADS = 16
-"""Threads that decode images on a machine of at least as many cores."""
 _Undistort = Callable[[dict[str, Any], NDArray[Any]], tuple[NDArray[np.float32], NDArray[Any], Tensor | None]]
-"""Takes the data and the image [H, W] or [H, W, C] of a camera; returns its intrinsics in px [3, 3], image and mask
-[H, W, 1], where there is one, without distortion."""
+"""Takes a camera's data and image [H, W] or [H, W, C]; returns intrinsics in px [3, 3], image, and perhaps mask
+[H, W, 1] without distortion."""
 
 
 def thread_count(asked: int | None) -> int:
-    """Return the number of threads that decode images in this process.
-
-    It is what was asked for, or one for each core, up to 16; several processes of a machine share its cores.
-    """
+    """Return the number of threads that decode images in this process, by default one a core, up to 16."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return asked or min(max(cores // processes_on_this_machine(), 1), _MOST_THREADS)
+    return asked or min(max(cores // processes_on_this_machine(), 1), 16)
 
 
 class LazyImages(Sequence[dict[str, Any]]):
     """Images of a dataset as nerfstudio's FullImageDatamanager loads and undistorts them, decoded at each access.
 
-    The dataset's cameras become those of the undistorted images at once, for which no image is opened. Several threads
-    may ask for images at the same time.
+    Several threads may access images at once.
 
     Args:
-        dataset: The images, with their cameras and masks. It must be given to one such object only.
-        keep_files: Whether to keep the bytes of files in memory once they have been read. Otherwise a file is read at
-            each access, from the operating system's cache of files where that has room.
+        dataset: The images, with their cameras and masks, for this object only. The cameras become those of the
+            undistorted images at once, without opening one.
+        keep_files: Whether to keep the bytes of files in memory once they were read.
     """
 
     def __init__(self, dataset: InputDataset, keep_files: bool = False) -> None:
@@ -61,7 +55,7 @@ class LazyImages(Sequence[dict[str, Any]]):
             outputs.mask_filenames = _Files(outputs.mask_filenames, read)  # type: ignore[assignment]
         self._dataset = copy.copy(dataset)
         self._dataset._dataparser_outputs = outputs
-        self._opencv_agrees: bool | None = None  # It is known once a JPEG has been decoded.
+        self._opencv_agrees: bool | None = None  # unknown until a JPEG was decoded
         if dataset.scale_factor == 1 and type(dataset).get_numpy_image is InputDataset.get_numpy_image:
             self._dataset.get_numpy_image = self._decode
 
@@ -71,12 +65,9 @@ class LazyImages(Sequence[dict[str, Any]]):
     def __getitem__(self, index: Any) -> Any:
         """Decode an image and undistort it.
 
-        Returns:
-            `image` uint8 [H, W, 3 or 4], contiguous and on the CPU, boolean `mask` [H, W, 1] if the image has one, and
-            what else the dataset adds.
-
-        Raises:
-            InputError: If the image or its mask cannot be read any more, or has another size than its camera.
+        Returns `image` uint8 [H, W, 3 or 4], contiguous and on the CPU, boolean `mask` [H, W, 1] if there is one, and
+        what else the dataset adds. Raises InputError if image or mask cannot be read, or has another size than
+        its camera.
         """
         name, size, undistort = self._names[index], tuple(self._sizes[index]), self._undistort[index]
         try:
@@ -102,14 +93,10 @@ class LazyImages(Sequence[dict[str, Any]]):
         return {**data, "image": image}
 
     def _decode(self, image_idx: int) -> NDArray[np.uint8]:
-        """Decode an image as nerfstudio's `get_numpy_image`, a whole JPEG with OpenCV instead of Pillow.
+        """Decode an image as nerfstudio's `get_numpy_image`, a whole JPEG with OpenCV instead of Pillow. [H, W, 3 or 4]
 
-        Of 2 megapixels Pillow keeps other threads from running Python for 5 ms in all, and the training loop is such
-        a thread. Both libraries decode with libjpeg-turbo, but with versions of their own: the first JPEG is decoded
-        with both, and OpenCV is used only if their pixels are equal.
-
-        Returns:
-            [H, W, 3 or 4]
+        For 2 megapixels, Pillow blocks Python in other threads, such as the training loop, for 5 ms. Both use
+        libjpeg-turbo, perhaps in two versions, so OpenCV is used only if the pixels of the first JPEG are equal.
         """
         content = self._dataset.image_filenames[image_idx].getbuffer()  # type: ignore[attr-defined]
         image = None
@@ -126,10 +113,9 @@ class LazyImages(Sequence[dict[str, Any]]):
 
 
 def _undistort_cameras(cameras: Cameras) -> list[_Undistort | None]:
-    """Give C cameras the intrinsics and sizes that they have once nerfstudio has undistorted their images.
+    """Give C cameras the intrinsics and sizes of their undistorted images, computing equal cameras once.
 
-    Cameras that are alike, which most are, are computed once. Returns what undistorts an image of each; None where that
-    changes nothing.
+    Returns a function for each camera that undistorts its image; None if there is no distortion.
     """
     undistorts: list[_Undistort | None] = [None] * len(cameras)
     distortion = cameras.distortion_params  # [C, D]
@@ -153,14 +139,14 @@ def _undistort_cameras(cameras: Cameras) -> list[_Undistort | None]:
 
 
 def _undistort_as(camera: Cameras) -> _Undistort:
-    """Return what undistorts images of a camera, without batch dimension, as it is now."""
+    """Return a function that undistorts images of a camera, without batch dimension, as it is now."""
     camera = copy.deepcopy(camera)
     K, distortion = camera.get_intrinsics_matrices().numpy(), camera.distortion_params.numpy()  # type: ignore[union-attr]
     return lambda data, image: _undistort_image(camera, distortion, data, image, K.copy())
 
 
 class _Files(Sequence[io.BytesIO]):
-    """The content of files in the place of their paths, since Pillow opens both."""
+    """The content of files instead of their paths; Pillow opens both."""
 
     def __init__(self, paths: Sequence[Path], read: Callable[[Path], bytes]) -> None:
         self._paths, self._read = paths, read

@@ -1,7 +1,7 @@
-"""The Gaussians that a run starts from: of SfM points, on their bounding box, random ones, and those of stereo depth.
+"""The Gaussians that a run starts from: SfM points, their bounding box, random points, or stereo depth.
 
-Parameters are by name: means [N, 3], log scales [N, 3], quats [N, 4], logit opacities [N, 1] and coefficients of
-harmonics, features_dc [N, 3] and features_rest [N, K, 3].
+Parameters are by name: means [N, 3], log scales [N, 3], quats [N, 4], logit opacities [N, 1], and coefficients of
+harmonics features_dc [N, 3] and features_rest [N, K, 3].
 """
 
 from __future__ import annotations
@@ -19,21 +19,16 @@ from sadgs_ns.outliers import POINT_SHARE, REACH
 from sadgs_ns.training.config import SadgsModelConfig
 
 CAMERA_CLEARANCE = 2.0
-"""Initial Gaussians nearer to a camera than this many of their standard deviations are dropped. The paper keeps them;
-on the scene `south` dropping them brought 1.7 dB, elsewhere nothing (docs/results.md#other-constants)."""
+"""Initial Gaussians within so many of their standard deviations of a camera are dropped, other than in the paper. That
+brought 1.7 dB on the scene `south`, elsewhere nothing (docs/results.md#other-constants)."""
 
 
 def initial_gaussians(
     config: SadgsModelConfig, seed_points: tuple[Tensor, Tensor] | None
 ) -> tuple[dict[str, Tensor], Tensor]:
-    """Make Gaussians of the SfM points, or random ones where there are none or they are not wanted.
+    """Make Gaussians of the SfM points [P, 3] and their colours in 0 … 255 [P, 3], or else random ones.
 
-    Args:
-        config: Options of the model.
-        seed_points: SfM points [P, 3] and their colours in 0 … 255 [P, 3].
-
-    Returns:
-        The parameters; and which of the Gaussians are synthetic, random or on the points' bounding box. bool [N]
+    Returns the parameters, and which Gaussians are synthetic: random or on the points' bounding box. bool [N]
     """
     if seed_points is None or config.random_init:
         if not config.random_init:
@@ -72,7 +67,7 @@ def spheres(
     *,
     sh_degree: int,
 ) -> dict[str, Tensor]:
-    """Return the parameters of spheres, turned at random."""
+    """Return the parameters of spheres with random rotations."""
     number = len(means)
     return {
         "means": means,
@@ -85,14 +80,9 @@ def spheres(
 
 
 def outside_cameras(params: Mapping[str, Tensor], positions: Tensor) -> Tensor:
-    """Tell which Gaussians contain no camera; the others could only become haze before it.
+    """Tell which Gaussians contain none of the cameras' centres [C, 3]; the others could only become haze. bool [N]
 
-    Args:
-        params: `means` and `scales`.
-        positions: The cameras' centres in world units. [C, 3]
-
-    Returns:
-        bool [N], all True where otherwise none would be.
+    If each of them contains a camera, all are True.
     """
     radii = CAMERA_CLEARANCE * params["scales"].detach().exp().amax(dim=1)  # [N]
     keep = clear_of_cameras(params["means"].detach(), radii, positions)  # [N]
@@ -106,7 +96,7 @@ def beside(
     scales: Tensor,  # [P]
     config: SadgsModelConfig,
 ) -> dict[str, Tensor]:
-    """Return the parameters of spheres no larger than these scales, or than the way to neighbours and known points."""
+    """Return the parameters of spheres no larger than these scales, or the distance to neighbours and known points."""
     spacing = neighbour_scales(torch.cat([known, means.to(known)]))[len(known) :]  # [P]
     scales = torch.minimum(scales, spacing.to(scales))
     return spheres(means, colors, scales, config.initial_opacity, sh_degree=config.sh_degree)

@@ -16,9 +16,9 @@ from typing import Any
 from rich.console import Console
 
 HANG_UP: int | None = getattr(signal, "SIGHUP", None)
-"""The signal that says that the terminal is gone, as of an ssh that was cut off; Windows has none."""
+"""The signal of a terminal that is gone, as when ssh is cut off; Windows has none."""
 _HANG_UP_SECONDS = 2.0
-"""Longest time from a write that fails because the terminal is gone to the signal that says so."""
+"""Longest time from a write that fails because the terminal is gone until its signal comes."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, *([] if HANG_UP is None else [HANG_UP]))
 """Signals that ask a run to stop."""
 
@@ -34,14 +34,13 @@ class Interrupted(KeyboardInterrupt):
 class Interrupts:
     """A context in which the first of `SIGNALS` makes `poll` raise, and a second SIGINT or SIGTERM acts as usual.
 
-    Signals are left alone outside the main thread, since other threads cannot handle them. A signal for which the
-    program has a handler of its own, or which it ignores, as SIGHUP under nohup, is left alone, too.
+    Other threads than the main one cannot handle signals. A signal that the program handles by itself, or ignores, as
+    SIGHUP under nohup, is left alone.
 
     Args:
-        waiting: Returns whether the program only waits for somebody, so that nobody polls. The signal then raises at
-            once.
-        started: Whether another process started this one. It sends SIGTERM where it is interrupted itself, as from the
-            keyboard, so that SIGTERM after another signal is left alone.
+        waiting: Tells whether the program waits for the user, so that nobody polls; signals then raise at once.
+        started: Whether another process started this one. That process sends SIGTERM when it is interrupted itself, so
+            SIGTERM after another signal is ignored.
     """
 
     def __init__(self, waiting: Callable[[], bool], started: bool = False) -> None:
@@ -49,7 +48,7 @@ class Interrupts:
         self._repeated = {HANG_UP, signal.SIGTERM} if started else {HANG_UP}
         self._previous: dict[int, Any] = {}
         self.received: int | None = None
-        """The first signal that has come, None where none has."""
+        """The first signal that has come."""
 
     def __enter__(self) -> Interrupts:
         self.received = None
@@ -75,7 +74,7 @@ class Interrupts:
     def cause_of(self, error: OSError) -> Interrupted | None:
         """Return the interruption that made a write fail, or None if the error has another cause.
 
-        The kernel takes a terminal away before it sends SIGHUP, so that what is printed between fails.
+        The kernel takes a terminal away before it sends SIGHUP, so a write in between fails.
         """
         if error.errno == errno.EIO and HANG_UP in self._previous:
             end = time.monotonic() + _HANG_UP_SECONDS
@@ -85,7 +84,7 @@ class Interrupts:
 
     def _handle(self, number: int, frame: object) -> None:
         if self.received is not None:
-            return  # Where a connection drops, the shell sends one SIGHUP and the kernel another.
+            return  # When a connection drops, the shell sends one SIGHUP and the kernel another.
         self.received = number
         for another in self._previous.keys() - self._repeated:
             signal.signal(another, self._previous[another])
@@ -96,27 +95,27 @@ class Interrupts:
 
 
 def discard_broken_output() -> None:
-    """Discard output to a terminal or pipe that is gone, since printing there would raise before the run is saved."""
+    """Discard output to a terminal or pipe that is gone: printing there would raise before the run is saved."""
     for descriptor in (1, 2):
         if not os.isatty(descriptor) and not stat.S_ISREG(os.fstat(descriptor).st_mode):
             _discard(descriptor)
 
 
 def redirect_on_broken_pipe(console: Console) -> None:
-    """Have standard output's console print where errors go, or else nowhere, as soon as what read its output has ended.
+    """Once nobody reads standard output any more, have its console print to standard error, or else nowhere.
 
-    `head` ends when it has read enough, and `tee` ends by the same Ctrl-C as the program whose output it copies. rich
-    would end the program then, wherever it is, with exit code 1 and without a word.
+    `head` ends when it has read enough, and `tee` by the same Ctrl-C as the program before it. rich would then end the
+    program, wherever it is, with exit code 1 and without a word.
     """
 
     def print_elsewhere() -> None:
         descriptor = console.file.fileno()
         errors_are_elsewhere = sys.stderr is not None and not os.path.sameopenfile(descriptor, 2)
         _discard(descriptor)
-        console.file.flush()  # rich has kept what could not be written, and so has the file.
+        console.file.flush()  # The file has kept what could not be written, and so has rich.
         if errors_are_elsewhere:
             os.dup2(2, descriptor)
-        with console:  # Its end prints what rich has kept, and calls this function again if that fails.
+        with console:  # On leaving, rich prints what it has kept, and calls this function again if that fails.
             pass
 
     console.on_broken_pipe = print_elsewhere

@@ -1,4 +1,4 @@
-"""The memory plan before the first step: how many Gaussians the device holds beside the images and a step's views."""
+"""Plans memory before the first step: where the images are kept, and how many Gaussians the device holds."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sadgs_ns.training.processes import least, number_of_processes, processes_on
 from sadgs_ns.training.structure_cache import PIXELS_PER_BATCH
 
 PLANNED_SHARE = 0.8
-"""Share of the available memory that is planned with; the rest is for fragments and other programs."""
+"""Share of the available memory to plan with; the rest is for fragments and other programs."""
 QUANTIZED_BYTES = 3
 """Bytes that S̄ takes for each pixel of the training images (`method.quantization`)."""
 STRUCTURE_PIXEL_BYTES = 300
@@ -31,14 +31,12 @@ STRUCTURE_PIXEL_BYTES = 300
 SAMPLED_CAMERAS = 8
 """Training cameras in which the pairs of the initial Gaussians are counted."""
 MANY_IMAGES = 500
-"""Number of training images up to which nerfstudio would keep them on the device, whatever their size."""
-IMAGE_SHARE = 0.25
-"""Share of the device's free memory up to which more images than these are kept on it."""
-FEW_IMAGES_SHARE = 0.5
-"""The same share where there are no more than these."""
+"""nerfstudio would keep up to so many training images on the device, whatever their size."""
+IMAGE_SHARE, FEW_IMAGES_SHARE = 0.25, 0.5
+"""Largest shares of the device's free memory for the images if there are more than `MANY_IMAGES`, and if not."""
 HOST_SHARE = 0.5
-"""Share of the host's available memory up to which decoded images are kept in it. torch takes up to twice as much for
-pinned memory as is asked for, since it rounds up to powers of two."""
+"""Largest share of the host's available memory for decoded images. torch may take twice as much for pinned memory,
+since it rounds up to powers of two."""
 _REACH = 3.0
 """Standard deviations of a Gaussian that gsplat draws."""
 
@@ -52,30 +50,24 @@ class TrainingSize:
     step: StepSize
     """The largest step of the run, with the pairs of the initial Gaussians."""
     structure_bytes: float = 0.0
-    """Bytes that S̄ of a step's images takes while it is computed, before they are rendered; 0 where that is done once,
-    with the initial Gaussians."""
+    """Bytes to compute S̄ of a step's images before they are rendered; 0 if that is done once at the start."""
 
 
 def training_size(
     datamanager: FullImageDatamanager, params: Params, views: int, processes: int = 1, near_plane: float = NEAR_PLANE
 ) -> TrainingSize:
-    """Measure a run before its first step; no image is opened for it.
+    """Measure a run of so many views a step before its first step, without opening an image.
 
-    Args:
-        datamanager: Holds the cameras of the training and of the held-out images.
-        params: The initial Gaussians of this process.
-        views: Views rendered in a step.
-        processes: Number of processes among which the step is shared out.
-        near_plane: Depth in world units from which Gaussians are drawn.
+    `params` are the initial Gaussians of this process, and `processes` share out each step.
     """
     cameras = datamanager.train_dataset.cameras
     largest = int((cameras.height * cameras.width).max())
     structure = 0.0
     if datamanager.config.cache_images == "gpu":
         kept = image_bytes(datamanager)
-    else:  # The images of the next step are there, too; a process has those that it composites, and S̄ of all.
+    else:  # The images of the next step are there, too. A process has those that it composites, and S̄ of all.
         sizes = torch.cat([cameras.height, cameras.width], dim=-1).unique(dim=0).tolist()
-        here = views  # Views of several sizes are shared out size by size, and a process may have a part of each.
+        here = views  # A process may have a part of each view if there are several sizes.
         if len(sizes) == 1:
             here = max(len(views_of_rank((*map(tuple, sizes),) * views, processes, r)) for r in range(processes))
         kept = float((3 * here + QUANTIZED_BYTES * views) * largest)
@@ -95,17 +87,10 @@ def image_bytes(datamanager: FullImageDatamanager) -> float:
 
 
 def choose_image_storage(datamanager: FullImageDatamanager, device: torch.device) -> str | None:
-    """Decide where the images are kept, from the memory that is there: alike in all processes of the run.
+    """Set where the images are kept, by the free memory and alike in all processes; call before they are loaded.
 
-    Images that are asked for on the host stay compressed where each of several processes would decode all of them, and
-    there is no room for that.
-
-    Args:
-        datamanager: Its images have not been loaded yet; its configuration is changed.
-        device: The device of training.
-
-    Returns:
-        A line for the user; None where they are kept on the device, or where the user asked for.
+    With several processes, each would decode all images: those that the user wants on the host stay compressed if that
+    has no room. Returns a line for the user; None if images are kept on the device, or where the user asked for.
     """
     config, size, sharing = datamanager.config, image_bytes(datamanager), processes_on_this_machine()
     host = least(memory.available_host_bytes() / sharing, device)
@@ -135,15 +120,10 @@ def choose_image_storage(datamanager: FullImageDatamanager, device: torch.device
 
 @torch.no_grad()
 def estimate_pairs(params: Params, cameras: Cameras, near_plane: float = NEAR_PLANE) -> int:
-    """Pairs of a Gaussian and a tile in the view that has most of them, of a few training cameras.
+    """Count the pairs of a Gaussian and a tile in a few training cameras, and return the largest count.
 
-    Each Gaussian counts as a sphere of its largest scale and in all tiles of the square around its projection: the
-    initial Gaussians are spheres, and where they are large, which is where memory runs out, the square is the image.
-
-    Args:
-        params: `means` [N, 3], log `scales` [N, 3], logit `opacities` [N] or [N, 1].
-        cameras: Training cameras. [C]
-        near_plane: Depth in world units from which Gaussians are drawn.
+    Each Gaussian counts as a sphere of its largest scale, in all tiles of the square around its projection. The initial
+    Gaussians are spheres, and if they are so large that memory runs out, the square is the image.
     """
     means, device = params["means"], params["means"].device
     chosen = torch.linspace(0, len(cameras) - 1, min(SAMPLED_CAMERAS, len(cameras))).round().long()
@@ -187,18 +167,21 @@ def fit_to_memory(
 ) -> tuple[int, str, str | None]:
     """Lower the cap of Gaussians to what the budget, or the device's free memory, holds; call before the first step.
 
-    A cap under the present number of Gaussians adds none and takes none away. Without a budget, a cap that is not the
-    default of `max_gaussians` stays as it is, as all do without CUDA. Raises InputError if the budget leaves no room.
+    A cap below the present number adds no Gaussian and removes none. Without a budget, only the default of
+    `max_gaussians` is lowered; without CUDA, nothing is.
 
     Args:
         cap: The strategy's `max_gaussians`.
-        params: The initial Gaussians of this process, on the device of training.
+        params: The initial Gaussians of this process, on the training device.
         size: What the run keeps and renders besides.
-        budget_gb: Memory that the run may take on each device, in 10⁹ bytes; None is `PLANNED_SHARE` of what is free.
-        processes: Number of processes, each of which holds an equal part of the Gaussians on a device of its own.
+        budget_gb: Memory for the run on each device, in 10⁹ bytes; None is `PLANNED_SHARE` of what is free.
+        processes: Number of processes, each with an equal part of the Gaussians on its own device.
 
     Returns:
         The cap, a line for the user, and a warning if the first step will probably not fit.
+
+    Raises:
+        InputError: If the budget leaves no room for Gaussians.
     """
     device, n = params["means"].device, len(params["means"])
     free, total = memory.available_bytes(device)

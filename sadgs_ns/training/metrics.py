@@ -1,4 +1,4 @@
-"""How held-out views are measured: PSNR, SSIM, and LPIPS where its weights can be loaded."""
+"""Metrics of held-out views: PSNR, SSIM, and LPIPS if its weights can be loaded."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from torch import Tensor
 
 
 class MeasuredModel(SplatfactoModel):
-    """A splatfacto model that loads what metrics need when they are first asked for."""
+    """A splatfacto model that loads the modules and weights of metrics when they are first used."""
 
     def make_metrics(self) -> None:
-        """Make the metrics that splatfacto would make with its Gaussians, with LPIPS' weights."""
+        """Make the metrics, which splatfacto would make with its Gaussians."""
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
-        self._lpips: list[torch.nn.Module | None] = []  # In a list its weights stay out of the checkpoint.
+        self._lpips: list[torch.nn.Module | None] = []  # A list keeps its weights out of the checkpoint.
 
     def psnr(self, predicted: Tensor, target: Tensor) -> Tensor:
         """Return PSNR in dB of images in [0, 1], [1, 3, H, W] or [H, W, 3]."""
@@ -25,10 +25,7 @@ class MeasuredModel(SplatfactoModel):
         return peak_signal_noise_ratio(predicted, target, data_range=1.0)
 
     def lpips(self, predicted: Tensor, target: Tensor) -> Tensor:
-        """Return LPIPS (AlexNet) of images [1, 3, H, W] in [0, 1], or NaN where its weights cannot be loaded.
-
-        The weights are loaded at the first call, so that neither training nor rendering needs them.
-        """
+        """Return LPIPS (AlexNet) of images [1, 3, H, W] in [0, 1], or NaN if its weights cannot be loaded."""
         if not self._lpips:
             self._lpips = [load_lpips(self.device)]
         metric = self._lpips[0]
@@ -37,7 +34,7 @@ class MeasuredModel(SplatfactoModel):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Return PSNR, SSIM and, where its weights can be loaded, LPIPS of one held-out view."""
+        """Return PSNR, SSIM and, if its weights can be loaded, LPIPS of one held-out view."""
         metrics, images = super().get_image_metrics_and_images(outputs, batch)
         return {name: value for name, value in metrics.items() if "lpips" not in name or value == value}, images
 

@@ -21,9 +21,7 @@ from sadgs_ns.method.averaging import RunningMean
 from sadgs_ns.method.camera_paths import MOST_VIEWS, CameraPaths
 from sadgs_ns.method.clearance import limit_scales
 from sadgs_ns.method.color_matrices import identities
-from sadgs_ns.method.initialization import (
-    camera_extent,
-)
+from sadgs_ns.method.initialization import camera_extent
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.near_plane import nearest_depths, scene_near_plane
 from sadgs_ns.method.strategy import StructureAwareStrategy
@@ -40,21 +38,16 @@ from sadgs_ns.viewer import gaussian_maps
 from sadgs_ns.viewer.elements import LazyOutputs, in_viewer, warn_once
 
 NORMALS = "normals"
-"""Name of the output that only its readers pay for."""
+"""Name of an output that is computed only if it is read."""
 LIMIT_EVERY = 25
-"""Iterations between two times that scales are limited; at the presets' rates an axis grows threefold until then."""
-_MOST_RANDOM = 10_000_000
-"""Largest number of random points to start from; they take the host's memory before the cap thins them out."""
+"""Iterations from one limit on scales to the next, in which an axis grows at most threefold at the presets' rates."""
 
 
 class SadgsModel(MeasuredModel):
     """The Gaussians, how they are rendered, and the loss of a rendering.
 
-    nerfstudio's viewer, evaluation and exporter treat it as a splatfacto model.
-
-    Args:
-        config: The model's configuration.
-        seed_points: SfM points [P, 3] and their colours in 0 … 255 [P, 3], or None for random points.
+    nerfstudio's viewer, evaluation and exporter treat it as a splatfacto model. `seed_points` are SfM points [P, 3] and
+    their colours in 0 … 255 [P, 3], or None for random points.
     """
 
     config: SadgsModelConfig
@@ -66,14 +59,14 @@ class SadgsModel(MeasuredModel):
     def populate_modules(self) -> None:
         """Make parameters, metrics and the strategy, or raise InputError as `SadgsModelConfig.check`.
 
-        splatfacto's method needs CUDA and the weights of LPIPS, which are loaded here when they are first needed.
+        splatfacto's own method needs CUDA, and LPIPS's weights, which are here loaded when they are first used.
         """
         config = self.config
         config.check()
         self.strategy = config.strategy
         self.strategy_state = self.strategy.initialize_state()
         params, self.synthetic = initial_gaussians(config, self.seed_points)
-        """Which of the initial Gaussians stand for no SfM point, but are random or on their bounding box. bool [N]"""
+        """Which initial Gaussians stand for no SfM point, but are random or on the bounding box. bool [N]"""
         self.gauss_params = torch.nn.ParameterDict({name: torch.nn.Parameter(p) for name, p in params.items()})
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
         self.make_metrics()
@@ -81,24 +74,19 @@ class SadgsModel(MeasuredModel):
         self.average = RunningMean()
         self.camera_positions: Tensor | None = None  # [C, 3]
         self.near_plane = NEAR_PLANE if config.near_plane is None else config.near_plane
-        """Depth in world units from which Gaussians are drawn."""
         self.infos: list[dict[str, Any]] = []
         self.tile_forecast: TileForecast | None = TileForecast()
         self.color_matrices: torch.nn.Parameter | None = None  # [V, 3, 4]
         self.crop_box: OrientedBox | None = None
         self.viewer_outputs: Callable[[Cameras, dict[str, Tensor]], dict[str, Tensor]] | None = None
         self.world = World()
-        """The processes among which the Gaussians are shared out."""
         if config.color_model == "affine":
             self.learn_color_matrices()
 
     def set_cameras(self, positions: Tensor) -> None:
-        """Fit the initial Gaussians and the strategy to the training cameras; call before optimizers are made.
+        """Set the scene's extent, and drop initial Gaussians that contain a camera; call before optimizers are made.
 
-        Initial Gaussians that contain a camera are dropped: they could only become haze in front of it.
-
-        Args:
-            positions: Camera centres in world units. [C, 3]
+        `positions` are the training cameras' centres in world units. [C, 3]
         """
         self.strategy_state["scene_scale"] = camera_extent(positions)
         self.camera_positions = positions.to(self.means)
@@ -120,15 +108,12 @@ class SadgsModel(MeasuredModel):
             self.near_plane = scene_near_plane(depths, float(self.strategy_state["scene_scale"]))
 
     def add_points(self, means: Tensor, colors: Tensor, scales: Tensor) -> int:
-        """Start from more points, as many as the cap has room for; call before optimizers are made.
+        """Start from more points, as far as the cap has room; call before optimizers are made. Return how many.
 
         Args:
             means: World units. [P, 3]
             colors: In [0, 1]. [P, 3]
-            scales: Largest standard deviations, world units; they are no longer than the way to neighbours. [P]
-
-        Returns:
-            Number of points that were added.
+            scales: Largest standard deviations, world units; the distance to neighbours limits them, too. [P]
         """
         room = max(min(len(means), self.strategy.max_gaussians - self.num_points), 0)
         means, colors, scales = means[:room], colors[:room], scales[:room]
@@ -142,9 +127,9 @@ class SadgsModel(MeasuredModel):
         return room
 
     def clear_paths(self, viewmats: Tensor) -> None:
-        """Let densification prune the haze near the cameras' paths, unless the run is told not to.
+        """Let densification prune haze near the training cameras [C, 4, 4], unless the options forbid it.
 
-        Call it once all initial Gaussians are there, with the training views' world-to-camera matrices. [C, 4, 4]
+        Call it once all initial Gaussians exist.
         """
         asked = self.config.clear_paths
         if len(viewmats) <= MOST_VIEWS if asked is None else asked:
@@ -152,17 +137,17 @@ class SadgsModel(MeasuredModel):
             self.strategy_state["camera_paths"] = CameraPaths.of(viewmats, self.near_plane, surfaces)
 
     def learn_color_matrices(self) -> None:
-        """Learn a matrix of colours for each training view; call before optimizers are made."""
+        """Learn a colour matrix for each training view; call before optimizers are made."""
         matrices = identities(self.num_train_data).to(self.means.device)
         self.color_matrices = torch.nn.Parameter(matrices)
-        # An index that is made in a step would have to be copied to the device there.
-        numbers = torch.arange(len(matrices), device=matrices.device)  # [V]
-        self.register_buffer("every_view_id", numbers, persistent=False)
+        # An index made in a step would have to be copied to the device there.
+        ids = torch.arange(len(matrices), device=matrices.device)  # [V]
+        self.register_buffer("every_view_id", ids, persistent=False)
 
     def shard(self, world: World) -> None:
-        """Keep this process's part of the Gaussians, all of which it has until now; call before optimizers are made.
+        """Keep this process's part of the Gaussians only; call before optimizers are made.
 
-        Raises InputError if the backend draws in one process alone.
+        Raises InputError if the backend works in one process only.
         """
         choose_backend(self.config.backend, world.device, world.alone)
         part = world.take_even_part(self.num_points)
@@ -177,17 +162,17 @@ class SadgsModel(MeasuredModel):
         return self.num_points if self.world.alone else self.world.total
 
     def follow(self, plan: RunPlan) -> None:
-        """Densify, average and draw as a plan says from now on."""
+        """Densify, average and draw according to a plan from now on."""
         self.plan, self.near_plane = plan, plan.near_plane
         self.strategy = plan.strategy.for_run(plan.iterations, self.world)
 
     def step_post_backward(self, step: int) -> None:
-        """Densify where that is due, limit scales, and average the parameters at the run's end."""
+        """Densify and limit scales if that is due, and average the parameters at the run's end."""
         self.strategy.densify(self.gauss_params, self.optimizers, self.strategy_state, self.step, self.infos)
         self.infos = []
         iterations, done = self.plan.iterations, self.step + 1
         if done <= iterations - round(self.config.averaged_share * iterations):
-            self.average.clear()  # A run that was to end here, and is trained on, may have begun to average.
+            self.average.clear()  # A run that is trained on may have begun to average earlier.
         else:
             self.average.add(self.gauss_params)
             if done >= iterations:
@@ -198,7 +183,7 @@ class SadgsModel(MeasuredModel):
 
     @property
     def trained_params(self) -> dict[str, Tensor]:
-        """Parameters by name that a training step reads: the Gaussians', and matrices of colours where there are."""
+        """Parameters by name that a training step reads: the Gaussians', and colour matrices if there are some."""
         learned = {} if self.color_matrices is None else {"color_matrices": self.color_matrices}
         return {**dict(self.gauss_params.items()), **learned}
 
@@ -209,7 +194,7 @@ class SadgsModel(MeasuredModel):
         return groups  # type: ignore[return-value]
 
     def view_ids(self, cam_indices: Sequence[int]) -> Tensor | None:
-        """Return indices of C views as int64 [C] on the device, without waiting; None without matrices of colours."""
+        """Return indices of C views on the device, int64 [C], without waiting; None without colour matrices."""
         if self.color_matrices is None:
             return None
         return torch.cat([self.every_view_id[index : index + 1] for index in cam_indices])
@@ -223,49 +208,40 @@ class SadgsModel(MeasuredModel):
 
     @property
     def sh_degree_now(self) -> int | None:
-        """Degree of the harmonics that are drawn at this step; None where colours do not depend on the direction."""
-        # Each iteration adds a degree: 3DGS's 1,000 iterations between them leave too few of so short a run.
+        """Degree of the harmonics drawn at this step; None if colours do not depend on the direction."""
+        # Each iteration adds a degree; 3DGS's 1,000 iterations for each would be too many in so short a run.
         return min(self.step, self.config.sh_degree) if self.config.sh_degree > 0 else None
 
     @property
     def backend(self) -> str:
-        """Name of what draws; raises InputError if the backend that is wanted cannot."""
+        """Name of the backend that draws; raises InputError if the option's cannot."""
         return choose_backend(self.config.backend, self.device)
 
     @property
     def drawing(self) -> RenderOptions:
-        """The options that every picture of these Gaussians shares; colours are drawn with `color_options`."""
+        """The options that all pictures of these Gaussians share; `color_options` are for colours."""
         config = self.config
         return RenderOptions(near_plane=self.near_plane, max_off_axis=config.max_off_axis, backend=config.backend)
 
     def color_options(self, **changes: Any) -> RenderOptions:
-        """Return the options with which colours are drawn at this step, and others of their fields."""
+        """Return the options to draw colours at this step, with other values of some fields."""
         return replace(self.drawing, sh_degree=self.sh_degree_now, **changes)
 
     def render(self, cameras: Pinholes, options: RenderOptions) -> tuple[Tensor, Tensor, dict[str, Any]]:
         """Rasterize the Gaussians, in the viewer those inside its crop box, in their colours.
 
-        Args:
-            cameras: Views of one size.
-            options: As `color_options` makes them.
-
         Returns:
-            Colours, not clamped, and depth if it was asked for [C, H, W, 3 or 4]; accumulated opacity [C, H, W, 1]; the
-            rasterizer's info.
+            Colours, not clamped, and depth if `options` ask for it [C, H, W, 3 or 4]; accumulated opacity [C, H, W, 1];
+            the rasterizer's info.
         """
         return rasterize(self.gaussians()[0], cameras, options)
 
     def gaussians(
         self, params: Mapping[str, Tensor] | None = None, opacity_reg: float = 0.0
     ) -> tuple[Gaussians, Tensor | None]:
-        """Return what the rasterizer takes of the Gaussians; in the viewer, of those inside its crop box.
+        """Return the activated Gaussians; in the viewer, those inside its crop box. `params` default to the model's.
 
-        Args:
-            params: Parameters by name; None is the model's own.
-            opacity_reg: Factor on the mean opacity.
-
-        Returns:
-            The Gaussians; and numbers [P] whose sum is the mean opacity times `opacity_reg`, or None where that is 0.
+        The second result are numbers [P] whose sum is the mean opacity times `opacity_reg`; None if that factor is 0.
         """
         params = self.cropped(dict(self.gauss_params.items()) if params is None else params)
         colors: Tensor | tuple[Tensor, Tensor] = (params["features_dc"], params["features_rest"])
@@ -275,10 +251,7 @@ class SadgsModel(MeasuredModel):
         return Gaussians(params["means"], params["quats"], scales, opacities, colors), penalty
 
     def step_options(self, cameras: Pinholes, indices: Sequence[int]) -> RenderOptions:
-        """Return how training views, by their indices, are drawn at this step.
-
-        With our kernels the host does not wait for the length of the tile lists, but foresees it.
-        """
+        """Return how training views, by their indices, are drawn at this step, with the foreseen length of lists."""
         forecast, capacity = self.tile_forecast, None
         if forecast is not None:
             capacity = forecast.capacity(indices, cameras[2:], self.num_points)
@@ -290,13 +263,13 @@ class SadgsModel(MeasuredModel):
         return self.config.opacity_reg if self.step < self.strategy.windows.refine_stop_iter else 0.0
 
     def before_background(self, render: Tensor, alpha: Tensor, background: Tensor) -> Tensor:
-        """Put renderings [C, H, W, ≥ 3] of accumulated opacity [C, H, W, 1] before a background [3]. → [C, H, W, 3]"""
+        """Put renderings [C, H, W, ≥ 3] with their opacity [C, H, W, 1] before a background [3]. → [C, H, W, 3]"""
         if self.config.background_color == "black":
             return render[..., :3]
         return render[..., :3] + (1 - alpha) * background
 
     def get_outputs(self, camera: Cameras) -> dict[str, Any]:
-        """Render one camera, shape [1], for the viewer, evaluation and rendering. Raise InputError if it is no pinhole.
+        """Render one camera, shape [1], for viewer and evaluation. Raise InputError if it is no pinhole.
 
         Returns:
             `rgb` [H, W, 3] in [0, 1]; `depth` [H, W, 1], the mean of the drawn Gaussians' depths along the viewing axis
@@ -323,8 +296,8 @@ class SadgsModel(MeasuredModel):
     def get_normals(self, camera: Cameras, params: Mapping[str, Tensor] | None = None) -> Tensor:
         """Render the normals of one camera, shape [1], which takes about as long as its colours. [H, W, 3]
 
-        They are 0.5 + 0.5 n, n being what `gaussian_maps.normals_map` returns, in the axes of the run's world, and
-        black where nothing is. `params` are by name; None is the model's own, inside the viewer's crop box.
+        They are 0.5 + 0.5 n with n of `gaussian_maps.normals_map`, in the world's axes, and black where nothing is.
+        `params` default to the model's own inside the viewer's crop box.
         """
         params = self.cropped(dict(self.gauss_params.items())) if params is None else params
         width, height = int(camera.width.item()), int(camera.height.item())
@@ -338,10 +311,10 @@ class SadgsModel(MeasuredModel):
     def get_outputs_for_camera(  # type: ignore[override]
         self, camera: Cameras, obb_box: OrientedBox | None = None
     ) -> MutableMapping[str, Tensor]:
-        """Render one camera, shape [1], as `get_outputs` does, inside a crop box, and add the pictures of the panels.
+        """Render one camera, shape [1], as `get_outputs` inside a crop box, and add the panels' pictures.
 
-        Outside the viewer, `get_normals` is added as `normals`, and computed when it is first read. A camera that is no
-        pinhole raises InputError; the viewer, whose thread would end, is shown nothing instead.
+        Outside the viewer, `normals` are added, and computed when they are first read. A camera that is no pinhole
+        raises InputError; the viewer, whose thread would end, shows nothing instead.
         """
         try:
             outputs: dict[str, Any] = super().get_outputs_for_camera(camera, obb_box)
@@ -359,16 +332,13 @@ class SadgsModel(MeasuredModel):
         return LazyOutputs({**outputs, NORMALS: lambda: self.get_normals(camera, params)})
 
     def get_gt_img(self, image: Tensor) -> Tensor:
-        """Return an image, uint8 or floats in [0, 1] [H, W, 3 or 4], on the model's device and in [0, 1].
-
-        splatfacto converts and divides bytes in two launches; this takes one.
-        """
+        """Return an image, uint8 or floats in [0, 1] [H, W, 3 or 4], on the device and in [0, 1], in one launch."""
         image = image.to(self.device)
         return image / 255.0 if image.dtype == torch.uint8 else image
 
     @property
     def background(self) -> Tensor:
-        """Colour behind the Gaussians, which is not made anew in each step. [3]"""
+        """Colour behind the Gaussians; it is made once. [3]"""
         return _constant_color(float(self.config.background_color == "white"), self.device)
 
     def composite_with_background(self, image: Tensor, background: Tensor) -> Tensor:
@@ -379,7 +349,7 @@ class SadgsModel(MeasuredModel):
         return image
 
     def training_metrics(self, psnr: Tensor) -> dict[str, Any]:
-        """Return what is logged of a step whose views have this PSNR in dB, a scalar."""
+        """Return what is logged of a step with this PSNR in dB, a scalar."""
         metrics: dict[str, Any] = {"psnr": psnr, "gaussian_count": self.num_gaussians}
         self.camera_optimizer.get_metrics_dict(metrics)
         return metrics
@@ -397,8 +367,7 @@ class SadgsModel(MeasuredModel):
 
         Args:
             rgb: Not clamped. […, H, W, 3]
-            batch: `image` of the same leading shape, uint8 or floats in [0, 1] […, H, W, 3 or 4], and perhaps a boolean
-                `mask` […, H, W, 1].
+            batch: `image`, uint8 or floats in [0, 1] […, H, W, 3 or 4], and perhaps a boolean `mask` […, H, W, 1].
             background: [3] or [H, W, 3]
 
         Returns:
@@ -413,7 +382,7 @@ class SadgsModel(MeasuredModel):
         return rgb, target
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Return what a checkpoint needs besides parameters: the step, the strategy's state and the mean so far."""
+        """Return the step, the strategy's state and the mean of the parameters so far."""
         return {
             "step": self.step,
             "strategy_state": {
@@ -438,8 +407,7 @@ class SadgsModel(MeasuredModel):
     def load_state_dict(self, dict: dict[str, Any], **kwargs: Any) -> Any:  # type: ignore[override]
         """Load a checkpoint of any number of Gaussians.
 
-        The parameters are resized in place: the optimizers were built on these very tensors. Where no matrices of
-        colours are learned, those of the checkpoint are left out, since nothing else reads them.
+        Parameters are resized in place, because optimizers may hold them. Colour matrices are ignored if unused.
         """
         if self.color_matrices is None:
             dict = {name: value for name, value in dict.items() if name != "color_matrices"}

@@ -1,4 +1,4 @@
-"""The optimizers: Adam in one launch for all parameters, and learning rates that decay over the run's own length."""
+"""The optimizers: Adam in one launch for all parameters, and learning rates that decay over the run's length."""
 
 from __future__ import annotations
 
@@ -19,33 +19,28 @@ from sadgs_ns.training.nonfinite import MAX_GRADIENT, leave_out_nonfinite
 from sadgs_ns.training.options import hide
 
 _ONE = torch.tensor(1.0, device="cpu")
-"""Adding it to the count of steps costs the host a third of adding Python's 1."""
+"""The host adds this to a count of steps in a third of the time for Python's 1."""
 
 
 class FusedAdam(Adam):
-    """torch's fused Adam, or the state of it that our kernel updates, of one parameter."""
+    """torch's fused Adam of one parameter, or its state that our kernel updates."""
 
     def __init__(self, params: Iterable[Tensor], **options: Any) -> None:
         (parameter,) = params
-        # torch's fused Adam keeps the step count on the device, and our kernel would make the host wait for it.
+        # torch's fused Adam keeps the step count on the device, where the host would have to wait for it.
         super().__init__([parameter], fused=not use_triton(parameter.device), **options)
 
 
 class AdamUpdate:
-    """One update of parameters, by our kernel where that runs, else by torch's fused Adam.
+    """An update of parameters by our kernel, or else by torch's fused Adam, all on one device.
 
-    At 300k Gaussians the GPU would wait for the host, which took a quarter of a step for six optimizers. One launch
-    updates all parameters that are equally many and have equal betas and eps.
-
-    Gradients that are NaN, infinite or beyond `nonfinite.MAX_GRADIENT` count as 0: parameters and moments stay finite.
+    One launch updates all parameters of one length with equal betas and eps: six optimizers took the host a quarter of
+    a step of 300k Gaussians. Gradients of at least `nonfinite.MAX_GRADIENT`, or NaN, count as 0.
 
     Attributes:
-        parameters: What is updated, by name, as it is now.
+        parameters: The present parameters, by name.
         exp_avgs: Their first moments.
         exp_avg_sqs: Their second moments.
-
-    Args:
-        optimizers: By name, all on one device.
     """
 
     def __init__(self, optimizers: Mapping[str, Adam]) -> None:
@@ -74,9 +69,9 @@ class AdamUpdate:
         )
 
     def factors(self) -> Tensor:
-        """Count an update of each parameter; return what the kernel multiplies with, on the host. float32 [2, P]
+        """Count an update of each parameter, and return the kernel's factors, on the host. float32 [2, P]
 
-        It is in pinned memory where there is CUDA. torch's Adam counts by itself and reads nothing of it.
+        With CUDA they are pinned. torch's Adam counts by itself, and has none.
         """
         if not self._triton:
             return torch.empty((2, 0))
@@ -100,9 +95,9 @@ class AdamUpdate:
 
         Args:
             gradients: By the parameters' names, of their shapes.
-            factors: What `factors` returned, on the parameters' device. [2, P]
+            factors: What `factors` returned, on the device.
             nonfinite_flag: Becomes NaN if a gradient was not finite. float32 [1]
-            overflowed: As for `kernels.adam.adam_step`; torch's Adam takes none.
+            overflowed: As for `kernels.adam.adam_step`; torch's Adam ignores it.
         """
         if not self._triton:
             for name, optimizer in self._optimizers.items():
@@ -129,14 +124,14 @@ class SadgsOptimizers(Optimizers):
 
     def __init__(self, config: dict[str, Any], param_groups: dict[str, list[torch.nn.Parameter]]) -> None:
         super().__init__(config, param_groups)
-        # nerfstudio would keep the parameters of the start, which densification replaces, to clip their gradients.
+        # nerfstudio would keep the first parameters, which densification replaces, to clip their gradients.
         self.parameters.clear()
 
     def update(self) -> AdamUpdate:
-        """Return an update of all parameters that hold numbers, as they are now."""
+        """Return an update of all present parameters that are not empty."""
         adams: Any = self.optimizers.items()
         for _, adam in adams:
-            adam._opt_called = True  # torch's schedulers look for it.
+            adam._opt_called = True  # for torch's schedulers
         return AdamUpdate({name: adam for name, adam in adams if adam.param_groups[0]["params"][0].numel()})
 
 
@@ -154,7 +149,7 @@ class FusedAdamOptimizerConfig(AdamOptimizerConfig):
 
 @dataclass
 class RunLengthDecaySchedulerConfig(SchedulerConfig):
-    """Exponential decay over the length of the run, or over its last part, whatever `--max-num-iterations` is."""
+    """Exponential decay over the run, or over its last part, whatever `--max-num-iterations` is."""
 
     _target: type = field(default_factory=lambda: RunLengthDecayScheduler)
     initial_factor: Suppress[float] = 1.0
@@ -180,12 +175,12 @@ class UnlistedDecaySchedulerConfig(RunLengthDecaySchedulerConfig):
 
 
 class RunLengthDecayScheduler(Scheduler):
-    """lr(t) = lr · initial^(1−t) · final^t with t the fraction that has passed of the run after `hold_share`."""
+    """lr(t) = lr · initial^(1−t) · final^t with t the fraction of the run after `hold_share` that has passed."""
 
     config: RunLengthDecaySchedulerConfig
 
     def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LambdaLR:
-        """Make torch's scheduler. Its state holds Python numbers only, which torch's safe loader loads."""
+        """Make torch's scheduler, whose state torch's safe loader can load."""
         max_steps = self.config.max_steps
         if max_steps is None:
             raise ValueError("max_steps is unset: SadgsTrainer sets it to the length of the run.")

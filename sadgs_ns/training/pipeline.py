@@ -1,4 +1,4 @@
-"""nerfstudio's pipeline for this method: several views in an iteration, with the structure tensors of their images."""
+"""nerfstudio's pipeline for this method: it holds data and model, prepares each step, and reports on it."""
 
 from __future__ import annotations
 
@@ -36,22 +36,14 @@ from sadgs_ns.viewer.cleaning_panel import CleaningPanel
 from sadgs_ns.viewer.elements import in_viewer, shows_output
 from sadgs_ns.viewer.structure_panel import StructurePanel
 
-_MOST_EFFORT = 100
-"""Largest `effort`, which is a million iterations of four views for a capture of 760 views."""
 _NAMED_STEPS = 5
-"""Number of iterations of which a report of what was not finite names the images."""
-_WIDEST_BLUR = 100
-"""Largest window of `energy_blur`, which makes kernels of thousands of pixels."""
+"""Number of iterations whose images a report of losses that are not finite names."""
 _SAMPLED = 1000
 """About so many cameras, and Gaussians, are enough to find out whether training can see anything."""
 
 
 class SadgsPipeline(VanillaPipeline):
-    """Draws views, renders those of one size together, and feeds the model their structure tensors.
-
-    Raises:
-        InputError: As `SadgsPipelineConfig.check`, or if the data cannot be trained on.
-    """
+    """Data, model and viewer panels of a run. Raises InputError if options are wrong or the data is unusable."""
 
     config: SadgsPipelineConfig
     datamanager: SadgsDatamanager
@@ -63,7 +55,7 @@ class SadgsPipeline(VanillaPipeline):
             if finding.severity == "warning":
                 CONSOLE.print(f"[yellow]{escape(finding.sentence)}[/]")
         super().__init__(config, *args, **kwargs)
-        backend = self.model.backend  # It may be refused.
+        backend = self.model.backend  # raises InputError if it cannot work
         for dataset in (self.datamanager.train_dataset, self.datamanager.eval_dataset):
             check_camera_types(dataset.cameras)
         if config.datamanager.cache_images != "compressed" and kwargs.get("test_mode") != "inference":
@@ -91,17 +83,16 @@ class SadgsPipeline(VanillaPipeline):
         )
         self.log = NonFiniteLog(self.device)
         self.world = World()
-        """The processes among which the Gaussians are shared out."""
         self._means_gradient: Tensor | None = None  # [N, 3], of the last step
-        self.diverged = ""  # It says why, where nothing is learned any more.
+        self.diverged = ""  # a sentence with the reason once nothing is learned any more
         self.structure = StructurePanel(self.structure_cache)
         self.cleaning = CleaningPanel(self.views)
         self.model.viewer_outputs = self._viewer_outputs
 
     def _viewer_outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return what the viewer may show besides the model's own outputs; what it does not show is `rgb`.
+        """Return what the viewer may show besides the model's own outputs; outputs not shown are `rgb`.
 
-        Normals cannot wait until they are read, because the viewer reads them when training goes on.
+        Normals cannot be lazy here: the viewer reads outputs while training goes on.
         """
         if not in_viewer():
             return {}
@@ -115,34 +106,33 @@ class SadgsPipeline(VanillaPipeline):
         return self._model  # type: ignore[return-value]
 
     def follow(self, plan: RunPlan) -> None:
-        """Train, and draw, as a plan says from now on."""
+        """Train and draw according to a plan from now on."""
         self.model.follow(plan)
         self.structure.set_max_gaussians.value = plan.strategy.max_gaussians
         self.structure.set_tau_split.value = plan.strategy.tau_split
 
     def shard(self, world: World) -> None:
-        """Keep this process's part of the Gaussians, all of which it has until now; call before optimizers are made."""
+        """Keep this process's part of the Gaussians only; call before optimizers are made."""
         self.world = self.views.world = world
         self.model.shard(world)
 
     def train(self, mode: bool = True) -> SadgsPipeline:
-        """Set the mode of all modules, unless they have it: nerfstudio asks before every step, and torch visits all."""
+        """Set the mode of all modules, unless they have it; nerfstudio calls this before every step."""
         return self if mode == self.training == self.model.training else super().train(mode)
 
     @property
     def views_per_iteration(self) -> int:
-        """Number of views in a step, at most as many as there are: a view that is rendered twice would count twice."""
+        """Number of views in a step, at most as many as there are."""
         return self.model.plan.views_per_iteration
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Return the callbacks of data and model, and two that read what was not finite."""
-        after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN]
-        counts = TrainingCallback(after, lambda step: self.structure.refresh())
-        after_step = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
-        read = TrainingCallback(after_step, lambda step: self._report_nonfinite() if self.log.full else None)
-        last = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self._report_at_the_end())
+        """Return the callbacks of data and model, and those that report and refresh the panel."""
+        step_end, run_end = TrainingCallbackLocation.AFTER_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN
+        counts = TrainingCallback([step_end, run_end], lambda step: self.structure.refresh())
+        read = TrainingCallback([step_end], lambda step: self._report_nonfinite() if self.log.full else None)
+        last = TrainingCallback([run_end], lambda step: self._report_at_the_end())
         # The log is read before densification makes new parameters, which have no gradients.
         return [read, *super().get_training_callbacks(training_callback_attributes), counts, last]
 
@@ -165,7 +155,7 @@ class SadgsPipeline(VanillaPipeline):
             )
 
     def _report_nonfinite(self, last: bool = False) -> None:
-        """Say in which of the last iterations, and with which images, a loss or gradient was not finite.
+        """Print in which of the last iterations, and with which images, a loss or gradient was not finite.
 
         If that lasts, and the present gradients move nothing, `diverged` becomes the sentence that says so. The report
         at the run's end may cover fewer iterations than `nonfinite.DIVERGED_STEPS`.
@@ -191,13 +181,13 @@ class SadgsPipeline(VanillaPipeline):
             )
 
     def _repeat_overflowed(self, *, wait: bool = False) -> None:
-        """Put back the views that were not drawn, because their tile lists were longer than foreseen."""
+        """Requeue the views that were not drawn because their tile lists were longer than foreseen."""
         forecast = self.model.tile_forecast
         if forecast is not None and (lost := forecast.overflowed(wait=wait)):
             self.views.sampler.requeue(lost)
 
     def _report_at_the_end(self) -> None:
-        """Say what was not finite in the last iterations, and how often nothing was drawn."""
+        """Print what was not finite in the last iterations, and how often nothing was drawn."""
         self._report_nonfinite(last=True)
         self._repeat_overflowed(wait=True)
         forecast = self.model.tile_forecast
@@ -215,7 +205,7 @@ class SadgsPipeline(VanillaPipeline):
         model = self.model
         groups: dict[tuple[int, ...], list[tuple[int, dict[str, Any]]]] = defaultdict(list)
         for index, data in self.views.draw(self.views_per_iteration):
-            # One of several processes does not have the images that only others composite.
+            # With several processes, some images are composited, and loaded, by others only.
             groups[data["image"].shape if self.world.alone else self.views.sizes[index]].append((index, data))
         result = []
         for (height, width, *_), views in groups.items():
@@ -227,7 +217,7 @@ class SadgsPipeline(VanillaPipeline):
         return result
 
     def finish_step(self, step: int, groups: list[ViewGroup], result: StepResult) -> None:
-        """Keep what later steps and reports ask for; nothing of it is waited for."""
+        """Keep what later steps and reports need, without waiting for the device."""
         self.model.infos, self._means_gradient = result.infos, result.means_gradient
         self.log.record(step, [index for group in groups for index in group.indices], result.loss)
         forecast = self.model.tile_forecast
@@ -239,9 +229,9 @@ class SadgsPipeline(VanillaPipeline):
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, float]:
-        """Return the mean of each metric over the held-out views, and with `get_std` its standard deviation, too.
+        """Return the mean of each metric over the held-out views, and with `get_std` its standard deviation.
 
-        A single view has no deviation (nerfstudio would return NaN, which is no JSON). Raises InputError without views.
+        A single view has none (nerfstudio would return NaN, which is no JSON). Raises InputError without views.
         """
         views = len(self.datamanager.eval_dataset)
         if views == 0:
@@ -252,9 +242,9 @@ class SadgsPipeline(VanillaPipeline):
         return super().get_average_eval_image_metrics(step, output_path, get_std and views > 1)
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
-        """Load a checkpoint, or raise InputError if it is of another method or of other settings of the model.
+        """Load a checkpoint, or raise InputError if it is another method's, or of another model.
 
-        nerfstudio would pass over missing parameters: another method's checkpoint would go on from a mixture.
+        nerfstudio would ignore missing parameters, so that another method's checkpoint would give a mixture.
         """
         loaded = {key.removeprefix("module."): value for key, value in loaded_state.items()}
         for name, parameter in self.model.gauss_params.items():
@@ -278,11 +268,8 @@ class SadgsPipeline(VanillaPipeline):
         super().load_pipeline(loaded_state, step)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Return what lets a resumed run go on as if it had never been stopped, and tells of which data it is.
-
-        This is random states, the order of the views, the plan, and the names and cameras of the images.
-        """
-        self._repeat_overflowed(wait=True)  # The sampler's state holds the views that are put back.
+        """Return what a resumed run needs to go on as if it had never stopped, and what identifies its data."""
+        self._repeat_overflowed(wait=True)  # The sampler's state must hold these views.
         state: dict[str, Any] = {
             "torch": torch.get_rng_state(),
             "views": self.views.sampler.state_dict(),
@@ -295,7 +282,7 @@ class SadgsPipeline(VanillaPipeline):
         return state
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what `get_extra_state` saved; the order of the views only where the data still has that many."""
+        """Restore what `get_extra_state` saved; the order of the views only if their number is the same."""
         self.follow(RunPlan.of(state["plan"]))
         torch.set_rng_state(state["torch"].cpu())
         self.views.sampler.load_state_dict(state["views"])

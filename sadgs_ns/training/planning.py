@@ -18,20 +18,18 @@ from sadgs_ns.training.progress import cpu_notice
 from sadgs_ns.training.run_plan import RunPlan, plan_rates
 
 DENSE_THRESHOLDS = 1.25
-"""Factor on AbsGS's thresholds in a run that starts from stereo depth. It takes back the Gaussians that such a start
-adds, with a higher SSIM than without the factor on all of four scenes (docs/results.md#dense-start)."""
+"""Factor on AbsGS's thresholds if a run starts from stereo depth, which adds Gaussians. The factor removes as many, and
+SSIM was higher with it on all of four scenes (docs/results.md#dense-start)."""
 LEAST_PIXELS = 1.5e6
-"""Pixels that a step must draw on each of several devices. Runs whose steps drew 1.9 and 3 million pixels on each of
-two took 1/1.1 of the time on one (one run of the latter 1/1.3), and a run of .7 million took 2.3 times as long
-(docs/results.md#several-devices)."""
-_OF_THE_CAP = ("memory_budget_gb", "model.strategy.max_gaussians")
-"""Options that decide the cap of Gaussians."""
+"""Pixels of a step on each of several devices, below which one is quicker. With 1.9 and 3 million, two devices took
+1/1.1 of the time of one (1/1.3 in one run), and with .7 million 2.3 times as long (docs/results.md#several-devices)."""
+_CAP_OPTIONS = ("memory_budget_gb", "model.strategy.max_gaussians")
 
 
 def plan_length(config: SadgsTrainerConfig, views: int, before: RunPlan | None) -> Schedule:
     """Decide the length of a run of so many training views, and the views of a step.
 
-    By hand, or as in the checkpoint's run, whose plan is `before`, if the effort is the same, or by rule.
+    Options come first, then the checkpoint's plan `before`, if its effort is the same, then the rule.
     """
     effort, iterations, in_step = config.pipeline.effort, config.max_num_iterations, config.pipeline.views_per_iteration
     if before is not None and before.asked["effort"] == effort:
@@ -41,7 +39,7 @@ def plan_length(config: SadgsTrainerConfig, views: int, before: RunPlan | None) 
 
 
 def one_device_is_quicker(cameras: Cameras, views: int, devices: int) -> bool:
-    """Tell whether steps of so many of these views have too few pixels for several devices, and say so."""
+    """Tell whether steps of so many views have too few pixels for several devices, and print so."""
     pixels = views * _pixels(cameras)
     if pixels >= LEAST_PIXELS * devices:
         return False
@@ -69,14 +67,15 @@ def plan_run(
     before: RunPlan | None,
     done: int,
 ) -> RunPlan:
-    """Decide what a run's options leave open, and print what a user should know of that.
+    """Decide what a run's options leave open, and print what a user should know.
 
     Raises InputError if `memory_budget_gb` leaves no room for Gaussians.
 
     Args:
-        config, pipeline: Of the run, each process with the Gaussians from which it starts.
-        length, before: As for `plan_length`.
-        dense: Whether the run starts, or started, from stereo depth.
+        config, pipeline: Options and pipeline of the run, with the Gaussians from which this process starts.
+        length: What `plan_length` returned.
+        dense: Whether the run started from stereo depth.
+        before: The plan of the checkpoint's run.
         done: Iterations that are done already.
     """
     options, model, asked = config.pipeline, pipeline.model, _asked(config.pipeline)
@@ -89,7 +88,7 @@ def plan_run(
     cap = strategy.max_gaussians
     if strategy.refine_stop_iter != 0:
         cap = _cap_in_memory(options, pipeline, length.views_per_iteration)
-        if before is not None and all(asked[name] == before.asked[name] for name in _OF_THE_CAP):
+        if before is not None and all(asked[name] == before.asked[name] for name in _CAP_OPTIONS):
             cap = _kept_cap(cap, before.strategy.max_gaussians)
     planned = replace(strategy, max_gaussians=cap, clone_grad2d=clone, split_absgrad2d=split)
     planned = planned.for_run(length.iterations)
@@ -116,13 +115,13 @@ def plan_run(
 
 
 def _asked(options: SadgsPipelineConfig) -> dict[str, Any]:
-    """Return the options that decide how training goes on from a checkpoint, by their names."""
+    """Return the options by name that decide how training goes on from a checkpoint."""
     own = {name: getattr(options, name) for name in ("effort", "views_per_iteration", "memory_budget_gb")}
     return own | {f"model.strategy.{name}": value for name, value in asdict(options.model.strategy).items()}
 
 
 def _warn_of_changes(now: dict[str, Any], before: dict[str, Any]) -> None:
-    """Say which options are others than the checkpoint's run had."""
+    """Print which options differ from those of the checkpoint's run."""
     changed = [name for name in before if name in now and now[name] != before[name]]
     if changed:
         listed = ", ".join(f"pipeline.{name} was {before[name]} and is {now[name]}" for name in changed)
@@ -158,7 +157,7 @@ def _print_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: S
 
 
 def _cap_in_memory(options: SadgsPipelineConfig, pipeline: SadgsPipeline, views: int) -> int:
-    """Return the cap of Gaussians that all devices hold, and say what decided it."""
+    """Return the cap of Gaussians that the devices' memory allows, and print what decided it."""
     model, processes, cap = pipeline.model, pipeline.world.num_ranks, options.model.strategy.max_gaussians
     gaussians: Any = model.gauss_params
     size = training_size(pipeline.datamanager, gaussians, views, processes, model.near_plane)
@@ -170,10 +169,9 @@ def _cap_in_memory(options: SadgsPipelineConfig, pipeline: SadgsPipeline, views:
 
 
 def _kept_cap(now: int, before: int) -> int:
-    """Return the cap with which a run goes on from a checkpoint, and say so if memory now allows more, or less."""
-    if now > before:
-        text = f"At most {before:,} Gaussians, as in the checkpoint's run."
-    else:
+    """Return the cap of a resumed run, and print a line if memory now allows more, or less."""
+    text = f"At most {before:,} Gaussians, as in the checkpoint's run."
+    if now < before:
         text = (
             f"[yellow]The checkpoint's run had room for {before:,} Gaussians, the GPU's free memory now has for "
             f"{now:,}, which is the cap from here on: stop this run and end other programs on the GPU to keep "

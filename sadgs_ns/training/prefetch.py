@@ -1,4 +1,4 @@
-"""Images that travel to the device ahead of their step."""
+"""Images that are copied to the device ahead of their step."""
 
 from __future__ import annotations
 
@@ -11,14 +11,10 @@ from torch import Tensor
 
 
 class ImagePrefetcher:
-    """Brings images from the host to the device ahead of the step that needs them, on a stream of its own.
+    """Copies images from the host to the device ahead of the step that needs them, on its own stream.
 
-    Threads decode what is not in pinned memory, or copy it there. torch keeps pinned memory that is no longer used for
-    the next images, so that it takes as much as the images that are under way. Without CUDA the images stay where they
-    are, and only decoding runs ahead.
-
-    Attributes:
-        decoded: Whether all images can be copied as they are, without a thread's help.
+    Threads decode images, and copy them to pinned memory, which torch reuses for later images. Without CUDA only
+    decoding runs ahead. `decoded` tells whether all images can be copied without a thread.
 
     Args:
         images: All images, on the host: a list of decoded ones, or `LazyImages`.
@@ -38,14 +34,9 @@ class ImagePrefetcher:
         self._sent: dict[int, tuple[dict[str, Any], torch.cuda.Event | None]] = {}
 
     def take(self, indices: Sequence[int]) -> dict[int, dict[str, Any]]:
-        """Return the data of a step's views on the device; the host waits only for images that are not decoded yet.
+        """Return the data of a step's views by index, as `LazyImages` gives it, on the device and for this stream.
 
-        Returns:
-            By index: `image` [H, W, 3 or 4], boolean `mask` [H, W, 1] if there is one, and what else the dataset added.
-            The present stream may use them.
-
-        Raises:
-            InputError: As `LazyImages.__getitem__`.
+        The host waits only for images that are not decoded yet. Raises InputError as `LazyImages.__getitem__`.
         """
         self._load(indices)
         taken = {}
@@ -56,15 +47,15 @@ class ImagePrefetcher:
                 stream.wait_event(copied)
                 for value in taken[index].values():
                     if isinstance(value, Tensor) and value.is_cuda:
-                        value.record_stream(stream)  # Its memory belongs to the stream of the copies.
+                        value.record_stream(stream)  # Its memory belongs to the copying stream.
         return taken
 
     def prefetch(self, upcoming: Sequence[int], following: Sequence[int]) -> None:
-        """Load the images of the next steps, and start to copy what is loaded of the next one; this waits for nothing.
+        """Load the images of the next steps, and start copies of loaded ones of the next step, without waiting.
 
         Args:
-            upcoming: Views of the next steps, in their order. What is under way and not among them is forgotten.
-            following: Those of the next step.
+            upcoming: Views of the next steps, in their order. Other images that are under way are dropped.
+            following: Views of the next step.
         """
         for index in self._loading.keys() - set(upcoming):
             self._loading.pop(index).cancel()
@@ -76,7 +67,7 @@ class ImagePrefetcher:
                 self._sent[index] = self._copy(index)
 
     def close(self) -> None:
-        """End the threads; they start again where another image is asked for."""
+        """End the threads; they start again if another image is needed."""
         pool, self._pool = self._pool, None
         self._loading.clear()
         self._sent.clear()
@@ -84,7 +75,7 @@ class ImagePrefetcher:
             pool.shutdown(cancel_futures=True)
 
     def _load(self, indices: Iterable[int]) -> None:
-        """Have threads load images, in this order, unless they are under way."""
+        """Have threads load images in this order, unless they are under way."""
         if self.decoded:
             return
         for index in indices:
@@ -96,14 +87,12 @@ class ImagePrefetcher:
             self._loading[index] = self._pool.submit(self._pinned, index)
 
     def _pinned(self, index: int) -> dict[str, Any]:
-        """Return a view's data on the host, in pinned memory where there is CUDA; this runs in a thread."""
-        data = dict(self.images[index])
-        if self._stream is not None:
-            data = {name: v.pin_memory() if isinstance(v, Tensor) else v for name, v in data.items()}
-        return data
+        """Return a view's data on the host, with CUDA in pinned memory; this runs in a thread."""
+        data, pin = dict(self.images[index]), self._stream is not None
+        return {name: v.pin_memory() if pin and isinstance(v, Tensor) else v for name, v in data.items()}
 
     def _copy(self, index: int) -> tuple[dict[str, Any], torch.cuda.Event | None]:
-        """Return a view's data on the device, and the event that says when they are there; None without CUDA."""
+        """Return a view's data on the device, and with CUDA the event of their arrival."""
         data = dict(self.images[index]) if self.decoded else self._loading.pop(index).result()
         if self._stream is None:
             return data, None

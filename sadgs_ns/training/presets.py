@@ -26,21 +26,20 @@ RATES: dict[str, tuple[float, float, float]] = {
     "camera_opt": (1e-4, 1.0, 0.005),
     "color_matrices": (3e-3, 1.0, 0.1),
 }
-"""Learning rate of each group of parameters, and the factors on it at the first and at the last iteration.
+"""Learning rate of each group of parameters, and factors on it at the first and last iteration, for steps of one view.
 
-The rates of positions, colours and opacities are 3DGS's at the start; the scales' is four times 3DGS's, the rotations'
-twice. They are those of a step of one view; `run_plan.RATES_OF_FOUR_VIEWS` says how they change with more.
+Positions, colours and opacities start at 3DGS's rates; scales have four times 3DGS's rate, rotations twice.
 """
 UNLISTED = ("color_matrices",)
-"""Groups whose rates `--help` does not list, since what they learn hardly depends on the capture."""
+"""Groups whose rates `--help` does not list, because they hardly depend on the capture."""
 HELD = ("features_dc", "features_rest", "opacities")
-"""Groups whose rate stays as it is until densification ends, and falls then."""
+"""Groups whose rates are constant until densification ends, and fall then."""
 CONSTANT = {name: (RATES[name][0], 1.0, 1.0) for name in HELD}
-"""What stands for these groups in the paper's presets, whose rates do not fall."""
+"""Rates of these groups in the paper's presets, which do not fall."""
 
 
 def optimizers(**rates: tuple[float, float, float]) -> dict[str, dict[str, Any]]:
-    """Return Adam for each group of parameters, and a schedule if its rate changes. `rates` override `RATES`."""
+    """Return Adam, and a schedule if its rate changes, of each group of parameters. `rates` override `RATES`."""
     groups: dict[str, dict[str, Any]] = {}
     for name, (lr, initial_factor, final_factor) in (RATES | rates).items():
         adam, decay = FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
@@ -48,19 +47,16 @@ def optimizers(**rates: tuple[float, float, float]) -> dict[str, dict[str, Any]]
             adam, decay = UnlistedAdamOptimizerConfig, UnlistedDecaySchedulerConfig
         groups[name] = {"optimizer": adam(lr=lr)}
         if (initial_factor, final_factor) != (1.0, 1.0):
-            groups[name]["scheduler"] = decay(
-                initial_factor=initial_factor,
-                final_factor=final_factor,
-                hold_share=DENSIFICATION_SHARE if name in HELD else 0.0,
-            )
+            hold = DENSIFICATION_SHARE if name in HELD else 0.0
+            factors = {"initial_factor": initial_factor, "final_factor": final_factor}
+            groups[name]["scheduler"] = decay(**factors, hold_share=hold)
     return groups
 
 
 def paper_pipeline(views_per_iteration: int) -> SadgsPipelineConfig:
-    """Return what the paper prints, and AbsGS's thresholds and the released code's window where it is silent.
+    """Return the paper's options, and where it gives none, AbsGS's thresholds and the released code's window.
 
-    It lacks what we added to need fewer Gaussians. docs/method.md lists what still departs from the paper, which takes
-    1 view per iteration outdoors and 2 indoors.
+    docs/method.md lists what still departs from the paper, which takes 1 view per iteration outdoors and 2 indoors.
     """
     return SadgsPipelineConfig(
         views_per_iteration=views_per_iteration,
@@ -113,7 +109,6 @@ sadgs_paper = MethodSpecification(
     ),
 )
 
-# Two views per iteration, and scales and rotations whose rates fall.
 sadgs_paper_indoor = MethodSpecification(
     description=(
         "Structure-aware densification with the paper's loss and children, indoor scenes; "

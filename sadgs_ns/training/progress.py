@@ -1,4 +1,4 @@
-"""What a run says while it trains and when it is done: its progress, how long it will take, and what comes next."""
+"""What a run prints: its progress, how long it will take, and which commands can follow."""
 
 from __future__ import annotations
 
@@ -19,16 +19,14 @@ from rich.text import Text
 from sadgs_ns.events import report
 
 COLUMNS = {"Step (% Done)": 18, "Loss": 9, "PSNR": 10, "Gaussians": 12, "Iteration": 11, "Time left": 10}
-"""Columns of the table, each with its width. A terminal of 80 characters holds them in one line."""
-MEASURED_STEPS = 3
-"""Number of iterations from which the length of the run is first estimated; the first iteration of all, which also
-loads images, is none of them."""
-MEASURED_SECONDS = 10.0
-"""Time after which `MEASURED_STEPS` iterations suffice for the estimate, which otherwise comes with a row."""
+"""Columns of the table and their widths, which fit a terminal of 80 characters."""
+MEASURED_STEPS, MEASURED_SECONDS = 3, 10.0
+"""Fewest iterations, and seconds, after which the length of the run is estimated before its first row. The very first
+iteration, which also loads images, does not count."""
 
 
 def duration(seconds: float) -> str:
-    """Return a time in words of at most two units, as "40 s", "12 min" or "3 h 5 min"."""
+    """Return a time as "40 s", "12 min" or "3 h 5 min"."""
     if seconds < 99.5:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
@@ -38,7 +36,7 @@ def duration(seconds: float) -> str:
 
 
 def cpu_notice(threads: int) -> str:
-    """Return what somebody should know who trains without a GPU, with so many threads of torch."""
+    """Return what a user should know who trains without a GPU, with so many threads of torch."""
     text = (
         "This run trains on the CPU, which is for small scenes and tests: a GPU with CUDA is about a hundred times as "
         "fast. After the first iterations a line says how long the run will take."
@@ -52,25 +50,26 @@ def cpu_notice(threads: int) -> str:
 
 
 def next_commands(config: Path, gaussians: int) -> str:
-    """Return the commands for a finished run: its `config.yml`, and the number of Gaussians that it ended with."""
-    commands = {
-        ("ns-viewer", "--load-config", str(config)): "shows the Gaussians in a browser",
-        ("ns-eval", "--load-config", str(config), "--output-path", str(config.with_name("eval.json"))): (
-            "compares held-out views with their photos"
-        ),
-        ("sadgs-export", str(config), "--output", str(config.with_name("splat.ply"))): (
-            "writes the Gaussians for other programs"
-        ),
-    }
-    lines = [f"  {shlex.join(command)}\n    {what}" for command, what in commands.items()]
-    return "\n".join([f"What can be done with these {gaussians:,} Gaussians:", *lines])
+    """Return the commands for a finished run, from the path of its `config.yml` and its number of Gaussians."""
+    file, metrics, splat = (shlex.quote(str(config.with_name(n))) for n in (config.name, "eval.json", "splat.ply"))
+    return "\n".join(
+        [
+            f"What can be done with these {gaussians:,} Gaussians:",
+            f"  ns-viewer --load-config {file}",
+            "    shows the Gaussians in a browser",
+            f"  ns-eval --load-config {file} --output-path {metrics}",
+            "    compares held-out views with their photos",
+            f"  sadgs-export {file} --output {splat}",
+            "    writes the Gaussians for other programs",
+        ]
+    )
 
 
 class ProgressTable(LocalWriter):
     """nerfstudio's table of progress with the loss, PSNR and number of Gaussians.
 
-    A terminal shows the latest rows in place, and what else is printed above them. Elsewhere, as in a file, every row
-    is a line. Loss and PSNR, which are of the row's iteration, are read from the device for these rows alone.
+    A terminal shows the latest rows in place, and other output above them. Elsewhere, as in a file, every row is a
+    line. Only for a row are loss and PSNR of its iteration read from the device.
 
     Args:
         config: nerfstudio's; `max_log_size` is the number of rows that stay in view, and 0 keeps all.
@@ -94,18 +93,23 @@ class ProgressTable(LocalWriter):
             return
         due = step % writer.GLOBAL_BUFFER["steps_per_log"] == 0
         if due:
-            cells = self._of_events(events)  # On CUDA this waits for the step, so the clock is read after it.
+            cells = _cells(events)  # On CUDA this waits for the step, so the clock is read after it.
         now = time.monotonic()
         if not self._times:
             self._times.append((step, now))
         first, start = self._times[0]
         pace = (now - start) / (step - first) if step > first else None
         left = writer.GLOBAL_BUFFER["max_iter"] - step - 1
-        # Nobody should have to wait for the next row of a table where so few iterations take so long.
-        few_are_slow = step - first >= MEASURED_STEPS and now - start >= MEASURED_SECONDS
-        if not self._estimated and pace is not None and (due or few_are_slow):
+        slow = step - first >= MEASURED_STEPS and now - start >= MEASURED_SECONDS  # The next row may take long.
+        if not self._estimated and pace is not None and (due or slow):
             self._estimated = True
-            self._say_how_long(step - first, pace, left)
+            if left > 0:
+                CONSOLE.print(
+                    f"{step - first} iterations after the first took {_short(pace)} each: at this pace the {left:,} "
+                    f"that are left take {duration(pace * left)}, and more where the number of Gaussians grows much.",
+                    highlight=False,
+                    soft_wrap=True,
+                )
         if due:
             if first != step:
                 self._times.append((step, now))
@@ -113,29 +117,6 @@ class ProgressTable(LocalWriter):
             timing = ["", ""] if pace is None else [_short(pace), duration(pace * left)]
             report("iteration", step=step, left=timing[1])
             self._show(_line([done, *cells, *timing]))
-
-    @staticmethod
-    def _of_events(events: dict[str, Any]) -> list[str]:
-        """Return loss, PSNR and number of Gaussians, as far as nerfstudio handed them over."""
-        metrics = events.get("Train Metrics Dict", {})
-        values = events.get("Train Loss"), metrics.get("psnr"), metrics.get("gaussian_count")
-        loss, psnr, gaussians = [None if value is None else float(torch.as_tensor(value).detach()) for value in values]
-        return [
-            "" if loss is None else f"{loss:.4f}",
-            "" if psnr is None else f"{psnr:.2f} dB",
-            "" if gaussians is None else f"{gaussians:,.0f}",
-        ]
-
-    @staticmethod
-    def _say_how_long(steps: int, pace: float, left: int) -> None:
-        """Print how long the `left` iterations take at the pace, in seconds, that was measured in so many steps."""
-        if left > 0:
-            CONSOLE.print(
-                f"{steps} iterations after the first took {_short(pace)} each: at this pace the {left:,} that are left "
-                f"take {duration(pace * left)}, and more where the number of Gaussians grows much.",
-                highlight=False,
-                soft_wrap=True,
-            )
 
     def _show(self, row: str) -> None:
         header = [_line(list(COLUMNS)), "-" * sum(COLUMNS.values())]
@@ -154,6 +135,17 @@ class ProgressTable(LocalWriter):
             self._live.stop()
 
 
+def _cells(events: dict[str, Any]) -> list[str]:
+    """Return loss, PSNR and number of Gaussians, each "" if nerfstudio did not hand it over."""
+    metrics = events.get("Train Metrics Dict", {})
+    values = {
+        "{:.4f}": events.get("Train Loss"),
+        "{:.2f} dB": metrics.get("psnr"),
+        "{:,.0f}": metrics.get("gaussian_count"),
+    }
+    return ["" if v is None else form.format(float(torch.as_tensor(v).detach())) for form, v in values.items()]
+
+
 def _line(cells: list[str]) -> str:
     return "".join(f"{cell:<{width}}" for cell, width in zip(cells, COLUMNS.values(), strict=True)).rstrip()
 
@@ -163,7 +155,7 @@ def _short(seconds: float) -> str:
 
 
 def remove_tables() -> None:
-    """Take the tables of progress of runs that are over from nerfstudio's list, and give the terminal back."""
+    """Remove the tables of finished runs from nerfstudio's list, and give the terminal back."""
     for table in [table for table in writer.EVENT_WRITERS if isinstance(table, ProgressTable)]:
         table.stop()
         writer.EVENT_WRITERS.remove(table)

@@ -29,7 +29,7 @@ _SAME_PLACE = 1e-3
 
 @dataclass
 class Resumption:
-    """A checkpoint between its reading and its loading.
+    """A checkpoint that was read, and is loaded in two parts.
 
     Each method raises InputError, which names the file and a remedy, if the checkpoint does not fit.
     """
@@ -39,7 +39,7 @@ class Resumption:
     """As nerfstudio's trainer writes it."""
 
     @contextmanager
-    def _told(self) -> Iterator[None]:
+    def _errors_name_file(self) -> Iterator[None]:
         try:
             yield
         except torch.cuda.OutOfMemoryError:
@@ -47,7 +47,7 @@ class Resumption:
         except InputError as error:
             told = f"{self.path} cannot be continued: {str(error).rstrip('.')}; {checkpoints.REMEDY}."
             raise InputError(told) from error
-        except Exception as error:  # The parts of a foreign file may raise anything.
+        except Exception as error:  # A foreign file may raise anything.
             what = f"{type(error).__name__}: {reason(error)}"
             raise InputError(
                 f"{self.path} is not a checkpoint of this version of sadgs ({what}): {checkpoints.REMEDY}."
@@ -55,15 +55,15 @@ class Resumption:
 
     @property
     def plan(self) -> RunPlan | None:
-        """The plan of the run that wrote it; None in one of another method, which `load_gaussians` refuses."""
-        with self._told():
+        """The plan of the run that wrote it; None if that was another method's, which `load_gaussians` refuses."""
+        with self._errors_name_file():
             pipeline = self.state["pipeline"]
             state = pipeline.get("_extra_state") if isinstance(pipeline, dict) else None
             return RunPlan.of(state["plan"]) if isinstance(state, dict) and "plan" in state else None
 
     def load_gaussians(self, pipeline: SadgsPipeline, world: World) -> None:
-        """Load what the pipeline holds, of the Gaussians this process's part; call before optimizers are made."""
-        with self._told():
+        """Load the pipeline with this process's part of the Gaussians; call before optimizers are made."""
+        with self._errors_name_file():
             if not world.alone:
                 part = world.take_even_part(len(self.state["pipeline"]["_model.gauss_params.means"]))
                 self.state = checkpoints.map_rows(self.state, lambda rows: rows[part].clone())
@@ -77,8 +77,8 @@ class Resumption:
                 )
 
     def load_optimizers(self, optimizers: Optimizers, scaler: GradScaler, schedulers: bool) -> None:
-        """Load the optimizers and, if they are wanted, their schedulers, and say so."""
-        with self._told():
+        """Load the optimizers and, if asked for, their schedulers, and print from where the run goes on."""
+        with self._errors_name_file():
             optimizers.load_optimizers(self.state["optimizers"])
             if "schedulers" in self.state and schedulers:
                 optimizers.load_schedulers(self.state["schedulers"])
@@ -87,11 +87,10 @@ class Resumption:
 
 
 def check_same_capture(pipeline: SadgsPipeline, before: Sequence[str], positions_before: Tensor) -> None:
-    """Check whether a checkpoint is of the data that training is about to go on with.
+    """Check that a checkpoint is of the pipeline's data.
 
-    Images may have been added or taken away since, if the others' poses stayed where they were. A warning is
-    printed where the cameras are the same and no image has its old name. Raises InputError if more than half of the
-    cameras of either are where the other has none.
+    Images may have been added or removed if the others' poses stayed. Raises InputError if less than half of the
+    cameras of the smaller capture are in the other; warns if the cameras are the same, and no image has its old name.
 
     Args:
         pipeline: The pipeline, with the data.

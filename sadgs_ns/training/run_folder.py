@@ -1,4 +1,4 @@
-"""The start of a run's folder: its `config.yml`, written once nothing speaks against the run."""
+"""The start of a run's folder: its `config.yml`, written once checkpoint and data were checked."""
 
 from __future__ import annotations
 
@@ -20,16 +20,14 @@ from sadgs_ns.training import checkpoints, processes
 
 
 def begin(config: TrainerConfig) -> None:
-    """Write `config.yml`, the first file of a run, once checkpoint and data have been found good.
+    """Check checkpoint, folder, viewer and data, and write `config.yml`, the first file of a run.
 
-    Raises:
-        InputError: If they are not; nothing is written then.
-        WriteError: If the folder cannot be written.
+    Raises InputError, before anything is written, or WriteError.
     """
     checkpoints.check_chosen(config.load_dir, config.load_step, config.load_checkpoint)
     _check_folder(config)
     if not processes.is_rank_zero():
-        return  # torchrun's other processes leave the files to the first.
+        return
     if config.is_viewer_enabled() or config.is_viewer_legacy_enabled():
         _check_address(config.viewer)
     data: Any = config.pipeline.datamanager
@@ -59,10 +57,7 @@ def _check_folder(config: TrainerConfig) -> None:
 
 
 def _check_address(viewer: ViewerConfig) -> None:
-    """Raise InputError if the viewer cannot listen where it is told to.
-
-    viser would take the next free port, of which nerfstudio knows nothing, or look for one for ever.
-    """
+    """Raise InputError if the viewer cannot listen at its address; viser would take another port, or never return."""
     host, port = viewer.websocket_host, viewer.websocket_port
     try:
         places = socket.getaddrinfo(host, port or 0, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)

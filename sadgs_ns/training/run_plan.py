@@ -1,4 +1,4 @@
-"""The plan of a run: what is decided once, before training, of all that `config.yml` leaves to rules."""
+"""The plan of a run: everything that `config.yml` leaves to rules, decided once before training."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from sadgs_ns.training.optimizers import RunLengthDecaySchedulerConfig
 
 RATES_OF_FOUR_VIEWS = {"means": (3.0, 3.0), "opacities": (1.5, 1.5), "scales": (2.25, 0.375), "quats": (2.25, 0.375)}
 """Factors on learning rates at the first and at the last iteration in steps of four views
-(docs/results.md#splits-and-rates).
-Rates that fall once densification has ended fall less in steps of several views, and not at all in steps of four."""
+(docs/results.md#splits-and-rates). Rates that fall after densification fall less in steps of several views, and not at
+all in steps of four."""
 _HEAD = "# What was decided for this run before its first step; config.yml says what was asked for.\n"
 
 
@@ -30,31 +30,31 @@ class Rate:
     final_factor: float = 1.0
     hold_share: float = 0.0
     max_steps: int | None = None
-    """None where the rate stays as it is, or has a scheduler of another kind."""
+    """Iterations of the decay; None if the rate is constant, or has a scheduler of another kind."""
 
 
 @dataclass(frozen=True)
 class RunPlan:
-    """What a run does: its length, its densification, its learning rates, and what they were derived from.
+    """Length, densification and learning rates of a run, and the options that they were derived from.
 
-    It is written as `plan.yml` beside `config.yml` and kept in checkpoints. Who changes it puts another in its place
-    (`SadgsModel.follow`).
+    It is written as `plan.yml` beside `config.yml` and kept in checkpoints. To change it, replace it with
+    `SadgsModel.follow`.
     """
 
     iterations: int
     """Length of the run in optimizer steps."""
     views_per_iteration: int
-    """Training views that are rendered for a step; the loss is their mean."""
+    """Training views of a step; the loss is their mean."""
     devices: int
-    """Number of devices among which the Gaussians are shared out, each with a process."""
+    """Number of devices, each with a process and a part of the Gaussians."""
     images: str
-    """Where the images are kept: "gpu", the training device, "cpu", the host, or "compressed"."""
+    """Where the images are kept: "gpu" (the training device), "cpu" (the host), or "compressed"."""
     near_plane: float
     """Depth from which Gaussians are drawn, in the run's units."""
     max_off_axis: float
     """As in the model's options."""
     strategy: StructureAwareStrategy
-    """Densification: windows that fit the run, thresholds as effort and start change them, and the cap in effect."""
+    """Densification with the run's windows, thresholds and cap."""
     rates: dict[str, Rate]
     """Learning rates by group of parameters."""
     asked: dict[str, Any]
@@ -62,7 +62,7 @@ class RunPlan:
 
     @classmethod
     def of(cls, state: Mapping[str, Any]) -> RunPlan:
-        """Make a plan of what `asdict` made of it, as checkpoints hold it."""
+        """Make a plan of its `asdict`, which checkpoints hold."""
         strategy = StructureAwareStrategy(**state["strategy"])
         rates = {name: Rate(**rate) for name, rate in state["rates"].items()}
         return cls(**{**state, "strategy": strategy, "rates": rates})
@@ -73,7 +73,7 @@ class RunPlan:
             partial.write_text(_HEAD + yaml.safe_dump(asdict(self), sort_keys=False), "utf8")
 
     def optimizers(self, asked: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-        """Return nerfstudio's configurations of optimizers and schedulers, which are given, with the planned rates."""
+        """Return nerfstudio's configurations of optimizers and schedulers with the planned rates."""
         configs = {}
         for name, rate in self.rates.items():
             group, decay = asked[name], asdict(rate)
@@ -87,16 +87,16 @@ class RunPlan:
 def plan_rates(
     asked: Mapping[str, Mapping[str, Any]], length: Schedule, extent: float, follow_views: bool
 ) -> dict[str, Rate]:
-    """Derive the learning rates of a run from nerfstudio's configurations, which are for steps of one view.
+    """Derive a run's learning rates from nerfstudio's configurations, which are for steps of one view.
 
-    Positions move in proportion to the extent of the cameras, as in 3DGS. With `follow_views`, the rates of
-    `RATES_OF_FOUR_VIEWS`, and those that fall late, change with the views of a step.
+    The rate of positions is in proportion to the cameras' extent, as in 3DGS. With `follow_views`, some rates change
+    with the views of a step (`RATES_OF_FOUR_VIEWS`).
     """
     rates = {}
     for name, group in asked.items():
         lr, decay = group["optimizer"].lr, group.get("scheduler")
-        at_four = RATES_OF_FOUR_VIEWS.get(name, (1.0, 1.0)) if follow_views else (1.0, 1.0)
-        start, end = (between_one_and_four(length.views_per_iteration, factor) for factor in at_four)
+        factors = RATES_OF_FOUR_VIEWS.get(name, (1.0, 1.0)) if follow_views else (1.0, 1.0)
+        start, end = (between_one_and_four(length.views_per_iteration, factor) for factor in factors)
         lr *= start
         if name == "means":
             lr *= extent

@@ -17,12 +17,12 @@ from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training.pipeline import SadgsPipeline
 
 FEWEST_VIEWS, MOST_VIEWS = 3, 60
-"""Numbers of training views between which a run starts from stereo depth, where nobody says. More views make up for
-sparse points, and end with more Gaussians at equal quality (docs/results.md#dense-start)."""
+"""Range of training views with which a run starts from stereo depth by default. With more views, it would end with more
+Gaussians at equal quality (docs/results.md#dense-start)."""
 
 
 def number_of_points(pipeline: SadgsPipeline) -> int:
-    """Return how many points of stereo depth a run starts from at most, with a line where CUDA lacks for them."""
+    """Return how many points of stereo depth a run may start from; print a line if CUDA is missing for them."""
     model, views = pipeline.model, len(pipeline.datamanager.train_dataset)
     asked = model.config.stereo_points
     if model.seed_points is None or model.config.random_init:
@@ -38,21 +38,14 @@ def number_of_points(pipeline: SadgsPipeline) -> int:
 
 
 def start_from_stereo(pipeline: SadgsPipeline, resumed: bool) -> bool:
-    """Start from points of stereo depth, too, where the run is to and is not resumed.
+    """Add points of stereo depth of the training views to the initial Gaussians, if the options ask for some.
 
-    Call it before optimizers are made. The images are loaded, where they are not yet.
-
-    Returns:
-        Whether the run starts, or a resumed one started, from such points.
+    Call it before optimizers are made. It loads the images. A resumed run has its points already. Returns whether the
+    run starts, or started, from such points.
     """
     number = number_of_points(pipeline)
-    if number and not resumed:
-        _add_points(pipeline, number)
-    return number > 0
-
-
-def _add_points(pipeline: SadgsPipeline, number: int) -> None:
-    """Compute depth maps of the training views, and add points of them to the initial Gaussians."""
+    if not number or resumed:
+        return number > 0
     model, cache = pipeline.model, pipeline.structure_cache
     data, started = pipeline.datamanager.cached_train, time.perf_counter()  # Undistorting images changes cameras.
     cameras = pipeline.datamanager.train_dataset.cameras
@@ -72,10 +65,7 @@ def _add_points(pipeline: SadgsPipeline, number: int) -> None:
     def image(view: int) -> Tensor:
         return cache.photo(data[view])[..., :3]
 
-    def wavelengths(view: int) -> Tensor:
-        return wavelength(dequantize(cache[view]))
-
-    points = dense_points(depths, viewmats, image, wavelengths, number)
+    points = dense_points(depths, viewmats, image, lambda view: wavelength(dequantize(cache[view])), number)
     added = model.add_points(*points)
     if model.device.type == "cuda":
         torch.cuda.synchronize()
@@ -86,3 +76,4 @@ def _add_points(pipeline: SadgsPipeline, number: int) -> None:
         highlight=False,
         soft_wrap=True,
     )
+    return True

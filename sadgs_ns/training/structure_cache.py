@@ -19,16 +19,14 @@ from sadgs_ns.render.types import Cameras
 from sadgs_ns.training.views import TrainingViews
 
 PIXELS_PER_BATCH = 4_000_000
-"""Structure tensors are computed for as many images at once as have this many pixels; each pixel takes at most about
-300 bytes meanwhile."""
+"""Pixels of the images whose structure tensors are computed at once, with about 300 bytes each."""
 
 
 class StructureCache:
     """Computes S̄ of images with a run's settings, and keeps that of the training images, quantized to bytes.
 
-    It is kept beside decoded images: on the device, where S̄ of all images is computed at once, or on the host, where
-    that of a view is computed when a step first needs it. Beside images that stay compressed it would take more memory
-    than they do, and is computed anew.
+    If decoded images are kept on the device, so is their S̄, all computed at once. If they are on the host, S̄ of a view
+    is computed when a step first needs it, and kept there. If they stay compressed, S̄ is not kept: it would be larger.
 
     Args:
         views: The training views, and the model that decides how transparent images look.
@@ -48,7 +46,7 @@ class StructureCache:
         self._kept: dict[int, Tensor] = {}
 
     def fill(self) -> None:
-        """Load the training images, and compute S̄ of all of them if they are on the device; once is enough."""
+        """Load the training images, and compute S̄ of all if they are on the device, unless that was done before."""
         if self.filled:
             return
         images = self.views.datamanager.cached_train
@@ -70,10 +68,10 @@ class StructureCache:
     def get(self, views: Sequence[tuple[int, Mapping[str, Any]]]) -> list[Tensor]:
         """Quantized S̄ of a step's views, on the device. uint8 [H, W, 3] each
 
-        All of several processes observe η, and the one that composites a view's first rows computes S̄ for the others.
+        The process that composites a view's first rows computes S̄ for all.
 
         Args:
-            views: Index and data of each, as drawn; all have one size, and all processes pass the same ones.
+            views: Index and data of each, as drawn; all have one size. All processes pass the same views.
         """
         self.fill()
         world, data, (height, width) = self.views.world, dict(views), self.views.sizes[views[0][0]]
@@ -92,9 +90,9 @@ class StructureCache:
 
     @cached_property
     def _room(self) -> list[Tensor]:
-        """Memory of the host for S̄ of all images, uint8 [H, W, 3] each; nothing if they are not there decoded.
+        """Memory of the host for S̄ of all images, uint8 [H, W, 3] each, if decoded images are there, too.
 
-        It is made at once, because the host waits for the device whenever pinned memory is new.
+        It is allocated at once, because the host waits for the device when it pins new memory.
         """
         prefetcher = self.views.prefetcher
         if prefetcher is None or not prefetcher.decoded:
@@ -103,15 +101,12 @@ class StructureCache:
         return [torch.empty((*size, 3), dtype=torch.uint8, pin_memory=pinned) for size in self.views.sizes]
 
     def photo(self, data: Mapping[str, Any]) -> Tensor:
-        """An image of the datamanager as the loss sees it: on the training device and on the background. [H, W, 3]"""
+        """An image of the datamanager as the loss sees it: on the device, before the background. [H, W, 3]"""
         model = self.views.model
         return model.composite_with_background(model.get_gt_img(data["image"]), model.background)
 
     def quantized(self, data: Sequence[Mapping[str, Any]]) -> Iterator[Tensor]:
-        """Yield quantized S̄ of images of one size, within their masks, on the device. uint8 [H, W, 3] each
-
-        Several are computed at once. `data` are the datamanager's.
-        """
+        """Yield quantized S̄ of the datamanager's images of one size, within their masks. uint8 [H, W, 3] each"""
         at_once = max(PIXELS_PER_BATCH // math.prod(data[0]["image"].shape[:2]), 1) if data else 1
         for start in range(0, len(data), at_once):
             batch = data[start : start + at_once]
@@ -126,10 +121,9 @@ class StructureCache:
 def observe_training_views(
     cache: StructureCache, progress: Callable[[range], Iterable[int]] = iter
 ) -> dict[str, Tensor]:
-    """η's statistics of the Gaussians as they are, in one look at each training view, as `statistics.empty_statistics`.
+    """Observe η of the present Gaussians once in each training view; return the sums of `empty_statistics`.
 
-    The samples are drawn from a generator of their own: a run that is watched goes on as if it were not. `progress`
-    wraps the numbers of the views, to show how far the work is.
+    Samples have their own generator, so a run's random numbers do not change. `progress` wraps the views' indices.
     """
     views, model = cache.views, cache.views.model
     model.set_crop(None)  # the viewer sets its crop box anew whenever it renders

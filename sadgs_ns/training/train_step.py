@@ -1,7 +1,7 @@
 """A training step: render views, compare them with their photos, differentiate, and update all parameters.
 
-One function serves every run. Processes come in where it asks `distributed.rasterization.rasterize` for pictures, and
-CUDA graphs where the trainer has it repeated instead of called (cuda_graphs.py).
+One function serves every run. Several processes come in at `distributed.rasterization.rasterize`, and CUDA graphs
+where the trainer replays a step instead of calling it (cuda_graphs.py).
 """
 
 from __future__ import annotations
@@ -28,23 +28,21 @@ class ViewGroup:
     """Views of a step that have one size, on the training device."""
 
     indices: list[int]
-    """Which of the training views they are, V of them."""
+    """Indices of V training views."""
     cameras: Cameras
-    """All of the views."""
     options: RenderOptions
-    """How they are drawn."""
     data: Sequence[Mapping[str, Tensor]]
-    """Of each view its `image`, uint8 or floats in [0, 1] [H, W, 3 or 4], and perhaps its `mask`, bool [H, W, 1]. With
-    several processes, views that only others composite have none."""
+    """`image` of each view, uint8 or floats in [0, 1] [H, W, 3 or 4], and perhaps `mask`, bool [H, W, 1]. With several
+    processes, views that only others composite have none."""
     view_ids: Tensor | None = None
-    """`indices` on the device, where views have matrices of colours. int64 [V]"""
+    """`indices` on the device if views have colour matrices. int64 [V]"""
     structure_tensors: Tensor | None = None
-    """Quantized S̄, where η is observed. uint8 [V, H, W, 3]"""
+    """Quantized S̄ if η is observed. uint8 [V, H, W, 3]"""
     images: Tensor | None = None
-    """The images, where they lie in one tensor already. [V, H, W, 3]"""
+    """The images, if they are in one tensor already. [V, H, W, 3]"""
 
     def batch(self, band: Band | None) -> dict[str, Tensor]:
-        """Return `image` and, where one view has a mask, `mask` of all views [V, H, W, ·], or of a band's rows."""
+        """Return `image` and, if a view has a mask, `mask` of all views [V, H, W, ·], or of a band's rows."""
         if band is not None:
             rows, data = slice(band.top, band.bottom), self.data[band.view]
             return {name: data[name][None, rows] for name in ("image", "mask") if name in data}
@@ -62,13 +60,13 @@ class StepResult:
     """What a step leaves on the device."""
 
     loss: Tensor
-    """The loss of all processes, without gradient."""
+    """Loss of all processes, without gradient, a scalar."""
     psnr: Tensor
-    """Of the views, in dB."""
+    """PSNR of the views in dB, a scalar."""
     means_gradient: Tensor
     """Gradient of the loss by the centres. [N, 3]"""
     infos: list[dict[str, Any]]
-    """What the rasterizer tells of each group of views."""
+    """The rasterizer's info of each group of views."""
 
 
 def training_step(
@@ -79,22 +77,22 @@ def training_step(
     factors: Tensor,
     nonfinite_flag: Tensor,
 ) -> StepResult:
-    """Train on the views of a step. This enqueues work and waits for none of it, and changes nothing but tensors.
+    """Train on the views of a step. This enqueues work, waits for none of it, and changes tensors only.
 
-    Where the tile lists of a group were too short, nothing of it was drawn, and no gradient comes from it. Where that
-    holds for all groups, neither parameters nor moments change.
+    If the tile lists of a group were too short, it was not drawn and gives no gradient. If that holds for all groups,
+    neither parameters nor moments change.
 
     Args:
         model: The model, in training, whose strategy sees the views.
         groups: The views; the loss is the mean over all of them.
         opacity_reg: Factor on the mean opacity in the loss.
-        update: Of all parameters.
+        update: The update of all parameters.
         factors: What `AdamUpdate.factors` returned, on the device.
         nonfinite_flag: Becomes NaN if a gradient was not finite. float32 [1]
     """
     strategy, state, world, step = model.strategy, model.strategy_state, model.strategy.world, model.step
-    # Gradients of the parameters themselves would be added up on the stream on which these were first used, which is
-    # not the one on which a graph is captured.
+    # Gradients of the parameters themselves would be added up on the stream of their first use, where no graph is
+    # captured.
     leaves = {name: parameter.detach().requires_grad_() for name, parameter in model.trained_params.items()}
     for name in update.parameters.keys() - leaves.keys():  # learned poses, which moved the groups' cameras
         update.parameters[name].grad = None
@@ -104,7 +102,7 @@ def training_step(
     losses: list[Tensor] = []
     qualities: list[Tensor] = []  # PSNR of groups; with several processes, mean square errors of bands
     infos: list[dict[str, Any]] = []
-    # Several processes have the same groups, and autograd goes back through them in the reverse order in each.
+    # All processes have the same groups, and autograd goes back through them in the same order.
     for group in groups:
         pictures, info = rasterize(world, gaussians, group.cameras, group.options)
         info |= {"viewmats": group.cameras.viewmats.detach(), "Ks": group.cameras.Ks}
@@ -117,7 +115,7 @@ def training_step(
             rgb = model.before_background(colors, alphas, background)
             predicted, target = model.masked_pair(rgb, group.batch(band), background)
             if band is None:
-                # The kernel adds up the loss of a single group and the penalty.
+                # The kernel adds the penalty to the loss of a single group.
                 parts, penalty = (penalty, None) if len(groups) == 1 else (None, penalty)
                 loss, quality = photometric_loss(predicted, target, ssim_lambda=model.config.ssim_lambda, parts=parts)
                 weight = len(group.indices) / num_views

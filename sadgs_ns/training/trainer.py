@@ -54,14 +54,14 @@ _SAVING_SHARE = 0.01
 
 
 def _memory(error: torch.cuda.OutOfMemoryError) -> str:
-    """Return the first two of torch's many sentences, which say how much memory was asked for, and of whom."""
+    """Return the first two of torch's many sentences: how much memory was asked for, on which device."""
     return ". ".join(reason(error).split(". ")[:2]).rstrip(".")
 
 
 class SadgsTrainer(Trainer):
-    """A trainer for one model on one device, or on several, each with a process and a part of the Gaussians.
+    """A trainer for one device, or for several, each with a process and a part of the Gaussians.
 
-    Where there are several, all processes call the same methods, and the first one alone prints and writes files.
+    All processes call the same methods; rank 0 alone prints and writes files.
     """
 
     config: SadgsTrainerConfig
@@ -71,33 +71,31 @@ class SadgsTrainer(Trainer):
     def __init__(self, config: SadgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         redirect_on_broken_pipe(CONSOLE)
         config.check()
-        config = copy.copy(config)  # Where there are several processes, they agree on what the file does not say.
+        config = copy.copy(config)  # Several processes agree on the time stamp, which `config.yml` must not hold.
         self.world, local_rank = processes.join(config, local_rank)
-        """What this process knows of the others; None where it is alone."""
         self._peers = None if self.world.alone else processes.Peers(self.world)
         if not self.world.alone:
             with processes.local_rank_zero_first(self.world, local_rank):
-                use_triton(self.world.device)  # This compiles a kernel, and is asked for again below.
+                use_triton(self.world.device)  # This compiles a kernel.
         config.pipeline.datamanager.train_cameras_sampling_seed = config.machine.seed
         self._vis: Any = config.vis
         # nerfstudio would wrap the pipeline for several devices in its own way.
         super().__init__(config, local_rank, world_size=1)
         self._stepping = False
         self.graphed: GraphedSteps | None = None
-        """What trains steps by CUDA graphs; None where all are launched one by one."""
         self._resumed: Resumption | None = None
         self._completed_step = self._saved_step = -1
         self._save_due = math.inf
-        # A run that is paused or done polls no signal, because nerfstudio waits for the viewer's user.
+        # While a run is paused or done, nerfstudio waits for the viewer's user, and nobody polls.
         self._interrupts = Interrupts(
             waiting=lambda: self.training_state != "training" and not self._stepping, started=not self.world.alone
         )
 
     def setup(self, *args: Any, **kwargs: Any) -> None:
-        """Load data, model and checkpoint, and compile what the machine has not compiled yet.
+        """Load data, model and checkpoint, and compile kernels.
 
         Raises:
-            InputError: If one of them cannot be used.
+            InputError: If data, options or checkpoint cannot be used.
             RunError: If they do not fit the GPU's memory, or another process ended.
             SystemExit: If SIGINT came; nerfstudio would print a traceback.
         """
@@ -127,29 +125,29 @@ class SadgsTrainer(Trainer):
     def _may_graph_steps(self) -> bool:
         """Tell whether steps of this run can be CUDA graphs.
 
-        The host must not wait in a step, as it does for lists of an exact length, and for the numbers of Gaussians that
-        several processes send each other. A camera optimizer computes what is not in the graphs.
+        The host may not wait in a graph, as it does for tile lists of an exact length and for the exchange of several
+        processes. A camera optimizer's work is not in the graphs.
         """
         model = self.pipeline.model
         known = model.backend == "triton" and model.tile_forecast is not None
         return self.config.cuda_graphs and self.world.alone and known and model.camera_optimizer.config.mode == "off"
 
     def _print_next_commands(self) -> None:
-        """Print the commands for a run that is done, below nerfstudio's box; not where the run ends with an error."""
+        """Print the commands for a finished run below nerfstudio's box, unless the run diverged."""
         if not self.pipeline.diverged:
             text = next_commands(self.base_dir / "config.yml", self.pipeline.model.num_gaussians)
             CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
             events.report("training ends", gaussians=self.pipeline.model.num_gaussians)
 
     def _load_checkpoint(self) -> None:
-        """Load the optimizers of the checkpoint, whose Gaussians are there since they were made."""
+        """Load the checkpoint's optimizers; `setup_optimizers` has loaded its Gaussians."""
         if self._resumed is None:
             return super()._load_checkpoint()
         self._resumed.load_optimizers(self.optimizers, self.grad_scaler, self.config.load_scheduler)
         self._resumed = None
 
     def _turn_viewer_off(self) -> None:
-        """Keep nerfstudio from starting a viewer, and say so where one was asked for."""
+        """Keep nerfstudio from starting a viewer, and say so if one was asked for."""
         if self.config.is_viewer_enabled() or self.config.is_viewer_legacy_enabled():
             CONSOLE.print("The viewer is off, since no device holds all Gaussians; `ns-viewer` shows the finished run.")
             others = self._vis.removeprefix("viewer_legacy").removeprefix("viewer").removeprefix("+")
@@ -158,7 +156,7 @@ class SadgsTrainer(Trainer):
     def setup_optimizers(self) -> SadgsOptimizers:
         """Load the checkpoint's Gaussians, if there is one, plan the run, and build optimizers with the planned rates.
 
-        Raises InputError if checkpoint, data or options cannot be used, or do not fit each other.
+        Raises InputError if checkpoint, data and options do not fit each other.
         """
         config, pipeline = self.config, self.pipeline
         chosen = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
@@ -171,7 +169,6 @@ class SadgsTrainer(Trainer):
         length = plan_length(config, len(cameras), before)
         peers, views = None if config.share_always else self._peers, length.views_per_iteration
         if peers is not None and peers.on_one_machine() and one_device_is_quicker(cameras, views, self.world.num_ranks):
-            # The other processes end with SystemExit, once this one, the first, has ended.
             processes.continue_on_rank_zero(self.world, peers)
             self.world, self._peers = World(), None
         if not self.world.alone:
@@ -187,20 +184,20 @@ class SadgsTrainer(Trainer):
         return SadgsOptimizers(plan.optimizers(config.optimizers), pipeline.get_param_groups())
 
     def train(self) -> None:
-        """Train up to `max_num_iterations` in all, where nerfstudio 1.1.5 would train that many more after resuming.
+        """Train up to `max_num_iterations` in all; nerfstudio 1.1.5 would train that many more after resuming.
 
         Raises:
-            RunError: If the GPU's memory is full, nothing is learned any more, or an image cannot be decoded any more.
+            RunError: If the GPU's memory is full, the run has diverged, or an image cannot be decoded any more.
             WriteError: If a checkpoint or log could not be written.
-            SystemExit: If SIGINT, SIGTERM or SIGHUP came. A checkpoint is saved then, a line says how to go on, and the
-                exit code is the one that shells give these signals.
+            SystemExit: If SIGINT, SIGTERM or SIGHUP came, with the exit code of shells, after a checkpoint was saved
+                and a line has said how to resume.
         """
         total = self.pipeline.model.plan.iterations
-        self.step: int = max(self._start_step - 1, 0)  # It names the checkpoint where nothing is left to do.
+        self.step: int = max(self._start_step - 1, 0)  # names the checkpoint if nothing is left to do
         self._completed_step = self._saved_step = self._start_step - 1
         self.config.max_num_iterations = max(total - self._start_step, 0)
         if self._start_step >= total:
-            writer.GLOBAL_BUFFER["step"] = self.step  # nerfstudio's table reads what only an iteration sets.
+            writer.GLOBAL_BUFFER["step"] = self.step  # Only an iteration would set it.
             CONSOLE.print(
                 f"This run is finished after {self._start_step} iterations: --max-num-iterations of more than "
                 f"{self._start_step} trains on.",
@@ -216,17 +213,16 @@ class SadgsTrainer(Trainer):
                 raise
             # An image that is decoded ahead of its step is gone or damaged, and no step is half done.
             self.save_checkpoint(self._completed_step)
-            raise RunError(
-                f"{error} What was trained is saved and goes on with --load-dir {self.checkpoint_dir}."
-            ) from error
+            told = f"{error} What was trained is saved and goes on with --load-dir {self.checkpoint_dir}."
+            raise RunError(told) from error
         except RunError:
             raise
         except torch.cuda.OutOfMemoryError as error:
-            out_of_memory = _memory(error)  # The RunError is raised below, when the failed step's tensors are gone.
+            out_of_memory = _memory(error)  # RunError is raised below, when the failed step's tensors are gone.
         except OSError as error:
-            if error.errno is None:  # It is a WriteError, or it does not come from the disk.
+            if error.errno is None:  # This is a WriteError, or not from the disk.
                 raise
-            # A logger, such as tensorboard's, could not write; its file may be on another disk, or its folder is gone.
+            # A logger, such as tensorboard's, could not write, perhaps to another disk.
             if not self._stepping and self._completed_step > self._saved_step and self.world.alone:
                 self.save_checkpoint(self._completed_step)
             raise WriteError(Path(os.fsdecode(error.filename or self.base_dir)), error) from error
@@ -244,10 +240,10 @@ class SadgsTrainer(Trainer):
         processes.leave()
 
     def _train_until_interrupted(self, total: int) -> None:
-        """Train as nerfstudio does, until the last iteration of all or a signal, which raises SystemExit once saved."""
+        """Train as nerfstudio does until the last iteration, or until a signal, which saves and raises SystemExit."""
         with self._interrupts:
             try:
-                if not self.world.alone:  # nerfstudio's way to make it fails where another process is as fast.
+                if not self.world.alone:  # Making it as nerfstudio does fails if another process is as fast.
                     self.base_dir.mkdir(parents=True, exist_ok=True)
                 super().train()
                 self._stop_if_diverged()
@@ -260,7 +256,7 @@ class SadgsTrainer(Trainer):
                 self._stop(interruption, total)
 
     def _ended(self) -> str | None:
-        """Say which other processes ended by themselves, and with them this one; None where none did."""
+        """Return a sentence on which other processes ended by themselves, and so this one; None if none did."""
         ended = [] if self._peers is None else self._peers.ended()
         if not ended:
             return None
@@ -270,20 +266,17 @@ class SadgsTrainer(Trainer):
     def _rescue(self, out_of_memory: str) -> str:
         """Save the state before the present step if it is whole, and return what to tell the user.
 
-        If memory ran out while Gaussians were split, the saved state holds the step's update already, and the resumed
-        run makes it a second time.
+        If memory ran out during a split, the state holds the step's update, and the resumed run makes it again.
         """
         torch.cuda.empty_cache()
         model = self.pipeline.model
-        lengths = {len(parameter) for parameter in model.gauss_params.values()}
+        tensors, whole = [*model.gauss_params.values(), *model.strategy_state.values()], True
         for name, parameter in model.gauss_params.items():
             states = self.optimizers.optimizers[name].state
-            if not states and parameter.numel() > 0:
-                lengths.add(-1)  # gsplat takes the state out while it rewrites it.
-            for state in states.values():
-                lengths |= {len(value) for value in state.values() if isinstance(value, torch.Tensor) and value.dim()}
-        lengths |= {len(v) for v in model.strategy_state.values() if isinstance(v, torch.Tensor) and v.dim()}
-        if len(lengths) > 1 or self.step <= self._start_step or not self.world.alone:
+            whole &= bool(states) or not parameter.numel()  # gsplat takes the state out while it rewrites it.
+            tensors += [value for state in states.values() for value in state.values()]
+        whole &= len({len(value) for value in tensors if isinstance(value, Tensor) and value.dim()}) == 1
+        if not whole or self.step <= self._start_step or not self.world.alone:
             kept = "nothing newer than the last checkpoint could be saved"
         else:
             try:
@@ -297,12 +290,12 @@ class SadgsTrainer(Trainer):
         )
 
     def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
-        """Train on the views of a step, in the place of nerfstudio's iteration, and return its loss and metrics.
+        """Train on the views of a step instead of nerfstudio's iteration, and return its loss, losses and metrics.
 
-        No signal may stop the run from here to `_update_viewer_state`.
+        No signal stops the run from here to `_update_viewer_state`.
         """
         self._stepping = True
-        # Several processes agree on what to do after a step in the step itself. A signal has the bit of its number.
+        # Several processes agree in the step what to do after it. A signal has the bit of its number.
         self.world.flags_in, signalled = 0, self._interrupts.received
         bit = 0 if signalled is None else 1 << signalled
         self.world.flags_out = int(time.monotonic() >= self._save_due) | bit
@@ -320,7 +313,7 @@ class SadgsTrainer(Trainer):
         return result.loss, {"main_loss": result.loss}, model.training_metrics(result.psnr)
 
     def _update_viewer_state(self, step: int) -> None:
-        """Stop or save where that is due; nerfstudio calls this after every step, when densification is done."""
+        """Stop or save if that is due; nerfstudio calls this after every step, when densification is done."""
         self._completed_step, self._stepping = step, False
         if self.world.alone:
             self._interrupts.poll()
@@ -336,12 +329,12 @@ class SadgsTrainer(Trainer):
         super()._update_viewer_state(step)
 
     def eval_iteration(self, step: int) -> None:
-        """Measure held-out views as nerfstudio does, unless no device holds all Gaussians."""
+        """Measure held-out views as nerfstudio does, if one device holds all Gaussians."""
         if self.world.alone:
             super().eval_iteration(step)
 
     def _train_complete_viewer(self) -> None:
-        """Wait for the viewer's user, as nerfstudio does for ever, unless the run must stop."""
+        """Wait for the viewer's user, as nerfstudio does, unless the run must stop."""
         self._interrupts.poll()
         self._stop_if_diverged()
         super()._train_complete_viewer()
@@ -354,7 +347,7 @@ class SadgsTrainer(Trainer):
         self._save_due = time.monotonic() + wait
 
     def _stop(self, interrupted: Interrupted, total: int) -> None:
-        """Save a checkpoint, and in `config.yml` that the run goes on from it; a run that was done just ends."""
+        """Save a checkpoint, and name it in `config.yml`; return if the run was done, else raise SystemExit."""
         if self._completed_step > self._saved_step:
             self.save_checkpoint(self._completed_step)
         done = self._completed_step + 1
@@ -363,7 +356,7 @@ class SadgsTrainer(Trainer):
         if done == self._start_step:
             text = f"{interrupted}: {_NOTHING_DONE}"
         else:
-            # With --load-config nerfstudio takes all options from the file, so the file must name the checkpoints, too.
+            # With --load-config nerfstudio takes all options from this file.
             config = copy.copy(self.config)
             config.max_num_iterations = total
             config.load_dir, config.load_step, config.load_checkpoint = self.checkpoint_dir, None, None
@@ -371,14 +364,14 @@ class SadgsTrainer(Trainer):
             file = write_config(config) if processes.is_rank_zero() else self.base_dir / "config.yml"
             command = shlex.join(["ns-train", str(config.method_name), "--load-config", str(file)])
             text = f"{interrupted}: stopped and saved after {done} of {total} iterations; resume with: {command}"
-        if interrupted.number == HANG_UP:  # Some systems send it before they take the terminal away.
+        if interrupted.number == HANG_UP:  # Some systems take the terminal away later.
             discard_broken_output()
         CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
-        self.world.all(True)  # What starts the processes ends all as soon as one has ended.
+        self.world.all(True)  # As soon as one process has ended, the others are ended.
         raise SystemExit(128 + interrupted.number)
 
     def _stop_if_diverged(self) -> None:
-        """Save the Gaussians and raise RunError if they learn nothing any more because gradients are not finite."""
+        """Save the Gaussians and raise RunError if the run has diverged."""
         if not self.pipeline.diverged:
             return
         kept = "the Gaussians themselves are not finite: train anew, or from a checkpoint in which they are"
@@ -393,19 +386,8 @@ class SadgsTrainer(Trainer):
         )
 
     def save_checkpoint(self, step: int) -> None:
-        """Save as `checkpoints.write` does. Where several processes train, the first writes what all of them hold."""
+        """Save as `checkpoints.write` does. Rank 0 gathers and writes the Gaussians of all processes."""
         start = time.monotonic()
-        state = self._state(step)
-        if processes.is_rank_zero():
-            # An earlier checkpoint may be better where nothing is learned any more.
-            keep = not self.config.save_only_latest_checkpoint or bool(self.pipeline.diverged)
-            checkpoints.write(self.checkpoint_dir, step, state, keep)
-        self.world.all(True)
-        self._saved_step = step
-        self._set_clock(time.monotonic() - start)
-
-    def _state(self, step: int) -> dict[str, Any]:
-        """Return what a checkpoint holds; the Gaussians of other processes are gathered by the first."""
         state = {
             "step": step,
             "pipeline": self.pipeline.state_dict(),
@@ -413,4 +395,12 @@ class SadgsTrainer(Trainer):
             "schedulers": {name: s.state_dict() for name, s in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),
         }
-        return state if self.world.alone else checkpoints.map_rows(state, self.world.gather_rows)
+        if not self.world.alone:
+            state = checkpoints.map_rows(state, self.world.gather_rows)
+        if processes.is_rank_zero():
+            # An earlier checkpoint may be better if the run has diverged.
+            keep = not self.config.save_only_latest_checkpoint or bool(self.pipeline.diverged)
+            checkpoints.write(self.checkpoint_dir, step, state, keep)
+        self.world.all(True)
+        self._saved_step = step
+        self._set_clock(time.monotonic() - start)

@@ -23,48 +23,43 @@ from sadgs_ns.training.prefetch import ImagePrefetcher
 
 
 class ViewSampler:
-    """Draws the training views of each step, in rounds that have every view once.
+    """Draws the training views of each step, in rounds of every view once, in an order that the seed decides.
 
-    Where a round ends inside a step, the step goes on with those views of the next round that it does not have yet. The
-    views that were passed over come first in the next step. So no view is drawn twice in a step, unless the step takes
-    more views than there are.
-
-    Args:
-        num_views: Number of training views, at least 1.
-        seed: Seed of the order, which depends on nothing else.
+    If a round ends inside a step, the step continues with views of the next round that it does not have yet; those it
+    skips come first in the next step. So no view is drawn twice in a step, unless the step takes more than there are.
     """
 
     def __init__(self, num_views: int, seed: int) -> None:
         self.num_views = num_views
         self._generator = random.Random(seed)
         self._order: list[int] = []
-        """Views to come; another round is appended when a step, drawn or foreseen, needs it."""
+        """Views to come; another round is appended when a step needs it."""
 
     def draw(self, number: int) -> list[int]:
         """Return the indices of the next step's views."""
         return self._take_step(self._order, number)
 
     def foresee(self, number: int, steps: int) -> list[list[int]]:
-        """Return what `draw` will return in the next steps if no view is put back meanwhile."""
+        """Return what `draw` will return in the next steps, unless views are requeued."""
         order = [*self._order]
         return [self._take_step(order, number) for _ in range(steps)]
 
     def requeue(self, views: Sequence[int]) -> None:
-        """Draw views again, first of all, because what was drawn of them did not count."""
+        """Draw these views again, before all others, because their step did not count."""
         self._order[:0] = views
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the views to come and the state of the generator that shuffles the rounds after them."""
+        """Return the views to come and the state of the generator of later rounds."""
         return {"num_views": self.num_views, "order": [*self._order], "generator": self._generator.getstate()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on with a saved order if it is of as many views; otherwise keep the new one."""
+        """Continue a saved order, unless the number of views has changed."""
         if state["num_views"] == self.num_views:
             self._order = [*state["order"]]
             self._generator.setstate(state["generator"])
 
     def _take_step(self, order: list[int], number: int) -> list[int]:
-        """Move the views of a step out of an order, which is the sampler's own or a copy of it."""
+        """Take the views of a step from an order, the sampler's own or a copy of it."""
         step: list[int] = []
         while len(step) < number:
             drawn = step[len(step) // self.num_views * self.num_views :]  # Beyond all views, each comes again.
@@ -81,15 +76,9 @@ class ViewSampler:
 
 
 class TrainingViews:
-    """Draws training views and gives their images and cameras.
+    """Draws training views, the same in all processes, and gives their images and cameras.
 
-    Args:
-        datamanager: Holds the images, the cameras and the seed of the order of the views.
-        model: Its camera optimizer corrects the cameras, and its device is the training device.
-
-    Attributes:
-        sampler: Draws the views of each step, the same ones in all processes.
-        world: The processes of the run, of which each composites its share of a step.
+    The datamanager holds images, cameras and the seed of the order; the model's camera optimizer corrects cameras.
     """
 
     def __init__(self, datamanager: FullImageDatamanager, model: SadgsModel) -> None:
@@ -104,7 +93,7 @@ class TrainingViews:
 
     @cached_property
     def prefetcher(self) -> ImagePrefetcher | None:
-        """What brings images from the host ahead of their step; None where all images are on the device."""
+        """Brings images from the host ahead of their step; None if all images are on the device."""
         config = self.datamanager.config
         if config.cache_images == "gpu":
             return None
@@ -119,11 +108,11 @@ class TrainingViews:
         return list(zip(cameras.height.flatten().tolist(), cameras.width.flatten().tolist(), strict=True))
 
     def draw(self, number: int) -> list[tuple[int, dict[str, Any]]]:
-        """Draw the views of one step, and bring images of the steps after it nearer. Raises as `ImagePrefetcher.take`.
+        """Draw the views of a step, and prefetch images of the next ones. Raises as `ImagePrefetcher.take`.
 
         Returns:
-            Index and data of each view; the image is on the training device, and where images travel so is the mask.
-            Where they travel, and there are several processes, views that only others composite come without data.
+            Index and data of each view. The image is on the training device, and so is the mask if it was prefetched.
+            With several processes, prefetched data is there only of views that this process composites.
         """
         indices, prefetcher = self.sampler.draw(number), self.prefetcher
         if prefetcher is None:
@@ -132,13 +121,13 @@ class TrainingViews:
         data = prefetcher.take(self._composited(indices))
         share, threads = math.ceil(number / self.world.num_ranks), prefetcher.threads
         steps = [self._composited(step) for step in self.sampler.foresee(number, 2 + math.ceil(threads / share))]
-        # As many views are on their way in each step, so that none is forgotten before its step.
+        # The number of views under way is the same in each step, so that none is forgotten before its step.
         most = max(threads + 2 * share, len(steps[0]))
         prefetcher.prefetch(list(dict.fromkeys(chain(*steps)))[:most], following=steps[0])
         return [(index, data.get(index, {})) for index in indices]
 
     def _composited(self, indices: Sequence[int]) -> list[int]:
-        """Return those of a step's views, each once, of which this process composites rows."""
+        """Return the views of a step, each once, of which this process composites rows."""
         if not self.world.alone:
             sizes = tuple(self.sizes[index] for index in indices)
             indices = [indices[position] for position in views_of_rank(sizes, self.world.num_ranks, self.world.rank)]
@@ -151,10 +140,10 @@ class TrainingViews:
 
     @cached_property
     def cameras(self) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
-        """World-to-camera matrices [4, 4] and intrinsics in px [3, 3] of all training views, each a tensor of its own.
+        """World-to-camera matrices [4, 4] and intrinsics in px [3, 3] of all training views, as separate tensors.
 
-        They are made once, because asking nerfstudio's cameras for them in each step makes the host wait for the
-        device. Raises InputError if undistorting an image failed.
+        They are made once: in a step, nerfstudio's cameras would make the host wait for the device. Raises InputError
+        if undistorting an image failed.
         """
         dataset = self.datamanager.train_dataset
         _ = self.datamanager.cached_train  # Undistorting the images has changed the intrinsics.
@@ -164,7 +153,7 @@ class TrainingViews:
         return viewmats.to(device).unbind(), cameras.get_intrinsics_matrices().to(device).unbind()
 
     def viewmat(self, index: int) -> Tensor:
-        """World-to-camera matrix of a training view, corrected by the camera optimizer where it is on. [4, 4]"""
+        """World-to-camera matrix of a training view, corrected by the camera optimizer. [4, 4]"""
         viewmats, _ = self.cameras
         optimizer = self.model.camera_optimizer
         if optimizer.config.mode == "off":

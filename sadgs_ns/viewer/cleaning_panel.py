@@ -1,6 +1,6 @@
-"""The viewer's panel for cleaning: sliders, how many Gaussians they would take away, and what that looks like.
+"""The viewer's panel for cleaning: sliders, how many Gaussians they would remove, and what that looks like.
 
-It takes nothing away: `sadgs-export` does, with the options that the panel prints.
+It removes nothing: `sadgs-export` does, with the options that the panel prints.
 """
 
 from __future__ import annotations
@@ -25,26 +25,21 @@ OUTPUT = "cleaned"
 """Name of the panel's picture among the viewer's output types."""
 OFF, STAYS, GOES = "off", "what stays", "what goes"
 NEAREST, FURTHEST = (-100.0, -100.0, -100.0), (100.0, 100.0, 100.0)
-"""Corners of the box at first, in world units: a box of these takes nothing away."""
+"""Corners of the box at first, in world units, which crop nothing."""
 
 
 @dataclass(frozen=True)
-class _Rows:
-    """Stands in for a crop box, as far as the model asks it: which Gaussians are drawn."""
+class _DrawnRows:
+    """A crop box for the model that holds the drawn Gaussians, bool [N]."""
 
     drawn: Tensor
-    """bool [N]"""
 
     def within(self, means: Tensor) -> Tensor:
-        """Return which are drawn. [N, 3] → [N]"""
         return self.drawn
 
 
 class CleaningPanel(torch.nn.Module):
-    """Elements of the viewer, and the picture that they choose, of a run's model.
-
-    It is a module because the viewer looks for elements in modules only; it has neither parameters nor state.
-    """
+    """The panel's elements and picture. It is a module because the viewer looks for elements in modules only."""
 
     def __init__(self, views: TrainingViews) -> None:
         super().__init__()
@@ -68,20 +63,18 @@ class CleaningPanel(torch.nn.Module):
 
     @property
     def _model(self) -> SadgsModel:
-        """The model; the name is private, lest the viewer walk from here into it again."""
+        """The model; with a public name, the viewer would find its elements twice."""
         return self._views.model
 
     @property
     def cleaning(self) -> Cleaning:
-        """What the elements ask for; raises InputError if the box is reversed."""
+        """The elements' values; raises InputError if the box is reversed."""
         low, high = self.crop_from.value, self.crop_to.value
-        crop = None
-        if (tuple(low), tuple(high)) != (NEAREST, FURTHEST):
-            crop = (low[0], low[1], low[2], high[0], high[1], high[2])
+        crop: Any = None if (tuple(low), tuple(high)) == (NEAREST, FURTHEST) else (*low, *high)
         return Cleaning(int(self.min_views.value), self.max_extent.value or None, crop, self.dust.value)
 
     def _changed(self, _: Any) -> None:
-        """Find what stays, and say how many go, or what went wrong: the viewer's threads keep errors to themselves."""
+        """Refresh, and show any error in the panel; viser swallows exceptions of callbacks."""
         try:
             self.refresh()
         except (RuntimeError, ValueError) as error:  # Memory is full, the box is reversed, or photos went away.
@@ -91,10 +84,10 @@ class CleaningPanel(torch.nn.Module):
         show_output(self.viewer, "rgb" if self._shown == OFF else OUTPUT)
 
     def refresh(self) -> None:
-        """Find what stays of the present Gaussians; raises InputError if the box is reversed."""
+        """Find which Gaussians stay, and show how many; raises InputError if the box is reversed."""
         cleaning, model = self.cleaning, self._model
         params = dict(model.gauss_params.items())
-        now = (model.num_points, model.step)  # While a run trains, what was seen becomes untrue.
+        now = (model.num_points, model.step)  # Training outdates what was seen.
         if cleaning.needs_views and (self._seen is None or self._seen[0] != now):
             self._say("Looking from all training views …")
             self._seen = now, see(params, self._cameras(), model.drawing)
@@ -116,9 +109,9 @@ class CleaningPanel(torch.nn.Module):
         self.text.refresh()
 
     def outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return `cleaned` [H, W, 3] in [0, 1], which the viewer may show; evaluation and `ns-render` get nothing.
+        """Return `cleaned` [H, W, 3] in [0, 1] in the viewer, and nothing elsewhere.
 
-        It is `rgb` of the model's outputs where densification has changed the Gaussians.
+        It is `rgb` if densification has changed the Gaussians.
         """
         if not in_viewer():
             return {}
@@ -126,7 +119,7 @@ class CleaningPanel(torch.nn.Module):
         if self._shown == OFF or len(stays) != model.num_points:
             return {OUTPUT: rendered["rgb"]}
         box, drawn = model.crop_box, stays if self._shown == STAYS else ~stays
-        model.crop_box = _Rows(drawn if box is None else drawn & box.within(model.means))  # type: ignore[assignment]
+        model.crop_box = _DrawnRows(drawn if box is None else drawn & box.within(model.means))  # type: ignore[assignment]
         try:
             return {OUTPUT: model.get_outputs(camera)["rgb"]}
         finally:
@@ -134,7 +127,7 @@ class CleaningPanel(torch.nn.Module):
 
 
 def command_line_options(cleaning: Cleaning) -> str:
-    """Return the options of `sadgs-export` that ask for the same, or "" for nothing."""
+    """Return the options of `sadgs-export` for the same cleaning, or "" for none."""
     options = [f"--min-views {cleaning.min_views}"] if cleaning.min_views else []
     options += [] if cleaning.max_extent is None else [f"--max-extent {cleaning.max_extent:g}"]
     options += [] if cleaning.crop is None else ["--crop " + " ".join(f"{value:g}" for value in cleaning.crop)]

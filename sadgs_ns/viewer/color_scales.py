@@ -1,7 +1,7 @@
-"""Colour scales of the quantities that are shown, their legends, and pictures with a scale beside them.
+"""Colour scales, their legends, and pictures with a scale beside them.
 
-The colour maps are those of matplotlib that colour-blind readers can tell apart. Its figures and fonts, which take a
-fifth of a second to import, are imported where they are drawn: training needs none.
+The colour maps are those of matplotlib that colour-blind readers can tell apart. Figures and fonts take a fifth of a
+second to import, and training needs none, so functions import them.
 """
 
 from __future__ import annotations
@@ -28,13 +28,12 @@ Picture = NDArray[np.uint8]
 """RGB. [H, W, 3]"""
 
 NOTHING = "black"
-"""Colour of pixels without a value: no scale has it. Grey is in the middle of cividis, and, to the colour-blind, of
-viridis."""
+"""Colour of pixels without a value, which no scale has, unlike grey, which cividis has in its middle."""
 
 
 @dataclass(frozen=True)
 class Scale:
-    """A colour scale, which says what colour a value has, and what a legend says of it."""
+    """A colour scale for values from `low` to `high`, with its legend."""
 
     label: str
     colors: str
@@ -47,12 +46,12 @@ class Scale:
 
     @property
     def norm(self) -> Normalize:
-        """What maps values to [0, 1]; values beyond the ends get the colours of the ends."""
+        """Maps values to [0, 1]; values beyond the ends get the colours of the ends."""
         return (LogNorm if self.log else Normalize)(self.low, self.high, clip=True)
 
     @property
     def colormap(self) -> Colormap:
-        """What maps [0, 1] to colours."""
+        """Maps [0, 1] to colours."""
         return matplotlib.colormaps[self.colors].with_extremes(bad=NOTHING)
 
     def __call__(self, values: Tensor) -> Picture:
@@ -69,12 +68,12 @@ LOW = Scale("share of consistently low Gaussians", "cividis", 0, 1, (0, 0.25, 0.
 
 
 def to_picture(image: Tensor) -> Picture:
-    """Return an image in [0, 1], [H, W, 3], as a picture; values beyond are cut."""
+    """Return an image, clamped to [0, 1], as a picture. [H, W, 3]"""
     return (255 * image.detach().float().clamp(0, 1)).round().byte().cpu().numpy()
 
 
 def bar(scale: Scale) -> Picture:
-    """Return the scale's colours, 720 px wide, with its numbers below them, to be shown at about half that size."""
+    """Return the scale's colours, 720 px wide, with its numbers below them, to be shown at half that size."""
     from matplotlib.font_manager import findfont
 
     size, length = 30, 630
@@ -91,7 +90,7 @@ def bar(scale: Scale) -> Picture:
 
 
 def legend(text: str, scale: Scale | None = None) -> str:
-    """Return a line of text as Markdown and, if a scale is given, its colours and numbers as an image."""
+    """Return Markdown of a line of text and, if a scale is given, of an image of its colours and numbers."""
     if scale is None:
         return text
     return f"{text}\n\n![{scale.label}](data:image/png;base64,{_encoded_bar(scale)})"
@@ -114,12 +113,9 @@ class Panel:
 
 
 def draw(path: Path, panels: Sequence[Panel], columns: int | None = None) -> None:
-    """Write pictures side by side as PNG, each with its title and a colour bar; the file appears whole or not at all.
+    """Write at least one picture, with titles and colour bars, as a PNG file, or raise WriteError.
 
-    Args:
-        path: The file. If it cannot be written, this raises WriteError.
-        panels: The pictures, at least one.
-        columns: Pictures in a row; None puts all in one row.
+    `columns` is the number of pictures in a row; None puts all in one row.
     """
     from matplotlib.figure import Figure
 

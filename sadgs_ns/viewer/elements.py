@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class ViewerMarkdown(ViewerElement[str]):
-    """A text in the viewer, which `text` returns when it is installed and at every `refresh`."""
+    """A text in the viewer; `text` returns it at the start and at every `refresh`."""
 
     def __init__(self, name: str, text: Callable[[], str]) -> None:
         super().__init__(name)
@@ -35,14 +35,14 @@ class ViewerMarkdown(ViewerElement[str]):
         self._create_gui_handle(viser_server)
 
     def refresh(self) -> None:
-        """Send the text to the viewer, if there is one and the text has changed."""
+        """Send the text to the viewer, if there is one, when it has changed."""
         if self.gui_handle is not None and (text := self.text()) != self._shown:
             self._shown = self.gui_handle.content = text
 
 
 def show_output(control: ViewerControl, name: str) -> None:
-    """Have the viewer, if it has met the control, show one of its output types, if it knows that already."""
-    viewer = getattr(control, "viewer", None)  # It is set when the viewer is made.
+    """Have the viewer, if there is one, show one of its output types, if it knows that type already."""
+    viewer = getattr(control, "viewer", None)  # set when the viewer is made
     if viewer is not None:
         output = viewer.control_panel._output_render  # nerfstudio 1.1 has no public way.
         if name in output.options:
@@ -50,7 +50,7 @@ def show_output(control: ViewerControl, name: str) -> None:
 
 
 def shows_output(control: ViewerControl, name: str) -> bool:
-    """Tell whether the viewer shows one of its output types, in the whole window or in a half of it."""
+    """Tell whether the viewer shows one of its output types, in the whole window or in half of it."""
     viewer = getattr(control, "viewer", None)
     if viewer is None:
         return False
@@ -59,10 +59,9 @@ def shows_output(control: ViewerControl, name: str) -> bool:
 
 
 class LazyOutputs(UserDict[str, Any]):
-    """Tensors by name, as nerfstudio reads them: a function that stands in for a tensor is called at the first read.
+    """Tensors by name, or functions that make them when they are first read.
 
-    nerfstudio does not tell a model which of its outputs are wanted, so that each of them would cost `ns-eval` and
-    `ns-render` time, also where nobody looks at it.
+    nerfstudio does not tell a model which outputs it needs, so each would cost `ns-eval` and `ns-render` time.
     """
 
     def __getitem__(self, name: str) -> Tensor:
@@ -73,7 +72,7 @@ class LazyOutputs(UserDict[str, Any]):
 
 
 def in_viewer() -> bool:
-    """Tell whether this is a thread in which nerfstudio's viewer draws."""
+    """Tell whether nerfstudio's viewer draws in this thread."""
     from nerfstudio.viewer.render_state_machine import RenderStateMachine
 
     return isinstance(threading.current_thread(), RenderStateMachine)

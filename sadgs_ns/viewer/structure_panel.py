@@ -1,6 +1,6 @@
-"""The viewer's panel, which shows what the method does and changes some of its settings while a run trains.
+"""The viewer's panel of the method: pictures of η and S̄, a table of structure steps, and two settings.
 
-The viewer finds the elements by walking the pipeline, and shows them in alphabetical order of their attributes.
+The viewer finds the elements in the pipeline, and shows them in alphabetical order of their attributes.
 """
 
 from __future__ import annotations
@@ -43,15 +43,15 @@ OUTPUT = "structure"
 OFF, ETA_OF, CHILDREN_OF, LOW_OF = "off", "η", "children", "low"
 PERIOD_HERE, ELLIPSES_HERE = "wavelength of this rendering", "ellipses of this rendering"
 PERIOD_NEAR, ELLIPSES_NEAR = "wavelength of the nearest photo", "ellipses of the nearest photo"
-CHOICES = [OFF, ETA_OF, CHILDREN_OF, LOW_OF, PERIOD_HERE, ELLIPSES_HERE, PERIOD_NEAR, ELLIPSES_NEAR]
 OF_PHOTOS = (PERIOD_NEAR, ELLIPSES_NEAR)
 """Choices that need the training photos."""
 OF_STATISTICS = (ETA_OF, CHILDREN_OF, LOW_OF)
 """Choices that need observations of the training views."""
+CHOICES = [OFF, *OF_STATISTICS, PERIOD_HERE, ELLIPSES_HERE, *OF_PHOTOS]
 RANGES = {"tau_split": (0.0, 1.0), "max_gaussians": (1, 100_000_000)}
-"""Fields of the strategy that may be changed while a run trains, each with its smallest and largest value."""
+"""Smallest and largest values of the strategy's fields that may change while a run trains."""
 ROWS = 8
-"""Number of structure steps in the table, which shows the last ones."""
+"""Number of the last structure steps in the table."""
 
 
 def changed(plan: RunPlan, name: str, value: float) -> RunPlan:
@@ -64,10 +64,10 @@ def changed(plan: RunPlan, name: str, value: float) -> RunPlan:
 
 
 def describe(strategy: StructureAwareStrategy, num_points: int, state: dict[str, Any]) -> str:
-    """Return the number of Gaussians now, and a table of how the last structure steps changed it, as Markdown.
+    """Return Markdown of the present number of Gaussians and a table of how the last structure steps changed it.
 
-    What AbsGS and pruning changed between the structure steps, which `state` lists, has rows of its own: each row
-    begins where the one above ends, and the last one ends with the number of now.
+    Changes by AbsGS and pruning between the structure steps have their own rows: each row begins with the number at
+    which the one above ends.
     """
     lines = [f"**{num_points:,} Gaussians** (cap {strategy.max_gaussians:,})", ""]
     steps = state.get("structure_steps", [])[-ROWS:]
@@ -91,9 +91,9 @@ def _between(when: str, before: int, after: int) -> str:
 
 
 def nearest_view(cameras: Tensor, camera: Tensor, extent: float) -> int:
-    """Return the index of the training view that is most like a camera's: near it, and looking in the same direction.
+    """Return the index of the training view that is nearest to a camera in place and direction.
 
-    The camera-to-world poses are [C, 3, 4] and [3, 4]; the extent is the distance that counts as much as 1 rad.
+    The camera-to-world poses are [C, 3, 4] and [3, 4]; a distance of `extent` counts as much as 1 rad.
     """
     distance = (cameras[:, :, 3] - camera[:, 3]).norm(dim=-1) / max(extent, 1e-12)
     angle = (cameras[:, :, 2] @ camera[:, 2]).clamp(-1, 1).acos()
@@ -101,29 +101,18 @@ def nearest_view(cameras: Tensor, camera: Tensor, extent: float) -> int:
 
 
 class StructurePanel(torch.nn.Module):
-    """Elements of the viewer, and the picture that they choose, of a run's structure tensors and its model.
-
-    It is a module because the viewer looks for elements in modules only; it has neither parameters nor state.
-    """
+    """The panel's elements and picture. It is a module because the viewer looks for elements in modules only."""
 
     def __init__(self, cache: StructureCache) -> None:
         super().__init__()
         self._cache = cache
         self._observed: dict[str, Tensor] = {}
         self._refreshed = 0.0
-        self._status = ""
-        self._shown = OFF
-        self._legend = ""
-        strategy = self._model.strategy
-        self.choice = ViewerDropdown(
-            "Show",
-            OFF,
-            CHOICES,
-            cb_hook=lambda _: self._told(self.choose),
-            hint="What the output type “structure” shows",
-        )
+        self._status, self._shown, self._legend = "", OFF, ""
+        strategy, hint = self._model.strategy, "What the output type “structure” shows"
+        self.choice = ViewerDropdown("Show", OFF, CHOICES, cb_hook=lambda _: self._call(self.choose), hint=hint)
         self.legend = ViewerMarkdown("legend", lambda: self._legend)
-        self.observe = ViewerButton("Observe all training views", cb_hook=lambda _: self._told(self.observe_now))
+        self.observe = ViewerButton("Observe all training views", cb_hook=lambda _: self._call(self.observe_now))
         self.set_max_gaussians = ViewerNumber(
             "max_gaussians",
             strategy.max_gaussians,
@@ -134,7 +123,7 @@ class StructurePanel(torch.nn.Module):
         self.set_tau_split = ViewerSlider(
             "tau_split",
             strategy.tau_split,
-            min(low, strategy.tau_split),  # The run's own options may lie beyond the range.
+            min(low, strategy.tau_split),  # The run's options may lie beyond the range.
             max(high, strategy.tau_split),
             0.05,
             cb_hook=lambda element: self._change("tau_split", element),
@@ -145,7 +134,7 @@ class StructurePanel(torch.nn.Module):
 
     @property
     def _model(self) -> SadgsModel:
-        """The model; the name is private, lest the viewer walk from here into it again."""
+        """The model; with a public name, the viewer would find its elements twice."""
         return self._cache.views.model
 
     def _describe(self) -> str:
@@ -154,7 +143,7 @@ class StructurePanel(torch.nn.Module):
         return f"{self._status}\n\n{text}" if self._status else text
 
     def _say(self, status: str) -> None:
-        """Show above the table what the panel is doing or has done."""
+        """Show above the table what the panel does or has done."""
         self._status = status
         self.table.refresh()
 
@@ -168,8 +157,8 @@ class StructurePanel(torch.nn.Module):
             element.value = getattr(plan.strategy, name)
         self.table.refresh()
 
-    def _told(self, act: Callable[[], None]) -> None:
-        """Call `act`, and say what went wrong: the viewer's threads keep their errors to themselves."""
+    def _call(self, act: Callable[[], None]) -> None:
+        """Call `act`, and show any error in the panel; viser swallows exceptions of callbacks."""
         self._say("")
         try:
             act()
@@ -179,16 +168,16 @@ class StructurePanel(torch.nn.Module):
             self._say(text)
 
     def refresh(self) -> None:
-        """Show the present numbers in the table, at most once a second; without a viewer this costs nothing."""
+        """Show the present numbers in the table, at most once a second."""
         now = time.monotonic()
         if self.table.gui_handle is not None and now - self._refreshed > 1.0:
             self._refreshed = now
             self.table.refresh()
 
     def statistics(self) -> dict[str, Tensor] | None:
-        """Return observations as `empty_statistics`: the run's since its last structure step, or else `observe_now`'s.
+        """Return sums as in `empty_statistics`: the run's since its last structure step, or else `observe_now`'s.
 
-        They are None where neither is of the present Gaussians.
+        None if neither is of the present Gaussians.
         """
         model = self._model
         live, n = model.strategy_state, model.num_points
@@ -197,22 +186,22 @@ class StructurePanel(torch.nn.Module):
         return self._observed if len(self._observed.get("n_total", ())) == n else None
 
     def observe_now(self) -> None:
-        """Observe all training views with the present Gaussians, and say above the table how far that is."""
+        """Observe all training views with the present Gaussians, and show the progress above the table."""
         number = len(self._cache.views)
-        self._set_busy(True)
+        self._disable_button(True)
         try:
             self._read_photos()
-            self._observed = observe_training_views(self._cache, self._told_of)
+            self._observed = observe_training_views(self._cache, self._with_progress)
         finally:
-            self._set_busy(False)
+            self._disable_button(False)
         seen = int((self._observed["n_total"] > 0).sum())
         self._say(
             f"Observed {number:,} training views, which see {seen:,} Gaussians: “{ETA_OF}”, “{CHILDREN_OF}” and "
             f"“{LOW_OF}” show what was found."
         )
 
-    def _told_of(self, views: range) -> Iterator[int]:
-        """Yield the views, and say at most twice a second which of them is looked at."""
+    def _with_progress(self, views: range) -> Iterator[int]:
+        """Yield the views, and show at most twice a second which one it is."""
         due = 0.0
         for view in views:
             if time.monotonic() >= due:
@@ -221,21 +210,20 @@ class StructurePanel(torch.nn.Module):
             yield view
 
     def _read_photos(self) -> None:
-        """Compute the structure tensors of the training photos, which are then kept."""
+        """Compute the structure tensors of the training photos, unless they were computed before."""
         if not self._cache.filled:
             self._say("Reading the training photos and their texture …")
             self._cache.fill()
 
-    def _set_busy(self, busy: bool) -> None:
-        """Let the button be pressed only while nothing is observed."""
+    def _disable_button(self, disabled: bool) -> None:
         if self.observe.gui_handle is not None:
-            self.observe.set_disabled(busy)
+            self.observe.set_disabled(disabled)
 
     def choose(self) -> None:
-        """Make what the present choice needs, and have the viewer show it.
+        """Compute what the present choice needs, and have the viewer show it.
 
-        This does not happen when the picture is drawn, because the viewer breaks off drawing at any line when its
-        camera moves, and photos that were then undistorted a second time would be wrong.
+        `picture` does not do so, because the viewer aborts drawing at any line when its camera moves, and photos that
+        are undistorted twice would be wrong.
         """
         chosen = self.choice.value
         if chosen in OF_STATISTICS and self.statistics() is None:
@@ -245,30 +233,30 @@ class StructurePanel(torch.nn.Module):
             self._say("")
         self._shown = chosen
         if chosen == OFF:
-            self._say_of_picture("")
+            self._show_legend("")
         show_output(self.viewer, "rgb" if chosen == OFF else OUTPUT)
 
     def outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return `structure` [H, W, 3] in [0, 1], which the viewer may show; evaluation and `ns-render` get nothing.
+        """Return `structure` [H, W, 3] in [0, 1] in the viewer, and nothing elsewhere.
 
-        The output exists whatever is chosen, because the viewer's thread fails where one goes missing.
+        It exists even if nothing is chosen, because the viewer's thread fails if an output vanishes.
         """
         if not in_viewer():
             return {}
         if self._shown == OFF:
             return {OUTPUT: rendered["rgb"]}
         drawn = self.picture(self._shown, camera, rendered["rgb"])
-        self._say_of_picture(color_scales.legend(drawn.title, drawn.scale))
+        self._show_legend(color_scales.legend(drawn.title, drawn.scale))
         return {OUTPUT: torch.from_numpy(drawn.picture).to(rendered["rgb"]) / 255}
 
-    def _say_of_picture(self, legend: str) -> None:
-        """Show a legend beside the picture, which the viewer would shrink with the picture if it were in it."""
+    def _show_legend(self, legend: str) -> None:
+        """Show a legend beside the picture; inside, the viewer would shrink it."""
         self._legend = legend
         self.legend.refresh()
 
     @torch.no_grad()
     def picture(self, choice: str, camera: Cameras, rgb: Tensor) -> Panel:
-        """Draw one of `CHOICES`, but not "off", as a camera, shape [1], that sees `rgb` [H, W, 3] in [0, 1] sees it."""
+        """Draw one of `CHOICES`, but not "off", for a camera, shape [1], that sees `rgb` [H, W, 3] in [0, 1]."""
         cache, datamanager, (height, width) = self._cache, self._cache.views.datamanager, rgb.shape[:2]
         constant = cache.frequency_constant
         if choice in OF_STATISTICS:
@@ -300,12 +288,9 @@ class StructurePanel(torch.nn.Module):
         if statistics is None:
             text = "No observations yet: press “Observe all training views”, or wait for some iterations."
             return Panel(text, np.zeros((height, width, 3), np.uint8))
-        strategy = model.strategy
         kept = {name: statistics[name] for name in ("eta_max", "n_total")}
-        kept |= {
-            "children": strategy.children_now(model.gauss_params, statistics),
-            "low": strategy.consistently_low(statistics),
-        }
+        kept["children"] = model.strategy.children_now(model.gauss_params, statistics)
+        kept["low"] = model.strategy.consistently_low(statistics)
         rows = model.cropped({**model.gauss_params, **kept})
         if len(rows["means"]) == 0:
             return Panel("No Gaussians in the crop box.", np.zeros((height, width, 3), np.uint8))

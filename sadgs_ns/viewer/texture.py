@@ -1,4 +1,4 @@
-"""Pictures of S̄: the period of the texture at each pixel, and S̄⁻¹ as ellipses over an image (paper, figure 1)."""
+"""Pictures of S̄: the texture's period at each pixel, and S̄⁻¹ as ellipses over an image (paper, figure 1)."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ ELLIPSES_ACROSS = 28
 def texture_period(structure_tensor: Tensor, frequency_constant: float = FREQUENCY_CONSTANT) -> Tensor:
     """Return the period of the finest texture in px at each pixel, 2π c Λ_min, or NaN without texture. [..., 3] → [...]
 
-    The structure tensor, as (xx, xy, yy) in 1/px², measures ω = c / σ, and a sine of period P answers most at σ = P /
-    2π.
+    The structure tensor (xx, xy, yy) in 1/px² measures ω = c / σ, and a sine of period P responds most at σ = P / 2π.
     """
     period = wavelength(structure_tensor)
     return torch.where(period < 0.999 / WAVELENGTH_EPSILON, 2 * torch.pi * frequency_constant * period, torch.nan)
@@ -30,10 +29,9 @@ def texture_period(structure_tensor: Tensor, frequency_constant: float = FREQUEN
 
 @dataclass(frozen=True)
 class Ellipses:
-    """S̄⁻¹ at some pixels (paper, figure 1); it is short across a texture's stripes and long along them."""
+    """S̄⁻¹ at E pixels; the ellipses are short across a texture's stripes and long along them."""
 
-    centers: Tensor
-    """Centres in px. [E, 2]"""
+    centers: Tensor  # [E, 2] px
     axes: Tensor
     """Wavelengths along the short and the long axis, px, at most `longest`. [E, 2]"""
     angles: Tensor
@@ -41,7 +39,7 @@ class Ellipses:
     periods: Tensor
     """Periods of the texture in px. [E]"""
     longest: float
-    """Wavelength of the coarsest level, at which axes are cut: stripes have an infinite one along them."""
+    """Wavelength of the coarsest level, which limits axes: along stripes they would be infinite."""
     spacing: float
     """Distance between neighbouring centres in px."""
 
@@ -49,9 +47,9 @@ class Ellipses:
 def structure_ellipses(
     structure_tensor: Tensor, frequency_constant: float = FREQUENCY_CONSTANT, spacing: float | None = None
 ) -> Ellipses:
-    """Return S̄⁻¹ on a regular grid of pixels, without those where there is no texture.
+    """Return S̄⁻¹ at the textured pixels of a regular grid.
 
-    S̄ is given as (xx, xy, yy) in 1/px² [H, W, 3], c in 1/px, and the grid's spacing, ≥ 1, in px; None puts
+    S̄ is (xx, xy, yy) in 1/px² [H, W, 3], and c in 1/px. The grid's spacing is in px and ≥ 1; None puts
     `ELLIPSES_ACROSS` along the shorter side.
     """
     height, width = structure_tensor.shape[:2]
@@ -83,21 +81,21 @@ def draw_ellipses(
     frequency_constant: float = FREQUENCY_CONSTANT,
     size: tuple[int, int] | None = None,
 ) -> Picture:
-    """Draw S̄⁻¹ as ellipses over an image, which is made dark grey. Both are [H, W, 3].
+    """Draw S̄⁻¹ as ellipses over a dark grey copy of an image. Both are [H, W, 3].
 
     A circle as wide as the grid's spacing has the coarsest wavelength on both axes. `size` is the height and width of
-    the drawing in px; None keeps those of the image.
+    the drawing in px; None keeps the image's.
     """
     ellipses = structure_ellipses(structure_tensor, frequency_constant)
     height, width = image.shape[:2] if size is None else size
     enlarge_x, enlarge_y = width / image.shape[1], height / image.shape[0]
     picture = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if enlarge_x < 1 else cv2.INTER_LINEAR)
-    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)  # Colour is left to the ellipses.
+    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     picture = np.repeat((0.5 * grey).astype(np.uint8)[..., None], 3, axis=-1)
     if len(ellipses.centers) == 0:
         return picture
     colors = PERIOD(ellipses.periods[None])[0]
-    # The grid's own size, not the wavelengths', decides how large they are drawn: none vanish or overlap.
+    # They are drawn relative to the grid's spacing, so that none vanish or overlap.
     radius = 0.5 * ellipses.spacing * min(enlarge_x, enlarge_y) / ellipses.longest
     fixed = 16  # OpenCV takes numbers with 4 bits after the point.
     thickness = max(round(min(height, width) / 350), 1)
