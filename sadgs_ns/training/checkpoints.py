@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.files import atomic_path
+from sadgs_ns.training.progress import warn
 
 REMEDY = "give --load-dir the folder of a run of sadgs, or train from scratch"
 _FOLDER = "nerfstudio_models"
@@ -173,7 +173,7 @@ def read_chosen(
             errors.append(error)
             continue
         for error in errors:
-            CONSOLE.print(f"{error} Going on from {path} instead.", style="yellow", markup=False, soft_wrap=True)
+            warn(f"{error} Going on from {path} instead.")
         return path, state
     if errors:
         raise errors[0]

@@ -9,8 +9,6 @@ from functools import partial
 from typing import Any
 
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
-from rich.markup import escape
 from torch import Tensor
 
 from sadgs_ns.errors import reason
@@ -26,6 +24,7 @@ from sadgs_ns.render.rasterization import rasterize
 from sadgs_ns.render.types import Cameras, Gaussians
 from sadgs_ns.training.optimizers import AdamUpdate, FusedAdam
 from sadgs_ns.training.pipeline import SadgsPipeline
+from sadgs_ns.training.progress import note, warn
 
 _GAUSSIANS, _SIZE = 64, 64
 """Number of Gaussians, and width and height in px, with which the kernels are tried."""
@@ -199,12 +198,11 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
         else:
             pending |= {name: pool.submit(stage) for name, stage in stages.after_projection().items()}
         if wait(pending.values(), timeout=_PATIENCE).not_done:
-            CONSOLE.print("Compiling kernels for this GPU, once …")
+            note("Compiling kernels for this GPU, once …")
     failures |= {name: error for name, future in pending.items() if (error := future.exception()) is not None}
     if failures:
-        why = escape(reason(next(iter(failures.values()))))
-        CONSOLE.print(
-            f"[yellow]The kernels of {', '.join(failures)} could not be compiled and tried before training ({why}): "
-            "training tries them again, and stops with an error of its own if it cannot do without them.[/]",
-            soft_wrap=True,
+        why = reason(next(iter(failures.values())))
+        warn(
+            f"The kernels of {', '.join(failures)} could not be compiled and tried before training ({why}): "
+            "training tries them again, and stops with an error of its own if it cannot do without them."
         )

@@ -15,14 +15,13 @@ from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
-from rich.markup import escape
 from torch import Tensor
 
 from sadgs_ns.errors import reason
 from sadgs_ns.render.types import Cameras
 from sadgs_ns.training.model import SadgsModel
 from sadgs_ns.training.optimizers import AdamUpdate
+from sadgs_ns.training.progress import warn
 from sadgs_ns.training.train_step import StepResult, ViewGroup, training_step
 
 MOST_GAUSSIANS = 2**20
@@ -234,10 +233,9 @@ class GraphedSteps:
         self.failure = reason(error)
         self._drop()
         self._recorder = None
-        CONSOLE.print(
-            f"[yellow]A training step could not be captured as a CUDA graph ({escape(self.failure)}): the kernels of "
-            "this run are launched one by one, which takes longer where Gaussians are few.[/]",
-            soft_wrap=True,
+        warn(
+            f"A training step could not be captured as a CUDA graph ({self.failure}): the kernels of "
+            "this run are launched one by one, which takes longer where Gaussians are few."
         )
 
 

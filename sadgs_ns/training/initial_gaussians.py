@@ -10,13 +10,13 @@ from collections.abc import Mapping
 
 import torch
 from nerfstudio.models.splatfacto import RGB2SH, num_sh_bases, random_quat_tensor
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from sadgs_ns.method.clearance import clear_of_cameras
 from sadgs_ns.method.initialization import neighbour_scales, plausible_points, starting_points
 from sadgs_ns.outliers import POINT_SHARE, REACH
 from sadgs_ns.training.config import SadgsModelConfig
+from sadgs_ns.training.progress import warn
 
 CAMERA_CLEARANCE = 2.0
 """Initial Gaussians within so many of their standard deviations of a camera are dropped, other than in the paper. That
@@ -32,9 +32,9 @@ def initial_gaussians(
     """
     if seed_points is None or config.random_init:
         if not config.random_init:
-            CONSOLE.print(
-                f"[yellow]The data has no SfM points: starting from {config.num_random} random ones in a cube of "
-                f"side {config.random_scale}. A sparse reconstruction (ns-process-data) gives a better splat.[/]"
+            warn(
+                f"The data has no SfM points: starting from {config.num_random} random ones in a cube of "
+                f"side {config.random_scale}. A sparse reconstruction (ns-process-data) gives a better splat."
             )
         points = (torch.rand((config.num_random, 3)) - 0.5) * config.random_scale  # [P, 3]
         start = starting_points(points, torch.rand((len(points), 3)), faces=False)
@@ -43,9 +43,9 @@ def initial_gaussians(
         points, colors = seed_points[0].float(), seed_points[1].float() / 255.0
         plausible = plausible_points(points)  # [P]
         if not plausible.all():
-            CONSOLE.print(
-                f"[yellow]Leaving out {int((~plausible).sum())} of {len(points)} SfM points, which are not finite "
-                f"or more than {REACH:g} times as far out as {POINT_SHARE:.0%} of them.[/]"
+            warn(
+                f"Leaving out {int((~plausible).sum())} of {len(points)} SfM points, which are not finite "
+                f"or more than {REACH:g} times as far out as {POINT_SHARE:.0%} of them."
             )
             points, colors = points[plausible], colors[plausible]
         start = starting_points(points, colors, faces=config.bounding_box_points, opacity=config.initial_opacity)
@@ -53,7 +53,7 @@ def initial_gaussians(
     means, cap = start[0], config.strategy.max_gaussians
     synthetic = torch.arange(len(means)) >= sfm
     if len(means) > cap:
-        CONSOLE.print(f"[yellow]Keeping a random {cap} of {len(means)} initial points: max_gaussians is {cap}.[/]")
+        warn(f"Keeping a random {cap} of {len(means)} initial points: max_gaussians is {cap}.")
         keep = torch.randperm(len(means))[:cap]
         start, synthetic = tuple(values[keep] for values in start), synthetic[keep]
     return spheres(*start, sh_degree=config.sh_degree), synthetic

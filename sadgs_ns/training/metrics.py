@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import torch
 from nerfstudio.models.splatfacto import SplatfactoModel
-from nerfstudio.utils.rich_utils import CONSOLE
 from pytorch_msssim import SSIM
 from torch import Tensor
+
+from sadgs_ns.training.progress import warn
 
 
 class MeasuredModel(SplatfactoModel):
@@ -46,5 +47,5 @@ def load_lpips(device: torch.device) -> torch.nn.Module | None:
         with torch.random.fork_rng(devices=[]):  # Drawing weights must not change training's random state.
             return LearnedPerceptualImagePatchSimilarity(normalize=True).to(device)
     except Exception as error:
-        CONSOLE.print(f"[yellow]LPIPS is not reported: its AlexNet weights could not be loaded ({error}).[/]")
+        warn(f"LPIPS is not reported: its AlexNet weights could not be loaded ({error}).")
         return None

@@ -11,8 +11,6 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
-from nerfstudio.utils.rich_utils import CONSOLE
-from rich.markup import escape
 from torch import Tensor
 
 from sadgs_ns.data.cameras import check_camera_types
@@ -28,6 +26,7 @@ from sadgs_ns.training.datamanager import SadgsDatamanager
 from sadgs_ns.training.memory_plan import choose_image_storage
 from sadgs_ns.training.model import NORMALS, SadgsModel
 from sadgs_ns.training.nonfinite import NonFiniteLog
+from sadgs_ns.training.progress import note, warn
 from sadgs_ns.training.run_plan import RunPlan
 from sadgs_ns.training.structure_cache import StructureCache
 from sadgs_ns.training.train_step import StepResult, ViewGroup, stack
@@ -53,7 +52,7 @@ class SadgsPipeline(VanillaPipeline):
         # Rendering new views ("inference") opens no image.
         for finding in findings_of(config.datamanager, open_images=kwargs.get("test_mode") != "inference"):
             if finding.severity == "warning":
-                CONSOLE.print(f"[yellow]{escape(finding.sentence)}[/]")
+                warn(finding.sentence)
         super().__init__(config, *args, **kwargs)
         backend = self.model.backend  # raises InputError if it cannot work
         for dataset in (self.datamanager.train_dataset, self.datamanager.eval_dataset):
@@ -61,15 +60,15 @@ class SadgsPipeline(VanillaPipeline):
         if config.datamanager.cache_images != "compressed" and kwargs.get("test_mode") != "inference":
             line = choose_image_storage(self.datamanager, self.device)
             if line is not None:
-                CONSOLE.print(line, highlight=False, soft_wrap=True)
+                note(line)
         parsed_on = getattr(self.datamanager.dataparser.config, "alpha_color", None)
         if parsed_on is not None and parsed_on != config.model.background_color:
-            CONSOLE.print(
-                f"[yellow]The images were put on {parsed_on}, the Gaussians lie on {config.model.background_color}: "
-                f"consider --pipeline.model.background-color {parsed_on}.[/]"
+            warn(
+                f"The images were put on {parsed_on}, the Gaussians lie on {config.model.background_color}: "
+                f"consider --pipeline.model.background-color {parsed_on}."
             )
         if config.model.backend == "auto" and backend == "gsplat":
-            CONSOLE.print("[yellow]Triton's kernels are not used: training takes about twice as long without them.[/]")
+            warn("Triton's kernels are not used: training takes about twice as long without them.")
         cameras = self.datamanager.train_dataset.cameras
         self.model.set_cameras(camera_positions(cameras))
         self.model.set_near_plane(
@@ -163,12 +162,10 @@ class SadgsPipeline(VanillaPipeline):
         wrong = self.log.read()
         files = self.datamanager.train_dataset.image_filenames
         for step, views, what in wrong[:_NAMED_STEPS]:
-            names = escape(" and ".join(files[view].name for view in views))
-            CONSOLE.print(
-                f"[yellow]Iteration {step + 1}, {names}: {what}; such gradients counted as 0, training goes on.[/]"
-            )
+            names = " and ".join(files[view].name for view in views)
+            warn(f"Iteration {step + 1}, {names}: {what}; such gradients counted as 0, training goes on.")
         if len(wrong) > _NAMED_STEPS:
-            CONSOLE.print(f"[yellow]The same in {len(wrong) - _NAMED_STEPS} more of the last iterations.[/]")
+            warn(f"The same in {len(wrong) - _NAMED_STEPS} more of the last iterations.")
         enough = nonfinite.DIVERGED_STEPS if not last else min(nonfinite.DIVERGED_STEPS, self.log.steps)
         lasts, gradient = bool(wrong) and self.log.streak >= enough, self._means_gradient
         if self.world.all(lasts and gradient is not None and nonfinite.has_no_update(gradient)):
@@ -192,11 +189,9 @@ class SadgsPipeline(VanillaPipeline):
         self._repeat_overflowed(wait=True)
         forecast = self.model.tile_forecast
         if forecast is not None and (times := forecast.times_overflowed) > 0:
-            CONSOLE.print(
+            note(
                 f"In {times:,} iteration{'s' * (times > 1)} nothing was drawn, since the Gaussians reached more tiles "
-                "than foreseen; these views were drawn again later.",
-                highlight=False,
-                soft_wrap=True,
+                "than foreseen; these views were drawn again later."
             )
 
     def next_views(self, step: int) -> list[ViewGroup]:

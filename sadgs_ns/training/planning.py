@@ -7,14 +7,12 @@ from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.utils.rich_utils import CONSOLE
-from rich.markup import escape
 
 from sadgs_ns.method.schedule import Schedule, growth_threshold, schedule
 from sadgs_ns.training.config import SadgsPipelineConfig, SadgsTrainerConfig
 from sadgs_ns.training.memory_plan import fit_to_memory, training_size
 from sadgs_ns.training.pipeline import SadgsPipeline
-from sadgs_ns.training.progress import cpu_notice
+from sadgs_ns.training.progress import cpu_notice, note, warn
 from sadgs_ns.training.run_plan import RunPlan, plan_rates
 
 DENSE_THRESHOLDS = 1.25
@@ -43,12 +41,10 @@ def one_device_is_quicker(cameras: Cameras, views: int, devices: int) -> bool:
     pixels = views * _pixels(cameras)
     if pixels >= LEAST_PIXELS * devices:
         return False
-    CONSOLE.print(
+    note(
         f"Training on one device: a step draws {pixels / 1e6:.2f} megapixels, and {devices} devices are expected to be "
         f"quicker from {LEAST_PIXELS * devices / 1e6:.1f} on (docs/results.md). If one device does not hold the "
-        "Gaussians, set --share-always True.",
-        highlight=False,
-        soft_wrap=True,
+        "Gaussians, set --share-always True."
     )
     return True
 
@@ -94,10 +90,10 @@ def plan_run(
     planned = planned.for_run(length.iterations)
     windows = planned.windows
     if windows.refine_stop_iter < windows.structure_every and strategy.refine_stop_iter != 0:
-        CONSOLE.print(
-            f"[yellow]{length.iterations} iterations are too few for a structure-aware split: densification ends at "
+        warn(
+            f"{length.iterations} iterations are too few for a structure-aware split: densification ends at "
             f"{windows.refine_stop_iter}, the first split would come at {windows.structure_every}. "
-            "Train longer or lower pipeline.model.strategy.structure-every.[/]"
+            "Train longer or lower pipeline.model.strategy.structure-every."
         )
     _print_length(config, pipeline, length, done)
     extent, groups = float(model.strategy_state["scene_scale"]), pipeline.get_param_groups()
@@ -125,10 +121,7 @@ def _warn_of_changes(now: dict[str, Any], before: dict[str, Any]) -> None:
     changed = [name for name in before if name in now and now[name] != before[name]]
     if changed:
         listed = ", ".join(f"pipeline.{name} was {before[name]} and is {now[name]}" for name in changed)
-        CONSOLE.print(
-            f"[yellow]The checkpoint's run had other settings; this one goes on with its own: {escape(listed)}.[/]",
-            soft_wrap=True,
-        )
+        warn(f"The checkpoint's run had other settings; this one goes on with its own: {listed}.")
 
 
 def _print_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: Schedule, done: int) -> None:
@@ -136,24 +129,20 @@ def _print_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: S
     cameras, options, taken = pipeline.datamanager.train_dataset.cameras, config.pipeline, length.views_per_iteration
     views, asked, iterations = len(cameras), options.views_per_iteration, length.iterations
     times = round(iterations * taken / views)
-    lines = [
+    note(
         f"{config.method_name} on {views:,} training views of {_pixels(cameras) / 1e6:.2g} megapixels: "
         f"{iterations:,} iterations of {taken} view{'s' * (taken > 1)}{f', of which {done:,} are done' if done else ''}"
         f", so that each view is rendered about {times:,} time{'s' * (times != 1)}."
-    ]
+    )
     if config.max_num_iterations is None:
-        lines.append(
+        note(
             f"The number of views and --pipeline.effort {options.effort:g} decide this: 0.5 is a draft of half as many "
             "renderings, 2 resolves more, with more Gaussians and, where views are many, renderings."
         )
     if asked is not None and asked > taken:
-        lines.append(
-            f"[yellow]pipeline.views_per_iteration is {asked}, but there are {views} training views: all are taken "
-            "each time.[/]"
-        )
+        warn(f"pipeline.views_per_iteration is {asked}, but there are {views} training views: all are taken each time.")
     if pipeline.device.type == "cpu":
-        lines.append(f"[yellow]{cpu_notice(torch.get_num_threads())}[/]")
-    CONSOLE.print("\n".join(lines), highlight=False, soft_wrap=True)
+        warn(cpu_notice(torch.get_num_threads()))
 
 
 def _cap_in_memory(options: SadgsPipelineConfig, pipeline: SadgsPipeline, views: int) -> int:
@@ -162,21 +151,19 @@ def _cap_in_memory(options: SadgsPipelineConfig, pipeline: SadgsPipeline, views:
     gaussians: Any = model.gauss_params
     size = training_size(pipeline.datamanager, gaussians, views, processes, model.near_plane)
     cap, line, warning = fit_to_memory(cap, gaussians, size, options.memory_budget_gb, processes)
-    CONSOLE.print(line, highlight=False, soft_wrap=True)
+    note(line)
     if warning is not None:
-        CONSOLE.print(f"[yellow]{escape(warning)}[/]", soft_wrap=True)
+        warn(warning)
     return int(pipeline.world.least(cap))
 
 
 def _kept_cap(now: int, before: int) -> int:
     """Return the cap of a resumed run, and print a line if memory now allows more, or less."""
-    text = f"At most {before:,} Gaussians, as in the checkpoint's run."
     if now < before:
-        text = (
-            f"[yellow]The checkpoint's run had room for {before:,} Gaussians, the GPU's free memory now has for "
-            f"{now:,}, which is the cap from here on: stop this run and end other programs on the GPU to keep "
-            f"{before:,}.[/]"
+        warn(
+            f"The checkpoint's run had room for {before:,} Gaussians, the GPU's free memory now has for {now:,}, which "
+            f"is the cap from here on: stop this run and end other programs on the GPU to keep {before:,}."
         )
-    if now != before:
-        CONSOLE.print(text, highlight=False, soft_wrap=True)
+    elif now > before:
+        note(f"At most {before:,} Gaussians, as in the checkpoint's run.")
     return min(now, before)

@@ -25,6 +25,16 @@ MEASURED_STEPS, MEASURED_SECONDS = 3, 10.0
 iteration, which also loads images, does not count."""
 
 
+def note(text: str) -> None:
+    """Print a line for the user, as long as it is."""
+    CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def warn(text: str) -> None:
+    """Print a line in yellow."""
+    CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True, style="yellow")
+
+
 def duration(seconds: float) -> str:
     """Return a time as "40 s", "12 min" or "3 h 5 min"."""
     if seconds < 99.5:

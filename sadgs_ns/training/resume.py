@@ -10,8 +10,6 @@ from typing import Any
 
 import torch
 from nerfstudio.engine.optimizers import Optimizers
-from nerfstudio.utils.rich_utils import CONSOLE
-from rich.markup import escape
 from scipy.spatial import KDTree
 from torch import Tensor
 from torch.cuda.amp.grad_scaler import GradScaler
@@ -21,6 +19,7 @@ from sadgs_ns.errors import InputError, reason
 from sadgs_ns.method.initialization import camera_extent
 from sadgs_ns.training import checkpoints
 from sadgs_ns.training.pipeline import SadgsPipeline, camera_positions
+from sadgs_ns.training.progress import note, warn
 from sadgs_ns.training.run_plan import RunPlan
 
 _SAME_PLACE = 1e-3
@@ -83,7 +82,7 @@ class Resumption:
             if "schedulers" in self.state and schedulers:
                 optimizers.load_schedulers(self.state["schedulers"])
             scaler.load_state_dict(self.state["scalers"])
-        CONSOLE.print(f"Resuming after step {self.state['step']} of {self.path}", markup=False, soft_wrap=True)
+        note(f"Resuming after step {self.state['step']} of {self.path}")
 
 
 def check_same_capture(pipeline: SadgsPipeline, before: Sequence[str], positions_before: Tensor) -> None:
@@ -108,9 +107,8 @@ def check_same_capture(pipeline: SadgsPipeline, before: Sequence[str], positions
             f"({now[0]}, …) does."
         )
     if not {Path(name).stem for name in before} & {Path(name).stem for name in now}:
-        CONSOLE.print(
-            "[yellow]The checkpoint's run had the same cameras, but none of its images had the name of one of "
-            f"these ({escape(before[0])} and {escape(now[0])} are the first): the Gaussians fit only if the images "
-            "were renamed.[/]",
-            soft_wrap=True,
+        warn(
+            "The checkpoint's run had the same cameras, but none of its images had the name of one of "
+            f"these ({before[0]} and {now[0]} are the first): the Gaussians fit only if the images "
+            "were renamed."
         )

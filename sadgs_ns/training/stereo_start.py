@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from sadgs_ns.method.dense_start import NUMBER, dense_points
@@ -15,6 +14,7 @@ from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.method.stereo import depth_maps
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training.pipeline import SadgsPipeline
+from sadgs_ns.training.progress import note
 
 FEWEST_VIEWS, MOST_VIEWS = 3, 60
 """Range of training views with which a run starts from stereo depth by default. With more views, it would end with more
@@ -32,7 +32,7 @@ def number_of_points(pipeline: SadgsPipeline) -> int:
     if not FEWEST_VIEWS <= views <= MOST_VIEWS:
         return 0
     if pipeline.device.type != "cuda":
-        CONSOLE.print("The start has no points of stereo depth, which takes minutes on the CPU.", highlight=False)
+        note("The start has no points of stereo depth, which takes minutes on the CPU.")
         return 0
     return NUMBER
 
@@ -70,10 +70,8 @@ def start_from_stereo(pipeline: SadgsPipeline, resumed: bool) -> bool:
     if model.device.type == "cuda":
         torch.cuda.synchronize()
     known = sum(float((d.confidence > 0).float().mean()) for d in depths) / len(depths)
-    CONSOLE.print(
+    note(
         f"The start has {added:,} points of stereo depth, known in {known:.0%} of the pixels, beside the SfM points "
-        f"({time.perf_counter() - started:.1f} s).",
-        highlight=False,
-        soft_wrap=True,
+        f"({time.perf_counter() - started:.1f} s)."
     )
     return True

@@ -38,7 +38,7 @@ from sadgs_ns.training.interrupts import (
 from sadgs_ns.training.optimizers import SadgsOptimizers
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.planning import one_device_is_quicker, plan_length, plan_run
-from sadgs_ns.training.progress import next_commands, remove_tables
+from sadgs_ns.training.progress import next_commands, note, remove_tables
 from sadgs_ns.training.resume import Resumption
 from sadgs_ns.training.run_folder import write_config
 from sadgs_ns.training.stereo_start import start_from_stereo
@@ -119,7 +119,7 @@ class SadgsTrainer(Trainer):
                 raise
             raise RunError(f"{ended}: {_NOTHING_DONE}") from error
         except KeyboardInterrupt:
-            CONSOLE.print(f"SIGINT: {_NOTHING_DONE}", soft_wrap=True)
+            note(f"SIGINT: {_NOTHING_DONE}")
             raise SystemExit(128 + signal.SIGINT) from None
 
     def _may_graph_steps(self) -> bool:
@@ -136,7 +136,7 @@ class SadgsTrainer(Trainer):
         """Print the commands for a finished run below nerfstudio's box, unless the run diverged."""
         if not self.pipeline.diverged:
             text = next_commands(self.base_dir / "config.yml", self.pipeline.model.num_gaussians)
-            CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
+            note(text)
             events.report("training ends", gaussians=self.pipeline.model.num_gaussians)
 
     def _load_checkpoint(self) -> None:
@@ -149,7 +149,7 @@ class SadgsTrainer(Trainer):
     def _turn_viewer_off(self) -> None:
         """Keep nerfstudio from starting a viewer, and say so if one was asked for."""
         if self.config.is_viewer_enabled() or self.config.is_viewer_legacy_enabled():
-            CONSOLE.print("The viewer is off, since no device holds all Gaussians; `ns-viewer` shows the finished run.")
+            note("The viewer is off, since no device holds all Gaussians; `ns-viewer` shows the finished run.")
             others = self._vis.removeprefix("viewer_legacy").removeprefix("viewer").removeprefix("+")
             self.config.vis = others or "none"  # type: ignore[assignment]
 
@@ -198,11 +198,9 @@ class SadgsTrainer(Trainer):
         self.config.max_num_iterations = max(total - self._start_step, 0)
         if self._start_step >= total:
             writer.GLOBAL_BUFFER["step"] = self.step  # Only an iteration would set it.
-            CONSOLE.print(
+            note(
                 f"This run is finished after {self._start_step} iterations: --max-num-iterations of more than "
-                f"{self._start_step} trains on.",
-                highlight=False,
-                soft_wrap=True,
+                f"{self._start_step} trains on."
             )
         out_of_memory = ""
         self._set_clock(0.0)
@@ -366,7 +364,7 @@ class SadgsTrainer(Trainer):
             text = f"{interrupted}: stopped and saved after {done} of {total} iterations; resume with: {command}"
         if interrupted.number == HANG_UP:  # Some systems take the terminal away later.
             discard_broken_output()
-        CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
+        note(text)
         self.world.all(True)  # As soon as one process has ended, the others are ended.
         raise SystemExit(128 + interrupted.number)
 

@@ -10,14 +10,13 @@ from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerDropdown, ViewerSlider, ViewerVec3
-from rich.markup import escape
 from torch import Tensor
 
 from sadgs_ns.errors import reason
 from sadgs_ns.method.cleaning import Cleaning, Seen, find, see
 from sadgs_ns.training.model import SadgsModel
+from sadgs_ns.training.progress import warn
 from sadgs_ns.training.views import TrainingViews
 from sadgs_ns.viewer.elements import ViewerMarkdown, in_viewer, show_output
 
@@ -79,7 +78,7 @@ class CleaningPanel(torch.nn.Module):
             self.refresh()
         except (RuntimeError, ValueError) as error:  # Memory is full, the box is reversed, or photos went away.
             self._say(f"The picture stays as it was: {reason(error)}.")
-            CONSOLE.print(f"[yellow]{escape(self._text)}[/]")
+            warn(self._text)
             return
         show_output(self.viewer, "rgb" if self._shown == OFF else OUTPUT)
 

@@ -9,10 +9,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
-from rich.markup import escape
 from torch import Tensor
+
+from sadgs_ns.training.progress import warn
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -81,4 +81,4 @@ def in_viewer() -> bool:
 @lru_cache(maxsize=8)
 def warn_once(text: str) -> None:
     """Print a warning, unless it was printed before."""
-    CONSOLE.print(f"[yellow]{escape(text)}[/]")
+    warn(text)

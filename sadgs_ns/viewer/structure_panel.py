@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer_elements import (
     ViewerButton,
     ViewerControl,
@@ -24,7 +23,6 @@ from nerfstudio.viewer.viewer_elements import (
     ViewerParameter,
     ViewerSlider,
 )
-from rich.markup import escape
 from torch import Tensor
 
 from sadgs_ns.errors import reason
@@ -32,6 +30,7 @@ from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training.model import SadgsModel
+from sadgs_ns.training.progress import warn
 from sadgs_ns.training.run_plan import RunPlan
 from sadgs_ns.training.structure_cache import StructureCache, observe_training_views
 from sadgs_ns.viewer import color_scales, gaussian_maps, texture
@@ -153,7 +152,7 @@ class StructurePanel(torch.nn.Module):
             if element.value != getattr(plan.strategy, name):
                 self._model.follow(changed(plan, name, element.value))
         except ValueError as error:
-            CONSOLE.print(f"[yellow]{error}[/]")
+            warn(str(error))
             element.value = getattr(plan.strategy, name)
         self.table.refresh()
 
@@ -164,7 +163,7 @@ class StructurePanel(torch.nn.Module):
             act()
         except (RuntimeError, ValueError) as error:  # Memory is full, or data went away.
             text = f"The viewer's panel stays as it was: {reason(error)}"
-            CONSOLE.print(f"[yellow]{escape(text)}[/]")
+            warn(text)
             self._say(text)
 
     def refresh(self) -> None:
