@@ -101,10 +101,7 @@ def _checkpoints_in(load_dir: Path) -> dict[int, Path]:
 
 
 def map_rows(state: dict[str, Any], change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
-    """Return a checkpoint in which `change` was called on all tensors [N, …] of Gaussians; the rest is not copied.
-
-    These are the parameters, Adam's moments, the statistics and the mean of the parameters, always in the same order.
-    """
+    """Return a checkpoint whose tensors [N, …] of Gaussians went, in a fixed order, through `change`."""
     pipeline, optimizers = dict(state["pipeline"]), dict(state["optimizers"])
     names = sorted(name for name in pipeline if ".gauss_params." in name)
     for name in names:

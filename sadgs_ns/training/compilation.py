@@ -171,12 +171,7 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
     """Launch the kernels of training once, on a few Gaussians and in threads, so that their compilations overlap.
 
     Triton keeps kernels on the disk, so only a machine's first run takes seconds here. The run's state, random numbers
-    included, does not change. If kernels fail, a sentence names them and the reason, and the run goes on: it may never
-    need them.
-
-    Args:
-        pipeline: A pipeline whose model and data are set up.
-        optimizers: The run's optimizers, by the names of their parameters.
+    included, does not change. If kernels fail, a warning names them, and the run goes on: it may never need them.
     """
     device = pipeline.device
     if not use_triton(device):

@@ -71,13 +71,8 @@ class CudaGraphs:
     def capture(self, function: Callable[[], Any]) -> Graph:
         """Capture what a function launches, without running it; its results keep their addresses.
 
-        torch's context manager would wait for the device, and free its unused memory, at each capture.
-
-        Args:
-            function: It may launch only kernels that were launched before: none may be compiled or loaded meanwhile.
-
-        Raises:
-            Exception: As `function`, or RuntimeError if it did something that cannot be captured.
+        The function may launch only kernels that were launched before, since none may be compiled or loaded meanwhile.
+        Raises as the function, or RuntimeError. torch's context manager would wait for the device at each capture.
         """
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.stream(self._stream):

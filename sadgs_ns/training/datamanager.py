@@ -76,10 +76,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         return super().create_eval_dataset()
 
     def _load_images(self, split: Literal["train", "eval"], cache_images_device: str) -> Any:
-        """Load and undistort the images of a split as nerfstudio does, or make `LazyImages` if they stay compressed.
-
-        Loaded, they are as in `LazyImages`, on the training device or in the host's memory, pinned with CUDA.
-        """
+        """Load the images of a split on the device or on the host, or return `LazyImages` if they stay compressed."""
         device, dataset = torch.device(self.device), self.train_dataset if split == "train" else self.eval_dataset
         on_demand = cache_images_device == "compressed"
         # Each of several processes would keep all files, while the system's cache of files keeps them once.

@@ -113,10 +113,7 @@ class LazyImages(Sequence[dict[str, Any]]):
 
 
 def _undistort_cameras(cameras: Cameras) -> list[_Undistort | None]:
-    """Give C cameras the intrinsics and sizes of their undistorted images, computing equal cameras once.
-
-    Returns a function for each camera that undistorts its image; None if there is no distortion.
-    """
+    """Give cameras their undistorted images' intrinsics and sizes; return what undistorts each image, or None."""
     undistorts: list[_Undistort | None] = [None] * len(cameras)
     distortion = cameras.distortion_params  # [C, D]
     if distortion is None or not distortion.any():

@@ -80,10 +80,7 @@ def spheres(
 
 
 def outside_cameras(params: Mapping[str, Tensor], positions: Tensor) -> Tensor:
-    """Tell which Gaussians contain none of the cameras' centres [C, 3]; the others could only become haze. bool [N]
-
-    If each of them contains a camera, all are True.
-    """
+    """Tell which Gaussians contain no camera's centre [C, 3], or all True if each contains one. bool [N]"""
     radii = CAMERA_CLEARANCE * params["scales"].detach().exp().amax(dim=1)  # [N]
     keep = clear_of_cameras(params["means"].detach(), radii, positions)  # [N]
     return keep if bool(keep.any()) else torch.ones_like(keep)

@@ -72,10 +72,7 @@ class Interrupts:
             raise Interrupted(self.received)
 
     def cause_of(self, error: OSError) -> Interrupted | None:
-        """Return the interruption that made a write fail, or None if the error has another cause.
-
-        The kernel takes a terminal away before it sends SIGHUP, so a write in between fails.
-        """
+        """Return the hang-up that made a write fail, if it did; the signal may come after the terminal is gone."""
         if error.errno == errno.EIO and HANG_UP in self._previous:
             end = time.monotonic() + _HANG_UP_SECONDS
             while self.received is None and time.monotonic() < end:

@@ -57,10 +57,7 @@ class SadgsModel(MeasuredModel):
     plan: RunPlan
 
     def populate_modules(self) -> None:
-        """Make parameters, metrics and the strategy, or raise InputError as `SadgsModelConfig.check`.
-
-        splatfacto's own method needs CUDA, and LPIPS's weights, which are here loaded when they are first used.
-        """
+        """Make parameters, metrics and the strategy; splatfacto's way needs CUDA, and LPIPS's weights at once."""
         config = self.config
         config.check()
         self.strategy = config.strategy
@@ -84,10 +81,7 @@ class SadgsModel(MeasuredModel):
             self.learn_color_matrices()
 
     def set_cameras(self, positions: Tensor) -> None:
-        """Set the scene's extent, and drop initial Gaussians that contain a camera; call before optimizers are made.
-
-        `positions` are the training cameras' centres in world units. [C, 3]
-        """
+        """Set the extent of the cameras' centres [C, 3], and drop initial Gaussians that contain one."""
         self.strategy_state["scene_scale"] = camera_extent(positions)
         self.camera_positions = positions.to(self.means)
         keep = outside_cameras(dict(self.gauss_params.items()), self.camera_positions)  # [N]
@@ -96,12 +90,7 @@ class SadgsModel(MeasuredModel):
         self.synthetic = self.synthetic[keep.cpu()]
 
     def set_near_plane(self, viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> None:
-        """Derive the near plane from the SfM points before the training cameras; call `set_cameras` before.
-
-        Args:
-            viewmats, Ks: As `render.types.Cameras` has them, of C views.
-            sizes: Width and height in px. [C, 2]
-        """
+        """Derive the near plane from the SfM points in the training cameras of these sizes in px [C, 2]."""
         points = self.means.new_zeros((0, 3)) if self.seed_points is None else self.seed_points[0].to(self.means)
         depths = nearest_depths(points, viewmats, Ks, sizes)
         if self.config.near_plane is None:
@@ -127,10 +116,7 @@ class SadgsModel(MeasuredModel):
         return room
 
     def clear_paths(self, viewmats: Tensor) -> None:
-        """Let densification prune haze near the training cameras [C, 4, 4], unless the options forbid it.
-
-        Call it once all initial Gaussians exist.
-        """
+        """Let densification prune haze near the training cameras [C, 4, 4], unless the options forbid it."""
         asked = self.config.clear_paths
         if len(viewmats) <= MOST_VIEWS if asked is None else asked:
             surfaces = self.means.detach()[~self.synthetic.to(self.device)]
@@ -145,10 +131,7 @@ class SadgsModel(MeasuredModel):
         self.register_buffer("every_view_id", ids, persistent=False)
 
     def shard(self, world: World) -> None:
-        """Keep this process's part of the Gaussians only; call before optimizers are made.
-
-        Raises InputError if the backend works in one process only.
-        """
+        """Keep this process's part of the Gaussians only, or raise InputError if the backend needs all."""
         choose_backend(self.config.backend, world.device, world.alone)
         part = world.take_even_part(self.num_points)
         for parameter in self.gauss_params.values():
@@ -363,15 +346,10 @@ class SadgsModel(MeasuredModel):
         return {"main_loss": photometric_loss(views[0], views[1], ssim_lambda=self.config.ssim_lambda)[0]}
 
     def masked_pair(self, rgb: Tensor, batch: Mapping[str, Any], background: Tensor) -> tuple[Tensor, Tensor]:
-        """Return a rendering and its photo as the loss compares them: within the mask, before the same background.
+        """Return a rendering and its photo […, H, W, 3] within the mask, before the same background, for the loss.
 
-        Args:
-            rgb: Not clamped. […, H, W, 3]
-            batch: `image`, uint8 or floats in [0, 1] […, H, W, 3 or 4], and perhaps a boolean `mask` […, H, W, 1].
-            background: [3] or [H, W, 3]
-
-        Returns:
-            Both on the model's device, the photo as floats in [0, 1] or as bytes. […, H, W, 3]
+        `rgb` is not clamped, and `batch` holds `image`, uint8 or floats in [0, 1] […, H, W, 3 or 4], and perhaps a
+        boolean `mask` […, H, W, 1]. The photo stays in bytes if nothing changes it.
         """
         target = batch["image"].to(self.device)
         if "mask" in batch or target.shape[-1] == 4:  # Otherwise the loss reads bytes as they are.
@@ -405,10 +383,7 @@ class SadgsModel(MeasuredModel):
         self.average.load_state_dict(state["average"], self.device)
 
     def load_state_dict(self, dict: dict[str, Any], **kwargs: Any) -> Any:  # type: ignore[override]
-        """Load a checkpoint of any number of Gaussians.
-
-        Parameters are resized in place, because optimizers may hold them. Colour matrices are ignored if unused.
-        """
+        """Load a checkpoint of any number of Gaussians, into the parameters that optimizers may hold."""
         if self.color_matrices is None:
             dict = {name: value for name, value in dict.items() if name != "color_matrices"}
         for name, parameter in self.gauss_params.items():

@@ -44,10 +44,7 @@ class NonFiniteLog:
         self._steps.append((step, views))
 
     def read(self) -> list[tuple[int, list[int], str]]:
-        """Return number, views and problem of each step that was not finite, and empty the log; waits for the device.
-
-        The problem is "the loss was nan" (or inf) or "gradients were not finite".
-        """
+        """Return number, views and problem of each step that was not finite, and empty the log; this waits."""
         if not self._steps:
             return []
         wrong = []

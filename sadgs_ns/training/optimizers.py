@@ -32,15 +32,10 @@ class FusedAdam(Adam):
 
 
 class AdamUpdate:
-    """An update of parameters by our kernel, or else by torch's fused Adam, all on one device.
+    """An update of parameters, given by name, by our kernel, or else by torch's fused Adam, all on one device.
 
     One launch updates all parameters of one length with equal betas and eps: six optimizers took the host a quarter of
     a step of 300k Gaussians. Gradients of at least `nonfinite.MAX_GRADIENT`, or NaN, count as 0.
-
-    Attributes:
-        parameters: The present parameters, by name.
-        exp_avgs: Their first moments.
-        exp_avg_sqs: Their second moments.
     """
 
     def __init__(self, optimizers: Mapping[str, Adam]) -> None:
@@ -69,10 +64,7 @@ class AdamUpdate:
         )
 
     def factors(self) -> Tensor:
-        """Count an update of each parameter, and return the kernel's factors, on the host. float32 [2, P]
-
-        With CUDA they are pinned. torch's Adam counts by itself, and has none.
-        """
+        """Count an update of each parameter, and return our kernel's factors, on the (pinned) host. float32 [2, P]"""
         if not self._triton:
             return torch.empty((2, 0))
         from sadgs_ns.kernels.adam import rate_and_scale

@@ -26,10 +26,7 @@ def hide(*names: str) -> Callable[[_Class], _Class]:
 def check_ranges(prefix: str, options: object, ranges: Iterable[tuple[str, bool, str]]) -> None:
     """Raise InputError for the first option that is out of its range.
 
-    Args:
-        prefix: What stands before the options' names on the command line.
-        options: The options, as attributes.
-        ranges: Name of each, whether it is in its range, and the range as the end of "must be …".
+    `ranges` have an option's name, whether it is in its range, and the range as the end of "must be …".
     """
     for name, fits, allowed in ranges:
         if not fits:

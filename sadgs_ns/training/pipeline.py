@@ -89,10 +89,7 @@ class SadgsPipeline(VanillaPipeline):
         self.model.viewer_outputs = self._viewer_outputs
 
     def _viewer_outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return what the viewer may show besides the model's own outputs; outputs not shown are `rgb`.
-
-        Normals cannot be lazy here: the viewer reads outputs while training goes on.
-        """
+        """Return the panels' pictures and normals, which cannot be lazy while training changes the Gaussians."""
         if not in_viewer():
             return {}
         shown = shows_output(self.structure.viewer, NORMALS)

@@ -14,12 +14,7 @@ class ImagePrefetcher:
     """Copies images from the host to the device ahead of the step that needs them, on its own stream.
 
     Threads decode images, and copy them to pinned memory, which torch reuses for later images. Without CUDA only
-    decoding runs ahead. `decoded` tells whether all images can be copied without a thread.
-
-    Args:
-        images: All images, on the host: a list of decoded ones, or `LazyImages`.
-        device: Device of training.
-        threads: Number of threads that decode.
+    decoding runs ahead. `images` are decoded ones or `LazyImages`; if they are `decoded`, no thread is needed.
     """
 
     def __init__(self, images: Sequence[Mapping[str, Any]], device: torch.device, threads: int) -> None:
@@ -51,12 +46,7 @@ class ImagePrefetcher:
         return taken
 
     def prefetch(self, upcoming: Sequence[int], following: Sequence[int]) -> None:
-        """Load the images of the next steps, and start copies of loaded ones of the next step, without waiting.
-
-        Args:
-            upcoming: Views of the next steps, in their order. Other images that are under way are dropped.
-            following: Views of the next step.
-        """
+        """Load the images of upcoming views, drop all others, and start copies of loaded ones of the following step."""
         for index in self._loading.keys() - set(upcoming):
             self._loading.pop(index).cancel()
         for index in self._sent.keys() - set(upcoming):

@@ -48,8 +48,7 @@ def optimizers(**rates: tuple[float, float, float]) -> dict[str, dict[str, Any]]
         groups[name] = {"optimizer": adam(lr=lr)}
         if (initial_factor, final_factor) != (1.0, 1.0):
             hold = DENSIFICATION_SHARE if name in HELD else 0.0
-            factors = {"initial_factor": initial_factor, "final_factor": final_factor}
-            groups[name]["scheduler"] = decay(**factors, hold_share=hold)
+            groups[name]["scheduler"] = decay(initial_factor=initial_factor, final_factor=final_factor, hold_share=hold)
     return groups
 
 

@@ -50,10 +50,7 @@ def least(number: float, device: torch.device) -> float:
 
 
 def check_devices(machine: MachineConfig) -> bool:
-    """Return whether a run takes several devices.
-
-    Raises InputError if a device is missing, or if the processes cannot be started with these options.
-    """
+    """Return whether a run takes several devices; raise InputError if they are missing or cannot be started."""
     if machine.num_machines != 1:
         raise InputError(
             f"machine.num_machines is {machine.num_machines}, and sadgs trains on several machines with torchrun: "
@@ -101,10 +98,7 @@ class Peers:
         return len({host for host, _, _ in self._places}) == 1
 
     def exit_after_rank_zero(self) -> NoReturn:
-        """Wait until rank 0, which runs on this machine, has ended; then exit with code 0.
-
-        Whoever started the processes takes the end of one for the end of all.
-        """
+        """Wait for the end of rank 0, because the end of one process would end all; then exit with code 0."""
         for number in (signal.SIGINT, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)  # The first process saves, and ends.
         signal.signal(signal.SIGTERM, signal.SIG_DFL)

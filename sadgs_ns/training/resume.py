@@ -86,15 +86,10 @@ class Resumption:
 
 
 def check_same_capture(pipeline: SadgsPipeline, before: Sequence[str], positions_before: Tensor) -> None:
-    """Check that a checkpoint is of the pipeline's data.
+    """Check that a checkpoint, with its images' names and cameras' centres [C, 3], is of the pipeline's data.
 
     Images may have been added or removed if the others' poses stayed. Raises InputError if less than half of the
     cameras of the smaller capture are in the other; warns if the cameras are the same, and no image has its old name.
-
-    Args:
-        pipeline: The pipeline, with the data.
-        before: Names of the images that the checkpoint's run was trained on.
-        positions_before: Centres of their cameras in world units. [C, 3]
     """
     dataset = pipeline.datamanager.train_dataset
     now, positions = [path.name for path in dataset.image_filenames], camera_positions(dataset.cameras)

@@ -20,10 +20,7 @@ from sadgs_ns.training import checkpoints, processes
 
 
 def begin(config: TrainerConfig) -> None:
-    """Check checkpoint, folder, viewer and data, and write `config.yml`, the first file of a run.
-
-    Raises InputError, before anything is written, or WriteError.
-    """
+    """Check checkpoint, folder, viewer and data, or raise InputError; then write `config.yml`."""
     checkpoints.check_chosen(config.load_dir, config.load_step, config.load_checkpoint)
     _check_folder(config)
     if not processes.is_rank_zero():

@@ -27,15 +27,7 @@ class StructureCache:
 
     If decoded images are kept on the device, so is their S̄, all computed at once. If they are on the host, S̄ of a view
     is computed when a step first needs it, and kept there. If they stay compressed, S̄ is not kept: it would be larger.
-
-    Args:
-        views: The training views, and the model that decides how transparent images look.
-        frequency_constant: c of ω_l = c / σ_l in 1/px.
-        options: Other arguments of `multiscale_structure_tensor`.
-
-    Attributes:
-        of_images: `multiscale_structure_tensor` with these arguments.
-        filled: Whether `fill` has been called.
+    `of_images` is `multiscale_structure_tensor` with the run's constant c in 1/px and its other `options`.
     """
 
     def __init__(self, views: TrainingViews, frequency_constant: float, **options: float | None) -> None:
@@ -66,12 +58,9 @@ class StructureCache:
         return next(self.quantized([self.views.datamanager.cached_train[index]]))
 
     def get(self, views: Sequence[tuple[int, Mapping[str, Any]]]) -> list[Tensor]:
-        """Quantized S̄ of a step's views, on the device. uint8 [H, W, 3] each
+        """Quantized S̄ of a step's views of one size, as drawn, on the device. uint8 [H, W, 3] each
 
-        The process that composites a view's first rows computes S̄ for all.
-
-        Args:
-            views: Index and data of each, as drawn; all have one size. All processes pass the same views.
+        All processes pass the same views; the one that composites a view's first rows computes its S̄.
         """
         self.fill()
         world, data, (height, width) = self.views.world, dict(views), self.views.sizes[views[0][0]]
@@ -90,10 +79,7 @@ class StructureCache:
 
     @cached_property
     def _room(self) -> list[Tensor]:
-        """Memory of the host for S̄ of all images, uint8 [H, W, 3] each, if decoded images are there, too.
-
-        It is allocated at once, because the host waits for the device when it pins new memory.
-        """
+        """Host memory for S̄ of decoded images, uint8 [H, W, 3] each; pinning it later would wait for the device."""
         prefetcher = self.views.prefetcher
         if prefetcher is None or not prefetcher.decoded:
             return []

@@ -94,10 +94,8 @@ class SadgsTrainer(Trainer):
     def setup(self, *args: Any, **kwargs: Any) -> None:
         """Load data, model and checkpoint, and compile kernels.
 
-        Raises:
-            InputError: If data, options or checkpoint cannot be used.
-            RunError: If they do not fit the GPU's memory, or another process ended.
-            SystemExit: If SIGINT came; nerfstudio would print a traceback.
+        Raises InputError if they cannot be used, RunError if memory is full or another process ended, and SystemExit
+        after SIGINT.
         """
         try:
             super().setup(*args, **kwargs)
@@ -123,11 +121,7 @@ class SadgsTrainer(Trainer):
             raise SystemExit(128 + signal.SIGINT) from None
 
     def _may_graph_steps(self) -> bool:
-        """Tell whether steps of this run can be CUDA graphs.
-
-        The host may not wait in a graph, as it does for tile lists of an exact length and for the exchange of several
-        processes. A camera optimizer's work is not in the graphs.
-        """
+        """Tell whether steps can be CUDA graphs: the host must not wait in them, and cameras must not move."""
         model = self.pipeline.model
         known = model.backend == "triton" and model.tile_forecast is not None
         return self.config.cuda_graphs and self.world.alone and known and model.camera_optimizer.config.mode == "off"
@@ -154,10 +148,7 @@ class SadgsTrainer(Trainer):
             self.config.vis = others or "none"  # type: ignore[assignment]
 
     def setup_optimizers(self) -> SadgsOptimizers:
-        """Load the checkpoint's Gaussians, if there is one, plan the run, and build optimizers with the planned rates.
-
-        Raises InputError if checkpoint, data and options do not fit each other.
-        """
+        """Load the Gaussians of a checkpoint, if there is one, plan the run, and build its optimizers."""
         config, pipeline = self.config, self.pipeline
         chosen = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
         self._resumed = resumed = None if chosen is None else Resumption(*chosen)

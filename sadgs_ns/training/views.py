@@ -76,10 +76,7 @@ class ViewSampler:
 
 
 class TrainingViews:
-    """Draws training views, the same in all processes, and gives their images and cameras.
-
-    The datamanager holds images, cameras and the seed of the order; the model's camera optimizer corrects cameras.
-    """
+    """Draws training views, the same in all processes, and gives their images and corrected cameras."""
 
     def __init__(self, datamanager: FullImageDatamanager, model: SadgsModel) -> None:
         self.datamanager = datamanager
@@ -140,10 +137,9 @@ class TrainingViews:
 
     @cached_property
     def cameras(self) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
-        """World-to-camera matrices [4, 4] and intrinsics in px [3, 3] of all training views, as separate tensors.
+        """World-to-camera matrices [4, 4] and intrinsics in px [3, 3] of all training views, separate tensors made once.
 
-        They are made once: in a step, nerfstudio's cameras would make the host wait for the device. Raises InputError
-        if undistorting an image failed.
+        In a step, nerfstudio's cameras would make the host wait. Raises InputError if undistorting an image failed.
         """
         dataset = self.datamanager.train_dataset
         _ = self.datamanager.cached_train  # Undistorting the images has changed the intrinsics.

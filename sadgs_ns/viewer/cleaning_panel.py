@@ -108,10 +108,7 @@ class CleaningPanel(torch.nn.Module):
         self.text.refresh()
 
     def outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return `cleaned` [H, W, 3] in [0, 1] in the viewer, and nothing elsewhere.
-
-        It is `rgb` if densification has changed the Gaussians.
-        """
+        """Return `cleaned` [H, W, 3] in [0, 1] in the viewer; it is `rgb` once densification changed the Gaussians."""
         if not in_viewer():
             return {}
         model, stays = self._model, self._stays

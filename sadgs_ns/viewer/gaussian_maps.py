@@ -86,12 +86,9 @@ def random_colors(number: int, generator: torch.Generator) -> Tensor:
 
 
 def recolor(colors: Tensor, origins: Tensor, generator: torch.Generator) -> Tensor:
-    """Return colours after a densification step: children get new ones, other Gaussians keep theirs.
+    """Return colours [M, 3] after a densification step: children get new ones, other Gaussians keep theirs.
 
-    Args:
-        colors: Colours before the step, in [0, 1]. [N, 3]
-        origins: Index before the step of each Gaussian, or of its parent. int64 [M]
-        generator: A generator on the CPU.
+    `origins`, int64 [M], are the indices before the step of each Gaussian, or of its parent.
     """
     is_child = torch.bincount(origins, minlength=len(colors))[origins] > 1  # [M]
     return torch.where(is_child[:, None], random_colors(len(origins), generator).to(colors), colors[origins])

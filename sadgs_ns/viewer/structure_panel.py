@@ -174,10 +174,7 @@ class StructurePanel(torch.nn.Module):
             self.table.refresh()
 
     def statistics(self) -> dict[str, Tensor] | None:
-        """Return sums as in `empty_statistics`: the run's since its last structure step, or else `observe_now`'s.
-
-        None if neither is of the present Gaussians.
-        """
+        """Return the run's sums of η since the last structure step, or `observe_now`'s; None if there are none."""
         model = self._model
         live, n = model.strategy_state, model.num_points
         if "n_total" in live and len(live["n_total"]) == n and bool((live["n_total"] > 0).any()):
