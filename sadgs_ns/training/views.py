@@ -137,7 +137,7 @@ class TrainingViews:
 
     @cached_property
     def cameras(self) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
-        """World-to-camera matrices [4, 4] and intrinsics in px [3, 3] of all training views, separate tensors made once.
+        """World-to-camera matrices [4, 4] and intrinsics in px [3, 3] of all training views, made once.
 
         In a step, nerfstudio's cameras would make the host wait. Raises InputError if undistorting an image failed.
         """
