@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, MutableMapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from gsplat.strategy.ops import duplicate, split
 from torch import Tensor
 
-from sadgs_ns.method.ops import Params, opacities
+from sadgs_ns.method.ops import Optimizers, Params, State, opacities
 from sadgs_ns.method.schedule import Windows, due
 from sadgs_ns.method.split import children_per_axis, grid_split, num_children
 from sadgs_ns.method.statistics import consistent
@@ -99,16 +99,10 @@ def due_rule(iteration: int, windows: Windows) -> Rule | None:
 
 
 @torch.no_grad()
-def apply(
-    proposal: Proposal,
-    allowed: Tensor,
-    params: Params,
-    optimizers: MutableMapping[str, torch.optim.Optimizer],
-    state: MutableMapping[str, Any],
-) -> None:
+def apply(proposal: Proposal, allowed: Tensor, params: Params, optimizers: Optimizers, state: State) -> None:
     """Let the `allowed` Gaussians, bool [N], grow as proposed, in place.
 
-    What is new starts with empty rows of every tensor in the strategy's state.
+    New Gaussians start with empty rows of every tensor in `state`.
     """
     counts = torch.where(allowed[:, None], proposal.children, 1)
     if proposal.clone is not None and (num_clones := int((is_clone := allowed & proposal.clone).sum())) > 0:
@@ -132,7 +126,7 @@ def _split_at_random(params: Any, optimizers: Any, state: Any, counts: Tensor) -
     _forget_last(state, 2 * int(is_split.sum()))
 
 
-def _forget_last(state: MutableMapping[str, Any], num_children: int) -> None:
+def _forget_last(state: State, num_children: int) -> None:
     """Empty the rows of the newest Gaussians, which gsplat's operations append as copies of their parents' rows."""
     for value in state.values():
         if isinstance(value, Tensor):

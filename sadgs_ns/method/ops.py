@@ -12,6 +12,10 @@ from sadgs_ns.distributed.world import World
 
 Params = MutableMapping[str, torch.nn.Parameter] | torch.nn.ParameterDict
 """gsplat's parameters by name, each with leading dimension N."""
+Optimizers = Mapping[str, torch.optim.Optimizer]
+"""The optimizers of parameters by their names; a parameter that is not trained may have none."""
+State = MutableMapping[str, Any]
+"""The state of a strategy; its tensors have leading dimension N."""
 
 
 def opacities(params: Params) -> Tensor:
@@ -24,7 +28,7 @@ def update_param_with_optimizer(
     param_fn: Callable[[str, Tensor], torch.nn.Parameter],
     optimizer_fn: Callable[[str, Tensor], Tensor],
     params: Params,
-    optimizers: Mapping[str, torch.optim.Optimizer],
+    optimizers: Optimizers,
     names: Sequence[str] | None = None,
 ) -> None:
     """Replace parameters and their optimizers' moments, as gsplat's `duplicate` and `split` do.
@@ -35,7 +39,6 @@ def update_param_with_optimizer(
     Args:
         param_fn: Makes the new parameter from its name and the old one.
         optimizer_fn: Makes a new moment from its key and the old one; `step` stays.
-        optimizers: One per parameter; a parameter that is not trained may have none.
         names: The parameters to change; None changes all.
     """
     for name in list(params) if names is None else names:
@@ -49,9 +52,7 @@ def update_param_with_optimizer(
             optimizer.param_groups[0]["params"], optimizer.state[new] = [new], state
 
 
-def map_opacities(
-    function: Callable[[Tensor], Tensor], params: Params, optimizers: Mapping[str, torch.optim.Optimizer]
-) -> None:
+def map_opacities(function: Callable[[Tensor], Tensor], params: Params, optimizers: Optimizers) -> None:
     """Change the opacities (not their logits) and forget their optimizer moments, as gsplat's reset does."""
 
     def param_fn(name: str, p: Tensor) -> torch.nn.Parameter:
@@ -61,9 +62,7 @@ def map_opacities(
     update_param_with_optimizer(param_fn, lambda key, v: torch.zeros_like(v), params, optimizers, names=["opacities"])
 
 
-def even_out(
-    world: World, params: Params, optimizers: Mapping[str, torch.optim.Optimizer], state: MutableMapping[str, Any]
-) -> None:
+def even_out(world: World, params: Params, optimizers: Optimizers, state: State) -> None:
     """Count the Gaussians of all processes, and give each equally many where they differ by more than a tenth."""
     world.count(len(params["means"]))
     if not world.is_uneven():

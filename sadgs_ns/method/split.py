@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import MutableMapping
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 
-from sadgs_ns.method.ops import Params, update_param_with_optimizer
+from sadgs_ns.method.ops import Optimizers, Params, State, update_param_with_optimizer
 
 MAX_CHILDREN_PER_AXIS = 8
 """Bound on n_k, reached at η = 64 with the square root: no parent has more than 8³ = 512 children."""
@@ -59,13 +57,7 @@ def grid_offsets(counts: Tensor, dtype: torch.dtype = torch.float32) -> tuple[Te
 
 
 @torch.no_grad()
-def grid_split(
-    params: Params,
-    optimizers: MutableMapping[str, torch.optim.Optimizer],
-    state: MutableMapping[str, Any],
-    counts: Tensor,
-    child_scale: float = 1.0,
-) -> None:
+def grid_split(params: Params, optimizers: Optimizers, state: State, counts: Tensor, child_scale: float = 1.0) -> None:
     """Replace every Gaussian with more than one child by its grid of children, in place, as gsplat's `split` does.
 
     μ_child = μ + R (s ⊙ g) and s_child = s ⊘ n (paper, eq. 9); rotation, colour and opacity are copied. The order

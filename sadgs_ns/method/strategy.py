@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, MutableMapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, cast
 
@@ -16,12 +16,14 @@ from sadgs_ns.distributed.ranking import limit_growth
 from sadgs_ns.distributed.world import World
 from sadgs_ns.method.growth import RULES, Proposal, Propose, Rule, apply, due_rule, structure_aware
 from sadgs_ns.method.memory import StepSize, affordable_growth, free_bytes
-from sadgs_ns.method.ops import Params, even_out, map_opacities, opacities
+from sadgs_ns.method.ops import Optimizers, Params, State, even_out, map_opacities, opacities
 from sadgs_ns.method.schedule import Windows, due, next_due, windows
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients, keep_gradient
 from sadgs_ns.method.statistics import consistent, empty_statistics, observe
 
 Info = Mapping[str, Any]
+Infos = Info | Sequence[Info]
+"""The info of the views of a step, or a list of those of its views of each size."""
 _WINDOWS = tuple(field.name for field in fields(Windows))
 
 TAU_PRUNE = 0.8
@@ -141,16 +143,13 @@ class StructureAwareStrategy(Strategy):
         """State to pass to the other methods; its tensors are made at the first step.
 
         Each structure step appends its numbers of Gaussians to the list `structure_steps`. With a `CameraPaths` under
-        `camera_paths`, each densification step prunes the haze near these, until densification ends. Raises ValueError
-        as `check`.
-
-        Args:
-            scene_scale: Extent of the cameras in world units, as 3DGS defines it.
+        `camera_paths`, each densification step prunes the haze near these, until densification ends. `scene_scale` is
+        `initialization.camera_extent`. Raises ValueError as `check`.
         """
         self.check()
         return {"scene_scale": scene_scale}
 
-    def check_sanity(self, params: Params, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
+    def check_sanity(self, params: Params, optimizers: Optimizers) -> None:
         """Check as gsplat's strategies do, and raise ValueError if a parameter that the method needs is missing."""
         super().check_sanity(params, optimizers)  # type: ignore[arg-type]
         missing = {"means", "scales", "quats", "opacities"} - set(params)
@@ -161,7 +160,7 @@ class StructureAwareStrategy(Strategy):
         """Whether `step_pre_backward` will measure η at this step, and so needs structure tensors."""
         windows = self.windows
         periods = [rule.every(windows) for rule in RULES.values() if rule.reads == "statistics"]
-        # Beyond the last step that would read it nobody does.
+        # After the last step that reads it, nobody does.
         return step % windows.eta_every == 0 and (
             min(next_due(step + 1, every) for every in periods) <= windows.refine_stop_iter
         )
@@ -186,14 +185,7 @@ class StructureAwareStrategy(Strategy):
         read, reads = min(((next_due(first, r.every(windows)), r.reads) for r in readers), key=lambda reader: reader[0])
         return read <= windows.refine_stop_iter and reads == "gradients"
 
-    def step_pre_backward(
-        self,
-        params: Params,
-        optimizers: Mapping[str, torch.optim.Optimizer],
-        state: MutableMapping[str, Any],
-        step: int,
-        info: Info | Sequence[Info],
-    ) -> None:
+    def step_pre_backward(self, params: Params, optimizers: Optimizers, state: State, step: int, info: Infos) -> None:
         """Keep the screen gradients and observe η, before `loss.backward()`."""
         if step >= self.windows.refine_stop_iter:
             return
@@ -206,25 +198,18 @@ class StructureAwareStrategy(Strategy):
                 observe(state, params, view, jitter=self.world.rand(view["means2d"]))
 
     def step_post_backward(
-        self,
-        params: Params,
-        optimizers: MutableMapping[str, torch.optim.Optimizer],
-        state: MutableMapping[str, Any],
-        step: int,
-        info: Info | Sequence[Info],
-        packed: bool = False,
+        self, params: Params, optimizers: Optimizers, state: State, step: int, info: Infos, packed: bool = False
     ) -> None:
         """Accumulate the screen gradients and densify when the schedule says so, after `loss.backward()`.
 
-        Raises:
-            ValueError: If `packed`; η and AbsGS read the unpacked meta.
+        Raise ValueError if `packed`: η and AbsGS read the unpacked meta.
         """
         if packed:
             raise ValueError("StructureAwareStrategy reads gsplat's unpacked meta: call rasterization(packed=False)")
         self.accumulate(state, step, info)
         self.densify(params, optimizers, state, step, info)
 
-    def accumulate(self, state: MutableMapping[str, Any], step: int, info: Info | Sequence[Info]) -> None:
+    def accumulate(self, state: State, step: int, info: Infos) -> None:
         """Add the screen gradients of a backward pass, where an AbsGS step will read them."""
         if step >= self.windows.refine_stop_iter or not self.needs_absgrad(step):
             return
@@ -233,14 +218,7 @@ class StructureAwareStrategy(Strategy):
         for view in views:
             accumulate_gradients(state, view, num_views)
 
-    def densify(
-        self,
-        params: Params,
-        optimizers: MutableMapping[str, torch.optim.Optimizer],
-        state: MutableMapping[str, Any],
-        step: int,
-        info: Info | Sequence[Info],
-    ) -> None:
+    def densify(self, params: Params, optimizers: Optimizers, state: State, step: int, info: Infos) -> None:
         """Split, clone, prune and reset what is due after this step."""
         iteration, windows, views = step + 1, self.windows, _views(info)
         if not windows.refine_start_iter <= iteration <= windows.refine_stop_iter:
@@ -259,7 +237,7 @@ class StructureAwareStrategy(Strategy):
             even_out(self.world, params, optimizers, state)
 
     def consistently_low(self, statistics: Mapping[str, Tensor]) -> Tensor:
-        """Gaussians that answered low on all three axes in more than τ_prune of their observations. bool [N]"""
+        """Gaussians whose η was low on all three axes in more than τ_prune of their observations. bool [N]"""
         n_low, n_total = statistics["n_low"], statistics["n_total"]
         return consistent(n_low, n_total, TAU_PRUNE, self.min_observations).all(dim=1)
 
@@ -332,16 +310,16 @@ class StructureAwareStrategy(Strategy):
             remove(params, optimizers, state, mask)
         return n_prune
 
-    def _clear_statistics(self, params: Any, state: MutableMapping[str, Any]) -> None:
+    def _clear_statistics(self, params: Any, state: State) -> None:
         state.update(empty_state(len(params["means"]), params["means"].device))
 
 
 def empty_state(num_gaussians: int, device: torch.device) -> dict[str, Tensor]:
-    """Return what densification keeps of Gaussians of which nothing is known: statistics of η, and screen gradients."""
+    """Return the statistics of η and the screen gradients of Gaussians that no view has seen yet."""
     return empty_statistics(num_gaussians, device) | empty_gradients(num_gaussians, device)
 
 
-def _views(info: Info | Sequence[Info]) -> Sequence[Info]:
+def _views(info: Infos) -> Sequence[Info]:
     return [info] if isinstance(info, Mapping) else info
 
 
