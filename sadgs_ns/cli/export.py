@@ -94,10 +94,8 @@ def export(options: Export) -> int:
     """Write the Gaussians of a run of sadgs or splatfacto, or a mesh; return the number of Gaussians or triangles.
 
     A printed line says what each option took away. Nothing in the run's folder is executed, not even `config.yml`.
-
-    Raises:
-        InputError: If the run, the capture, an option or the output cannot be used.
-        WriteError: If the file could not be written.
+    Raise InputError if the run, the capture, an option or the output cannot be used, and WriteError if the file could
+    not be written.
     """
     is_page, is_mesh = format_of(options.output) == ".html", format_of(options.output) == MESH
     _check(options)

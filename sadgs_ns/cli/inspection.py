@@ -63,13 +63,9 @@ class View:
 def load_run(path: Path, load_step: int | None = None, data: Path | None = None) -> tuple[SadgsPipeline, int]:
     """Load a finished or running run from its `config.yml`, as nerfstudio's `eval_setup` does; options as `Inspect`'s.
 
-    The file is read with PyYAML's full loader, which calls what it names. Checkpoints are looked for beside it.
-
-    Returns:
-        The pipeline in evaluation mode, and the iterations that it was trained.
-
-    Raises:
-        InputError: If there is no such file or checkpoint, or they are of another method.
+    The file is read with PyYAML's full loader, which calls what it names. Checkpoints are looked for beside it. Return
+    the pipeline in evaluation mode, and the iterations that it was trained; raise InputError if there is no such file
+    or checkpoint, or they are of another method.
     """
     if path.is_dir():
         path = path / "config.yml"
@@ -149,8 +145,7 @@ def screen_gradients(pipeline: SadgsPipeline, progress: Callable[[range], Iterab
 def _try(model: SadgsModel, state: dict[str, Any], densify: Callable[[Any, Any, Any], Any]) -> dict[str, Tensor]:
     """Densify copies of the model's Gaussians by a function of parameters, optimizers and state.
 
-    Returns:
-        The raw parameters of M Gaussians, and as `origins`, int64 [M], the Gaussian that each one was or came from.
+    Return the raw parameters of M Gaussians, and as `origins`, int64 [M], the Gaussian that each was or came from.
     """
     params = {name: torch.nn.Parameter(value.detach().clone()) for name, value in model.gauss_params.items()}
     # Children inherit parameters, while rows of the state begin anew. float64 counts exactly.

@@ -75,10 +75,9 @@ def write_json(file: Path, value: Any) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path, refusal: str, seconds: float = 0.0) -> Iterator[int]:
-    """Lock a folder until all processes have ended that have the file descriptor which this yields.
+    """Lock a folder until all processes with the yielded file descriptor have ended.
 
-    Raises:
-        InputError: With the message `refusal` if the folder does not become free in these seconds.
+    Raise InputError with the message `refusal` if the folder does not become free in these seconds.
     """
     lock, end = os.open(folder, os.O_RDONLY), time.monotonic() + seconds
     try:

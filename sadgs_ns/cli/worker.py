@@ -52,16 +52,13 @@ class Worker:
     """A process that imports a function at once, and calls it when `run` brings the arguments.
 
     It has a session of its own, so that a terminal's Ctrl-C reaches it once, from here. It gets a SIGTERM if this
-    process ends, and is killed when the context is left.
+    process ends, and is killed when the context is left. Raise OSError if the log cannot be written.
 
     Args:
         function: As `module:name`.
         log: All that the process prints is added to this file.
         keep_open: File descriptors that it inherits, such as a lock's.
         saves: Whether it may save its work when it is interrupted. Otherwise it is killed.
-
-    Raises:
-        OSError: If the log cannot be written.
     """
 
     def __init__(self, function: str, log: Path, keep_open: Sequence[int] = (), saves: bool = False) -> None:
@@ -91,14 +88,12 @@ class Worker:
     def run(self, *arguments: Any, on_event: OnEvent, command: Sequence[str] = ()) -> Any:
         """Call the function, and return its result as JSON holds it: a dataclass as a dictionary.
 
+        Raise an InputError of the function, or WorkerError if it raises anything else or its process ends.
+
         Args:
             arguments: The function's; they are pickled.
             on_event: Called here with each event, and with "stopping" when the process is interrupted.
             command: The command line that does the same, for the log and the function's `sys.argv`.
-
-        Raises:
-            InputError: If the function raises it.
-            WorkerError: If the function raises anything else, or if its process ends.
         """
         assert self._process.stdin is not None
         if command:

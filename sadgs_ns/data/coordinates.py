@@ -94,14 +94,9 @@ class Similarity:
 
 
 def spherical_harmonics(directions: Array, degree: int) -> Array:
-    """Return the real, orthonormal spherical harmonics, in the order and with the signs of 3D Gaussian splatting.
+    """Return the real, orthonormal spherical harmonics of unit vectors, in the order and with the signs of 3DGS.
 
-    Args:
-        directions: Unit vectors. [..., 3]
-        degree: Highest degree, 0 … 3; another raises ValueError.
-
-    Returns:
-        [..., (degree + 1)²]
+    Raise ValueError if the highest degree is not 0 … 3. [..., 3] → [..., (degree + 1)²]
     """
     if not 0 <= degree <= 3:
         raise ValueError(f"spherical harmonics of degree {degree}: only 0 to 3 are known")
@@ -112,22 +107,13 @@ def spherical_harmonics(directions: Array, degree: int) -> Array:
 
     basis = [
         np.full_like(x, root(1, 4)),
-        -root(3, 4) * y,
-        root(3, 4) * z,
-        -root(3, 4) * x,
-        root(15, 4) * x * y,
-        -root(15, 4) * y * z,
-        root(5, 16) * (3 * z * z - 1),
-        -root(15, 4) * x * z,
-        root(15, 16) * (x * x - y * y),
-        -root(35, 32) * y * (3 * x * x - y * y),
-        root(105, 4) * x * y * z,
-        -root(21, 32) * y * (5 * z * z - 1),
-        root(7, 16) * z * (5 * z * z - 3),
-        -root(21, 32) * x * (5 * z * z - 1),
-        root(105, 16) * z * (x * x - y * y),
-        -root(35, 32) * x * (x * x - 3 * y * y),
-    ]
+        -root(3, 4) * y, root(3, 4) * z, -root(3, 4) * x,
+        root(15, 4) * x * y, -root(15, 4) * y * z, root(5, 16) * (3 * z * z - 1),
+        -root(15, 4) * x * z, root(15, 16) * (x * x - y * y),
+        -root(35, 32) * y * (3 * x * x - y * y), root(105, 4) * x * y * z, -root(21, 32) * y * (5 * z * z - 1),
+        root(7, 16) * z * (5 * z * z - 3), -root(21, 32) * x * (5 * z * z - 1),
+        root(105, 16) * z * (x * x - y * y), -root(35, 32) * x * (x * x - 3 * y * y),
+    ]  # fmt: skip
     return np.stack(basis[: (degree + 1) ** 2], -1)
 
 
@@ -144,8 +130,7 @@ def from_data(path: Path) -> Similarity:
 def fixed_frame(meta: Mapping[str, Any], path: Path) -> Similarity | None:
     """Return how the content of a `transforms.json`, `meta`, wants to be moved, or None if nerfstudio decides.
 
-    Raises:
-        InputError: If it wants to be moved by anything but a similarity.
+    Raise InputError if it wants to be moved by anything but a similarity.
     """
     if not any(name in meta for name in FRAME_KEYS):
         return None

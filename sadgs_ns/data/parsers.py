@@ -64,8 +64,7 @@ CHECKS = {
 def choose_parser(config: FullImageDatamanagerConfig) -> None:
     """Replace the automatic parser by the one that fits the data, so that a run's `config.yml` names that one.
 
-    Raises:
-        InputError: If the folder cannot be read; as `automatic_options`.
+    Raise InputError if the folder cannot be read, and as `automatic_options`.
     """
     if not isinstance(config.dataparser, AutomaticDataParserConfig):
         return
@@ -88,11 +87,7 @@ def choose_parser(config: FullImageDatamanagerConfig) -> None:
 def check_capture(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[Finding]:
     """Choose the parser if none was named, and check the data before nerfstudio parses them.
 
-    Returns:
-        The findings that do not stop training.
-
-    Raises:
-        InputError: With the first finding that does; as `choose_parser`.
+    Return the findings that do not stop training; raise InputError with the first that does, and as `choose_parser`.
     """
     vars(config).pop("findings", None)
     choose_parser(config)

@@ -67,9 +67,7 @@ class Exchange:
     def send(self, projected: Projected, absgrad: bool) -> tuple[Tensor, list[Projected]]:
         """Send the Gaussians, differentiably; call once.
 
-        Args:
-            absgrad: Whether `backward` also brings the absolute gradients of the centres, as `absgrad` of `means2d`.
-                The gradient of the centres then is `grad2d` of `means2d`.
+        With `absgrad`, `backward` also sets `absgrad` and `grad2d` of `means2d`, its absolute gradients and its gradient.
 
         Returns:
             Zero, which must be added to the loss so that gradients come to a process that composites nothing; and the

@@ -13,24 +13,20 @@ _DIGITS = ((20, 11), (10, 10), (0, 10))
 
 @torch.no_grad()
 def limit_growth(world: World, growth: Tensor, priority: Tensor, budget: float) -> Tensor:
-    """Choose which Gaussians may grow so that the hard cap holds, those of largest priority first.
+    """Choose which Gaussians may grow so that the hard cap holds, those of the largest priority first.
 
-    By priority, each one is taken that fits what those before it left over; of equal ones the first come first, in the
-    order of the ranks. One that does not fit is passed over: otherwise a single parent of 512 children would block all
-    others near the cap.
+    Each one is taken if it fits into the budget that those before it left; of equal priorities the first come first, in
+    the order of the ranks. One that does not fit is passed over: otherwise a single parent of 512 children would block
+    all others near the cap.
 
     Nobody sorts or gathers the priorities. Where the budget does not suffice, histograms of them, summed over the
     processes, find the priority of the first Gaussian that does not fit; that is repeated with smaller ones, at most as
     often as there are sizes. Alone, too, this is faster than a sort (a million Gaussians on the CPU: 3 to 130 ms, and
     130 to 160).
 
-    Args:
-        growth: Gaussians that each one of this process would add, ≥ 0. int64 [N]
-        priority: Larger comes first, ≥ 0. [N]
-        budget: Gaussians that may be added in all, the same in all processes; ≤ 0 allows none.
-
-    Returns:
-        The chosen ones of this process; those that would add none are never chosen. bool [N]
+    `growth` is the number of Gaussians that each one of this process would add, ≥ 0, int64 [N], and its `priority` is
+    ≥ 0 [N]. `budget` is the number that may be added in all, the same in all processes; ≤ 0 allows none. Gaussians that
+    would add none are never chosen. bool [N]
     """
     # The bits of floats that are not negative have the order of the floats.
     bits = priority.float().contiguous().view(torch.int32)

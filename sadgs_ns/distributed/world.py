@@ -23,15 +23,13 @@ class World:
     The Gaussians of all processes, in the order of their ranks, are those of one process. All processes must call every
     method in the same order. A world of one process asks nobody: its sums return their argument.
 
+    `device` must be torch's current one if it is CUDA; None makes a world of this process alone.
+
     Attributes:
         rank, num_ranks: The number of this process, from 0, and R.
         sizes: Numbers of Gaussians of all processes, in the order of their ranks.
         flags_out: Bits by which this process asks something of all; `Exchange` sends them along.
         flags_in: All bits that any process has sent since this was last set to 0.
-
-    Args:
-        device: The device of this process, which must be torch's current one if it is CUDA. None makes a world of this
-            process alone.
     """
 
     def __init__(self, device: torch.device | None = None) -> None:
@@ -64,8 +62,7 @@ class World:
     def take_even_part(self, total: int) -> slice:
         """Let each process hold an equal shard of Gaussians that all of them have, and return this one's.
 
-        Raises:
-            InputError: If there are fewer Gaussians than processes.
+        Raise InputError if there are fewer Gaussians than processes.
         """
         if total < self.num_ranks:
             raise InputError(f"{self.num_ranks} processes cannot share out {total} Gaussians: start fewer processes.")

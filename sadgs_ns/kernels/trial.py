@@ -13,12 +13,7 @@ def _write_one(target):
 
 
 def run_trial(device: torch.device) -> None:
-    """Run a kernel on a device, and wait for its result.
-
-    Raises:
-        Exception: Whatever Triton raises where it cannot compile or launch a kernel.
-        RuntimeError: If the kernel ran and did nothing.
-    """
+    """Run a kernel on a device and wait for it; raise whatever Triton raises, or RuntimeError if it did nothing."""
     target = torch.zeros(1, device=device)
     _write_one[1,](target)
     if float(target) != 1:

@@ -19,14 +19,9 @@ VARIANCE_EXTENT = math.sqrt(3.0)
 
 
 def children_per_axis(eta_max: Tensor, violates: Tensor) -> Tensor:
-    """Split factor n_k = ⌈√η_k⌉ on the axes that violate consistently, 1 elsewhere (paper, eq. 8).
+    """Split factor n_k = ⌈√η_k⌉ on the axes that violate consistently, 1 elsewhere (paper, eq. 8). int64 [N, 3]
 
-    Args:
-        eta_max: Largest η observed per axis, ≥ 0; one that is no number splits nothing. [N, 3]
-        violates: Axes that violate consistently over the views. bool [N, 3]
-
-    Returns:
-        n in 1 … MAX_CHILDREN_PER_AXIS. int64 [N, 3]
+    It is at most MAX_CHILDREN_PER_AXIS. `eta_max` is the largest η observed per axis [N, 3]; NaN splits nothing.
     """
     counts = eta_max.clamp_min(1.0).sqrt().ceil().clamp_max(MAX_CHILDREN_PER_AXIS)
     # NaN is no violation: as an integer it could be anything.

@@ -117,16 +117,16 @@ def multiscale_structure_tensor(
         smallest = torch.finfo(image.dtype).tiny
         trace_floors = [(epsilon / brightest.square()).clamp_min(smallest)] * NUM_LEVELS
         weight_floor = (epsilon / brightest**GAMMA).clamp_min(smallest)
-    operations = _operations(image)
+    correlate, differentiate, aggregate = _operations(image)
     # Without masks the weights of all images are the same: one image's are kept.
-    sums = _WeightedSums(valid[:1] if masks is None else valid, masks is not None, truncation, operations.correlate)
+    sums = _WeightedSums(valid[:1] if masks is None else valid, masks is not None, truncation, correlate)
     numerator = torch.zeros_like(image[:, :1]).repeat(1, 3, 1, 1)  # [B, 3, H, W]
     denominator = weight_floor.expand_as(valid).contiguous()  # [B, 1, H, W]
     previous = image  # I_{l−1}
     for level, sigma in enumerate(levels):
         # The scale space: I_l and its gradient.
         blurs, totals = sums.blur_and_gradient(image, sigma), sums.total_and_gradient(sigma)
-        smoothed, products, energy = operations.differentiate(blurs, totals, sums.weight, previous)
+        smoothed, products, energy = differentiate(blurs, totals, sums.weight, previous)
         # Eq. 2, the structure tensor: S_l is the mean of the gradient's products over a window of ρ_l.
         rho = INTEGRATION_FACTOR * sigma
         tensor = sums.blur(products, rho), sums.total(rho)
@@ -137,9 +137,7 @@ def multiscale_structure_tensor(
             energy, total = sums.blur(energy, window), sums.total(window)
         # Eq. 3 and 5: normalise S_l, and add it with its weight E_l^γ ω_l².
         frequency = frequency_constant / sigma
-        operations.aggregate(
-            tensor, (energy, total), trace_floors[level], numerator, denominator, 0.5 * GAMMA, frequency
-        )
+        aggregate(tensor, (energy, total), trace_floors[level], numerator, denominator, 0.5 * GAMMA, frequency)
         previous = smoothed
     result = numerator / denominator
     if masks is not None:
@@ -226,24 +224,15 @@ class _WeightedSums:
         return self.correlate(image, kernel, axis)
 
 
-@dataclass(frozen=True)
-class _Operations:
-    """The three operations that torch and Triton both have."""
-
-    correlate: Callable[[Tensor, Tensor, int], Tensor]
-    differentiate: Callable[..., tuple[Tensor, Tensor, Tensor]]
-    aggregate: Callable[..., None]
-
-
-def _operations(image: Tensor) -> _Operations:
-    """Triton's operations where they run, else torch's."""
+def _operations(image: Tensor) -> tuple[Callable[..., Tensor], Callable[..., tuple[Tensor, Tensor, Tensor]], Callable]:
+    """The operations `_correlate`, `_differentiate` and `_aggregate`, by Triton where it runs."""
     if not use_triton(image):
-        return _Operations(_correlate, _differentiate, _aggregate)
+        return _correlate, _differentiate, _aggregate
     from sadgs_ns.kernels import limits
     from sadgs_ns.kernels import structure_tensor as kernel
 
     limits.check_batch(*image.shape)
-    return _Operations(kernel.correlate, kernel.differentiate, kernel.aggregate)
+    return kernel.correlate, kernel.differentiate, kernel.aggregate
 
 
 def _correlate(image: Tensor, kernel: Tensor, axis: int) -> Tensor:

@@ -15,14 +15,9 @@ from sadgs_ns.gsplat_compat import has_radius_per_axis
 
 @torch.no_grad()
 def cull_off_axis(radii: Tensor, means2d: Tensor, width: int, height: int, max_off_axis: float) -> Tensor:
-    """Make the radii of Gaussians zero that are too far off the axis: compositing draws none whose radius is zero.
+    """Return the radii of `Projected`, but 0 where Gaussians are too far off the axis or their centre is not finite.
 
-    Args:
-        radii, means2d, width, height: As `Projected` has them. Where a centre is not finite, nothing is drawn.
-        max_off_axis: Largest distance from the image's centre, in halves of its width and height along x and y, > 0.
-
-    Returns:
-        Radii of the same shape and type.
+    `max_off_axis` > 0 is the largest distance from the image's centre, in halves of its width and height along x and y.
     """
     # Numbers, not a tensor of them, which the host would have to send to the device.
     x, y = means2d.unbind(dim=-1)

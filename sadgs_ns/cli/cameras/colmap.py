@@ -29,10 +29,7 @@ _ERROR_LINE = re.compile(r"^[EF]\d{8} |^\s*what\(\): |Error: ")
 def run_colmap(function: str, *arguments: Any, folder: Path, report: Report) -> Any:
     """Call a function of `reconstruct.py`, which writes to `folder`, in another process, as `Worker.run` does.
 
-    Raises:
-        InputError: If the function raises it.
-        OSError: If the disk is full.
-        RunError: If the function raises anything else, or if its process ends.
+    Raise an InputError of the function, OSError if the disk is full, or RunError if it fails otherwise.
     """
     begun, log = "its start", folder / "colmap.txt"
 

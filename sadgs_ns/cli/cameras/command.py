@@ -156,11 +156,8 @@ def process(options: Process) -> Summary:
 
     A run that was interrupted goes on. New photos are added to a finished scene, whose other cameras stay as they are.
 
-    Raises:
-        InputError: If the photos, the folder or the settings cannot be used.
-        Interrupted: If a signal came; what was done is kept.
-        OSError: If a file cannot be written.
-        RunError: If COLMAP fails.
+    Raise InputError if the photos, the folder or the settings cannot be used, OSError if a file cannot be written,
+    RunError if COLMAP fails, and Interrupted if a signal came: the work so far is kept.
     """
     with Interrupts(waiting=lambda: True):
         scene = _Scene(options)

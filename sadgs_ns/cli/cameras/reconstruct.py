@@ -62,6 +62,8 @@ def make_model(
 ) -> Summary:  # fmt: skip
     """Make a model of photos, and from it the undistorted scene in the folder `undistorted` beside it.
 
+    Raise InputError if no two photos could be related, or none could be added.
+
     Args:
         photos: The folder of the photos.
         groups: The photos' names, those of one camera together.
@@ -72,9 +74,6 @@ def make_model(
         base: An earlier model's folder, to which photos are added; its cameras stay as they are, and the added photos
             alone are undistorted.
         rigs: The names of the views of each panorama.
-
-    Raises:
-        InputError: If no two photos could be related, or none could be added.
     """
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
     names, database = sorted(itertools.chain(*groups, *rigs)), model.with_name("database.db")
@@ -204,10 +203,8 @@ def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Pat
     """Estimate cameras and points, and write the model with the most photos; its folder appears when it is complete.
 
     Photos are added to an earlier model: its poses and intrinsics stay as they are, points are triangulated with the
-    new photos, and photos that did not register before are tried again.
-
-    Raises:
-        InputError: If no two photos could be related, or no photo could be added.
+    new photos, and photos that did not register before are tried again. Raise InputError if no two photos could be
+    related, or no photo could be added.
     """
     before = None if base is None else pycolmap.Reconstruction(base)
     with pycolmap.Database.open(database) as opened:
