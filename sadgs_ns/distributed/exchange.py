@@ -67,7 +67,7 @@ class Exchange:
     def send(self, projected: Projected, absgrad: bool) -> tuple[Tensor, list[Projected]]:
         """Send the Gaussians, differentiably; call once.
 
-        With `absgrad`, `backward` also sets `absgrad` and `grad2d` of `means2d`, its absolute gradients and its gradient.
+        With `absgrad`, `backward` sets `absgrad` and `grad2d` of `means2d`, its absolute gradients and its gradient.
 
         Returns:
             Zero, which must be added to the loss so that gradients come to a process that composites nothing; and the
