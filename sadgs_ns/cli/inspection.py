@@ -158,7 +158,7 @@ def _try(model: SadgsModel, state: dict[str, Any], densify: Callable[[Any, Any, 
 
 def structure_step(model: SadgsModel, statistics: dict[str, Tensor]) -> dict[str, Tensor]:
     """Return the Gaussians after a structure-aware step without its pruning, as `_try`."""
-    counts = model.strategy.children_now(model.gauss_params, statistics)
+    counts = model.strategy.planned_children(model.gauss_params, statistics)
     return _try(model, {}, partial(grid_split, counts=counts, child_scale=model.strategy.child_scale))
 
 
@@ -166,7 +166,7 @@ def conventional_step(model: SadgsModel, gradients: dict[str, Tensor]) -> dict[s
     """Return the Gaussians after a step of AbsGS, clones and splits in two, without its pruning, as `_try`."""
     strategy = replace(model.strategy, absgs_long_axis=False)
     state = {**gradients, "scene_scale": model.strategy_state["scene_scale"]}
-    densify = partial(apply, *strategy.growth_now(absgs, model.gauss_params, state))
+    densify = partial(apply, *strategy.planned_growth(absgs, model.gauss_params, state))
     with torch.random.fork_rng(devices=[model.device] if model.device.type == "cuda" else []):
         torch.manual_seed(SEED)  # gsplat draws the children's places at random.
         return _try(model, state, densify)
@@ -176,7 +176,7 @@ def view_panels(pipeline: SadgsPipeline, view: View, statistics: dict[str, Tenso
     """Return the pictures of one view by their names."""
     model, constant = pipeline.model, pipeline.config.frequency_constant
     params, options = dict(model.gauss_params.items()), model.drawing
-    counts = model.strategy.children_now(model.gauss_params, statistics)
+    counts = model.strategy.planned_children(model.gauss_params, statistics)
     is_low = model.strategy.consistently_low(statistics)
     enlarge = max(MIN_SIDE / max(view.photo.shape), 1.0)
     size = round(enlarge * view.photo.shape[0]), round(enlarge * view.photo.shape[1])

@@ -241,12 +241,12 @@ class StructureAwareStrategy(Strategy):
         n_low, n_total = statistics["n_low"], statistics["n_total"]
         return consistent(n_low, n_total, TAU_PRUNE, self.min_observations).all(dim=1)
 
-    def children_now(self, params: Params, statistics: Mapping[str, Tensor]) -> Tensor:
+    def planned_children(self, params: Params, statistics: Mapping[str, Tensor]) -> Tensor:
         """n per axis that a structure step would split by now, 1 where whole or over the cap. int64 [N, 3]"""
-        proposal, fits = self.growth_now(structure_aware, params, statistics)
+        proposal, fits = self.planned_growth(structure_aware, params, statistics)
         return torch.where(fits[:, None], proposal.children, 1)
 
-    def growth_now(self, propose: Propose, params: Params, state: Mapping[str, Any]) -> tuple[Proposal, Tensor]:
+    def planned_growth(self, propose: Propose, params: Params, state: Mapping[str, Any]) -> tuple[Proposal, Tensor]:
         """What a rule would propose by now, and the Gaussians that the cap lets grow, bool [N]."""
         proposal = propose(self, params, state)
         room = self.max_gaussians - len(params["means"])

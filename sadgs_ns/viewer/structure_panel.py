@@ -285,7 +285,7 @@ class StructurePanel(torch.nn.Module):
             text = "No observations yet: press “Observe all training views”, or wait for some iterations."
             return Panel(text, np.zeros((height, width, 3), np.uint8))
         kept = {name: statistics[name] for name in ("eta_max", "n_total")}
-        kept["children"] = model.strategy.children_now(model.gauss_params, statistics)
+        kept["children"] = model.strategy.planned_children(model.gauss_params, statistics)
         kept["low"] = model.strategy.consistently_low(statistics)
         rows = model.cropped({**model.gauss_params, **kept})
         if len(rows["means"]) == 0:

@@ -241,7 +241,7 @@ def test_observing_leaves_the_run_as_it_was(early: SadgsPipeline):
 
 def test_the_structure_step_makes_the_children_of_the_plan(early: SadgsPipeline):
     model, statistics = early.model, observe_training_views(early.structure_cache)
-    children = model.strategy.children_now(model.gauss_params, statistics).prod(dim=1)
+    children = model.strategy.planned_children(model.gauss_params, statistics).prod(dim=1)
     step = inspection.structure_step(model, statistics)
     assert int(children.max()) > 1
     assert torch.equal(torch.bincount(step["origins"], minlength=model.num_points), children)

@@ -283,7 +283,7 @@ def grow_with(params, state, budget: int = 1000, long_axis: bool = False) -> tup
     options = {"clone_grad2d": 2e-4, "split_absgrad2d": 4e-4, "absgs_long_axis": long_axis}
     strategy = StructureAwareStrategy(max_gaussians=len(params["means"]) + budget, **options)
     state["scene_scale"] = 100.0
-    proposal, allowed = strategy.growth_now(absgs, params, state)
+    proposal, allowed = strategy.planned_growth(absgs, params, state)
     apply(proposal, allowed, params, adam(params, lr=0.0), state)
     assert proposal.clone is not None
     return int((allowed & proposal.clone).sum()), int((allowed & ~proposal.clone).sum())
@@ -377,13 +377,13 @@ def test_what_would_be_split_now_keeps_to_the_cap():
     statistics["n_high"][:] = (statistics["eta_max"] > 1).to(statistics["n_high"])
     params = random_params(3)
     strategy = StructureAwareStrategy(max_gaussians=6, min_observations=1, split_min_opacity=0.0)
-    assert strategy.children_now(params, statistics).tolist() == [[2, 1, 1], [1, 3, 1], [1, 1, 1]]
+    assert strategy.planned_children(params, statistics).tolist() == [[2, 1, 1], [1, 3, 1], [1, 1, 1]]
     strategy.max_gaussians = 5  # room for two more: the larger η comes first
-    assert strategy.children_now(params, statistics).tolist() == [[1, 1, 1], [1, 3, 1], [1, 1, 1]]
+    assert strategy.planned_children(params, statistics).tolist() == [[1, 1, 1], [1, 3, 1], [1, 1, 1]]
     strategy.max_gaussians = 2
-    assert (strategy.children_now(params, statistics) == 1).all()
+    assert (strategy.planned_children(params, statistics) == 1).all()
     strategy.max_gaussians, strategy.min_observations = 6, 2
-    assert (strategy.children_now(params, statistics) == 1).all(), "one observation is no consistency"
+    assert (strategy.planned_children(params, statistics) == 1).all(), "one observation is no consistency"
     strategy.min_observations, strategy.split_min_opacity = 1, 0.5
     params["opacities"].data = torch.logit(torch.tensor([0.4, 0.6, 0.6]))
-    assert strategy.children_now(params, statistics).tolist() == [[1, 1, 1], [1, 3, 1], [1, 1, 1]]
+    assert strategy.planned_children(params, statistics).tolist() == [[1, 1, 1], [1, 3, 1], [1, 1, 1]]
