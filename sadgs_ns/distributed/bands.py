@@ -27,7 +27,7 @@ class Band(NamedTuple):
     """First row that is drawn, and the one after the last."""
 
 
-def share_out(num_views: int, height: int, num_ranks: int) -> list[Band]:
+def share_rows(num_views: int, height: int, num_ranks: int) -> list[Band]:
     """Share the rows of one view or more, of one height in px, evenly among processes.
 
     The bands are in the order of their processes, views and rows. They are whole views if the number of processes
@@ -62,5 +62,5 @@ def views_of_rank(sizes: tuple[tuple[int, int], ...], num_ranks: int, rank: int)
     groups: dict[tuple[int, int], list[int]] = defaultdict(list)
     for view, size in enumerate(sizes):
         groups[size].append(view)
-    bands = ((share_out(len(views), height, num_ranks), views) for (height, _), views in groups.items())
+    bands = ((share_rows(len(views), height, num_ranks), views) for (height, _), views in groups.items())
     return tuple(views[band.view] for shared, views in bands for band in shared if band.rank == rank)

@@ -38,7 +38,7 @@ class Exchange:
 
     Args:
         projected: The Gaussians of this process in all V views.
-        bands: All bands, as `share_out` returns them.
+        bands: All bands, as `share_rows` returns them.
     """
 
     def __init__(self, world: World, projected: Projected, bands: Sequence[Band]) -> None:

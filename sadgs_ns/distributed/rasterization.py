@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from sadgs_ns.distributed.bands import Band, share_out
+from sadgs_ns.distributed.bands import Band, share_rows
 from sadgs_ns.distributed.exchange import Exchange
 from sadgs_ns.distributed.world import World
 from sadgs_ns.render import rasterization as render
@@ -46,7 +46,7 @@ def rasterize(
         return [Picture(None, colors, alphas)], info
     options = replace(options, tile_capacity=None)
     projected = render.project(gaussians, cameras, options, begin_tiles=False)
-    exchange = Exchange(world, projected, share_out(len(cameras.viewmats), cameras.height, world.num_ranks))
+    exchange = Exchange(world, projected, share_rows(len(cameras.viewmats), cameras.height, world.num_ranks))
     anchor, received = exchange.send(projected, options.absgrad)
     pictures, num_pairs, num_pixels = [], 0, 0
     for band, splats in zip(exchange.bands, received, strict=True):

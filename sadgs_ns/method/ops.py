@@ -62,7 +62,7 @@ def map_opacities(function: Callable[[Tensor], Tensor], params: Params, optimize
     update_param_with_optimizer(param_fn, lambda key, v: torch.zeros_like(v), params, optimizers, names=["opacities"])
 
 
-def even_out(world: World, params: Params, optimizers: Optimizers, state: State) -> None:
+def rebalance(world: World, params: Params, optimizers: Optimizers, state: State) -> None:
     """Count the Gaussians of all processes, and give each equally many where they differ by more than a tenth."""
     world.count(len(params["means"]))
     if not world.is_uneven():

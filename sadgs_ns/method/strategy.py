@@ -16,7 +16,7 @@ from sadgs_ns.distributed.ranking import limit_growth
 from sadgs_ns.distributed.world import World
 from sadgs_ns.method.growth import RULES, Proposal, Propose, Rule, apply, due_rule, structure_aware
 from sadgs_ns.method.memory import StepSize, affordable_growth, free_bytes
-from sadgs_ns.method.ops import Optimizers, Params, State, even_out, map_opacities, opacities
+from sadgs_ns.method.ops import Optimizers, Params, State, map_opacities, opacities, rebalance
 from sadgs_ns.method.schedule import Windows, due, next_due, windows
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients, keep_gradient
 from sadgs_ns.method.statistics import consistent, empty_statistics, observe
@@ -234,7 +234,7 @@ class StructureAwareStrategy(Strategy):
         elif due(iteration, windows.reset_every) and iteration <= windows.refine_stop_iter - windows.reset_every // 4:
             map_opacities(lambda alpha: alpha * RESET_FACTOR, params, optimizers)
         if not self.world.alone and self.densifies(step):
-            even_out(self.world, params, optimizers, state)
+            rebalance(self.world, params, optimizers, state)
 
     def consistently_low(self, statistics: Mapping[str, Tensor]) -> Tensor:
         """Gaussians whose η was low on all three axes in more than τ_prune of their observations. bool [N]"""

@@ -11,7 +11,7 @@ from ranks import run_ranks
 from sharded_scene import GAUSSIANS, HEIGHT, inputs, splats, weights
 from torch import Tensor
 
-from sadgs_ns.distributed.bands import ROWS, first_ranks, share_out, views_of_rank
+from sadgs_ns.distributed.bands import ROWS, first_ranks, share_rows, views_of_rank
 from sadgs_ns.distributed.rasterization import rasterize
 from sadgs_ns.distributed.world import World
 from sadgs_ns.render.rasterization import rasterize as rasterize_alone
@@ -101,7 +101,7 @@ def test_processes_draw_and_differentiate_what_one_does(
 
 @pytest.mark.parametrize(("views", "height", "ranks"), [(4, 100, 2), (1, 33, 3), (3, 75, 2), (2, 10, 3), (5, 64, 3)])
 def test_bands_cover_every_row_once_and_evenly(views: int, height: int, ranks: int):
-    bands = share_out(views, height, ranks)
+    bands = share_rows(views, height, ranks)
     assert [(b.view, b.first) for b in bands] == sorted((b.view, b.first) for b in bands)
     assert [b.rank for b in bands] == sorted(b.rank for b in bands)
     rows = [(b.view, row) for b in bands for row in range(b.first, b.last)]

@@ -12,7 +12,7 @@ from ranks import run_ranks
 from sadgs_ns.distributed.ranking import limit_growth
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
-from sadgs_ns.method.ops import even_out
+from sadgs_ns.method.ops import rebalance
 from sadgs_ns.method.strategy import StructureAwareStrategy
 
 BUDGETS = (0, 1, 5, 37, 120, 2000, float("inf"), -3)
@@ -102,7 +102,7 @@ def prune_together(world: World) -> list[int]:
     for mask in (faint, faint if world.rank == 0 else ~faint):
         strategy._prune(params, optimizers, {}, mask)
         numbers.append(len(params["means"]))
-    even_out(world, params, optimizers, {})
+    rebalance(world, params, optimizers, {})
     return [*numbers, len(params["means"])]
 
 
