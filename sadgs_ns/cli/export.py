@@ -148,7 +148,7 @@ def _cleaned(
     from rich.console import Console
     from rich.progress import track
 
-    from sadgs_ns.method.cleaning import Cleaning, find, see
+    from sadgs_ns.method.cleaning import Cleaning, find_remaining, measure_visibility
     from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
     if cleaning == Cleaning():
@@ -160,8 +160,8 @@ def _cleaned(
         views = [(viewmat, K, *size) for viewmat, K, size in zip(viewmats, Ks, cameras.sizes, strict=True)]
         console = Console(stderr=True)
         shown = track(views, "Looking from the training views", console=console, disable=not console.is_terminal)
-        seen = see(shapes, shown, drawing)
-    stays, sentences = find(shapes, cleaning, seen)
+        seen = measure_visibility(shapes, shown, drawing)
+    stays, sentences = find_remaining(shapes, cleaning, seen)
     print("\n".join(sentences))
     if not stays.any():
         problem = f"These options take away all {len(stays):,} Gaussians"

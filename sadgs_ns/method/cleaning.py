@@ -50,12 +50,12 @@ class Cleaning:
 
     @property
     def needs_views(self) -> bool:
-        """Whether `find` must be told what the training views see."""
+        """Whether `find_remaining` needs the `Visibility` of the Gaussians."""
         return self.min_views > 0 or self.dust > 0
 
 
 @dataclass(frozen=True)
-class Seen:
+class Visibility:
     """What the training views see of N Gaussians."""
 
     views: Tensor
@@ -66,11 +66,11 @@ class Seen:
     """Number of views."""
 
 
-def see(
+def measure_visibility(
     params: Mapping[str, Tensor],
     cameras: Iterable[tuple[Tensor, Tensor, int, int]],
     drawing: RenderOptions = DEFAULTS,
-) -> Seen:
+) -> Visibility:
     """Measure how many pixels Gaussians make up in training views: opacity × area, less what is hidden by others.
 
     Args:
@@ -95,11 +95,13 @@ def see(
         views += weights[:, 0] >= _SEEN
         pixels = torch.maximum(pixels, weights[:, 0])
         number += 1
-    return Seen(views, pixels, number)
+    return Visibility(views, pixels, number)
 
 
 @torch.no_grad()
-def find(params: Mapping[str, Tensor], cleaning: Cleaning, seen: Seen | None = None) -> tuple[Tensor, list[str]]:
+def find_remaining(
+    params: Mapping[str, Tensor], cleaning: Cleaning, seen: Visibility | None = None
+) -> tuple[Tensor, list[str]]:
     """Find which Gaussians stay. `seen` is needed where `cleaning.needs_views`.
 
     Returns:

@@ -14,7 +14,7 @@ from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerDropdown, Vie
 from torch import Tensor
 
 from sadgs_ns.errors import reason
-from sadgs_ns.method.cleaning import Cleaning, Seen, find, see
+from sadgs_ns.method.cleaning import Cleaning, Visibility, find_remaining, measure_visibility
 from sadgs_ns.training.model import SadgsModel
 from sadgs_ns.training.progress import warn
 from sadgs_ns.training.views import TrainingViews
@@ -43,7 +43,7 @@ class CleaningPanel(torch.nn.Module):
     def __init__(self, views: TrainingViews) -> None:
         super().__init__()
         self._views = views
-        self._seen: tuple[tuple[int, int], Seen] | None = None
+        self._seen: tuple[tuple[int, int], Visibility] | None = None
         self._stays = torch.ones(0, dtype=torch.bool)
         self._shown, self._text = OFF, ""
         self.choice = ViewerDropdown(
@@ -89,8 +89,8 @@ class CleaningPanel(torch.nn.Module):
         now = (model.num_points, model.step)  # Training outdates what was seen.
         if cleaning.needs_views and (self._seen is None or self._seen[0] != now):
             self._say("Looking from all training views …")
-            self._seen = now, see(params, self._cameras(), model.drawing)
-        stays, sentences = find(params, cleaning, None if self._seen is None else self._seen[1])
+            self._seen = now, measure_visibility(params, self._cameras(), model.drawing)
+        stays, sentences = find_remaining(params, cleaning, None if self._seen is None else self._seen[1])
         self._stays, self._shown = stays, self.choice.value
         left = f"{int(stays.sum()):,} of {len(stays):,} Gaussians would stay."
         options = command_line_options(cleaning)

@@ -12,7 +12,7 @@ from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
 from runs import in_the_viewer
 
-from sadgs_ns.method.cleaning import Cleaning, find, see
+from sadgs_ns.method.cleaning import Cleaning, find_remaining, measure_visibility
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.viewer.cleaning_panel import GOES, OUTPUT, STAYS, CleaningPanel, command_line_options
@@ -81,16 +81,16 @@ def test_what_views_see_is_measured_once_and_again_when_training_went_on(
 
     def look(params: Any, cameras: Any, drawing: Any) -> Any:
         looks.append(len(cameras))
-        return see(params, cameras, drawing)
+        return measure_visibility(params, cameras, drawing)
 
-    monkeypatch.setattr("sadgs_ns.viewer.cleaning_panel.see", look)
+    monkeypatch.setattr("sadgs_ns.viewer.cleaning_panel.measure_visibility", look)
     said = set_to(panel, min_views=3)
     set_to(panel, dust=0.5)
     views = len(pipeline.views)
     assert looks == [views]
     params = dict(model.gauss_params.items())
-    seen = see(params, panel._cameras(), model.drawing)
-    _, sentences = find(params, Cleaning(min_views=3), seen)
+    seen = measure_visibility(params, panel._cameras(), model.drawing)
+    _, sentences = find_remaining(params, Cleaning(min_views=3), seen)
     assert said.startswith(sentences[0])
     model.step += 1
     set_to(panel, dust=0.6)
