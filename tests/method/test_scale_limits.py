@@ -6,8 +6,8 @@ import pytest
 import torch
 from gsplat_like import splatted
 
-from sadgs_ns.method import clearance
-from sadgs_ns.method.clearance import clear_of_cameras, limit_scales
+from sadgs_ns.method import scale_limits
+from sadgs_ns.method.scale_limits import clear_of_cameras, limit_scales
 
 
 def test_points_are_clear_of_cameras_from_their_radius_on():
@@ -37,7 +37,7 @@ def test_only_axes_that_are_too_long_for_the_distance_are_shortened(offset: floa
     expected = torch.minimum(scales.double(), (0.5 * distances).log()[:, None])
     assert 100 < int((expected < scales).sum()) < 1_000
     for pairs in (2**22, 700, 1):  # as many Gaussians at a time as there are, then 100, then one
-        monkeypatch.setattr(clearance, "_PAIRS", pairs)
+        monkeypatch.setattr(scale_limits, "_PAIRS", pairs)
         limited = torch.nn.Parameter(scales.clone())
         limit_scales(limited, means, positions, 0.5)
         torch.testing.assert_close(limited.detach().double(), expected, rtol=0, atol=1e-5)
