@@ -55,7 +55,11 @@ class CameraPaths:
     """Which of its cells reach into the empty space. bool [32, 32, 32]"""
 
     @staticmethod
-    def of(viewmats: Tensor, near_plane: float, points: Tensor) -> CameraPaths:
+    def of(
+        viewmats: Tensor,  # [C, 4, 4]
+        near_plane: float,
+        points: Tensor,  # [P, 3]
+    ) -> CameraPaths:
         """Connect neighbouring cameras, given the scene's near plane > 0 and the points that a run starts from."""
         rotations = viewmats[:, :3, :3].double().cpu()
         centres = -(rotations.mT @ viewmats[:, :3, 3:].double().cpu())[..., 0]  # [C, 3]
@@ -87,7 +91,11 @@ class CameraPaths:
         return replace(self, **moved)
 
     @torch.no_grad()
-    def haze(self, means: Tensor, scales: Tensor) -> Tensor:
+    def haze(
+        self,
+        means: Tensor,  # [N, 3]
+        scales: Tensor,  # [N, 3]
+    ) -> Tensor:
         """Tell which Gaussians are haze near a path; those whose centre is not finite are none. bool [N]"""
         cells = ((means - self.corner) / self.cell).nan_to_num(-1.0).clamp(-1, _CELLS).floor().long()  # [N, 3]
         inside = ((cells >= 0) & (cells < _CELLS)).all(dim=1)

@@ -17,7 +17,10 @@ def identities(views: int) -> Tensor:
     return torch.eye(3, 4).repeat(views, 1, 1)
 
 
-def anchored(matrices: Tensor, views: Tensor) -> Tensor:
+def anchored(
+    matrices: Tensor,  # [V, 3, 4]
+    views: Tensor,  # [C]
+) -> Tensor:
     """Return the matrices of views, int64 [C], moved so that the mean over all views [V, 3, 4] is the identity.
 
     Otherwise the Gaussians and all matrices could change together, and held-out views, which have no matrix, would be
@@ -28,7 +31,11 @@ def anchored(matrices: Tensor, views: Tensor) -> Tensor:
     return matrices.index_select(0, views) + shift
 
 
-def correct_colors(render: Tensor, alpha: Tensor, matrices: Tensor) -> Tensor:
+def correct_colors(
+    render: Tensor,  # [C, H, W, 3]
+    alpha: Tensor,  # [C, H, W, 1]
+    matrices: Tensor,  # [C, 3, 4]
+) -> Tensor:
     """Apply affine maps (M | b) [C, 3, 4] to the colours [C, H, W, 3] and alphas that `composite` returned: M c + α b.
 
     The offset b counts as much as the Gaussians cover, as if each Gaussian's own colour had been changed. Pixels that

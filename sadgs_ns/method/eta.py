@@ -19,7 +19,9 @@ WAVELENGTH_EPSILON = 1e-5
 """ε of Λ_min = 1 / (√λ_1 + ε) in 1/px: a textureless region has a wavelength of 10⁵ px, not infinity."""
 
 
-def principal_eigenvalue(structure_tensor: Tensor) -> Tensor:
+def principal_eigenvalue(
+    structure_tensor: Tensor,  # [..., 3]
+) -> Tensor:
     """Larger eigenvalue λ_1 [...] of symmetric 2×2 tensors (xx, xy, yy) [..., 3], in closed form.
 
     Both terms are non-negative, so that nothing cancels, however close to isotropic the tensor is.
@@ -28,7 +30,9 @@ def principal_eigenvalue(structure_tensor: Tensor) -> Tensor:
     return 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)
 
 
-def wavelength(structure_tensor: Tensor) -> Tensor:
+def wavelength(
+    structure_tensor: Tensor,  # [..., 3]
+) -> Tensor:
     """Smallest local wavelength Λ_min = 1 / (√λ_1 + ε) (paper, section 3.3).
 
     It is in px, in (0, 1/ε] [...], and S̄ is (xx, xy, yy) in 1/px² [..., 3].
@@ -37,7 +41,13 @@ def wavelength(structure_tensor: Tensor) -> Tensor:
 
 
 def projected_axes(
-    means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int
+    means: Tensor,  # [M, 3] world units, in front of the camera
+    quats: Tensor,  # [M, 4] wxyz, of any length
+    scales: Tensor,  # [M, 3] standard deviations in world units, > 0
+    viewmats: Tensor,  # [M, 4, 4] world to camera, one for each observation
+    Ks: Tensor,  # [M, 3, 3] px
+    width: int,
+    height: int,
 ) -> Tensor:
     """Screen-space vectors of the three principal axes, v_k = J W R S_k (paper, eq. 1).
 
@@ -59,7 +69,11 @@ def projected_axes(
     return (jacobian @ rotation @ axes).transpose(1, 2)
 
 
-def sample_footprint(means2d: Tensor, conics: Tensor, jitter: Tensor) -> Tensor:
+def sample_footprint(
+    means2d: Tensor,  # [M, 2] px
+    conics: Tensor,  # [M, 3] (a, b, c) of the inverse of Σ2D + SCREEN_BLUR·I, in 1/px²
+    jitter: Tensor,  # [M, 2] in [0, 1)
+) -> Tensor:
     """Draw one point in each Gaussian's footprint, uniformly if the jitter [M, 2] is uniform in [0, 1).
 
     `means2d` [M, 2] and `conics` [M, 3] are those of `render.types.Projected`. The footprint is the 2σ ellipse of Σ2D:
@@ -88,7 +102,11 @@ def sample_footprint(means2d: Tensor, conics: Tensor, jitter: Tensor) -> Tensor:
     return means2d + torch.stack([factor_xx * u, factor_xy * u + factor_yy * v], -1).to(means2d.dtype)
 
 
-def sample_map(structure_tensors: Tensor, camera_ids: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+def sample_map(
+    structure_tensors: Tensor,  # [C, H, W, 3]
+    camera_ids: Tensor,  # int64 [M]
+    points: Tensor,  # [M, 2]
+) -> tuple[Tensor, Tensor]:
     """Read S̄ of images, of any floating dtype or quantized [C, H, W, 3], at the pixel under each point.
 
     `camera_ids` are the points' images, int64 [M]. Points are in px, pixel centres at half-integers [M, 2].
@@ -109,7 +127,10 @@ def sample_map(structure_tensors: Tensor, camera_ids: Tensor, points: Tensor) ->
     return torch.where(known[:, None], values, 0.0), known
 
 
-def eta(axes: Tensor, structure_tensor: Tensor) -> Tensor:
+def eta(
+    axes: Tensor,  # [M, 3, 2]
+    structure_tensor: Tensor,  # [M, 3]
+) -> Tensor:
     """Frequency violation of each axis: η_k = ‖v_k‖ / Λ_min (paper, eq. 6). [M, 3]
 
     It is above 1 where an axis is longer than the local wavelength. The arguments are what `projected_axes` and

@@ -73,7 +73,11 @@ def _far_outliers(positions: Tensor, share: float) -> Tensor:
 
 
 def starting_points(
-    points: Tensor, colors: Tensor, *, faces: bool, opacity: float = POINT_OPACITY
+    points: Tensor,  # [P, 3]
+    colors: Tensor,  # [P, 3]
+    *,
+    faces: bool,
+    opacity: float = POINT_OPACITY,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The points that training starts from, with the scale and opacity of each; raises ValueError if there is no point.
 

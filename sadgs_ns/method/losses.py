@@ -24,9 +24,13 @@ def _window(device: torch.device, dtype: torch.dtype) -> Tensor:
 
 
 def photometric_loss(
-    predicted: Tensor, target: Tensor, *, ssim_lambda: float = 0.2, l2_lambda: float = L2_LAMBDA,
-    parts: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
+    predicted: Tensor,  # [C, H, W, 3]
+    target: Tensor,  # [C, H, W, 3]
+    *,
+    ssim_lambda: float = 0.2,
+    l2_lambda: float = L2_LAMBDA,
+    parts: Tensor | None = None,  # [P]
+) -> tuple[Tensor, Tensor]:
     """(1 − λ) L1 + λ (1 − SSIM) + λ_2 ℓ2, each a mean over views, pixels and channels.
 
     The paper gives no weights; these defaults are the released code's.
@@ -69,7 +73,13 @@ def photometric_loss(
 
 
 def photometric_part(
-    predicted: Tensor, target: Tensor, *, rows: tuple[int, int], top: int, height: int, ssim_lambda: float = 0.2
+    predicted: Tensor,  # [1, H', W, 3]
+    target: Tensor,  # [1, H', W, 3]
+    *,
+    rows: tuple[int, int],
+    top: int,
+    height: int,
+    ssim_lambda: float = 0.2,
 ) -> tuple[Tensor, Tensor]:
     """What some rows of a view add to its `photometric_loss`: over rows that cover the view, these parts sum to it.
 

@@ -27,7 +27,12 @@ _PAIRS = 2**24
 """Pairs of a pose and a point that are computed at a time, in arrays of 64 MB."""
 
 
-def nearest_depths(points: Tensor, viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> Tensor:
+def nearest_depths(
+    points: Tensor,  # [P, 3]
+    viewmats: Tensor,  # [C, 4, 4]
+    Ks: Tensor,  # [C, 3, 3]
+    sizes: Tensor,  # [C, 2]
+) -> Tensor:
     """Measure the depth of the `NEAREST_POINTS`-th SfM point before each view; a few nearer ones may be wrong.
 
     It is along the viewing axis, in world units, > 0, and infinite in views that see fewer points. The arguments are
@@ -46,7 +51,10 @@ def nearest_depths(points: Tensor, viewmats: Tensor, Ks: Tensor, sizes: Tensor) 
     return torch.cat(nearest)
 
 
-def scene_near_plane(depths: Tensor, extent: float) -> float:
+def scene_near_plane(
+    depths: Tensor,  # [C]
+    extent: float,
+) -> float:
     """Derive the near plane of a scene, > 0, from the `nearest_depths` of its training cameras.
 
     It follows the camera that comes nearest to anything: an object close to a single camera is drawn, too. `extent` is

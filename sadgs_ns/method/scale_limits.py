@@ -16,13 +16,22 @@ _LEAST_LIMIT = 1e-7
 """World units. A Gaussian around a camera's very centre keeps this size, so that its logarithm is finite."""
 
 
-def clear_of_cameras(means: Tensor, radii: Tensor, positions: Tensor) -> Tensor:
+def clear_of_cameras(
+    means: Tensor,  # [N, 3]
+    radii: Tensor,  # [N]
+    positions: Tensor,  # [C, 3]
+) -> Tensor:
     """Which points [N, 3] have no camera [C, 3] nearer than their radius [N], all in world units. bool [N]"""
     return _distances(means, positions) >= radii
 
 
 @torch.no_grad()
-def limit_scales(scales: Tensor, means: Tensor, positions: Tensor, angular_scale: float) -> None:
+def limit_scales(
+    scales: Tensor,  # [N, 3]
+    means: Tensor,  # [N, 3]
+    positions: Tensor,  # [C, 3]
+    angular_scale: float,
+) -> None:
     """Shorten, in place, the axes that are too long for the distance from the nearest camera.
 
     The host does not wait for the device.

@@ -18,7 +18,9 @@ def empty_gradients(num_gaussians: int, device: torch.device) -> dict[str, Tenso
     return {"grad2d": zeros, "absgrad2d": zeros.clone(), "grad_count": zeros.clone()}
 
 
-def keep_gradient(means2d: Tensor) -> None:
+def keep_gradient(
+    means2d: Tensor,  # [C, N, 2]
+) -> None:
     """Have the backward pass keep the gradient of projected centres, from a call with `absgrad`.
 
     Our compositing keeps it by itself, without the copy that torch makes.

@@ -35,7 +35,10 @@ def num_children(counts: Tensor) -> Tensor:
     return n_x * n_y * n_z
 
 
-def grid_offsets(counts: Tensor, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:
+def grid_offsets(
+    counts: Tensor,  # int64 [P, 3]
+    dtype: torch.dtype = torch.float32,
+) -> tuple[Tensor, Tensor]:
     """Place the cell centres of regular grids of n_x × n_y × n_z cells, int64 [P, 3], centred on their parents.
 
     Returns:

@@ -70,7 +70,7 @@ def observe(
     info: Mapping[str, Any],
     *,
     generator: torch.Generator | None = None,
-    jitter: Tensor | None = None,
+    jitter: Tensor | None = None,  # [C, N, 2]
 ) -> None:
     """Add one forward pass to `STATISTICS`, in place: one jittered sample per visible Gaussian and view.
 
@@ -87,7 +87,11 @@ def observe(
         statistic.update(statistics[name], of_views)
 
 
-def observed_eta(params: Params, info: Mapping[str, Any], jitter: Tensor) -> Tensor:
+def observed_eta(
+    params: Params,
+    info: Mapping[str, Any],
+    jitter: Tensor,  # [C, N, 2] in [0, 1)
+) -> Tensor:
     """Return η of the axes in each view, NaN where there is no observation. [C, N, 3]
 
     A Gaussian is observed in a view when the rasterizer drew it there, its sample lies in the image and not on a masked
@@ -133,7 +137,12 @@ def observed_eta(params: Params, info: Mapping[str, Any], jitter: Tensor) -> Ten
     return torch.stack(views)
 
 
-def consistent(counts: Tensor, n_total: Tensor, threshold: float, min_observations: int = 1) -> Tensor:
+def consistent(
+    counts: Tensor,  # [N, 3]
+    n_total: Tensor,  # [N]
+    threshold: float,
+    min_observations: int = 1,
+) -> Tensor:
     """Whether a response was seen in more than a fraction of the observations: N / N_total > τ (paper, section 3.4).
 
     `counts` are `n_high` or `n_low`, and the threshold τ_split or τ_prune. Fewer than `min_observations` say nothing:

@@ -141,7 +141,13 @@ def depth_maps(
 
 
 @torch.no_grad()
-def choose_neighbours(viewmats: Tensor, Ks: Tensor, sizes: Tensor, points: Tensor, count: int = NEIGHBOURS) -> Tensor:
+def choose_neighbours(
+    viewmats: Tensor,  # [V, 4, 4]
+    Ks: Tensor,  # [V, 3, 3]
+    sizes: Tensor,  # [V, 2]
+    points: Tensor,  # [P, 3]
+    count: int = NEIGHBOURS,
+) -> Tensor:
     """Choose the views with which each view is compared, given the arguments of `depths_in_views`.
 
     Two views gain from every point that both see: less if the angle between their rays is too small or too wide, and

@@ -8,7 +8,11 @@ from torch import Tensor
 from sadgs_ns.kernels import use_triton
 
 
-def activate(log_scales: Tensor, logits: Tensor, penalty: float = 0.0) -> tuple[Tensor, Tensor, Tensor | None]:
+def activate(
+    log_scales: Tensor,  # [N, 3]
+    logits: Tensor,  # [N, 1]
+    penalty: float = 0.0,
+) -> tuple[Tensor, Tensor, Tensor | None]:
     """Compute the `scales` [N, 3] and `opacities` [N] of `Gaussians` from their logarithms [N, 3] and logits [N, 1].
 
     Also return numbers [P] whose sum is the mean opacity times `penalty` ≥ 0, or None where `penalty` is 0.

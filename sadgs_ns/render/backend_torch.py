@@ -163,7 +163,13 @@ def _radii(means2d: Tensor, covars2d: Tensor, opacities: Tensor, valid: Tensor, 
 
 
 @torch.no_grad()
-def _bin_into_tiles(means2d: Tensor, depths: Tensor, extents: Tensor, width: int, height: int) -> _Tiles:
+def _bin_into_tiles(
+    means2d: Tensor,  # [C, N, 2]
+    depths: Tensor,  # [C, N]
+    extents: Tensor,  # [C, N, 2]
+    width: int,
+    height: int,
+) -> _Tiles:
     """Make the tiles' lists, as gsplat's `isect_tiles` and `isect_offset_encode` do. `extents` are radii [C, N, 2]."""
     C, N = depths.shape
     device, tile_size = means2d.device, TILE_SIZE
@@ -203,9 +209,14 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, tiles: _Tiles, absgrad: bool
+        ctx: Any,
+        means2d: Tensor,  # [C, N, 2]
+        conics: Tensor,  # [C, N, 3]
+        colors: Tensor,  # [C, N, D]
+        opacities: Tensor,  # [C, N]
+        tiles: _Tiles,
+        absgrad: bool,
     ) -> Tensor:
-        # Alpha is the image of Gaussians of colour one.
         values = torch.cat([colors, torch.ones_like(colors[..., :1])], dim=-1).flatten(0, 1)  # [C * N, D + 1]
         canvas = values.new_zeros(len(tiles.counts), tiles.size**2, values.shape[-1])
         # The transmittance at the start of each segment is kept for each chunk, since the backward pass starts from the
@@ -264,9 +275,15 @@ def _chunks(tiles: _Tiles) -> Iterator[tuple[Tensor, int]]:
 
 
 def _segment(
-    means2d: Tensor, conics: Tensor, opacities: Tensor, tiles: _Tiles, chunk: Tensor, begin: int, length: int,
-    start: Tensor,
-) -> _Segment:  # fmt: skip
+    means2d: Tensor,  # [C, N, 2]
+    conics: Tensor,  # [C, N, 3]
+    opacities: Tensor,  # [C, N]
+    tiles: _Tiles,
+    chunk: Tensor,  # [B]
+    begin: int,
+    length: int,
+    start: Tensor,  # [B, S, S] transmittance before the segment
+) -> _Segment:
     """Composite the entries from `begin` of the lists of a chunk of tiles [B], before which `start` is left [B, S, S].
 
     `length` is that of the longest list.
@@ -295,7 +312,11 @@ def _segment(
 
 
 def _segment_gradients(
-    segment: _Segment, colors: Tensor, v_colors: Tensor, behind: Tensor, absgrad: bool
+    segment: _Segment,
+    colors: Tensor,  # [B, L, D]
+    v_colors: Tensor,  # [B, S * S, D]
+    behind: Tensor,  # [B, S * S, 1] what is behind the segment, dotted with v_colors
+    absgrad: bool,
 ) -> tuple[Tensor, Tensor]:
     """Gradients [B * L, 6 + D (+ 2)] of means2d, conics, opacity, colours (and absgrad), and the new `behind`.
 

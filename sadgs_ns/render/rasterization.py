@@ -101,7 +101,9 @@ def visible(info: Mapping[str, Any]) -> Tensor:
     return gsplat_compat.drawn(info["radii"], info["means2d"])
 
 
-def viewmats_from_camera_to_world(camera_to_worlds: Tensor) -> Tensor:
+def viewmats_from_camera_to_world(
+    camera_to_worlds: Tensor,  # [C, 3, 4]
+) -> Tensor:
     """Make `Cameras.viewmats` [C, 4, 4] from nerfstudio's poses [C, 3, 4].
 
     Those are orthonormal, from camera to world, in OpenGL's axes (x right, y up, z backward).
