@@ -12,7 +12,7 @@ import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -42,19 +42,16 @@ class Results(NamedTuple):
     """Gradient of the loss by the centres. [N, 3]"""
 
 
-class Graph(Protocol):
-    """Captured launches; `replay` launches them all, and returns what they write."""
-
-    def replay(self) -> Results: ...
-
-
 @dataclass(frozen=True)
-class _CudaGraph:
-    graph: torch.cuda.CUDAGraph
+class Graph:
+    """Captured launches, and where they write."""
+
+    launches: torch.cuda.CUDAGraph
     results: Any
 
     def replay(self) -> Results:
-        self.graph.replay()
+        """Launch them all, and return what they write."""
+        self.launches.replay()
         return self.results
 
 
@@ -90,7 +87,7 @@ class CudaGraphs:
             except RuntimeError:
                 self._repair_generator()
                 raise
-        return _CudaGraph(graph, results)
+        return Graph(graph, results)
 
     def wait(self) -> None:
         """Wait until no graph is running, before which none may be dropped."""

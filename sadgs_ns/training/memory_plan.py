@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
-from torch import Tensor
 
 from sadgs_ns.distributed.bands import views_of_rank
 from sadgs_ns.errors import InputError
@@ -134,32 +133,20 @@ def estimate_pairs(params: Params, cameras: Cameras, near_plane: float = NEAR_PL
     scales = params["scales"].exp().amax(dim=-1)  # [N]
     level = 2 * (255 * torch.sigmoid(params["opacities"].flatten())).clamp_min(1).log()
     reach = level.sqrt().clamp_max(_REACH)  # [N] standard deviations at which a Gaussian is 1/255 opaque
-    return max(
-        _count_pairs(means, scales, reach, viewmat, K, size.to(means), near_plane)
-        for viewmat, K, size in zip(viewmats, Ks, sizes, strict=True)
-    )
-
-
-def _count_pairs(
-    means: Tensor,  # [N, 3]
-    scales: Tensor,  # [N]
-    reach: Tensor,  # [N]
-    viewmat: Tensor,  # [4, 4]
-    K: Tensor,  # [3, 3]
-    size: Tensor,  # [2] width and height in px
-    near_plane: float,
-) -> int:
-    points = means @ viewmat[:3, :3].T + viewmat[:3, 3]  # [N, 3]
-    depths = points[:, 2:]  # [N, 1]
-    focals, center = K.diagonal()[:2], K[:2, 2]  # [2], [2]
-    means2d = focals * points[:, :2] / depths + center  # [N, 2]
-    radii = reach[:, None] * ((focals * scales[:, None] / depths).square() + SCREEN_BLUR).sqrt()  # [N, 2]
-    tiles = (size / TILE_SIZE).ceil()
-    first = ((means2d - radii) / TILE_SIZE).floor().clamp_min(0).minimum(tiles)
-    last = ((means2d + radii) / TILE_SIZE).ceil().clamp_min(0).minimum(tiles)
-    counts = (last - first).prod(dim=-1)  # [N]
-    drawn = (depths[:, 0] >= near_plane) & (reach > 0) & counts.isfinite()
-    return int(torch.where(drawn, counts, 0.0).double().sum())
+    most = 0
+    for viewmat, K, size in zip(viewmats, Ks, sizes.to(means), strict=True):
+        points = means @ viewmat[:3, :3].T + viewmat[:3, 3]  # [N, 3]
+        depths = points[:, 2:]  # [N, 1]
+        focals, center = K.diagonal()[:2], K[:2, 2]  # [2], [2]
+        means2d = focals * points[:, :2] / depths + center  # [N, 2]
+        radii = reach[:, None] * ((focals * scales[:, None] / depths).square() + SCREEN_BLUR).sqrt()  # [N, 2]
+        tiles = (size / TILE_SIZE).ceil()
+        first = ((means2d - radii) / TILE_SIZE).floor().clamp_min(0).minimum(tiles)
+        last = ((means2d + radii) / TILE_SIZE).ceil().clamp_min(0).minimum(tiles)
+        counts = (last - first).prod(dim=-1)  # [N]
+        drawn = (depths[:, 0] >= near_plane) & (reach > 0) & counts.isfinite()
+        most = max(most, int(torch.where(drawn, counts, 0.0).double().sum()))
+    return most
 
 
 def fit_to_memory(

@@ -78,23 +78,25 @@ class SadgsModel(MeasuredModel):
         self.viewer_outputs: Callable[[Cameras, dict[str, Tensor]], dict[str, Tensor]] | None = None
         self.world = World()
         if config.color_model == "affine":
-            self.learn_color_matrices()
+            self.color_matrices = torch.nn.Parameter(identities(self.num_train_data))
+            # An index made in a step would have to be copied to the device there.
+            self.register_buffer("every_view_id", torch.arange(self.num_train_data), persistent=False)  # [V]
 
-    def set_cameras(self, positions: Tensor) -> None:
-        """Set the extent of the cameras' centres [C, 3], and drop initial Gaussians that contain one."""
-        self.strategy_state["scene_scale"] = camera_extent(positions)
+    def set_cameras(self, cameras: Cameras) -> None:
+        """Fit extent, initial Gaussians and near plane to the training cameras; call before optimizers are made."""
+        positions = cameras.camera_to_worlds[:, :3, 3].cpu()
+        self.strategy_state["scene_scale"] = extent = camera_extent(positions)
         self.camera_positions = positions.to(self.means)
         keep = outside_cameras(dict(self.gauss_params.items()), self.camera_positions)  # [N]
         for parameter in self.gauss_params.values():
             parameter.data = parameter.data[keep]
         self.synthetic = self.synthetic[keep.cpu()]
-
-    def set_near_plane(self, viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> None:
-        """Derive the near plane from the SfM points in the training cameras of these sizes in px [C, 2]."""
-        points = self.means.new_zeros((0, 3)) if self.seed_points is None else self.seed_points[0].to(self.means)
-        depths = nearest_depths(points, viewmats, Ks, sizes)
         if self.config.near_plane is None:
-            self.near_plane = scene_near_plane(depths, float(self.strategy_state["scene_scale"]))
+            points = self.means.new_zeros((0, 3)) if self.seed_points is None else self.seed_points[0].to(self.means)
+            viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
+            sizes = torch.cat([cameras.width, cameras.height], dim=-1)
+            depths = nearest_depths(points, viewmats, cameras.get_intrinsics_matrices(), sizes)
+            self.near_plane = scene_near_plane(depths, extent)
 
     def add_points(self, means: Tensor, colors: Tensor, scales: Tensor) -> int:
         """Start from more points, as far as the cap has room; call before optimizers are made. Return how many.
@@ -121,14 +123,6 @@ class SadgsModel(MeasuredModel):
         if len(viewmats) <= MOST_VIEWS if asked is None else asked:
             surfaces = self.means.detach()[~self.synthetic.to(self.device)]
             self.strategy_state["camera_paths"] = CameraPaths.of(viewmats, self.near_plane, surfaces)
-
-    def learn_color_matrices(self) -> None:
-        """Learn a colour matrix for each training view; call before optimizers are made."""
-        matrices = identities(self.num_train_data).to(self.means.device)
-        self.color_matrices = torch.nn.Parameter(matrices)
-        # An index made in a step would have to be copied to the device there.
-        ids = torch.arange(len(matrices), device=matrices.device)  # [V]
-        self.register_buffer("every_view_id", ids, persistent=False)
 
     def shard(self, world: World) -> None:
         """Keep this process's part of the Gaussians only, or raise InputError if the backend needs all."""
@@ -190,12 +184,6 @@ class SadgsModel(MeasuredModel):
         return {name: value[inside] for name, value in values.items()}
 
     @property
-    def sh_degree_now(self) -> int | None:
-        """Degree of the harmonics drawn at this step; None if colours do not depend on the direction."""
-        # Each iteration adds a degree; 3DGS's 1,000 iterations for each would be too many in so short a run.
-        return min(self.step, self.config.sh_degree) if self.config.sh_degree > 0 else None
-
-    @property
     def backend(self) -> str:
         """Name of the backend that draws; raises InputError if the option's cannot."""
         return choose_backend(self.config.backend, self.device)
@@ -208,7 +196,9 @@ class SadgsModel(MeasuredModel):
 
     def color_options(self, **changes: Any) -> RenderOptions:
         """Return the options to draw colours at this step, with other values of some fields."""
-        return replace(self.drawing, sh_degree=self.sh_degree_now, **changes)
+        # Each iteration adds a degree; 3DGS's 1,000 iterations for each would be too many in so short a run.
+        degree = min(self.step, self.config.sh_degree) if self.config.sh_degree > 0 else None
+        return replace(self.drawing, sh_degree=degree, **changes)
 
     def render(self, cameras: Pinholes, options: RenderOptions) -> tuple[Tensor, Tensor, dict[str, Any]]:
         """Rasterize the Gaussians, in the viewer those inside its crop box, in their colours.
@@ -330,12 +320,6 @@ class SadgsModel(MeasuredModel):
             alpha = image[..., 3:]
             return alpha * image[..., :3] + (1 - alpha) * background
         return image
-
-    def training_metrics(self, psnr: Tensor) -> dict[str, Any]:
-        """Return what is logged of a step with this PSNR in dB, a scalar."""
-        metrics: dict[str, Any] = {"psnr": psnr, "gaussian_count": self.num_gaussians}
-        self.camera_optimizer.get_metrics_dict(metrics)
-        return metrics
 
     def get_loss_dict(
         self, outputs: Mapping[str, Any], batch: Mapping[str, Any], metrics_dict: Mapping[str, Any] | None = None

@@ -69,13 +69,7 @@ class SadgsPipeline(VanillaPipeline):
             )
         if config.model.backend == "auto" and backend == "gsplat":
             warn("Triton's kernels are not used: training takes about twice as long without them.")
-        cameras = self.datamanager.train_dataset.cameras
-        self.model.set_cameras(camera_positions(cameras))
-        self.model.set_near_plane(
-            viewmats_from_camera_to_world(cameras.camera_to_worlds),
-            cameras.get_intrinsics_matrices(),
-            torch.cat([cameras.width, cameras.height], dim=-1),
-        )
+        self.model.set_cameras(self.datamanager.train_dataset.cameras)
         self.views = TrainingViews(self.datamanager, self.model)
         self.structure_cache = StructureCache(
             self.views, config.frequency_constant, energy_blur=config.energy_blur, epsilon=config.epsilon

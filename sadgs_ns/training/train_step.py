@@ -136,7 +136,8 @@ def training_step(
     losses += pose_penalties.values()
     loss = reduce(torch.add, losses)
     loss.backward()
-    gradients = {name: _gradient(leaves.get(name, parameter)) for name, parameter in update.parameters.items()}
+    learned = {name: leaves.get(name, parameter) for name, parameter in update.parameters.items()}
+    gradients = {name: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for name, leaf in learned.items()}
     overflowed = tuple(info["overflowed"] for info in infos if "overflowed" in info)
     update.launch(gradients, factors, nonfinite_flag, overflowed)
     strategy.accumulate(state, step, infos)
@@ -147,11 +148,6 @@ def training_step(
         loss, error = world.sum(torch.stack([loss, sum(qualities, torch.zeros_like(loss))]))
         psnr = -10 * error.log10()
     return StepResult(loss, psnr, gradients["means"], infos)
-
-
-def _gradient(leaf: Tensor) -> Tensor:
-    """Return the gradient that a leaf got, zeros where it got none."""
-    return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
 
 
 def stack(tensors: Sequence[Tensor]) -> Tensor:

@@ -140,13 +140,6 @@ class SadgsTrainer(Trainer):
         self._resumed.load_optimizers(self.optimizers, self.grad_scaler, self.config.load_scheduler)
         self._resumed = None
 
-    def _turn_viewer_off(self) -> None:
-        """Keep nerfstudio from starting a viewer, and say so if one was asked for."""
-        if self.config.is_viewer_enabled() or self.config.is_viewer_legacy_enabled():
-            note("The viewer is off, since no device holds all Gaussians; `ns-viewer` shows the finished run.")
-            others = self._vis.removeprefix("viewer_legacy").removeprefix("viewer").removeprefix("+")
-            self.config.vis = others or "none"  # type: ignore[assignment]
-
     def setup_optimizers(self) -> SadgsOptimizers:
         """Load the Gaussians of a checkpoint, if there is one, plan the run, and build its optimizers."""
         config, pipeline = self.config, self.pipeline
@@ -163,7 +156,10 @@ class SadgsTrainer(Trainer):
             processes.continue_on_rank_zero(self.world, peers)
             self.world, self._peers = World(), None
         if not self.world.alone:
-            self._turn_viewer_off()
+            if config.is_viewer_enabled() or config.is_viewer_legacy_enabled():
+                note("The viewer is off, since no device holds all Gaussians; `ns-viewer` shows the finished run.")
+                others = self._vis.removeprefix("viewer_legacy").removeprefix("viewer").removeprefix("+")
+                config.vis = others or "none"  # type: ignore[assignment]
             pipeline.shard(self.world)
         if resumed is not None:
             resumed.load_gaussians(pipeline, self.world)
@@ -299,7 +295,9 @@ class SadgsTrainer(Trainer):
             result = training_step(model, *inputs, factors.to(update.device, non_blocking=True), slot)
         pipeline.finish_step(step, groups, result)
         self.optimizers.scheduler_step_all(step)
-        return result.loss, {"main_loss": result.loss}, model.training_metrics(result.psnr)
+        metrics: dict[str, Any] = {"psnr": result.psnr, "gaussian_count": model.num_gaussians}
+        model.camera_optimizer.get_metrics_dict(metrics)
+        return result.loss, {"main_loss": result.loss}, metrics
 
     def _update_viewer_state(self, step: int) -> None:
         """Stop or save if that is due; nerfstudio calls this after every step, when densification is done."""
