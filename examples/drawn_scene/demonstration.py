@@ -28,7 +28,7 @@ from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.structure_cache import observe_training_views
 from sadgs_ns.training.trainer import SadgsTrainer
-from sadgs_ns.viewer import color_scales, gaussian_maps, texture
+from sadgs_ns.viewer import color_scales, maps
 from sadgs_ns.viewer.color_scales import ETA, PERIOD, Panel, to_picture
 
 ABSGS_THRESHOLD_FACTOR = 16.0
@@ -115,7 +115,7 @@ def draw_wavelength_and_eta(path: Path, scene: SceneDescription, runs: dict[str,
     pipeline = runs["sadgs"].pipeline
     view = get_view(pipeline, 0)
     truth = expected_wavelength_map(scene.surfaces, next(v for v in scene.views if v.name == view.name))
-    estimate = texture.texture_period(view.structure_tensor, pipeline.config.frequency_constant)
+    estimate = maps.texture_period(view.structure_tensor, pipeline.config.frequency_constant)
     panels = [
         Panel(f"training view {view.name}", to_picture(view.photo)),
         Panel("wavelength, estimated", PERIOD(estimate), PERIOD),
@@ -124,7 +124,7 @@ def draw_wavelength_and_eta(path: Path, scene: SceneDescription, runs: dict[str,
     for label, run in runs.items():
         params = dict(run.pipeline.model.gauss_params.items())
         statistics = observe_training_views(run.pipeline.structure_cache)
-        panels.append(Panel(f"η, {label}", ETA(gaussian_maps.eta_map(params, statistics, *view.camera)), ETA))
+        panels.append(Panel(f"η, {label}", ETA(maps.eta_map(params, statistics, *view.camera)), ETA))
     color_scales.draw(path, panels, columns=3)
 
 

@@ -27,7 +27,7 @@ from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.model import SadgsModel
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.structure_cache import observe_training_views
-from sadgs_ns.viewer import color_scales, gaussian_maps, texture
+from sadgs_ns.viewer import color_scales, maps
 from sadgs_ns.viewer.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
 
 Split = Literal["train", "eval"]
@@ -55,7 +55,7 @@ class View:
 
     @property
     def camera(self) -> tuple[Tensor, Tensor, int, int]:
-        """Viewmat, K, width and height, as `gaussian_maps.blend` takes them."""
+        """Viewmat, K, width and height, as `maps.blend` takes them."""
         height, width = self.photo.shape[:2]
         return self.viewmat, self.K, width, height
 
@@ -182,10 +182,10 @@ def view_panels(pipeline: SadgsPipeline, view: View, statistics: dict[str, Tenso
     size = round(enlarge * view.photo.shape[0]), round(enlarge * view.photo.shape[1])
     split, added = int((counts > 1).any(dim=1).sum()), int((num_children(counts) - 1).sum())
     of_all = f"of {model.num_points:,} Gaussians"
-    period = texture.texture_period(view.structure_tensor, constant)
-    eta = gaussian_maps.eta_map(params, statistics, *view.camera, options)
-    children = gaussian_maps.children_map(params, counts, *view.camera, options)
-    low = gaussian_maps.share_map(params, is_low, *view.camera, options)
+    period = maps.texture_period(view.structure_tensor, constant)
+    eta = maps.eta_map(params, statistics, *view.camera, options)
+    children = maps.children_map(params, counts, *view.camera, options)
+    low = maps.share_map(params, is_low, *view.camera, options)
     panels = {
         name: Panel(f"{view.name}: {title}", scale(values), scale)
         for name, title, scale, values in (
@@ -195,7 +195,7 @@ def view_panels(pipeline: SadgsPipeline, view: View, statistics: dict[str, Tenso
             ("low", f"{int(is_low.sum()):,} {of_all} are consistently low (η < 0.1)", LOW, low),
         )
     }
-    ellipses = texture.draw_ellipses(to_picture(view.photo), view.structure_tensor, constant, size)
+    ellipses = maps.draw_ellipses(to_picture(view.photo), view.structure_tensor, constant, size)
     title = f"{view.name}: the structure tensor, its inverse as ellipses"
     return {"ellipses": Panel(title, ellipses, PERIOD)} | panels
 
@@ -205,20 +205,20 @@ def step_panels(
 ) -> list[Panel]:
     """Return the photo, and the Gaussians in random colours before and after a step of each kind (paper, figure 3)."""
     generator = torch.Generator().manual_seed(SEED)
-    colors = gaussian_maps.random_colors(model.num_points, generator).to(model.device)
+    colors = maps.random_colors(model.num_points, generator).to(model.device)
     viewmat, K, width, height = view.camera
     enlarge = max(math.ceil(MIN_RENDER_SIDE / max(height, width)), 1)
     camera = (viewmat, K * K.new_tensor([[enlarge], [enlarge], [1.0]]), enlarge * width, enlarge * height)
 
     def panel(title: str, params: Any, its_colors: Tensor) -> Panel:
-        render, _ = gaussian_maps.blend(params, its_colors, *camera, model.drawing)
+        render, _ = maps.blend(params, its_colors, *camera, model.drawing)
         return Panel(f"{title}: {len(params['means']):,} Gaussians", to_picture(render))
 
     return [
         Panel(f"photo {view.name}", to_picture(view.photo).repeat(enlarge, axis=0).repeat(enlarge, axis=1)),
         panel("before", model.gauss_params, colors),
         *(
-            panel(title, step, gaussian_maps.recolor(colors, step["origins"], generator))
+            panel(title, step, maps.recolor(colors, step["origins"], generator))
             for title, step in (("one conventional step", conventional), ("one structure-aware step", structure))
         ),
     ]

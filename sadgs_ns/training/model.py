@@ -34,7 +34,7 @@ from sadgs_ns.training.config import SadgsModelConfig
 from sadgs_ns.training.initial_gaussians import beside, initial_gaussians, outside_cameras
 from sadgs_ns.training.metrics import MeasuredModel
 from sadgs_ns.training.run_plan import RunPlan
-from sadgs_ns.viewer import gaussian_maps
+from sadgs_ns.viewer import maps
 from sadgs_ns.viewer.elements import LazyOutputs, in_viewer, warn_once
 
 NORMALS = "normals"
@@ -269,7 +269,7 @@ class SadgsModel(MeasuredModel):
     def get_normals(self, camera: Cameras, params: Mapping[str, Tensor] | None = None) -> Tensor:
         """Render the normals of one camera, shape [1], which takes about as long as its colours. [H, W, 3]
 
-        They are 0.5 + 0.5 n with n of `gaussian_maps.normals_map`, in the world's axes, and black where nothing is.
+        They are 0.5 + 0.5 n with n of `maps.normals_map`, in the world's axes, and black where nothing is.
         `params` default to the model's own inside the viewer's crop box.
         """
         params = self.cropped(dict(self.gauss_params.items())) if params is None else params
@@ -278,7 +278,7 @@ class SadgsModel(MeasuredModel):
             return torch.zeros((height, width, 3), device=self.device)
         viewmat = viewmats_from_camera_to_world(camera.camera_to_worlds)[0].to(self.device)
         K = camera.get_intrinsics_matrices()[0].to(self.device)
-        normals = gaussian_maps.normals_map(params, viewmat, K, width, height, self.drawing)
+        normals = maps.normals_map(params, viewmat, K, width, height, self.drawing)
         return torch.where((normals != 0).any(dim=-1, keepdim=True), 0.5 + 0.5 * normals, 0.0)
 
     def get_outputs_for_camera(  # type: ignore[override]

@@ -33,7 +33,7 @@ from sadgs_ns.training.model import SadgsModel
 from sadgs_ns.training.progress import warn
 from sadgs_ns.training.run_plan import RunPlan
 from sadgs_ns.training.structure_cache import StructureCache, observe_training_views
-from sadgs_ns.viewer import color_scales, gaussian_maps, texture
+from sadgs_ns.viewer import color_scales, maps
 from sadgs_ns.viewer.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
 from sadgs_ns.viewer.elements import ViewerMarkdown, in_viewer, show_output
 
@@ -269,10 +269,10 @@ class StructurePanel(torch.nn.Module):
         scale = min(height / photo.shape[0], width / photo.shape[1])
         size = max(round(scale * photo.shape[0]), 1), max(round(scale * photo.shape[1]), 1)
         if choice in (ELLIPSES_HERE, ELLIPSES_NEAR):
-            drawn = texture.draw_ellipses(photo, tensor, constant, size)
+            drawn = maps.draw_ellipses(photo, tensor, constant, size)
             what = "S̄⁻¹ as ellipses, coloured by period,"
         else:
-            drawn = cv2.resize(PERIOD(texture.texture_period(tensor, constant)), size[::-1])
+            drawn = cv2.resize(PERIOD(maps.texture_period(tensor, constant)), size[::-1])
             what = "Period of the texture, px,"
         top, left = (height - size[0]) // 2, (width - size[1]) // 2
         whole = np.zeros((height, width, 3), np.uint8)
@@ -294,13 +294,13 @@ class StructurePanel(torch.nn.Module):
         view = viewmat, camera.get_intrinsics_matrices()[0].to(model.device), width, height
         seen = f"{int((statistics['n_total'] > 0).sum()):,} of {model.num_points:,} Gaussians observed"
         if choice == ETA_OF:
-            drawn, scale = gaussian_maps.eta_map(rows, rows, *view, model.drawing), ETA
+            drawn, scale = maps.eta_map(rows, rows, *view, model.drawing), ETA
             text = f"largest η: over 1 violates, under 0.1 is low ({seen})"
         elif choice == CHILDREN_OF:
-            drawn, scale = gaussian_maps.children_map(rows, rows["children"], *view, model.drawing), CHILDREN
+            drawn, scale = maps.children_map(rows, rows["children"], *view, model.drawing), CHILDREN
             split = int((kept["children"] > 1).any(dim=1).sum())
             text = f"children at a structure step now: {split:,} Gaussians would split ({seen})"
         else:
-            drawn, scale = gaussian_maps.share_map(rows, rows["low"], *view, model.drawing), LOW
+            drawn, scale = maps.share_map(rows, rows["low"], *view, model.drawing), LOW
             text = f"share of consistently low Gaussians, {int(kept['low'].sum()):,} in all ({seen})"
         return Panel(text, scale(drawn), scale)

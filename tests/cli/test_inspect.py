@@ -35,7 +35,7 @@ from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.render.types import Gaussians
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.structure_cache import observe_training_views
-from sadgs_ns.viewer import color_scales, gaussian_maps, texture
+from sadgs_ns.viewer import color_scales, maps
 from sadgs_ns.viewer.elements import warn_once
 from sadgs_ns.viewer.structure_panel import CHOICES, OFF, OUTPUT, StructurePanel, changed, describe, nearest_view
 
@@ -344,7 +344,7 @@ def test_the_pictures_survive_tiny_windows_and_crop_boxes(panel: StructurePanel,
         rendered.append(len(gaussians.means))
         return rasterization.rasterize(gaussians, *args)
 
-    monkeypatch.setattr(gaussian_maps, "rasterize", rasterize)
+    monkeypatch.setattr(maps, "rasterize", rasterize)
     pipeline = pipeline_of(panel)
     camera = a_camera(pipeline)
     camera.rescale_output_resolution(0.2)
@@ -493,4 +493,4 @@ def test_what_the_panel_draws_of_a_training_view_is_what_the_command_draws(panel
     expected = inspection.view_panels(pipeline, view, statistics)["eta"].picture
     assert (np.abs(drawn.astype(int) - expected) <= 2).mean() > 0.99
     near = panel.picture("wavelength of the nearest photo", a_camera(pipeline, 2), rgb).picture
-    assert np.array_equal(near, color_scales.PERIOD(texture.texture_period(view.structure_tensor)))
+    assert np.array_equal(near, color_scales.PERIOD(maps.texture_period(view.structure_tensor)))

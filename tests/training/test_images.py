@@ -27,7 +27,7 @@ from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.training import structure_cache
 from sadgs_ns.training.config import SadgsDatamanagerConfig
 from sadgs_ns.training.datamanager import SadgsDatamanager
-from sadgs_ns.training.prefetch import ImagePrefetcher
+from sadgs_ns.training.images import ImagePrefetcher
 from sadgs_ns.training.structure_cache import StructureCache, observe_training_views
 from sadgs_ns.training.trainer import SadgsTrainer
 from sadgs_ns.training.views import ViewSampler

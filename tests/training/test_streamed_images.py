@@ -21,9 +21,8 @@ from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.method import memory
 from sadgs_ns.training.config import SadgsDatamanagerConfig, SadgsTrainerConfig
-from sadgs_ns.training.images import LazyImages, thread_count
+from sadgs_ns.training.images import ImagePrefetcher, LazyImages, thread_count
 from sadgs_ns.training.memory_plan import choose_image_storage, image_bytes
-from sadgs_ns.training.prefetch import ImagePrefetcher
 from sadgs_ns.training.structure_cache import StructureCache
 from sadgs_ns.training.views import TrainingViews
 

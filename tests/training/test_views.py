@@ -11,7 +11,7 @@ import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 
 from sadgs_ns.distributed.world import World
-from sadgs_ns.training.prefetch import ImagePrefetcher
+from sadgs_ns.training.images import ImagePrefetcher
 from sadgs_ns.training.views import TrainingViews, ViewSampler
 
 STEPS = 1000

@@ -24,7 +24,7 @@ from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.run_folder import write_config
 from sadgs_ns.training.trainer import SadgsTrainer
 from sadgs_ns.viewer.elements import LazyOutputs, shows_output
-from sadgs_ns.viewer.gaussian_maps import normals_map
+from sadgs_ns.viewer.maps import normals_map
 
 
 def discs(angles: list[float], spacing: float = 1.5) -> dict[str, torch.Tensor]:

@@ -16,7 +16,7 @@ from PIL import Image
 from scenes import camera, random_params
 
 from sadgs_ns.method.structure_tensor import FREQUENCY_CONSTANT, multiscale_structure_tensor
-from sadgs_ns.viewer import color_scales, gaussian_maps, texture
+from sadgs_ns.viewer import color_scales, maps
 from sadgs_ns.viewer.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel
 
 WIDTH, HEIGHT = 128, 96
@@ -52,7 +52,7 @@ def view(width: int = 64, height: int = 48) -> tuple[torch.Tensor, torch.Tensor,
 @pytest.mark.parametrize(("period", "read_off"), [(8.0, 1.13), (12.0, 1.27), (24.0, 1.11)])
 def test_the_wavelength_map_of_a_grating_has_the_color_of_its_period(period: float, read_off: float, constant: float):
     """Up to what S̄ itself reads off a grating: docs/results.md#gratings."""
-    found = texture.texture_period(structure_tensor(grating(period), constant), constant)[32:64, 32:96]
+    found = maps.texture_period(structure_tensor(grating(period), constant), constant)[32:64, 32:96]
     assert float(found.median()) == pytest.approx(read_off * period, rel=0.05)
     position = math.log(read_off * period / 3) / math.log(60 / 3)
     expected = np.asarray(matplotlib.colormaps["viridis"](position)[:3]) * 255
@@ -61,11 +61,11 @@ def test_the_wavelength_map_of_a_grating_has_the_color_of_its_period(period: flo
 
 def test_without_texture_there_is_no_wavelength_and_no_ellipse():
     flat = torch.full((HEIGHT, WIDTH, 3), 0.5)
-    period = texture.texture_period(structure_tensor(flat))
+    period = maps.texture_period(structure_tensor(flat))
     assert period.isnan().all()
     assert (PERIOD(period) == PERIOD(period)[0, 0]).all() and PERIOD(period)[0, 0].tolist() == [0, 0, 0]
-    assert len(texture.structure_ellipses(structure_tensor(flat)).centers) == 0
-    drawn = texture.draw_ellipses(color_scales.to_picture(flat), structure_tensor(flat))
+    assert len(maps.structure_ellipses(structure_tensor(flat)).centers) == 0
+    drawn = maps.draw_ellipses(color_scales.to_picture(flat), structure_tensor(flat))
     assert len(np.unique(drawn)) == 1
 
 
@@ -74,17 +74,17 @@ def test_masked_pixels_are_drawn_as_those_without_texture():
     image, mask = grating(8.0), torch.ones((1, HEIGHT, WIDTH), dtype=torch.bool)
     mask[:, :, : WIDTH // 2] = False
     tensor = multiscale_structure_tensor(image[None], mask)[0]
-    shown = PERIOD(texture.texture_period(tensor))
+    shown = PERIOD(maps.texture_period(tensor))
     assert not shown[:, : WIDTH // 2].any() and shown[:, WIDTH // 2 :].any(axis=-1).all()
-    ellipses = texture.structure_ellipses(tensor)
+    ellipses = maps.structure_ellipses(tensor)
     assert len(ellipses.centers) > 0 and ellipses.centers[:, 0].min() > WIDTH / 2
-    assert len(texture.structure_ellipses(torch.full_like(tensor, torch.nan)).centers) == 0
-    texture.draw_ellipses(color_scales.to_picture(image), tensor)
+    assert len(maps.structure_ellipses(torch.full_like(tensor, torch.nan)).centers) == 0
+    maps.draw_ellipses(color_scales.to_picture(image), tensor)
 
 
 @pytest.mark.parametrize("degrees", [0, 30, 90, 135])
 def test_ellipses_are_short_across_the_stripes_and_long_along_them(degrees: int):
-    ellipses = texture.structure_ellipses(structure_tensor(grating(8.0, math.radians(degrees))), spacing=16.0)
+    ellipses = maps.structure_ellipses(structure_tensor(grating(8.0, math.radians(degrees))), spacing=16.0)
     assert len(ellipses.centers) == (HEIGHT // 16) * (WIDTH // 16)
     off = torch.remainder(ellipses.angles - math.radians(degrees) + math.pi / 2, math.pi) - math.pi / 2
     assert off.abs().max() < math.radians(5)
@@ -97,11 +97,11 @@ def test_ellipses_are_drawn_where_and_as_they_lie():
     """Of vertical stripes each ellipse is a tall one: coloured pixels reach further up and down than to the sides."""
     tensor = torch.zeros(40, 40, 3)
     tensor[20, 20] = torch.tensor([0.4**2, 0.0, 0.4**2 / 25])  # axes of 2.5 and 12.5 px
-    ellipses = texture.structure_ellipses(tensor, 0.4, spacing=40.0)
+    ellipses = maps.structure_ellipses(tensor, 0.4, spacing=40.0)
     assert ellipses.centers.tolist() == [[20.0, 20.0]]
     torch.testing.assert_close(ellipses.axes, torch.tensor([[2.5, 12.5]], dtype=torch.float64), rtol=1e-3, atol=0)
     tensor[:] = tensor[20, 20]
-    drawn = texture.draw_ellipses(np.zeros((40, 40, 3), np.uint8), tensor, 0.4, size=(1120, 1120))
+    drawn = maps.draw_ellipses(np.zeros((40, 40, 3), np.uint8), tensor, 0.4, size=(1120, 1120))
     cell = drawn[520:560, 520:560]  # 28 ellipses across: cells of 40 px
     rows, columns = np.nonzero(cell.sum(axis=-1))
     assert np.ptp(rows) == 39, "as long as the cell"
@@ -112,8 +112,8 @@ def test_ellipses_are_drawn_where_and_as_they_lie():
 def test_images_of_any_size_can_be_drawn(size: tuple[int, int]):
     image = torch.rand((*size, 3), generator=torch.Generator().manual_seed(0))
     tensor = structure_tensor(image)
-    assert texture.draw_ellipses(color_scales.to_picture(image), tensor).shape == (*size, 3)
-    assert PERIOD(texture.texture_period(tensor)).shape == (*size, 3)
+    assert maps.draw_ellipses(color_scales.to_picture(image), tensor).shape == (*size, 3)
+    assert PERIOD(maps.texture_period(tensor)).shape == (*size, 3)
 
 
 def test_eta_is_colored_around_one():
@@ -133,29 +133,29 @@ def test_nothing_has_another_color_than_every_value(scale: color_scales.Scale):
 
 def test_each_gaussian_has_its_own_eta_and_unobserved_ones_none():
     statistics = {"eta_max": torch.tensor([[0.1, 4.0, 1.0], [0.2, 0.1, 0.1]]), "n_total": torch.tensor([5.0, 3.0])}
-    seen = gaussian_maps.eta_map(wall(), statistics, *view())
+    seen = maps.eta_map(wall(), statistics, *view())
     assert float(seen[24, 17]) == pytest.approx(4.0, rel=1e-3)
     assert float(seen[24, 47]) == pytest.approx(0.2, rel=1e-3)
     assert seen[1, 32].isnan()
     statistics["n_total"][1] = 0
-    assert gaussian_maps.eta_map(wall(), statistics, *view())[24, 47].isnan()
+    assert maps.eta_map(wall(), statistics, *view())[24, 47].isnan()
 
 
 def test_children_and_low_gaussians_are_seen_where_they_are():
     counts = torch.tensor([[2, 3, 1], [1, 1, 1]])
-    children = gaussian_maps.children_map(wall(), counts, *view())
+    children = maps.children_map(wall(), counts, *view())
     assert float(children[24, 17]) == pytest.approx(6.0, rel=1e-3) and float(children[24, 47]) == pytest.approx(1.0)
-    low = gaussian_maps.share_map(wall(), torch.tensor([False, True]), *view())
+    low = maps.share_map(wall(), torch.tensor([False, True]), *view())
     assert float(low[24, 17]) == pytest.approx(0.0) and float(low[24, 47]) == pytest.approx(1.0)
     assert CHILDREN(children).shape == LOW(low).shape == (48, 64, 3)
 
 
 def test_only_children_get_new_colors():
     generator = torch.Generator().manual_seed(0)
-    colors = gaussian_maps.random_colors(4, generator)
+    colors = maps.random_colors(4, generator)
     assert (colors.amax(dim=1) >= 0.5).all() and len(colors.unique(dim=0)) == 4
     origins = torch.tensor([0, 3, 1, 1, 1])  # 2 was pruned, 1 split in three
-    after = gaussian_maps.recolor(colors, origins, generator)
+    after = maps.recolor(colors, origins, generator)
     assert torch.equal(after[:2], colors[[0, 3]])
     assert not (after[2:, None] == colors[None]).all(dim=-1).any() and len(after.unique(dim=0)) == 5
 
@@ -189,7 +189,7 @@ def test_figures_are_written_whole_with_all_panels(tmp_path: Path):
 def test_blending_agrees_with_the_splatter_s_colors():
     params = {name: value.detach() for name, value in random_params(50).items()}
     colors = torch.rand((50, 3), generator=torch.Generator().manual_seed(1))
-    render, cover = gaussian_maps.blend(params, colors, *view())
-    ones, _ = gaussian_maps.blend(params, torch.ones(50, 3), *view())
+    render, cover = maps.blend(params, colors, *view())
+    ones, _ = maps.blend(params, torch.ones(50, 3), *view())
     torch.testing.assert_close(ones, cover.expand(-1, -1, 3))
     assert render.shape == (48, 64, 3) and (render <= ones + 1e-6).all()
