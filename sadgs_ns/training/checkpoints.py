@@ -50,13 +50,8 @@ def read(path: Path, remedy: str = REMEDY, mmap: bool = False) -> dict[str, Any]
 def checkpoint_paths(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> list[Path]:
     """Return the checkpoints that nerfstudio's options for resuming name, in the order to try them.
 
-    Args:
-        load_dir: The folder of a run, or its folder of checkpoints.
-        load_step: Step of the checkpoint of `load_dir` to take; None takes all, the latest first.
-        load_checkpoint: A file. If it and `load_dir` are None, no checkpoint is named.
-
-    Raises:
-        InputError: If both are given, one does not exist, or the folder does not hold checkpoints alone.
+    `load_dir` is the folder of a run, or its folder of checkpoints; without `load_step` the latest one comes first.
+    Raises InputError if both a folder and a file are given, one does not exist, or the folder holds other files, too.
     """
     if load_dir is None:
         if load_checkpoint is None:

@@ -61,11 +61,7 @@ class PoseOptimizerConfig(CameraOptimizerConfig):
 
 @dataclass
 class SadgsModelConfig(InstantiateConfig):
-    """Options of the Gaussians, their loss and their densification.
-
-    The model is a splatfacto model, because nerfstudio's viewer and exporter ask for one; its configuration is not one
-    of splatfacto's, most of whose options concern a densification that this method replaces.
-    """
+    """Options of the Gaussians, their loss and their densification; most of splatfacto's have no place here."""
 
     _target: type = field(default_factory=lambda: _class("model", "SadgsModel"))
     strategy: StructureAwareStrategy = field(default_factory=StructureAwareStrategy)

@@ -135,11 +135,7 @@ class GraphedSteps:
     """Captures and replays training steps of a model that this process holds alone.
 
     The first step of a key after parameters were replaced is launched kernel by kernel, which compiles and loads what
-    is missing. The second one is captured, and all later ones are replayed.
-
-    Attributes:
-        replayed: Number of steps that were replayed.
-        failure: Why no step is captured from now on, or "".
+    is missing. The second one is captured, and all later ones are `replayed`. `failure` says why none is captured.
     """
 
     def __init__(self, model: SadgsModel) -> None:

@@ -37,12 +37,8 @@ def thread_count(asked: int | None) -> int:
 class LazyImages(Sequence[dict[str, Any]]):
     """Images of a dataset as nerfstudio's FullImageDatamanager loads and undistorts them, decoded at each access.
 
-    Several threads may access images at once.
-
-    Args:
-        dataset: The images, with their cameras and masks, for this object only. The cameras become those of the
-            undistorted images at once, without opening one.
-        keep_files: Whether to keep the bytes of files in memory once they were read.
+    Several threads may access images at once. The dataset is for this object only: its cameras become those of the
+    undistorted images at once, without opening one. With `keep_files`, bytes of files stay in memory once read.
     """
 
     def __init__(self, dataset: InputDataset, keep_files: bool = False) -> None:

@@ -101,10 +101,8 @@ class SadgsModel(MeasuredModel):
     def add_points(self, means: Tensor, colors: Tensor, scales: Tensor) -> int:
         """Start from more points, as far as the cap has room; call before optimizers are made. Return how many.
 
-        Args:
-            means: World units. [P, 3]
-            colors: In [0, 1]. [P, 3]
-            scales: Largest standard deviations, world units; the distance to neighbours limits them, too. [P]
+        They have means [P, 3], colours in [0, 1] [P, 3] and largest standard deviations [P], in world units; the
+        distance to neighbours limits these, too.
         """
         room = max(min(len(means), self.strategy.max_gaussians - self.num_points), 0)
         means, colors, scales = means[:room], colors[:room], scales[:room]
@@ -203,9 +201,8 @@ class SadgsModel(MeasuredModel):
     def render(self, cameras: Pinholes, options: RenderOptions) -> tuple[Tensor, Tensor, dict[str, Any]]:
         """Rasterize the Gaussians, in the viewer those inside its crop box, in their colours.
 
-        Returns:
-            Colours, not clamped, and depth if `options` ask for it [C, H, W, 3 or 4]; accumulated opacity [C, H, W, 1];
-            the rasterizer's info.
+        Returns unclamped colours, with depth if `options` ask for it [C, H, W, 3 or 4], accumulated opacity
+        [C, H, W, 1], and the rasterizer's info.
         """
         return rasterize(self.gaussians()[0], cameras, options)
 

@@ -44,17 +44,14 @@ class AdamUpdate:
             group = optimizer.param_groups[0]
             alike.setdefault((len(group["params"][0]), group["betas"], group["eps"]), {})[name] = optimizer
         self._launches: list[tuple[Any, list[str]]] = [(key, list(chosen)) for key, chosen in alike.items()]
-        self._optimizers = {name: optimizer for chosen in alike.values() for name, optimizer in chosen.items()}
-        self._groups = [optimizer.param_groups[0] for optimizer in self._optimizers.values()]
+        self._optimizers = {name: adam for chosen in alike.values() for name, adam in chosen.items()}
+        self._groups = [adam.param_groups[0] for adam in self._optimizers.values()]
         self.parameters: dict[str, Tensor] = {
-            name: group["params"][0] for name, group in zip(self._optimizers, self._groups, strict=True)
+            n: adam.param_groups[0]["params"][0] for n, adam in self._optimizers.items()
         }
         self.device = next(iter(self.parameters.values())).device
         self._triton = use_triton(self.device)
-        self._states = [
-            optimizer.state[parameter]
-            for optimizer, parameter in zip(self._optimizers.values(), self.parameters.values(), strict=True)
-        ]
+        self._states = [self._optimizers[name].state[parameter] for name, parameter in self.parameters.items()]
         for state, parameter in zip(self._states, self.parameters.values(), strict=True):
             if self._triton and not state:
                 state["step"] = torch.tensor(0.0)

@@ -65,14 +65,9 @@ def plan_run(
 ) -> RunPlan:
     """Decide what a run's options leave open, and print what a user should know.
 
-    Raises InputError if `memory_budget_gb` leaves no room for Gaussians.
-
-    Args:
-        config, pipeline: Options and pipeline of the run, with the Gaussians from which this process starts.
-        length: What `plan_length` returned.
-        dense: Whether the run started from stereo depth.
-        before: The plan of the checkpoint's run.
-        done: Iterations that are done already.
+    The pipeline has the Gaussians from which this process starts, which is `dense` if stereo depth was added. `before`
+    is the plan of the checkpoint's run, of which `done` iterations are done. Raises InputError if `memory_budget_gb`
+    leaves no room for Gaussians.
     """
     options, model, asked = config.pipeline, pipeline.model, _asked(config.pipeline)
     if before is not None:

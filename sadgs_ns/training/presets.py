@@ -94,30 +94,23 @@ sadgs = MethodSpecification(
     config=SadgsTrainerConfig(method_name="sadgs", optimizers=optimizers()),
 )
 
-sadgs_paper = MethodSpecification(
-    description=(
-        "Structure-aware densification with the paper's loss and children, outdoor scenes; "
-        "3,000 iterations of one view."
-    ),
-    config=SadgsTrainerConfig(
-        method_name="sadgs-paper",
-        max_num_iterations=3000,
-        pipeline=paper_pipeline(views_per_iteration=1),
-        rates_follow_views=False,
-        optimizers=optimizers(**CONSTANT, scales=(0.01, 1.0, 1.0)),
-    ),
-)
 
-sadgs_paper_indoor = MethodSpecification(
-    description=(
-        "Structure-aware densification with the paper's loss and children, indoor scenes; "
-        "3,000 iterations of two views."
-    ),
-    config=SadgsTrainerConfig(
-        method_name="sadgs-paper-indoor",
-        max_num_iterations=3000,
-        pipeline=paper_pipeline(views_per_iteration=2),
-        rates_follow_views=False,
-        optimizers=optimizers(**CONSTANT, scales=(5e-3, 3.0, 0.5), quats=(1e-3, 3.0, 0.5)),
-    ),
-)
+def paper_method(name: str, where: str, views: int, **rates: tuple[float, float, float]) -> MethodSpecification:
+    """Return a preset of the paper, with these rates of scales and rotations."""
+    return MethodSpecification(
+        description=(
+            f"Structure-aware densification with the paper's loss and children, {where} scenes; 3,000 iterations of "
+            f"{'one view' if views == 1 else 'two views'}."
+        ),
+        config=SadgsTrainerConfig(
+            method_name=name,
+            max_num_iterations=3000,
+            pipeline=paper_pipeline(views_per_iteration=views),
+            rates_follow_views=False,
+            optimizers=optimizers(**CONSTANT, **rates),
+        ),
+    )
+
+
+sadgs_paper = paper_method("sadgs-paper", "outdoor", 1, scales=(0.01, 1.0, 1.0))
+sadgs_paper_indoor = paper_method("sadgs-paper-indoor", "indoor", 2, scales=(5e-3, 3.0, 0.5), quats=(1e-3, 3.0, 0.5))

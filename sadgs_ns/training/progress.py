@@ -78,12 +78,9 @@ def next_commands(config: Path, gaussians: int) -> str:
 class ProgressTable(LocalWriter):
     """nerfstudio's table of progress with the loss, PSNR and number of Gaussians.
 
-    A terminal shows the latest rows in place, and other output above them. Elsewhere, as in a file, every row is a
-    line. Only for a row are loss and PSNR of its iteration read from the device.
-
-    Args:
-        config: nerfstudio's; `max_log_size` is the number of rows that stay in view, and 0 keeps all.
-        banner_messages: Lines under the table, such as the viewer's address.
+    A terminal shows the latest `max_log_size` rows in place, other output above them, and the banner, such as the
+    viewer's address, below. Elsewhere, as in a file, every row is a line. Only for a row are loss and PSNR of its
+    iteration read from the device.
     """
 
     def __init__(self, config: LocalWriterConfig, banner_messages: list[str] | None = None) -> None:

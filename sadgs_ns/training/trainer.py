@@ -173,11 +173,8 @@ class SadgsTrainer(Trainer):
     def train(self) -> None:
         """Train up to `max_num_iterations` in all; nerfstudio 1.1.5 would train that many more after resuming.
 
-        Raises:
-            RunError: If the GPU's memory is full, the run has diverged, or an image cannot be decoded any more.
-            WriteError: If a checkpoint or log could not be written.
-            SystemExit: If SIGINT, SIGTERM or SIGHUP came, with the exit code of shells, after a checkpoint was saved
-                and a line has said how to resume.
+        Raises RunError if memory is full, the run has diverged, or an image cannot be decoded any more; WriteError if
+        a checkpoint or log could not be written; SystemExit after a signal, once a checkpoint is saved.
         """
         total = self.pipeline.model.plan.iterations
         self.step: int = max(self._start_step - 1, 0)  # names the checkpoint if nothing is left to do
