@@ -124,13 +124,10 @@ def _changed(value: Any, change: Callable[[Tensor], Tensor]) -> Any:
 
 
 def write(folder: Path, step: int, state: dict[str, Any], keep: bool) -> None:
-    """Save a checkpoint whole or not at all and, unless they are to be kept, delete the others. Raises WriteError.
-
-    The temporary file lies beside the folder, because nerfstudio takes every file inside for a checkpoint.
-    """
+    """Save a checkpoint whole, and delete the others unless they are to be kept. Raises WriteError."""
     path = folder / f"step-{step:09d}.ckpt"
     others = [other for other in folder.glob("*.ckpt") if other != path]
-    with atomic_path(path, beside=folder) as partial:
+    with atomic_path(path, beside=folder) as partial:  # nerfstudio takes every file inside for a checkpoint.
         try:
             torch.save(state, partial)
         except RuntimeError as error:  # This is how torch's writer reports a full disk.

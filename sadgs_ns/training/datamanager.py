@@ -30,11 +30,7 @@ KEPT_FILES_SHARE = 0.25
 
 
 class SadgsDatamanager(FullImageDatamanager[InputDataset]):
-    """Loads images in several threads or only when they are needed, and SfM points faster and without open3d.
-
-    It checks names and sizes of images, and raises InputError, here rather than in the pipeline, because `ns-render
-    dataset` makes its own datamanager.
-    """
+    """Loads images in threads or on demand, and SfM points fast. Raises InputError for wrong names or sizes."""
 
     def __init__(self, config: FullImageDatamanagerConfig, *args: Any, **kwargs: Any) -> None:
         config = copy.copy(config)  # The original is written to config.yml.

@@ -26,10 +26,7 @@ brought 1.7 dB on the scene `south`, elsewhere nothing (docs/results.md#other-co
 def initial_gaussians(
     config: SadgsModelConfig, seed_points: tuple[Tensor, Tensor] | None
 ) -> tuple[dict[str, Tensor], Tensor]:
-    """Make Gaussians of the SfM points [P, 3] and their colours in 0 … 255 [P, 3], or else random ones.
-
-    Returns the parameters, and which Gaussians are synthetic: random or on the points' bounding box. bool [N]
-    """
+    """Return Gaussians of SfM points [P, 3], colours in 0 … 255, or random points, and which are synthetic [N]."""
     if seed_points is None or config.random_init:
         if not config.random_init:
             warn(

@@ -55,10 +55,7 @@ class TrainingSize:
 def training_size(
     datamanager: FullImageDatamanager, params: Params, views: int, processes: int = 1, near_plane: float = NEAR_PLANE
 ) -> TrainingSize:
-    """Measure a run of so many views a step before its first step, without opening an image.
-
-    `params` are the initial Gaussians of this process, and `processes` share out each step.
-    """
+    """Measure a run with so many views a step, shared out to processes, without opening an image."""
     cameras = datamanager.train_dataset.cameras
     largest = int((cameras.height * cameras.width).max())
     structure = 0.0

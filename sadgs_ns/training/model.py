@@ -11,6 +11,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.splatfacto import SplatfactoModel
+from pytorch_msssim import SSIM
 from torch import Tensor
 
 from sadgs_ns.data.cameras import check_camera_types
@@ -32,7 +33,7 @@ from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.render.types import Gaussians, RenderOptions
 from sadgs_ns.training.config import SadgsModelConfig
 from sadgs_ns.training.initial_gaussians import beside, initial_gaussians, outside_cameras
-from sadgs_ns.training.metrics import MeasuredModel
+from sadgs_ns.training.progress import warn
 from sadgs_ns.training.run_plan import RunPlan
 from sadgs_ns.viewer import maps
 from sadgs_ns.viewer.elements import LazyOutputs, in_viewer, warn_once
@@ -43,7 +44,7 @@ LIMIT_EVERY = 25
 """Iterations from one limit on scales to the next, in which an axis grows at most threefold at the presets' rates."""
 
 
-class SadgsModel(MeasuredModel):
+class SadgsModel(SplatfactoModel):
     """The Gaussians, how they are rendered, and the loss of a rendering.
 
     nerfstudio's viewer, evaluation and exporter treat it as a splatfacto model. `seed_points` are SfM points [P, 3] and
@@ -66,7 +67,8 @@ class SadgsModel(MeasuredModel):
         """Which initial Gaussians stand for no SfM point, but are random or on the bounding box. bool [N]"""
         self.gauss_params = torch.nn.ParameterDict({name: torch.nn.Parameter(p) for name, p in params.items()})
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
-        self.make_metrics()
+        self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
+        self._lpips: list[torch.nn.Module | None] = []  # A list keeps its weights out of the checkpoint.
         self.step = 0
         self.average = RunningMean()
         self.camera_positions: Tensor | None = None  # [C, 3]
@@ -209,7 +211,7 @@ class SadgsModel(MeasuredModel):
     def gaussians(
         self, params: Mapping[str, Tensor] | None = None, opacity_reg: float = 0.0
     ) -> tuple[Gaussians, Tensor | None]:
-        """Return the activated Gaussians; in the viewer, those inside its crop box. `params` default to the model's.
+        """Return the activated Gaussians inside the viewer's crop box, of `params` or the model's own.
 
         The second result are numbers [P] whose sum is the mean opacity times `opacity_reg`; None if that factor is 0.
         """
@@ -340,6 +342,27 @@ class SadgsModel(MeasuredModel):
             target, rgb = target * mask, rgb * mask
         return rgb, target
 
+    def psnr(self, predicted: Tensor, target: Tensor) -> Tensor:
+        """Return PSNR in dB of images in [0, 1], [1, 3, H, W] or [H, W, 3]."""
+        # The import takes a second, and training does not need it.
+        from torchmetrics.functional.image import peak_signal_noise_ratio
+
+        return peak_signal_noise_ratio(predicted, target, data_range=1.0)
+
+    def lpips(self, predicted: Tensor, target: Tensor) -> Tensor:
+        """Return LPIPS (AlexNet) of images [1, 3, H, W] in [0, 1], or NaN if its weights cannot be loaded."""
+        if not self._lpips:
+            self._lpips = [load_lpips(self.device)]
+        metric = self._lpips[0]
+        return predicted.new_tensor(float("nan")) if metric is None else metric(predicted, target)
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Return PSNR, SSIM and, if its weights can be loaded, LPIPS of one held-out view."""
+        metrics, images = super().get_image_metrics_and_images(outputs, batch)
+        return {name: value for name, value in metrics.items() if "lpips" not in name or value == value}, images
+
     def get_extra_state(self) -> dict[str, Any]:
         """Return the step, the strategy's state and the mean of the parameters so far."""
         return {
@@ -375,3 +398,15 @@ class SadgsModel(MeasuredModel):
 @lru_cache(maxsize=8)
 def _constant_color(grey: float, device: torch.device) -> Tensor:
     return torch.full((3,), grey, device=device)
+
+
+def load_lpips(device: torch.device) -> torch.nn.Module | None:
+    """Return LPIPS (AlexNet), or None with a warning if its weights cannot be loaded."""
+    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+    try:
+        with torch.random.fork_rng(devices=[]):  # Drawing weights must not change training's random state.
+            return LearnedPerceptualImagePatchSimilarity(normalize=True).to(device)
+    except Exception as error:
+        warn(f"LPIPS is not reported: its AlexNet weights could not be loaded ({error}).")
+        return None

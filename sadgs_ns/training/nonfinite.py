@@ -14,10 +14,7 @@ DIVERGED_STEPS = 100
 
 
 class NonFiniteLog:
-    """The losses of the steps since the log was last read, and whether gradients were left out.
-
-    It holds `capacity` steps. `steps` have been read so far, and the last `streak` of them were not finite.
-    """
+    """Losses and flags of up to `capacity` steps; of all `steps` read, the last `streak` were not finite."""
 
     def __init__(self, device: torch.device | str, capacity: int = 100) -> None:
         self._losses: list[Tensor] = []  # scalars on the device

@@ -215,10 +215,7 @@ class SadgsPipeline(VanillaPipeline):
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, float]:
-        """Return the mean of each metric over the held-out views, and with `get_std` its standard deviation.
-
-        A single view has none (nerfstudio would return NaN, which is no JSON). Raises InputError without views.
-        """
+        """Return the mean, and for several views the deviation, of each metric; raise InputError without views."""
         views = len(self.datamanager.eval_dataset)
         if views == 0:
             raise InputError(
@@ -228,10 +225,7 @@ class SadgsPipeline(VanillaPipeline):
         return super().get_average_eval_image_metrics(step, output_path, get_std and views > 1)
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
-        """Load a checkpoint, or raise InputError if it is another method's, or of another model.
-
-        nerfstudio would ignore missing parameters, so that another method's checkpoint would give a mixture.
-        """
+        """Load a checkpoint, or raise InputError where nerfstudio would mix it with another method or model."""
         loaded = {key.removeprefix("module."): value for key, value in loaded_state.items()}
         for name, parameter in self.model.gauss_params.items():
             value = loaded.get(f"_model.gauss_params.{name}")

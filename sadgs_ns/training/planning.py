@@ -25,10 +25,7 @@ _CAP_OPTIONS = ("memory_budget_gb", "model.strategy.max_gaussians")
 
 
 def plan_length(config: SadgsTrainerConfig, views: int, before: RunPlan | None) -> Schedule:
-    """Decide the length of a run of so many training views, and the views of a step.
-
-    Options come first, then the checkpoint's plan `before`, if its effort is the same, then the rule.
-    """
+    """Decide iterations and views a step: by options, by an equal effort's plan `before`, or by rule."""
     effort, iterations, in_step = config.pipeline.effort, config.max_num_iterations, config.pipeline.views_per_iteration
     if before is not None and before.asked["effort"] == effort:
         iterations = before.iterations if iterations is None else iterations

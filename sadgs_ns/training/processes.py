@@ -107,10 +107,7 @@ class Peers:
         raise SystemExit(0)
 
     def ended(self) -> list[int]:
-        """Wait some seconds until a process of this machine has ended; return the ranks that ended by themselves.
-
-        A process to which this method returned others ends because of them, and is not counted.
-        """
+        """Return the ranks that ended by themselves, not because of others, after waiting some seconds for one."""
         end, here = time.monotonic() + _REAPED_SECONDS, socket.gethostname()
         while True:
             gone = (rank for rank, (host, pid, _) in enumerate(self._places) if host == here and not _exists(pid))
@@ -171,10 +168,7 @@ def local_rank_zero_first(world: World, local_rank: int) -> Iterator[None]:
 
 
 def continue_on_rank_zero(world: World, peers: Peers) -> None:
-    """Continue the run in rank 0 alone; the other processes, of the same machine, wait for its end and exit with 0.
-
-    `world` must not be used afterwards.
-    """
+    """Continue in rank 0 without `world`; the other processes, of the same machine, exit with 0 after it."""
     world.all(True)
     dist.destroy_process_group()
     if world.rank > 0:

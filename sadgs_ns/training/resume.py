@@ -28,10 +28,7 @@ _SAME_PLACE = 1e-3
 
 @dataclass
 class Resumption:
-    """A checkpoint that was read, and is loaded in two parts.
-
-    Each method raises InputError, which names the file and a remedy, if the checkpoint does not fit.
-    """
+    """A checkpoint to load in two parts; errors are InputError, and name the file and a remedy."""
 
     path: Path
     state: dict[str, Any]

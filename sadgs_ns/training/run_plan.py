@@ -35,11 +35,7 @@ class Rate:
 
 @dataclass(frozen=True)
 class RunPlan:
-    """Length, densification and learning rates of a run, and the options that they were derived from.
-
-    It is written as `plan.yml` beside `config.yml` and kept in checkpoints. To change it, replace it with
-    `SadgsModel.follow`.
-    """
+    """What was decided for a run, in `plan.yml` and its checkpoints; `SadgsModel.follow` replaces it."""
 
     iterations: int
     """Length of the run in optimizer steps."""

@@ -38,10 +38,9 @@ def number_of_points(pipeline: SadgsPipeline) -> int:
 
 
 def start_from_stereo(pipeline: SadgsPipeline, resumed: bool) -> bool:
-    """Add points of stereo depth of the training views to the initial Gaussians, if the options ask for some.
+    """Add points of stereo depth to the initial Gaussians, if the options ask for some and no run is resumed.
 
-    Call it before optimizers are made. It loads the images. A resumed run has its points already. Returns whether the
-    run starts, or started, from such points.
+    It loads the images. Returns whether the run starts, or started, from such points.
     """
     number = number_of_points(pipeline)
     if not number or resumed:

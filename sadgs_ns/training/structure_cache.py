@@ -107,10 +107,7 @@ class StructureCache:
 def observe_training_views(
     cache: StructureCache, progress: Callable[[range], Iterable[int]] = iter
 ) -> dict[str, Tensor]:
-    """Observe η of the present Gaussians once in each training view; return the sums of `empty_statistics`.
-
-    Samples have their own generator, so a run's random numbers do not change. `progress` wraps the views' indices.
-    """
+    """Observe η of the present Gaussians once in each training view; the run's random numbers do not change."""
     views, model = cache.views, cache.views.model
     model.set_crop(None)  # the viewer sets its crop box anew whenever it renders
     params = model.gauss_params

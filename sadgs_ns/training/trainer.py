@@ -59,10 +59,7 @@ def _memory(error: torch.cuda.OutOfMemoryError) -> str:
 
 
 class SadgsTrainer(Trainer):
-    """A trainer for one device, or for several, each with a process and a part of the Gaussians.
-
-    All processes call the same methods; rank 0 alone prints and writes files.
-    """
+    """A trainer for one or several processes, which call the same methods; rank 0 prints and writes files."""
 
     config: SadgsTrainerConfig
     pipeline: SadgsPipeline
@@ -272,10 +269,7 @@ class SadgsTrainer(Trainer):
         )
 
     def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
-        """Train on the views of a step instead of nerfstudio's iteration, and return its loss, losses and metrics.
-
-        No signal stops the run from here to `_update_viewer_state`.
-        """
+        """Train on the views of a step, which no signal stops until `_update_viewer_state`; return loss and metrics."""
         self._stepping = True
         # Several processes agree in the step what to do after it. A signal has the bit of its number.
         self.world.flags_in, signalled = 0, self._interrupts.received

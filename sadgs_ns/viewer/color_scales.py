@@ -113,10 +113,7 @@ class Panel:
 
 
 def draw(path: Path, panels: Sequence[Panel], columns: int | None = None) -> None:
-    """Write at least one picture, with titles and colour bars, as a PNG file, or raise WriteError.
-
-    `columns` is the number of pictures in a row; None puts all in one row.
-    """
+    """Write pictures, at least one, with titles and colour bars in rows of `columns` as PNG, or raise WriteError."""
     from matplotlib.figure import Figure
 
     columns = len(panels) if columns is None else columns

@@ -49,10 +49,7 @@ def blend(
 
 
 def eta_map(params: Mapping[str, Tensor], statistics: Mapping[str, Tensor], *view) -> Tensor:
-    """Return the geometric mean, by what each adds to a pixel, of the observed Gaussians' largest η. [H, W]
-
-    `statistics` holds `eta_max` [N, 3] and `n_total` [N].
-    """
+    """Return the geometric mean of the largest η of the Gaussians observed (`eta_max`, `n_total`). [H, W]"""
     largest = statistics["eta_max"].amax(dim=1)
     known = ((statistics["n_total"] > 0) & (largest > 0)).float()
     values = torch.stack([torch.where(known > 0, largest, 1.0).log(), known], dim=-1)

@@ -90,10 +90,7 @@ def _between(when: str, before: int, after: int) -> str:
 
 
 def nearest_view(cameras: Tensor, camera: Tensor, extent: float) -> int:
-    """Return the index of the training view that is nearest to a camera in place and direction.
-
-    The camera-to-world poses are [C, 3, 4] and [3, 4]; a distance of `extent` counts as much as 1 rad.
-    """
+    """Return the index of the pose [C, 3, 4] nearest to one [3, 4]; a distance of `extent` counts as 1 rad."""
     distance = (cameras[:, :, 3] - camera[:, 3]).norm(dim=-1) / max(extent, 1e-12)
     angle = (cameras[:, :, 2] @ camera[:, 2]).clamp(-1, 1).acos()
     return int((distance + angle).argmin())
@@ -233,10 +230,7 @@ class StructurePanel(torch.nn.Module):
         show_output(self.viewer, "rgb" if chosen == OFF else OUTPUT)
 
     def outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return `structure` [H, W, 3] in [0, 1] in the viewer, and nothing elsewhere.
-
-        It exists even if nothing is chosen, because the viewer's thread fails if an output vanishes.
-        """
+        """Return `structure` [H, W, 3] in [0, 1] in the viewer, whatever is chosen: its thread needs each output."""
         if not in_viewer():
             return {}
         if self._shown == OFF:

@@ -41,8 +41,7 @@ from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world, visible
 from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.training.config import SadgsTrainerConfig
-from sadgs_ns.training.metrics import load_lpips
-from sadgs_ns.training.model import SadgsModel
+from sadgs_ns.training.model import SadgsModel, load_lpips
 from sadgs_ns.training.optimizers import AdamUpdate, FusedAdam
 from sadgs_ns.training.presets import RATES
 from sadgs_ns.training.train_step import training_step
