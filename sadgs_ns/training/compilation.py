@@ -111,8 +111,9 @@ class _Stages:
                 known = name in self.model.gauss_params
                 value = self.blank(name) if known else torch.zeros((1, 3, 4), device=self.device)
                 options = {key: optimizer.defaults[key] for key in ("betas", "eps")}
-                twins[name] = FusedAdam([torch.nn.Parameter(value)], **options)
-        update = AdamUpdate({name: twin for name, twin in twins.items() if twin.param_groups[0]["params"][0].numel()})
+                if value.numel():
+                    twins[name] = FusedAdam([torch.nn.Parameter(value)], **options)
+        update = AdamUpdate(twins)
         gradients = {name: torch.zeros_like(parameter) for name, parameter in update.parameters.items()}
         # Several processes wait for the lengths of tile lists, which then cannot overflow.
         flags = (torch.zeros(1, dtype=torch.int64, device=self.device),) if self.pipeline.world.alone else ()
@@ -149,14 +150,10 @@ class _Stages:
         torch.autograd.backward([value.sum() for value in results])
 
     def observation(self) -> None:
-        params = {"means": self.means, "quats": self.gaussians.quats, "scales": self.scales.log()}
-        tensors = self.image.byte().repeat(self.views, 1, 1, 1)
-        observe(
-            empty_statistics(_GAUSSIANS, self.device),
-            params,  # type: ignore[arg-type]
-            self.info | {"structure_tensors": tensors, "viewmats": self.cameras.viewmats, "Ks": self.cameras.Ks},
-            generator=torch.Generator(self.device).manual_seed(0),
-        )
+        params: Any = {"means": self.means, "quats": self.gaussians.quats, "scales": self.scales.log()}
+        tensors, generator = self.image.byte().repeat(self.views, 1, 1, 1), torch.Generator(self.device).manual_seed(0)
+        info = self.info | {"structure_tensors": tensors, "viewmats": self.cameras.viewmats, "Ks": self.cameras.Ks}
+        observe(empty_statistics(_GAUSSIANS, self.device), params, info, generator=generator)
 
     def exchange(self) -> None:
         from sadgs_ns.kernels.exchange import pack, unpack

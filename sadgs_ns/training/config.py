@@ -429,15 +429,12 @@ class SadgsTrainerConfig(TrainerConfig):
                 raise InputError(f"optimizers.{group}.optimizer.lr must be in [0, 1], got {rate:g}.")
             if isinstance(scheduler, RunLengthDecaySchedulerConfig):
                 for name in ("initial_factor", "final_factor"):
-                    if not 0 < (factor := getattr(scheduler, name)) < math.inf:
-                        raise InputError(
-                            f"optimizers.{group}.scheduler.{name} must be positive and finite, got {factor:g}."
-                        )
+                    option, factor = f"optimizers.{group}.scheduler.{name}", getattr(scheduler, name)
+                    if not 0 < factor < math.inf:
+                        raise InputError(f"{option} must be positive and finite, got {factor:g}.")
                     if rate * factor > 1:
-                        raise InputError(
-                            f"optimizers.{group}.scheduler.{name} must leave the rate in [0, 1], got {factor:g}, which "
-                            f"makes {rate * factor:g} of {rate:g}."
-                        )
+                        got = f"got {factor:g}, which makes {rate * factor:g} of {rate:g}"
+                        raise InputError(f"{option} must leave the rate in [0, 1], {got}.")
 
     def save_config(self) -> None:
         """Write `config.yml` if the run can begin; raises InputError as `check`, and as `run_folder.begin`."""

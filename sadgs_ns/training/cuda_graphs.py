@@ -34,12 +34,9 @@ otherwise be captured more often than they are replayed."""
 class Results(NamedTuple):
     """What a graph leaves on the device; its next replay overwrites it."""
 
-    values: Tensor
-    """Loss, PSNR in dB, two unused numbers, and NaN if a gradient was left out, else 0. [5]"""
-    pair_counts: Tensor
-    """Pairs of a Gaussian and a tile of each view. int64 [V]"""
-    means_gradient: Tensor
-    """Gradient of the loss by the centres. [N, 3]"""
+    values: Tensor  # Loss, PSNR in dB, two unused numbers, and NaN if a gradient was left out, else 0. [5]
+    pair_counts: Tensor  # Pairs of a Gaussian and a tile of each view. int64 [V]
+    means_gradient: Tensor  # Gradient of the loss by the centres. [N, 3]
 
 
 @dataclass(frozen=True)

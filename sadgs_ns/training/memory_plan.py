@@ -44,10 +44,8 @@ _REACH = 3.0
 class TrainingSize:
     """What a run keeps and renders besides its Gaussians."""
 
-    image_bytes: float
-    """Bytes of images and their S̄ on the training device."""
-    step: StepSize
-    """The largest step of the run, with the pairs of the initial Gaussians."""
+    image_bytes: float  # Bytes of images and their S̄ on the training device
+    step: StepSize  # The largest step of the run, with the pairs of the initial Gaussians
     structure_bytes: float = 0.0
     """Bytes to compute S̄ of a step's images before they are rendered; 0 if that is done once at the start."""
 

@@ -67,8 +67,10 @@ def plan_run(
     leaves no room for Gaussians.
     """
     options, model, asked = config.pipeline, pipeline.model, _asked(config.pipeline)
-    if before is not None:
-        _warn_of_changes(asked, before.asked)
+    old = {} if before is None else {n: value for n, value in before.asked.items() if n in asked and asked[n] != value}
+    if old:
+        changed = ", ".join(f"pipeline.{name} was {value} and is {asked[name]}" for name, value in old.items())
+        warn(f"The checkpoint's run had other settings; this one goes on with its own: {changed}.")
     strategy, growth = options.model.strategy, growth_threshold(options.effort)
     clone, split = growth * strategy.clone_grad2d, growth * strategy.split_absgrad2d
     if dense:
@@ -106,14 +108,6 @@ def _asked(options: SadgsPipelineConfig) -> dict[str, Any]:
     """Return the options by name that decide how training goes on from a checkpoint."""
     own = {name: getattr(options, name) for name in ("effort", "views_per_iteration", "memory_budget_gb")}
     return own | {f"model.strategy.{name}": value for name, value in asdict(options.model.strategy).items()}
-
-
-def _warn_of_changes(now: dict[str, Any], before: dict[str, Any]) -> None:
-    """Print which options differ from those of the checkpoint's run."""
-    changed = [name for name in before if name in now and now[name] != before[name]]
-    if changed:
-        listed = ", ".join(f"pipeline.{name} was {before[name]} and is {now[name]}" for name in changed)
-        warn(f"The checkpoint's run had other settings; this one goes on with its own: {listed}.")
 
 
 def _print_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: Schedule, done: int) -> None:

@@ -31,8 +31,7 @@ class Resumption:
     """A checkpoint to load in two parts; errors are InputError, and name the file and a remedy."""
 
     path: Path
-    state: dict[str, Any]
-    """As nerfstudio's trainer writes it."""
+    state: dict[str, Any]  # As nerfstudio's trainer writes it
 
     @contextmanager
     def _errors_name_file(self) -> Iterator[None]:

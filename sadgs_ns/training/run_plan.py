@@ -37,24 +37,15 @@ class Rate:
 class RunPlan:
     """What was decided for a run, in `plan.yml` and its checkpoints; `SadgsModel.follow` replaces it."""
 
-    iterations: int
-    """Length of the run in optimizer steps."""
-    views_per_iteration: int
-    """Training views of a step; the loss is their mean."""
-    devices: int
-    """Number of devices, each with a process and a part of the Gaussians."""
-    images: str
-    """Where the images are kept: "gpu" (the training device), "cpu" (the host), or "compressed"."""
-    near_plane: float
-    """Depth from which Gaussians are drawn, in the run's units."""
-    max_off_axis: float
-    """As in the model's options."""
-    strategy: StructureAwareStrategy
-    """Densification with the run's windows, thresholds and cap."""
-    rates: dict[str, Rate]
-    """Learning rates by group of parameters."""
-    asked: dict[str, Any]
-    """Options of the pipeline from which this was derived, by their names."""
+    iterations: int  # Length of the run in optimizer steps
+    views_per_iteration: int  # Training views of a step; the loss is their mean
+    devices: int  # Number of devices, each with a process and a part of the Gaussians
+    images: str  # Where the images are kept: "gpu" (the training device), "cpu" (the host), or "compressed"
+    near_plane: float  # Depth from which Gaussians are drawn, in the run's units
+    max_off_axis: float  # As in the model's options
+    strategy: StructureAwareStrategy  # Densification with the run's windows, thresholds and cap
+    rates: dict[str, Rate]  # Learning rates by group of parameters
+    asked: dict[str, Any]  # Options of the pipeline from which this was derived, by their names
 
     @classmethod
     def of(cls, state: Mapping[str, Any]) -> RunPlan:

@@ -27,19 +27,15 @@ from sadgs_ns.training.optimizers import AdamUpdate
 class ViewGroup:
     """Views of a step that have one size, on the training device."""
 
-    indices: list[int]
-    """Indices of V training views."""
+    indices: list[int]  # Indices of V training views
     cameras: Cameras
     options: RenderOptions
     data: Sequence[Mapping[str, Tensor]]
     """`image` of each view, uint8 or floats in [0, 1] [H, W, 3 or 4], and perhaps `mask`, bool [H, W, 1]. With several
     processes, views that only others composite have none."""
-    view_ids: Tensor | None = None
-    """`indices` on the device if views have colour matrices. int64 [V]"""
-    structure_tensors: Tensor | None = None
-    """Quantized S̄ if η is observed. uint8 [V, H, W, 3]"""
-    images: Tensor | None = None
-    """The images, if they are in one tensor already. [V, H, W, 3]"""
+    view_ids: Tensor | None = None  # `indices` on the device if views have colour matrices. int64 [V]
+    structure_tensors: Tensor | None = None  # Quantized S̄ if η is observed. uint8 [V, H, W, 3]
+    images: Tensor | None = None  # The images, if they are in one tensor already. [V, H, W, 3]
 
     def batch(self, band: Band | None) -> dict[str, Tensor]:
         """Return `image` and, if a view has a mask, `mask` of all views [V, H, W, ·], or of a band's rows."""
@@ -59,14 +55,10 @@ class ViewGroup:
 class StepResult:
     """What a step leaves on the device."""
 
-    loss: Tensor
-    """Loss of all processes, without gradient, a scalar."""
-    psnr: Tensor
-    """PSNR of the views in dB, a scalar."""
-    means_gradient: Tensor
-    """Gradient of the loss by the centres. [N, 3]"""
-    infos: list[dict[str, Any]]
-    """The rasterizer's info of each group of views."""
+    loss: Tensor  # Loss of all processes, without gradient, a scalar
+    psnr: Tensor  # PSNR of the views in dB, a scalar
+    means_gradient: Tensor  # Gradient of the loss by the centres. [N, 3]
+    infos: list[dict[str, Any]]  # The rasterizer's info of each group of views
 
 
 def training_step(

@@ -23,18 +23,11 @@ from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
-from sadgs_ns.training import checkpoints, processes
+from sadgs_ns.training import checkpoints, interrupts, processes
 from sadgs_ns.training.compilation import compile_kernels
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.cuda_graphs import GraphedSteps
-from sadgs_ns.training.interrupts import (
-    HANG_UP,
-    SIGNALS,
-    Interrupted,
-    Interrupts,
-    discard_broken_output,
-    redirect_on_broken_pipe,
-)
+from sadgs_ns.training.interrupts import HANG_UP, SIGNALS, Interrupted, Interrupts
 from sadgs_ns.training.optimizers import SadgsOptimizers
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.planning import one_device_is_quicker, plan_length, plan_run
@@ -66,7 +59,7 @@ class SadgsTrainer(Trainer):
     optimizers: SadgsOptimizers
 
     def __init__(self, config: SadgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
-        redirect_on_broken_pipe(CONSOLE)
+        interrupts.redirect_on_broken_pipe(CONSOLE)
         config.check()
         config = copy.copy(config)  # Several processes agree on the time stamp, which `config.yml` must not hold.
         self.world, local_rank = processes.join(config, local_rank)
@@ -126,8 +119,7 @@ class SadgsTrainer(Trainer):
     def _print_next_commands(self) -> None:
         """Print the commands for a finished run below nerfstudio's box, unless the run diverged."""
         if not self.pipeline.diverged:
-            text = next_commands(self.base_dir / "config.yml", self.pipeline.model.num_gaussians)
-            note(text)
+            note(next_commands(self.base_dir / "config.yml", self.pipeline.model.num_gaussians))
             events.report("training ends", gaussians=self.pipeline.model.num_gaussians)
 
     def _load_checkpoint(self) -> None:
@@ -343,7 +335,7 @@ class SadgsTrainer(Trainer):
             command = shlex.join(["ns-train", str(config.method_name), "--load-config", str(file)])
             text = f"{interrupted}: stopped and saved after {done} of {total} iterations; resume with: {command}"
         if interrupted.number == HANG_UP:  # Some systems take the terminal away later.
-            discard_broken_output()
+            interrupts.discard_broken_output()
         note(text)
         self.world.all(True)  # As soon as one process has ended, the others are ended.
         raise SystemExit(128 + interrupted.number)

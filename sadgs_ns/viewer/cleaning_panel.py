@@ -89,19 +89,15 @@ class CleaningPanel(torch.nn.Module):
         now = (model.num_points, model.step)  # Training outdates what was seen.
         if cleaning.needs_views and (self._seen is None or self._seen[0] != now):
             self._say("Looking from all training views …")
-            self._seen = now, measure_visibility(params, self._cameras(), model.drawing)
+            views = self._views
+            poses = [(views.viewmat(i).detach(), views.cameras[1][i], w, h) for i, (h, w) in enumerate(views.sizes)]
+            self._seen = now, measure_visibility(params, poses, model.drawing)
         stays, sentences = find_remaining(params, cleaning, None if self._seen is None else self._seen[1])
         self._stays, self._shown = stays, self.choice.value
         left = f"{int(stays.sum()):,} of {len(stays):,} Gaussians would stay."
         options = command_line_options(cleaning)
         how = f"\n\n`sadgs-export RUN --output splat.ply {options}` does this." if options else ""
         self._say("\n\n".join([*sentences, left]) + how)
-
-    def _cameras(self) -> list[tuple[Tensor, Tensor, int, int]]:
-        cameras = self._views.datamanager.train_dataset.cameras
-        sizes = torch.cat([cameras.width, cameras.height], dim=1).tolist()
-        views = (self._views.stacked_cameras([index]) for index in range(len(sizes)))
-        return [(viewmats[0].detach(), Ks[0], *size) for (viewmats, Ks), size in zip(views, sizes, strict=True)]
 
     def _say(self, text: str) -> None:
         self._text = text

@@ -114,16 +114,11 @@ class Ellipses:
     """S̄⁻¹ at E pixels; the ellipses are short across a texture's stripes and long along them."""
 
     centers: Tensor  # [E, 2] px
-    axes: Tensor
-    """Wavelengths along the short and the long axis, px, at most `longest`. [E, 2]"""
-    angles: Tensor
-    """Direction of the short axis, from x towards y, rad. [E]"""
-    periods: Tensor
-    """Periods of the texture in px. [E]"""
-    longest: float
-    """Wavelength of the coarsest level, which limits axes: along stripes they would be infinite."""
-    spacing: float
-    """Distance between neighbouring centres in px."""
+    axes: Tensor  # Wavelengths along the short and the long axis, px, at most `longest`. [E, 2]
+    angles: Tensor  # Direction of the short axis, from x towards y, rad. [E]
+    periods: Tensor  # Periods of the texture in px. [E]
+    longest: float  # Wavelength of the coarsest level, which limits axes: along stripes they would be infinite
+    spacing: float  # Distance between neighbouring centres in px
 
 
 def structure_ellipses(
