@@ -28,10 +28,8 @@ MAX_FLAT = 6
 LINES = 19_450
 """Most lines of Python in the package. This number and those below may only fall: what is added takes the place of
 something, and who makes the package smaller lowers them."""
-LINES_OF_A_FILE = 500
-LINES_OF_LARGE_FILES = {
-    "training/model.py": 810,
-}
+LINES_OF_A_FILE = 450
+LINES_OF_LARGE_FILES: dict[str, int] = {}
 
 
 def names_imported(path: Path) -> set[str]:
