@@ -184,7 +184,7 @@ def _checkpoint_of(run: Path) -> Path:
 def read_checkpoint(run: Path) -> tuple[dict[str, Tensor], RenderOptions]:
     """Read a run's parameters, as `of_parameters` takes them, and the options with which it drew them.
 
-    The tensors are mapped from the file, so that what is not read takes no memory. Raise InputError if there is no
+    The tensors are mapped from the file, and take no memory until they are read. Raise InputError if there is no
     checkpoint of this method or of splatfacto, or its Gaussians cannot be exported.
     """
     # These import torch, which takes seconds, and `--help` and a wrong path need not wait for it.

@@ -40,7 +40,7 @@ def parse(options: type[Options], name: str, argv: Sequence[str] | None) -> Opti
 def exit_code(name: str, folder: Path | None, run: Callable[[], int]) -> int:
     """Run a command that can be resumed, print the sentence of an error, and return the exit code.
 
-    It is what `run` returns, 1 if a file in `folder` could not be written or the run failed, 2 if the input is wrong,
+    It is the result of `run`, 1 if a file in `folder` could not be written or the run failed, 2 if the input is wrong,
     and 130, 143 or 129 after SIGINT, SIGTERM or SIGHUP.
     """
     try:

@@ -32,9 +32,9 @@ _POLL_SECONDS = 0.1
 _KEPT_BYTES = 65536
 """Size of the end of a failed process's output that is searched for the reason."""
 _PROMPT = "$ "
-"""What stands before a command in a log."""
+"""Stands before a command in a log."""
 _PREFIX = re.compile(r"^(error|sadgs-[\w-]+): ")
-"""What commands put before the sentence of an error."""
+"""Commands put this before the sentence of an error."""
 
 
 class WorkerError(RunError):

@@ -34,7 +34,7 @@ def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         raise
     except OSError as error:
         raise InputError(f"{path} cannot be read ({reason(error)}): restore it.") from error
-    except Exception as error:  # What a damaged header leads plyfile's parser to is open.
+    except Exception as error:  # A damaged header may lead plyfile's parser to anything.
         raise InputError(f"{path} is not a PLY file of points ({reason(error)}): restore it.") from error
     named = {name.lower(): name for name in vertices.dtype.names or () if vertices.dtype[name].kind in "fiu"}
     channels = next((names for names in COLORS if named.keys() >= set(names)), None)

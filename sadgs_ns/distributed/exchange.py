@@ -24,7 +24,8 @@ gradient, and an unused one."""
 class Exchange:
     """Sends the Gaussians that each band draws to the process that composites it.
 
-    The host waits for the device once, to learn their number; the processes' flags come along.
+    It is made with the Gaussians of this process in all V views and all bands of `share_rows`. The host waits for the
+    device once, to learn the Gaussians' numbers; the processes' flags come along.
 
     Attributes:
         bands: Those that this process composites.
@@ -35,10 +36,6 @@ class Exchange:
         whole_views: Whether each view is one band, so that no row is sent twice.
         absolute: The centres in which compositing leaves absolute gradients for `backward`, for each of these bands, if
             they are asked for.
-
-    Args:
-        projected: The Gaussians of this process in all V views.
-        bands: All bands, as `share_rows` returns them.
     """
 
     def __init__(self, world: World, projected: Projected, bands: Sequence[Band]) -> None:

@@ -22,7 +22,7 @@ _SEEN = 1 / 255
 
 @dataclass(frozen=True)
 class Cleaning:
-    """What is taken away; by default nothing."""
+    """Which Gaussians are taken away; by default none."""
 
     min_views: int = 0
     """Take away Gaussians that fewer training views see; 0 takes none."""
@@ -56,7 +56,7 @@ class Cleaning:
 
 @dataclass(frozen=True)
 class Visibility:
-    """What the training views see of N Gaussians."""
+    """How much of N Gaussians the training views see."""
 
     views: Tensor
     """Number of views that see each. int64 [N]"""
@@ -71,7 +71,7 @@ def measure_visibility(
     cameras: Iterable[tuple[Tensor, Tensor, int, int]],
     drawing: RenderOptions = DEFAULTS,
 ) -> Visibility:
-    """Measure how many pixels Gaussians make up in training views: opacity × area, less what is hidden by others.
+    """Measure how many pixels Gaussians make up in training views: opacity × area, less the part that others hide.
 
     Args:
         params: `means`, `quats`, log `scales`, logit `opacities`.
@@ -80,7 +80,7 @@ def measure_visibility(
     """
     shapes = [params[name].detach() for name in ("means", "quats", "scales")]
     opacities = params["opacities"].detach().flatten().sigmoid()
-    sound = torch.cat([*shapes, opacities[:, None]], dim=1).isfinite().all(dim=1)  # What is not cannot be drawn.
+    sound = torch.cat([*shapes, opacities[:, None]], dim=1).isfinite().all(dim=1)  # Others cannot be drawn.
     means, quats, scales = (torch.where(sound[:, None], value, 0.0) for value in shapes)
     scales, opacities = scales.exp(), torch.where(sound, opacities, 0.0)
     views, pixels = means.new_zeros(len(means), dtype=torch.int64), means.new_zeros(len(means))

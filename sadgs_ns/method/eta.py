@@ -78,8 +78,8 @@ def sample_footprint(
 
     `means2d` [M, 2] and `conics` [M, 3] are those of `render.types.Projected`. The footprint is the 2σ ellipse of Σ2D:
     a uniform point in it has mean μ_2D and covariance Σ2D. gsplat's conic contains its screen-space blur, which is
-    taken out again; what rounding makes negative is set to 0. Rounded to float32, a conic tells its determinant from 0
-    only above ε a c: footprints longer than that (thousands of px) are cut to it.
+    taken out again; variances that rounding makes negative are set to 0. Rounded to float32, a conic tells its
+    determinant from 0 only above ε a c: footprints longer than that (thousands of px) are cut to it.
 
     Returns:
         Points in px, pixel centres at half-integers; NaN where the conic is NaN or infinite. [M, 2]
@@ -133,7 +133,7 @@ def eta(
 ) -> Tensor:
     """Frequency violation of each axis: η_k = ‖v_k‖ / Λ_min (paper, eq. 6). [M, 3]
 
-    It is above 1 where an axis is longer than the local wavelength. The arguments are what `projected_axes` and
-    `sample_map` return.
+    It is above 1 where an axis is longer than the local wavelength. The arguments are results of
+    `projected_axes` and `sample_map`.
     """
     return torch.hypot(axes[..., 0], axes[..., 1]) / wavelength(structure_tensor)[:, None]

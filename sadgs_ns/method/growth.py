@@ -1,4 +1,4 @@
-"""What may grow: rules that propose splits and clones, and what becomes of a proposal under one budget."""
+"""Rules that propose splits and clones, and their application under one budget."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _OTHER_AXES = 0.8
 
 @dataclass(frozen=True)
 class Proposal:
-    """How N Gaussians would grow, each of which does so as a whole or not at all."""
+    """How N Gaussians would grow, each as a whole or not at all."""
 
     children: Tensor
     """Into how many a Gaussian is split along each of its axes; 1, 1, 1 leaves it whole. int64 [N, 3]"""
@@ -56,8 +56,8 @@ class Rule:
     """Iterations between its steps inside the densification window; 0 turns it off."""
     propose: Propose
     reads: Literal["statistics", "gradients"] | None = None
-    """What its steps read of the state, which begins anew after each. A rule that reads η's statistics prunes by them
-    before it grows, and gradients begin anew after it, too; others prune the faint after they grew."""
+    """The part of the state that its steps read, and that begins anew after each. A rule that reads η's statistics
+    prunes by them before it grows, and gradients begin anew after it, too; others prune the faint after they grew."""
 
 
 def structure_aware(options: Any, params: Params, state: Mapping[str, Any]) -> Proposal:

@@ -81,7 +81,7 @@ def photometric_part(
     height: int,
     ssim_lambda: float = 0.2,
 ) -> tuple[Tensor, Tensor]:
-    """What some rows of a view add to its `photometric_loss`: over rows that cover the view, these parts sum to it.
+    """The share of some rows in a view's `photometric_loss`: over rows that cover the view, the shares sum to it.
 
     SSIM's windows belong to the rows in which they are centred. Raises ValueError as `photometric_loss`.
 

@@ -64,7 +64,7 @@ Gaussians in two views), and 11 with 300,000 made-up Gaussians of 2 to 5 px at 1
 
 @dataclass(frozen=True)
 class StepSize:
-    """What a step renders, besides the number of Gaussians."""
+    """The size of a step, besides the number of Gaussians."""
 
     views: int = 0
     """Number of views."""
@@ -80,7 +80,7 @@ class StepSize:
     def of(cls, infos: Sequence[Mapping[str, Any]]) -> StepSize:
         """The size of a step that was rendered, from the `info` of each of its groups of views.
 
-        That is gsplat's, or that of `distributed.rasterization`, which says what this process composited.
+        It is gsplat's, or that of `distributed.rasterization` with the numbers of this process.
         """
         return cls(
             sum(info["n_cameras"] for info in infos),
@@ -136,7 +136,7 @@ def affordable_growth(params: Params, state: Mapping[str, Any], free: float, siz
 
     Args:
         free: Bytes left, as `free_bytes` counts them.
-        size: What the next step renders, with the pairs of the present Gaussians.
+        size: The next step's, with the pairs of the present Gaussians.
     """
     if math.isinf(free):
         return free

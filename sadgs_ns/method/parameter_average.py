@@ -15,7 +15,7 @@ class RunningMean:
     """The mean of parameters over iterations (Polyak and Juditsky, "Acceleration of stochastic approximation by
     averaging").
 
-    Each step renders few views, so that the parameters keep moving around what is best for all of them. Their mean
+    Each step renders few views, so that the parameters keep moving around the best ones for all views. Their mean
     lies closer to it. Parameters are averaged as they are optimized: log scales, logits of opacities, and quaternions,
     which move too little within a twentieth of a run to need more than that.
     """
@@ -48,10 +48,10 @@ class RunningMean:
         self.count, self.means = 0, {}
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what a checkpoint needs; its tensors are the mean's own."""
+        """Return the state for a checkpoint, without copying its tensors."""
         return {"count": self.count, "means": dict(self.means)}
 
     def load_state_dict(self, state: Mapping[str, Any], device: torch.device) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore the result of `state_dict`."""
         self.count = state["count"]
         self.means = {name: mean.to(device) for name, mean in state["means"].items()}

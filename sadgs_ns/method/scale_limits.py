@@ -1,8 +1,8 @@
 """How near Gaussians may come to cameras, for their size.
 
-What a Gaussian looks like is computed from its centre (EWA splatting): a linear approximation, which fails where the
-Gaussian subtends a large angle. A giant beside the field of view, whose tail is all that training views see of it, can
-cover every pixel of another view.
+The look of a Gaussian is computed from its centre (EWA splatting): a linear approximation, which fails where the
+Gaussian subtends a large angle. Training views may see only the tail of a giant beside the field of view, while it
+covers every pixel of another view.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How long a run is, how many views a step takes, and when densification does what; derived from the capture.
+"""The length of a run, the views of a step, and the times of densification, derived from the capture.
 
 A *view visit* is one rendering of one training view with its gradients. Many visits to few views overfit, and few
 visits to many underfit, so that the number of visits follows the number of views (docs/results.md#schedule).
@@ -53,7 +53,7 @@ class Schedule:
 
 @dataclass(frozen=True)
 class Windows:
-    """When densification does what, as the options of `StructureAwareStrategy` that have these names."""
+    """The times of densification, as the options of `StructureAwareStrategy` that have these names."""
 
     structure_every: int
     absgs_every: int
@@ -86,7 +86,7 @@ def schedule(
 
 @lru_cache(maxsize=64)
 def windows(iterations: int, **given: int | None) -> Windows:
-    """Derive when densification does what from the number of iterations; fields that are given and not None stay.
+    """Derive the times of densification from the number of iterations; fields that are given and not None stay.
 
     In the proportions of the released code: of thirty parts of the run, an AbsGS step ends each from the first to the
     sixteenth, a structure step takes the place of every fifth, and opacities are reset once after twelve, but not in
@@ -105,7 +105,7 @@ def windows(iterations: int, **given: int | None) -> Windows:
 
 
 def due(iteration: int, every: int) -> bool:
-    """Whether what comes every so many iterations comes at this one; 0 is never."""
+    """Whether something that comes every so many iterations comes at this one; 0 is never."""
     return every > 0 and iteration % every == 0
 
 

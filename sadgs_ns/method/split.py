@@ -60,7 +60,7 @@ def grid_split(params: Params, optimizers: Optimizers, state: State, counts: Ten
 
     μ_child = μ + R (s ⊙ g) and s_child = s ⊘ n (paper, eq. 9); rotation, colour and opacity are copied. The order
     afterwards is [unsplit, children grouped by parent]. Children start with zero optimizer moments and empty rows of
-    every tensor in `state`: what was observed of the parent, which was longer, does not hold for them.
+    every tensor in `state`: observations of the parent, which was longer, do not hold for them.
 
     Such children stand √12 of their own standard deviations apart. Children k times as large (not in the paper) fill
     these gaps: their grid is narrower, so that the covariance stays, and their opacity 1/k for each axis that is split,

@@ -29,7 +29,7 @@ LOW_ETA = 0.1
 
 @dataclass(frozen=True)
 class Statistic:
-    """What is kept of η for each Gaussian."""
+    """A number, or three, that a run keeps of η for each Gaussian."""
 
     shape: tuple[int, ...]
     """(3,) is a number for each axis, () one for the Gaussian. All are 0 while there is no observation."""

@@ -32,7 +32,7 @@ section 3.4)."""
 PRUNE_OPACITY = 0.1
 """τ_α: opacity under which a Gaussian with consistently low η is pruned (paper, section 3.4)."""
 CLAMP_OPACITY = 0.8
-"""Structure steps lower opacities to at most this, so that what lies behind gets gradients again (released code)."""
+"""Structure steps lower opacities to at most this, so that Gaussians behind get gradients again (released code)."""
 RESET_FACTOR = 0.1
 """Factor of an opacity reset on every opacity (released code)."""
 FINAL_PRUNE_OPACITY = 0.1
@@ -100,7 +100,7 @@ class StructureAwareStrategy(Strategy):
     _fitted = cast("Windows | None", None)
     world = World()
     """The processes among which the Gaussians are shared out.
-    The cap and the ranking of what may grow are those of all, and densification ends with equal shards."""
+    The cap and the ranking are those of all processes, and densification ends with equal shards."""
 
     def for_run(self, num_iterations: int, world: World | None = None) -> StructureAwareStrategy:
         """Return this strategy for a run: windows that are None are derived from its length, and all fit into it.
@@ -114,7 +114,7 @@ class StructureAwareStrategy(Strategy):
 
     @property
     def windows(self) -> Windows:
-        """When densification does what; where a window is None, as in a run of 3,000 iterations."""
+        """The times of densification; where a window is None, as in a run of 3,000 iterations."""
         if self._fitted is not None:  # Steps ask for them often.
             return self._fitted
         given = self._given
@@ -219,7 +219,7 @@ class StructureAwareStrategy(Strategy):
             accumulate_gradients(state, view, num_views)
 
     def densify(self, params: Params, optimizers: Optimizers, state: State, step: int, info: Infos) -> None:
-        """Split, clone, prune and reset what is due after this step."""
+        """Split, clone, prune and reset Gaussians where that is due after this step."""
         iteration, windows, views = step + 1, self.windows, _views(info)
         if not windows.refine_start_iter <= iteration <= windows.refine_stop_iter:
             return
@@ -247,7 +247,7 @@ class StructureAwareStrategy(Strategy):
         return torch.where(fits[:, None], proposal.children, 1)
 
     def planned_growth(self, propose: Propose, params: Params, state: Mapping[str, Any]) -> tuple[Proposal, Tensor]:
-        """What a rule would propose by now, and the Gaussians that the cap lets grow, bool [N]."""
+        """The proposal of a rule by now, and the Gaussians that the cap lets grow, bool [N]."""
         proposal = propose(self, params, state)
         room = self.max_gaussians - len(params["means"])
         return proposal, limit_growth(self.world, proposal.growth, proposal.priority, room)
@@ -255,12 +255,12 @@ class StructureAwareStrategy(Strategy):
     def _grow(
         self, rule: Rule, params: Any, optimizers: Any, state: Any, iteration: int, views: Sequence[Info]
     ) -> None:
-        """Prune, let what a rule proposes grow as far as there is room, and forget what it has read."""
+        """Prune, let Gaussians grow as a rule proposes and room allows, and forget the state that it has read."""
         n_before, n_low, n_pruned, by_eta = len(params["means"]), 0, 0, rule.reads == "statistics"
         if by_eta:
             is_low = self.consistently_low(state)
             n_low = int(is_low.sum())
-            # The final prune, before children are made: those are fainter, and would go with what they replace.
+            # The final prune comes before children are made: they are fainter than their parents, and would go, too.
             faint = max(self.min_opacity, FINAL_PRUNE_OPACITY if iteration == self.windows.refine_stop_iter else 0.0)
             n_pruned = self._prune_faint(params, optimizers, state, faint, is_low & (opacities(params) < PRUNE_OPACITY))
             map_opacities(lambda alpha: alpha.clamp_max(CLAMP_OPACITY), params, optimizers)
@@ -271,7 +271,7 @@ class StructureAwareStrategy(Strategy):
             _warn_of_memory(iteration, in_memory)
         apply(proposal, allowed, params, optimizers, state)
         if by_eta:
-            # What was learned about parents says nothing about their children.
+            # The statistics of parents say nothing about their children.
             self._clear_statistics(params, state)
             names = ("before", "violating", "low", "split", "pruned", "after")
             of_this = (n_before, int((growth > 0).sum()), n_low, int(allowed.sum()), n_pruned, len(params["means"]))

@@ -32,9 +32,10 @@ that settled it."""
 NOISE_FLOOR = 0.02
 """Amplitude, relative to the image's own contrast, under which structure counts as noise: the ε of eq. 3 and 5."""
 ENERGY_BLUR = 2.0
-"""E_l² is averaged over a Gaussian window of ENERGY_BLUR · σ_l px before its root; 0 is eq. 4 as printed."""
+"""E_l² is averaged over a Gaussian window of ENERGY_BLUR · σ_l px before its root; 0 is eq. 4 as printed. E_l crosses
+zero twice a period; without the window S̄ follows the phase of the texture instead of its frequency."""
 TRUNCATION = 3.0
-"""Kernels end at this many standard deviations; what is cut off is 0.3 % of the mass."""
+"""Kernels end at this many standard deviations, without 0.3 % of the mass."""
 
 _ROUNDING_FLOOR = 1e-5
 """Amplitude relative to the brightest pixel under which float32 rounding, not the image, makes the differences."""
@@ -88,18 +89,13 @@ def multiscale_structure_tensor(
             [B, H, W, C]
         masks: Valid pixels; the others, which may hold anything, NaN too, neither contribute nor receive a tensor.
             bool [B, H, W] or None for all.
-        frequency_constant: c of ω_l = c / σ_l, in 1/px.
-        noise_floor: Amplitude relative to the image's contrast under which S̄ fades to 0.
-        energy_blur: Window, in multiples of σ_l, over which the band energy E_l² is averaged. E_l crosses zero twice a
-            period; without the window S̄ follows the phase of the texture instead of its frequency.
+        frequency_constant, noise_floor, energy_blur, truncation: See the constants of these names.
         epsilon: ε > 0 of eq. 3 and 5 as the paper prints it, the same number for every image and level, in the units
             of the pixel values; the released code takes 1e-6 with values in [0, 1]. `noise_floor` then has no effect.
-        truncation: Radius of every kernel, in multiples of its standard deviation.
-        known_finite: The valid pixels are known to be finite. To find that out, the host waits for the device.
+        known_finite: The valid pixels are known to be finite; otherwise the host waits for the device to find out.
 
     Returns:
-        S̄ as (xx, xy, yy) in 1/px², positive semidefinite, trace ≤ (c / σ_0)²; NaN at masked pixels, where it is not
-        known. [B, H, W, 3]
+        S̄ as (xx, xy, yy) in 1/px², positive semidefinite, trace ≤ (c / σ_0)²; NaN at masked pixels. [B, H, W, 3]
 
     Raises:
         ValueError: If the images or masks have another shape, the images are empty or not floating point, a valid

@@ -1,6 +1,6 @@
 """Which Gaussians lie too far off a view's axis to be drawn.
 
-What a Gaussian looks like is a linear approximation at its centre (EWA splatting). Far off the axis it is wrong: a
+The look of a Gaussian is a linear approximation at its centre (EWA splatting). Far off the axis it is wrong: a
 Gaussian beside the camera, near the plane of its lens, covers the image with haze, although none of it is in sight.
 Viewers on the web leave out Gaussians whose centre is 1.2 to 1.4 half images from the image's centre.
 """

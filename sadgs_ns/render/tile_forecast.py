@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 MARGIN = 1.25
-"""Factor on what is foreseen. It was chosen without measurements: larger ones sort more unused places, and smaller ones
+"""Factor on the prediction. It was chosen without measurements: larger ones sort more unused places, and smaller ones
 repeat more steps."""
 RECENT = 8
 """Number of the latest visits among which the largest change is taken."""

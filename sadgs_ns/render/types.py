@@ -1,4 +1,4 @@
-"""What is drawn, from where and how. Shapes and units stand here, and at no function that passes these on.
+"""Gaussians, cameras and options of rendering. Shapes and units stand here, and at no function that passes these on.
 
 C is a number of views of one size, N one of Gaussians.
 """
@@ -64,7 +64,7 @@ class RenderOptions:
     does not wait for the exact number. If there are more, nothing is drawn, no gradient flows and all radii are 0. With
     None the host waits. The other backends need no such number."""
     backend: BackendName = "auto"
-    """What draws (`rasterization.choose_backend`)."""
+    """The backend that draws (`rasterization.choose_backend`)."""
 
 
 DEFAULTS = RenderOptions()
@@ -96,6 +96,6 @@ class Projected(NamedTuple):
     them."""
 
     def info(self) -> dict[str, Any]:
-        """Return what strategies read of gsplat's `info`; read `radii` through `rasterization.visible`."""
+        """Return the part of gsplat's `info` that strategies read; read `radii` through `rasterization.visible`."""
         names = ("radii", "means2d", "depths", "conics", "opacities", "width", "height")
         return {name: getattr(self, name) for name in names} | {"n_cameras": len(self.means2d)}

@@ -146,7 +146,7 @@ class _Scene:
                 (self.work / "pairs.txt").unlink(missing_ok=True)
 
     def remove_intermediate_files(self) -> None:
-        """Remove what adding photos to the finished scene does not need."""
+        """Remove the files that are not needed to add photos to the finished scene."""
         for path in {*self.work.iterdir()} - {self.model, self.work / "database.db", self.settings_file}:
             shutil.rmtree(path) if path.is_dir() else path.unlink()
 

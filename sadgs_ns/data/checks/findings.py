@@ -1,4 +1,4 @@
-"""What a check found, and how an error among it stops a run."""
+"""The findings of a check, and how an error among them stops a run."""
 
 from __future__ import annotations
 

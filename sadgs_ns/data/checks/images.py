@@ -33,7 +33,7 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True)
 class Frame:
-    """An image with what its camera says."""
+    """An image, and the size that its camera tells."""
 
     image: Path
     size: Size | None

@@ -1,4 +1,4 @@
-"""Layouts of a capture's folder, and what to say where there is none that is known."""
+"""Layouts of a capture's folder, and the sentences for folders with no known one."""
 
 from __future__ import annotations
 

@@ -167,7 +167,7 @@ def read_blender(path: Path) -> dict[str, Any]:
 
 
 def _check_transform(meta: dict[str, Any], path: Path) -> None:
-    """Raise InputError if what the file says of all poses together makes no sense."""
+    """Raise InputError if the settings of all poses together make no sense."""
     try:
         applied = applied_transform(meta)
     except (TypeError, ValueError, OverflowError):
