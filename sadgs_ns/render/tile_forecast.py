@@ -52,8 +52,8 @@ class TileForecast:
     views, and `size` the width and height in px in which they were rendered.
 
     Attributes:
-        coarse: Whether capacities are rounded up to powers of two and one and a half times these, so that only few
-            different ones occur. They then are a fifth larger in the mean, which small scenes do not notice.
+        round_to_powers: Whether capacities are rounded up to powers of two and one and a half times these, so that
+            only few different ones occur. They are a fifth larger in the mean then, which small scenes do not notice.
         times_overflowed: Number of calls that drew nothing so far, because they needed more places.
     """
 
@@ -62,7 +62,7 @@ class TileForecast:
         self._visits: dict[tuple[int, tuple[int, int]], _Visit] = {}
         self._changes: deque[tuple[int, float]] = deque(maxlen=RECENT)  # epoch of the visit before, and the factor
         self._calls: deque[_Call] = deque()
-        self.coarse = False
+        self.round_to_powers = False
         self.times_overflowed = 0
 
     def capacity(self, views: Sequence[int], size: tuple[int, int], num_gaussians: int) -> int | None:
@@ -85,7 +85,7 @@ class TileForecast:
             if visit.epoch < self._epoch and not changes:
                 return None
             total += max([1.0, *changes]) * visit.num_pairs
-        rounded = _round_up(int(MARGIN * total) + 1, 2 if self.coarse else 16)
+        rounded = _round_up(int(MARGIN * total) + 1, 2 if self.round_to_powers else 16)
         return rounded if rounded <= MOST_PAIRS else None
 
     def rendered(self, views: Sequence[int], size: tuple[int, int], capacity: int | None, counts: Counts) -> None:

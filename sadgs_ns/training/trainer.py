@@ -269,7 +269,7 @@ class SadgsTrainer(Trainer):
         self.world.flags_out = int(time.monotonic() >= self._save_due) | bit
         pipeline, model, graphed = self.pipeline, self.pipeline.model, self.graphed
         if graphed is not None and model.tile_forecast is not None:
-            model.tile_forecast.coarse = graphed.prepare(pipeline.views_per_iteration)
+            model.tile_forecast.round_to_powers = graphed.prepare(pipeline.views_per_iteration)
         groups, update = pipeline.next_views(step), self.optimizers.update()
         inputs = groups, model.opacity_reg_now, update
         factors, slot = update.factors(), pipeline.log.slot

@@ -50,7 +50,7 @@ def test_capacities_suffice_and_are_few(coarse: bool):
     capacities = []
     for pairs in range(100_000, 3_000_000, 10_007):
         forecast = TileForecast()
-        forecast.coarse = coarse
+        forecast.round_to_powers = coarse
         render(forecast, [0], [pairs])
         capacity = forecast.capacity([0], SIZE, 100)
         assert capacity is not None and MARGIN * pairs < capacity <= MARGIN * pairs * (3 / 2 if coarse else 17 / 16) + 1

@@ -272,7 +272,7 @@ def test_where_capturing_fails_the_steps_are_launched_one_by_one_and_one_sentenc
     assert_equal(one_step.trained(False), one_step.trained(True))
     printed = " ".join(capsys.readouterr().out.split())
     assert printed.count("could not be captured as a CUDA graph (CUDA error: operation not permitted when") == 1
-    assert not one_step.model.tile_forecast.coarse  # type: ignore[union-attr]
+    assert not one_step.model.tile_forecast.round_to_powers  # type: ignore[union-attr]
 
 
 @on_cpu
