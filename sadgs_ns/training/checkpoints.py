@@ -36,14 +36,14 @@ def read(path: Path, remedy: str = REMEDY, mmap: bool = False) -> dict[str, Any]
         state = torch.load(path, map_location="cpu", weights_only=True, mmap=mmap or None)
     except Exception as error:  # Damaged archives, pickles and tensors each raise their own.
         # torch's message goes on with advice to load the file unsafely.
-        what = re.split(r"(?<=[a-z])[.:]\s", reason(error), maxsplit=1)[0]
+        problem = re.split(r"(?<=[a-z])[.:]\s", reason(error), maxsplit=1)[0]
         raise InputError(
-            f"{path} is cut off, damaged or not of tensors and plain values alone ({what}): {remedy}."
+            f"{path} is cut off, damaged or not of tensors and plain values alone ({problem}): {remedy}."
         ) from error
     missing = [part for part in _PARTS if not isinstance(state, dict) or part not in state]
     if missing or type(state["step"]) is not int:
-        what = f"it has no {missing[0]}" if missing else "its step is no number"
-        raise InputError(f"{path} is not a checkpoint that nerfstudio's trainer wrote ({what}): {remedy}.")
+        problem = f"it has no {missing[0]}" if missing else "its step is no number"
+        raise InputError(f"{path} is not a checkpoint that nerfstudio's trainer wrote ({problem}): {remedy}.")
     return state
 
 

@@ -136,8 +136,8 @@ class SadgsModelConfig(InstantiateConfig):
         check_ranges("pipeline.model.", self, ranges)
         for name in ("trans_l2_penalty", "rot_l2_penalty"):
             if (penalty := getattr(self.camera_optimizer, name)) != getattr(PoseOptimizerConfig, name):
-                told = f"cannot be set, got {penalty:g}: leave it out."
-                raise InputError(f"pipeline.model.camera_optimizer.{name} {told}")
+                problem = f"cannot be set, got {penalty:g}: leave it out."
+                raise InputError(f"pipeline.model.camera_optimizer.{name} {problem}")
         try:
             self.strategy.check()
         except ValueError as error:

@@ -48,9 +48,9 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         parser._target = OWN.get(parser._target, parser._target)
         config.dataparser = parser
         # nerfstudio would keep more than 500 images on the host, whatever their size.
-        asked, config.cache_images = config.cache_images, "cpu"
+        requested, config.cache_images = config.cache_images, "cpu"
         super().__init__(config, *args, **kwargs)  # type: ignore[arg-type]
-        self.config.cache_images = asked
+        self.config.cache_images = requested
         for dataset in (self.train_dataset, self.eval_dataset):
             splits.check_paths(dataset.image_filenames)
             dataset.cameras.metadata = dataset.cameras.metadata or {}  # `ns-export cameras` needs one.

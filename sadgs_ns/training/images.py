@@ -28,10 +28,10 @@ _Undistort = Callable[[dict[str, Any], NDArray[Any]], tuple[NDArray[np.float32],
 [H, W, 1] without distortion."""
 
 
-def thread_count(asked: int | None) -> int:
+def thread_count(requested: int | None) -> int:
     """Return the number of threads that decode images in this process, by default one a core, up to 16."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return asked or min(max(cores // processes_on_this_machine(), 1), 16)
+    return requested or min(max(cores // processes_on_this_machine(), 1), 16)
 
 
 class LazyImages(Sequence[dict[str, Any]]):
@@ -176,16 +176,16 @@ class ImagePrefetcher:
         The host waits only for images that are not decoded yet. Raises InputError as `LazyImages.__getitem__`.
         """
         self._load(indices)
-        taken = {}
+        data_by_view = {}
         for index in indices:
-            taken[index], copied = self._sent.pop(index, None) or self._copy(index)
+            data_by_view[index], copied = self._sent.pop(index, None) or self._copy(index)
             if copied is not None:
                 stream = torch.cuda.current_stream(self.device)
                 stream.wait_event(copied)
-                for value in taken[index].values():
+                for value in data_by_view[index].values():
                     if isinstance(value, Tensor) and value.is_cuda:
                         value.record_stream(stream)  # Its memory belongs to the copying stream.
-        return taken
+        return data_by_view
 
     def prefetch(self, upcoming: Sequence[int], following: Sequence[int]) -> None:
         """Load the images of upcoming views, drop all others, and start copies of loaded ones of the following step."""

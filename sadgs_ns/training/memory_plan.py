@@ -168,8 +168,8 @@ def fit_to_memory(
     device, n = params["means"].device, len(params["means"])
     free, total = memory.available_bytes(device)
     if math.isinf(free):
-        told = f"At most {cap:,} Gaussians: this device's memory is not planned with, so this is max_gaussians."
-        return cap, told, None
+        line = f"At most {cap:,} Gaussians: this device's memory is not planned with, so this is max_gaussians."
+        return cap, line, None
     state = empty_state(0, device)
     each = memory.kept_bytes(params, state) + memory.widest_bytes(params)
 

@@ -44,31 +44,31 @@ class NonFiniteLog:
         """Return number, views and problem of each step that was not finite, and empty the log; this waits."""
         if not self._steps:
             return []
-        wrong = []
+        problems = []
         losses, gradients = torch.stack(self._losses).tolist(), self._gradients[: len(self._steps), 0].tolist()
         for (step, views), loss, gradient in zip(self._steps, losses, gradients, strict=True):
             if not math.isfinite(loss):
-                what = f"the loss was {loss}"
+                problem = f"the loss was {loss}"
             elif not math.isfinite(gradient):
-                what = "gradients were not finite"
+                problem = "gradients were not finite"
             else:
                 self.streak = 0
                 continue
             self.streak += 1
-            wrong.append((step, views, what))
+            problems.append((step, views, problem))
         self.steps += len(self._steps)
         self._steps.clear()
         self._losses.clear()
         self._gradients.zero_()
-        return wrong
+        return problems
 
 
 @torch.no_grad()
 def leave_out_nonfinite(gradient: Tensor, nonfinite_flag: Tensor) -> None:
     """Set gradients that are not finite to 0, in place, and `nonfinite_flag` [1] to NaN if there were some."""
-    wrong = ~(gradient.abs() < MAX_GRADIENT)  # Comparing NaN gives False.
-    gradient.masked_fill_(wrong, 0.0)
-    nonfinite_flag.masked_fill_(wrong.any(), torch.nan)
+    nonfinite = ~(gradient.abs() < MAX_GRADIENT)  # Comparing NaN gives False.
+    gradient.masked_fill_(nonfinite, 0.0)
+    nonfinite_flag.masked_fill_(nonfinite.any(), torch.nan)
 
 
 def has_no_update(gradient: Tensor) -> bool:

@@ -99,11 +99,11 @@ class AdamUpdate:
 
         begin = 0
         for (_, betas, eps), names in self._launches:
-            these, begin = slice(begin, begin + len(names)), begin + len(names)
+            part, begin = slice(begin, begin + len(names)), begin + len(names)
             parameters = tuple(self.parameters[name] for name in names)
             in_order = tuple(gradients[name].contiguous() for name in names)
             adam_step(
-                parameters, in_order, self.exp_avgs[these], self.exp_avg_sqs[these], factors[:, these], nonfinite_flag,
+                parameters, in_order, self.exp_avgs[part], self.exp_avg_sqs[part], factors[:, part], nonfinite_flag,
                 overflowed, betas=betas, eps=eps, max_gradient=MAX_GRADIENT,
             )  # fmt: skip
 

@@ -150,21 +150,21 @@ class SadgsPipeline(VanillaPipeline):
         If that lasts, and the present gradients move nothing, `diverged` becomes the sentence that says so. The report
         at the run's end may cover fewer iterations than `nonfinite.DIVERGED_STEPS`.
         """
-        wrong = self.log.read()
+        problems = self.log.read()
         files = self.datamanager.train_dataset.image_filenames
-        for step, views, what in wrong[:_NAMED_STEPS]:
+        for step, views, problem in problems[:_NAMED_STEPS]:
             names = " and ".join(files[view].name for view in views)
-            warn(f"Iteration {step + 1}, {names}: {what}; such gradients counted as 0, training goes on.")
-        if len(wrong) > _NAMED_STEPS:
-            warn(f"The same in {len(wrong) - _NAMED_STEPS} more of the last iterations.")
+            warn(f"Iteration {step + 1}, {names}: {problem}; such gradients counted as 0, training goes on.")
+        if len(problems) > _NAMED_STEPS:
+            warn(f"The same in {len(problems) - _NAMED_STEPS} more of the last iterations.")
         enough = nonfinite.DIVERGED_STEPS if not last else min(nonfinite.DIVERGED_STEPS, self.log.steps)
-        lasts, gradient = bool(wrong) and self.log.streak >= enough, self._means_gradient
+        lasts, gradient = bool(problems) and self.log.streak >= enough, self._means_gradient
         if self.world.all(lasts and gradient is not None and nonfinite.has_no_update(gradient)):
-            step, _, what = wrong[-1]
-            names = [files[view].name for view in dict.fromkeys(view for _, views, _ in wrong for view in views)]
+            step, _, problem = problems[-1]
+            names = [files[view].name for view in dict.fromkeys(view for _, views, _ in problems for view in views)]
             more = f" and {len(names) - _NAMED_STEPS} more" if len(names) > _NAMED_STEPS else ""
             self.diverged = (
-                f"Nothing was learned in the last {self.log.streak} iterations, up to iteration {step + 1}: {what} "
+                f"Nothing was learned in the last {self.log.streak} iterations, up to iteration {step + 1}: {problem} "
                 f"(images {', '.join(names[:_NAMED_STEPS])}{more})"
             )
 

@@ -27,7 +27,7 @@ _CAP_OPTIONS = ("memory_budget_gb", "model.strategy.max_gaussians")
 def plan_length(config: SadgsTrainerConfig, views: int, before: RunPlan | None) -> Schedule:
     """Decide iterations and views a step: by options, by an equal effort's plan `before`, or by rule."""
     effort, iterations, in_step = config.pipeline.effort, config.max_num_iterations, config.pipeline.views_per_iteration
-    if before is not None and before.asked["effort"] == effort:
+    if before is not None and before.requested["effort"] == effort:
         iterations = before.iterations if iterations is None else iterations
         in_step = before.views_per_iteration if in_step is None else in_step
     return schedule(views, effort=effort, iterations=iterations, views_per_iteration=in_step)
@@ -66,11 +66,16 @@ def plan_run(
     is the plan of the checkpoint's run, of which `done` iterations are done. Raises InputError if `memory_budget_gb`
     leaves no room for Gaussians.
     """
-    options, model, asked = config.pipeline, pipeline.model, _asked(config.pipeline)
-    old = {} if before is None else {n: value for n, value in before.asked.items() if n in asked and asked[n] != value}
-    if old:
-        changed = ", ".join(f"pipeline.{name} was {value} and is {asked[name]}" for name, value in old.items())
-        warn(f"The checkpoint's run had other settings; this one goes on with its own: {changed}.")
+    options, model, requested = config.pipeline, pipeline.model, _requested(config.pipeline)
+    if before is not None:
+        old = before.requested
+        changed = [
+            f"pipeline.{name} was {old[name]} and is {value}"
+            for name, value in requested.items()
+            if old.get(name, value) != value
+        ]
+        if changed:
+            warn(f"The checkpoint's run had other settings; this one goes on with its own: {', '.join(changed)}.")
     strategy, growth = options.model.strategy, growth_threshold(options.effort)
     clone, split = growth * strategy.clone_grad2d, growth * strategy.split_absgrad2d
     if dense:
@@ -78,7 +83,7 @@ def plan_run(
     cap = strategy.max_gaussians
     if strategy.refine_stop_iter != 0:
         cap = _cap_in_memory(options, pipeline, length.views_per_iteration)
-        if before is not None and all(asked[name] == before.asked[name] for name in _CAP_OPTIONS):
+        if before is not None and all(requested[name] == before.requested[name] for name in _CAP_OPTIONS):
             cap = _kept_cap(cap, before.strategy.max_gaussians)
     planned = replace(strategy, max_gaussians=cap, clone_grad2d=clone, split_absgrad2d=split)
     planned = planned.for_run(length.iterations)
@@ -100,11 +105,11 @@ def plan_run(
         max_off_axis=options.model.max_off_axis,
         strategy=planned,
         rates=plan_rates(optimizers, length, extent, config.rates_follow_views),
-        asked=asked,
+        requested=requested,
     )
 
 
-def _asked(options: SadgsPipelineConfig) -> dict[str, Any]:
+def _requested(options: SadgsPipelineConfig) -> dict[str, Any]:
     """Return the options by name that decide how training goes on from a checkpoint."""
     own = {name: getattr(options, name) for name in ("effort", "views_per_iteration", "memory_budget_gb")}
     return own | {f"model.strategy.{name}": value for name, value in asdict(options.model.strategy).items()}
@@ -112,21 +117,25 @@ def _asked(options: SadgsPipelineConfig) -> dict[str, Any]:
 
 def _print_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: Schedule, done: int) -> None:
     """Print how long the run is, and what decided it."""
-    cameras, options, taken = pipeline.datamanager.train_dataset.cameras, config.pipeline, length.views_per_iteration
-    views, asked, iterations = len(cameras), options.views_per_iteration, length.iterations
-    times = round(iterations * taken / views)
+    cameras, effort = pipeline.datamanager.train_dataset.cameras, config.pipeline.effort
+    requested = config.pipeline.views_per_iteration
+    views, in_step, iterations = len(cameras), length.views_per_iteration, length.iterations
+    steps_done, times = f", of which {done:,} are done" if done else "", round(iterations * in_step / views)
     note(
         f"{config.method_name} on {views:,} training views of {_pixels(cameras) / 1e6:.2g} megapixels: "
-        f"{iterations:,} iterations of {taken} view{'s' * (taken > 1)}{f', of which {done:,} are done' if done else ''}"
-        f", so that each view is rendered about {times:,} time{'s' * (times != 1)}."
+        f"{iterations:,} iterations of {in_step} view{'s' * (in_step > 1)}{steps_done}, so that each view is rendered "
+        f"about {times:,} time{'s' * (times != 1)}."
     )
     if config.max_num_iterations is None:
         note(
-            f"The number of views and --pipeline.effort {options.effort:g} decide this: 0.5 is a draft of half as many "
+            f"The number of views and --pipeline.effort {effort:g} decide this: 0.5 is a draft of half as many "
             "renderings, 2 resolves more, with more Gaussians and, where views are many, renderings."
         )
-    if asked is not None and asked > taken:
-        warn(f"pipeline.views_per_iteration is {asked}, but there are {views} training views: all are taken each time.")
+    if requested is not None and requested > in_step:
+        warn(
+            f"pipeline.views_per_iteration is {requested}, but there are {views} training views: all are taken each "
+            "time."
+        )
     if pipeline.device.type == "cpu":
         warn(cpu_notice(torch.get_num_threads()))
 

@@ -82,10 +82,10 @@ class Peers:
         with tempfile.NamedTemporaryFile() as file:
             file.write(bytes(number))
             file.flush()
-            mine = (socket.gethostname(), os.getpid(), file.name)
-            self._places = [mine] * number
-            dist.all_gather_object(self._places, mine)
-            shared = next(path for host, _, path in self._places if host == mine[0])
+            own = (socket.gethostname(), os.getpid(), file.name)
+            self._places = [own] * number
+            dist.all_gather_object(self._places, own)
+            shared = next(path for host, _, path in self._places if host == own[0])
             try:
                 # This file is memory that all processes of the machine share. The byte of a process becomes 1 if it
                 # ends because another has ended.

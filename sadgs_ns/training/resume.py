@@ -40,12 +40,12 @@ class Resumption:
         except torch.cuda.OutOfMemoryError:
             raise
         except InputError as error:
-            told = f"{self.path} cannot be continued: {str(error).rstrip('.')}; {checkpoints.REMEDY}."
-            raise InputError(told) from error
+            message = f"{self.path} cannot be continued: {str(error).rstrip('.')}; {checkpoints.REMEDY}."
+            raise InputError(message) from error
         except Exception as error:  # A foreign file may raise anything.
-            what = f"{type(error).__name__}: {reason(error)}"
+            problem = f"{type(error).__name__}: {reason(error)}"
             raise InputError(
-                f"{self.path} is not a checkpoint of this version of sadgs ({what}): {checkpoints.REMEDY}."
+                f"{self.path} is not a checkpoint of this version of sadgs ({problem}): {checkpoints.REMEDY}."
             ) from error
 
     @property

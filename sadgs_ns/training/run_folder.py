@@ -67,10 +67,12 @@ def _check_address(viewer: ViewerConfig) -> None:
         for family, _, _, _, address in places:
             socket.create_server(address, family=family).close()
     except OSError as error:
-        what = reason(error).partition(" (while")[0]
+        problem = reason(error).partition(" (while")[0]
         if error.errno == errno.EADDRINUSE:
-            told = f"viewer.websocket_port {port} is taken on {host} ({what}): give another, or none for a free one."
+            message = (
+                f"viewer.websocket_port {port} is taken on {host} ({problem}): give another, or none for a free one."
+            )
         else:
-            told = f"The viewer cannot listen on {host}{f':{port}' if port else ''} ({what}): give another "
-            told += "viewer.websocket_host or viewer.websocket_port."
-        raise InputError(told) from error
+            message = f"The viewer cannot listen on {host}{f':{port}' if port else ''} ({problem}): give another "
+            message += "viewer.websocket_host or viewer.websocket_port."
+        raise InputError(message) from error

@@ -45,7 +45,7 @@ class RunPlan:
     max_off_axis: float  # As in the model's options
     strategy: StructureAwareStrategy  # Densification with the run's windows, thresholds and cap
     rates: dict[str, Rate]  # Learning rates by group of parameters
-    asked: dict[str, Any]  # Options of the pipeline from which this was derived, by their names
+    requested: dict[str, Any]  # Pipeline options from which this was derived, by their names
 
     @classmethod
     def of(cls, state: Mapping[str, Any]) -> RunPlan:
@@ -59,20 +59,20 @@ class RunPlan:
         with atomic_path(folder / "plan.yml") as partial:
             partial.write_text(_HEAD + yaml.safe_dump(asdict(self), sort_keys=False), "utf8")
 
-    def optimizers(self, asked: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    def optimizers(self, configs: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
         """Return nerfstudio's configurations of optimizers and schedulers with the planned rates."""
-        configs = {}
+        planned = {}
         for name, rate in self.rates.items():
-            group, decay = asked[name], asdict(rate)
+            group, decay = configs[name], asdict(rate)
             optimizer = replace(group["optimizer"], lr=decay.pop("lr"))
             ours = decay["max_steps"] is not None
             scheduler = RunLengthDecaySchedulerConfig(**decay) if ours else group.get("scheduler")
-            configs[name] = {"optimizer": optimizer, "scheduler": scheduler}
-        return configs
+            planned[name] = {"optimizer": optimizer, "scheduler": scheduler}
+        return planned
 
 
 def plan_rates(
-    asked: Mapping[str, Mapping[str, Any]], length: Schedule, extent: float, follow_views: bool
+    configs: Mapping[str, Mapping[str, Any]], length: Schedule, extent: float, follow_views: bool
 ) -> dict[str, Rate]:
     """Derive a run's learning rates from nerfstudio's configurations, which are for steps of one view.
 
@@ -80,7 +80,7 @@ def plan_rates(
     with the views of a step (`RATES_OF_FOUR_VIEWS`).
     """
     rates = {}
-    for name, group in asked.items():
+    for name, group in configs.items():
         lr, decay = group["optimizer"].lr, group.get("scheduler")
         factors = RATES_OF_FOUR_VIEWS.get(name, (1.0, 1.0)) if follow_views else (1.0, 1.0)
         start, end = (between_one_and_four(length.views_per_iteration, factor) for factor in factors)

@@ -24,11 +24,11 @@ Gaussians at equal quality (docs/results.md#dense-start)."""
 def number_of_points(pipeline: SadgsPipeline) -> int:
     """Return how many points of stereo depth a run may start from; print a line if CUDA is missing for them."""
     model, views = pipeline.model, len(pipeline.datamanager.train_dataset)
-    asked = model.config.stereo_points
+    requested = model.config.stereo_points
     if model.seed_points is None or model.config.random_init:
         return 0
-    if asked is not None:
-        return asked
+    if requested is not None:
+        return requested
     if not FEWEST_VIEWS <= views <= MOST_VIEWS:
         return 0
     if pipeline.device.type != "cuda":

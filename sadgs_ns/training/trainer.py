@@ -184,8 +184,8 @@ class SadgsTrainer(Trainer):
                 raise
             # An image that is decoded ahead of its step is gone or damaged, and no step is half done.
             self.save_checkpoint(self._completed_step)
-            told = f"{error} What was trained is saved and goes on with --load-dir {self.checkpoint_dir}."
-            raise RunError(told) from error
+            message = f"{error} What was trained is saved and goes on with --load-dir {self.checkpoint_dir}."
+            raise RunError(message) from error
         except RunError:
             raise
         except torch.cuda.OutOfMemoryError as error:

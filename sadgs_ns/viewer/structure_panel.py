@@ -264,14 +264,14 @@ class StructurePanel(torch.nn.Module):
         size = max(round(scale * photo.shape[0]), 1), max(round(scale * photo.shape[1]), 1)
         if choice in (ELLIPSES_HERE, ELLIPSES_NEAR):
             drawn = maps.draw_ellipses(photo, tensor, constant, size)
-            what = "S̄⁻¹ as ellipses, coloured by period,"
+            title = "S̄⁻¹ as ellipses, coloured by period,"
         else:
             drawn = cv2.resize(PERIOD(maps.texture_period(tensor, constant)), size[::-1])
-            what = "Period of the texture, px,"
+            title = "Period of the texture, px,"
         top, left = (height - size[0]) // 2, (width - size[1]) // 2
         whole = np.zeros((height, width, 3), np.uint8)
         whole[top : top + size[0], left : left + size[1]] = drawn
-        return Panel(f"{what} of {name}", whole, PERIOD)
+        return Panel(f"{title} of {name}", whole, PERIOD)
 
     def _of_gaussians(self, choice: str, camera: Cameras, width: int, height: int) -> Panel:
         model, statistics = self._model, self.statistics()
