@@ -23,9 +23,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sadgs_ns.kernels import TILE_SIZE
-from sadgs_ns.kernels.compositing_blocks import (
+from sadgs_ns.kernels.compositing_forward import (
     SCALE,
     alphas,
+    composite_forward,
     highest_alpha,
     load_gaussians,
     load_tile,
@@ -33,7 +34,6 @@ from sadgs_ns.kernels.compositing_blocks import (
     row,
     split4,
 )
-from sadgs_ns.kernels.compositing_forward import composite_forward
 
 PRECISION = "tf32x3"
 """How Triton multiplies float32 on tensor cores. "tf32x3" makes three products of the two parts of 11 bits that each
