@@ -21,7 +21,7 @@ def anchored(
     matrices: Tensor,  # [V, 3, 4]
     views: Tensor,  # [C]
 ) -> Tensor:
-    """Return the matrices of views, int64 [C], moved so that the mean over all views [V, 3, 4] is the identity.
+    """Return the matrices of some views, moved so that the mean over all views is the identity. [C, 3, 4]
 
     Otherwise the Gaussians and all matrices could change together, and held-out views, which have no matrix, would be
     rendered in colours that no photo has. No gradient flows through the mean, so that a view moves its own matrix only.
@@ -36,7 +36,7 @@ def correct_colors(
     alpha: Tensor,  # [C, H, W, 1]
     matrices: Tensor,  # [C, 3, 4]
 ) -> Tensor:
-    """Apply affine maps (M | b) [C, 3, 4] to the colours [C, H, W, 3] and alphas that `composite` returned: M c + α b.
+    """Apply affine maps (M | b) to the colours and alphas that `composite` returned: M c + α b. [C, H, W, 3]
 
     The offset b counts as much as the Gaussians cover, as if each Gaussian's own colour had been changed. Pixels that
     nothing covers stay black, and teach the matrices nothing. Raises InputError if the views have more pixels than the

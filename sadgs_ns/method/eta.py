@@ -22,7 +22,7 @@ WAVELENGTH_EPSILON = 1e-5
 def principal_eigenvalue(
     structure_tensor: Tensor,  # [..., 3]
 ) -> Tensor:
-    """Larger eigenvalue λ_1 [...] of symmetric 2×2 tensors (xx, xy, yy) [..., 3], in closed form.
+    """Larger eigenvalue λ_1 of symmetric 2×2 tensors (xx, xy, yy), in closed form. [...]
 
     Both terms are non-negative, so that nothing cancels, however close to isotropic the tensor is.
     """
@@ -33,10 +33,7 @@ def principal_eigenvalue(
 def wavelength(
     structure_tensor: Tensor,  # [..., 3]
 ) -> Tensor:
-    """Smallest local wavelength Λ_min = 1 / (√λ_1 + ε) (paper, section 3.3).
-
-    It is in px, in (0, 1/ε] [...], and S̄ is (xx, xy, yy) in 1/px² [..., 3].
-    """
+    """Smallest local wavelength Λ_min = 1 / (√λ_1 + ε) in px of S̄ in 1/px², in (0, 1/ε] (paper, section 3.3). [...]"""
     return 1.0 / (principal_eigenvalue(structure_tensor).clamp_min(0).sqrt() + WAVELENGTH_EPSILON)
 
 
@@ -49,13 +46,9 @@ def projected_axes(
     width: int,
     height: int,
 ) -> Tensor:
-    """Screen-space vectors of the three principal axes, v_k = J W R S_k (paper, eq. 1).
+    """Screen-space vectors of the three principal axes in px, v_k = J W R S_k (paper, eq. 1). [M, 3, 2]
 
-    Each observation has a Gaussian in front of a camera (`render.types`): [M, 3], [M, 4], [M, 3], [M, 4, 4], [M, 3, 3].
     J is the Jacobian that gsplat's forward pass uses for a pinhole camera, with its clamp near the frustum's border.
-
-    Returns:
-        v_k in px, axis k before component. [M, 3, 2]
     """
     rotation = viewmats[:, :3, :3]  # W [M, 3, 3]
     x, y, z = (torch.einsum("mij,mj->mi", rotation, means) + viewmats[:, :3, 3]).unbind(-1)  # [M] each
@@ -74,12 +67,12 @@ def sample_footprint(
     conics: Tensor,  # [M, 3] (a, b, c) of the inverse of Σ2D + SCREEN_BLUR·I, in 1/px²
     jitter: Tensor,  # [M, 2] in [0, 1)
 ) -> Tensor:
-    """Draw one point in each Gaussian's footprint, uniformly if the jitter [M, 2] is uniform in [0, 1).
+    """Draw one point in each Gaussian's footprint, uniformly if the jitter is uniform.
 
-    `means2d` [M, 2] and `conics` [M, 3] are those of `render.types.Projected`. The footprint is the 2σ ellipse of Σ2D:
-    a uniform point in it has mean μ_2D and covariance Σ2D. gsplat's conic contains its screen-space blur, which is
-    taken out again; variances that rounding makes negative are set to 0. Rounded to float32, a conic tells its
-    determinant from 0 only above ε a c: footprints longer than that (thousands of px) are cut to it.
+    The footprint is the 2σ ellipse of Σ2D: a uniform point in it has mean μ_2D and covariance Σ2D. gsplat's conic
+    contains its screen-space blur, which is taken out again; variances that rounding makes negative are set to 0.
+    Rounded to float32, a conic tells its determinant from 0 only above ε a c: footprints longer than that (thousands of
+    px) are cut to it.
 
     Returns:
         Points in px, pixel centres at half-integers; NaN where the conic is NaN or infinite. [M, 2]
@@ -107,9 +100,9 @@ def sample_map(
     camera_ids: Tensor,  # int64 [M]
     points: Tensor,  # [M, 2]
 ) -> tuple[Tensor, Tensor]:
-    """Read S̄ of images, of any floating dtype or quantized [C, H, W, 3], at the pixel under each point.
+    """Read S̄ of images, of any floating dtype or quantized, at the pixel under each point.
 
-    `camera_ids` are the points' images, int64 [M]. Points are in px, pixel centres at half-integers [M, 2].
+    `camera_ids` are the points' images. Points are in px, pixel centres at half-integers.
 
     Returns:
         S̄ in float32 or wider [M, 3], and whether it is known [M]: the point lies inside the image, on a pixel whose S̄

@@ -81,8 +81,8 @@ def starting_points(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The points that training starts from, with the scale and opacity of each; raises ValueError if there is no point.
 
-    `faces` adds `bounding_box_points` to the given points [P, 3] with their colours in [0, 1] [P, 3]. Return points and
-    colours [N, 3] each, scales in world units, > 0, and opacities [N] each.
+    `faces` adds `bounding_box_points` to the given points with their colours in [0, 1]. Return points and colours,
+    [N, 3] each, and scales in world units, > 0, and opacities, [N] each.
     """
     scales, opacities = neighbour_scales(points), torch.full((len(points),), opacity)
     if not faces:

@@ -21,7 +21,7 @@ def clear_of_cameras(
     radii: Tensor,  # [N]
     positions: Tensor,  # [C, 3]
 ) -> Tensor:
-    """Which points [N, 3] have no camera [C, 3] nearer than their radius [N], all in world units. bool [N]"""
+    """Which points have no camera nearer than their radius, all in world units. bool [N]"""
     return _distances(means, positions) >= radii
 
 
@@ -32,14 +32,10 @@ def limit_scales(
     positions: Tensor,  # [C, 3]
     angular_scale: float,
 ) -> None:
-    """Shorten, in place, the axes that are too long for the distance from the nearest camera.
+    """Shorten, in place, the axes that are too long for the distance from the nearest of C > 0 cameras.
 
-    The host does not wait for the device.
-
-    Args:
-        scales: Parameters: logarithms of the standard deviations. [N, 3]
-        positions: Camera centres in world units, C > 0. [C, 3]
-        angular_scale: Largest standard deviation, as a share of that distance, > 0.
+    `scales` are the parameters, logarithms of the standard deviations, and `angular_scale` > 0 is the largest standard
+    deviation as a share of that distance. The host does not wait for the device.
     """
     limits = (angular_scale * _distances(means, positions)).clamp_min(_LEAST_LIMIT).log()  # [N]
     scales.copy_(torch.minimum(scales, limits[:, None]))

@@ -39,7 +39,7 @@ def grid_offsets(
     counts: Tensor,  # int64 [P, 3]
     dtype: torch.dtype = torch.float32,
 ) -> tuple[Tensor, Tensor]:
-    """Place the cell centres of regular grids of n_x × n_y × n_z cells, int64 [P, 3], centred on their parents.
+    """Place the cell centres of regular grids of n_x × n_y × n_z cells, centred on their parents.
 
     Returns:
         Index of each child's parent, int64 [Q], and the grid coordinate g in parent standard deviations [Q, 3],

@@ -13,7 +13,7 @@ def activate(
     logits: Tensor,  # [N, 1]
     penalty: float = 0.0,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Compute the `scales` [N, 3] and `opacities` [N] of `Gaussians` from their logarithms [N, 3] and logits [N, 1].
+    """Compute the `scales` and `opacities` of `Gaussians` from their logarithms and logits.
 
     Also return numbers [P] whose sum is the mean opacity times `penalty` ≥ 0, or None where `penalty` is 0.
     Differentiate their sum only.

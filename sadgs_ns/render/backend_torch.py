@@ -284,10 +284,7 @@ def _segment(
     length: int,
     start: Tensor,  # [B, S, S] transmittance before the segment
 ) -> _Segment:
-    """Composite the entries from `begin` of the lists of a chunk of tiles [B], before which `start` is left [B, S, S].
-
-    `length` is that of the longest list.
-    """
+    """Composite the entries from `begin` of the lists of a chunk of tiles; the longest list has this `length`."""
     positions = torch.arange(begin, min(begin + _SEGMENT, length), device=means2d.device)
     counts = tiles.counts[chunk, None]  # [B, 1]
     # The padding repeats a tile's own last Gaussian, with opacity zero.
@@ -318,11 +315,7 @@ def _segment_gradients(
     behind: Tensor,  # [B, S * S, 1] what is behind the segment, dotted with v_colors
     absgrad: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Gradients [B * L, 6 + D (+ 2)] of means2d, conics, opacity, colours (and absgrad), and the new `behind`.
-
-    `colors` are [B, L, D], their pixels' gradients [B, S * S, D]. `behind` is the colour behind the segment, dotted
-    with these gradients [B, S * S, 1].
-    """
+    """Gradients [B * L, 6 + D (+ 2)] of means2d, conics, opacity, colours (and absgrad), and the new `behind`."""
     dx, dy, alphas, weights = segment.dx, segment.dy, segment.alphas, segment.weights
     a, b, c = segment.conics
     dots = v_colors @ colors.mT  # [B, S * S, L]
