@@ -149,10 +149,9 @@ def check_chosen(load_dir: Path | None, load_step: int | None, load_checkpoint: 
 def read_chosen(
     load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None, remedy: str = REMEDY, mmap: bool = False
 ) -> tuple[Path, dict[str, Any]] | None:
-    """Return path and content of the checkpoint that these options name; None if they name none.
+    """Return path and content of the checkpoint that these options name, or None, with errors as `read`.
 
-    A damaged one is skipped for the one before it, unless a step was asked for. Arguments and errors are those of
-    `checkpoint_paths` and `read`.
+    A damaged one is skipped for the one before it, unless a step was asked for.
     """
     errors = []
     for path in checkpoint_paths(load_dir, load_step, load_checkpoint):

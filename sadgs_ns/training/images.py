@@ -171,10 +171,7 @@ class ImagePrefetcher:
         self._sent: dict[int, tuple[dict[str, Any], torch.cuda.Event | None]] = {}
 
     def take(self, indices: Sequence[int]) -> dict[int, dict[str, Any]]:
-        """Return the data of a step's views by index, as `LazyImages` gives it, on the device and for this stream.
-
-        The host waits only for images that are not decoded yet. Raises InputError as `LazyImages.__getitem__`.
-        """
+        """Return data of a step's views by index, on the device, for this stream; only decoding is waited for."""
         self._load(indices)
         data_by_view = {}
         for index in indices:

@@ -33,13 +33,9 @@ class Interrupted(KeyboardInterrupt):
 class Interrupts:
     """A context in which the first of `SIGNALS` makes `poll` raise, and a second SIGINT or SIGTERM acts as usual.
 
-    Other threads than the main one cannot handle signals. A signal that the program handles by itself, or ignores, as
-    SIGHUP under nohup, is left alone.
-
-    Args:
-        waiting: Tells whether the program waits for the user, so that nobody polls; signals then raise at once.
-        started: Whether another process started this one. That process sends SIGTERM when it is interrupted itself, so
-            SIGTERM after another signal is ignored.
+    A signal that the program handles itself, or ignores, is left alone. While `waiting` returns True, nobody polls, and
+    signals raise at once. A process that `started` this one sends SIGTERM when it is interrupted itself, so then
+    SIGTERM after another signal is ignored.
     """
 
     def __init__(self, waiting: Callable[[], bool], started: bool = False) -> None:

@@ -154,16 +154,13 @@ def fit_to_memory(
 
     Args:
         cap: The strategy's `max_gaussians`.
-        params: The initial Gaussians of this process, on the training device.
+        params: The initial Gaussians of this process, one of `processes` with equal parts and a device each.
         size: What the run keeps and renders besides.
         budget_gb: Memory for the run on each device, in 10⁹ bytes; None is `PLANNED_SHARE` of what is free.
-        processes: Number of processes, each with an equal part of the Gaussians on its own device.
 
     Returns:
-        The cap, a line for the user, and a warning if the first step will probably not fit.
-
-    Raises:
-        InputError: If the budget leaves no room for Gaussians.
+        The cap, a line for the user, and a warning if the first step will probably not fit. Raises InputError if the
+        budget leaves no room for Gaussians.
     """
     device, n = params["means"].device, len(params["means"])
     free, total = memory.available_bytes(device)

@@ -45,11 +45,7 @@ LIMIT_EVERY = 25
 
 
 class SadgsModel(SplatfactoModel):
-    """The Gaussians, how they are rendered, and the loss of a rendering.
-
-    nerfstudio's viewer, evaluation and exporter treat it as a splatfacto model. `seed_points` are SfM points [P, 3] and
-    their colours in 0 … 255 [P, 3], or None for random points.
-    """
+    """The Gaussians, how they are rendered, and their loss; a splatfacto model for nerfstudio's other programs."""
 
     config: SadgsModelConfig
     strategy: StructureAwareStrategy

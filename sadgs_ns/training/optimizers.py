@@ -80,13 +80,9 @@ class AdamUpdate:
         nonfinite_flag: Tensor,
         overflowed: tuple[Tensor, ...] = (),
     ) -> None:
-        """Update the parameters.
+        """Update the parameters by gradients of their names; `nonfinite_flag` [1] becomes NaN if one was not finite.
 
-        Args:
-            gradients: By the parameters' names, of their shapes.
-            factors: What `factors` returned, on the device.
-            nonfinite_flag: Becomes NaN if a gradient was not finite. float32 [1]
-            overflowed: As for `kernels.adam.adam_step`; torch's Adam ignores it.
+        `factors` are on the device, and `overflowed` is as for `kernels.adam.adam_step`; torch's Adam ignores both.
         """
         if not self._triton:
             for name, optimizer in self._optimizers.items():

@@ -147,8 +147,8 @@ class SadgsPipeline(VanillaPipeline):
     def _report_nonfinite(self, last: bool = False) -> None:
         """Print in which of the last iterations, and with which images, a loss or gradient was not finite.
 
-        If that lasts, and the present gradients move nothing, `diverged` becomes the sentence that says so. The report
-        at the run's end may cover fewer iterations than `nonfinite.DIVERGED_STEPS`.
+        If that lasts and gradients move nothing, `diverged` becomes the sentence that says so. The `last` report may
+        cover fewer iterations than `nonfinite.DIVERGED_STEPS`.
         """
         problems = self.log.read()
         files = self.datamanager.train_dataset.image_filenames

@@ -66,7 +66,9 @@ def plan_run(
     is the plan of the checkpoint's run, of which `done` iterations are done. Raises InputError if `memory_budget_gb`
     leaves no room for Gaussians.
     """
-    options, model, requested = config.pipeline, pipeline.model, _requested(config.pipeline)
+    options, model = config.pipeline, pipeline.model
+    requested = {name: getattr(options, name) for name in ("effort", "views_per_iteration", "memory_budget_gb")}
+    requested |= {f"model.strategy.{name}": value for name, value in asdict(options.model.strategy).items()}
     if before is not None:
         old = before.requested
         changed = [
@@ -107,12 +109,6 @@ def plan_run(
         rates=plan_rates(optimizers, length, extent, config.rates_follow_views),
         requested=requested,
     )
-
-
-def _requested(options: SadgsPipelineConfig) -> dict[str, Any]:
-    """Return the options by name that decide how training goes on from a checkpoint."""
-    own = {name: getattr(options, name) for name in ("effort", "views_per_iteration", "memory_budget_gb")}
-    return own | {f"model.strategy.{name}": value for name, value in asdict(options.model.strategy).items()}
 
 
 def _print_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: Schedule, done: int) -> None:

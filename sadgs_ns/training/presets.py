@@ -53,10 +53,7 @@ def optimizers(**rates: tuple[float, float, float]) -> dict[str, dict[str, Any]]
 
 
 def paper_pipeline(views_per_iteration: int) -> SadgsPipelineConfig:
-    """Return the paper's options, and where it gives none, AbsGS's thresholds and the released code's window.
-
-    docs/method.md lists what still departs from the paper, which takes 1 view per iteration outdoors and 2 indoors.
-    """
+    """Return the paper's options, with those of AbsGS and the released code where it gives none (docs/method.md)."""
     return SadgsPipelineConfig(
         views_per_iteration=views_per_iteration,
         energy_blur=0.0,

@@ -129,11 +129,7 @@ def _exists(pid: int) -> bool:
 
 
 def join(config: TrainerConfig, local_rank: int) -> tuple[World, int]:
-    """Join the other processes of the run, if there are others; return them and this process's local rank.
-
-    All processes are seeded alike, while nerfstudio seeds each in its own way. The time stamp of `config` becomes that
-    of rank 0. Only rank 0 prints.
-    """
+    """Join the other processes, if there are some, with one seed for all; return them and the local rank."""
     if number_of_processes() == 1:
         return World(), local_rank
     cuda = config.machine.device_type == "cuda"

@@ -29,8 +29,7 @@ class Rate:
     initial_factor: float = 1.0
     final_factor: float = 1.0
     hold_share: float = 0.0
-    max_steps: int | None = None
-    """Iterations of the decay; None if the rate is constant, or has a scheduler of another kind."""
+    max_steps: int | None = None  # Iterations of the decay; None if there is none, or another kind of scheduler
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 
 import torch
-from torch import Tensor
 
 from sadgs_ns.method.dense_start import NUMBER, dense_points
 from sadgs_ns.method.eta import wavelength
@@ -61,11 +60,8 @@ def start_from_stereo(pipeline: SadgsPipeline, resumed: bool) -> bool:
         device=model.device,
     )
 
-    def image(view: int) -> Tensor:
-        return cache.photo(data[view])[..., :3]
-
-    points = dense_points(depths, viewmats, image, lambda view: wavelength(dequantize(cache[view])), number)
-    added = model.add_points(*points)
+    photos, wavelengths = lambda i: cache.photo(data[i])[..., :3], lambda i: wavelength(dequantize(cache[i]))
+    added = model.add_points(*dense_points(depths, viewmats, photos, wavelengths, number))
     if model.device.type == "cuda":
         torch.cuda.synchronize()
     known = sum(float((d.confidence > 0).float().mean()) for d in depths) / len(depths)

@@ -82,11 +82,7 @@ class SadgsTrainer(Trainer):
         )
 
     def setup(self, *args: Any, **kwargs: Any) -> None:
-        """Load data, model and checkpoint, and compile kernels.
-
-        Raises InputError if they cannot be used, RunError if memory is full or another process ended, and SystemExit
-        after SIGINT.
-        """
+        """Load data, model and checkpoint, and compile kernels, or raise InputError, RunError, SystemExit on SIGINT."""
         try:
             super().setup(*args, **kwargs)
             plan = self.pipeline.model.plan
@@ -228,8 +224,7 @@ class SadgsTrainer(Trainer):
 
     def _ended(self) -> str | None:
         """Return a sentence on which other processes ended by themselves, and so this one; None if none did."""
-        ended = [] if self._peers is None else self._peers.ended()
-        if not ended:
+        if self._peers is None or not (ended := self._peers.ended()):
             return None
         number = processes.number_of_processes()
         return f"Process {' and '.join(map(str, ended))} of {number} ended (counted from 0), and the others with it"

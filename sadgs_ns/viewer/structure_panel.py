@@ -63,11 +63,7 @@ def changed(plan: RunPlan, name: str, value: float) -> RunPlan:
 
 
 def describe(strategy: StructureAwareStrategy, num_points: int, state: dict[str, Any]) -> str:
-    """Return Markdown of the present number of Gaussians and a table of how the last structure steps changed it.
-
-    Changes by AbsGS and pruning between the structure steps have their own rows: each row begins with the number at
-    which the one above ends.
-    """
+    """Return Markdown of the number of Gaussians, and of how structure steps, AbsGS and pruning changed it."""
     lines = [f"**{num_points:,} Gaussians** (cap {strategy.max_gaussians:,})", ""]
     steps = state.get("structure_steps", [])[-ROWS:]
     if not steps:
