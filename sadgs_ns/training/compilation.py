@@ -51,8 +51,7 @@ class _Stages:
         self.cameras = Cameras(viewmats, Ks, _SIZE, _SIZE)
         # The run's own near plane may lie behind these Gaussians, which would launch no compositing.
         self.drawing = replace(self.model.drawing, near_plane=NEAR_PLANE)
-        self.info: dict[str, Any] = {}
-        """The rasterizer's info, once `project` was called."""
+        self.info: dict[str, Any] = {}  # the rasterizer's, once `project` was called
 
     def alone(self) -> dict[str, Callable[[], None]]:
         """Return the stages that need no projection, by their names for users."""

@@ -42,8 +42,7 @@ class Interrupts:
         self._waiting = waiting
         self._repeated = {HANG_UP, signal.SIGTERM} if started else {HANG_UP}
         self._previous: dict[int, Any] = {}
-        self.received: int | None = None
-        """The first signal that has come."""
+        self.received: int | None = None  # the first signal that has come
 
     def __enter__(self) -> Interrupts:
         self.received = None
