@@ -106,12 +106,8 @@ def _parse(settings: Mapping[str, Any], data: Path, split: str, as_fits: bool) -
 def read_cameras(run: Path, data: Path | None = None, split: str = "train") -> RunCameras:
     """Read a run's cameras, in its frame, as the run read them, or as fits the folder if the run does not tell how.
 
-    Args:
-        data: The capture's folder; None is where the run's `config.yml` says that it was.
-        split: "train", or "test" for the views that are held out.
-
-    Raises:
-        InputError: If the capture cannot be read, or the run does not tell how it was moved.
+    `data` is the capture's folder, by default where the run's `config.yml` says that it was. `split` is "train", or
+    "test" for held-out views. Raise InputError if the capture cannot be read, or the run does not tell how it moved it.
     """
     try:
         found, settings = find_capture(run)

@@ -21,7 +21,7 @@ class World:
     """The R processes that train a splat together, each of which holds a shard of it.
 
     The Gaussians of all processes, in the order of their ranks, are those of one process. All processes must call every
-    method in the same order. A world of one process asks nobody: its sums return their argument.
+    method in the same order. A world of one process sends nothing: its sums return their argument.
 
     `device` must be torch's current one if it is CUDA; None makes a world of this process alone.
 

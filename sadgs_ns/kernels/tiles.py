@@ -320,17 +320,13 @@ class PendingTiles:
 
     @torch.no_grad()
     def lists(self, capacity: int | None = None) -> TileLists:
-        """Make the lists, in the length that they need or in a given one.
+        """Make the lists with a given length, in [1, 2³¹), or wait for the exact length.
 
         Lists of a given length have one more row of tiles in each view, which lies below the image. The last tile of
-        that row in the last view is given the places that are left, so that nobody draws them. If there are more pairs
-        than places, it is given all of them, and the radii that the lists were made of are set to 0: then nothing is
-        drawn, no gradient flows and no statistic counts the views. All of this is decided on the device. Raises
-        InputError if there are more pairs than 32 bits number.
-
-        Args:
-            capacity: Length of the lists, in [1, 2³¹), for which the host does not wait. With None it waits for the
-                exact length.
+        that row in the last view gets the places that are left, so that nobody draws them. If there are more pairs than
+        places, it gets all of them, and the radii that the lists were made of are set to 0: then nothing is drawn, no
+        gradient flows and no statistic counts the views. All of this is decided on the device. Raises InputError if
+        there are more pairs than 32 bits number.
         """
         views, rows, columns = self.tile_counts
         if capacity is None:

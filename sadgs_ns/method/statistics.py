@@ -114,15 +114,10 @@ def observed_eta(
     # Every Gaussian is measured and the unseen are masked out: selecting them first would make the host wait.
     for camera in range(num_cameras):
         camera_ids = torch.full((num_gaussians,), camera, device=seen.device)  # [N]
-        axes = projected_axes(
-            params["means"],
-            params["quats"],
-            scales,
-            info["viewmats"][camera].expand(num_gaussians, 4, 4),
-            info["Ks"][camera].expand(num_gaussians, 3, 3),
-            info["width"],
-            info["height"],
-        )  # [N, 3, 2]
+        viewmats = info["viewmats"][camera].expand(num_gaussians, 4, 4)
+        Ks = info["Ks"][camera].expand(num_gaussians, 3, 3)
+        shapes = params["means"], params["quats"], scales
+        axes = projected_axes(*shapes, viewmats, Ks, info["width"], info["height"])  # [N, 3, 2]
         # An unseen Gaussian's projection is garbage; its sample is moved to a place where nothing can overflow.
         means2d = torch.where(seen[camera, :, None], info["means2d"][camera], -1.0)
         a, b, c = info["conics"][camera].unbind(-1)
