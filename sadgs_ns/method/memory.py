@@ -21,7 +21,6 @@ import torch
 from torch import Tensor
 
 from sadgs_ns.kernels import use_triton
-from sadgs_ns.method.host_memory import available_host_bytes as available_host_bytes
 from sadgs_ns.method.ops import Params
 
 COPIES = 4

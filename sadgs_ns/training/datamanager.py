@@ -21,7 +21,7 @@ from sadgs_ns.data import colmap
 from sadgs_ns.data.checks import splits
 from sadgs_ns.data.parsers import OWN, choose_parser, points_in_the_run
 from sadgs_ns.errors import InputError
-from sadgs_ns.method.memory import available_host_bytes
+from sadgs_ns.method.host_memory import available_host_bytes
 from sadgs_ns.training.images import LazyImages, thread_count
 from sadgs_ns.training.processes import processes_on_this_machine
 

@@ -13,7 +13,7 @@ from sadgs_ns.distributed.bands import views_of_rank
 from sadgs_ns.errors import InputError
 from sadgs_ns.gsplat_compat import NEAR_PLANE, SCREEN_BLUR
 from sadgs_ns.kernels import TILE_SIZE
-from sadgs_ns.method import memory
+from sadgs_ns.method import host_memory, memory
 from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.ops import Params
 from sadgs_ns.method.strategy import StructureAwareStrategy, empty_state
@@ -87,7 +87,7 @@ def choose_image_storage(datamanager: FullImageDatamanager, device: torch.device
     has no room. Returns a line for the user; None if images are kept on the device, or where the user asked for.
     """
     config, size, sharing = datamanager.config, image_bytes(datamanager), processes_on_this_machine()
-    host = least(memory.available_host_bytes() / sharing, device)
+    host = least(host_memory.available_host_bytes() / sharing, device)
     if config.cache_images == "cpu":
         if number_of_processes() == 1 or size <= HOST_SHARE * host:
             return None

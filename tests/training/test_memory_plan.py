@@ -28,7 +28,7 @@ from scenes import camera, random_params, splat
 from examples.drawn_scene.scene import write_scene
 from sadgs_ns.errors import InputError
 from sadgs_ns.kernels import TILE_SIZE, triton_switched
-from sadgs_ns.method import memory
+from sadgs_ns.method import host_memory, memory
 from sadgs_ns.method import strategy as strategy_module
 from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.strategy import StructureAwareStrategy, empty_state
@@ -348,7 +348,7 @@ def test_images_are_kept_where_there_is_room(number: int, card: Any, monkeypatch
     small, large = datamanager(100), datamanager(10_000)
     size = image_bytes(small)
     assert size == 3 * (number + 100) * 100**2 + 3 * number * 100**2
-    monkeypatch.setattr(memory, "available_host_bytes", lambda: 1e15)
+    monkeypatch.setattr(host_memory, "available_host_bytes", lambda: 1e15)
 
     card(1.01 * size / share / 1e9, 80)
     assert choose_image_storage(small, gpu) is None
@@ -361,13 +361,13 @@ def test_images_are_kept_where_there_is_room(number: int, card: Any, monkeypatch
     assert small.config.cache_images == "cpu"
 
     card(80, 80)
-    monkeypatch.setattr(memory, "available_host_bytes", lambda: 1.99 * image_bytes(large))
+    monkeypatch.setattr(host_memory, "available_host_bytes", lambda: 1.99 * image_bytes(large))
     for device, name in ((gpu, "GPU"), (torch.device("cpu"), "host")):
         line = choose_image_storage(large, device) or ""
         assert line.startswith("The images stay compressed and are decoded ahead of the steps: decoded images and ")
         assert f" take {image_bytes(large) / 1e9:.2g} GB, and the {name} has " in line
         assert large.config.cache_images == "compressed"
-    monkeypatch.setattr(memory, "available_host_bytes", lambda: 2.01 * image_bytes(large))
+    monkeypatch.setattr(host_memory, "available_host_bytes", lambda: 2.01 * image_bytes(large))
     assert choose_image_storage(large, torch.device("cpu")) is None
     assert large.config.cache_images == "gpu"  # the training device
 
@@ -400,5 +400,5 @@ def test_the_host_s_memory_is_what_linux_and_a_container_leave(files: dict, expe
         path = tmp_path / (name if name.startswith("proc") else f"sys/fs/cgroup/{name}")
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
-    assert memory.available_host_bytes(tmp_path) == expected
-    assert memory.available_host_bytes() > 0
+    assert host_memory.available_host_bytes(tmp_path) == expected
+    assert host_memory.available_host_bytes() > 0
