@@ -47,6 +47,7 @@ def compare_with_one(world: World, views: int) -> None:
     rendered, own = rasterize(world, *splats(mine, views), options)
     loss = own["anchor"]
     for band, colors, alphas in rendered:
+        assert band is not None
         image = torch.cat([colors, alphas], dim=-1)[0, band.first - band.top : band.last - band.top]
         rows = slice(band.first, band.last)
         torch.testing.assert_close(image, expected[band.view, rows], atol=1e-5, rtol=0)

@@ -36,6 +36,7 @@ def draw_together(world: World, views: int, uneven: bool, fused: bool) -> dict[s
     loss = info["anchor"]
     images = []
     for band, colors, alphas in rendered:
+        assert band is not None
         rows = slice(band.first - band.top, band.last - band.top)
         image = torch.cat([colors, alphas], dim=-1)[0, rows]
         loss = loss + (image * weights(views)[band.view, band.first : band.last]).sum()
