@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import os
 import re
 import shlex
@@ -42,6 +41,7 @@ from sadgs_ns.data.coordinates import FRAME_KEYS, TRANSFORMS_NAME
 from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.formats import FORMATS, MESH
 from sadgs_ns.formats.mesh import load_open3d
+from sadgs_ns.method.schedule import MOST_EFFORT
 from sadgs_ns.training.interrupts import Interrupts, redirect_on_broken_pipe
 
 _OURS = ("data", "output-dir", "experiment-name", "timestamp", "vis", "load-dir", "load-checkpoint", "load-config")
@@ -93,8 +93,8 @@ class PhotosToSplat:
         self._scene, self._runs = self.folder / "scene", self.folder / "training" / "sadgs"
         self._data = self.source if self._camera_file else self._scene
         self._settings: dict[str, Any] = {}
-        if not 0 < options.effort < math.inf:
-            raise InputError("--effort must be more than 0.")
+        if not 0 < options.effort <= MOST_EFFORT:
+            raise InputError(f"--effort must be in (0, {MOST_EFFORT}].")
         check_size(options.max_size)
         for option in train_options:
             name = option.partition("=")[0].lstrip("-").replace("_", "-")

@@ -15,7 +15,7 @@ from torch import Tensor
 from sadgs_ns.method.initialization import plausible_points
 
 NEAREST_POINTS = 5
-"""A view's nearest SfM points up to this one may be errors; the depth of this one is taken for true."""
+"""The depth of a view's fifth SfM point is taken for true; the four that are nearer may be errors."""
 NEAR_SHARE = 0.5
 """The near plane, as a share of the smallest such depth of all views. At 0.25 haze was left in two of nine sets of
 held-out views, and at 1 a view of leaves lost 9 dB (docs/results.md#near-plane)."""

@@ -16,6 +16,8 @@ VISITS_PER_VIEW = 50
 """View visits of a run for each training view."""
 STEPS_BEFORE_VIEWS = 2000
 """Optimizer steps that a run should have before a step takes a view more."""
+MOST_EFFORT = 100
+"""Largest `effort`, which is a million iterations of four views for a capture of 760 views."""
 MOST_VIEWS = 4
 """Largest number of views in a step that is derived."""
 MORE_VISITS_FROM = (50, 90)

@@ -12,7 +12,7 @@ from torch import Tensor
 from sadgs_ns.method.ops import Optimizers, Params, State, update_param_with_optimizer
 
 MAX_CHILDREN_PER_AXIS = 8
-"""Bound on n_k, reached at η = 64 with the square root: no parent has more than 8³ = 512 children."""
+"""Bound on n_k, which η > 64 would exceed: no parent has more than 8³ = 512 children."""
 VARIANCE_EXTENT = math.sqrt(3.0)
 """Half-width of the child grid in parent standard deviations that keeps the parent's covariance exactly: n cells over
 [−√3, √3] have variance 1 − 1/n², and each child adds 1/n²."""

@@ -86,7 +86,7 @@ class StructureAwareStrategy(Strategy):
     They stand closer and are 1/k as opaque an axis, which keeps the covariance and the mass; 1 is the paper's."""
     clone_grad2d: float = 3.75e-4
     """AbsGS: normalised mean screen gradient at which a small Gaussian is cloned; AbsGS's own is 2e-4.
-    In `ns-train` an effort above 1 lowers this and the next threshold, to 0.8 of what is set."""
+    `ns-train` lowers this and the next one by up to 20 % for an effort above 1, and adds 25 % after a stereo start."""
     split_absgrad2d: float = 7.5e-4
     """AbsGS: normalised mean absolute screen gradient at which a large Gaussian is split; AbsGS's own is 4e-4."""
     absgs_long_axis: bool = True

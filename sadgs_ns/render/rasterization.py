@@ -73,8 +73,8 @@ def choose_backend(wanted: BackendName, device: torch.device, alone: bool = True
 
     "auto" is Triton where its kernels run, gsplat on CUDA without them, and torch elsewhere. They draw the same, but
     that gsplat 1.4 cuts Gaussians off at borders of larger tiles. Only Triton predicts the lengths of its tile lists,
-    so only its steps become CUDA graphs. gsplat draws where one process trains alone. Raise InputError if the backend
-    that is wanted does not draw here.
+    so only its steps become CUDA graphs. gsplat cannot draw for several processes. Raise InputError if the backend that
+    is wanted does not draw here.
     """
     chosen: str = wanted
     if wanted == "auto":

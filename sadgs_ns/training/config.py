@@ -27,6 +27,7 @@ from sadgs_ns.errors import InputError, reason
 from sadgs_ns.kernels import SWITCH, switched_off
 from sadgs_ns.method.initialization import POINT_OPACITY
 from sadgs_ns.method.quantization import HIGHEST_FREQUENCY
+from sadgs_ns.method.schedule import MOST_EFFORT
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.method.structure_tensor import ENERGY_BLUR, FREQUENCY_CONSTANT
 from sadgs_ns.render.rasterization import choose_backend
@@ -39,8 +40,6 @@ from sadgs_ns.training.run_folder import begin
 
 _MOST_RANDOM = 10_000_000
 """Largest number of random points to start from; they take the host's memory before the cap thins them out."""
-_MOST_EFFORT = 100
-"""Largest `effort`, which is a million iterations of four views for a capture of 760 views."""
 _WIDEST_BLUR = 100
 """Largest window of `energy_blur`, which makes kernels of thousands of pixels."""
 
@@ -218,7 +217,7 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
         """Raise InputError if an option is out of its range."""
         views, epsilon, budget = self.views_per_iteration, self.epsilon, self.memory_budget_gb
         ranges = [
-            ("effort", 0 < self.effort <= _MOST_EFFORT, f"in (0, {_MOST_EFFORT}]"),
+            ("effort", 0 < self.effort <= MOST_EFFORT, f"in (0, {MOST_EFFORT}]"),
             ("views_per_iteration", views is None or views >= 1, "at least 1"),
             ("energy_blur", 0 <= self.energy_blur <= _WIDEST_BLUR, f"in [0, {_WIDEST_BLUR}]"),
             ("epsilon", epsilon is None or 0 < epsilon < math.inf, "positive and finite"),

@@ -69,7 +69,8 @@ def training_step(
     factors: Tensor,
     nonfinite_flag: Tensor,
 ) -> StepResult:
-    """Train on the views of a step. This enqueues work, waits for none of it, and changes tensors only.
+    """Train on the views of a step. This enqueues work and changes tensors only. It waits for none of it,
+    but in several processes, for the numbers of Gaussians that they send each other.
 
     If the tile lists of a group were too short, it was not drawn and gives no gradient. If that holds for all groups,
     neither parameters nor moments change.

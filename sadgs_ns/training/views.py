@@ -35,11 +35,7 @@ class ViewSampler:
         """Views to come; another round is appended when a step needs it."""
 
     def draw(self, number: int) -> list[int]:
-        """Draw the views of a step, and prefetch images of the next ones. Raises as `ImagePrefetcher.take`.
-
-        Returns index and data of each view, with its image on the training device, and so is a prefetched mask. With
-        several processes, prefetched data is there only of views that this process composites.
-        """
+        """Return the indices of the next step's views."""
         return self._take_step(self._order, number)
 
     def foresee(self, number: int, steps: int) -> list[list[int]]:

@@ -323,7 +323,8 @@ def test_wrong_input_is_told_in_a_sentence_before_any_work(
             [source, "--formats", "ply,mesh.ply"],
             "A mesh is made by open3d, which cannot be imported (libusb-1.0.so.0: c",
         ),
-        ([source, "--effort", "0"], "--effort must be more than 0"),
+        ([source, "--effort", "0"], "--effort must be in (0, 100]"),
+        ([source, "--effort", "1000"], "--effort must be in (0, 100]"),
         ([source, "--max-size", "20"], "--max-size must be at least 64 px, or 0 to keep the photos' size"),
     ):
         monkeypatch.setattr(sadgs.shutil, "which", lambda _: None)
