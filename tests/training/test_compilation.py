@@ -126,10 +126,11 @@ def test_kernels_that_fail_are_told_in_one_sentence(
         monkeypatch.setattr(compilation, name, lambda *args, **options: None)
     monkeypatch.setattr(compilation, "quantize", full)
     monkeypatch.setattr(compilation, "photometric_loss", full)
-    threads = threading.active_count()
+    before = set(threading.enumerate())
     capsys.readouterr()
     compilation.compile_kernels(trainer.pipeline, trainer.optimizers.optimizers)
-    assert threading.active_count() == threads
+    # Others, such as autograd's, may begin meanwhile.
+    assert not [t.name for t in set(threading.enumerate()) - before if t.name.startswith("ThreadPoolExecutor")]
     told = " ".join(capsys.readouterr().out.split())
     assert told.count("could not be compiled") == 1
     assert "The kernels of the loss, S̄" in told
