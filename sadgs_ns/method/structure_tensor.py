@@ -89,7 +89,7 @@ def multiscale_structure_tensor(
             [B, H, W, C]
         masks: Valid pixels; the others, which may hold anything, NaN too, neither contribute nor receive a tensor.
             bool [B, H, W] or None for all.
-        frequency_constant, noise_floor, energy_blur, truncation: See the constants of these names.
+        frequency_constant: See FREQUENCY_CONSTANT; so have `noise_floor`, `energy_blur` and `truncation` constants.
         epsilon: ε > 0 of eq. 3 and 5 as the paper prints it, the same number for every image and level, in the units
             of the pixel values; the released code takes 1e-6 with values in [0, 1]. `noise_floor` then has no effect.
         known_finite: The valid pixels are known to be finite; otherwise the host waits for the device to find out.

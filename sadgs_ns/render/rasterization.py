@@ -51,8 +51,8 @@ def composite(projected: Projected, options: RenderOptions = DEFAULTS) -> tuple[
         options: The same as for `project`.
 
     Returns:
-        Colours [C, height, width, D], with the expected depth in the last of them where it was asked for; alphas in
-        [0, 1] [C, height, width, 1]; and `projected.info()` with `flatten_ids`, the tile lists, and from the Triton
+        Colours [C, height, width, D], with the expected depth in the last of them where it was asked for; alphas
+        [C, height, width, 1] in [0, 1]; and `projected.info()` with `flatten_ids`, the tile lists, and from the Triton
         backend `pair_counts` (kernels/tiles.py), the numbers of pairs of a Gaussian and a tile.
 
     Raises:
@@ -68,6 +68,9 @@ def composite(projected: Projected, options: RenderOptions = DEFAULTS) -> tuple[
     return renders, alphas, projected.info() | lists
 
 
+_REMEDY = "set the option model.backend to auto, of a finished run in its config.yml"
+
+
 def choose_backend(wanted: BackendName, device: torch.device, alone: bool = True) -> str:
     """Return which backend draws on a device: "triton", "gsplat" or "torch".
 
@@ -80,9 +83,9 @@ def choose_backend(wanted: BackendName, device: torch.device, alone: bool = True
     if wanted == "auto":
         chosen = "triton" if use_triton(device) else "gsplat" if device.type == "cuda" else "torch"
     if wanted == "triton" and not use_triton(device):
-        raise InputError(f"The backend triton does not run on {device} here (see sadgs-doctor): leave it at auto.")
+        raise InputError(f"The backend triton does not run on {device} here (see sadgs-doctor): {_REMEDY}.")
     if chosen == "gsplat" and device.type != "cuda":
-        raise InputError(f"The backend gsplat needs a CUDA device, and this is {device}: leave it at auto.")
+        raise InputError(f"The backend gsplat needs a CUDA device, and this is {device}: {_REMEDY}.")
     if chosen == "gsplat" and not alone:
         raise InputError(
             "The backend gsplat works on one device only, and this run takes several: take one, or let Triton draw "
