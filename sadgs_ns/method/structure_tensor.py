@@ -41,17 +41,14 @@ _ROUNDING_FLOOR = 1e-5
 """Amplitude relative to the brightest pixel under which float32 rounding, not the image, makes the differences."""
 
 
-def gaussian_kernel(
-    sigma: float, order: int = 0, dtype: torch.dtype = torch.float32, truncation: float = TRUNCATION
-) -> Tensor:
-    """Sample a 1-D Gaussian, or its derivative, for cross-correlation; it is computed in float64. [K]
+def gaussian_kernel(sigma: float, order: int = 0, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Sample a 1-D Gaussian, or its derivative, for cross-correlation; it is computed in float64. [2·⌈3σ⌉ + 1]
 
     Args:
         sigma: Standard deviation in px, > 0.
         order: 0 for the Gaussian (sums to 1), 1 for its first derivative (a unit ramp gives exactly 1).
-        truncation: Radius in standard deviations, > 0: K is 2·⌈truncation · σ⌉ + 1.
     """
-    radius = math.ceil(truncation * sigma)
+    radius = math.ceil(TRUNCATION * sigma)
     x = torch.arange(-radius, radius + 1, dtype=torch.float64)  # [K]
     kernel = torch.exp(-0.5 * (x / sigma) ** 2)
     kernel = kernel / kernel.sum()
@@ -62,9 +59,9 @@ def gaussian_kernel(
 
 
 @lru_cache(maxsize=256)
-def _kernel(sigma: float, order: int, dtype: torch.dtype, device: torch.device, truncation: float) -> Tensor:
+def _kernel(sigma: float, order: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """`gaussian_kernel` [K], kept on the device: to make it anew for each batch of images takes most of the time."""
-    return gaussian_kernel(sigma, order, dtype, truncation).to(device)
+    return gaussian_kernel(sigma, order, dtype).to(device)
 
 
 def multiscale_structure_tensor(
@@ -75,7 +72,6 @@ def multiscale_structure_tensor(
     noise_floor: float = NOISE_FLOOR,
     energy_blur: float = ENERGY_BLUR,
     epsilon: float | None = None,
-    truncation: float = TRUNCATION,
     known_finite: bool = False,
 ) -> Tensor:
     """Aggregate the per-scale structure tensors of a batch of images of one size (paper, eq. 2–5).
@@ -89,7 +85,7 @@ def multiscale_structure_tensor(
             [B, H, W, C]
         masks: Valid pixels; the others, which may hold anything, NaN too, neither contribute nor receive a tensor.
             bool [B, H, W] or None for all.
-        frequency_constant: See FREQUENCY_CONSTANT; so have `noise_floor`, `energy_blur` and `truncation` constants.
+        frequency_constant: See FREQUENCY_CONSTANT; `noise_floor` and `energy_blur` have constants, too.
         epsilon: ε > 0 of eq. 3 and 5 as the paper prints it, the same number for every image and level, in the units
             of the pixel values; the released code takes 1e-6 with values in [0, 1]. `noise_floor` then has no effect.
         known_finite: The valid pixels are known to be finite; otherwise the host waits for the device to find out.
@@ -115,7 +111,7 @@ def multiscale_structure_tensor(
         weight_floor = (epsilon / brightest**GAMMA).clamp_min(smallest)
     correlate, differentiate, aggregate = _operations(image)
     # Without masks the weights of all images are the same: one image's are kept.
-    sums = _WeightedSums(valid[:1] if masks is None else valid, masks is not None, truncation, correlate)
+    sums = _WeightedSums(valid[:1] if masks is None else valid, masks is not None, correlate)
     numerator = torch.zeros_like(image[:, :1]).repeat(1, 3, 1, 1)  # [B, 3, H, W]
     denominator = weight_floor.expand_as(valid).contiguous()  # [B, 1, H, W]
     previous = image  # I_{l−1}
@@ -184,8 +180,6 @@ class _WeightedSums:
     weight: Tensor
     """1 at valid pixels and 0 at masked ones [B, 1, H, W], or [1, 1, H, W] of ones without masks."""
     masked: bool
-    truncation: float
-    """Radius of every kernel, in multiples of its standard deviation."""
     correlate: Callable[[Tensor, Tensor, int], Tensor]
 
     def blur(self, image: Tensor, sigma: float) -> Tensor:
@@ -216,7 +210,7 @@ class _WeightedSums:
         return self._along(down, sigma, order_y, 2) * self._along(across, sigma, order_x, 3)
 
     def _along(self, image: Tensor, sigma: float, order: int, axis: int) -> Tensor:
-        kernel = _kernel(sigma, order, image.dtype, image.device, self.truncation)
+        kernel = _kernel(sigma, order, image.dtype, image.device)
         return self.correlate(image, kernel, axis)
 
 

@@ -22,7 +22,7 @@ from random_scene import random_scene
 from torch import Tensor
 
 from sadgs_ns import kernels
-from sadgs_ns.method import losses
+from sadgs_ns.method import losses, structure_tensor
 from sadgs_ns.method.quantization import quantize
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients
 from sadgs_ns.method.statistics import STATISTICS, Statistic, empty_statistics, observe, observed_eta
@@ -243,7 +243,9 @@ def test_structure_tensors_are_the_same_with_the_kernels(monkeypatch, masked, en
     if DEVICE.type == "cpu":  # the interpreter also computes what a block has beyond the image
         monkeypatch.setattr(structure, "_TILES", {2: (16, 16), 3: (16, 16)})
         monkeypatch.setattr(structure, "_PIXELS", 64)
-    options = {"energy_blur": energy_blur, "epsilon": epsilon, "truncation": 1.5}
+    monkeypatch.setattr(structure_tensor, "TRUNCATION", 1.5)  # Shorter kernels, which must not be remembered.
+    monkeypatch.setattr(structure_tensor, "_kernel", structure_tensor._kernel.__wrapped__)
+    options = {"energy_blur": energy_blur, "epsilon": epsilon}
     expected = multiscale_structure_tensor(images.double(), masks, **options)
     monkeypatch.setattr(kernels, "available", lambda device: True)
     calls = recorded(monkeypatch, structure, "correlate", "differentiate", "aggregate")
