@@ -1,4 +1,4 @@
-"""Checks of nerfstudio's cameras: this method renders pinholes, and fisheyes that nerfstudio undistorts."""
+"""nerfstudio's cameras: this method renders pinholes, and fisheyes that nerfstudio undistorts."""
 
 from __future__ import annotations
 
@@ -7,12 +7,18 @@ from pathlib import Path
 
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
+from torch import Tensor
 
 from sadgs_ns.data.checks.geometry import NO_COEFFICIENTS
 from sadgs_ns.errors import InputError
 
 _UNDISTORTED = (CameraType.FISHEYE, CameraType.FISHEYE624)
 """Types whose images nerfstudio's FullImageDatamanager turns into pinhole images, if a coefficient is not 0."""
+
+
+def camera_positions(cameras: Cameras) -> Tensor:
+    """Return the centres of cameras in world units. [C, 3]"""
+    return cameras.camera_to_worlds[:, :3, 3].cpu()
 
 
 def check_camera_types(cameras: Cameras) -> None:

@@ -14,7 +14,7 @@ from nerfstudio.models.splatfacto import SplatfactoModel
 from pytorch_msssim import SSIM
 from torch import Tensor
 
-from sadgs_ns.data.cameras import check_camera_types
+from sadgs_ns.data.cameras import camera_positions, check_camera_types
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
 from sadgs_ns.gsplat_compat import NEAR_PLANE
@@ -82,7 +82,7 @@ class SadgsModel(SplatfactoModel):
 
     def set_cameras(self, cameras: Cameras) -> None:
         """Fit extent, initial Gaussians and near plane to the training cameras; call before optimizers are made."""
-        positions = cameras.camera_to_worlds[:, :3, 3].cpu()
+        positions = camera_positions(cameras)
         self.strategy_state["scene_scale"] = extent = camera_extent(positions)
         self.camera_positions = positions.to(self.means)
         keep = outside_cameras(dict(self.gauss_params.items()), self.camera_positions)  # [N]

@@ -13,7 +13,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from torch import Tensor
 
-from sadgs_ns.data.cameras import check_camera_types
+from sadgs_ns.data.cameras import camera_positions, check_camera_types
 from sadgs_ns.data.parsers import findings_of
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
@@ -268,8 +268,3 @@ class SadgsPipeline(VanillaPipeline):
         self.views.sampler.load_state_dict(state["views"])
         if "cuda" in state and self.device.type == "cuda":
             torch.cuda.set_rng_state(state["cuda"].cpu(), self.device)
-
-
-def camera_positions(cameras: Cameras) -> Tensor:
-    """Return the centres of cameras in world units. [C, 3]"""
-    return cameras.camera_to_worlds[:, :3, 3].cpu()

@@ -14,11 +14,12 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.cuda.amp.grad_scaler import GradScaler
 
+from sadgs_ns.data.cameras import camera_positions
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.method.initialization import camera_extent
 from sadgs_ns.training import checkpoints
-from sadgs_ns.training.pipeline import SadgsPipeline, camera_positions
+from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.progress import note, warn
 from sadgs_ns.training.run_plan import RunPlan
 
