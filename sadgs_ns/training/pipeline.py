@@ -75,7 +75,6 @@ class SadgsPipeline(VanillaPipeline):
             self.views, config.frequency_constant, energy_blur=config.energy_blur, epsilon=config.epsilon
         )
         self.log = NonFiniteLog(self.device)
-        self.world = World()
         self._means_gradient: Tensor | None = None  # [N, 3], of the last step
         self.diverged = ""  # a sentence with the reason once nothing is learned any more
         self.structure = StructurePanel(self.structure_cache)
@@ -101,10 +100,10 @@ class SadgsPipeline(VanillaPipeline):
         self.structure.set_max_gaussians.value = plan.strategy.max_gaussians
         self.structure.set_tau_split.value = plan.strategy.tau_split
 
-    def shard(self, world: World) -> None:
-        """Keep this process's part of the Gaussians only; call before optimizers are made."""
-        self.world = self.views.world = world
-        self.model.shard(world)
+    @property
+    def world(self) -> World:
+        """The processes among which the Gaussians are shared out."""
+        return self.model.world
 
     def train(self, mode: bool = True) -> SadgsPipeline:
         """Set the mode of all modules, unless they have it; nerfstudio calls this before every step."""

@@ -145,7 +145,7 @@ class SadgsTrainer(Trainer):
                 note("The viewer is off, since no device holds all Gaussians; `ns-viewer` shows the finished run.")
                 others = self._vis.removeprefix("viewer_legacy").removeprefix("viewer").removeprefix("+")
                 config.vis = others or "none"  # type: ignore[assignment]
-            pipeline.shard(self.world)
+            pipeline.model.shard(self.world)
         if resumed is not None:
             resumed.load_gaussians(pipeline, self.world)
             self._start_step = resumed.state["step"] + 1

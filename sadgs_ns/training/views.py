@@ -81,7 +81,11 @@ class TrainingViews:
         self.datamanager = datamanager
         self.model = model
         self.sampler = ViewSampler(len(datamanager.train_dataset), datamanager.config.train_cameras_sampling_seed)
-        self.world = World()
+
+    @property
+    def world(self) -> World:
+        """The processes of the run, each of which composites its share of a step."""
+        return self.model.world
 
     def __len__(self) -> int:
         """Number of training views."""

@@ -29,9 +29,8 @@ class Datamanager:
 
 
 def views_of(datamanager: Any, world: Any = None) -> TrainingViews:
-    views = TrainingViews(datamanager, SimpleNamespace(device=torch.device("cpu")))  # type: ignore[arg-type]
-    views.world = world or views.world
-    return views
+    model: Any = SimpleNamespace(device=torch.device("cpu"), world=world or World())
+    return TrainingViews(datamanager, model)
 
 
 def steps_of(views: TrainingViews, number: int, steps: int = STEPS) -> list[list[int]]:
