@@ -34,6 +34,22 @@ def thread_count(requested: int | None) -> int:
     return requested or min(max(cores // processes_on_this_machine(), 1), 16)
 
 
+def stack(tensors: Sequence[Tensor]) -> Tensor:
+    """Stack tensors as `torch.stack` does, but do not copy a single one."""
+    return tensors[0][None] if len(tensors) == 1 else torch.stack(list(tensors))
+
+
+def stack_masks(data: Sequence[Mapping[str, Any]], size: Sequence[int], device: torch.device) -> Tensor | None:
+    """Return the masks of views of one size (H, W), of ones where a view has none, or None if none has one.
+
+    bool [V, H, W, 1], on the device
+    """
+    if not any("mask" in view for view in data):
+        return None
+    everything = torch.ones((*size, 1), dtype=torch.bool, device=device)
+    return stack([view.get("mask", everything).to(device, non_blocking=True) for view in data])
+
+
 class LazyImages(Sequence[dict[str, Any]]):
     """Images of a dataset as nerfstudio's FullImageDatamanager loads and undistorts them, decoded at each access.
 

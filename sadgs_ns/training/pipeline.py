@@ -23,13 +23,14 @@ from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.training import nonfinite
 from sadgs_ns.training.config import SadgsPipelineConfig
 from sadgs_ns.training.datamanager import SadgsDatamanager
+from sadgs_ns.training.images import stack
 from sadgs_ns.training.memory_plan import choose_image_storage
 from sadgs_ns.training.model import NORMALS, SadgsModel
 from sadgs_ns.training.nonfinite import NonFiniteLog
 from sadgs_ns.training.progress import note, warn
 from sadgs_ns.training.run_plan import RunPlan
 from sadgs_ns.training.structure_cache import StructureCache
-from sadgs_ns.training.train_step import StepResult, ViewGroup, stack
+from sadgs_ns.training.train_step import StepResult, ViewGroup
 from sadgs_ns.training.views import TrainingViews
 from sadgs_ns.viewer.cleaning_panel import CleaningPanel
 from sadgs_ns.viewer.elements import in_viewer, shows_output

@@ -16,6 +16,7 @@ from sadgs_ns.method.quantization import quantize
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.render.types import Cameras
+from sadgs_ns.training.images import stack_masks
 from sadgs_ns.training.views import TrainingViews
 
 PIXELS_PER_BATCH = 4_000_000
@@ -96,10 +97,9 @@ class StructureCache:
         at_once = max(PIXELS_PER_BATCH // math.prod(data[0]["image"].shape[:2]), 1) if data else 1
         for start in range(0, len(data), at_once):
             batch = data[start : start + at_once]
-            images, masks = torch.stack([self.photo(d) for d in batch]), None
-            if any("mask" in d for d in batch):
-                everything = torch.ones(images.shape[1:3], dtype=torch.bool, device=images.device)
-                masks = torch.stack([d["mask"][..., 0].to(images.device) if "mask" in d else everything for d in batch])
+            images = torch.stack([self.photo(d) for d in batch])
+            masks = stack_masks(batch, images.shape[1:3], images.device)
+            masks = None if masks is None else masks[..., 0]
             yield from quantize(self.of_images(images, masks, known_finite=True))
 
 

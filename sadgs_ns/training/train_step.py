@@ -19,6 +19,7 @@ from sadgs_ns.distributed.rasterization import rasterize
 from sadgs_ns.method.color_matrices import anchored, correct_colors
 from sadgs_ns.method.losses import photometric_loss, photometric_part
 from sadgs_ns.render.types import Cameras, RenderOptions
+from sadgs_ns.training.images import stack, stack_masks
 from sadgs_ns.training.model import SadgsModel
 from sadgs_ns.training.optimizers import AdamUpdate
 
@@ -43,12 +44,8 @@ class ViewGroup:
             rows, data = slice(band.top, band.bottom), self.data[band.view]
             return {name: data[name][None, rows] for name in ("image", "mask") if name in data}
         batch = {"image": stack([data["image"] for data in self.data]) if self.images is None else self.images}
-        if any("mask" in data for data in self.data):
-            device = self.cameras.viewmats.device
-            everything = torch.ones((*batch["image"].shape[1:3], 1), dtype=torch.bool, device=device)
-            masks = [data.get("mask", everything).to(device, non_blocking=True) for data in self.data]
-            batch["mask"] = stack(masks)
-        return batch
+        masks = stack_masks(self.data, batch["image"].shape[1:3], self.cameras.viewmats.device)
+        return batch if masks is None else batch | {"mask": masks}
 
 
 @dataclass(frozen=True)
@@ -98,8 +95,8 @@ def training_step(
     # All processes have the same groups, and autograd goes back through them in the same order.
     for group in groups:
         pictures, info = rasterize(world, gaussians, group.cameras, group.options)
-        info |= {"viewmats": group.cameras.viewmats.detach(), "Ks": group.cameras.Ks}
-        info["structure_tensors"] = group.structure_tensors
+        viewmats, Ks = group.cameras[:2]
+        info |= {"viewmats": viewmats.detach(), "Ks": Ks, "structure_tensors": group.structure_tensors}
         strategy.step_pre_backward(model.gauss_params, {}, state, step, info)
         infos.append(info)
         for band, colors, alphas in pictures:
@@ -141,8 +138,3 @@ def training_step(
         loss, error = world.sum(torch.stack([loss, sum(qualities, torch.zeros_like(loss))]))
         psnr = -10 * error.log10()
     return StepResult(loss, psnr, gradients["means"], infos)
-
-
-def stack(tensors: Sequence[Tensor]) -> Tensor:
-    """Stack tensors as `torch.stack` does, but do not copy a single one."""
-    return tensors[0][None] if len(tensors) == 1 else torch.stack(list(tensors))
