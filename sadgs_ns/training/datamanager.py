@@ -21,12 +21,7 @@ from sadgs_ns.data import colmap
 from sadgs_ns.data.checks import splits
 from sadgs_ns.data.parsers import OWN, choose_parser, points_in_the_run
 from sadgs_ns.errors import InputError
-from sadgs_ns.method.host_memory import available_host_bytes
 from sadgs_ns.training.images import LazyImages, thread_count
-from sadgs_ns.training.processes import processes_on_this_machine
-
-KEPT_FILES_SHARE = 0.25
-"""Largest share of the host's free memory in which the files of compressed images are kept."""
 
 
 class SadgsDatamanager(FullImageDatamanager[InputDataset]):
@@ -74,15 +69,9 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
     def _load_images(self, split: Literal["train", "eval"], cache_images_device: str) -> Any:
         """Load the images of a split on the device or on the host, or return `LazyImages` if they stay compressed."""
         device, dataset = torch.device(self.device), self.train_dataset if split == "train" else self.eval_dataset
-        on_demand = cache_images_device == "compressed"
-        # Each of several processes would keep all files, while the system's cache of files keeps them once.
-        keep = on_demand and processes_on_this_machine() == 1
-        if keep:
-            size = sum(path.stat().st_size for path in dataset.image_filenames)
-            keep = size <= KEPT_FILES_SHARE * available_host_bytes()
-        images = LazyImages(dataset, keep)
+        images = LazyImages(dataset)
         self.train_cameras = self.train_dataset.cameras
-        if on_demand:
+        if cache_images_device == "compressed":
             return images
 
         def place(tensor: Tensor) -> Tensor:

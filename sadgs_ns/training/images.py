@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import copy
-import io
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cache
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -54,20 +51,14 @@ class LazyImages(Sequence[dict[str, Any]]):
     """Images of a dataset as nerfstudio's FullImageDatamanager loads and undistorts them, decoded at each access.
 
     Several threads may access images at once. The dataset is for this object only: its cameras become those of the
-    undistorted images at once, without opening one. With `keep_files`, bytes of files stay in memory once read.
+    undistorted images at once, without opening one.
     """
 
-    def __init__(self, dataset: InputDataset, keep_files: bool = False) -> None:
+    def __init__(self, dataset: InputDataset) -> None:
         self._names = dataset.image_filenames
         self._sizes = torch.cat([dataset.cameras.width, dataset.cameras.height], dim=-1).tolist()  # [C][2] px
         self._undistort = _undistort_cameras(dataset.cameras)
-        read = cache(Path.read_bytes) if keep_files else Path.read_bytes
-        outputs = copy.copy(dataset._dataparser_outputs)
-        outputs.image_filenames = _Files(outputs.image_filenames, read)  # type: ignore[assignment]
-        if outputs.mask_filenames is not None:
-            outputs.mask_filenames = _Files(outputs.mask_filenames, read)  # type: ignore[assignment]
         self._dataset = copy.copy(dataset)
-        self._dataset._dataparser_outputs = outputs
         self._opencv_agrees: bool | None = None  # unknown until a JPEG was decoded
         if dataset.scale_factor == 1 and type(dataset).get_numpy_image is InputDataset.get_numpy_image:
             self._dataset.get_numpy_image = self._decode
@@ -111,8 +102,7 @@ class LazyImages(Sequence[dict[str, Any]]):
         For 2 megapixels, Pillow blocks Python in other threads, such as the training loop, for 5 ms. Both use
         libjpeg-turbo, perhaps in two versions, so OpenCV is used only if the pixels of the first JPEG are equal.
         """
-        content = self._dataset.image_filenames[image_idx].getbuffer()  # type: ignore[attr-defined]
-        image = None
+        content, image = self._names[image_idx].read_bytes(), None
         if self._opencv_agrees is not False and content[:2] == b"\xff\xd8" and content[-2:] == b"\xff\xd9":
             image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is not None:
@@ -153,19 +143,6 @@ def _undistort_as(camera: Cameras) -> _Undistort:
     camera = copy.deepcopy(camera)
     K, distortion = camera.get_intrinsics_matrices().numpy(), camera.distortion_params.numpy()  # type: ignore[union-attr]
     return lambda data, image: _undistort_image(camera, distortion, data, image, K.copy())
-
-
-class _Files(Sequence[io.BytesIO]):
-    """The content of files instead of their paths; Pillow opens both."""
-
-    def __init__(self, paths: Sequence[Path], read: Callable[[Path], bytes]) -> None:
-        self._paths, self._read = paths, read
-
-    def __len__(self) -> int:
-        return len(self._paths)
-
-    def __getitem__(self, index: Any) -> Any:
-        return io.BytesIO(self._read(self._paths[index]))
 
 
 class ImagePrefetcher:

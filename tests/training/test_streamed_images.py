@@ -20,7 +20,7 @@ from sharded_runs import STRUCTURE_EVERY, few_steps, record, set_up_together
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.method import host_memory
-from sadgs_ns.training.config import SadgsDatamanagerConfig, SadgsTrainerConfig
+from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.images import ImagePrefetcher, LazyImages, thread_count
 from sadgs_ns.training.memory_plan import choose_image_storage, image_bytes
 from sadgs_ns.training.structure_cache import StructureCache
@@ -199,19 +199,10 @@ def test_decoded_images_stay_on_the_host_where_all_processes_have_room(monkeypat
     assert choose_image_storage(datamanager, torch.device("cpu")) is None and datamanager.config.cache_images == "cpu"
 
 
-def test_processes_of_a_machine_share_what_keeps_files_and_the_cores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    parser = nerfstudio_data(tmp_path)
-
-    def keeps_files() -> bool:
-        datamanager = SadgsDatamanagerConfig(dataparser=parser, cache_images="compressed").setup(device="cpu")
-        _ = datamanager.cached_train[0]
-        return datamanager.cached_train._dataset.image_filenames._read is not Path.read_bytes
-
-    files = sum(path.stat().st_size for path in (tmp_path / "images").iterdir())
-    monkeypatch.setattr("sadgs_ns.training.datamanager.available_host_bytes", lambda: 6 * files)
+def test_processes_of_a_machine_share_the_cores(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(12))
-    assert keeps_files() and thread_count(None) == 12
+    assert thread_count(None) == 12
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
-    assert not keeps_files() and thread_count(None) == 6 and thread_count(3) == 3
+    assert thread_count(None) == 6 and thread_count(3) == 3
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "16")
     assert thread_count(None) == 1
