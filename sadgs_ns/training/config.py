@@ -49,7 +49,7 @@ def _class(module: str, name: str) -> type:
     return getattr(import_module(f"sadgs_ns.training.{module}"), name)
 
 
-@hide("trans_l2_penalty", "rot_l2_penalty")  # Others than nerfstudio's are refused below.
+@hide("trans_l2_penalty", "rot_l2_penalty")
 @dataclass
 class PoseOptimizerConfig(CameraOptimizerConfig):
     """nerfstudio's options of learned camera poses, with its own penalties, which hold them near the given ones."""
@@ -134,9 +134,9 @@ class SadgsModelConfig(InstantiateConfig):
         ]
         check_ranges("pipeline.model.", self, ranges)
         for name in ("trans_l2_penalty", "rot_l2_penalty"):
-            if (penalty := getattr(self.camera_optimizer, name)) != getattr(PoseOptimizerConfig, name):
-                problem = f"cannot be set, got {penalty:g}: leave it out."
-                raise InputError(f"pipeline.model.camera_optimizer.{name} {problem}")
+            given, kept = getattr(self.camera_optimizer, name), getattr(PoseOptimizerConfig, name)
+            allowed = [(name, given == kept, f"{kept:g}, as in nerfstudio")]
+            check_ranges("pipeline.model.camera_optimizer.", self.camera_optimizer, allowed)
         try:
             self.strategy.check()
         except ValueError as error:
@@ -165,26 +165,19 @@ class SadgsDatamanagerConfig(FullImageDatamanagerConfig):
 def check_options(config: FullImageDatamanagerConfig) -> None:
     """Raise InputError if an option of a datamanager, or of its parser of data, is out of its range."""
     parser: Any = config.dataparser
-    ranges = {
-        "scale_factor": (lambda value: 0 < value < math.inf, "positive and finite"),
-        "train_split_fraction": (lambda value: 0 < value <= 1, "in (0, 1]"),
-        "eval_interval": (lambda value: value >= 2, "at least 2"),
-    }
-    for name, (fits, allowed) in ranges.items():
-        if hasattr(parser, name) and not fits(value := getattr(parser, name)):
-            raise InputError(f"{name}, an option of the data's parser, must be {allowed}, got {value:g}.")
-    if config.cache_images_type != "uint8":
-        raise InputError(
-            f"pipeline.datamanager.cache_images_type is {config.cache_images_type}, and sadgs keeps images as bytes, "
-            "which is what their files hold: leave it out."
-        )
-    if config.train_cameras_sampling_strategy != "random":
-        raise InputError(
-            f"pipeline.datamanager.train_cameras_sampling_strategy is {config.train_cameras_sampling_strategy}, and "
-            "sadgs takes each view once a round: leave it out."
-        )
-    scale = config.camera_res_scale_factor
-    check_ranges("pipeline.datamanager.", config, [("camera_res_scale_factor", 0 < scale <= 1, "in (0, 1]")])
+    ranges = [
+        ("scale_factor", 0 < getattr(parser, "scale_factor", 1) < math.inf, "positive and finite"),
+        ("train_split_fraction", 0 < getattr(parser, "train_split_fraction", 1) <= 1, "in (0, 1]"),
+        ("eval_interval", getattr(parser, "eval_interval", 2) >= 2, "at least 2"),
+    ]
+    check_ranges("pipeline.datamanager.dataparser.", parser, ranges)
+    sampling = config.train_cameras_sampling_strategy
+    ranges = [
+        ("cache_images_type", config.cache_images_type == "uint8", "uint8, which is what files of images hold"),
+        ("train_cameras_sampling_strategy", sampling == "random", "random, which takes each view once a round"),
+        ("camera_res_scale_factor", 0 < config.camera_res_scale_factor <= 1, "in (0, 1]"),
+    ]
+    check_ranges("pipeline.datamanager.", config, ranges)
 
 
 @dataclass
@@ -222,10 +215,9 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
             ("energy_blur", 0 <= self.energy_blur <= _WIDEST_BLUR, f"in [0, {_WIDEST_BLUR}]"),
             ("epsilon", epsilon is None or 0 < epsilon < math.inf, "positive and finite"),
             ("memory_budget_gb", budget is None or 0 < budget < math.inf, "positive and finite"),
+            ("frequency_constant", 0 < self.frequency_constant <= HIGHEST_FREQUENCY, f"in (0, {HIGHEST_FREQUENCY:g}]"),
         ]
         check_ranges("pipeline.", self, ranges)
-        if not 0 < (constant := self.frequency_constant) <= HIGHEST_FREQUENCY:
-            raise InputError(f"pipeline.frequency_constant must be in (0, {HIGHEST_FREQUENCY:g}], got {constant}.")
         check_options(self.datamanager)
         self.model.check()
 
@@ -246,7 +238,7 @@ class SadgsMachineConfig(MachineConfig):
     """Kind of device to train on; CUDA where there is one."""
 
 
-@hide("websocket_port_default", "relative_log_filename", "num_rays_per_chunk")
+@hide("websocket_port_default", "relative_log_filename", "num_rays_per_chunk", "make_share_url")
 @hide("camera_frustum_scale", "default_composite_depth")
 @dataclass
 class SadgsViewerConfig(ViewerConfig):
@@ -258,13 +250,9 @@ class SadgsViewerConfig(ViewerConfig):
     """Port at which the viewer listens; None is 7007, or a free one where that is taken."""
     quit_on_train_completion: bool = False
     """End the command when training is done, instead of keeping the viewer open."""
-    max_num_display_images: int = 512
-    """Number of training images shown as cameras in the viewer, -1 for all; training takes all images anyway."""
-    make_share_url: bool = False
-    """Print an address at which others can open the viewer, through a server of viser's makers."""
 
 
-@hide("method_name", "prompt", "relative_model_dir", "load_scheduler", "log_gradients")
+@hide("method_name", "prompt", "project_name", "relative_model_dir", "load_scheduler", "log_gradients")
 @hide("mixed_precision", "use_grad_scaler", "gradient_accumulation_steps")  # The check below refuses them.
 @dataclass
 class SadgsTrainerConfig(TrainerConfig):
@@ -308,24 +296,14 @@ class SadgsTrainerConfig(TrainerConfig):
     """Steps between metrics of all held-out views; 0 is never. `ns-eval` measures them after training."""
     data: Path | None = None
     """Folder of the data."""
-    project_name: str | None = "nerfstudio-project"
-    """Name of the project in wandb and comet."""
     vis: Literal[
         "viewer", "wandb", "tensorboard", "comet", "viewer+wandb", "viewer+tensorboard", "viewer+comet", "viewer_legacy"
     ] = "viewer"
     """Where the run can be watched. With a viewer the command waits at the end, until Ctrl+C."""
-    save_only_latest_checkpoint: bool = True
-    """Keep the latest checkpoint only, instead of all."""
     load_dir: Path | None = None
     """Folder of a run, or of its checkpoints, from which the run goes on."""
-    load_step: int | None = None
-    """Step of the checkpoint in `load_dir`; None takes the latest."""
-    load_checkpoint: Path | None = None
-    """Checkpoint from which the run goes on."""
     load_config: Path | None = None
     """The config.yml of a run whose options are taken, instead of all others; nerfstudio executes what it says."""
-    start_paused: bool = False
-    """Wait for a click in the viewer before training starts."""
     logging: Suppress[LoggingConfig] = field(
         default_factory=lambda: LoggingConfig(
             local_writer=LocalWriterConfig(_target=ProgressTable, enable=True), profiler="none"
@@ -361,31 +339,27 @@ class SadgsTrainerConfig(TrainerConfig):
 
     def check(self) -> None:
         """Raise InputError if training cannot work with these options, or if the device is not there."""
-        length, periods = self.max_num_iterations, ("save", "eval_batch", "eval_image", "eval_all_images")
-        check_ranges("", self, [("max_num_iterations", length is None or length >= 1, "at least 1")])
+        length, port = self.max_num_iterations, self.viewer.websocket_port
+        periods = [f"steps_per_{what}" for what in ("save", "eval_batch", "eval_image", "eval_all_images")]
+        accumulated = any(steps != 1 for steps in self.gradient_accumulation_steps.values())
+        ranges = [
+            ("max_num_iterations", length is None or length >= 1, "at least 1"),
+            *((name, getattr(self, name) >= 0, "at least 0") for name in (*periods, "seconds_per_save")),
+            ("mixed_precision", not self.mixed_precision, "False, since sadgs trains in float32"),
+            ("use_grad_scaler", not self.use_grad_scaler, "False, since sadgs trains in float32"),
+            ("log_gradients", not self.log_gradients, "False, since gradients are freed in each step"),
+            ("gradient_accumulation_steps", not accumulated, "1: pipeline.views_per_iteration takes more views a step"),
+        ]
+        check_ranges("", self, ranges)
         check_ranges("logging.", self.logging, [("steps_per_log", self.logging.steps_per_log >= 1, "at least 1")])
-        for name in (*(f"steps_per_{what}" for what in periods), "seconds_per_save"):
-            if not (value := getattr(self, name)) >= 0:
-                raise InputError(f"{name} must not be negative, got {value:g}.")
+        valid = port is None or 1 <= port <= 65535
+        check_ranges("viewer.", self.viewer, [("websocket_port", valid, "in [1, 65535]")])
         if self.load_step is not None and self.load_dir is None:
             raise InputError(
                 f"load_step is {self.load_step}, but load_dir is not set: add --load-dir with the folder of a run."
             )
-        port = self.viewer.websocket_port
-        if port is not None and not 1 <= port <= 65535:
-            raise InputError(f"viewer.websocket_port must be in [1, 65535], got {port}.")
         self._check_machine()
         self._check_rates()
-        if self.mixed_precision or self.use_grad_scaler or self.log_gradients:
-            raise InputError(
-                "sadgs trains in float32, and its densification reads gradients as they are: leave mixed_precision, "
-                "use_grad_scaler and log_gradients off."
-            )
-        if any(steps != 1 for steps in self.gradient_accumulation_steps.values()):
-            raise InputError(
-                "sadgs updates every parameter in every iteration, and densification would lose gradients that were "
-                "kept for later: leave gradient_accumulation_steps out, and set pipeline.views_per_iteration instead."
-            )
         self.pipeline.check()
 
     def _check_machine(self) -> None:
@@ -398,8 +372,7 @@ class SadgsTrainerConfig(TrainerConfig):
                 f"machine.device_type is {device}, but torch finds no {name} device: set it to cpu, or install torch "
                 f"for {name}."
             )
-        if not 0 <= self.machine.seed < 2**32:
-            raise InputError(f"machine.seed must be in [0, 2³²), got {self.machine.seed}.")
+        check_ranges("machine.", self.machine, [("seed", 0 <= self.machine.seed < 2**32, "in [0, 2³²)")])
         model, several = self.pipeline.model, processes.check_devices(self.machine)
         if model.backend != "auto":  # That is decided in the process that trains, where Triton tries a kernel.
             choose_backend(model.backend, torch.device(device), not several)
@@ -424,16 +397,12 @@ class SadgsTrainerConfig(TrainerConfig):
                     f"optimizers.{group}.optimizer must be sadgs's Adam without max_norm and weight_decay: leave out "
                     "all but its lr."
                 )
-            if not 0 <= rate <= 1:
-                raise InputError(f"optimizers.{group}.optimizer.lr must be in [0, 1], got {rate:g}.")
+            check_ranges(f"optimizers.{group}.optimizer.", adam, [("lr", 0 <= rate <= 1, "in [0, 1]")])
             if isinstance(scheduler, RunLengthDecaySchedulerConfig):
-                for name in ("initial_factor", "final_factor"):
-                    option, factor = f"optimizers.{group}.scheduler.{name}", getattr(scheduler, name)
-                    if not 0 < factor < math.inf:
-                        raise InputError(f"{option} must be positive and finite, got {factor:g}.")
-                    if rate * factor > 1:
-                        got = f"got {factor:g}, which makes {rate * factor:g} of {rate:g}"
-                        raise InputError(f"{option} must leave the rate in [0, 1], {got}.")
+                factors = {name: getattr(scheduler, name) for name in ("initial_factor", "final_factor")}
+                allowed = f"positive, and {rate:g} times it at most 1"
+                ranges = [(name, value > 0 and rate * value <= 1, allowed) for name, value in factors.items()]
+                check_ranges(f"optimizers.{group}.scheduler.", scheduler, ranges)
 
     def save_config(self) -> None:
         """Write `config.yml` if the run can begin; raises InputError as `check`, and as `run_folder.begin`."""

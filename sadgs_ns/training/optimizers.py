@@ -147,18 +147,6 @@ class RunLengthDecaySchedulerConfig(SchedulerConfig):
     """Iterations until `final_factor`; None is the length of the run."""
 
 
-@hide("lr")
-@dataclass
-class UnlistedAdamOptimizerConfig(FusedAdamOptimizerConfig):
-    """Adam whose rate `--help` does not list; a config.yml, or a benchmark's protocol, can set it."""
-
-
-@hide("final_factor")
-@dataclass
-class UnlistedDecaySchedulerConfig(RunLengthDecaySchedulerConfig):
-    """Exponential decay as above, whose factors `--help` does not list."""
-
-
 class RunLengthDecayScheduler(Scheduler):
     """lr(t) = lr · initial^(1−t) · final^t with t the fraction of the run after `hold_share` that has passed."""
 

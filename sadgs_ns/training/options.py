@@ -31,5 +31,5 @@ def check_ranges(prefix: str, options: object, ranges: Iterable[tuple[str, bool,
     for name, fits, allowed in ranges:
         if not fits:
             value = getattr(options, name)
-            got = format(value, "" if isinstance(value, str) else "," if isinstance(value, int) else "g")
+            got = f"{value:g}" if isinstance(value, float) else f"{value:,}" if type(value) is int else str(value)
             raise InputError(f"{prefix}{name} must be {allowed}, got {got}.")

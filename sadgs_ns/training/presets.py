@@ -9,12 +9,7 @@ from nerfstudio.plugins.types import MethodSpecification
 from sadgs_ns.method.schedule import DENSIFICATION_SHARE
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.training.config import SadgsModelConfig, SadgsPipelineConfig, SadgsTrainerConfig
-from sadgs_ns.training.optimizers import (
-    FusedAdamOptimizerConfig,
-    RunLengthDecaySchedulerConfig,
-    UnlistedAdamOptimizerConfig,
-    UnlistedDecaySchedulerConfig,
-)
+from sadgs_ns.training.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
 
 RATES: dict[str, tuple[float, float, float]] = {
     "means": (1.6e-4, 1.0, 0.01),
@@ -30,8 +25,6 @@ RATES: dict[str, tuple[float, float, float]] = {
 
 Positions, colours and opacities start at 3DGS's rates; scales have four times 3DGS's rate, rotations twice.
 """
-UNLISTED = ("color_matrices",)
-"""Groups whose rates `--help` does not list, because they hardly depend on the capture."""
 HELD = ("features_dc", "features_rest", "opacities")
 """Groups whose rates are constant until densification ends, and fall then."""
 CONSTANT = {name: (RATES[name][0], 1.0, 1.0) for name in HELD}
@@ -42,13 +35,12 @@ def optimizers(**rates: tuple[float, float, float]) -> dict[str, dict[str, Any]]
     """Return Adam, and a schedule if its rate changes, of each group of parameters. `rates` override `RATES`."""
     groups: dict[str, dict[str, Any]] = {}
     for name, (lr, initial_factor, final_factor) in (RATES | rates).items():
-        adam, decay = FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
-        if name in UNLISTED:
-            adam, decay = UnlistedAdamOptimizerConfig, UnlistedDecaySchedulerConfig
-        groups[name] = {"optimizer": adam(lr=lr)}
+        groups[name] = {"optimizer": FusedAdamOptimizerConfig(lr=lr)}
         if (initial_factor, final_factor) != (1.0, 1.0):
             hold = DENSIFICATION_SHARE if name in HELD else 0.0
-            groups[name]["scheduler"] = decay(initial_factor=initial_factor, final_factor=final_factor, hold_share=hold)
+            groups[name]["scheduler"] = RunLengthDecaySchedulerConfig(
+                initial_factor=initial_factor, final_factor=final_factor, hold_share=hold
+            )
     return groups
 
 

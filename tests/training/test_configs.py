@@ -235,7 +235,7 @@ def test_help_texts_break_their_lines_between_sentences_as_tyro_does_not_join_th
         (
             "camera_optimizer",
             PoseOptimizerConfig(rot_l2_penalty=float("nan")),
-            "pipeline.model.camera_optimizer.rot_l2_penalty cannot be set, got nan: leave it out.",
+            "pipeline.model.camera_optimizer.rot_l2_penalty must be 0.001, as in nerfstudio, got nan.",
         ),
     ],
 )

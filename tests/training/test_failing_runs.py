@@ -59,7 +59,7 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig
 @pytest.mark.parametrize(
     ("option", "value", "sentence"),
     [
-        ("gradient_accumulation_steps", {"means": 4}, "sadgs updates every parameter in every iteration, and "),
+        ("gradient_accumulation_steps", {"means": 4}, "gradient_accumulation_steps must be 1: pipeline."),
         (
             "machine.num_devices",
             2,
@@ -72,34 +72,34 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig
         (
             "pipeline.datamanager.cache_images_type",
             "float32",
-            "pipeline.datamanager.cache_images_type is float32, and sadgs keeps images as bytes, which is what their ",
+            "pipeline.datamanager.cache_images_type must be uint8, which is what files of images hold, got float32.",
         ),
         (
             "pipeline.datamanager.train_cameras_sampling_strategy",
             "fps",
-            "pipeline.datamanager.train_cameras_sampling_strategy is fps, and sadgs takes each view once a round: ",
+            "pipeline.datamanager.train_cameras_sampling_strategy must be random, which takes each view once a round, ",
         ),
         ("machine.seed", -1, "machine.seed must be in [0, 2³²), got -1."),
-        ("machine.seed", 2**32, "machine.seed must be in [0, 2³²), got 4294967296."),
+        ("machine.seed", 2**32, "machine.seed must be in [0, 2³²), got 4,294,967,296."),
         (
             "pipeline.datamanager.dataparser.scale_factor",
             0.0,
-            "scale_factor, an option of the data's parser, must be positive and finite, got 0.",
+            "pipeline.datamanager.dataparser.scale_factor must be positive and finite, got 0.",
         ),
         (
             "pipeline.datamanager.dataparser.scale_factor",
             math.nan,
-            "scale_factor, an option of the data's parser, must be positive and finite, got nan.",
+            "pipeline.datamanager.dataparser.scale_factor must be positive and finite, got nan.",
         ),
         (
             "pipeline.datamanager.dataparser.train_split_fraction",
             2.0,
-            "train_split_fraction, an option of the data's parser, must be in (0, 1], got 2.",
+            "pipeline.datamanager.dataparser.train_split_fraction must be in (0, 1], got 2.",
         ),
         (
             "pipeline.datamanager.dataparser.eval_interval",
             1,
-            "eval_interval, an option of the data's parser, must be at least 2, got 1.",
+            "pipeline.datamanager.dataparser.eval_interval must be at least 2, got 1.",
         ),
         (
             "pipeline.datamanager.camera_res_scale_factor",
@@ -111,13 +111,13 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig
             math.nan,
             "pipeline.datamanager.camera_res_scale_factor must be in (0, 1], got nan.",
         ),
-        ("steps_per_save", -3, "steps_per_save must not be negative, got -3."),
-        ("seconds_per_save", math.nan, "seconds_per_save must not be negative, got nan."),
-        ("steps_per_eval_batch", -1, "steps_per_eval_batch must not be negative, got -1."),
-        ("steps_per_eval_image", -1, "steps_per_eval_image must not be negative, got -1."),
-        ("steps_per_eval_all_images", -1, "steps_per_eval_all_images must not be negative, got -1."),
+        ("steps_per_save", -3, "steps_per_save must be at least 0, got -3."),
+        ("seconds_per_save", math.nan, "seconds_per_save must be at least 0, got nan."),
+        ("steps_per_eval_batch", -1, "steps_per_eval_batch must be at least 0, got -1."),
+        ("steps_per_eval_image", -1, "steps_per_eval_image must be at least 0, got -1."),
+        ("steps_per_eval_all_images", -1, "steps_per_eval_all_images must be at least 0, got -1."),
         ("logging.steps_per_log", 0, "logging.steps_per_log must be at least 1, got 0."),
-        ("viewer.websocket_port", 99999, "viewer.websocket_port must be in [1, 65535], got 99999."),
+        ("viewer.websocket_port", 99999, "viewer.websocket_port must be in [1, 65535], got 99,999."),
         ("pipeline.effort", 0.0, "pipeline.effort must be in (0, 100], got 0."),
         ("pipeline.model.averaged_share", 0.5, "pipeline.model.averaged_share must be in [0, 0.3], got 0.5."),
         (
@@ -143,12 +143,12 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig
         (
             "optimizers.means.scheduler.initial_factor",
             1e9,
-            "optimizers.means.scheduler.initial_factor must leave the rate in [0, 1], got 1e+09, which makes 160000 ",
+            "optimizers.means.scheduler.initial_factor must be positive, and 0.00016 times it at most 1, got 1e+09.",
         ),
         (
             "optimizers.means.scheduler.final_factor",
             0.0,
-            "optimizers.means.scheduler.final_factor must be positive and finite, got 0.",
+            "optimizers.means.scheduler.final_factor must be positive, and 0.00016 times it at most 1, got 0.",
         ),
     ],
 )

@@ -150,6 +150,7 @@ def test_jpegs_are_decoded_by_opencv_only_if_it_agrees_with_pillow(
     assert by_pillow == ([0] if agrees else 2 * list(range(VIEWS - 1)))
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # nerfstudio leaves the file open.
 def test_a_file_that_breaks_later_is_named(tmp_path: Path):
     read = datamanager_of(nerfstudio_data(tmp_path, masks=True), cache_images="compressed")
     assert len(list(read.cached_train)) == len(read.train_dataset)
