@@ -14,7 +14,7 @@ import triton.language as tl
 from torch import Tensor
 
 from sadgs_ns.kernels import cdiv
-from sadgs_ns.kernels.visibility import drawn
+from sadgs_ns.kernels.shared import drawn
 
 MAX_DEGREE = 3
 """Highest degree that the kernels know."""

@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 from sadgs_ns import gsplat_compat
 from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.kernels import cdiv
-from sadgs_ns.kernels.visibility import drawn
+from sadgs_ns.kernels.shared import drawn
 
 _LANES = 128
 """Gaussians that one program handles."""

@@ -7,7 +7,7 @@ import triton.language as tl
 from torch import Tensor
 
 from sadgs_ns.kernels import cdiv
-from sadgs_ns.kernels.visibility import drawn
+from sadgs_ns.kernels.shared import drawn
 
 _LANES = 256
 """Gaussians that one program handles."""
