@@ -19,38 +19,10 @@ from torch.autograd.function import once_differentiable
 from sadgs_ns import gsplat_compat
 from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.kernels import cdiv
-from sadgs_ns.kernels.shared import drawn
+from sadgs_ns.kernels.shared import drawn, load3, rotation, store3
 
 _LANES = 128
 """Gaussians that one program handles."""
-
-
-@triton.jit
-def _load3(values, at, exists):
-    """Load three numbers that lie side by side, 0 where they do not exist."""
-    return (
-        tl.load(values + at, exists, 0.0),
-        tl.load(values + at + 1, exists, 0.0),
-        tl.load(values + at + 2, exists, 0.0),
-    )
-
-
-@triton.jit
-def _store3(values, at, x, y, z, exists):
-    """Store three numbers side by side."""
-    tl.store(values + at, x, exists)
-    tl.store(values + at + 1, y, exists)
-    tl.store(values + at + 2, z, exists)
-
-
-@triton.jit
-def _rotation(w, x, y, z):
-    """Return the nine entries, row by row, of the rotation that a unit quaternion stands for."""
-    return (
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    )  # fmt: skip
 
 
 @triton.jit
@@ -89,13 +61,13 @@ def _project_backward(
     """
     g = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
     exists = g < n
-    mean_x, mean_y, mean_z = _load3(means, 3 * g, exists)
+    mean_x, mean_y, mean_z = load3(means, 3 * g, exists)
     qw = tl.load(quats + 4 * g, exists, 1.0)
-    qx, qy, qz = _load3(quats, 4 * g + 1, exists)
+    qx, qy, qz = load3(quats, 4 * g + 1, exists)
     inverse_norm = 1 / tl.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
     qw, qx, qy, qz = qw * inverse_norm, qx * inverse_norm, qy * inverse_norm, qz * inverse_norm
-    r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(qw, qx, qy, qz)
-    sx, sy, sz = _load3(scales, 3 * g, exists)
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation(qw, qx, qy, qz)
+    sx, sy, sz = load3(scales, 3 * g, exists)
     m00, m01, m02 = r00 * sx, r01 * sy, r02 * sz  # M = R S, and Σ = M Mᵀ
     m10, m11, m12 = r10 * sx, r11 * sy, r12 * sz
     m20, m21, m22 = r20 * sx, r21 * sy, r22 * sz
@@ -117,8 +89,8 @@ def _project_backward(
         inverse = 1 / z
 
         # The gradient H of Σ2D, of whose blurred inverse the conic has three entries.
-        a, b, c = _load3(conics, 3 * at, seen)
-        h_a, h_b, h_c = _load3(v_conics, at * row_conic, seen)
+        a, b, c = load3(conics, 3 * at, seen)
+        h_a, h_b, h_c = load3(v_conics, at * row_conic, seen)
         h_b = 0.5 * h_b
         top, right, left, bottom = a * h_a + b * h_b, a * h_b + b * h_c, b * h_a + c * h_b, b * h_b + c * h_c
         h00, h01, h11 = -(top * a + right * b), -(top * b + right * c), -(left * b + bottom * c)
@@ -160,9 +132,9 @@ def _project_backward(
         count += seen
 
     if PASSED:
-        x, y, z = _load3(v_passed, 3 * g, exists)
+        x, y, z = load3(v_passed, 3 * g, exists)
         v_x, v_y, v_z = v_x + x, v_y + y, v_z + z
-    _store3(v_means, 3 * g, v_x, v_y, v_z, exists)
+    store3(v_means, 3 * g, v_x, v_y, v_z, exists)
     seen = count > 0  # What no view drew has gradients of 0, whatever its numbers are.
     # v_M = 2 v_Σ M, of which R's gradient is v_M S.
     n00, n01, n02 = (
@@ -185,7 +157,7 @@ def _project_backward(
         r01 * n01 + r11 * n11 + r21 * n21,
         r02 * n02 + r12 * n12 + r22 * n22,
     )
-    _store3(
+    store3(
         v_scales, 3 * g, tl.where(seen, 2 * v_sx, 0.0), tl.where(seen, 2 * v_sy, 0.0), tl.where(seen, 2 * v_sz, 0.0),
         exists,
     )  # fmt: skip
@@ -199,7 +171,7 @@ def _project_backward(
     v_qz = qx * (n20 + n02) + qy * (n21 + n12) + qw * (n10 - n01) - 2 * qz * (n00 + n11)
     along = v_qw * qw + v_qx * qx + v_qy * qy + v_qz * qz
     tl.store(v_quats + 4 * g, tl.where(seen, (v_qw - along * qw) * inverse_norm, 0.0), exists)
-    _store3(
+    store3(
         v_quats, 4 * g + 1, tl.where(seen, (v_qx - along * qx) * inverse_norm, 0.0),
         tl.where(seen, (v_qy - along * qy) * inverse_norm, 0.0),
         tl.where(seen, (v_qz - along * qz) * inverse_norm, 0.0), exists,

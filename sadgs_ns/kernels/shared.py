@@ -1,4 +1,4 @@
-"""`render.rasterization.visible` for use inside other kernels: which Gaussians the rasterizer drew."""
+"""Functions that several kernels call."""
 
 from __future__ import annotations
 
@@ -13,3 +13,31 @@ def drawn(radii, at, exists, PER_GAUSSIAN: tl.constexpr):
     if PER_GAUSSIAN == 2:
         radius = tl.minimum(radius, tl.load(radii + 2 * at + 1, exists, 0))
     return exists & (radius > 0)
+
+
+@triton.jit
+def load3(values, at, exists):
+    """Load three numbers that lie side by side, 0 where they do not exist."""
+    return (
+        tl.load(values + at, exists, 0.0),
+        tl.load(values + at + 1, exists, 0.0),
+        tl.load(values + at + 2, exists, 0.0),
+    )
+
+
+@triton.jit
+def store3(values, at, x, y, z, exists):
+    """Store three numbers side by side."""
+    tl.store(values + at, x, exists)
+    tl.store(values + at + 1, y, exists)
+    tl.store(values + at + 2, z, exists)
+
+
+@triton.jit
+def rotation(w, x, y, z):
+    """Return the nine entries, row by row, of the rotation that a unit quaternion stands for."""
+    return (
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
