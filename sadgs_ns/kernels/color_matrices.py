@@ -15,6 +15,7 @@ from torch import Tensor
 
 from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.limits import check_pixels
+from sadgs_ns.kernels.shared import load3, store3
 
 _LANES = 1024
 """Pixels that one program handles."""
@@ -28,9 +29,7 @@ def _correct(render, alpha, matrices, corrected, n, LANES: tl.constexpr):
     exists = i < n
     pixel = view * n + i
     opacity = tl.load(alpha + pixel, exists, 0.0)
-    r = tl.load(render + 3 * pixel, exists, 0.0)
-    g = tl.load(render + 3 * pixel + 1, exists, 0.0)
-    b = tl.load(render + 3 * pixel + 2, exists, 0.0)
+    r, g, b = load3(render, 3 * pixel, exists)
     for k in tl.static_range(3):
         row = matrices + 12 * view + 4 * k
         value = tl.load(row) * r + tl.load(row + 1) * g + tl.load(row + 2) * b + tl.load(row + 3) * opacity
@@ -47,9 +46,7 @@ def _correct_backward(
     exists = i < n
     pixel = view * n + i
     opacity = tl.load(alpha + pixel, exists, 0.0)
-    r = tl.load(render + 3 * pixel, exists, 0.0)
-    g = tl.load(render + 3 * pixel + 1, exists, 0.0)
-    b = tl.load(render + 3 * pixel + 2, exists, 0.0)
+    r, g, b = load3(render, 3 * pixel, exists)
     v_r = tl.zeros([LANES], tl.float32)
     v_g, v_b, v_opacity = v_r, v_r, v_r
     part = sums + 12 * (view * tl.num_programs(0) + tl.program_id(0))
@@ -60,13 +57,9 @@ def _correct_backward(
         v_g += v * tl.load(row + 1)
         v_b += v * tl.load(row + 2)
         v_opacity += v * tl.load(row + 3)
-        tl.store(part + 4 * k, tl.sum(v * r))
-        tl.store(part + 4 * k + 1, tl.sum(v * g))
-        tl.store(part + 4 * k + 2, tl.sum(v * b))
+        store3(part, 4 * k, tl.sum(v * r), tl.sum(v * g), tl.sum(v * b), True)
         tl.store(part + 4 * k + 3, tl.sum(v * opacity))
-    tl.store(v_render + 3 * pixel, v_r, exists)
-    tl.store(v_render + 3 * pixel + 1, v_g, exists)
-    tl.store(v_render + 3 * pixel + 2, v_b, exists)
+    store3(v_render, 3 * pixel, v_r, v_g, v_b, exists)
     tl.store(v_alpha + pixel, v_opacity, exists)
 
 

@@ -34,6 +34,7 @@ from sadgs_ns.kernels.compositing_forward import (
     row,
     split4,
 )
+from sadgs_ns.kernels.shared import load3
 
 PRECISION = "tf32x3"
 """How Triton multiplies float32 on tensor cores. "tf32x3" makes three products of the two parts of 11 bits that each
@@ -88,9 +89,7 @@ def _composite_backward(
     x, y = x.to(tl.float32) - (TILE - 1) / 2, y.to(tl.float32) - (TILE - 1) / 2
     scaled_x, scaled_y = x * SCALE, y * SCALE
 
-    red = tl.load(v_renders + 3 * at, inside, 0.0)
-    green = tl.load(v_renders + 3 * at + 1, inside, 0.0)
-    blue = tl.load(v_renders + 3 * at + 2, inside, 0.0)
+    red, green, blue = load3(v_renders, 3 * at, inside)
     v_alpha = red * 0
     if ALPHAS:
         v_alpha = tl.load(v_alphas + at, inside, 0.0)

@@ -13,6 +13,7 @@ import triton.language as tl
 from torch import Tensor
 
 from sadgs_ns.kernels import TILE_SIZE
+from sadgs_ns.kernels.shared import store3
 
 SCALE = tl.constexpr(0.8493218002880191)
 """√(log2(e) / 2), of offsets in px: exp(-σ) is then exp2 of a plain polynomial. It stands
@@ -182,9 +183,7 @@ def _composite_forward(
         last = tl.maximum(last, tl.max(tl.where(weight > 0, position[:, None], 0), axis=0))
         passed = row(behind, GAUSSIANS - 1)
     nan = tl.where(flaws > 0, float("nan"), 0.0)
-    tl.store(renders + 3 * at, red + nan, inside)
-    tl.store(renders + 3 * at + 1, green + nan, inside)
-    tl.store(renders + 3 * at + 2, blue + nan, inside)
+    store3(renders, 3 * at, red + nan, green + nan, blue + nan, inside)
     tl.store(drawn_alphas + at, 1 - left, inside)
     tl.store(last_ids + at, last, inside)
 

@@ -14,7 +14,7 @@ import triton.language as tl
 from torch import Tensor
 
 from sadgs_ns.kernels import cdiv
-from sadgs_ns.kernels.shared import drawn
+from sadgs_ns.kernels.shared import drawn, load3, store3
 
 MAX_DEGREE = 3
 """Highest degree that the kernels know."""
@@ -36,9 +36,8 @@ def _minus_centre(viewmat, column):
 def _direction(means, viewmats, view, g, exists):
     """Unit vector from the camera to each Gaussian, and the inverse of their distance."""
     viewmat = viewmats + 16 * view
-    x = tl.load(means + 3 * g, exists, 1.0) + _minus_centre(viewmat, 0)
-    y = tl.load(means + 3 * g + 1, exists, 0.0) + _minus_centre(viewmat, 1)
-    z = tl.load(means + 3 * g + 2, exists, 0.0) + _minus_centre(viewmat, 2)
+    x, y, z = load3(means, 3 * g, exists)
+    x, y, z = x + _minus_centre(viewmat, 0), y + _minus_centre(viewmat, 1), z + _minus_centre(viewmat, 2)
     inverse = 1 / tl.maximum(tl.sqrt(x * x + y * y + z * z), 1e-30)
     return x * inverse, y * inverse, z * inverse, inverse
 
@@ -97,30 +96,23 @@ def _forward(
     x, y, z, _ = _direction(means, viewmats, view, g, exists)
     basis = _basis(x, y, z)
     others = rest + g.to(tl.int64) * stride  # in 32 bits, 45 g would overflow from 47.7 million Gaussians
-    red = 0.2820947917738781 * tl.load(first + 3 * g, exists, 0.0) + 0.5
-    green = 0.2820947917738781 * tl.load(first + 3 * g + 1, exists, 0.0) + 0.5
-    blue = 0.2820947917738781 * tl.load(first + 3 * g + 2, exists, 0.0) + 0.5
+    r, g_, b = load3(first, 3 * g, exists)
+    red, green, blue = 0.2820947917738781 * r + 0.5, 0.2820947917738781 * g_ + 0.5, 0.2820947917738781 * b + 0.5
     for k in tl.static_range(15):
-        read = exists & (k < used)
-        red += basis[k] * tl.load(others + 3 * k, read, 0.0)
-        green += basis[k] * tl.load(others + 3 * k + 1, read, 0.0)
-        blue += basis[k] * tl.load(others + 3 * k + 2, read, 0.0)
+        r, g_, b = load3(others, 3 * k, exists & (k < used))
+        red, green, blue = red + basis[k] * r, green + basis[k] * g_, blue + basis[k] * b
     # A broken coefficient must show in the image, where it is found; a maximum that drops NaN would paint it black.
-    tl.store(colors + 3 * at, tl.maximum(red, 0.0, tl.PropagateNan.ALL), g < n)
-    tl.store(colors + 3 * at + 1, tl.maximum(green, 0.0, tl.PropagateNan.ALL), g < n)
-    tl.store(colors + 3 * at + 2, tl.maximum(blue, 0.0, tl.PropagateNan.ALL), g < n)
+    red, green = tl.maximum(red, 0.0, tl.PropagateNan.ALL), tl.maximum(green, 0.0, tl.PropagateNan.ALL)
+    store3(colors, 3 * at, red, green, tl.maximum(blue, 0.0, tl.PropagateNan.ALL), g < n)
 
 
 @triton.jit
 def _add(sums, basis, v):
     """Sums of the coefficients' gradients [LANES, 4] with one view's added."""
-    return (
-        sums[0] + basis[0][:, None] * v, sums[1] + basis[1][:, None] * v, sums[2] + basis[2][:, None] * v,
-        sums[3] + basis[3][:, None] * v, sums[4] + basis[4][:, None] * v, sums[5] + basis[5][:, None] * v,
-        sums[6] + basis[6][:, None] * v, sums[7] + basis[7][:, None] * v, sums[8] + basis[8][:, None] * v,
-        sums[9] + basis[9][:, None] * v, sums[10] + basis[10][:, None] * v, sums[11] + basis[11][:, None] * v,
-        sums[12] + basis[12][:, None] * v, sums[13] + basis[13][:, None] * v, sums[14] + basis[14][:, None] * v,
-    )  # fmt: skip
+    added = ()
+    for k in tl.static_range(15):
+        added = added + (sums[k] + basis[k][:, None] * v,)  # noqa: RUF005 (Triton knows no starred expressions)
+    return added
 
 
 # The colours' gradients may be parts of rows that begin at no multiple of 16 bytes: Triton would compile a new kernel.
@@ -143,9 +135,7 @@ def _backward(
     at_others = (g.to(tl.int64) * stride)[:, None] + channel  # in 64 bits as forward
     earlier = mine & (start > 0)
     v_sum = tl.zeros([LANES, 4], tl.float32)
-    v_x = tl.load(v_means + 3 * g, (g < n) & (start > 0), 0.0)
-    v_y = tl.load(v_means + 3 * g + 1, (g < n) & (start > 0), 0.0)
-    v_z = tl.load(v_means + 3 * g + 2, (g < n) & (start > 0), 0.0)
+    v_x, v_y, v_z = load3(v_means, 3 * g, (g < n) & (start > 0))
     sums = (v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum)
     for i in tl.static_range(VIEWS):
         view = tl.minimum(start + i, num_views - 1)
@@ -175,9 +165,7 @@ def _backward(
         at_rest = v_rest + at_others + 3 * k
         value = tl.where(k < used, sums[k], 0.0) + tl.load(at_rest, earlier & (3 * k < stride), 0.0)
         tl.store(at_rest, value, mine & (3 * k < stride))
-    tl.store(v_means + 3 * g, v_x, g < n)
-    tl.store(v_means + 3 * g + 1, v_y, g < n)
-    tl.store(v_means + 3 * g + 2, v_z, g < n)
+    store3(v_means, 3 * g, v_x, v_y, v_z, g < n)
 
 
 class _Colors(torch.autograd.Function):

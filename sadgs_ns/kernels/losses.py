@@ -17,6 +17,7 @@ from torch import Tensor
 
 from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.limits import check_pixels
+from sadgs_ns.kernels.shared import load3, store3
 
 _STRIP = 256
 """Numbers along the rows that one program handles."""
@@ -52,9 +53,7 @@ def _blur_along_rows(x, y, blurred, sums, n, GAUSSIAN: tl.constexpr, STRIP: tl.c
         wa, wb = GAUSSIAN[k] * a, GAUSSIAN[k] * b
         e_x, e_y, e_xx, e_yy, e_xy = e_x + wa, e_y + wb, e_xx + wa * a, e_yy + wb * b, e_xy + wa * b
     size = tl.cast(n, tl.int64)
-    tl.store(blurred + i, e_x, inside)
-    tl.store(blurred + size + i, e_y, inside)
-    tl.store(blurred + 2 * size + i, e_xx, inside)
+    store3(blurred, i, e_x, e_y, e_xx, inside, size)
     tl.store(blurred + 3 * size + i, e_yy, inside)
     tl.store(blurred + 4 * size + i, e_xy, inside)
     difference = tl.load(x + i, inside, 0.0) - _target(y, i, inside)
@@ -115,9 +114,8 @@ def _similarity(
         by_xy = 2 * luminance * of_variances
         by_x = 2 * (e_y - e_x * luminance) * of_means * structure - 2 * e_x * by_xx - e_y * by_xy
         inside = (c < row) & (first + t < height)
-        tl.store(slopes + i + t * row, tl.where(valid, by_x, 0.0), inside)
-        tl.store(slopes + size + i + t * row, tl.where(valid, by_xx, 0.0), inside)
-        tl.store(slopes + 2 * size + i + t * row, tl.where(valid, by_xy, 0.0), inside)
+        by_x, by_xx, by_xy = tl.where(valid, by_x, 0.0), tl.where(valid, by_xx, 0.0), tl.where(valid, by_xy, 0.0)
+        store3(slopes, i + t * row, by_x, by_xx, by_xy, inside, size)
         similarity += tl.where(valid, luminance * structure, 0.0)
     program = (tl.program_id(2) * tl.num_programs(1) + tl.program_id(1)) * tl.num_programs(0) + tl.program_id(0)
     tl.store(sums + program, tl.sum(similarity))
@@ -157,13 +155,9 @@ def _spread_along_rows(slopes, spread, n, GAUSSIAN: tl.constexpr, STRIP: tl.cons
     by_xx, by_xy = by_x, by_x
     for k in tl.static_range(len(GAUSSIAN)):
         exists = (i < n) & (i >= 3 * k)
-        at = slopes + i - 3 * k
-        by_x += GAUSSIAN[k] * tl.load(at, exists, 0.0)
-        by_xx += GAUSSIAN[k] * tl.load(at + size, exists, 0.0)
-        by_xy += GAUSSIAN[k] * tl.load(at + 2 * size, exists, 0.0)
-    tl.store(spread + i, by_x, i < n)
-    tl.store(spread + size + i, by_xx, i < n)
-    tl.store(spread + 2 * size + i, by_xy, i < n)
+        x, xx, xy = load3(slopes, i - 3 * k, exists, size)
+        by_x, by_xx, by_xy = by_x + GAUSSIAN[k] * x, by_xx + GAUSSIAN[k] * xx, by_xy + GAUSSIAN[k] * xy
+    store3(spread, i, by_x, by_xx, by_xy, i < n, size)
 
 
 @triton.jit(do_not_specialize=["n", "height", "row"], do_not_specialize_on_alignment=["y"])

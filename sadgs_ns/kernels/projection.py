@@ -26,6 +26,12 @@ _LANES = 128
 
 
 @triton.jit
+def _symmetric_times(xx, xy, xz, yy, yz, zz, x, y, z):
+    """Multiply a symmetric matrix by a vector."""
+    return xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z
+
+
+@triton.jit
 def _clamped(ratio, focal, centre, size):
     """Clamp x / z where the Jacobian is taken: 0.3 half images beyond the image's border."""
     margin = 0.15 * size / focal
@@ -110,8 +116,8 @@ def _project_backward(
         v_zz += tl.where(seen, t02 * k02 + t12 * k12, 0.0)
 
         # The gradient 2 H T Σ Wᵀ of J, of which four entries depend on the centre.
-        u00, u01, u02 = k00 * xx + k01 * xy + k02 * xz, k00 * xy + k01 * yy + k02 * yz, k00 * xz + k01 * yz + k02 * zz
-        u10, u11, u12 = k10 * xx + k11 * xy + k12 * xz, k10 * xy + k11 * yy + k12 * yz, k10 * xz + k11 * yz + k12 * zz
+        u00, u01, u02 = _symmetric_times(xx, xy, xz, yy, yz, zz, k00, k01, k02)
+        u10, u11, u12 = _symmetric_times(xx, xy, xz, yy, yz, zz, k10, k11, k12)
         by_x, by_z_of_x = _by_row(
             x * inverse, slope_x, inverse, jx,
             2 * (u00 * w00 + u01 * w01 + u02 * w02), 2 * (u00 * w20 + u01 * w21 + u02 * w22),
@@ -137,45 +143,26 @@ def _project_backward(
     store3(v_means, 3 * g, v_x, v_y, v_z, exists)
     seen = count > 0  # What no view drew has gradients of 0, whatever its numbers are.
     # v_M = 2 v_Σ M, of which R's gradient is v_M S.
-    n00, n01, n02 = (
-        v_xx * m00 + v_xy * m10 + v_xz * m20,
-        v_xx * m01 + v_xy * m11 + v_xz * m21,
-        v_xx * m02 + v_xy * m12 + v_xz * m22,
-    )
-    n10, n11, n12 = (
-        v_xy * m00 + v_yy * m10 + v_yz * m20,
-        v_xy * m01 + v_yy * m11 + v_yz * m21,
-        v_xy * m02 + v_yy * m12 + v_yz * m22,
-    )
-    n20, n21, n22 = (
-        v_xz * m00 + v_yz * m10 + v_zz * m20,
-        v_xz * m01 + v_yz * m11 + v_zz * m21,
-        v_xz * m02 + v_yz * m12 + v_zz * m22,
-    )
-    v_sx, v_sy, v_sz = (
-        r00 * n00 + r10 * n10 + r20 * n20,
-        r01 * n01 + r11 * n11 + r21 * n21,
-        r02 * n02 + r12 * n12 + r22 * n22,
-    )
-    store3(
-        v_scales, 3 * g, tl.where(seen, 2 * v_sx, 0.0), tl.where(seen, 2 * v_sy, 0.0), tl.where(seen, 2 * v_sz, 0.0),
-        exists,
-    )  # fmt: skip
+    n00, n10, n20 = _symmetric_times(v_xx, v_xy, v_xz, v_yy, v_yz, v_zz, m00, m10, m20)
+    n01, n11, n21 = _symmetric_times(v_xx, v_xy, v_xz, v_yy, v_yz, v_zz, m01, m11, m21)
+    n02, n12, n22 = _symmetric_times(v_xx, v_xy, v_xz, v_yy, v_yz, v_zz, m02, m12, m22)
+    v_sx = tl.where(seen, 2 * (r00 * n00 + r10 * n10 + r20 * n20), 0.0)
+    v_sy = tl.where(seen, 2 * (r01 * n01 + r11 * n11 + r21 * n21), 0.0)
+    v_sz = tl.where(seen, 2 * (r02 * n02 + r12 * n12 + r22 * n22), 0.0)
+    store3(v_scales, 3 * g, v_sx, v_sy, v_sz, exists)
     sx, sy, sz = 4 * sx, 4 * sy, 4 * sz  # both factors 2: of v_M and of the rotation's derivatives
-    n00, n10, n20, n01, n11, n21, n02, n12, n22 = (
-        n00 * sx, n10 * sx, n20 * sx, n01 * sy, n11 * sy, n21 * sy, n02 * sz, n12 * sz, n22 * sz
-    )  # fmt: skip
+    n00, n10, n20, n01, n11, n21 = n00 * sx, n10 * sx, n20 * sx, n01 * sy, n11 * sy, n21 * sy
+    n02, n12, n22 = n02 * sz, n12 * sz, n22 * sz
     v_qw = qx * (n21 - n12) + qy * (n02 - n20) + qz * (n10 - n01)
     v_qx = qy * (n10 + n01) + qz * (n20 + n02) + qw * (n21 - n12) - 2 * qx * (n11 + n22)
     v_qy = qx * (n10 + n01) + qz * (n21 + n12) + qw * (n02 - n20) - 2 * qy * (n00 + n22)
     v_qz = qx * (n20 + n02) + qy * (n21 + n12) + qw * (n10 - n01) - 2 * qz * (n00 + n11)
     along = v_qw * qw + v_qx * qx + v_qy * qy + v_qz * qz
     tl.store(v_quats + 4 * g, tl.where(seen, (v_qw - along * qw) * inverse_norm, 0.0), exists)
-    store3(
-        v_quats, 4 * g + 1, tl.where(seen, (v_qx - along * qx) * inverse_norm, 0.0),
-        tl.where(seen, (v_qy - along * qy) * inverse_norm, 0.0),
-        tl.where(seen, (v_qz - along * qz) * inverse_norm, 0.0), exists,
-    )  # fmt: skip
+    v_qx = tl.where(seen, (v_qx - along * qx) * inverse_norm, 0.0)
+    v_qy = tl.where(seen, (v_qy - along * qy) * inverse_norm, 0.0)
+    v_qz = tl.where(seen, (v_qz - along * qz) * inverse_norm, 0.0)
+    store3(v_quats, 4 * g + 1, v_qx, v_qy, v_qz, exists)
 
 
 def _rows(gradient: Tensor | None, like: Tensor) -> tuple[Tensor, int]:

@@ -8,6 +8,7 @@ import triton.language as tl
 from torch import Tensor
 
 from sadgs_ns.kernels import cdiv
+from sadgs_ns.kernels.shared import load3, store3
 
 _PIXELS = 1024
 """Pixels that one program handles."""
@@ -29,9 +30,7 @@ def _quantize(
 ):  # fmt: skip
     pixel = tl.program_id(0).to(tl.int64) * PIXELS + tl.arange(0, PIXELS)
     exists = pixel < n
-    xx = tl.load(tensor + 3 * pixel, exists, 0.0)
-    xy = tl.load(tensor + 3 * pixel + 1, exists, 0.0)
-    yy = tl.load(tensor + 3 * pixel + 2, exists, 0.0)
+    xx, xy, yy = load3(tensor, 3 * pixel, exists)
     # NaN is told by comparison, for Triton's maximum drops it on a GPU, and no integer is made of it.
     known = (xx == xx) & (xy == xy) & (yy == yy)
     xx, xy, yy = tl.where(known, xx, 0.0), tl.where(known, xy, 0.0), tl.where(known, yy, 0.0)
@@ -39,9 +38,8 @@ def _quantize(
     correlation = tl.where(product > 0, xy / tl.maximum(product, TINY), 0.0)
     correlation = 127.5 + 127 * tl.minimum(tl.maximum(correlation, -1.0), 1.0)
     correlation = tl.where(known, correlation, INVALID)
-    tl.store(quantized + 3 * pixel, _to_byte(xx, HIGHEST, OCTAVES, TINY).to(tl.uint8), exists)
-    tl.store(quantized + 3 * pixel + 1, correlation.to(tl.uint8), exists)
-    tl.store(quantized + 3 * pixel + 2, _to_byte(yy, HIGHEST, OCTAVES, TINY).to(tl.uint8), exists)
+    x, y = _to_byte(xx, HIGHEST, OCTAVES, TINY), _to_byte(yy, HIGHEST, OCTAVES, TINY)
+    store3(quantized, 3 * pixel, x.to(tl.uint8), correlation.to(tl.uint8), y.to(tl.uint8), exists)
 
 
 def quantize(tensor: Tensor, highest_frequency: float, octaves: float, invalid: int) -> Tensor:

@@ -16,21 +16,18 @@ def drawn(radii, at, exists, PER_GAUSSIAN: tl.constexpr):
 
 
 @triton.jit
-def load3(values, at, exists):
-    """Load three numbers that lie side by side, 0 where they do not exist."""
-    return (
-        tl.load(values + at, exists, 0.0),
-        tl.load(values + at + 1, exists, 0.0),
-        tl.load(values + at + 2, exists, 0.0),
-    )
+def load3(values, at, exists, step=1):
+    """Load three numbers that lie `step` apart, 0 where they do not exist."""
+    first = tl.load(values + at, exists, 0.0)
+    return first, tl.load(values + at + step, exists, 0.0), tl.load(values + at + 2 * step, exists, 0.0)
 
 
 @triton.jit
-def store3(values, at, x, y, z, exists):
-    """Store three numbers side by side."""
+def store3(values, at, x, y, z, exists, step=1):
+    """Store three numbers `step` apart."""
     tl.store(values + at, x, exists)
-    tl.store(values + at + 1, y, exists)
-    tl.store(values + at + 2, z, exists)
+    tl.store(values + at + step, y, exists)
+    tl.store(values + at + 2 * step, z, exists)
 
 
 @triton.jit

@@ -7,7 +7,7 @@ import triton.language as tl
 from torch import Tensor
 
 from sadgs_ns.kernels import cdiv
-from sadgs_ns.kernels.shared import drawn
+from sadgs_ns.kernels.shared import drawn, load3, rotation, store3
 
 _LANES = 128
 """Gaussians that one program handles."""
@@ -30,8 +30,9 @@ def _matrix_row(matrix, row, x, y, z):
 
 
 @triton.jit
-def _screen_axis(viewmat, x, y, z, scale, jxx, jxz, jyy, jyz):
+def _screen_axis(viewmat, x, y, z, scale, jacobian):
     """J W times one axis of the Gaussian: x and y in px."""
+    jxx, jxz, jyy, jyz = jacobian
     to_right, down = _matrix_row(viewmat, 0, x, y, z), _matrix_row(viewmat, 1, x, y, z)
     forward = _matrix_row(viewmat, 2, x, y, z)
     return (jxx * to_right + jxz * forward) * scale, (jyy * down + jyz * forward) * scale
@@ -65,14 +66,11 @@ def _observe(
     """Observe LANES Gaussians in all views."""
     g = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
     candidate = g < n
-    x = tl.load(means + 3 * g, candidate, 0.0)
-    y = tl.load(means + 3 * g + 1, candidate, 0.0)
-    z = tl.load(means + 3 * g + 2, candidate, 1.0)
-    scale0 = tl.exp(tl.load(scales + 3 * g, candidate, 0.0))
-    scale1 = tl.exp(tl.load(scales + 3 * g + 1, candidate, 0.0))
-    scale2 = tl.exp(tl.load(scales + 3 * g + 2, candidate, 0.0))
-    qw, qx = tl.load(quats + 4 * g, candidate, 1.0), tl.load(quats + 4 * g + 1, candidate, 0.0)
-    qy, qz = tl.load(quats + 4 * g + 2, candidate, 0.0), tl.load(quats + 4 * g + 3, candidate, 0.0)
+    x, y, z = load3(means, 3 * g, candidate)
+    scale0, scale1, scale2 = load3(scales, 3 * g, candidate)
+    scale0, scale1, scale2 = tl.exp(scale0), tl.exp(scale1), tl.exp(scale2)
+    qw = tl.load(quats + 4 * g, candidate, 1.0)
+    qx, qy, qz = load3(quats, 4 * g + 1, candidate)
     norm = 1 / tl.maximum(tl.sqrt(qw * qw + qx * qx + qy * qy + qz * qz), 1e-12)
     qw, qx, qy, qz = qw * norm, qx * norm, qy * norm, qz * norm
     for view in range(num_views):
@@ -121,26 +119,17 @@ def _observe(
         tangent_x = tl.maximum(tl.minimum(tangent_x, (width - cx) / fx + margin_x), -cx / fx - margin_x)
         tangent_y = tl.maximum(tl.minimum(tangent_y, (height - cy) / fy + margin_y), -cy / fy - margin_y)
         jxx, jyy = fx / depth, fy / depth
-        jxz, jyz = -jxx * tangent_x, -jyy * tangent_y
-        u0, v0 = _screen_axis(
-            viewmat, 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + qw * qz), 2 * (qx * qz - qw * qy),
-            scale0, jxx, jxz, jyy, jyz,
-        )  # fmt: skip
-        u1, v1 = _screen_axis(
-            viewmat, 2 * (qx * qy - qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz + qw * qx),
-            scale1, jxx, jxz, jyy, jyz,
-        )  # fmt: skip
-        u2, v2 = _screen_axis(
-            viewmat, 2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy),
-            scale2, jxx, jxz, jyy, jyz,
-        )  # fmt: skip
+        jacobian = jxx, -jxx * tangent_x, jyy, -jyy * tangent_y
+        r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation(qw, qx, qy, qz)
+        u0, v0 = _screen_axis(viewmat, r00, r10, r20, scale0, jacobian)
+        u1, v1 = _screen_axis(viewmat, r01, r11, r21, scale1, jacobian)
+        u2, v2 = _screen_axis(viewmat, r02, r12, r22, scale2, jacobian)
         eta0 = _eta(u0, v0, s_xx, s_xy, s_yy, EPSILON)
         eta1 = _eta(u1, v1, s_xx, s_xy, s_yy, EPSILON)
         eta2 = _eta(u2, v2, s_xx, s_xy, s_yy, EPSILON)
         observed = observed & (eta0 < float("inf")) & (eta1 < float("inf")) & (eta2 < float("inf"))
-        tl.store(eta + 3 * at, tl.where(observed, eta0, float("nan")), candidate)
-        tl.store(eta + 3 * at + 1, tl.where(observed, eta1, float("nan")), candidate)
-        tl.store(eta + 3 * at + 2, tl.where(observed, eta2, float("nan")), candidate)
+        eta0, eta1 = tl.where(observed, eta0, float("nan")), tl.where(observed, eta1, float("nan"))
+        store3(eta, 3 * at, eta0, eta1, tl.where(observed, eta2, float("nan")), candidate)
 
 
 def observed_eta(

@@ -13,6 +13,7 @@ import triton.language as tl
 from torch import Tensor
 
 from sadgs_ns.kernels import cdiv
+from sadgs_ns.kernels.shared import load3, store3
 
 _TILES = {2: (16, 64), 3: (2, 512)}
 """Rows and columns that a program handles, by the axis: tall where the neighbours are above and below."""
@@ -67,10 +68,7 @@ def _differentiate(
         difference = tl.load(previous + at, exists, 0.0) - smoothed
         xx, xy, yy, band = xx + x * x, xy + x * y, yy + y * y, band + difference * difference
         tl.store(blurred + at, smoothed, exists)
-    at = 3 * image * n + pixel
-    tl.store(products + at, xx * within, exists)
-    tl.store(products + at + n, xy * within, exists)
-    tl.store(products + at + 2 * n, yy * within, exists)
+    store3(products, 3 * image * n + pixel, xx * within, xy * within, yy * within, exists, n)
     tl.store(energy + image * n + pixel, band * within, exists)
 
 
@@ -85,16 +83,14 @@ def _aggregate(
     of_weight = image * weight_stride + pixel
     totals = tl.load(total + of_weight, exists, 1.0)
     at = 3 * image * n + pixel
-    xx = tl.load(products + at, exists, 0.0) / totals
-    xy = tl.load(products + at + n, exists, 0.0) / totals
-    yy = tl.load(products + at + 2 * n, exists, 0.0) / totals
+    xx, xy, yy = load3(products, at, exists, n)
+    xx, xy, yy = xx / totals, xy / totals, yy / totals
     band = tl.load(energy + image * n + pixel, exists, 0.0)
     band = band / tl.load(total_of_energy + of_weight, exists, 1.0)
     weight = tl.where(band > 0, tl.exp(exponent * tl.log(tl.maximum(band, TINY))), 0.0)
     factor = weight * frequency * frequency / (xx + yy + tl.load(trace_floor + image))
-    tl.store(numerator + at, tl.load(numerator + at, exists, 0.0) + factor * xx, exists)
-    tl.store(numerator + at + n, tl.load(numerator + at + n, exists, 0.0) + factor * xy, exists)
-    tl.store(numerator + at + 2 * n, tl.load(numerator + at + 2 * n, exists, 0.0) + factor * yy, exists)
+    sum_xx, sum_xy, sum_yy = load3(numerator, at, exists, n)
+    store3(numerator, at, sum_xx + factor * xx, sum_xy + factor * xy, sum_yy + factor * yy, exists, n)
     at = image * n + pixel
     tl.store(denominator + at, tl.load(denominator + at, exists, 0.0) + weight, exists)
 

@@ -45,9 +45,9 @@ def _load_ellipse(
     """Load what decides which tiles the Gaussians with indices g in C · N reach.
 
     Returns:
-        The centre x, y; the conic a, b, c; the level 2 ln(255 α) at which the ellipse ends; the conic's determinant;
-        whether these are proper numbers, without which every tile of gsplat's is listed; and the first and one past the
-        last column and row of tiles.
+        The ellipse: its centre x, y; the conic a, b, c; the level 2 ln(255 α) at which it ends; the conic's
+        determinant; whether these are proper numbers, without which every tile of gsplat's is listed; the first and one
+        past the last column of tiles. Then the first and one past the last row of tiles.
     """
     rx = tl.load(radii + PER_GAUSSIAN * g, exists, 0).to(tl.float32)
     ry = rx
@@ -77,12 +77,13 @@ def _load_ellipse(
     first_row = tl.where(proper, tl.maximum(first_row, tl.ceil((y - reach + 0.5) / TILE) - 1), first_row).to(tl.int32)
     last_row = tl.where(proper, tl.minimum(last_row, tl.floor((y + reach - 0.5) / TILE) + 1), last_row).to(tl.int32)
     last_row = tl.where(drawn, last_row, first_row)
-    return x, y, a, b, c, level, determinant, proper, first_column, last_column, first_row, last_row
+    return (x, y, a, b, c, level, determinant, proper, first_column, last_column), first_row, last_row
 
 
 @triton.jit
-def _columns_of_row(row, x, y, a, b, c, level, determinant, proper, first_column, last_column, TILE: tl.constexpr):
+def _columns_of_row(row, ellipse, TILE: tl.constexpr):
     """Return the first, and one past the last, column of the tiles in a row that the ellipse meets."""
+    x, y, a, b, c, level, determinant, proper, first_column, last_column = ellipse
     low = row * TILE + 0.5 - y  # the row's first pixel centres, from the Gaussian's
     high = low + (TILE - 1)
     reach_x = tl.sqrt(level * c / determinant)
@@ -114,15 +115,13 @@ def _count(
         for i in tl.static_range(PER_GAUSSIAN):
             tl.store(radii + PER_GAUSSIAN * g + i, 0, exists & ~near)
         exists = exists & near
-    x, y, a, b, c, level, determinant, proper, first_column, last_column, first_row, last_row = _load_ellipse(
+    ellipse, first_row, last_row = _load_ellipse(
         means2d, radii, conics, opacities, g, exists, tile_width, tile_height, PER_GAUSSIAN, TILE
     )
     count = tl.zeros([LANES], tl.int32)
     for i in range(tl.max(last_row - first_row)):
         row = first_row + i
-        first, last = _columns_of_row(
-            row, x, y, a, b, c, level, determinant, proper, first_column, last_column, TILE
-        )  # fmt: skip
+        first, last = _columns_of_row(row, ellipse, TILE)
         count += tl.where(row < last_row, tl.maximum(last - first, 0), 0)
     tl.store(counts + g, count, g < n)
 
@@ -157,7 +156,7 @@ def _list(
         noted = tl.atomic_add(part_count, total) + tl.cumsum(cut, 0) - cut
         for i in range(tl.max(cut)):
             tl.store(parts + noted + i, lane.to(tl.int64) * _PLACE + i, i < cut)
-    x, y, a, b, c, level, determinant, proper, first_column, last_column, first_row, last_row = _load_ellipse(
+    ellipse, first_row, last_row = _load_ellipse(
         means2d, radii, conics, opacities, g, exists, tile_width, tile_height, PER_GAUSSIAN, TILE
     )
     for i in tl.static_range(PER_GAUSSIAN):
@@ -167,9 +166,7 @@ def _list(
     place = at
     for i in range(tl.max(last_row - first_row)):
         row = first_row + i
-        first, last = _columns_of_row(
-            row, x, y, a, b, c, level, determinant, proper, first_column, last_column, TILE
-        )  # fmt: skip
+        first, last = _columns_of_row(row, ellipse, TILE)
         last = tl.where(row < last_row, last, first)
         for j in range(tl.max(last - first)):
             listed = first + j < last
@@ -202,7 +199,7 @@ def _list_parts(
         g = tl.load(order + position).to(tl.int32)
         place = tl.load(ends + position - 1, position > 0, 0)
         cut = (tl.load(ends + position) - place + PART - 1) // PART
-        x, y, a, b, c, level, determinant, proper, first_column, last_column, first_row, last_row = _load_ellipse(
+        ellipse, first_row, last_row = _load_ellipse(
             means2d, radii, conics, opacities, g, True, tile_width, tile_height, PER_GAUSSIAN, TILE
         )
         number, rows = part % _PLACE, last_row - first_row
@@ -210,17 +207,13 @@ def _list_parts(
         last_row = first_row + (rows * (number + 1) // cut).to(tl.int32)
         while first_row < begin:  # Parts before this one take the places before this one's.
             row = first_row + every
-            first, last = _columns_of_row(
-                row, x, y, a, b, c, level, determinant, proper, first_column, last_column, TILE
-            )  # fmt: skip
+            first, last = _columns_of_row(row, ellipse, TILE)
             place += tl.sum(tl.where(row < begin, tl.maximum(last - first, 0), 0))
             first_row += 32
         above = g // num_gaussians * rows_per_view
         while begin < last_row:
             row = begin + index
-            first, last = _columns_of_row(
-                row, x, y, a, b, c, level, determinant, proper, first_column, last_column, TILE
-            )  # fmt: skip
+            first, last = _columns_of_row(row, ellipse, TILE)
             count = tl.where(row < last_row, tl.maximum(last - first, 0), 0)
             places = place + tl.cumsum(count, 0) - count
             numbers = (above + row) * tile_width + first - 32768
