@@ -27,7 +27,7 @@ from sadgs_ns.data import colmap, ply
 from sadgs_ns.data.checks.colmap import automatic_options, check_colmap
 from sadgs_ns.data.checks.findings import Finding, check_findings, unreadable
 from sadgs_ns.data.checks.images import mask_name
-from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS, ParserOptions, find_reconstruction, layout_of
+from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS, ParserOptions, layout_of
 from sadgs_ns.data.checks.transforms import check_blender, check_nerfstudio, read_blender, read_json, read_transforms
 from sadgs_ns.data.coordinates import FRAME_KEYS, Similarity, fixed_frame
 from sadgs_ns.errors import InputError
@@ -70,16 +70,17 @@ def choose_parser(config: FullImageDatamanagerConfig) -> None:
         return
     data = Path(config.data or config.dataparser.data)
     try:
-        layout, folder = layout_of(data), find_reconstruction(data)
+        layout = layout_of(data)
     except OSError as error:
         raise InputError(unreadable(error)) from error
     if layout == "blender":
         config.dataparser = BlenderDataParserConfig(data=data)
-    elif layout == "colmap" and folder is not None:
-        options = automatic_options(data, folder)
+    elif layout == "colmap":
+        options = automatic_options(data)
         config.dataparser = ColmapDataParserConfig(
-            data=data, colmap_path=folder, images_path=options.images_path, downscale_factor=options.downscale_factor
-        )
+            data=data, colmap_path=options.colmap_path, images_path=options.images_path,
+            downscale_factor=options.downscale_factor,
+        )  # fmt: skip
     else:
         config.dataparser = NerfstudioDataParserConfig(data=data, load_3D_points=True)
 

@@ -257,7 +257,6 @@ def test_a_run_s_config_names_the_parser_and_serves_other_commands_and_more_trai
 def large(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A capture whose images are larger than nerfstudio takes without a question."""
     monkeypatch.setattr("sadgs_ns.data.checks.images.MAX_AUTO_RESOLUTION", 20)
-    monkeypatch.setattr("sadgs_ns.data.checks.colmap.MAX_AUTO_RESOLUTION", 20)
     return Path(shutil.copytree(scene, tmp_path / "large"))
 
 

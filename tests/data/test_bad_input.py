@@ -640,7 +640,7 @@ NERFSTUDIO = {
     ),
     "ply-nan": (
         with_points([[0, 0, 0], [1, float("nan"), 0]]),
-        r"\S+/p\.ply should hold the SfM points but has NaN or infinity in a point: restore it, or remove .*\.",
+        r"\S+/p\.ply has NaN or infinity in a point: restore it, or remove .*\.",
     ),
     "ply-missing": (
         meta(lambda m: m.update(ply_file_path="points.ply")),
@@ -651,7 +651,7 @@ NERFSTUDIO = {
             overwrite("p.ply", PLY.format(0))(data),
             meta(lambda m: m.update(ply_file_path="p.ply"))(data),
         ),
-        r"\S+/p\.ply should hold the SfM points but is empty: .*\.",
+        r"\S+/p\.ply holds no SfM point: .*\.",
     ),
     "ply-truncated": (
         lambda data: (
@@ -1101,7 +1101,7 @@ def test_points_beside_a_blender_scene_are_checked(copied: Callable[[str], Path]
     (sentence,) = check([50, 50, 20], [51, 50, 20])
     assert re.fullmatch(r"\S+/p\.ply has points that no camera can see in front of it: .*\.", sentence)
     (sentence,) = check()
-    assert re.fullmatch(r"\S+/p\.ply should hold the SfM points but is empty: restore it, or leave .*\.", sentence)
+    assert re.fullmatch(r"\S+/p\.ply holds no SfM point: restore it, or leave .*\.", sentence)
 
 
 @pytest.mark.hard_case("one point 10⁵ to 10²⁰⁰ units away", "trains as without it; the run says how many it leaves out")

@@ -10,20 +10,15 @@ from pathlib import Path
 
 from sadgs_ns.data.checks.colmap import automatic_options, check_colmap
 from sadgs_ns.data.checks.findings import Finding, collect_findings
-from sadgs_ns.data.checks.layouts import ParserOptions, find_reconstruction, layout_of, no_layout
+from sadgs_ns.data.checks.layouts import ParserOptions, layout_of
 from sadgs_ns.data.checks.transforms import check_blender, check_nerfstudio
-from sadgs_ns.errors import InputError
 
 
 @collect_findings
 def check_data(data: Path) -> Iterator[Finding]:
     """Return findings on a folder, or on a `transforms.json`, as `ns-train` reads it where no parser is named."""
     layout = layout_of(data)
-    if layout == "nerfstudio":
-        yield from check_nerfstudio(data, ParserOptions())
-    elif layout == "blender":
-        yield from check_blender(data, ParserOptions())
-    elif (folder := find_reconstruction(data)) is not None:
-        yield from check_colmap(data, automatic_options(data, folder))
-    else:
-        raise InputError(no_layout(data))
+    if layout == "colmap":
+        yield from check_colmap(data, automatic_options(data))
+    else:  # Without a known layout, the check of a transforms.json says what is missing.
+        yield from (check_blender if layout == "blender" else check_nerfstudio)(data, ParserOptions())

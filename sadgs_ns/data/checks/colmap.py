@@ -13,26 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sadgs_ns.data import colmap
+from sadgs_ns.data.checks import images, layouts
 from sadgs_ns.data.checks.findings import Finding, collect_findings, fault, warning
 from sadgs_ns.data.checks.geometry import Camera, View, check_points, check_positive, check_views
-from sadgs_ns.data.checks.images import (
-    MAX_AUTO_RESOLUTION,
-    Frame,
-    automatic_factor,
-    check_images,
-    images_in,
-    mask_name,
-    no_copies,
-    scaled_size,
-    smaller_folder,
-)
-from sadgs_ns.data.checks.layouts import (
-    ParserOptions,
-    find_reconstruction,
-    find_reconstructions,
-    images_folder,
-    no_layout,
-)
+from sadgs_ns.data.checks.layouts import ParserOptions
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
 from sadgs_ns.data.text import read_text
 from sadgs_ns.errors import InputError
@@ -44,51 +28,56 @@ UNSUPPORTED_CAMERAS = {"FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}
 @collect_findings
 def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -> Iterator[Finding]:
     """Check a COLMAP reconstruction in a folder, to which the options' paths are relative, and its images if asked."""
-    images, model_folder = data / options.images_path, data / options.colmap_path
+    folder, model_folder = data / options.images_path, data / options.colmap_path
     if (kind := colmap.model_kind(model_folder)) is None:
-        if found := find_reconstruction(data):
-            problem = f"{model_folder} holds no COLMAP reconstruction, but {data / found} does"
-            raise InputError(f"{problem}: add `{_words(data, automatic_options(data, found))}` after `colmap`.")
-        raise InputError(no_layout(data))
+        if layouts.find_reconstruction(data) is None:
+            raise InputError(layouts.no_layout(data))
+        found = automatic_options(data)
+        problem = f"{model_folder} holds no COLMAP reconstruction, but {data / found.colmap_path} does"
+        raise InputError(f"{problem}: add `{_words(data, found)}` after `colmap`.")
     cameras_path, poses_path = model_folder / f"cameras.{kind}", model_folder / f"images.{kind}"
     names, views = _read_views(poses_path, cameras_path)
     this_model = f"end the command with `colmap {_words(data, options)}"
     yield from _check_folders(data, options, names, poses_path)
     files = {split: data / f"{split}_list.txt" for split in SPLITS}
     lists = {split: read_text(file).splitlines() for split, file in files.items() if file.is_file()}
-    training = yield from check_splits(names, lists, lambda split: f"{files[split]}", images.joinpath, options)
+    training = yield from check_splits(names, lists, lambda split: f"{files[split]}", folder.joinpath, options)
     sound = yield from check_views(views, training, poses_path)
     if options.load_3D_points:
         random = f"{this_model} --load-3D-points False` to start from random points"
-        yield from _check_points(model_folder, views if sound else [], random)
-    if options.masks_path is None and images_in(data / "masks"):
+        if (points := colmap.points_file(model_folder)) is None:
+            yield fault(f"{model_folder} has no points3D.bin or .txt: copy the whole reconstruction, or {random}.")
+        else:
+            remedy = f"run COLMAP's mapper again, or {random}"
+            yield from check_points(colmap.read_points(points)[0], views if sound else [], points, remedy)
+    if options.masks_path is None and images.images_in(data / "masks"):
         problem = f"{data / 'masks'} holds masks that are not used"
         yield warning(f"{problem}: {this_model} --masks-path masks` to leave out what is black in them.")
     if not open_images:
         return
-    factor = yield from _check_factor(images, names, options)
+    factor = yield from _check_factor(folder, names, options)
     masks, frames = None if options.masks_path is None else data / options.masks_path, []
     for name, camera in zip(names, (view.camera for view in views), strict=True):
-        size = scaled_size((camera.width, camera.height), factor, options.downscale_rounding_mode)
-        mask = None if masks is None else smaller_folder(masks, factor) / mask_name(masks, name)
-        frames.append(Frame(smaller_folder(images, factor) / name, size, mask))
-    yield from check_images(frames, poses_path, look_for_unused=factor == 1)
+        size = images.scaled_size((camera.width, camera.height), factor, options.downscale_rounding_mode)
+        mask = None if masks is None else images.smaller_folder(masks, factor) / images.mask_name(masks, name)
+        frames.append(images.Frame(images.smaller_folder(folder, factor) / name, size, mask))
+    yield from images.check_images(frames, poses_path, look_for_unused=factor == 1)
 
 
 def _check_folders(data: Path, options: ParserOptions, names: Sequence[str], poses: Path) -> Iterator[Finding]:
     """Refuse a folder of images that are not those of the model, and warn of a larger model beside it."""
-    images = data / options.images_path
-    if not any(os.path.isfile(images / name) for name in names):
-        if found := images_folder(data, options.colmap_path):
-            problem = f"{poses}: image {names[0]} is not in {images}, but in {data / found}"
+    folder = data / options.images_path
+    if not any(os.path.isfile(folder / name) for name in names):
+        if found := layouts.images_folder(data, options.colmap_path):
+            problem = f"{poses}: image {names[0]} is not in {folder}, but in {data / found}"
             remedy = _words(data, dataclasses.replace(options, images_path=found))
             raise InputError(f"{problem}: add `{remedy}` after `colmap`.")
-        if not images.is_dir():
+        if not folder.is_dir():
             raise InputError(
-                f"{poses} has poses of {len(names)} images, but there is no folder {images}: put them there, or end "
+                f"{poses} has poses of {len(names)} images, but there is no folder {folder}: put them there, or end "
                 f"the command with `colmap {_words(data, options)} --images-path FOLDER`."
             )
-    for other, count in find_reconstructions(data).items():
+    for other, count in layouts.find_reconstructions(data).items():
         if count > len(names):
             problem = f"{poses} has {len(names)} images, {data / other} has {count}"
             remedy = f"end the command with `colmap {_words(data, dataclasses.replace(options, colmap_path=other))}`"
@@ -100,7 +89,7 @@ def _words(data: Path, options: ParserOptions) -> str:
     words, names = ["--colmap-path", str(options.colmap_path)], colmap.image_names(data / options.colmap_path)
     if options.images_path != ParserOptions.images_path:
         words += ["--images-path", str(options.images_path)]
-    if options.downscale_factor not in (None, automatic_factor(data / options.images_path / [*names, ""][0])):
+    if options.downscale_factor not in (None, images.automatic_factor(data / options.images_path / [*names, ""][0])):
         words += ["--downscale-factor", str(options.downscale_factor)]
     return shlex.join(words)
 
@@ -131,19 +120,19 @@ def _read_views(poses_path: Path, cameras_path: Path) -> tuple[list[str], list[V
     return [name for name, _, _ in poses], views
 
 
-def _check_factor(images_folder: Path, names: Sequence[str], options: ParserOptions) -> Generator[Finding, None, int]:
+def _check_factor(folder: Path, names: Sequence[str], options: ParserOptions) -> Generator[Finding, None, int]:
     """Return the factor by which the images are scaled down that will be read.
 
     If they do not exist, raise InputError unless somebody can answer nerfstudio's question whether to make them.
     """
-    factor = options.downscale_factor or automatic_factor(images_folder / names[0])
-    smaller = smaller_folder(images_folder, factor)
+    factor = options.downscale_factor or images.automatic_factor(folder / names[0])
+    smaller = images.smaller_folder(folder, factor)
     if factor == 1 or all((smaller / name).parent.exists() for name in names):
         return factor
     if options.downscale_factor is not None:
-        problem, remedy = no_copies(smaller, factor)
+        problem, remedy = images.no_copies(smaller, factor)
     else:
-        problem = f"{images_folder} holds images of more than {MAX_AUTO_RESOLUTION} px and there is no {smaller}"
+        problem = f"{folder} holds images of more than {images.MAX_AUTO_RESOLUTION} px and there is no {smaller}"
         remedy = "add `--downscale-factor 1` after `colmap` to take them as they are"
     if sys.stdin is None or not sys.stdin.isatty():
         raise InputError(f"{problem}: {remedy}.")
@@ -151,17 +140,18 @@ def _check_factor(images_folder: Path, names: Sequence[str], options: ParserOpti
     return 1
 
 
-def automatic_options(data: Path, model: Path) -> ParserOptions:
-    """Return how a reconstruction is read where no parser is named; raises as `colmap.read_poses`.
+def automatic_options(data: Path) -> ParserOptions:
+    """Return how a folder's reconstruction is read where no parser is named; raises as `colmap.read_poses`.
 
     Without the smaller copies that it wants, nerfstudio's parser of COLMAP's files asks a question at the terminal. So
     that it never has to, the images are then taken at full resolution, as they are beside a `transforms.json`.
     """
+    model = layouts.find_reconstruction(data) or Path(layouts.COLMAP_FOLDERS[0])
     names, factor = colmap.image_names(data / model), 1
-    folder = images_folder(data, model, names) or Path("images")
+    folder = layouts.images_folder(data, model, names) or Path("images")
     if names and folder != Path():  # The smaller copies of images right in the capture would lie outside of it.
         copies = data / folder
-        factor = automatic_factor(copies / names[0], lambda by: smaller_folder(copies, by) / names[0])
+        factor = images.automatic_factor(copies / names[0], lambda by: images.smaller_folder(copies, by) / names[0])
     return ParserOptions(images_path=folder, colmap_path=model, downscale_factor=factor, eval_mode="interval")
 
 
@@ -193,18 +183,3 @@ def _rotations(quats: NDArray[np.float64]) -> NDArray[np.float64]:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return np.array(rows).transpose(2, 0, 1)
-
-
-def _check_points(model_folder: Path, views: Sequence[View], random: str) -> Iterator[Finding]:
-    """Check the SfM points and, if there are views, how the points lie to them; `random` tells how to do without."""
-    path = colmap.points_file(model_folder)
-    if path is None:
-        yield fault(f"{model_folder} has no points3D.bin or .txt: copy the whole reconstruction, or {random}.")
-        return
-    positions, _ = colmap.read_points(path)
-    if not np.isfinite(positions).all():
-        yield fault(f"{path} has NaN or infinity in a point: run COLMAP's mapper again, or {random}.")
-    if len(positions) == 0:
-        yield fault(f"{path} holds no SfM point: run COLMAP's mapper again, or {random}.")
-    elif np.isfinite(positions).all():
-        yield from check_points(positions, views, path)

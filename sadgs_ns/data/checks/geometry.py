@@ -23,8 +23,7 @@ _FEWEST_STEPS = 1_000
 """Steps of float32 that the cameras' spread must have at least, so that their positions are not too coarse."""
 _WIDEST, _NARROW, _NARROWEST = 170.0, 0.5, 0.01
 """Angles of view in degrees: lenses without fisheye stay below the first; under the last no pixel shows any depth."""
-_FARTHEST_CENTER = 10
-"""Distance in image sizes at which a principal point is a mistake, and not due to a crop."""
+_FARTHEST_CENTER = 10  # Distance in image sizes at which a principal point is a mistake, and not due to a crop
 NO_COEFFICIENTS = (
     "with all distortion coefficients 0, and nerfstudio undistorts no such image: undistort the images yourself, or "
     "give one coefficient a tiny value (k1 = 1e-9)."
@@ -189,34 +188,34 @@ def _can_be_undone(camera: Camera, radius: float) -> bool:
 
 
 def check_ply(path: Path, views: Sequence[View], remedy: str) -> Iterator[Finding]:
-    """Check a PLY file of SfM points and, if there are views, how the points lie to them."""
+    """Check a PLY file of SfM points as `check_points` does."""
     try:
         positions, colors = ply.read_points(path)
     except InputError as error:
         problem = str(error).removeprefix(f"{path} ").rpartition(": ")[0]
-    else:
-        problem = "is empty" if len(positions) == 0 else None
-        if not np.isfinite(positions).all():
-            problem = "has NaN or infinity in a point"
-        elif problem is None:
-            yield from check_points(positions, views, path)
-            if (colors == ply.GREY).all():
-                yield note(f"{path} has points without colours, which start grey.")
-    if problem is not None:
         yield fault(f"{path} should hold the SfM points but {problem}: {remedy}.")
-
-
-def check_points(positions: NDArray[np.floating], views: Sequence[View], path: Path) -> Iterator[Finding]:
-    """Count SfM points, and check them against the views that should show them.
-
-    Args:
-        positions: Finite, in the world of the views. [P, 3]
-        views: All of them, or none if they are not to be relied on.
-        path: The points' file.
-    """
-    yield note(f"{path} has {len(positions):,} points.")
-    if not views or len(positions) == 0:
         return
+    yield from check_points(positions, views, path, remedy)
+    if len(colors) and (colors == ply.GREY).all():
+        yield note(f"{path} has points without colours, which start grey.")
+
+
+def check_points(positions: NDArray[np.floating], views: Sequence[View], path: Path, remedy: str) -> Iterator[Finding]:
+    """Count SfM points [P, 3], and check whether the views, if there are any, can see them.
+
+    `remedy` ends the sentence about points that are not sound.
+    """
+    if not np.isfinite(positions).all():
+        yield fault(f"{path} has NaN or infinity in a point: {remedy}.")
+    elif len(positions) == 0:
+        yield fault(f"{path} holds no SfM point: {remedy}.")
+    else:
+        yield note(f"{path} has {len(positions):,} points.")
+        if views:
+            yield from _check_distances(positions, views, path)
+
+
+def _check_distances(positions: NDArray[np.floating], views: Sequence[View], path: Path) -> Iterator[Finding]:
     positions = positions.astype(np.float64)
     far = far_outliers(positions, POINT_SHARE)
     if far.any():

@@ -45,15 +45,11 @@ class Frame:
 class _Image:
     """The header of an image file."""
 
-    size: Size = (0, 0)
-    """Zeros if it is unknown."""
+    size: Size = (0, 0)  # Zeros if it is unknown
     mode: str = ""
-    format: str = ""
-    """Pillow's names for the kind of pixels and the format of the file."""
-    orientation: int = 1
-    """As EXIF tells it."""
-    problem: str = ""
-    """The rest of a sentence that starts with the file; empty for a good image."""
+    format: str = ""  # Pillow's names for the kind of pixels and the format of the file
+    orientation: int = 1  # As EXIF tells it
+    problem: str = ""  # The rest of a sentence that starts with the file; empty for a good image
 
 
 def image_size(path: Path) -> Size:

@@ -26,16 +26,15 @@ def check_splits(
 ) -> Generator[Finding, None, int]:  # fmt: skip
     """Check how the images with poses are divided, and return how many are trained on.
 
+    Raise InputError if "train" or "val" lacks a list beside others, a list names an unknown image, or a name that shall
+    divide the images does not say where it belongs.
+
     Args:
         names: The names of all images that have poses.
         lists: The list of each split that has one; if any has, nerfstudio divides the images by nothing else.
         called: Returns the start of a sentence about a split's list.
         locate: Returns the file that a name stands for.
         options: How the images are divided without lists.
-
-    Raises:
-        InputError: If "train" or "val" lacks a list beside others, a list names an unknown image, or a name that shall
-            divide the images does not say where it belongs.
     """
     if not lists:
         return _count_training_images(names, options)

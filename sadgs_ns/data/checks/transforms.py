@@ -265,6 +265,8 @@ def _check_ply(meta: dict[str, Any], path: Path, views: Sequence[geometry.View])
     elif (source := colmap.points_file(path.parent / COLMAP_FOLDERS[0])) is not None:
         positions, transform = colmap.read_points(source)[0], applied_transform(meta)
         positions = positions[np.isfinite(positions).all(axis=1)]
-        yield from geometry.check_points(positions @ transform[:, :3].T + transform[:, 3], views, source)
+        positions = positions @ transform[:, :3].T + transform[:, 3]
+        if len(positions):
+            yield from geometry.check_points(positions, views, source, "run COLMAP's mapper again")
     else:
         yield note(f"{path} has no ply_file_path: training will start from random points.")
