@@ -10,62 +10,42 @@ import traceback as tracebacks
 from pathlib import Path
 from types import TracebackType
 
-_NERFSTUDIOS: tuple[tuple[str, str, type[Exception], str, str], ...] = (
-    (
-        "nerfstudio.utils.eval_utils", "eval_setup", OSError, "",
+_NERFSTUDIOS: dict[tuple[str, type[Exception], str], str] = {
+    ("utils.eval_utils.eval_setup", OSError, ""):
         "{error.filename} cannot be read ({reason}): give --load-config the config.yml of a run; paths in that file "
         "may be relative to the folder in which the run was started.",
-    ),
-    (
-        "nerfstudio.utils.eval_utils", "eval_setup", AssertionError, "",
+    ("utils.eval_utils.eval_setup", AssertionError, ""):
         "The file that --load-config names is no config.yml of a run: give it one.",
-    ),
-    (
-        "nerfstudio.cameras.camera_utils", "get_interpolated_poses_many", ValueError, "at least one array",
+    ("cameras.camera_utils.get_interpolated_poses_many", ValueError, "at least one array"):
         "A path between views needs two of them, and the run holds out fewer: add --pose-source train, which takes the "
         "training views.",
-    ),
-    (
-        "nerfstudio.scripts.render", "main", ValueError, "empty sequence",
+    ("scripts.render.main", ValueError, "empty sequence"):
         "The run holds out no view that could be rendered: add --split train, which takes the training views.",
-    ),
-    (
-        "nerfstudio.scripts.render", "main", AssertionError, "",
+    ("scripts.render.main", AssertionError, ""):
         "`ns-render spiral` does not work with methods that train on whole images, as this one and splatfacto do: use "
         "`ns-render interpolate`, or `ns-render camera-path` with a path that was drawn in the viewer.",
-    ),
-    (
-        "nerfstudio.scripts.eval", "main", AssertionError, "",
+    ("scripts.eval.main", AssertionError, ""):
         "--output-path must end with .json: give the file of results another name.",
+    **dict.fromkeys(
+        [
+            ("models.base_model.forward", Exception, "camera_type"),
+            ("models.base_model.get_outputs_for_camera_ray_bundle", Exception, "eval_num_rays_per_chunk"),
+            ("scripts.exporter.main", Exception, "train_pixel_sampler"),
+            ("scripts.exporter.main", Exception, "SDF field"),
+        ],
+        "`ns-export pointcloud`, `poisson`, `tsdf` and `marching-cubes` are for fields of density, and a splat has "
+        "none: `sadgs-export RUN --output room.mesh.ply` writes a mesh, and to a .ply the Gaussians.",
     ),
-    *(
-        (
-            module, function, Exception, part,
-            "`ns-export pointcloud`, `poisson`, `tsdf` and `marching-cubes` are for fields of density, and a splat has "
-            "none: `sadgs-export RUN --output room.mesh.ply` writes a mesh, and to a .ply the Gaussians.",
-        )
-        for module, function, part in (
-            ("nerfstudio.models.base_model", "forward", "camera_type"),
-            ("nerfstudio.models.base_model", "get_outputs_for_camera_ray_bundle", "eval_num_rays_per_chunk"),
-            ("nerfstudio.scripts.exporter", "main", "train_pixel_sampler"),
-            ("nerfstudio.scripts.exporter", "main", "SDF field"),
-        )
+    **dict.fromkeys(
+        [("scripts.train.launch", Exception, f"terminated with {how}") for how in ("signal", "exit code")],
+        "A process of the run ended, and the others with it ({reason}): what the last checkpoint holds goes on "
+        "with --load-dir and the run's folder.",
     ),
-    *(
-        (
-            "nerfstudio.scripts.train", "launch", Exception, part,
-            "A process of the run ended, and the others with it ({reason}): what the last checkpoint holds goes on "
-            "with --load-dir and the run's folder.",
-        )
-        for part in ("terminated with signal", "terminated with exit code")
-    ),
-    (
-        "nerfstudio.utils.writer", "__init__", Exception, "",
+    ("utils.writer.__init__", Exception, ""):
         "The logger that --vis names could not start ({reason}): log in to its service, or choose another --vis.",
-    ),
-)  # fmt: skip
-"""Errors of nerfstudio's commands, around which none of our code runs: module and name of nerfstudio's innermost
-function in the traceback; the kind of error, and a part of its text; the sentence to print instead."""
+}  # fmt: skip
+"""Errors of nerfstudio's commands, around which none of our code runs: nerfstudio's innermost function in the
+traceback, the kind of error and a part of its text; and the sentence to print instead."""
 
 
 class InputError(ValueError):
@@ -117,13 +97,13 @@ def sentence_of(error: BaseException) -> str | None:
     if isinstance(error, InputError | RunError | WriteError):
         return str(error)
     frames = [frame for frame, _ in tracebacks.walk_tb(error.__traceback__)]
-    places = [(str(frame.f_globals.get("__name__")), frame.f_code.co_name) for frame in frames]
+    places = [f"{frame.f_globals.get('__name__')}.{frame.f_code.co_name}" for frame in frames]
     raised = re.findall(r"^sadgs_ns\.errors\.\w+: (.*)", str(error), re.MULTILINE)
     if raised and type(error).__name__ == "ProcessRaisedException":  # One of several processes told it to the first.
         return raised[-1]
-    last = next((place for place in reversed(places) if place[0].startswith("nerfstudio.")), None)
-    for module, function, kind, part, sentence in _NERFSTUDIOS:
-        if (module, function) == last and isinstance(error, kind) and part in str(error):
+    last = next((place for place in reversed(places) if place.startswith("nerfstudio.")), None)
+    for (place, kind, part), sentence in _NERFSTUDIOS.items():
+        if f"nerfstudio.{place}" == last and isinstance(error, kind) and part in str(error):
             return sentence.format(error=error, reason=reason(error))
     return None
 

@@ -16,12 +16,9 @@ def report(event: str, **fields: Any) -> None:
     """Report an event to the listener, if there is one; its fields are JSON or dataclasses."""
     if path := os.environ.get(FILE):
         line = json.dumps({"event": event, **fields}, default=dataclasses.asdict) + "\n"
-        with suppress(OSError):
-            file = os.open(path, os.O_WRONLY | os.O_APPEND)
-            try:
-                os.write(file, line.encode())
-            finally:
-                os.close(file)
+        # The listener has made the file; one that it removed stays away.
+        with suppress(OSError), open(os.open(path, os.O_WRONLY | os.O_APPEND), "wb", buffering=0) as file:
+            file.write(line.encode())
 
 
 def progress(stage: str, done: int, total: int) -> None:

@@ -14,15 +14,9 @@ from sadgs_ns.errors import WriteError
 def atomic_path(path: Path, beside: Path | None = None) -> Iterator[Path]:
     """Give a temporary path that becomes `path` when the block ends, and is removed when the block raises.
 
-    Its name is the same each time, so that the next write replaces the rest of a killed one.
-
-    Args:
-        path: The file to write or replace. Its folder is made if there is none.
-        beside: The temporary path lies beside this path and is named after it, by default beside `path`, whose folder
-            may have to hold no other files.
-
-    Raises:
-        WriteError: If the disk is full or the folder cannot be written.
+    Its name is the same each time, so that the next write replaces the rest of a killed one. It lies beside `path`, or
+    beside another path where the folder of `path`, which is made if there is none, must hold no other files. Raise
+    WriteError if the disk is full or the folder cannot be written.
     """
     path = Path(path)
     neighbour = path if beside is None else beside

@@ -1,10 +1,8 @@
 """Where gsplat 1.4.0 and 1.5.3 differ, so that a new gsplat changes this file; all that is used of it is public.
 
-1.4.0, 1.5.0 and 1.5.3 were read, and 1.5.1 and 1.5.2 lie between two that agree. gsplat 1.6, which is not released,
-makes exact tile lists of its own and reorganizes how its functions call each other; its sources were not read, and
-nothing is claimed of it. tests/test_gsplat_compat.py fails where a gsplat has other signatures or shapes.
-
-Importing this module loads none of gsplat's CUDA kernels: gsplat loads or compiles them when the first of them runs.
+Their sources were read, and nothing is claimed of gsplat 1.6, which is not released. tests/test_gsplat_compat.py fails
+where a gsplat has other signatures or shapes. Importing this module loads none of gsplat's CUDA kernels: gsplat loads
+or compiles them when the first of them runs.
 """
 
 from __future__ import annotations
@@ -63,12 +61,8 @@ def project(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Project Gaussians into pinhole cameras (render/types.py) differentiably, as `gsplat.rasterization` does.
 
-    This is gsplat's `fully_fused_projection`. A new gsplat may pass it more arguments than this does. The opacities
-    bound the radii of gsplat 1.5.
-
-    Returns:
-        radii, means2d, depths and conics as `render.types.Projected` has them. What is not drawn has radius zero, and
-        its other values are not written.
+    Return radii, means2d, depths and conics as `render.types.Projected` has them. What is not drawn has radius zero,
+    and its other values are not written. The opacities bound the radii of gsplat 1.5.
     """
     bound: dict[str, Any] = {"opacities": opacities} if RADII_PER_AXIS else {}
     return gsplat.fully_fused_projection(  # type: ignore[return-value]
@@ -79,9 +73,8 @@ def project(
 def try_kernels() -> None:
     """Run one of gsplat's CUDA kernels, for which gsplat loads or compiles them all.
 
-    Raises:
-        RuntimeError: If they neither came with the wheel nor can be compiled for lack of a toolkit.
-        Exception: Whatever compiling them raises.
+    Raise RuntimeError if they neither came with the wheel nor can be compiled for lack of a toolkit, and whatever
+    compiling them raises.
     """
     direction = torch.ones((1, 3), device="cuda")
     try:
