@@ -80,17 +80,12 @@ class Similarity:
     def harmonics(self, degree: int) -> Array:
         """Return the matrix D with which colours' coefficients c of degree 0 … 3 become D c in the new frame.
 
-        D = ∫ Y(d)ᵀ Y(Qᵀ d) over the unit sphere, Q being the orthogonal part. The quadrature, 4 Gauss–Legendre nodes in
-        z times 8 in azimuth, is exact for these polynomials of degree 6. [(degree + 1)², (degree + 1)²]
+        Turned harmonics are sums of harmonics, so that a few directions tell D. [(degree + 1)², (degree + 1)²]
         """
-        z, weights = np.polynomial.legendre.leggauss(4)
-        azimuth = np.arange(8) * (2 * np.pi / 8)
-        radius = np.sqrt(1 - z**2)[:, None]
-        axes = np.broadcast_arrays(radius * np.cos(azimuth), radius * np.sin(azimuth), z[:, None])
-        directions = np.stack(axes, -1).reshape(-1, 3)
-        weights = np.repeat(weights * (2 * np.pi / 8), 8)
+        directions = np.random.default_rng(0).normal(size=(64, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         before = spherical_harmonics(directions @ self.orthogonal, degree)
-        return (spherical_harmonics(directions, degree) * weights[:, None]).T @ before
+        return np.linalg.lstsq(spherical_harmonics(directions, degree), before, rcond=None)[0]
 
 
 def spherical_harmonics(directions: Array, degree: int) -> Array:

@@ -15,10 +15,8 @@ from numpy.typing import NDArray
 from sadgs_ns.formats.gaussians import DEGREE_0, Context, Gaussians
 from sadgs_ns.formats.packing import morton_order, sigmoid, smallest_three
 
-_CHUNK = 256
-"""Number of Gaussians that share their extremes."""
-_HARMONICS_SPAN = 8.0
-"""The higher harmonics lie between −4 and 4."""
+_CHUNK = 256  # Number of Gaussians that share their extremes
+_HARMONICS_SPAN = 8.0  # The higher harmonics lie between −4 and 4
 
 
 def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:

@@ -13,8 +13,7 @@ from sadgs_ns.data.coordinates import Similarity
 
 DEGREE_0 = 0.5 / np.sqrt(np.pi)
 """The spherical harmonic of degree 0."""
-_ROWS = 1 << 16
-"""Number of Gaussians that are converted at a time, so that float64 takes little memory."""
+_ROWS = 1 << 16  # Number of Gaussians that are converted at a time, so that float64 takes little memory
 
 Array = NDArray[np.float32]
 Frame = Literal["nerfstudio", "colmap"]
@@ -96,14 +95,10 @@ class Gaussians:
 
 
 def of_parameters(params: Mapping[str, NDArray[np.floating]]) -> Gaussians:
-    """Return the Gaussians of a run's parameters.
+    """Return the Gaussians of a run's parameters; raise ValueError, which names the array, if a shape does not fit.
 
-    Args:
-        params: `means` [N, 3], `scales` (logarithms) [N, 3], `quats` (wxyz, of any length) [N, 4], `opacities` (logits)
-            [N, 1] or [N], `features_dc` [N, 3] and `features_rest` [N, K, 3] with a K of 0, 3, 8 or 15.
-
-    Raises:
-        ValueError: If an array has another shape than the number of means asks for, naming it.
+    The parameters are `means` [N, 3], `scales` (logarithms) [N, 3], `quats` (wxyz, of any length) [N, 4], `opacities`
+    (logits) [N, 1] or [N], `features_dc` [N, 3] and `features_rest` [N, K, 3] with a K of 0, 3, 8 or 15.
     """
     count, rest = len(params["means"]), params["features_rest"]
     bands = rest.shape[1] if rest.ndim == 3 else 0

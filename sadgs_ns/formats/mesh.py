@@ -23,16 +23,12 @@ MOST_VOXELS = 60_000_000
 """Most voxels of a mesh; at the peak, while their number doubles, each takes 71 bytes, 4.3 GB in all."""
 PIXELS_PER_VOXEL = 2.0
 """Edge of a voxel if none is given, in pixels of the median depth."""
-_TRUNCATION = 4.0
-"""Voxels behind a surface that count as near it; thinner walls have no two sides."""
+_TRUNCATION = 4.0  # Voxels behind a surface that count as near it; thinner walls have no two sides
 _WIDEST_PIXEL = 4.0
 """Width in voxels, at their depth, above which pixels are left out, as they are far behind what the views show."""
-_RESOLUTION = 16
-"""Voxels along the edge of a block."""
-_BLOCKS = 1000
-"""Blocks with room at first, 82 MB; Open3D doubles that if it must."""
-_VIEWS = 3
-"""A surface needs so many views, or all where there are fewer."""
+_RESOLUTION = 16  # Voxels along the edge of a block
+_BLOCKS = 1000  # Blocks with room at first, 82 MB; Open3D doubles that if it must
+_VIEWS = 3  # A surface needs so many views, or all where there are fewer
 _SMALLEST_SHARE = 0.01
 """Connected components with fewer triangles than this share of the largest one's are left out."""
 

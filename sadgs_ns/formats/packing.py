@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-_BITS = 21
-"""Bits of each coordinate in a Morton code of 63 bits."""
-_SPREADING = (
-    (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
-    (2, 0x1249249249249249),
-)  # fmt: skip
-"""Shifts and masks that put two zeros between the bits of a coordinate."""
+_BITS = 21  # Bits of each coordinate in a Morton code of 63 bits
 _LEVELS, _BINS, _SAMPLE, _ROUNDS = 256, 256, 1 << 18, 20
 """Of a codebook: levels, as many as a byte tells apart; bins of the histogram from which it begins; values that it is
 made of; and rounds in which levels move to the means of their values."""
@@ -23,12 +18,10 @@ def morton_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
     """Return the order [N] of positions [N, 3] along a curve that keeps neighbours together."""
     low, high = means.min(axis=0), means.max(axis=0)
     cells = (means - low) / np.maximum(high - low, 1e-30).astype(np.float64)
-    codes = np.zeros(len(means), np.uint64)
-    for axis, bits in enumerate((cells * ((1 << _BITS) - 1)).astype(np.uint64).T):
-        spread = bits
-        for shift, mask in _SPREADING:
-            spread = (spread | (spread << np.uint64(shift))) & np.uint64(mask)
-        codes |= spread << np.uint64(axis)
+    coordinates = (cells * ((1 << _BITS) - 1)).astype(np.int64).T  # [3, N]
+    codes = np.zeros(len(means), np.int64)
+    for bit, (axis, values) in itertools.product(range(_BITS), enumerate(coordinates)):
+        codes |= (values >> bit & 1) << (3 * bit + axis)
     return np.argsort(codes, kind="stable")
 
 

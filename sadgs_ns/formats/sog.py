@@ -22,14 +22,10 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.formats.gaussians import Context, Gaussians
 from sadgs_ns.formats.packing import codebook, morton_order, nearest_level, sigmoid, smallest_three, to_bytes
 
-_MOST_PIXELS = 16383
-"""Longest side of a WebP image."""
-_PALETTE = 1 << 16
-"""Most sets of higher harmonics."""
-_SETS_A_ROW = 64
-"""Sets of harmonics in a row of their image."""
-_SAMPLE, _ROUNDS = 1 << 16, 8
-"""Sets from which the coarse clusters are made, and rounds of k-means."""
+_MOST_PIXELS = 16383  # Longest side of a WebP image
+_PALETTE = 1 << 16  # Most sets of higher harmonics
+_SETS_A_ROW = 64  # Sets of harmonics in a row of their image
+_SAMPLE, _ROUNDS = 1 << 16, 8  # Sets from which the coarse clusters are made, and rounds of k-means
 
 
 def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:

@@ -26,17 +26,13 @@ from sadgs_ns.formats.gaussians import Context, Gaussians
 from sadgs_ns.formats.packing import sigmoid, smallest_three, to_bytes
 
 _MAGIC, _VERSION = 0x5053474E, 3
-_MOST_BITS, _LEAST_BITS = 20, 8
-"""Binary places of positions; the least are steps of 1/256 of a unit."""
+_MOST_BITS, _LEAST_BITS = 20, 8  # Binary places of positions; the least are steps of 1/256 of a unit
 _RANGE = 1 << 23
-_COLOR = 0.15 * 255
-"""Steps in a unit of the harmonic of degree 0."""
+_COLOR = 0.15 * 255  # Steps in a unit of the harmonic of degree 0
 _AXES = struct.pack("<III", 0xADBE0003, 4, 6)
 """Record `SPZ_ADOBE_coordinate_system`: its type, its length and x right, y down, z forward, a PLY's axes."""
-_HAS_RECORDS = 2
-"""Flag of a file with records after the Gaussians; readers that know none stop before them."""
-_STEP = 4
-"""Steps of the higher harmonics, in 128ths; gzip makes use of the bits that are always zero."""
+_HAS_RECORDS = 2  # Flag of a file with records after the Gaussians; readers that know none stop before them
+_STEP = 4  # Steps of the higher harmonics, in 128ths; gzip makes use of the bits that are always zero
 
 
 def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:
