@@ -24,8 +24,7 @@ from sadgs_ns.data.checks.findings import Finding, fault, note, warning
 from sadgs_ns.errors import free_space, reason
 
 PACKAGES = ("sadgs_ns", "torch", "torchvision", "gsplat", "nerfstudio", "triton", "pycolmap", "open3d")
-_LPIPS_FILE = "alexnet-owt-7be5be79.pth"
-"""The file in which torchvision keeps the weights of LPIPS's AlexNet."""
+_LPIPS_FILE = "alexnet-owt-7be5be79.pth"  # The file in which torchvision keeps the weights of LPIPS's AlexNet
 
 
 def versions() -> dict[str, str]:

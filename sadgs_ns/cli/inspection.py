@@ -48,16 +48,8 @@ class View:
     """Colours in [0, 1]. [H, W, 3]"""
     structure_tensor: Tensor
     """S̄ of the photo. [H, W, 3]"""
-    viewmat: Tensor
-    """Transform from world to camera. [4, 4]"""
-    K: Tensor
-    """Intrinsics in px. [3, 3]"""
-
-    @property
-    def camera(self) -> tuple[Tensor, Tensor, int, int]:
-        """Viewmat, K, width and height, as `maps.blend` takes them."""
-        height, width = self.photo.shape[:2]
-        return self.viewmat, self.K, width, height
+    camera: tuple[Tensor, Tensor, int, int]
+    """Viewmat [4, 4], K [3, 3], width and height, as `maps.blend` takes them."""
 
 
 def load_run(path: Path, load_step: int | None = None, data: Path | None = None) -> tuple[SadgsPipeline, int]:
@@ -108,15 +100,13 @@ def get_view(pipeline: SadgsPipeline, index: int, split: Split = "train") -> Vie
         raise InputError(f"--view {index}: the {split} split has views 0 to {len(dataset) - 1}.")
     # Loading the images undistorts them, which changes the intrinsics.
     data = (datamanager.cached_train if training else datamanager.cached_eval)[index]
-    camera = dataset.cameras[index : index + 1]
+    camera = dataset.cameras[index : index + 1].to(pipeline.device)
     viewmat = viewmats_from_camera_to_world(camera.camera_to_worlds)[0]
-    return View(
-        name=dataset.image_filenames[index].name,
-        photo=pipeline.structure_cache.photo(data),
-        structure_tensor=dequantize(next(pipeline.structure_cache.quantized([data]))),
-        viewmat=(pipeline.views.viewmat(index) if training else viewmat).to(pipeline.device),
-        K=camera.get_intrinsics_matrices()[0].to(pipeline.device),
-    )
+    photo, K = pipeline.structure_cache.photo(data), camera.get_intrinsics_matrices()[0]
+    viewmat = pipeline.views.viewmat(index).to(pipeline.device) if training else viewmat  # Poses may be learned.
+    structure_tensor = dequantize(next(pipeline.structure_cache.quantized([data])))
+    name = dataset.image_filenames[index].name
+    return View(name, photo, structure_tensor, (viewmat, K, photo.shape[1], photo.shape[0]))
 
 
 def screen_gradients(pipeline: SadgsPipeline, progress: Callable[[range], Iterable[int]] = iter) -> dict[str, Tensor]:

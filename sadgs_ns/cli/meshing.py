@@ -24,8 +24,7 @@ from sadgs_ns.render.types import DEFAULTS, Cameras, Gaussians, RenderOptions
 
 MIN_ALPHA = 0.5
 """Pixels with less accumulated opacity show no surface."""
-_SAMPLED = 16
-"""Most views from which the size of voxels is derived."""
+_SAMPLED = 16  # Most views from which the size of voxels is derived
 
 
 def write_mesh(
@@ -34,15 +33,14 @@ def write_mesh(
 ) -> int:  # fmt: skip
     """Fuse what the training views see into a mesh, write it as `atomic_path` does, and return its number of triangles.
 
+    Raise InputError if no view shows a surface, voxels do not fit in memory, or open3d cannot be imported, and
+    WriteError if the file could not be written.
+
     Args:
         params: As `of_parameters` takes them.
         cameras: The training views, in the parameters' frame.
         similarity: From the parameters' frame to the file's; None leaves the mesh as it is.
         voxel_size: Edge of a voxel in the parameters' frame; None derives it from the median depth.
-
-    Raises:
-        InputError: If no view shows a surface, voxels do not fit in memory, or open3d cannot be imported.
-        WriteError: If the file could not be written.
     """
     number = len(cameras.sizes)
     if not number:

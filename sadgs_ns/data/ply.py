@@ -59,11 +59,8 @@ def _read_vertices(path: Path) -> NDArray[Any]:
     from plyfile import PlyData, PlyElementParseError
 
     with path.open("rb") as file:
-        header = b""
-        while (
-            len(header) < 1 << 16 and not header.rstrip().endswith(b"end_header") and (line := file.readline(1 << 12))
-        ):
-            header += line
+        found = re.match(rb".*?end_header\s*?\n", file.read(1 << 16), re.DOTALL)
+        header = found[0] if found else b""
         # plyfile reads what follows a header at once, so it is given one that promises nothing.
         empty = PlyData.read(io.BytesIO(re.sub(rb"(?m)^(element\s+\S+)\s+\d+", rb"\1 0", header)))
         if "vertex" not in empty:
@@ -73,10 +70,10 @@ def _read_vertices(path: Path) -> NDArray[Any]:
         if count == 0:
             return np.empty(0, dtype)
         if empty.text and empty.elements[0].name == "vertex" and not dtype.hasobject:  # Lists are objects.
-            start = file.tell()
+            file.seek(len(header))
             if sum(1 for _ in file) < count:
                 raise _cut_off(path, count)
-            file.seek(start)
+            file.seek(len(header))
             return np.loadtxt(file, dtype, comments=None, max_rows=count, ndmin=1)
     try:
         return PlyData.read(str(path))["vertex"].data

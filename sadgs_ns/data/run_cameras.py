@@ -30,8 +30,7 @@ class RunCameras:
     photos: list[Path]
 
 
-_CLASS = "<class>"
-"""Key of an object's class in its mapping."""
+_CLASS = "<class>"  # Key of an object's class in its mapping
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -92,22 +91,22 @@ def _parser(settings: Mapping[str, Any], data: Path) -> Any:
     return made
 
 
-def _parse(settings: Mapping[str, Any], data: Path, split: str, as_fits: bool) -> Any:
-    """Parse a split with settings for `_parser`; if that fails, as fits the folder, if that has another layout."""
+def _parse(settings: Mapping[str, Any], data: Path, as_fits: bool) -> Any:
+    """Parse with settings for `_parser`; if that fails, as fits the folder, if that has another layout."""
     try:
-        return _parser(settings, data).get_dataparser_outputs(split=split)
+        return _parser(settings, data).get_dataparser_outputs(split="train")
     except Exception:
         fitting = _parser({}, data) if as_fits and settings else None
         if fitting is None or settings.get(_CLASS, "").endswith(f".{type(fitting.config).__qualname__}"):
             raise  # The folder may hold another COLMAP model than the run's, whose frame is another.
-        return fitting.get_dataparser_outputs(split=split)
+        return fitting.get_dataparser_outputs(split="train")
 
 
-def read_cameras(run: Path, data: Path | None = None, split: str = "train") -> RunCameras:
-    """Read a run's cameras, in its frame, as the run read them, or as fits the folder if the run does not tell how.
+def read_cameras(run: Path, data: Path | None = None) -> RunCameras:
+    """Read a run's training cameras in its frame, as the run did, or as fits the folder if it does not tell how.
 
-    `data` is the capture's folder, by default where the run's `config.yml` says that it was. `split` is "train", or
-    "test" for held-out views. Raise InputError if the capture cannot be read, or the run does not tell how it moved it.
+    `data` is the capture's folder, by default where the run's `config.yml` says that it was. Raise InputError if the
+    capture cannot be read, or the run does not tell how it moved it.
     """
     try:
         found, settings = find_capture(run)
@@ -119,7 +118,7 @@ def read_cameras(run: Path, data: Path | None = None, split: str = "train") -> R
         raise InputError(f"{found}, on which {run} was trained, is not there: give the capture's folder with --data.")
     found = data or found
     try:
-        outputs = _parse(settings, found, split, as_fits=data is not None)
+        outputs = _parse(settings, found, as_fits=data is not None)
     except Exception as error:  # The parsers' errors are of every kind.
         raise InputError(f"{found} cannot be read as a capture ({reason(error)}): give another with --data.") from error
     cameras, poses = outputs.cameras, outputs.cameras.camera_to_worlds.double().numpy()

@@ -198,7 +198,7 @@ def test_training_is_the_same_bit_for_bit_wherever_images_are_kept(data: str, tm
         sums.append(steps)
         view = get_view(trainer.pipeline, 1)  # as sadgs-inspect and the viewer's panel ask for it
         observed = observe_training_views(trainer.pipeline.structure_cache)
-        seen.append([view.photo, view.structure_tensor.nan_to_num(-1), view.K, *observed.values()])
+        seen.append([view.photo, view.structure_tensor.nan_to_num(-1), view.camera[1], *observed.values()])
     for tensors in zip(*seen, strict=True):
         assert all(torch.equal(tensor, tensors[0]) for tensor in tensors)
     assert sums[0] == sums[1] == sums[2]

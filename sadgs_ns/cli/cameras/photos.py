@@ -28,8 +28,7 @@ _KEPT_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
 _FOCAL_LENGTHS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
 """The second alone tells of a phone's digital zoom."""
 _POSITION = (ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLongitude, ExifTags.GPS.GPSAltitude)
-_NAMED = 20
-"""How many unreadable photos a message names."""
+_NAMED = 20  # How many unreadable photos a message names
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,8 +17,7 @@ _FEATURES_PER_MEGAPIXEL = 0.55
 """Processor time in s to find features in a million pixels, as measured on castle, fox and tree."""
 _PAIR_PER_MEGAPIXEL, _LONGEST_PAIR = 0.12, 0.14
 """Processor time in s to match two photos of a million pixels, and of so many that the limit of features holds."""
-_POSE = 0.5
-"""Processor time in s to find a photo's camera; .2 to 1.1 as measured."""
+_POSE = 0.5  # Processor time in s to find a photo's camera; .2 to 1.1 as measured
 MAX_SIDE = 3200
 """Longest side in px to which photos are scaled down to find features, as COLMAP does."""
 _PAIRS_PER_PHOTO = {"sequential": 16, "spatial": 50, "vocabulary": 100}
