@@ -124,7 +124,7 @@ def draw_wavelength_and_eta(path: Path, scene: SceneDescription, runs: dict[str,
     for label, run in runs.items():
         params = dict(run.pipeline.model.gauss_params.items())
         statistics = observe_training_views(run.pipeline.structure_cache)
-        panels.append(Panel(f"η, {label}", ETA(maps.eta_map(params, statistics, *view.camera)), ETA))
+        panels.append(Panel(f"η, {label}", ETA(maps.eta_map(params, statistics, view.camera)), ETA))
     color_scales.draw(path, panels, columns=3)
 
 

@@ -20,7 +20,6 @@ from sadgs_ns.method.growth import absgs, apply
 from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients, keep_gradient
 from sadgs_ns.method.split import grid_split, num_children
-from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.training import checkpoints
 from sadgs_ns.training.config import SadgsTrainerConfig
@@ -48,8 +47,8 @@ class View:
     """Colours in [0, 1]. [H, W, 3]"""
     structure_tensor: Tensor
     """S̄ of the photo. [H, W, 3]"""
-    camera: tuple[Tensor, Tensor, int, int]
-    """Viewmat [4, 4], K [3, 3], width and height, as `maps.blend` takes them."""
+    camera: Pinholes
+    """A single camera."""
 
 
 def load_run(path: Path, load_step: int | None = None, data: Path | None = None) -> tuple[SadgsPipeline, int]:
@@ -100,13 +99,12 @@ def get_view(pipeline: SadgsPipeline, index: int, split: Split = "train") -> Vie
         raise InputError(f"--view {index}: the {split} split has views 0 to {len(dataset) - 1}.")
     # Loading the images undistorts them, which changes the intrinsics.
     data = (datamanager.cached_train if training else datamanager.cached_eval)[index]
-    camera = dataset.cameras[index : index + 1].to(pipeline.device)
-    viewmat = viewmats_from_camera_to_world(camera.camera_to_worlds)[0]
-    photo, K = pipeline.structure_cache.photo(data), camera.get_intrinsics_matrices()[0]
-    viewmat = pipeline.views.viewmat(index).to(pipeline.device) if training else viewmat  # Poses may be learned.
+    camera = pipeline.model.pinhole(dataset.cameras[index : index + 1])
+    if training:  # Poses may be learned.
+        camera = camera._replace(viewmats=pipeline.views.viewmat(index)[None])
     structure_tensor = dequantize(next(pipeline.structure_cache.quantized([data])))
     name = dataset.image_filenames[index].name
-    return View(name, photo, structure_tensor, (viewmat, K, photo.shape[1], photo.shape[0]))
+    return View(name, pipeline.structure_cache.photo(data), structure_tensor, camera)
 
 
 def screen_gradients(pipeline: SadgsPipeline, progress: Callable[[range], Iterable[int]] = iter) -> dict[str, Tensor]:
@@ -173,9 +171,9 @@ def view_panels(pipeline: SadgsPipeline, view: View, statistics: dict[str, Tenso
     split, added = int((counts > 1).any(dim=1).sum()), int((num_children(counts) - 1).sum())
     of_all = f"of {model.num_points:,} Gaussians"
     period = maps.texture_period(view.structure_tensor, constant)
-    eta = maps.eta_map(params, statistics, *view.camera, options)
-    children = maps.children_map(params, counts, *view.camera, options)
-    low = maps.share_map(params, is_low, *view.camera, options)
+    eta = maps.eta_map(params, statistics, view.camera, options)
+    children = maps.children_map(params, counts, view.camera, options)
+    low = maps.share_map(params, is_low, view.camera, options)
     panels = {
         name: Panel(f"{view.name}: {title}", scale(values), scale)
         for name, title, scale, values in (
@@ -196,12 +194,12 @@ def step_panels(
     """Return the photo, and the Gaussians in random colours before and after a step of each kind (paper, figure 3)."""
     generator = torch.Generator().manual_seed(SEED)
     colors = maps.random_colors(model.num_points, generator).to(model.device)
-    viewmat, K, width, height = view.camera
+    viewmats, Ks, width, height = view.camera
     enlarge = max(math.ceil(MIN_RENDER_SIDE / max(height, width)), 1)
-    camera = (viewmat, K * K.new_tensor([[enlarge], [enlarge], [1.0]]), enlarge * width, enlarge * height)
+    camera = Pinholes(viewmats, Ks * Ks.new_tensor([[enlarge], [enlarge], [1.0]]), enlarge * width, enlarge * height)
 
     def panel(title: str, params: Any, its_colors: Tensor) -> Panel:
-        render, _ = maps.blend(params, its_colors, *camera, model.drawing)
+        render, _ = maps.blend(params, its_colors, camera, model.drawing)
         return Panel(f"{title}: {len(params['means']):,} Gaussians", to_picture(render))
 
     return [

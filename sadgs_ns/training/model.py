@@ -244,21 +244,23 @@ class SadgsModel(SplatfactoModel):
             in the run's units, and the largest one where nothing is; `accumulation` [H, W, 1]; `background` [H, W, 3].
         """
         check_camera_types(camera)
-        width, height = int(camera.width.item()), int(camera.height.item())
-        background = self.background
+        pinhole, background = self.pinhole(camera), self.background
         if self.crop_box is not None and not self.crop_box.within(self.means).any():
-            return self.get_empty_outputs(width, height, background)
-        viewmats = viewmats_from_camera_to_world(camera.camera_to_worlds)
-        Ks = camera.get_intrinsics_matrices().to(self.device)
-        cameras = Pinholes(viewmats, Ks, width, height)
-        render, alpha, _ = self.render(cameras, self.color_options(expected_depth=True))
+            return self.get_empty_outputs(pinhole.width, pinhole.height, background)
+        render, alpha, _ = self.render(pinhole, self.color_options(expected_depth=True))
         depth = render[..., 3:4]
         return {
             "rgb": (render[..., :3] + (1 - alpha) * background).clamp(0.0, 1.0)[0],
             "depth": torch.where(alpha > 0, depth, depth.detach().max())[0],
             "accumulation": alpha[0],
-            "background": background.expand(height, width, 3),
+            "background": background.expand(pinhole.height, pinhole.width, 3),
         }
+
+    def pinhole(self, camera: Cameras) -> Pinholes:
+        """Return nerfstudio's camera, shape [1], as the rasterizer takes it."""
+        viewmats = viewmats_from_camera_to_world(camera.camera_to_worlds).to(self.device)
+        Ks = camera.get_intrinsics_matrices().to(self.device)
+        return Pinholes(viewmats, Ks, int(camera.width.item()), int(camera.height.item()))
 
     @torch.no_grad()
     def get_normals(self, camera: Cameras, params: Mapping[str, Tensor] | None = None) -> Tensor:
@@ -268,12 +270,10 @@ class SadgsModel(SplatfactoModel):
         `params` default to the model's own inside the viewer's crop box.
         """
         params = self.cropped(dict(self.gauss_params.items())) if params is None else params
-        width, height = int(camera.width.item()), int(camera.height.item())
+        pinhole = self.pinhole(camera)
         if not len(params["means"]):
-            return torch.zeros((height, width, 3), device=self.device)
-        viewmat = viewmats_from_camera_to_world(camera.camera_to_worlds)[0].to(self.device)
-        K = camera.get_intrinsics_matrices()[0].to(self.device)
-        normals = maps.normals_map(params, viewmat, K, width, height, self.drawing)
+            return torch.zeros((pinhole.height, pinhole.width, 3), device=self.device)
+        normals = maps.normals_map(params, pinhole, self.drawing)
         return torch.where((normals != 0).any(dim=-1, keepdim=True), 0.5 + 0.5 * normals, 0.0)
 
     def get_outputs_for_camera(  # type: ignore[override]

@@ -13,16 +13,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import matplotlib
 import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LogNorm, Normalize
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from sadgs_ns.files import atomic_path
+
+if TYPE_CHECKING:
+    from matplotlib.colorbar import Colorbar
+    from matplotlib.figure import Figure
 
 Picture = NDArray[np.uint8]
 """RGB. [H, W, 3]"""
@@ -36,8 +40,7 @@ class Scale:
     """A colour scale for values from `low` to `high`, with its legend."""
 
     label: str
-    colors: str
-    """Name of a colour map of matplotlib."""
+    colors: str  # Name of a colour map of matplotlib
     low: float
     high: float
     ticks: tuple[float, ...]
@@ -61,7 +64,7 @@ class Scale:
 
 
 PERIOD = Scale("period of the texture", "viridis", 3, 60, (3, 5, 10, 20, 40), unit="px")
-ETA = Scale("largest η", "PuOr_r", 1 / 30, 30, (0.03, 0.1, 0.3, 1, 3, 10, 30))
+ETA = Scale("largest η", "PuOr_r", 1 / 30, 30, (1 / 30, 0.1, 0.3, 1, 3, 10, 30))
 """The scale is centred at 1: violet Gaussians are finer than the texture, orange ones violate."""
 CHILDREN = Scale("children, 16 or more at the end", "cividis", 1, 16, (1, 2, 4, 8, 16))
 LOW = Scale("share of consistently low Gaussians", "cividis", 0, 1, (0, 0.25, 0.5, 0.75, 1), log=False)
@@ -72,35 +75,32 @@ def to_picture(image: Tensor) -> Picture:
     return (255 * image.detach().float().clamp(0, 1)).round().byte().cpu().numpy()
 
 
-def bar(scale: Scale) -> Picture:
-    """Return the scale's colours, 720 px wide, with its numbers below them, to be shown at half that size."""
-    from matplotlib.font_manager import findfont
-
-    size, length = 30, 630
-    font, x0 = ImageFont.truetype(findfont("DejaVu Sans"), size), size
-    image = Image.new("RGB", (length + 3 * size, 3 * size), (20, 20, 20))
-    ramp = scale.colormap(np.linspace(0, 1, length), bytes=True)[None, :, :3]
-    image.paste(Image.fromarray(np.repeat(ramp, size, axis=0)), (x0, size // 3))
-    pen = ImageDraw.Draw(image)
-    for tick in scale.ticks:
-        half = font.getlength(f"{tick:g}") / 2
-        x = max(x0 + float(scale.norm(tick)) * length, half + 1)
-        pen.text((x, size + size // 2), f"{tick:g}", fill="white", font=font, anchor="ma")
-    return np.array(image)
-
-
 def legend(text: str, scale: Scale | None = None) -> str:
     """Return Markdown of a line of text and, if a scale is given, of an image of its colours and numbers."""
     if scale is None:
         return text
-    return f"{text}\n\n![{scale.label}](data:image/png;base64,{_encoded_bar(scale)})"
+    return f"{text}\n\n![{scale.label}](data:image/png;base64,{base64.b64encode(bar(scale)).decode()})"
 
 
 @lru_cache(maxsize=8)
-def _encoded_bar(scale: Scale) -> str:
+def bar(scale: Scale) -> bytes:
+    """Return a PNG of the scale's colours, 720 px wide, with its numbers below them, to be shown at half that size."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(3.6, 0.45), dpi=200, facecolor="#141414", layout="constrained")
+    axes = _add_bar(figure, scale, cax=figure.subplots(), orientation="horizontal").ax
+    axes.tick_params(colors="white", labelsize=8, length=0)
     png = io.BytesIO()
-    Image.fromarray(bar(scale)).save(png, "png")
-    return base64.b64encode(png.getvalue()).decode()
+    figure.savefig(png, format="png")
+    return png.getvalue()
+
+
+def _add_bar(figure: Figure, scale: Scale, **place: Any) -> Colorbar:
+    """Add a bar of colours to a figure, with `place` as `Figure.colorbar` takes it."""
+    form = f"%.2g {scale.unit}".rstrip()
+    bar = figure.colorbar(ScalarMappable(scale.norm, scale.colormap), ticks=scale.ticks, format=form, **place)
+    bar.minorticks_off()
+    return bar
 
 
 @dataclass(frozen=True)
@@ -127,10 +127,7 @@ def draw(path: Path, panels: Sequence[Panel], columns: int | None = None) -> Non
         axes.imshow(panel.picture, interpolation="nearest")
         axes.set_title(panel.title, fontsize=10)
         axes.set_axis_off()
-        if (scale := panel.scale) is not None:
-            bar = figure.colorbar(ScalarMappable(scale.norm, scale.colormap), ax=axes, ticks=scale.ticks)
-            bar.ax.set_yticklabels([f"{tick:g} {scale.unit}".strip() for tick in scale.ticks])
-            bar.ax.minorticks_off()
-            bar.set_label(scale.label)
+        if panel.scale is not None:
+            _add_bar(figure, panel.scale, ax=axes).set_label(panel.scale.label)
     with atomic_path(path) as partial:
         figure.savefig(partial, dpi=100, metadata={"Software": None})

@@ -1,7 +1,7 @@
 """Maps of the Gaussians' η, children, normals and chosen shares, and pictures of S̄: its period, and S̄⁻¹ as ellipses.
 
-`params` are means [N, 3], quats [N, 4], log scales [N, 3] and logit opacities [N] or [N, 1], by name. `view` are the
-other arguments of `blend`. Maps are NaN where hardly anything with a value is drawn.
+`params` are means [N, 3], quats [N, 4], log scales [N, 3] and logit opacities [N] or [N, 1], by name. `camera` is a
+single one, and maps have its height and width. They are NaN where hardly anything with a value is drawn.
 """
 
 from __future__ import annotations
@@ -35,42 +35,45 @@ MIN_COVER = 0.05
 def blend(
     params: Mapping[str, Tensor],
     values: Tensor,  # [N, D]
-    viewmat: Tensor,  # [4, 4]
-    K: Tensor,  # [3, 3]
-    width: int,
-    height: int,
+    camera: Cameras,
     drawing: RenderOptions = DEFAULTS,
 ) -> tuple[Tensor, Tensor]:
     """Blend D values of each Gaussian like colours. → [H, W, D], and the covered share of each pixel [H, W, 1]"""
     opacities = torch.sigmoid(params["opacities"].flatten())
     gaussians = Gaussians(params["means"], params["quats"], params["scales"].exp(), opacities, values)
-    render, alpha, _ = rasterize(gaussians, Cameras(viewmat[None], K[None], width, height), drawing)
+    render, alpha, _ = rasterize(gaussians, camera, drawing)
     return render[0], alpha[0]
 
 
-def eta_map(params: Mapping[str, Tensor], statistics: Mapping[str, Tensor], *view) -> Tensor:
+def eta_map(
+    params: Mapping[str, Tensor], statistics: Mapping[str, Tensor], camera: Cameras, drawing: RenderOptions = DEFAULTS
+) -> Tensor:
     """Return the geometric mean of the largest η of the Gaussians observed (`eta_max`, `n_total`). [H, W]"""
     largest = statistics["eta_max"].amax(dim=1)
     known = ((statistics["n_total"] > 0) & (largest > 0)).float()
     values = torch.stack([torch.where(known > 0, largest, 1.0).log(), known], dim=-1)
-    total, cover = blend(params, values, *view)[0].unbind(-1)
+    total, cover = blend(params, values, camera, drawing)[0].unbind(-1)
     return torch.where(cover > MIN_COVER, (total / cover).exp(), torch.nan)
 
 
-def children_map(params: Mapping[str, Tensor], counts: Tensor, *view) -> Tensor:
+def children_map(
+    params: Mapping[str, Tensor], counts: Tensor, camera: Cameras, drawing: RenderOptions = DEFAULTS
+) -> Tensor:
     """Return the geometric mean of the Gaussians' numbers of children, ≥ 1 along each axis [N, 3]. [H, W]"""
-    total, cover = blend(params, num_children(counts)[:, None].float().log(), *view)
+    total, cover = blend(params, num_children(counts)[:, None].float().log(), camera, drawing)
     return torch.where(cover > MIN_COVER, (total / cover).exp(), torch.nan)[..., 0]
 
 
-def share_map(params: Mapping[str, Tensor], chosen: Tensor, *view) -> Tensor:
+def share_map(
+    params: Mapping[str, Tensor], chosen: Tensor, camera: Cameras, drawing: RenderOptions = DEFAULTS
+) -> Tensor:
     """Return the share of the chosen Gaussians, bool [N], in what is drawn at each pixel. [H, W]"""
-    total, cover = blend(params, chosen[:, None].float(), *view)
+    total, cover = blend(params, chosen[:, None].float(), camera, drawing)
     return torch.where(cover > MIN_COVER, total / cover, torch.nan)[..., 0]
 
 
 @torch.no_grad()
-def normals_map(params: Mapping[str, Tensor], viewmat: Tensor, *view) -> Tensor:
+def normals_map(params: Mapping[str, Tensor], camera: Cameras, drawing: RenderOptions = DEFAULTS) -> Tensor:
     """Return the blended normals of the Gaussians, of unit length in world axes, 0 where nothing is drawn. [H, W, 3]
 
     A Gaussian's normal is the axis of its smallest scale, turned towards the camera. This is an estimate, because
@@ -79,9 +82,10 @@ def normals_map(params: Mapping[str, Tensor], viewmat: Tensor, *view) -> Tensor:
     rotmats = normalized_quat_to_rotmat(F.normalize(params["quats"], dim=-1))  # [N, 3, 3]
     thinnest = params["scales"].argmin(dim=1)[:, None, None].expand(-1, 3, 1)  # [N, 3, 1]
     normals = rotmats.gather(2, thinnest)[..., 0]  # [N, 3]
+    viewmat = camera.viewmats[0]
     rays = params["means"] + viewmat[:3, :3].T @ viewmat[:3, 3]  # [N, 3] from the camera's centre, −Rᵀ t
     away = (rays * normals).sum(dim=1, keepdim=True) > 0
-    return F.normalize(blend(params, torch.where(away, -normals, normals), viewmat, *view)[0], dim=-1)
+    return F.normalize(blend(params, torch.where(away, -normals, normals), camera, drawing)[0], dim=-1)
 
 
 def random_colors(number: int, generator: torch.Generator) -> Tensor:

@@ -28,7 +28,6 @@ from torch import Tensor
 from sadgs_ns.errors import reason
 from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training.model import SadgsModel
 from sadgs_ns.training.progress import warn
 from sadgs_ns.training.run_plan import RunPlan
@@ -280,17 +279,16 @@ class StructurePanel(torch.nn.Module):
         rows = model.cropped({**model.gauss_params, **kept})
         if len(rows["means"]) == 0:
             return Panel("No Gaussians in the crop box.", np.zeros((height, width, 3), np.uint8))
-        viewmat = viewmats_from_camera_to_world(camera.camera_to_worlds)[0].to(model.device)
-        view = viewmat, camera.get_intrinsics_matrices()[0].to(model.device), width, height
+        pinhole = model.pinhole(camera)
         seen = f"{int((statistics['n_total'] > 0).sum()):,} of {model.num_points:,} Gaussians observed"
         if choice == ETA_OF:
-            drawn, scale = maps.eta_map(rows, rows, *view, model.drawing), ETA
+            drawn, scale = maps.eta_map(rows, rows, pinhole, model.drawing), ETA
             text = f"largest η: over 1 violates, under 0.1 is low ({seen})"
         elif choice == CHILDREN_OF:
-            drawn, scale = maps.children_map(rows, rows["children"], *view, model.drawing), CHILDREN
+            drawn, scale = maps.children_map(rows, rows["children"], pinhole, model.drawing), CHILDREN
             split = int((kept["children"] > 1).any(dim=1).sum())
             text = f"children at a structure step now: {split:,} Gaussians would split ({seen})"
         else:
-            drawn, scale = maps.share_map(rows, rows["low"], *view, model.drawing), LOW
+            drawn, scale = maps.share_map(rows, rows["low"], pinhole, model.drawing), LOW
             text = f"share of consistently low Gaussians, {int(kept['low'].sum()):,} in all ({seen})"
         return Panel(text, scale(drawn), scale)

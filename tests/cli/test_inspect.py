@@ -267,8 +267,8 @@ def test_the_photo_and_its_camera_belong_together(early: SadgsPipeline):
     colors = colors / 255
     views = [inspection.get_view(early, index) for index in range(TRAIN_VIEWS)]
     for number, view in enumerate(views):
-        viewmat, K, *_ = view.camera
-        pixels = (points @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
+        viewmat = view.camera.viewmats[0]
+        pixels = (points @ viewmat[:3, :3].T + viewmat[:3, 3]) @ view.camera.Ks[0].T
         x, y = (pixels[:, :2] / pixels[:, 2:]).floor().long().unbind(-1)
         inside = (pixels[:, 2] > 0) & (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)
         errors = [(other.photo[y[inside], x[inside]] - colors[inside]).abs().mean() for other in views]

@@ -18,6 +18,7 @@ from PIL import Image
 from runs import in_the_viewer
 from scenes import HEIGHT, WIDTH, camera
 
+from sadgs_ns.render.types import Cameras
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.model import NORMALS, SadgsModel
 from sadgs_ns.training.pipeline import SadgsPipeline
@@ -43,7 +44,7 @@ def discs(angles: list[float], spacing: float = 1.5) -> dict[str, torch.Tensor]:
 def test_a_normal_is_the_thinnest_axis_turned_towards_the_camera():
     viewmats, Ks = camera(64, 48)
     for angle in (0.0, 0.4, -0.7, math.pi, math.pi + 0.4):
-        seen = normals_map(discs([angle]), viewmats[0], Ks[0], 64, 48)
+        seen = normals_map(discs([angle]), Cameras(viewmats, Ks, 64, 48))
         facing = math.atan(math.tan(angle))  # A disc that is turned by π faces the camera again.
         expected = torch.tensor([-math.sin(facing), 0.0, -math.cos(facing)])
         torch.testing.assert_close(seen[24, 32], expected, atol=1e-5, rtol=0)
@@ -64,8 +65,8 @@ def test_normals_are_in_the_world_s_axes_and_of_unit_length():
     }
     viewmat = viewmats[0].clone()
     viewmat[:3, :3] = rotation.T
-    before = normals_map(plain, viewmats[0], Ks[0], 64, 48)
-    after = normals_map(turned, viewmat, Ks[0], 64, 48)
+    before = normals_map(plain, Cameras(viewmats, Ks, 64, 48))
+    after = normals_map(turned, Cameras(viewmat[None], Ks, 64, 48))
     torch.testing.assert_close(after, before @ rotation.T, atol=1e-4, rtol=0)
     lengths = before.norm(dim=-1)
     torch.testing.assert_close(lengths[lengths > 0], torch.ones_like(lengths[lengths > 0]))
@@ -176,9 +177,9 @@ def test_ns_render_writes_depth_and_normals(trainer: SadgsTrainer, tmp_path: Pat
 def test_normals_on_a_gpu_are_those_of_the_cpu():
     viewmats, Ks = camera(64, 48)
     params = discs([0.0, 0.4, -0.7], spacing=0.8)
-    on_cpu = normals_map(params, viewmats[0], Ks[0], 64, 48)
+    on_cpu = normals_map(params, Cameras(viewmats, Ks, 64, 48))
     moved = {name: value.cuda() for name, value in params.items()}
-    on_gpu = normals_map(moved, viewmats[0].cuda(), Ks[0].cuda(), 64, 48).cpu()
+    on_gpu = normals_map(moved, Cameras(viewmats.cuda(), Ks.cuda(), 64, 48)).cpu()
     both = (on_cpu != 0).any(dim=-1) & (on_gpu != 0).any(dim=-1)
     assert (both == (on_cpu != 0).any(dim=-1)).float().mean() > 0.98  # A rim of 1/255 may round either way.
     torch.testing.assert_close(on_gpu[both], on_cpu[both], atol=1e-3, rtol=0)
