@@ -6,18 +6,14 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
 
 from sadgs_ns.distributed.bands import views_of_rank
 from sadgs_ns.errors import InputError
-from sadgs_ns.gsplat_compat import NEAR_PLANE, SCREEN_BLUR
-from sadgs_ns.kernels import TILE_SIZE
 from sadgs_ns.method import host_memory, memory
 from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.ops import Params
 from sadgs_ns.method.strategy import StructureAwareStrategy, empty_state
-from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training.processes import least, number_of_processes, processes_on_this_machine
 from sadgs_ns.training.structure_cache import PIXELS_PER_BATCH
 
@@ -27,8 +23,6 @@ QUANTIZED_BYTES = 3
 """Bytes that S̄ takes for each pixel of the training images (`method.quantization`)."""
 STRUCTURE_PIXEL_BYTES = 300
 """Bytes that a pixel takes at most while S̄ is computed."""
-SAMPLED_CAMERAS = 8
-"""Training cameras in which the pairs of the initial Gaussians are counted."""
 MANY_IMAGES = 500
 """nerfstudio would keep up to so many training images on the device, whatever their size."""
 IMAGE_SHARE, FEW_IMAGES_SHARE = 0.25, 0.5
@@ -36,8 +30,6 @@ IMAGE_SHARE, FEW_IMAGES_SHARE = 0.25, 0.5
 HOST_SHARE = 0.5
 """Largest share of the host's available memory for decoded images. torch may take twice as much for pinned memory,
 since it rounds up to powers of two."""
-_REACH = 3.0
-"""Standard deviations of a Gaussian that gsplat draws."""
 
 
 @dataclass(frozen=True)
@@ -45,14 +37,12 @@ class TrainingSize:
     """What a run keeps and renders besides its Gaussians."""
 
     image_bytes: float  # Bytes of images and their S̄ on the training device
-    step: StepSize  # The largest step of the run, with the pairs of the initial Gaussians
+    step: StepSize  # The largest step of the run, without the Gaussians' pairs
     structure_bytes: float = 0.0
     """Bytes to compute S̄ of a step's images before they are rendered; 0 if that is done once at the start."""
 
 
-def training_size(
-    datamanager: FullImageDatamanager, params: Params, views: int, processes: int = 1, near_plane: float = NEAR_PLANE
-) -> TrainingSize:
+def training_size(datamanager: FullImageDatamanager, views: int, processes: int = 1) -> TrainingSize:
     """Measure a run with so many views a step, shared out to processes, without opening an image."""
     cameras = datamanager.train_dataset.cameras
     largest = int((cameras.height * cameras.width).max())
@@ -66,9 +56,8 @@ def training_size(
             here = max(len(views_of_rank((*map(tuple, sizes),) * views, processes, r)) for r in range(processes))
         kept = float((3 * here + QUANTIZED_BYTES * views) * largest)
         structure = float(STRUCTURE_PIXEL_BYTES * max(largest, min(PIXELS_PER_BATCH, here * largest)))
-    # A process composites its share of the pixels, and as many pairs as its share of the Gaussians has in all views.
-    pixels, pairs = -(-views * largest // processes), views * estimate_pairs(params, cameras, near_plane)
-    return TrainingSize(kept, StepSize(views, pixels, pairs, processes > 1), structure)
+    pixels = -(-views * largest // processes)  # A process composites its share.
+    return TrainingSize(kept, StepSize(views, pixels, exchanged=processes > 1), structure)
 
 
 def image_bytes(datamanager: FullImageDatamanager) -> float:
@@ -83,70 +72,33 @@ def image_bytes(datamanager: FullImageDatamanager) -> float:
 def choose_image_storage(datamanager: FullImageDatamanager, device: torch.device) -> str | None:
     """Set where the images are kept, by the free memory and alike in all processes; call before they are loaded.
 
-    With several processes, each would decode all images: those that the user wants on the host stay compressed if that
-    has no room. Returns a line for the user; None if images are kept on the device, or where the user asked for.
+    Returns a line for the user; None if images are kept on the device, or where the user asked for.
     """
     config, size, sharing = datamanager.config, image_bytes(datamanager), processes_on_this_machine()
     host = least(host_memory.available_host_bytes() / sharing, device)
+    needs = f"decoded images and their structure take {size / 1e9:.2g} GB"
+    compressed = "The images stay compressed and are decoded ahead of the steps"
     if config.cache_images == "cpu":
+        # Several processes would each decode all images.
         if number_of_processes() == 1 or size <= HOST_SHARE * host:
             return None
         config.cache_images = "compressed"  # type: ignore[assignment]
-        return (
-            f"The images stay compressed and are decoded ahead of the steps: decoded they take {size / 1e9:.2g} GB in "
-            f"each process, and the host has {host / 1e9:.2g} GB free for each of its {sharing}."
-        )
-    many = len(datamanager.train_dataset) > MANY_IMAGES
+        return f"{compressed}: {needs} in each process, and the host has {host / 1e9:.2g} GB free for each."
     free, share, name = host, HOST_SHARE, "the host"
     if device.type == "cuda":
-        share, name = IMAGE_SHARE if many else FEW_IMAGES_SHARE, "the GPU"
-        free = least(memory.available_bytes(device)[0], device)
+        share = IMAGE_SHARE if len(datamanager.train_dataset) > MANY_IMAGES else FEW_IMAGES_SHARE
+        free, name = least(memory.available_bytes(device)[0], device), "the GPU"
     if size <= share * free:
-        config.cache_images = "gpu"
         return None
-    needs = f"decoded images and their structure take {size / 1e9:.2g} GB, and {name} has {free / 1e9:.2g} GB free"
-    if device.type == "cuda" and size <= HOST_SHARE * host:
-        config.cache_images = "cpu"
-        return f"The images stay in the host's memory and are copied ahead of the steps: {needs}."
-    config.cache_images = "compressed"  # type: ignore[assignment]
-    return f"The images stay compressed and are decoded ahead of the steps: {needs}."
-
-
-@torch.no_grad()
-def estimate_pairs(params: Params, cameras: Cameras, near_plane: float = NEAR_PLANE) -> int:
-    """Count the pairs of a Gaussian and a tile in a few training cameras, and return the largest count.
-
-    Each Gaussian counts as a sphere of its largest scale, in all tiles of the square around its projection. The initial
-    Gaussians are spheres, and if they are so large that memory runs out, the square is the image.
-    """
-    means, device = params["means"], params["means"].device
-    chosen = torch.linspace(0, len(cameras) - 1, min(SAMPLED_CAMERAS, len(cameras))).round().long()
-    chosen = chosen.to(cameras.camera_to_worlds.device)
-    viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds[chosen]).to(device)
-    Ks = cameras.get_intrinsics_matrices()[chosen].to(device)
-    sizes = torch.cat([cameras.width[chosen], cameras.height[chosen]], dim=-1)  # [C, 2]
-    scales = params["scales"].exp().amax(dim=-1)  # [N]
-    level = 2 * (255 * torch.sigmoid(params["opacities"].flatten())).clamp_min(1).log()
-    reach = level.sqrt().clamp_max(_REACH)  # [N] standard deviations at which a Gaussian is 1/255 opaque
-    most = 0
-    for viewmat, K, size in zip(viewmats, Ks, sizes.to(means), strict=True):
-        points = means @ viewmat[:3, :3].T + viewmat[:3, 3]  # [N, 3]
-        depths = points[:, 2:]  # [N, 1]
-        focals, center = K.diagonal()[:2], K[:2, 2]  # [2], [2]
-        means2d = focals * points[:, :2] / depths + center  # [N, 2]
-        radii = reach[:, None] * ((focals * scales[:, None] / depths).square() + SCREEN_BLUR).sqrt()  # [N, 2]
-        tiles = (size / TILE_SIZE).ceil()
-        first = ((means2d - radii) / TILE_SIZE).floor().clamp_min(0).minimum(tiles)
-        last = ((means2d + radii) / TILE_SIZE).ceil().clamp_min(0).minimum(tiles)
-        counts = (last - first).prod(dim=-1)  # [N]
-        drawn = (depths[:, 0] >= near_plane) & (reach > 0) & counts.isfinite()
-        most = max(most, int(torch.where(drawn, counts, 0.0).double().sum()))
-    return most
+    fits_host = device.type == "cuda" and size <= HOST_SHARE * host
+    config.cache_images = "cpu" if fits_host else "compressed"  # type: ignore[assignment]
+    where = "The images stay in the host's memory and are copied ahead of the steps" if fits_host else compressed
+    return f"{where}: {needs}, and {name} has {free / 1e9:.2g} GB free."
 
 
 def fit_to_memory(
     cap: int, params: Params, size: TrainingSize, budget_gb: float | None = None, processes: int = 1
-) -> tuple[int, str, str | None]:
+) -> tuple[int, str]:
     """Lower the cap of Gaussians to what the budget, or the device's free memory, holds; call before the first step.
 
     A cap below the present number adds no Gaussian and removes none. Without a budget, only the default of
@@ -159,18 +111,17 @@ def fit_to_memory(
         budget_gb: Memory for the run on each device, in 10⁹ bytes; None is `PLANNED_SHARE` of what is free.
 
     Returns:
-        The cap, a line for the user, and a warning if the first step will probably not fit. Raises InputError if the
-        budget leaves no room for Gaussians.
+        The cap and a line for the user. Raises InputError if the budget leaves no room for Gaussians.
     """
     device, n = params["means"].device, len(params["means"])
     free, total = memory.available_bytes(device)
     if math.isinf(free):
-        line = f"At most {cap:,} Gaussians: this device's memory is not planned with, so this is max_gaussians."
-        return cap, line, None
+        return cap, f"At most {cap:,} Gaussians: this device's memory is not planned with, so this is max_gaussians."
     state = empty_state(0, device)
     each = memory.kept_bytes(params, state) + memory.widest_bytes(params)
 
-    def need(num_gaussians: int, step: StepSize) -> float:
+    def need(num_gaussians: int) -> float:
+        step = replace(size.step, pairs=memory.PAIRS_PER_GAUSSIAN * size.step.views * num_gaussians)
         working = max(size.structure_bytes, *memory.step_bytes(num_gaussians, step, device).values())
         return size.image_bytes + each * num_gaussians + working
 
@@ -179,13 +130,12 @@ def fit_to_memory(
         budget = PLANNED_SHARE * free if budget_gb is None else min(1e9 * budget_gb, free)
         none = {name: value[:0] for name, value in params.items()}
         left = budget - size.image_bytes
-        affordable = memory.affordable_growth(none, state, left, replace(size.step, pairs=0))  # type: ignore[arg-type]
+        affordable = memory.affordable_growth(none, state, left, size.step)  # type: ignore[arg-type]
         affordable = processes * min(affordable, (left - size.structure_bytes) / each)
         if budget_gb is not None and affordable < 1:
-            fixed = need(0, replace(size.step, pairs=0))
             raise InputError(
                 f"pipeline.memory_budget_gb is {budget_gb:g} and leaves no room for Gaussians: images and rendering "
-                f"take {fixed / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; raise it, take fewer or "
+                f"take {need(0) / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; raise it, take fewer or "
                 "smaller images, or lower pipeline.views-per-iteration."
             )
         if affordable < cap:
@@ -193,19 +143,5 @@ def fit_to_memory(
             why = f"; {free / 1e9:.1f} GB are free" if budget_gb is None else f"; memory_budget_gb is {budget_gb:g}"
             if cap < n * processes:
                 why += f", which holds no more than the {n * processes:,} at the start: none will be added"
-    most = max(-(-cap // processes), n)
-    at_most = need(most, replace(size.step, pairs=memory.PAIRS_PER_GAUSSIAN * size.step.views * most))
-    line = (
-        f"At most {cap:,} Gaussians: {at_most / 1e9:.1f} GB of "
-        f"{'the card' if processes == 1 else 'each card'}'s {total / 1e9:.1f} GB{why}."
-    )
-    first = need(n, size.step)
-    if first <= free:
-        return cap, line, None
-    fewer_views = "lower --pipeline.views-per-iteration, or " if size.step.views > 1 else ""
-    warning = (
-        f"The first step will probably not fit the GPU's memory: {n:,} Gaussians, which reach "
-        f"{size.step.pairs / 1e6:,.0f} million tiles of {size.step.views} views, take {first / 1e9:.1f} GB with the "
-        f"images, and {free / 1e9:.1f} GB are free; {fewer_views}take smaller images."
-    )
-    return cap, line, warning
+    needed, card = need(max(-(-cap // processes), n)), "the card" if processes == 1 else "each card"
+    return cap, f"At most {cap:,} Gaussians: {needed / 1e9:.1f} GB of {card}'s {total / 1e9:.1f} GB{why}."

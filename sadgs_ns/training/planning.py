@@ -138,14 +138,12 @@ def _print_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: S
 
 def _cap_in_memory(options: SadgsPipelineConfig, pipeline: SadgsPipeline, views: int) -> int:
     """Return the cap of Gaussians that the devices' memory allows, and print what decided it."""
-    model, processes, cap = pipeline.model, pipeline.world.num_ranks, options.model.strategy.max_gaussians
-    gaussians: Any = model.gauss_params
-    size = training_size(pipeline.datamanager, gaussians, views, processes, model.near_plane)
-    cap, line, warning = fit_to_memory(cap, gaussians, size, options.memory_budget_gb, processes)
+    params: Any = pipeline.model.gauss_params
+    world, cap = pipeline.world, options.model.strategy.max_gaussians
+    size = training_size(pipeline.datamanager, views, world.num_ranks)
+    cap, line = fit_to_memory(cap, params, size, options.memory_budget_gb, world.num_ranks)
     note(line)
-    if warning is not None:
-        warn(warning)
-    return int(pipeline.world.least(cap))
+    return int(world.least(cap))
 
 
 def _kept_cap(now: int, before: int) -> int:

@@ -23,11 +23,10 @@ import pytest
 import torch
 from kill_and_resume import configure, set_up
 from nerfstudio.cameras.cameras import Cameras
-from scenes import camera, random_params, splat
 
 from examples.drawn_scene.scene import write_scene
 from sadgs_ns.errors import InputError
-from sadgs_ns.kernels import TILE_SIZE, triton_switched
+from sadgs_ns.kernels import triton_switched
 from sadgs_ns.method import host_memory, memory
 from sadgs_ns.method import strategy as strategy_module
 from sadgs_ns.method.memory import StepSize
@@ -35,7 +34,6 @@ from sadgs_ns.method.strategy import StructureAwareStrategy, empty_state
 from sadgs_ns.training.memory_plan import (
     TrainingSize,
     choose_image_storage,
-    estimate_pairs,
     fit_to_memory,
     image_bytes,
     training_size,
@@ -79,16 +77,13 @@ def fit(
     n: int = 10,
     views: int = 1,
     pixels: int = 0,
-    pairs: float = 0,
     budget_gb: float | None = None,
     cap: int = DEFAULT,
 ):
     """The cap, and what the user is told."""
-    size = TrainingSize(other, StepSize(views, pixels, pairs))
+    size = TrainingSize(other, StepSize(views, pixels))
     with triton_switched(True):  # The loss is computed by our kernels, as on a card.
-        cap, line, warning = fit_to_memory(cap, params(n), size, budget_gb)  # type: ignore[arg-type]
-    assert line is not None
-    return cap, line, warning
+        return fit_to_memory(cap, params(n), size, budget_gb)  # type: ignore[arg-type]
 
 
 def test_what_a_gaussian_takes_is_what_a_split_asks_for():
@@ -123,35 +118,17 @@ def test_several_views_leave_room_for_fewer_gaussians(card: Any):
     assert fit(views=4)[0] == int(4e9 // each(4))
 
 
-@pytest.mark.hard_case(
-    "a first step that will probably not fit, as with few Gaussians as large as four 4K images",
-    "one sentence warns before it",
-)
-def test_a_first_step_that_cannot_fit_is_warned_of(card: Any):
-    """A few Gaussians as large as the images, in four views of 4K."""
-    card(8, 8)
-    pixels = 3840 * 2160
-    size = {"n": 800, "views": 4, "pixels": 4 * pixels}
-    assert fit(**size, pairs=4 * 800)[2] is None
-    warning = fit(**size, pairs=4 * 800 * pixels // 64)[2]
-    assert warning == (
-        "The first step will probably not fit the GPU's memory: 800 Gaussians, which reach 415 million tiles of 4 "
-        "views, take 16.6 GB with the images, and 8.0 GB are free; lower --pipeline.views-per-iteration, or take "
-        "smaller images."
-    )
-
-
 @pytest.mark.parametrize("free", [30.0, 80.0, 139.0])
 def test_a_large_card_keeps_the_default(free: float, card: Any):
     card(free, 140)
-    cap, line, _ = fit(other=1e9)
+    cap, line = fit(other=1e9)
     assert cap == DEFAULT == 4_000_000
     assert line == f"At most 4,000,000 Gaussians: {1 + 4e-3 * each():.1f} GB of the card's 140.0 GB."
 
 
 def test_a_small_card_gets_a_cap_that_takes_four_fifths_of_what_is_free(card: Any):
     card(7.5, 8)
-    cap, line, _ = fit(other=1e9)
+    cap, line = fit(other=1e9)
     assert cap == int((0.8 * 7.5e9 - 1e9) // each()) < DEFAULT
     assert 1e9 + cap * each() <= 0.8 * 7.5e9 < 1e9 + (cap + 1) * each()
     assert line == f"At most {cap:,} Gaussians: 6.0 GB of the card's 8.0 GB; 7.5 GB are free."
@@ -159,7 +136,7 @@ def test_a_small_card_gets_a_cap_that_takes_four_fifths_of_what_is_free(card: An
 
 def test_a_budget_bounds_it_and_never_raises_max_gaussians(card: Any):
     card(139, 140)
-    cap, line, _ = fit(other=1e9, budget_gb=4.0)
+    cap, line = fit(other=1e9, budget_gb=4.0)
     assert cap == int(3e9 // each())
     assert line == f"At most {cap:,} Gaussians: 4.0 GB of the card's 140.0 GB; memory_budget_gb is 4."
     assert fit(budget_gb=100.0)[0] == DEFAULT
@@ -172,14 +149,14 @@ def test_a_budget_bounds_it_and_never_raises_max_gaussians(card: Any):
 
 def test_a_cap_that_the_user_chose_stays_without_a_budget(card: Any):
     card(2, 8)
-    cap, line, _ = fit(cap=1_000_000)
+    cap, line = fit(cap=1_000_000)
     assert cap == 1_000_000 and line.startswith("At most 1,000,000 Gaussians: 1.8 GB of the card's 8.0 GB.")
 
 
 @pytest.mark.hard_case("a memory budget that leaves no room", "refused in one sentence")
 def test_a_full_card_still_starts_and_a_budget_for_nothing_is_refused(card: Any):
     card(0.5, 8)
-    cap, line, _ = fit(other=1e9)
+    cap, line = fit(other=1e9)
     assert cap == 1 and line.endswith("which holds no more than the 10 at the start: none will be added.")
     with pytest.raises(InputError) as error:
         fit(other=1e9, budget_gb=0.5)
@@ -201,7 +178,6 @@ def test_without_cuda_nothing_changes():
     assert fit_to_memory(DEFAULT, params(), size, 0.1) == (  # type: ignore[arg-type]
         DEFAULT,
         "At most 4,000,000 Gaussians: this device's memory is not planned with, so this is max_gaussians.",
-        None,
     )
 
 
@@ -214,7 +190,7 @@ def test_what_is_free_counts_what_this_process_holds_as_its_own(monkeypatch: pyt
     assert memory.available_bytes(device) == (80, 100) and memory.free_bytes(device) == 70
 
 
-# --- tile pairs of the initial Gaussians ---
+# --- the size of a run ---
 
 
 def cameras(width: int = 64, height: int = 48, focal: float = 60.0, number: int = 1) -> Cameras:
@@ -225,54 +201,6 @@ def cameras(width: int = 64, height: int = 48, focal: float = 60.0, number: int 
     return Cameras(torch.cat([poses, positions], dim=-1), focal, focal, width / 2, height / 2, width, height)
 
 
-def spheres(n: int) -> dict[str, torch.nn.Parameter]:
-    drawn = random_params(n)
-    drawn["scales"] = torch.nn.Parameter(drawn["scales"][:, :1].repeat(1, 3))
-    return drawn
-
-
-def test_estimated_pairs_are_a_little_more_than_the_tiles_that_gaussians_show_in():
-    width, height, tile = 64, 48, TILE_SIZE
-    drawn = spheres(60)
-    _, _, info = splat(drawn, *camera(width, height), width, height)
-    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    offsets = torch.stack([x, y], -1) - info["means2d"][0][:, None, None]  # [N, H, W, 2]
-    a, b, c = info["conics"][0][:, None, None].unbind(-1)
-    sigmas = 0.5 * (a * offsets[..., 0] ** 2 + c * offsets[..., 1] ** 2) + b * offsets[..., 0] * offsets[..., 1]
-    shows = torch.sigmoid(drawn["opacities"])[:, None, None] * (-sigmas).exp() >= 1 / 255
-    exact = int(shows.unflatten(2, (-1, tile)).unflatten(1, (-1, tile)).any(dim=(2, 4)).sum())
-    estimated = estimate_pairs(drawn, cameras())  # type: ignore[arg-type]
-    assert 0.95 * exact <= estimated <= 1.6 * exact
-
-
-def test_large_gaussians_reach_all_tiles_of_the_image_and_those_behind_the_camera_none():
-    large = spheres(5)
-    large["scales"].data.fill_(3.0)
-    large["opacities"].data.fill_(2.0)
-    large["means"].data[:2, 2] = -5.0
-    tiles = (3840 // 8) * (2160 // 8)
-    assert estimate_pairs(large, cameras(3840, 2160, 3000.0)) == 3 * tiles  # type: ignore[arg-type]
-    assert estimate_pairs(large, cameras(3841, 2160, 3000.0)) == 3 * (tiles + 2160 // 8)  # type: ignore[arg-type]
-    large["opacities"].data.fill_(-9.0)  # too faint to be drawn
-    assert estimate_pairs(large, cameras(3840, 2160, 3000.0)) == 0  # type: ignore[arg-type]
-
-
-def test_the_view_with_most_pairs_counts():
-    drawn = spheres(50)
-    alone = [estimate_pairs(drawn, cameras(number=20)[i : i + 1]) for i in range(20)]  # type: ignore[arg-type]
-    together = estimate_pairs(drawn, cameras(number=20))  # type: ignore[arg-type]
-    assert together == max(alone) == alone[0] and min(alone) < together
-
-
-def test_points_that_are_not_finite_or_at_the_camera_count_for_nothing_or_one_image():
-    odd = spheres(4)
-    odd["means"].data[0] = math.nan
-    odd["means"].data[1] = math.inf
-    odd["means"].data[2] = 0.0
-    odd["means"].data[3] = torch.tensor([0.0, 0.0, 1e30])
-    assert 0 <= estimate_pairs(odd, cameras()) <= 2 * 48  # type: ignore[arg-type]
-
-
 def test_the_size_of_a_run_is_that_of_its_images_and_largest_step():
     train, held_out = cameras(number=3), cameras(100, 10, number=2)
     datamanager: Any = SimpleNamespace(
@@ -280,19 +208,18 @@ def test_the_size_of_a_run_is_that_of_its_images_and_largest_step():
         train_dataset=SimpleNamespace(cameras=train),
         eval_dataset=SimpleNamespace(cameras=held_out),
     )
-    drawn: Any = spheres(10)
-    size = training_size(datamanager, drawn, views=2)
+    size = training_size(datamanager, views=2)
     assert size.image_bytes == 3 * (3 * 64 * 48 + 2 * 1000) + 3 * 3 * 64 * 48
-    assert size.step == StepSize(2, 2 * 64 * 48, 2 * estimate_pairs(drawn, train))
+    assert size.step == StepSize(2, 2 * 64 * 48)
     datamanager.config.cache_images = "cpu"
-    size = training_size(datamanager, drawn, views=2)
+    size = training_size(datamanager, views=2)
     assert size.image_bytes == 2 * 6 * 64 * 48  # of the next step
     assert size.structure_bytes == 300 * 2 * 64 * 48  # Only images on the device have theirs from the start.
-    size = training_size(datamanager, drawn, views=2, processes=2)
+    size = training_size(datamanager, views=2, processes=2)
     assert size.image_bytes == (3 + 2 * 3) * 64 * 48  # Each process has one of the images, and the codes of both.
     assert size.structure_bytes == 300 * 64 * 48
     train.height = torch.tensor([[30], [48], [48]])  # Of two sizes each process may have a part of either.
-    assert training_size(datamanager, drawn, views=2, processes=2).image_bytes == 2 * 6 * 64 * 48
+    assert training_size(datamanager, views=2, processes=2).image_bytes == 2 * 6 * 64 * 48
 
 
 # --- ns-train ---
@@ -368,6 +295,7 @@ def test_images_are_kept_where_there_is_room(number: int, card: Any, monkeypatch
         assert f" take {image_bytes(large) / 1e9:.2g} GB, and the {name} has " in line
         assert large.config.cache_images == "compressed"
     monkeypatch.setattr(host_memory, "available_host_bytes", lambda: 2.01 * image_bytes(large))
+    large.config.cache_images = "gpu"
     assert choose_image_storage(large, torch.device("cpu")) is None
     assert large.config.cache_images == "gpu"  # the training device
 

@@ -184,7 +184,7 @@ def test_processes_that_find_different_memory_place_their_images_alike(asked: st
     (first, line), (second, same_line) = run_ranks(place_together, 2, tmp_path, asked)
     assert first == second == "compressed" and line == same_line and line is not None
     assert line.startswith("The images stay compressed and are decoded ahead of the steps: decoded ")
-    of_each = "they take 0.0009 GB in each process, and the host has 0.0018 GB free for each of its 2."
+    of_each = "structure take 0.0009 GB in each process, and the host has 0.0018 GB free for each."
     assert asked == "gpu" or line.endswith(of_each)
 
 
