@@ -6,7 +6,6 @@ import os
 import random
 import signal
 import socket
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -75,27 +74,15 @@ def check_devices(machine: MachineConfig) -> bool:
 
 
 class Peers:
-    """The processes of a run by their hosts and ids, to find out which of them ended."""
+    """The processes of a run by their hosts and ids, to find out whether one of them ended."""
 
     def __init__(self, world: World) -> None:
-        self._rank, number = world.rank, world.num_ranks
-        with tempfile.NamedTemporaryFile() as file:
-            file.write(bytes(number))
-            file.flush()
-            own = (socket.gethostname(), os.getpid(), file.name)
-            self._places = [own] * number
-            dist.all_gather_object(self._places, own)
-            shared = next(path for host, _, path in self._places if host == own[0])
-            try:
-                # This file is memory that all processes of the machine share. The byte of a process becomes 1 if it
-                # ends because another has ended.
-                self._followed = torch.from_file(shared, shared=True, size=number, dtype=torch.uint8)
-            except RuntimeError:  # This process has another folder of temporary files.
-                self._followed = torch.zeros(number, dtype=torch.uint8)
-            world.all(True)  # The files go, and the memory stays as long as a process has it.
+        own = (socket.gethostname(), os.getpid())
+        self._places = [own] * world.num_ranks
+        dist.all_gather_object(self._places, own)
 
     def on_one_machine(self) -> bool:
-        return len({host for host, _, _ in self._places}) == 1
+        return len({host for host, _ in self._places}) == 1
 
     def exit_after_rank_zero(self) -> NoReturn:
         """Wait for the end of rank 0, because the end of one process would end all; then exit with code 0."""
@@ -106,17 +93,14 @@ class Peers:
             time.sleep(0.2)
         raise SystemExit(0)
 
-    def ended(self) -> list[int]:
-        """Return the ranks that ended by themselves, not because of others, after waiting some seconds for one."""
+    def ended(self) -> bool:
+        """Tell whether a process of this machine ended, after waiting some seconds for one."""
         end, here = time.monotonic() + _REAPED_SECONDS, socket.gethostname()
-        while True:
-            gone = (rank for rank, (host, pid, _) in enumerate(self._places) if host == here and not _exists(pid))
-            ranks = [rank for rank in gone if not self._followed[rank]]
-            if ranks:
-                self._followed[self._rank] = 1
-            if ranks or time.monotonic() > end:
-                return ranks
+        while all(_exists(pid) for host, pid in self._places if host == here):
+            if time.monotonic() > end:
+                return False
             time.sleep(0.1)
+        return True
 
 
 def _exists(pid: int) -> bool:

@@ -20,9 +20,6 @@ from sadgs_ns.events import report
 
 COLUMNS = {"Step (% Done)": 18, "Loss": 9, "PSNR": 10, "Gaussians": 12, "Iteration": 11, "Time left": 10}
 """Columns of the table and their widths, which fit a terminal of 80 characters."""
-MEASURED_STEPS, MEASURED_SECONDS = 3, 10.0
-"""Fewest iterations, and seconds, after which the length of the run is estimated before its first row. The very first
-iteration, which also loads images, does not count."""
 
 
 def note(text: str) -> None:
@@ -49,7 +46,7 @@ def cpu_notice(threads: int) -> str:
     """Return what a user should know who trains without a GPU, with so many threads of torch."""
     text = (
         "This run trains on the CPU, which is for small scenes and tests: a GPU with CUDA is about a hundred times as "
-        "fast. After the first iterations a line says how long the run will take."
+        "fast."
     )
     if threads > 1:
         text += (
@@ -88,7 +85,6 @@ class ProgressTable(LocalWriter):
         self._banner = banner_messages or []
         self._rows: deque[str] = deque(maxlen=config.max_log_size or None)
         self._times: deque[tuple[int, float]] = deque(maxlen=10)
-        self._estimated = False
         in_place = config.max_log_size > 0 and CONSOLE.is_interactive
         self._live = Live(console=CONSOLE, auto_refresh=False) if in_place else None
 
@@ -98,32 +94,17 @@ class ProgressTable(LocalWriter):
         if EventName.ITER_TRAIN_TIME.value not in events:  # Training is over.
             self.stop()
             return
-        due = step % writer.GLOBAL_BUFFER["steps_per_log"] == 0
-        if due:
-            cells = _cells(events)  # On CUDA this waits for the step, so the clock is read after it.
-        now = time.monotonic()
-        if not self._times:
-            self._times.append((step, now))
-        first, start = self._times[0]
-        pace = (now - start) / (step - first) if step > first else None
-        left = writer.GLOBAL_BUFFER["max_iter"] - step - 1
-        slow = step - first >= MEASURED_STEPS and now - start >= MEASURED_SECONDS  # The next row may take long.
-        if not self._estimated and pace is not None and (due or slow):
-            self._estimated = True
-            if left > 0:
-                CONSOLE.print(
-                    f"{step - first} iterations after the first took {_short(pace)} each: at this pace the {left:,} "
-                    f"that are left take {duration(pace * left)}, and more where the number of Gaussians grows much.",
-                    highlight=False,
-                    soft_wrap=True,
-                )
-        if due:
-            if first != step:
-                self._times.append((step, now))
-            done = f"{step} ({step / writer.GLOBAL_BUFFER['max_iter']:.2%})"
-            timing = ["", ""] if pace is None else [_short(pace), duration(pace * left)]
-            report("iteration", step=step, left=timing[1])
-            self._show(_line([done, *cells, *timing]))
+        if step % writer.GLOBAL_BUFFER["steps_per_log"] != 0:
+            return
+        cells = _cells(events)  # On CUDA this waits for the step, so the clock is read after it.
+        self._times.append((step, time.monotonic()))
+        (first, start), (_, now) = self._times[0], self._times[-1]
+        total, timing = writer.GLOBAL_BUFFER["max_iter"], ["", ""]
+        if step > first:
+            pace = (now - start) / (step - first)
+            timing = [_short(pace), duration(pace * (total - step - 1))]
+        report("iteration", step=step, left=timing[1])
+        self._show(_line([f"{step} ({step / total:.2%})", *cells, *timing]))
 
     def _show(self, row: str) -> None:
         header = [_line(list(COLUMNS)), "-" * sum(COLUMNS.values())]

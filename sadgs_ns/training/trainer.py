@@ -41,6 +41,7 @@ _LESS_MEMORY = (
     "lower --pipeline.model.strategy.max-gaussians or --pipeline.views-per-iteration, or take smaller images "
     "(`--downscale-factor 2` after `nerfstudio-data` or `colmap`), or several devices (`--share-always True`)"
 )
+_ANOTHER_ENDED = "Another process of the run ended, and this one with it"
 _NOTHING_DONE = "stopped before an iteration was done; the same command starts again."
 _SAVING_SHARE = 0.01
 """Largest share of the time between two checkpoints by the clock that saving may take."""
@@ -99,9 +100,9 @@ class SadgsTrainer(Trainer):
         except RunError:
             raise
         except RuntimeError as error:
-            if (ended := self._ended()) is None:
+            if self._peers is None or not self._peers.ended():
                 raise
-            raise RunError(f"{ended}: {_NOTHING_DONE}") from error
+            raise RunError(f"{_ANOTHER_ENDED}: {_NOTHING_DONE}") from error
         except KeyboardInterrupt:
             note(f"SIGINT: {_NOTHING_DONE}")
             raise SystemExit(128 + signal.SIGINT) from None
@@ -194,10 +195,10 @@ class SadgsTrainer(Trainer):
                 self.save_checkpoint(self._completed_step)
             raise WriteError(Path(os.fsdecode(error.filename or self.base_dir)), error) from error
         except RuntimeError as error:
-            if (ended := self._ended()) is None:
+            if self._peers is None or not self._peers.ended():
                 raise
             resume = f"what the last checkpoint holds goes on with --load-dir {self.checkpoint_dir}"
-            raise RunError(f"{ended}: {resume}.") from error
+            raise RunError(f"{_ANOTHER_ENDED}: {resume}.") from error
         finally:
             self.config.max_num_iterations = total
             self.pipeline.views.close()
@@ -221,13 +222,6 @@ class SadgsTrainer(Trainer):
                 if interruption is None or self._stepping:
                     raise
                 self._stop(interruption, total)
-
-    def _ended(self) -> str | None:
-        """Return a sentence on which other processes ended by themselves, and so this one; None if none did."""
-        if self._peers is None or not (ended := self._peers.ended()):
-            return None
-        number = processes.number_of_processes()
-        return f"Process {' and '.join(map(str, ended))} of {number} ended (counted from 0), and the others with it"
 
     def _rescue(self, out_of_memory: str) -> str:
         """Save the state before the present step if it is whole, and return what to tell the user.

@@ -31,7 +31,6 @@ from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.training import trainer as trainer_module
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.presets import sadgs
-from sadgs_ns.training.processes import Peers
 from sadgs_ns.training.trainer import SadgsTrainer
 
 
@@ -249,13 +248,13 @@ def die_in_setup(world: World, config: SadgsTrainerConfig) -> str:
     return str(error.value)
 
 
-@pytest.mark.hard_case("one of several processes is killed before the first step", "the others name it")
-def test_a_process_that_is_killed_before_the_first_step_is_named(scene: Path, tmp_path: Path):
+@pytest.mark.hard_case("one of several processes is killed before the first step", "the others say so")
+def test_a_process_that_is_killed_before_the_first_step_ends_the_others(scene: Path, tmp_path: Path):
     config = configure(scene, tmp_path / "runs", 20, save_every=0)
     _, *messages = run_ranks(die_in_setup, 3, tmp_path / "meet", config, doomed=(0,))
     for message in messages:
         assert message == (
-            "Process 0 of 3 ended (counted from 0), and the others with it: stopped before an iteration was done; "
+            "Another process of the run ended, and this one with it: stopped before an iteration was done; "
             "the same command starts again."
         )
 
@@ -277,13 +276,13 @@ def train_and_die(world: World, config: SadgsTrainerConfig, doomed: int, killed:
 
 @pytest.mark.hard_case(
     "one of several processes is killed",
-    "all end within a minute; the others name it and the last checkpoint, from which the run resumes",
+    "all end within a minute; the others say so and name the last checkpoint, from which the run resumes",
 )
-def test_a_killed_process_ends_the_others_with_a_sentence_that_names_it(scene: Path, tmp_path: Path):
+def test_a_killed_process_ends_the_others_with_a_sentence_that_names_the_checkpoint(scene: Path, tmp_path: Path):
     config = configure(scene, tmp_path / "runs", 20, save_every=3)
     endings = run_ranks(train_and_die, 3, tmp_path / "meet", config, 1, tmp_path / "killed", doomed=(1,))
     for message, seconds in (endings[0], endings[2]):
-        assert message.startswith("Process 1 of 3 ended (counted from 0)"), message
+        assert message.startswith("Another process of the run ended, and this one with it: what"), message
         assert str(config.get_checkpoint_dir()) in message and seconds < 60
     assert saved(config.get_checkpoint_dir())[0] == 3
 
@@ -334,23 +333,6 @@ def test_a_run_has_its_viewer_where_it_goes_on_with_one_device(share: bool, scen
     first, second = run_ranks(ask_for_a_viewer, 2, tmp_path / "meet", config)
     assert first[0] is not share and ("The viewer is off" in first[1]) is share
     assert not second[0]
-
-
-def look_after_another_has_left(world: World) -> list[int]:
-    """Kill process 1; process 0 looks for it and ends, and only then process 2 looks, too."""
-    peers = Peers(world)
-    pids: list[Any] = [None] * world.num_ranks
-    torch.distributed.all_gather_object(pids, os.getpid())
-    if world.rank == 1:
-        os.kill(os.getpid(), signal.SIGKILL)
-    while world.rank == 2 and Path(f"/proc/{pids[0]}").exists():
-        time.sleep(0.1)
-    return peers.ended()
-
-
-def test_a_process_that_left_because_of_another_is_not_named(tmp_path: Path):
-    first, _, last = run_ranks(look_after_another_has_left, 3, tmp_path, doomed=(1,))
-    assert first == last == [1]
 
 
 @pytest.mark.parametrize(
