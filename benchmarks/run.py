@@ -186,7 +186,7 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
     record = {
         "devices": devices,
         "iterations": trainer.config.max_num_iterations,
-        "views_per_iteration": getattr(pipeline, "views_per_iteration", 1),
+        "views_per_iteration": model.plan.views_per_iteration if hasattr(model, "plan") else 1,
         "loop_seconds": timer.seconds,
         **seconds,
         **held_out,

@@ -15,16 +15,12 @@ because SSIM's window reaches 5 px beyond the rows that count."""
 class Band(NamedTuple):
     """Rows of a view that one process composites; a whole view is a band, too."""
 
-    view: int
-    """Number of the view in the step."""
-    rank: int
-    """The process that composites it."""
-    first: int
-    last: int
-    """First row that counts in the loss, and the one after the last."""
-    top: int
-    bottom: int
-    """First row that is drawn, and the one after the last."""
+    view: int  # Number of the view in the step
+    rank: int  # The process that composites it
+    first: int  # First row that counts in the loss
+    last: int  # The row after the last that counts
+    top: int  # First row that is drawn
+    bottom: int  # The row after the last that is drawn
 
 
 def share_rows(num_views: int, height: int, num_ranks: int) -> list[Band]:

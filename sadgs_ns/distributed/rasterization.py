@@ -17,13 +17,9 @@ from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
 class Picture(NamedTuple):
     """Rows of one view, or all views, that this process composited."""
 
-    band: Band | None
-    """Which rows of one view they are, from `band.top` to `band.bottom`, and which of them count. None is all rows of
-    all views."""
-    colors: Tensor
-    """[B, H', W, D]"""
-    alphas: Tensor
-    """[B, H', W, 1]"""
+    band: Band | None  # Which rows of one view they are, and which of them count; None is all rows of all views
+    colors: Tensor  # [B, H', W, D]
+    alphas: Tensor  # [B, H', W, 1]
 
 
 def rasterize(

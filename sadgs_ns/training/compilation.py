@@ -37,7 +37,7 @@ class _Stages:
 
     def __init__(self, pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
         self.pipeline, self.optimizers = pipeline, optimizers
-        self.model, self.device, self.views = pipeline.model, pipeline.device, pipeline.views_per_iteration
+        self.model, self.device, self.views = pipeline.model, pipeline.device, pipeline.model.plan.views_per_iteration
         n, device = _GAUSSIANS, pipeline.device
         ramp = torch.linspace(-0.5, 0.5, n, device=device)
         self.means = torch.stack([ramp, ramp.flip(0), torch.full_like(ramp, 2.0)], dim=-1)
@@ -73,7 +73,7 @@ class _Stages:
                 "tile lists": self.tile_lists,
                 "compositing": partial(self.composite, False),
             }
-        return stages if self.pipeline.world.alone else stages | {"what travels between devices": self.exchange}
+        return stages if self.model.world.alone else stages | {"what travels between devices": self.exchange}
 
     def project(self) -> None:
         _, _, self.info = rasterize(self.gaussians, self.cameras, self.drawing)
@@ -115,7 +115,7 @@ class _Stages:
         update = AdamUpdate(twins)
         gradients = {name: torch.zeros_like(parameter) for name, parameter in update.parameters.items()}
         # Several processes wait for the lengths of tile lists, which then cannot overflow.
-        flags = (torch.zeros(1, dtype=torch.int64, device=self.device),) if self.pipeline.world.alone else ()
+        flags = (torch.zeros(1, dtype=torch.int64, device=self.device),) if self.model.world.alone else ()
         update.launch(gradients, update.factors().to(self.device), torch.zeros(1, device=self.device), flags)
 
     def composite(self, absgrad: bool) -> None:

@@ -232,7 +232,7 @@ class SadgsMachineConfig(MachineConfig):
     num_devices: int = 1
     """Number of CUDA devices of this machine to train on, among which the Gaussians are shared out.
     torchrun can start the processes instead, on several machines, too; this is then 1."""
-    device_type: Literal["cpu", "cuda", "mps"] = field(
+    device_type: Literal["cpu", "cuda"] = field(  # type: ignore[assignment]
         default_factory=lambda: "cuda" if torch.cuda.is_available() else "cpu"
     )
     """Kind of device to train on; CUDA where there is one."""
@@ -365,13 +365,9 @@ class SadgsTrainerConfig(TrainerConfig):
     def _check_machine(self) -> None:
         """Raise InputError if a device is not there, or several cannot work with these options."""
         device = self.machine.device_type
-        available = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
-        if not available[device]:
-            name = device.upper()
-            raise InputError(
-                f"machine.device_type is {device}, but torch finds no {name} device: set it to cpu, or install torch "
-                f"for {name}."
-            )
+        if device == "cuda" and not torch.cuda.is_available():
+            problem = "machine.device_type is cuda, but torch finds no CUDA device"
+            raise InputError(f"{problem}: set it to cpu, or install torch for CUDA.")
         check_ranges("machine.", self.machine, [("seed", 0 <= self.machine.seed < 2**32, "in [0, 2³²)")])
         model, several = self.pipeline.model, processes.check_devices(self.machine)
         if model.backend != "auto":  # That is decided in the process that trains, where Triton tries a kernel.

@@ -39,19 +39,6 @@ class Results(NamedTuple):
     means_gradient: Tensor  # Gradient of the loss by the centres. [N, 3]
 
 
-@dataclass(frozen=True)
-class Graph:
-    """Captured launches, and where they write."""
-
-    launches: torch.cuda.CUDAGraph
-    results: Any
-
-    def replay(self) -> Results:
-        """Launch them all, and return what they write."""
-        self.launches.replay()
-        return self.results
-
-
 class CudaGraphs:
     """Captures functions as CUDA graphs on a device. They share memory, since only one runs at a time."""
 
@@ -62,11 +49,12 @@ class CudaGraphs:
         # The shared memory lives as long as one of its graphs, so this one is kept.
         self._first = self.capture(lambda: torch.zeros((), device=device))
 
-    def capture(self, function: Callable[[], Any]) -> Graph:
-        """Capture what a function launches, without running it; its results keep their addresses.
+    def capture(self, function: Callable[[], Any]) -> Callable[[], Any]:
+        """Capture what a function launches, without running it, and return one that replays it.
 
-        The function may launch only kernels that were launched before, since none may be compiled or loaded meanwhile.
-        Raises as the function, or RuntimeError. torch's context manager would wait for the device at each capture.
+        The results of all replays are the same tensors. The function may launch only kernels that were launched before,
+        since none may be compiled or loaded meanwhile. Raises as the function, or RuntimeError. torch's context manager
+        would wait for the device at each capture.
         """
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.stream(self._stream):
@@ -84,7 +72,12 @@ class CudaGraphs:
             except RuntimeError:
                 self._repair_generator()
                 raise
-        return Graph(graph, results)
+
+        def replay() -> Any:
+            graph.replay()
+            return results
+
+        return replay
 
     def wait(self) -> None:
         """Wait until no graph is running, before which none may be dropped."""
@@ -140,7 +133,7 @@ class GraphedSteps:
         self._recorder: CudaGraphs | None = None
         self._addresses: tuple[int, ...] = ()
         self._launched: set[Any] = set()  # keys of steps that were launched at these addresses
-        self._graphs: dict[Any, tuple[Graph, _Inputs]] = {}
+        self._graphs: dict[Any, tuple[Callable[[], Results], _Inputs]] = {}
         self.replayed = 0
         self.failure = ""
 
@@ -174,9 +167,9 @@ class GraphedSteps:
         found = self._graph(group, opacity_reg, update, factors)
         if found is None:
             return None
-        graph, inputs = found
+        replay, inputs = found
         inputs.write(group, factors)
-        results = graph.replay()
+        results = replay()
         self.replayed += 1
         values = results.values.clone()
         nonfinite_flag.copy_(values[4:])
@@ -185,8 +178,8 @@ class GraphedSteps:
 
     def _graph(
         self, group: ViewGroup, opacity_reg: float, update: AdamUpdate, factors: Tensor
-    ) -> tuple[Graph, _Inputs] | None:
-        """Return the graph of such a step. Capture it at the second step of its key, unless memory is short."""
+    ) -> tuple[Callable[[], Results], _Inputs] | None:
+        """Return what replays such a step, and its inputs. The second step of a key is captured if there is memory."""
         sums = [value for value in self._model.strategy_state.values() if isinstance(value, Tensor)]
         changed = (*update.parameters.values(), *update.exp_avgs, *update.exp_avg_sqs, *sums)
         # New tensors of another length may have the old addresses.

@@ -14,12 +14,10 @@ from typing import Any
 
 from rich.console import Console
 
-HANG_UP: int | None = getattr(signal, "SIGHUP", None)
-"""The signal of a terminal that is gone, as when ssh is cut off; Windows has none."""
 _HANG_UP_SECONDS = 2.0
 """Longest time from a write that fails because the terminal is gone until its signal comes."""
-SIGNALS = (signal.SIGINT, signal.SIGTERM, *([] if HANG_UP is None else [HANG_UP]))
-"""Signals that ask a run to stop."""
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals that ask a run to stop. The last one is that of a terminal that is gone, as when ssh is cut off."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -40,7 +38,7 @@ class Interrupts:
 
     def __init__(self, waiting: Callable[[], bool], started: bool = False) -> None:
         self._waiting = waiting
-        self._repeated = {HANG_UP, signal.SIGTERM} if started else {HANG_UP}
+        self._repeated = {signal.SIGHUP, signal.SIGTERM} if started else {signal.SIGHUP}
         self._previous: dict[int, Any] = {}
         self.received: int | None = None  # the first signal that has come
 
@@ -65,11 +63,11 @@ class Interrupts:
 
     def cause_of(self, error: OSError) -> Interrupted | None:
         """Return the hang-up that made a write fail, if it did; the signal may come after the terminal is gone."""
-        if error.errno == errno.EIO and HANG_UP in self._previous:
+        if error.errno == errno.EIO and signal.SIGHUP in self._previous:
             end = time.monotonic() + _HANG_UP_SECONDS
             while self.received is None and time.monotonic() < end:
                 time.sleep(0.01)
-        return None if self.received is None or self.received != HANG_UP else Interrupted(self.received)
+        return Interrupted(self.received) if self.received == signal.SIGHUP else None
 
     def _handle(self, number: int, frame: object) -> None:
         if self.received is not None:
@@ -77,7 +75,7 @@ class Interrupts:
         self.received = number
         for another in self._previous.keys() - self._repeated:
             signal.signal(another, self._previous[another])
-        if number == HANG_UP:
+        if number == signal.SIGHUP:
             discard_broken_output()
         if self._waiting():
             self.poll()

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from sadgs_ns.data.cameras import camera_positions, check_camera_types
 from sadgs_ns.data.parsers import findings_of
-from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
 from sadgs_ns.gsplat_compat import FAR_PLANE
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
@@ -101,19 +100,9 @@ class SadgsPipeline(VanillaPipeline):
         self.structure.set_max_gaussians.value = plan.strategy.max_gaussians
         self.structure.set_tau_split.value = plan.strategy.tau_split
 
-    @property
-    def world(self) -> World:
-        """The processes among which the Gaussians are shared out."""
-        return self.model.world
-
     def train(self, mode: bool = True) -> SadgsPipeline:
         """Set the mode of all modules, unless they have it; nerfstudio calls this before every step."""
         return self if mode == self.training == self.model.training else super().train(mode)
-
-    @property
-    def views_per_iteration(self) -> int:
-        """Number of views in a step, at most as many as there are."""
-        return self.model.plan.views_per_iteration
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
@@ -135,7 +124,8 @@ class SadgsPipeline(VanillaPipeline):
         depths = means @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]  # [N, C]
         near = self.model.near_plane
         drawn = ((depths > near) & (depths < FAR_PLANE)).any(dim=1)
-        share = self.world.sum(drawn.float().mean().to(self.world.device)) / self.world.num_ranks
+        world = self.model.world
+        share = world.sum(drawn.float().mean().to(world.device)) / world.num_ranks
         if share < 0.01:
             extent = float(self.model.strategy_state["scene_scale"])
             raise InputError(
@@ -159,7 +149,7 @@ class SadgsPipeline(VanillaPipeline):
             warn(f"The same in {len(problems) - _NAMED_STEPS} more of the last iterations.")
         enough = nonfinite.DIVERGED_STEPS if not last else min(nonfinite.DIVERGED_STEPS, self.log.steps)
         lasts, gradient = bool(problems) and self.log.streak >= enough, self._means_gradient
-        if self.world.all(lasts and gradient is not None and nonfinite.has_no_update(gradient)):
+        if self.model.world.all(lasts and gradient is not None and nonfinite.has_no_update(gradient)):
             step, _, problem = problems[-1]
             names = [files[view].name for view in dict.fromkeys(view for _, views, _ in problems for view in views)]
             more = f" and {len(names) - _NAMED_STEPS} more" if len(names) > _NAMED_STEPS else ""
@@ -190,9 +180,9 @@ class SadgsPipeline(VanillaPipeline):
         self._repeat_overflowed()
         model = self.model
         groups: dict[tuple[int, ...], list[tuple[int, dict[str, Any]]]] = defaultdict(list)
-        for index, data in self.views.draw(self.views_per_iteration):
+        for index, data in self.views.draw(model.plan.views_per_iteration):
             # With several processes, some images are composited, and loaded, by others only.
-            groups[data["image"].shape if self.world.alone else self.views.sizes[index]].append((index, data))
+            groups[data["image"].shape if model.world.alone else self.views.sizes[index]].append((index, data))
         result = []
         for (height, width, *_), views in groups.items():
             indices, data = [index for index, _ in views], [data for _, data in views]

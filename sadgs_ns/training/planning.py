@@ -101,7 +101,7 @@ def plan_run(
     optimizers = {name: group for name, group in config.optimizers.items() if name in groups}
     return RunPlan(
         **vars(length),
-        devices=pipeline.world.num_ranks,
+        devices=model.world.num_ranks,
         images=pipeline.datamanager.config.cache_images,
         near_plane=model.near_plane if options.model.near_plane is None else options.model.near_plane,
         max_off_axis=options.model.max_off_axis,
@@ -139,7 +139,7 @@ def _print_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: S
 def _cap_in_memory(options: SadgsPipelineConfig, pipeline: SadgsPipeline, views: int) -> int:
     """Return the cap of Gaussians that the devices' memory allows, and print what decided it."""
     params: Any = pipeline.model.gauss_params
-    world, cap = pipeline.world, options.model.strategy.max_gaussians
+    world, cap = pipeline.model.world, options.model.strategy.max_gaussians
     size = training_size(pipeline.datamanager, views, world.num_ranks)
     cap, line = fit_to_memory(cap, params, size, options.memory_budget_gb, world.num_ranks)
     note(line)

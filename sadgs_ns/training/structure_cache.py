@@ -64,7 +64,7 @@ class StructureCache:
         All processes pass the same views; the one that composites a view's first rows computes its S̄.
         """
         self.fill()
-        world, data, (height, width) = self.views.world, dict(views), self.views.sizes[views[0][0]]
+        world, data, (height, width) = self.views.model.world, dict(views), self.views.sizes[views[0][0]]
         found = {index: self[index] for index in data if index in self._kept}
         ranks = first_ranks(share_rows(len(views), height, world.num_ranks))
         missing = {index: ranks[place] for place, (index, _) in enumerate(views) if index not in found}

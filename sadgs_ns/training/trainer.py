@@ -27,7 +27,7 @@ from sadgs_ns.training import checkpoints, interrupts, processes
 from sadgs_ns.training.compilation import compile_kernels
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.cuda_graphs import GraphedSteps
-from sadgs_ns.training.interrupts import HANG_UP, SIGNALS, Interrupted, Interrupts
+from sadgs_ns.training.interrupts import SIGNALS, Interrupted, Interrupts
 from sadgs_ns.training.optimizers import SadgsOptimizers
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.planning import one_device_is_quicker, plan_length, plan_run
@@ -258,7 +258,7 @@ class SadgsTrainer(Trainer):
         self.world.flags_out = int(time.monotonic() >= self._save_due) | bit
         pipeline, model, graphed = self.pipeline, self.pipeline.model, self.graphed
         if graphed is not None and model.tile_forecast is not None:
-            model.tile_forecast.round_to_powers = graphed.prepare(pipeline.views_per_iteration)
+            model.tile_forecast.round_to_powers = graphed.prepare(model.plan.views_per_iteration)
         groups, update = pipeline.next_views(step), self.optimizers.update()
         inputs = groups, model.opacity_reg_now, update
         factors, slot = update.factors(), pipeline.log.slot
@@ -323,7 +323,7 @@ class SadgsTrainer(Trainer):
             file = write_config(config) if processes.is_rank_zero() else self.base_dir / "config.yml"
             command = shlex.join(["ns-train", str(config.method_name), "--load-config", str(file)])
             text = f"{interrupted}: stopped and saved after {done} of {total} iterations; resume with: {command}"
-        if interrupted.number == HANG_UP:  # Some systems take the terminal away later.
+        if interrupted.number == signal.SIGHUP:  # Some systems take the terminal away later.
             interrupts.discard_broken_output()
         note(text)
         self.world.all(True)  # As soon as one process has ended, the others are ended.

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from sadgs_ns.data.cameras import check_undistortion
 from sadgs_ns.distributed.bands import views_of_rank
-from sadgs_ns.distributed.world import World
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training.images import ImagePrefetcher, thread_count
 from sadgs_ns.training.model import SadgsModel
@@ -82,11 +81,6 @@ class TrainingViews:
         self.model = model
         self.sampler = ViewSampler(len(datamanager.train_dataset), datamanager.config.train_cameras_sampling_seed)
 
-    @property
-    def world(self) -> World:
-        """The processes of the run, each of which composites its share of a step."""
-        return self.model.world
-
     def __len__(self) -> int:
         """Number of training views."""
         return self.sampler.num_views
@@ -119,7 +113,7 @@ class TrainingViews:
             cached, device = self.datamanager.cached_train, self.model.device
             return [(i, {**cached[i], "image": cached[i]["image"].to(device, non_blocking=True)}) for i in indices]
         data = prefetcher.take(self._composited(indices))
-        share, threads = math.ceil(number / self.world.num_ranks), prefetcher.threads
+        share, threads = math.ceil(number / self.model.world.num_ranks), prefetcher.threads
         steps = [self._composited(step) for step in self.sampler.foresee(number, 2 + math.ceil(threads / share))]
         # The number of views under way is the same in each step, so that none is forgotten before its step.
         most = max(threads + 2 * share, len(steps[0]))
@@ -128,9 +122,10 @@ class TrainingViews:
 
     def _composited(self, indices: Sequence[int]) -> list[int]:
         """Return the views of a step, each once, of which this process composites rows."""
-        if not self.world.alone:
+        world = self.model.world
+        if not world.alone:
             sizes = tuple(self.sizes[index] for index in indices)
-            indices = [indices[position] for position in views_of_rank(sizes, self.world.num_ranks, self.world.rank)]
+            indices = [indices[position] for position in views_of_rank(sizes, world.num_ranks, world.rank)]
         return list(dict.fromkeys(indices))
 
     def close(self) -> None:

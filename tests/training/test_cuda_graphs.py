@@ -36,7 +36,7 @@ class Rerun:
         self.function = function
         self.results: Results | None = None
 
-    def replay(self) -> Results:
+    def __call__(self) -> Results:
         now = self.function()
         if self.results is None:
             self.results = now

@@ -49,7 +49,7 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig
 
 
 @pytest.mark.hard_case(
-    "accumulated gradients; several devices on the CPU without torchrun; CUDA or MPS on a machine without one; "
+    "accumulated gradients; several devices on the CPU without torchrun; CUDA on a machine without it; "
     "a seed of −1 or 2³²; `--scale-factor`, `--camera-res-scale-factor` or `--train-split-fraction` of 0, −1 "
     "or NaN; `--eval-interval` 0, 1, −2; learning rates outside [0, 1], NaN or 10⁹; schedule factors that are "
     "not positive or leave that range; negative distances between checkpoints; a port beyond 65535; "
@@ -68,7 +68,6 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig
         ("machine.num_devices", 0, "machine.num_devices must be at least 1, got 0."),
         ("machine.num_machines", 2, "machine.num_machines is 2, and sadgs trains on several machines with torchrun: "),
         ("machine.device_type", "cuda", "machine.device_type is cuda, but torch finds no CUDA device: set it to cpu,"),
-        ("machine.device_type", "mps", "machine.device_type is mps, but torch finds no MPS device: set it to cpu, or "),
         (
             "pipeline.datamanager.cache_images_type",
             "float32",
@@ -156,7 +155,7 @@ def test_options_with_which_no_run_can_work_are_refused_before_anything_is_writt
     option: str, value: Any, sentence: str, config: SadgsTrainerConfig
 ):
     needs_none = value == "cuda" or (option == "machine.num_devices" and value == 2)
-    if (needs_none and torch.cuda.is_available()) or (value == "mps" and torch.backends.mps.is_available()):
+    if needs_none and torch.cuda.is_available():
         pytest.skip("there is a device of this kind")
     owner: Any = config
     *owners, name = option.split(".")

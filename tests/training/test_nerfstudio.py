@@ -149,7 +149,7 @@ def test_an_iteration_takes_no_more_views_than_there_are(
     seen: list[list[int]] = []
     draw = ViewSampler.draw
     monkeypatch.setattr(ViewSampler, "draw", lambda *args: seen.append(draw(*args)) or seen[-1])
-    assert train(config).pipeline.views_per_iteration == TRAIN_VIEWS
+    assert train(config).pipeline.model.plan.views_per_iteration == TRAIN_VIEWS
     assert len(seen) == 3 and all(sorted(drawn) == list(range(TRAIN_VIEWS)) for drawn in seen), "a round each"
 
 
