@@ -1,7 +1,7 @@
 """Colour scales, their legends, and pictures with a scale beside them.
 
-The colour maps are those of matplotlib that colour-blind readers can tell apart. Figures and fonts take a fifth of a
-second to import, and training needs none, so functions import them.
+The colour maps are those of matplotlib that colour-blind readers can tell apart. It takes a third of a second to
+import, and training needs it only where a viewer shows it, so functions import it.
 """
 
 from __future__ import annotations
@@ -15,10 +15,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import matplotlib
 import numpy as np
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Colormap, LogNorm, Normalize
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -26,6 +23,7 @@ from sadgs_ns.files import atomic_path
 
 if TYPE_CHECKING:
     from matplotlib.colorbar import Colorbar
+    from matplotlib.colors import Colormap, Normalize
     from matplotlib.figure import Figure
 
 Picture = NDArray[np.uint8]
@@ -50,11 +48,15 @@ class Scale:
     @property
     def norm(self) -> Normalize:
         """Maps values to [0, 1]; values beyond the ends get the colours of the ends."""
+        from matplotlib.colors import LogNorm, Normalize
+
         return (LogNorm if self.log else Normalize)(self.low, self.high, clip=True)
 
     @property
     def colormap(self) -> Colormap:
         """Maps [0, 1] to colours."""
+        import matplotlib
+
         return matplotlib.colormaps[self.colors].with_extremes(bad=NOTHING)
 
     def __call__(self, values: Tensor) -> Picture:
@@ -97,6 +99,8 @@ def bar(scale: Scale) -> bytes:
 
 def _add_bar(figure: Figure, scale: Scale, **place: Any) -> Colorbar:
     """Add a bar of colours to a figure, with `place` as `Figure.colorbar` takes it."""
+    from matplotlib.cm import ScalarMappable
+
     form = f"%.2g {scale.unit}".rstrip()
     bar = figure.colorbar(ScalarMappable(scale.norm, scale.colormap), ticks=scale.ticks, format=form, **place)
     bar.minorticks_off()

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from gsplat.utils import normalized_quat_to_rotmat
-from matplotlib.colors import hsv_to_rgb
 from torch import Tensor
 
 from sadgs_ns.method.eta import WAVELENGTH_EPSILON, wavelength
@@ -90,6 +89,8 @@ def normals_map(params: Mapping[str, Tensor], camera: Cameras, drawing: RenderOp
 
 def random_colors(number: int, generator: torch.Generator) -> Tensor:
     """Return N bright colours in [0, 1] that tell neighbouring Gaussians apart, on the CPU. [N, 3]"""
+    from matplotlib.colors import hsv_to_rgb  # Training does not need it.
+
     hue, saturation, value = torch.rand((3, number), generator=generator)
     hsv = torch.stack([hue, 0.35 + 0.65 * saturation, 0.5 + 0.5 * value], -1)
     return torch.from_numpy(hsv_to_rgb(hsv.numpy())).float()

@@ -1,0 +1,46 @@
+"""The start of training in `sadgs`: what `ns-train sadgs` does, without the import of all that nerfstudio has."""
+
+from __future__ import annotations
+
+import copy
+import random
+import sys
+
+import numpy as np
+import torch
+import tyro
+from tyro.conf import FlagConversionOff, SuppressFixed
+
+from sadgs_ns.training.deferred_imports import import_nerfstudio
+
+import_nerfstudio()  # It precedes what imports nerfstudio.
+
+from sadgs_ns.training import trainer  # noqa: E402, F401 - a run's config imports it when it begins
+from sadgs_ns.training.config import SadgsTrainerConfig  # noqa: E402
+from sadgs_ns.training.presets import sadgs  # noqa: E402
+
+
+def train() -> None:
+    """Do what `ns-train` does with `sys.argv`, whose first two words are `ns-train sadgs`."""
+    config = tyro.cli(
+        SuppressFixed[FlagConversionOff[SadgsTrainerConfig]],  # as nerfstudio annotates its methods
+        prog=" ".join(sys.argv[:2]),
+        args=sys.argv[2:],
+        default=copy.deepcopy(sadgs.config),
+    )
+    if config.data:
+        config.pipeline.datamanager.data = config.data
+    config.set_timestamp()
+    config.save_config()
+    if config.machine.num_devices > 1:
+        from nerfstudio.scripts.train import launch, train_loop
+
+        launch(train_loop, config.machine.num_devices, config.machine.num_machines, config=config)
+        return
+    torch.backends.cudnn.benchmark = True
+    random.seed(config.machine.seed)
+    np.random.seed(config.machine.seed)
+    torch.manual_seed(config.machine.seed)
+    run = config.setup(local_rank=0, world_size=1)
+    run.setup()
+    run.train()
