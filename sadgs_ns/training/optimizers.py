@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from inspect import unwrap
 from typing import Any
 
 import torch
@@ -24,6 +25,10 @@ _ONE = torch.tensor(1.0, device="cpu")
 
 class FusedAdam(Adam):
     """torch's fused Adam of one parameter, or its state that our kernel updates."""
+
+    # Around these methods torch has others that import its compiler, which takes a second.
+    add_param_group, state_dict = unwrap(Adam.add_param_group), unwrap(Adam.state_dict)
+    load_state_dict, step = unwrap(Adam.load_state_dict), torch.no_grad()(unwrap(Adam.step))
 
     def __init__(self, params: Iterable[Tensor], **options: Any) -> None:
         (parameter,) = params
