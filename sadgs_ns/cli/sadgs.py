@@ -46,7 +46,7 @@ from sadgs_ns.training.interrupts import Interrupts, redirect_on_broken_pipe
 
 _OURS = ("data", "output-dir", "experiment-name", "timestamp", "vis", "load-dir", "load-checkpoint", "load-config")
 """Options of ns-train that this command sets."""
-_TRAINING = "nerfstudio.scripts.train:entrypoint"
+_TRAINING = "sadgs_ns.training.start:train"
 _LOCK_SECONDS = 10.0
 """Time in which the last stage of a killed run may save."""
 _FORMATS = [suffix[1:] for suffix in (*FORMATS, MESH)]
@@ -154,7 +154,7 @@ class PhotosToSplat:
         with locked(self.folder, refusal, _LOCK_SECONDS) as self._lock, contextlib.ExitStack() as self._workers:
             self._read_settings()  # Another run may have gone on meanwhile.
             self._note()
-            # Importing nerfstudio takes some 12 s, in which cameras can be found.
+            # Meanwhile it imports what training needs.
             needs_training = not self._trained() or (not self._camera_file and photos_added(self.source, self._scene))
             self._trainer = self.worker("training", _TRAINING) if needs_training else None
             for name, stage in STAGES.items():
@@ -303,7 +303,7 @@ class PhotosToSplat:
         line.update("going on" if begun else "starting")
         command = ["ns-train", "sadgs", "--data", os.path.abspath(self._data)]
         command += ["--output-dir", str(self.folder.absolute()), "--experiment-name", "training"]
-        command += ["--timestamp", self._run.name, "--vis", "tensorboard"]
+        command += ["--timestamp", self._run.name, "--vis", "none"]
         command += ["--steps-per-eval-image", "0", "--pipeline.effort", f"{self.options.effort:g}"]
         command += ["--load-dir", str(self._run.absolute())] if begun else []
         worker = self._trainer or self.worker("training", _TRAINING)

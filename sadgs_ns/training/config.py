@@ -296,9 +296,10 @@ class SadgsTrainerConfig(TrainerConfig):
     """Steps between metrics of all held-out views; 0 is never. `ns-eval` measures them after training."""
     data: Path | None = None
     """Folder of the data."""
-    vis: Literal[
-        "viewer", "wandb", "tensorboard", "comet", "viewer+wandb", "viewer+tensorboard", "viewer+comet", "viewer_legacy"
-    ] = "viewer"
+    vis: Literal[  # type: ignore[assignment]
+        "none", "viewer", "wandb", "tensorboard", "comet",
+        "viewer+wandb", "viewer+tensorboard", "viewer+comet", "viewer_legacy",
+    ] = "viewer"  # fmt: skip
     """Where the run can be watched. With a viewer the command waits at the end, until Ctrl+C."""
     load_dir: Path | None = None
     """Folder of a run, or of its checkpoints, from which the run goes on."""
