@@ -18,7 +18,6 @@ from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradien
 from sadgs_ns.render.rasterization import visible
 
 compositing = pytest.importorskip("sadgs_ns.kernels.compositing", reason="Triton is not installed")
-forward = pytest.importorskip("sadgs_ns.kernels.compositing_forward", reason="Triton is not installed")
 tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not installed")
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -154,7 +153,7 @@ def test_gradients_equal_float64_autograd(kind):
 def drawn_by_the_kernel(scene: dict[str, Any]) -> tuple[Tensor, Tensor, Tensor]:
     height, width = scene["v_renders"].shape[1:3]
     splats = (scene[name] for name in NAMES[:4])
-    return forward.composite_forward(*splats, width, height, scene["starts"], scene["ids"])
+    return compositing.composite_forward(*splats, width, height, scene["starts"], scene["ids"])
 
 
 @pytest.mark.parametrize("kind", TOLERANCES)
