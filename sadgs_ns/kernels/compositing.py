@@ -79,11 +79,11 @@ def split4(values):
 
 
 @triton.jit
-def load_gaussians(means2d, conics, colors, opacities, g):
+def load_gaussians(means2d, conics, colors, opacities, g, FLAWS: tl.constexpr):
     """Load centre and opacity, conic, and colour of the Gaussians with indices g [N, 1] into three blocks [N, 4].
 
-    Triton spreads a block over the threads if it has at least as many values; of a smaller one every thread would load
-    everything.
+    With FLAWS, 1 stands beside a colour that is not finite, else 0. Triton spreads a block over the threads if it has
+    at least as many values; of a smaller one every thread would load everything.
     """
     k = tl.arange(0, 4)[None, :]
     centres = tl.load(tl.where(k < 2, means2d + 2 * g + k, opacities + g))
@@ -91,7 +91,12 @@ def load_gaussians(means2d, conics, colors, opacities, g):
     rgb = tl.load(colors + 3 * g + k)
     # A colour that is not finite makes the pixels that see it NaN. Elsewhere its weight is 0, but 0 · NaN would reach
     # the gradients of the Gaussians in front of it: here it counts as 0.
-    return centres, tl.load(conics + 3 * g + k), tl.where(tl.abs(rgb) < float("inf"), rgb, 0.0)
+    finite = tl.abs(rgb) < float("inf")
+    rgb = tl.where(finite, rgb, 0.0)
+    if FLAWS:
+        flaw = tl.max(tl.where(finite, 0.0, 1.0), axis=1)[:, None]
+        rgb = tl.where(tl.arange(0, 4)[None, :] == 3, flaw, rgb)
+    return centres, tl.load(conics + 3 * g + k), rgb
 
 
 @triton.jit
@@ -143,16 +148,6 @@ def alphas(dx, dy, a, b, c, opacity, limit):
     return tl.where(seen, tl.minimum(alpha, 0.999), 0.0)
 
 
-@triton.jit
-def _load_with_flaws(means2d, conics, colors, opacities, g):
-    """Load what `load_gaussians` loads, with 1 beside a colour that is not finite, else 0."""
-    centres, conic, rgb = load_gaussians(means2d, conics, colors, opacities, g)
-    k = tl.arange(0, 4)[None, :]
-    value = tl.load(colors + 3 * g + tl.minimum(k, 2))
-    flaw = tl.max(tl.where(tl.abs(value) < float("inf"), 0.0, 1.0), axis=1)[:, None]
-    return centres, conic, tl.where(k == 3, flaw, rgb)
-
-
 @triton.jit(do_not_specialize=["num_pairs", "height", "width", "tile_width", "tile_height"])
 def _composite_forward(
     means2d, conics, colors, opacities, starts, ids, renders, drawn_alphas, last_ids,
@@ -176,7 +171,7 @@ def _composite_forward(
     rows = tl.arange(0, GAUSSIANS)
     first_row = rows[:, None] == 0
     next_g = tl.load(ids + tl.minimum(start + rows, num_pairs - 1))
-    next_centre, next_conic, next_rgb = _load_with_flaws(means2d, conics, colors, opacities, next_g[:, None])
+    next_centre, next_conic, next_rgb = load_gaussians(means2d, conics, colors, opacities, next_g[:, None], True)
     done = start
     while (done < end) & (tl.max(passed) > OPAQUE):
         position = done + rows
@@ -186,7 +181,7 @@ def _composite_forward(
         # The next batch is loaded while this one is computed.
         done += GAUSSIANS
         next_g = tl.load(ids + tl.minimum(done + rows, num_pairs - 1))
-        next_centre, next_conic, next_rgb = _load_with_flaws(means2d, conics, colors, opacities, next_g[:, None])
+        next_centre, next_conic, next_rgb = load_gaussians(means2d, conics, colors, opacities, next_g[:, None], True)
 
         limit = highest_alpha(position < end, opacity)[:, None]
         dx = (mean_x - centre_x)[:, None] * SCALE - scaled_x[None, :]
@@ -225,19 +220,15 @@ def composite_forward(
         that a pixel drew, int32 [C, height, width].
     """
     views, tile_height, tile_width = isect_offsets.shape
-    if not len(flatten_ids):
-        return (
-            means2d.new_zeros((views, height, width, 3)),
-            means2d.new_zeros((views, height, width, 1)),
-            flatten_ids.new_zeros((views, height, width)),
-        )
-    renders, alphas = means2d.new_empty((views, height, width, 3)), means2d.new_empty((views, height, width, 1))
-    last_ids = flatten_ids.new_empty((views, height, width))
-    _composite_forward[(isect_offsets.numel(),)](
-        means2d, conics, colors, opacities, isect_offsets, flatten_ids, renders, alphas, last_ids,
-        len(flatten_ids), height, width, tile_width, tile_height, TILE_SIZE, _GAUSSIANS,
-        num_warps=_WARPS, num_stages=1,
-    )  # fmt: skip
+    make = means2d.new_empty if len(flatten_ids) else means2d.new_zeros
+    renders, alphas = make((views, height, width, 3)), make((views, height, width, 1))
+    last_ids = make((views, height, width), dtype=flatten_ids.dtype)
+    if len(flatten_ids):
+        _composite_forward[(isect_offsets.numel(),)](
+            means2d, conics, colors, opacities, isect_offsets, flatten_ids, renders, alphas, last_ids,
+            len(flatten_ids), height, width, tile_width, tile_height, TILE_SIZE, _GAUSSIANS,
+            num_warps=_WARPS, num_stages=1,
+        )  # fmt: skip
     return renders, alphas, last_ids
 
 
@@ -309,7 +300,7 @@ def _composite_backward(
     rows = tl.arange(0, GAUSSIANS)
     first_row = rows[:, None] == 0
     next_g = tl.load(ids + tl.minimum(tl.maximum(end - 1 - rows, start), num_pairs - 1))
-    next_centre, next_conic, next_rgb = load_gaussians(means2d, conics, colors, opacities, next_g[:, None])
+    next_centre, next_conic, next_rgb = load_gaussians(means2d, conics, colors, opacities, next_g[:, None], False)
     for done in range(0, end - start, GAUSSIANS):
         position = end - 1 - done - rows
         g = next_g
@@ -318,7 +309,7 @@ def _composite_backward(
         r, g_, b_, _ = split4(next_rgb)
         # The next batch is loaded while this one is computed.
         next_g = tl.load(ids + tl.maximum(position - GAUSSIANS, start))
-        next_centre, next_conic, next_rgb = load_gaussians(means2d, conics, colors, opacities, next_g[:, None])
+        next_centre, next_conic, next_rgb = load_gaussians(means2d, conics, colors, opacities, next_g[:, None], False)
         mean_x -= centre_x
         mean_y -= centre_y
 

@@ -14,7 +14,7 @@ import triton.language as tl
 from torch import Tensor
 
 from sadgs_ns.kernels import cdiv
-from sadgs_ns.kernels.shared import drawn, load3, store3
+from sadgs_ns.kernels.shared import drawn, equally_spaced_rows, load3, store3
 
 MAX_DEGREE = 3
 """Highest degree that the kernels know."""
@@ -192,13 +192,11 @@ class _Colors(torch.autograd.Function):
         # The kernel writes up to degree MAX_DEGREE; beyond that nothing depends on coefficients.
         written = rest.shape[1] < (MAX_DEGREE + 1) ** 2
         v_rest = torch.empty_like(rest) if written else torch.zeros_like(rest)
-        row, stride = v_colors.stride(1), rest.shape[1] * 3
-        if v_colors.stride() != (n * row, row, 1):  # parts of rows, which compositing makes, are read where they lie
-            v_colors, row = v_colors.contiguous(), 3
+        v_colors, row = equally_spaced_rows(v_colors, colors)
         for start in range(0, num_views, _VIEWS):
             _backward[cdiv(n, _BACKWARD_LANES),](
                 means, viewmats, rest, radii, colors, v_colors, v_means, v_first, v_rest,
-                n, start, num_views, ctx.used, stride, row, radii.dim() - 1, _BACKWARD_LANES, _VIEWS,
+                n, start, num_views, ctx.used, rest.shape[1] * 3, row, radii.dim() - 1, _BACKWARD_LANES, _VIEWS,
             )  # fmt: skip
         return v_means, v_first, v_rest, None, None, None
 

@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 from sadgs_ns import gsplat_compat
 from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.kernels import cdiv
-from sadgs_ns.kernels.shared import drawn, load3, rotation, store3
+from sadgs_ns.kernels.shared import drawn, equally_spaced_rows, load3, rotation, store3
 
 _LANES = 128
 """Gaussians that one program handles."""
@@ -165,16 +165,6 @@ def _project_backward(
     store3(v_quats, 4 * g + 1, v_qx, v_qy, v_qz, exists)
 
 
-def _rows(gradient: Tensor | None, like: Tensor) -> tuple[Tensor, int]:
-    """Return a gradient [C, N, D] whose rows are equally far apart, and how many numbers; zeros where there is none."""
-    if gradient is None:
-        gradient = torch.zeros_like(like)
-    row = gradient.stride(1)
-    if gradient.stride() != (gradient.shape[1] * row, row, 1):  # compositing's, parts of rows, are read where they lie
-        gradient, row = gradient.contiguous(), gradient.shape[2]
-    return gradient, row
-
-
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(  # type: ignore[override]
@@ -199,7 +189,8 @@ class _Project(torch.autograd.Function):
     ) -> tuple[Tensor | None, ...]:  # fmt: skip
         means, quats, scales, viewmats, Ks, radii, means2d, conics = ctx.saved_tensors
         v_means, v_quats, v_scales = torch.empty_like(means), torch.empty_like(quats), torch.empty_like(scales)
-        (v_means2d, row2d), (v_conics, row_conic) = _rows(v_means2d, means2d), _rows(v_conics, conics)
+        v_means2d, row2d = equally_spaced_rows(v_means2d, means2d)
+        v_conics, row_conic = equally_spaced_rows(v_conics, conics)
         # The kernel reads no tensor that stands in for one that is None.
         depths, passed = (conics if value is None else value.contiguous() for value in (v_depths, v_passed))
         n = len(means)

@@ -1,9 +1,11 @@
-"""Functions that several kernels call."""
+"""Functions that several kernels call, or their launches."""
 
 from __future__ import annotations
 
+import torch
 import triton
 import triton.language as tl
+from torch import Tensor
 
 
 @triton.jit
@@ -38,3 +40,16 @@ def rotation(w, x, y, z):
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     )  # fmt: skip
+
+
+def equally_spaced_rows(gradient: Tensor | None, like: Tensor) -> tuple[Tensor, int]:
+    """Return a gradient [C, N, D] whose rows are equally far apart, and how many numbers; zeros where there is none.
+
+    Compositing's gradients, which are parts of rows, are read where they lie.
+    """
+    if gradient is None:
+        gradient = torch.zeros_like(like)
+    row = gradient.stride(1)
+    if gradient.stride() != (gradient.shape[1] * row, row, 1):
+        gradient, row = gradient.contiguous(), gradient.shape[2]
+    return gradient, row
