@@ -3,11 +3,11 @@
 Each view is compared with a few neighbours, which see the same points from other directions. A hypothesis is an inverse
 depth: it says where a pixel lies in a neighbour. The windows around both places are compared by their zero-mean
 normalised cross-correlation (NCC), which ignores exposure. The coarsest level tests the view's whole range of depths,
-and each finer level tests a few hypotheses around the depth that is known so far. In the end, a depth counts only where
-the depth maps of neighbours agree with it.
+each finer level a few hypotheses around the depth known so far. In the end, a depth counts only where the depth maps of
+neighbours agree with it.
 
-Depths are inverse: pixels move evenly with them, and planes are linear functions of the pixel. Places in a picture are
-those of `grid_sample`: the picture spans [−1, 1]² on every level.
+Pixels move evenly with inverse depth, and planes are linear in it. Places in a picture are those of `grid_sample`: it
+spans [−1, 1]² on every level.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class _View:
 
 @torch.no_grad()
 def depth_maps(
-    images: Sequence[Tensor] | Callable[[int], Tensor],
+    images: Callable[[int], Tensor],
     viewmats: Tensor,
     Ks: Tensor,
     points: Tensor,
@@ -101,16 +101,13 @@ def depth_maps(
 ) -> list[DepthMap]:
     """Compute a depth map with confidence for each view of a capture.
 
-    Nothing is random. After the images are read, the host waits for the device only to choose neighbours. Raises
-    ValueError if an image or a mask has another shape or type, or their numbers differ.
+    Nothing is random. Raises ValueError if an image or a mask has another shape or type, or their numbers differ.
 
     Args:
-        images: Of all views, or a function that returns a view's. They may lie anywhere and differ in size. uint8, or
-            floating point in [0, 1]. RGB is multiplied by alpha; pixels with an alpha under 0.5 are masked.
-            Each [H, W, 3 or 4]
+        images: Returns a view's image, which may lie anywhere and have any size. uint8, or floating point in [0, 1].
+            RGB is multiplied by alpha; pixels with an alpha under 0.5 are masked. [H, W, 3 or 4]
         viewmats, Ks: As `render.types.Cameras`, of the images; the centre of the first pixel is (0.5, 0.5).
-        points: Points on surfaces, as from structure from motion, in world units. They only tell which views see the
-            same things, and how far away things are. [P, 3]
+        points: Points on surfaces, in world units, which tell what the views see, and how far away it is. [P, 3]
         masks: Valid pixels of each view, or None for all. Others get no depth, and nothing is compared with them.
             Each bool [H, W]
         device: Where to compute. The results lie there.
@@ -120,15 +117,15 @@ def depth_maps(
         has no usable neighbour.
     """
     count, device = len(viewmats), torch.device(device)
-    given = [len(Ks)] + ([] if callable(images) else [len(images)]) + ([] if masks is None else [len(masks)])
-    if any(number != count for number in given):
-        raise ValueError(f"there are {count} viewmats, but {given} Ks, images and masks")
+    masks = [None] * count if masks is None else masks
+    if not len(Ks) == len(masks) == count:
+        raise ValueError(f"there are {count} viewmats, but {len(Ks)} Ks and {len(masks)} masks")
     # In float64, since positions may be far from the origin, and on the host, which needs the numbers.
     viewmats, Ks = viewmats.to("cpu", torch.float64), Ks.to("cpu", torch.float64, copy=True)
     pyramids, sizes = [], torch.zeros((count, 2), dtype=torch.float64)
     for v in range(count):
-        image = images(v) if callable(images) else images[v]
-        pyramids.append(_pyramid(image, None if masks is None else masks[v], device))
+        image = images(v)
+        pyramids.append(_pyramid(image, masks[v], device))
         sizes[v] = torch.tensor(pyramids[v][0].shape[:0:-1])
         Ks[v, :2] *= (sizes[v] / torch.tensor([image.shape[1], image.shape[0]]))[:, None]
     views, placed = _views(pyramids, viewmats, Ks, sizes, points.to(device)), Ks.to(device, torch.float32)
@@ -148,17 +145,15 @@ def choose_neighbours(
     points: Tensor,  # [P, 3]
     count: int = NEIGHBOURS,
 ) -> Tensor:
-    """Choose the views with which each view is compared, given the arguments of `depths_in_views`.
+    """Choose the views with which each view is compared, given float64 arguments of `depths_in_views`.
 
     Two views gain from every point that both see: less if the angle between their rays is too small or too wide, and
-    less if one of them sees it larger. Occlusion is not known. A view counts less if one that is chosen already lies in
-    the same direction, so that not all of them miss the same places.
+    less if one of them sees it larger. A view counts less if one that is chosen already lies in the same direction, so
+    that not all of them miss the same places.
 
     Returns:
         Indices of views, the best first, and −1 where there are fewer; on the device of the points. int64 [V, count]
     """
-    points = points[:: math.ceil(max(len(points), 1) / _POINTS)]
-    viewmats, Ks, sizes, points = (tensor.to(points.device, torch.float64) for tensor in (viewmats, Ks, sizes, points))
     depths = depths_in_views(points, viewmats, Ks, sizes)
     seen = depths.isfinite()
     centres = viewmats.inverse()[:, :3, 3]  # [V, 3]

@@ -72,7 +72,7 @@ def check(maps: list[DepthMap], planes: str, viewmats: Tensor, share: float = 0.
 @pytest.mark.parametrize("planes", PLANES)
 def test_depths_of_planes_are_found(planes: str):
     images, viewmats, Ks, points = capture(planes)
-    maps = depth_maps(images, viewmats, Ks, points, device="cpu")
+    maps = depth_maps(images.__getitem__, viewmats, Ks, points, device="cpu")
     check(maps, planes, viewmats, 0.8)
     for depth_map, K in zip(maps, Ks, strict=True):
         assert depth_map.depth.shape == depth_map.confidence.shape == (HEIGHT, WIDTH)
@@ -83,7 +83,7 @@ def test_depths_of_planes_are_found(planes: str):
 def test_reduced_images_have_their_depths_at_the_right_pixels(planes: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(stereo, "WORKING_SIDE", 100)
     images, viewmats, Ks, points = capture(planes)
-    maps = depth_maps([(255 * image).round().byte() for image in images], viewmats, Ks, points, device="cpu")
+    maps = depth_maps(lambda v: (255 * images[v]).round().byte(), viewmats, Ks, points, device="cpu")
     assert maps[0].depth.shape == (76, 100)
     check(maps, planes, viewmats)
 
@@ -101,7 +101,7 @@ def test_far_from_the_origin_depths_are_as_good():
     shift = torch.tensor([1e5, -2e5, 1e5]).double()
     moved = viewmats.clone()
     moved[:, :3, 3] -= viewmats[:, :3, :3] @ shift
-    check(depth_maps(images, moved, Ks, points + shift, device="cpu"), "slanted", viewmats, 0.8)
+    check(depth_maps(images.__getitem__, moved, Ks, points + shift, device="cpu"), "slanted", viewmats, 0.8)
 
 
 def test_masked_pixels_have_no_depth_and_are_no_evidence():
@@ -110,20 +110,21 @@ def test_masked_pixels_have_no_depth_and_are_no_evidence():
     mask[30:70, 50:100] = False
     # The same picture stands at the same place of all views, as a watermark does.
     marked = [torch.where(mask[..., None], image, images[0]) for image in images]
-    maps = depth_maps(marked, viewmats, Ks, points, masks=[mask] * 5, device="cpu")
+    maps = depth_maps(marked.__getitem__, viewmats, Ks, points, masks=[mask] * 5, device="cpu")
     check(maps, "slanted", viewmats, 0.6)
     assert not any(depth_map.confidence[~mask].any() or depth_map.depth[~mask].any() for depth_map in maps)
     broken = [torch.where(mask[..., None], image, torch.nan) for image in images]
     transparent = [torch.cat([image, mask[..., None]], dim=2) for image in images]
     for same in (
-        depth_maps(broken, viewmats, Ks, points, masks=[mask] * 5, device="cpu"),
-        depth_maps(transparent, viewmats, Ks, points, device="cpu"),
+        depth_maps(broken.__getitem__, viewmats, Ks, points, masks=[mask] * 5, device="cpu"),
+        depth_maps(transparent.__getitem__, viewmats, Ks, points, device="cpu"),
     ):
         assert all(torch.equal(a.depth, b.depth) for a, b in zip(maps, same, strict=True))
 
 
 def test_repeated_calls_give_the_same():
-    first, second = (depth_maps(*capture("ridge", 2), device="cpu") for _ in range(2))
+    images, *cameras = capture("ridge", 2)
+    first, second = (depth_maps(images.__getitem__, *cameras, device="cpu") for _ in range(2))
     for a, b in zip(first, second, strict=True):
         assert torch.equal(a.depth, b.depth) and torch.equal(a.confidence, b.confidence)
         assert (a.confidence > 0).double().mean() > 0.3
@@ -132,9 +133,9 @@ def test_repeated_calls_give_the_same():
 def test_nothing_is_known_without_texture_neighbours_or_points():
     images, viewmats, Ks, points = capture()
     for empty in (
-        depth_maps([torch.full_like(image, 0.7) for image in images], viewmats, Ks, points, device="cpu"),
-        depth_maps(images[:1], viewmats[:1], Ks[:1], points, device="cpu"),
-        depth_maps(images, viewmats, Ks, points[:0], device="cpu"),
+        depth_maps(lambda v: torch.full_like(images[v], 0.7), viewmats, Ks, points, device="cpu"),
+        depth_maps(images.__getitem__, viewmats[:1], Ks[:1], points, device="cpu"),
+        depth_maps(images.__getitem__, viewmats, Ks, points[:0], device="cpu"),
     ):
         for depth_map in empty:
             assert depth_map.depth.shape == depth_map.confidence.shape == (HEIGHT, WIDTH)
@@ -144,24 +145,19 @@ def test_nothing_is_known_without_texture_neighbours_or_points():
 def test_arguments_that_do_not_fit_are_named():
     images, viewmats, Ks, points = capture(count=2)
     mask = torch.ones((HEIGHT, WIDTH), dtype=torch.bool)
-    for changed, masks in (
-        (images[:1], None),
-        (images, [mask]),
-        (images, [mask, mask[1:]]),
-        (images, [mask, 1 * mask]),
-    ):
+    for masks in ([mask], [mask, mask[1:]], [mask, 1 * mask]):
         with pytest.raises(ValueError, match="masks"):
-            depth_maps(changed, viewmats, Ks, points, masks=masks, device="cpu")
+            depth_maps(images.__getitem__, viewmats, Ks, points, masks=masks, device="cpu")
     for image in (images[0][..., :2], images[0][..., 0], images[0].int()):
         with pytest.raises(ValueError, match="images must be"):
-            depth_maps([image] * 2, viewmats, Ks, points, device="cpu")
+            depth_maps([image, image].__getitem__, viewmats, Ks, points, device="cpu")
 
 
 def test_neighbours_see_the_same_points_from_good_angles():
     y, x = torch.meshgrid(torch.linspace(-20, 20, 40), torch.linspace(-30, 30, 60), indexing="ij")
-    points = torch.stack([x, y, torch.full_like(x, 10)], dim=2).flatten(0, 1)
+    points = torch.stack([x, y, torch.full_like(x, 10)], dim=2).flatten(0, 1)[::2].double()
     Ks, sizes = capture(count=1)[2].expand(9, 3, 3), torch.tensor([[WIDTH, HEIGHT]]).expand(9, 2)
-    viewmats = torch.eye(4).repeat(9, 1, 1)
+    viewmats = torch.eye(4).double().repeat(9, 1, 1)
     for spacing, expected in ((1.2, [2, 3, 5, 6]), (0.3, [0, 1, 7, 8])):
         viewmats[:, 0, 3] = -spacing * torch.arange(9)
         chosen = choose_neighbours(viewmats, Ks, sizes, points)
