@@ -39,16 +39,12 @@ def nearest_depths(
     those of `depths_in_views`. [C]
     """
     points = points[plausible_points(points)]
-    points = points[:: -(-len(points) // _MOST_POINTS) or 1]  # [P, 3]
-    nearest = [points.new_full((0,), torch.inf)]
-    step = max(_PAIRS // max(len(points), 1), 1)
-    for part in (slice(start, start + step) for start in range(0, len(viewmats), step)):
-        depths = depths_in_views(points, viewmats[part], Ks[part], sizes[part])  # [c, P]
-        if len(points) < NEAREST_POINTS:
-            nearest.append(points.new_full((len(depths),), torch.inf))
-        else:
-            nearest.append(depths.kthvalue(NEAREST_POINTS, dim=1).values)
-    return torch.cat(nearest)
+    if len(points) < NEAREST_POINTS:
+        return points.new_full((len(viewmats),), torch.inf)
+    points = points[:: -(-len(points) // _MOST_POINTS)]  # [P, 3]
+    cameras = (tensor.split(max(_PAIRS // len(points), 1)) for tensor in (viewmats, Ks, sizes))
+    depths = (depths_in_views(points, *some) for some in zip(*cameras, strict=True))  # each [c, P]
+    return torch.cat([some.kthvalue(NEAREST_POINTS, dim=1).values for some in depths])
 
 
 def scene_near_plane(

@@ -41,8 +41,13 @@ _ROUNDING_FLOOR = 1e-5
 """Amplitude relative to the brightest pixel under which float32 rounding, not the image, makes the differences."""
 
 
-def gaussian_kernel(sigma: float, order: int = 0, dtype: torch.dtype = torch.float32) -> Tensor:
+@lru_cache(maxsize=256)
+def gaussian_kernel(
+    sigma: float, order: int = 0, dtype: torch.dtype = torch.float32, device: torch.device | None = None
+) -> Tensor:
     """Sample a 1-D Gaussian, or its derivative, for cross-correlation; it is computed in float64. [2·⌈3σ⌉ + 1]
+
+    Kernels are kept on the device: making them anew for each batch of images would take most of the time.
 
     Args:
         sigma: Standard deviation in px, > 0.
@@ -55,13 +60,7 @@ def gaussian_kernel(sigma: float, order: int = 0, dtype: torch.dtype = torch.flo
     if order == 1:
         kernel = x * kernel
         kernel = kernel / (x * kernel).sum()
-    return kernel.to(dtype)
-
-
-@lru_cache(maxsize=256)
-def _kernel(sigma: float, order: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """`gaussian_kernel` [K], kept on the device: to make it anew for each batch of images takes most of the time."""
-    return gaussian_kernel(sigma, order, dtype).to(device)
+    return kernel.to(device=device, dtype=dtype)
 
 
 def multiscale_structure_tensor(
@@ -110,7 +109,7 @@ def multiscale_structure_tensor(
         trace_floors = [(epsilon / brightest.square()).clamp_min(smallest)] * NUM_LEVELS
         weight_floor = (epsilon / brightest**GAMMA).clamp_min(smallest)
     correlate, differentiate, aggregate = _operations(image)
-    # Without masks the weights of all images are the same: one image's are kept.
+    # Without masks all images have the same weights.
     sums = _WeightedSums(valid[:1] if masks is None else valid, masks is not None, correlate)
     numerator = torch.zeros_like(image[:, :1]).repeat(1, 3, 1, 1)  # [B, 3, H, W]
     denominator = weight_floor.expand_as(valid).contiguous()  # [B, 1, H, W]
@@ -123,9 +122,8 @@ def multiscale_structure_tensor(
         rho = INTEGRATION_FACTOR * sigma
         tensor = sums.blur(products, rho), sums.total(rho)
         # Eq. 4, the band energy: E_l² is (I_{l−1} − I_l)², or its mean over a window.
-        window = energy_blur * sigma
         total = torch.ones_like(sums.weight)
-        if window > 0:
+        if (window := energy_blur * sigma) > 0:
             energy, total = sums.blur(energy, window), sums.total(window)
         # Eq. 3 and 5: normalise S_l, and add it with its weight E_l^γ ω_l².
         frequency = frequency_constant / sigma
@@ -210,8 +208,7 @@ class _WeightedSums:
         return self._along(down, sigma, order_y, 2) * self._along(across, sigma, order_x, 3)
 
     def _along(self, image: Tensor, sigma: float, order: int, axis: int) -> Tensor:
-        kernel = _kernel(sigma, order, image.dtype, image.device)
-        return self.correlate(image, kernel, axis)
+        return self.correlate(image, gaussian_kernel(sigma, order, image.dtype, image.device), axis)
 
 
 def _operations(image: Tensor) -> tuple[Callable[..., Tensor], Callable[..., tuple[Tensor, Tensor, Tensor]], Callable]:
@@ -240,15 +237,12 @@ def _correlate(image: Tensor, kernel: Tensor, axis: int) -> Tensor:
 
 
 def _differentiate(
-    blurs: tuple[Tensor, Tensor, Tensor], totals: tuple[Tensor, Tensor, Tensor], weight: Tensor, previous: Tensor
+    blurs: tuple[Tensor, Tensor, Tensor],  # the image's blur and its derivatives along x and y, each [B, C, H, W]
+    totals: tuple[Tensor, Tensor, Tensor],  # the same of the weights, the first positive, each [1 or B, 1, H, W]
+    weight: Tensor,  # [1 or B, 1, H, W]
+    previous: Tensor,  # I_{l−1} [B, C, H, W]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Level I_l from blurs of the image, with the integrands of eq. 2 and 4.
-
-    Args:
-        blurs: The image's blur and its derivatives along x and y. Each [B, C, H, W]
-        totals: The same of the weights, the first positive. Each [1 or B, 1, H, W]
-        weight: Of the pixels. [1 or B, 1, H, W]
-        previous: I_{l−1}. [B, C, H, W]
 
     Returns:
         I_l [B, C, H, W]; and, times the weights, the products xx, xy, yy of its gradient, summed over the channels
@@ -265,20 +259,15 @@ def _differentiate(
 
 
 def _aggregate(
-    tensor: tuple[Tensor, Tensor], energy: tuple[Tensor, Tensor], trace_floor: Tensor,
-    numerator: Tensor, denominator: Tensor, exponent: float, frequency: float,
-) -> None:  # fmt: skip
-    """Add a level to the sums of eq. 5, in place.
-
-    Args:
-        tensor: The blurred products [B, 3, H, W], and the same blur of the weights [1 or B, 1, H, W].
-        energy: The blurred energy [B, 1, H, W], and the same blur of the weights.
-        trace_floor: ε of eq. 3. [B, 1, 1, 1]
-        numerator: [B, 3, H, W]
-        denominator: [B, 1, H, W]
-        exponent: γ / 2.
-        frequency: ω_l in 1/px.
-    """
+    tensor: tuple[Tensor, Tensor],  # blurred products [B, 3, H, W], the same blur of the weights [1 or B, 1, H, W]
+    energy: tuple[Tensor, Tensor],  # blurred energy [B, 1, H, W], the same blur of the weights
+    trace_floor: Tensor,  # ε of eq. 3 [B, 1, 1, 1]
+    numerator: Tensor,  # [B, 3, H, W]
+    denominator: Tensor,  # [B, 1, H, W]
+    exponent: float,  # γ / 2
+    frequency: float,  # ω_l in 1/px
+) -> None:
+    """Add a level to the sums of eq. 5, in place."""
     structure = tensor[0] / tensor[1]  # S_l, eq. 2
     normalised = structure / (structure[:, :1] + structure[:, 2:] + trace_floor)  # Ŝ_l, eq. 3
     weight = (energy[0] / energy[1]).clamp_min(0) ** exponent  # E_l^γ, eq. 4

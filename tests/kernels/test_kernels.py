@@ -244,7 +244,7 @@ def test_structure_tensors_are_the_same_with_the_kernels(monkeypatch, masked, en
         monkeypatch.setattr(structure, "_TILES", {2: (16, 16), 3: (16, 16)})
         monkeypatch.setattr(structure, "_PIXELS", 64)
     monkeypatch.setattr(structure_tensor, "TRUNCATION", 1.5)  # Shorter kernels, which must not be remembered.
-    monkeypatch.setattr(structure_tensor, "_kernel", structure_tensor._kernel.__wrapped__)
+    monkeypatch.setattr(structure_tensor, "gaussian_kernel", structure_tensor.gaussian_kernel.__wrapped__)
     options = {"energy_blur": energy_blur, "epsilon": epsilon}
     expected = multiscale_structure_tensor(images.double(), masks, **options)
     monkeypatch.setattr(kernels, "available", lambda device: True)
