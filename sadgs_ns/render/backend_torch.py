@@ -1,9 +1,7 @@
-"""Gaussian splatting in plain torch, to train and test on a CPU.
+"""Gaussian splatting in plain torch, as gsplat draws, in float32 or float64, on any device.
 
-It draws as gsplat does, with the same cut-offs and tile lists, in float32 or float64, on any device.
-
-Compositing is an autograd function which handles bounded chunks of (pixel, Gaussian) pairs and evaluates them again in
-the backward pass, so that the peak memory does not grow with the number of pairs.
+Compositing handles bounded chunks of (pixel, Gaussian) pairs and evaluates them again in the backward pass, so that the
+peak memory does not grow with the number of pairs.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sadgs_ns.gsplat_compat import FAR_PLANE, RADII_PER_AXIS, SCREEN_BLUR
-from sadgs_ns.render.ewa import MAX_DEGREE, covariances, perspective, spherical_harmonics, world_to_camera
+from sadgs_ns.render.ewa import covariances, perspective, spherical_harmonics, world_to_camera
 from sadgs_ns.render.off_axis import cull_off_axis
 from sadgs_ns.render.types import Cameras, Gaussians, Projected, RenderOptions
 
@@ -25,14 +23,11 @@ TILE_SIZE = 16
 """Size of tiles in px."""
 
 # These are the constants of gsplat's compositing.
-_MAX_ALPHA = 0.999
-_MIN_ALPHA = 1.0 / 255.0
-_MIN_TRANSMITTANCE = 1e-4
+_MAX_ALPHA, _MIN_ALPHA, _MIN_TRANSMITTANCE = 0.999, 1.0 / 255.0, 1e-4
 # exp(-sigma) is invisible long before this. Beyond 87 it would be subnormal, which is many times slower to compute.
 _MAX_SIGMA = 60.0
 
-# This many (pixel, Gaussian) pairs are held at a time at most, unless a segment of one tile has more. About ten
-# temporaries have this many elements.
+# This many (pixel, Gaussian) pairs are held at a time, in ten temporaries, unless a segment of one tile has more.
 _CHUNK_PAIRS = 1 << 18
 # Tile lists are composited in segments of at most this many Gaussians, so that opaque tiles can stop early.
 _SEGMENT = 128
@@ -66,7 +61,6 @@ def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions, begi
     means, quats, scales, opacities, colors = gaussians
     if isinstance(colors, tuple):
         colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
-    _check_shapes(gaussians, cameras, colors, options.sh_degree)
     viewmats, Ks, width, height = cameras
     C, N = len(viewmats), len(means)
     means2d, depths, conics, covars2d, valid = _project(
@@ -81,22 +75,6 @@ def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions, begi
         colors = spherical_harmonics(options.sh_degree, dirs, colors.expand(C, N, -1, 3))
         colors = (colors + 0.5).clamp_min(0.0)
     return Projected(radii, means2d, depths, conics, opacities, colors.expand(C, N, -1), width, height)
-
-
-def _check_shapes(gaussians: Gaussians, cameras: Cameras, colors: Tensor, sh_degree: int | None) -> None:
-    """Raise ValueError if a shape is not what types.py says, or a degree is higher than MAX_DEGREE."""
-    C, N = len(cameras.viewmats), len(gaussians.means)
-    expected = {"means": (N, 3), "quats": (N, 4), "scales": (N, 3), "opacities": (N,)}
-    expected |= {"viewmats": (C, 4, 4), "Ks": (C, 3, 3)}
-    tensors = {**gaussians._asdict(), **cameras._asdict()}
-    for name, shape in expected.items():
-        if tensors[name].shape != shape:
-            raise ValueError(f"{name} has shape {tuple(tensors[name].shape)}, expected {shape}")
-    features = 1 if sh_degree is None else 2
-    if colors.shape[:-features] not in ((N,), (C, N)) or (sh_degree is not None and colors.shape[-1] != 3):
-        raise ValueError(f"colors has shape {tuple(colors.shape)}, which does not fit {C} cameras and {N} Gaussians")
-    if sh_degree is not None and not (sh_degree + 1) ** 2 <= min(colors.shape[-2], (MAX_DEGREE + 1) ** 2):
-        raise ValueError(f"sh_degree {sh_degree} needs {(sh_degree + 1) ** 2} coefficients, got {colors.shape[-2]}")
 
 
 def composite(projected: Projected, options: RenderOptions) -> tuple[Tensor, Tensor, dict[str, Any]]:
@@ -166,19 +144,18 @@ def _radii(means2d: Tensor, covars2d: Tensor, opacities: Tensor, valid: Tensor, 
 def _bin_into_tiles(
     means2d: Tensor,  # [C, N, 2]
     depths: Tensor,  # [C, N]
-    extents: Tensor,  # [C, N, 2]
+    extents: Tensor,  # [C, N, 2], radii along x and y
     width: int,
     height: int,
 ) -> _Tiles:
-    """Make the tiles' lists, as gsplat's `isect_tiles` and `isect_offset_encode` do. `extents` are radii [C, N, 2]."""
-    C, N = depths.shape
-    device, tile_size = means2d.device, TILE_SIZE
-    tile_width, tile_height = math.ceil(width / tile_size), math.ceil(height / tile_size)
+    """Make the tiles' lists, as gsplat's `isect_tiles` and `isect_offset_encode` do."""
+    (C, N), device = depths.shape, means2d.device
+    tile_width, tile_height = math.ceil(width / TILE_SIZE), math.ceil(height / TILE_SIZE)
     n_tiles = tile_width * tile_height
     grid = torch.tensor([tile_width, tile_height], device=device)
     visible = (extents > 0).all(dim=-1)
     # gsplat divides before it adds; the same order rounds to the same tiles.
-    centers, reach = means2d / tile_size, extents / tile_size
+    centers, reach = means2d / TILE_SIZE, extents / TILE_SIZE
     low = (centers - reach).floor().clamp(-1e9, 1e9).long().clamp_min(0).minimum(grid)  # [C, N, 2]
     high = (centers + reach).ceil().clamp(-1e9, 1e9).long().clamp_min(0).minimum(grid)
     spans = (high - low) * visible[..., None]
@@ -197,11 +174,9 @@ def _bin_into_tiles(
     flatten_ids = flatten_ids[keys.argsort(stable=True)]
 
     per_tile = torch.bincount(camera_ids * n_tiles + tile_ids, minlength=C * n_tiles)  # [T]
-    rows, cols = torch.meshgrid(
-        torch.arange(tile_height, device=device), torch.arange(tile_width, device=device), indexing="ij"
-    )
-    origins = (torch.stack([cols, rows], dim=-1) * tile_size).reshape(-1, 2).repeat(C, 1)
-    return _Tiles(tile_size, origins, per_tile.cumsum(0) - per_tile, per_tile, flatten_ids)
+    tops, lefts = (TILE_SIZE * torch.arange(count, device=device) for count in (tile_height, tile_width))
+    origins = torch.cartesian_prod(tops, lefts).flip(1).repeat(C, 1)
+    return _Tiles(TILE_SIZE, origins, per_tile.cumsum(0) - per_tile, per_tile, flatten_ids)
 
 
 class _Composite(torch.autograd.Function):
@@ -219,8 +194,7 @@ class _Composite(torch.autograd.Function):
     ) -> Tensor:
         values = torch.cat([colors, torch.ones_like(colors[..., :1])], dim=-1).flatten(0, 1)  # [C * N, D + 1]
         canvas = values.new_zeros(len(tiles.counts), tiles.size**2, values.shape[-1])
-        # The transmittance at the start of each segment is kept for each chunk, since the backward pass starts from the
-        # last one. Of the pairs of long lists nothing else is kept: one number for `_SEGMENT` pairs.
+        # Of the pairs only the transmittance before each segment is kept: the backward pass begins with the last.
         ctx.starts = []
         for chunk, length in _chunks(tiles):
             starts = [values.new_ones(len(chunk), tiles.size, tiles.size)]
@@ -327,8 +301,7 @@ def _segment_gradients(
     # Nothing flows through a Gaussian that is not drawn or whose alpha is cut off at the top.
     v_sigmas = v_alphas.mul_(alphas).neg_().masked_fill_((weights == 0) | (alphas >= _MAX_ALPHA), 0.0)
 
-    # These are moments of v_sigmas over the pixels. dx depends on the column only and dy on the row only, so that the
-    # other axis is summed first.
+    # Moments over the pixels. dx depends on the column and dy on the row only: the other axis is summed first.
     columns, rows = v_sigmas.sum(dim=1, keepdim=True), v_sigmas.sum(dim=2, keepdim=True)  # [B, 1, S, L], [B, S, 1, L]
     mixed = (v_sigmas * dx).sum(dim=2, keepdim=True)  # [B, S, 1, L]
     total, mx, my, mxx, mxy, myy = (

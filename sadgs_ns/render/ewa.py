@@ -10,8 +10,6 @@ import torch.nn.functional as F
 from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 
-MAX_DEGREE = 3
-"""Highest degree of spherical harmonics."""
 FRUSTUM_MARGIN = 0.3
 """The projection's Jacobian is taken at most this many half images beyond the image's border."""
 
@@ -50,26 +48,21 @@ def perspective(means: Tensor, covars: Tensor, Ks: Tensor, width: int, height: i
 
 
 def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor) -> Tensor:
-    """Evaluate harmonics up to a degree ≤ MAX_DEGREE, in 3DGS's order, without a colour's 0.5. […, 3]
+    """Evaluate harmonics up to a degree ≤ 3, in 3DGS's order, without a colour's 0.5. […, 3]
 
     `dirs` are directions from the camera, of any length […, 3], and `coeffs` at least (degree + 1)² coefficients
     […, K, 3].
     """
     x, y, z = F.normalize(dirs, p=2, dim=-1).unbind(dim=-1)
+    number = (degree + 1) ** 2
     bases = torch.zeros_like(coeffs[..., 0])  # Those of higher degrees stay 0.
-    bases[..., : (degree + 1) ** 2] = torch.stack(_bases(degree, x, y, z), dim=-1)
+    bases[..., :number] = torch.stack(_bases(x, y, z)[:number], dim=-1)
     return (bases[..., None] * coeffs).sum(dim=-2)
 
 
-def _bases(degree: int, x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
+def _bases(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
     """Evaluate the basis of the harmonics at unit vectors; the order of operations decides how gradients round."""
-    bases = [torch.full_like(x, 0.2820947917738781)]
-    if degree == 0:
-        return bases
     along_z, along_x, along_y = 0.48860251190292 * z, -0.48860251190292 * x, -0.48860251190292 * y
-    bases += [along_y, along_z, along_x]
-    if degree == 1:
-        return bases
     z2 = z * z
     tilt = -1.092548430592079 * z
     cos2 = x * x - y * y
@@ -77,9 +70,6 @@ def _bases(degree: int, x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
     b6 = 0.9461746957575601 * z2 - 0.3153915652525201
     b7, b5 = tilt * x, tilt * y
     b8, b4 = 0.5462742152960395 * cos2, 0.5462742152960395 * sin2
-    bases += [b4, b5, b6, b7, b8]
-    if degree == 2:
-        return bases
     ring = -2.285228997322329 * z2 + 0.4570457994644658
     tilt = 1.445305721320277 * z
     cos3 = x * cos2 - y * sin2
@@ -88,4 +78,5 @@ def _bases(degree: int, x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
     b13, b11 = ring * x, ring * y
     b14, b10 = tilt * cos2, tilt * sin2
     b15, b9 = -0.5900435899266435 * cos3, -0.5900435899266435 * sin3
-    return [*bases, b9, b10, b11, b12, b13, b14, b15]
+    b0 = torch.full_like(x, 0.2820947917738781)
+    return [b0, along_y, along_z, along_x, b4, b5, b6, b7, b8, b9, b10, b11, b12, b13, b14, b15]

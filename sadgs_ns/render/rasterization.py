@@ -37,8 +37,6 @@ def project(
     Raises:
         InputError: If `options.backend` cannot draw on this device, or there are more Gaussians or pixels than the
             Triton kernels can address (kernels/limits.py).
-        ValueError: From the torch backend, if a shape does not match. gsplat raises AssertionError, and the Triton
-            kernels do not check shapes.
     """
     return _backend(options.backend, gaussians.means.device).project(gaussians, cameras, options, begin_tiles)
 
@@ -75,9 +73,8 @@ def choose_backend(wanted: BackendName, device: torch.device, alone: bool = True
     """Return which backend draws on a device: "triton", "gsplat" or "torch".
 
     "auto" is Triton where its kernels run, gsplat on CUDA without them, and torch elsewhere. They draw the same, but
-    that gsplat 1.4 cuts Gaussians off at borders of larger tiles. Only Triton predicts the lengths of its tile lists,
-    so only its steps become CUDA graphs. gsplat cannot draw for several processes. Raise InputError if the backend that
-    is wanted does not draw here.
+    that gsplat 1.4 cuts Gaussians off at borders of larger tiles. Only Triton's steps become CUDA graphs, and gsplat
+    cannot draw for several processes. Raise InputError if the backend that is wanted does not draw here.
     """
     chosen: str = wanted
     if wanted == "auto":

@@ -332,21 +332,6 @@ def test_two_cameras_equal_two_calls() -> None:
         assert torch.equal(info["radii"][index], one_info["radii"][0])
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"quats": torch.zeros(3, 4)}, "quats"),
-        ({"Ks": torch.eye(3)}, "Ks"),
-        ({"colors": torch.zeros(3, 3)}, "colors"),
-        ({"colors": torch.zeros(24, 4, 3), "sh_degree": 2}, "sh_degree"),
-        ({"colors": torch.zeros(24, 25, 3), "sh_degree": 4}, "sh_degree"),
-    ],
-)
-def test_wrong_arguments_are_named(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        render(small_scene() | change)
-
-
 class LargestTensor(TorchDispatchMode):
     """Records the number of elements of the largest tensor that any operation returns."""
 
