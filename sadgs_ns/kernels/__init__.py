@@ -74,9 +74,8 @@ def available(device: torch.device) -> bool:
     """Return whether the kernels run on a device.
 
     It must be CUDA's current device, on which Triton launches any tensors, and Triton must compile for it, which needs
-    a C compiler, Python's headers and a GPU that Triton knows. One small kernel is tried, and success is remembered. A
-    failure may pass, such as a full memory, so the kernel is tried again at the 2nd, 4th, 8th, … question. Only the
-    first failure warns.
+    a C compiler, Python's headers and a GPU that Triton knows. One small kernel is tried, and success is remembered. As
+    a failure may pass, it is tried again at the 2nd, 4th, 8th, … question. Only the first failure warns.
     """
     if device.type != "cuda" or device.index not in (None, torch.cuda.current_device()):
         return False

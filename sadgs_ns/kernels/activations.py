@@ -1,7 +1,4 @@
-"""`render.activations.activate` in one kernel forward and one backward.
-
-The torch functions and the mean opacity take five launches forward and six backward, for which small scenes wait.
-"""
+"""`render.activations.activate` in one launch forward and one backward, where torch takes five and six."""
 
 from __future__ import annotations
 
@@ -87,9 +84,6 @@ class _Activate(torch.autograd.Function):
 
 
 def activate(log_scales: Tensor, logits: Tensor, penalty: float) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Do what `render.activations.activate` does, for N > 0 in float32.
-
-    The gradient of the penalty's first part is taken for that of all parts.
-    """
+    """Do what `render.activations.activate` does, for N > 0 in float32."""
     scales, opacities, sums = _Activate.apply(log_scales.contiguous(), logits.contiguous(), penalty / len(logits))  # type: ignore[misc]
     return scales, opacities, sums if penalty > 0 else None

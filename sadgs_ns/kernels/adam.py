@@ -1,7 +1,4 @@
-"""Adam for all parameters in one launch.
-
-On parameters of Gaussians torch's fused Adam reaches a third of the memory's bandwidth.
-"""
+"""Adam for all parameters in one launch; torch's fused Adam reaches a third of the memory's bandwidth on them."""
 
 from __future__ import annotations
 
@@ -33,8 +30,7 @@ def _update(
 ):  # fmt: skip
     """Update a block of one of the parameters, which together are covered by the grid, unless all flags are set.
 
-    The parameters' sizes are computed from `rows` here. If they were passed as a tuple, Triton would specialise the
-    kernel on which of them 16 divides, and compile anew when densification changes that.
+    The sizes are computed from `rows`: of a tuple of them Triton would specialise the kernel on which 16 divides.
     """
     block = tl.program_id(0).to(tl.int64)
     n = rows.to(tl.int64) * WIDTHS[0]
@@ -70,10 +66,7 @@ def _update(
 
 
 def rate_and_scale(step: int, lr: float, betas: tuple[float, float]) -> tuple[float, float]:
-    """Return Adam's factors on the mean of the gradients, and on the root of the mean of their squares.
-
-    They correct the running means, which begin at 0. `step` counts the updates of the parameter from 1.
-    """
+    """Return Adam's factors on the mean of gradients and on the root of their mean square; `step` counts from 1."""
     return lr / (1 - betas[0] ** step), (1 - betas[1] ** step) ** -0.5
 
 

@@ -1,7 +1,6 @@
 """`method.color_matrices.correct_colors` in one kernel forward and one backward.
 
-Matrix products of three columns reach a small part of the memory's bandwidth, above all their derivative by the
-matrices, which is a sum over all pixels.
+Matrix products of three columns are slow, above all their derivative by the matrices, which is a sum over all pixels.
 """
 
 from __future__ import annotations

@@ -2,8 +2,7 @@
 
 gsplat's kernel gives each pixel a thread, which goes through the tile's list Gaussian by Gaussian. Here a warp draws a
 tile of 64 pixels in blocks [Gaussians, pixels]: a thread holds all Gaussians of a batch for its two pixels, so that
-their arithmetic does not wait for one another. The image is the same but for rounding: a weight errs by some 1e-7 of
-itself.
+their arithmetic does not wait for one another. Rounding changes a weight by some 1e-7 of itself.
 
 gsplat's backward pass sums nine quantities per Gaussian over the lanes of a warp, which takes most of its instructions.
 All nine are linear in two numbers per Gaussian and pixel: the weight of the Gaussian's colour, and the gradient of its
@@ -31,8 +30,7 @@ from sadgs_ns.kernels import TILE_SIZE
 from sadgs_ns.kernels.shared import load3, store3
 
 SCALE = tl.constexpr(0.8493218002880191)
-"""√(log2(e) / 2), of offsets in px: exp(-σ) is then exp2 of a plain polynomial. It stands
-on the right of products, as Triton's interpreter needs it."""
+"""√(log2(e) / 2), of offsets in px: exp(-σ) is then exp2 of a plain polynomial."""
 _FAINTEST = tl.constexpr(0x3B808081)
 """Bits of 1/255."""
 _GAUSSIANS, _BACKWARD_GAUSSIANS = 8, 16
@@ -40,9 +38,8 @@ _GAUSSIANS, _BACKWARD_GAUSSIANS = 8, 16
 _WARPS = 1
 """Warps of a program."""
 PRECISION = "tf32x3"
-"""How Triton multiplies float32 on tensor cores. "tf32x3" makes three products of the two parts of 11 bits that each
-factor is cut into. "tf32" makes one, takes a fifth less time and errs by 4e-4 instead of 2e-5; "ieee" takes twice the
-time."""
+"""How Triton multiplies float32 on tensor cores: three products of the two parts of 11 bits of each factor. "tf32" is
+one, takes a fifth less time and errs by 4e-4 instead of 2e-5; "ieee" takes twice the time."""
 _STRIDE = 12
 """Numbers in a row of gradients: centre 2, conic 3, opacity 1, colour 3, the centre's absolute gradient 2, unused 1."""
 

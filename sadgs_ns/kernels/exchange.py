@@ -1,7 +1,4 @@
-"""`pack` and `unpack` of `distributed.exchange` in one launch each.
-
-In torch they take a launch for each tensor, and read every row once for each of its columns.
-"""
+"""`pack` and `unpack` of `distributed.exchange` in one launch each, where torch takes one for each tensor."""
 
 from __future__ import annotations
 

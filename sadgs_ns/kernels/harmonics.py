@@ -126,8 +126,7 @@ def _backward(
 ):  # fmt: skip
     """Add the gradients of VIEWS views to those of the views before `start`.
 
-    Three neighbouring threads have the three channels of a Gaussian, as they lie in memory; a fourth does nothing. Rows
-    of the colours' gradients lie `row` numbers apart.
+    Three threads have a Gaussian's three channels, a fourth does nothing. Rows of `v_colors` lie `row` numbers apart.
     """
     g = tl.program_id(0) * LANES + tl.arange(0, LANES)
     channel = tl.arange(0, 4)[None, :]

@@ -11,9 +11,6 @@ between, have 32. What remains limited, with C views in one step, N Gaussians an
 | pairs of a Gaussian and a tile | MAX_PAIRS | lists of tiles, here and in gsplat, hold their places in 32 bits |
 | C, and images times channels of one batch | MAX_BLOCKS | CUDA launches no more blocks along an axis |
 | H | MAX_HEIGHT | the same: two rows of an image are a block of `structure_tensor` |
-
-N alone is limited by C · N; `adam`, `quantization`, `screen_gradients` and `statistics` have no limit of their
-own.
 """
 
 from __future__ import annotations

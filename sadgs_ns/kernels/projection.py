@@ -1,9 +1,8 @@
 """gsplat's projection with a backward pass of our own, in one launch.
 
-gsplat's backward pass adds with atomic operations, also where there is one view, to gradients that it fills with zeros
-first, and takes contiguous copies of the gradients that compositing gives it in the rows of one tensor. With these
-fills and copies it is eight launches. Here each Gaussian's gradients are summed over the views in registers and written
-once, and what else depends on the centres is added on the way. The formulas are those of gsplat 1.4.0 and 1.5.3.
+gsplat's takes eight: it fills gradients with zeros, copies those that compositing gives it as parts of rows, and adds
+with atomic operations. Here each Gaussian's gradients are summed over the views in registers, and what else depends on
+the centres is added on the way. The formulas are those of gsplat 1.4.0 and 1.5.3.
 """
 
 from __future__ import annotations
@@ -211,8 +210,7 @@ def project(
 
     Returns:
         The results of `gsplat_compat.project`, whose radii may be set to 0 in place until the backward pass; and
-        `means`. Let everything else that depends on the centres take this tensor: the backward kernel then adds its
-        gradient on the way.
+        `means`, for everything else that depends on the centres, whose gradient the backward kernel then adds.
     """
     tensors = (value.contiguous() for value in (means, quats, scales, opacities, viewmats, Ks))
     return _Project.apply(*tensors, width, height, near_plane)  # type: ignore[return-value]

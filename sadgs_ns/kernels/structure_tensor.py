@@ -1,7 +1,6 @@
-"""The three operations of `method.structure_tensor`: convolution along an axis, and what a level does to each pixel
-before and after the convolutions.
+"""The three operations of `method.structure_tensor`.
 
-cuDNN's depthwise convolutions take several times as long for these long kernels, and torch needs forty launches for the
+cuDNN's depthwise convolutions take several times as long for such long kernels, and torch needs forty launches for the
 rest of a level.
 """
 

@@ -22,17 +22,14 @@ from sadgs_ns.kernels.limits import check_pairs
 _LANES = 32
 """Gaussians that one program handles: one warp of them, so that a large Gaussian holds up only 31 others."""
 _FEW_PAIRS, _PART_PAIRS = 64, 256
-"""Largest number of tiles of a Gaussian that one lane lists, and how many tiles a part has on average into which a
-larger Gaussian is cut. A Gaussian may reach all of an image's tiles, which would take a lane, or a program, longer than
-the whole rest of a step."""
+"""Largest number of tiles of a Gaussian that one lane lists, and mean number of tiles of the parts into which a larger
+one is cut. One that reaches all tiles of an image would take a lane, or a program, longer than the rest of a step."""
 _PART_ROWS, _PART_COLUMNS = 4, 8
 """Rows and columns of tiles that a program writes at once, of a part."""
 _PROGRAMS = 4096
-"""Largest number of programs that share out the parts, whose number the host does not know: as many as an H100 runs at
-once, of one warp each."""
+"""Largest number of programs that share out the parts: as many as an H100 runs at once, of one warp each."""
 _PLACE = tl.constexpr(2**24)
-"""Factor on a Gaussian's place in the order by depth, where it is noted with the number of one of its parts. It stands
-on the right of products, as Triton's interpreter needs it."""
+"""Factor on a Gaussian's place in the order by depth, where it is noted with the number of one of its parts."""
 _ORDER_LANES = 512
 """Pairs or tiles that one program handles where the lists are put in order."""
 
@@ -139,8 +136,8 @@ def _list(
     A Gaussian of more than FEW pairs is left to `_list_parts`: each of its parts is noted in `parts`, as _PLACE times
     its place in the order plus the part's number, and counted in `part_count`.
 
-    The rest of the `num_pairs` places is given to the last tile. If there are more pairs than places, this tile gets
-    all places, all radii become 0 and `overflowed` 1: nothing is drawn, and no statistic counts the views.
+    The rest of the `num_pairs` places is given to the last tile, or all of them where they are too few: then all radii
+    become 0 and `overflowed` 1.
     """
     lane = tl.program_id(0) * LANES + tl.arange(0, LANES)
     exists = lane < n
@@ -231,8 +228,7 @@ def _list_parts(
 def _order(tiles, by_tile, ids, ordered, starts, num_pairs, num_tiles, of_pairs, halvings, LANES: tl.constexpr):
     """Bring the Gaussians of the pairs into the order of the tiles, and find where each tile's list starts.
 
-    The first `of_pairs` programs handle LANES pairs each, and the others LANES tiles, whose starts they find by
-    bisection.
+    The first `of_pairs` programs handle LANES pairs each, the others LANES tiles, whose starts are found by bisection.
     """
     program, lane = tl.program_id(0), tl.arange(0, LANES)
     if program < of_pairs:
@@ -257,8 +253,7 @@ class PairCounts:
     """How many pairs of a Gaussian and a tile each view of a call has, on their way to the host."""
 
     counts: Tensor
-    """They are in the host's memory once `arrived` has happened; on the device while a CUDA graph is captured, in which
-    nothing happens yet. int64 [C]"""
+    """In the host's memory once `arrived` has happened; on the device while a CUDA graph is captured. int64 [C]"""
     arrived: torch.cuda.Event | None
     """None where the host need not wait."""
 
@@ -318,8 +313,7 @@ class PendingTiles:
         Lists of a given length have one more row of tiles in each view, which lies below the image. The last tile of
         that row in the last view gets the places that are left, so that nobody draws them. If there are more pairs than
         places, it gets all of them, and the radii that the lists were made of are set to 0: then nothing is drawn, no
-        gradient flows and no statistic counts the views. All of this is decided on the device. Raises InputError if
-        there are more pairs than 32 bits number.
+        gradient flows and no statistic counts the views. Raises InputError if 32 bits do not number the pairs.
         """
         views, rows, columns = self.tile_counts
         if capacity is None:
@@ -376,9 +370,8 @@ def intersect_tiles(
         width / 2, height / 2, max_off_axis * width / 2, max_off_axis * height / 2,
         radii.dim() - 1, tile_size, max_off_axis > 0, _LANES, num_warps=1,
     )  # fmt: skip
-    # The Gaussians are sorted by depth, and then their pairs by tile: in 16 bits up to 4.2 megapixels of all views (in
-    # tiles of 8 px), in 32 beyond. That moves a fraction of the bytes of one sort of the pairs by both in 64 bits. Both
-    # sorts are stable, as gsplat's is.
+    # The Gaussians are sorted by depth, and then their pairs by tile in 16 or 32 bits. That moves a fraction of the
+    # bytes of one sort of the pairs by both in 64 bits. Both sorts are stable, as gsplat's is.
     order = depths.flatten().argsort(stable=True)
     ends = counts[order].cumsum(0)
     per_view = ends[-1:] if num_views == 1 else counts.view(num_views, -1).sum(1)

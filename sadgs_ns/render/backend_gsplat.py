@@ -29,8 +29,7 @@ def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions, begi
 
 def opacities_in_views(opacities: Tensor, num_views: int) -> Tensor:
     """Return opacities [N] once for each view. [C, N]"""
-    # One copy serves the tiles and compositing. `expand` would be slower: torch reduces its gradient over the views ten
-    # times as slowly as it adds.
+    # Torch reduces the gradient of `expand` ten times as slowly as it adds.
     return opacities[None] if num_views == 1 else torch.stack([opacities] * num_views)
 
 

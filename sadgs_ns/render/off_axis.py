@@ -1,8 +1,7 @@
 """Which Gaussians lie too far off a view's axis to be drawn.
 
-The look of a Gaussian is a linear approximation at its centre (EWA splatting). Far off the axis it is wrong: a
-Gaussian beside the camera, near the plane of its lens, covers the image with haze, although none of it is in sight.
-Viewers on the web leave out Gaussians whose centre is 1.2 to 1.4 half images from the image's centre.
+EWA splatting is linear around a Gaussian's centre. Far off the axis that is wrong: a Gaussian beside the camera, which
+is not in sight, covers the image with haze. Viewers on the web leave out what is 1.2 to 1.4 half images off its centre.
 """
 
 from __future__ import annotations

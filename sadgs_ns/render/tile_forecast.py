@@ -11,13 +11,11 @@ from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 MARGIN = 1.25
-"""Factor on the prediction. It was chosen without measurements: larger ones sort more unused places, and smaller ones
-repeat more steps."""
+"""Factor on the prediction, not measured: larger ones sort more unused places, and smaller ones repeat more steps."""
 RECENT = 8
 """Number of the latest visits among which the largest change is taken."""
 MOST_PAIRS = 2**25
-"""Lists longer than this are not foreseen: their unused places would take more than 200 MB, and rendering them takes so
-long that a wait does not matter."""
+"""Longer lists are not foreseen: their unused places would take 200 MB, and beside rendering a wait does not matter."""
 _SMALL = 1000
 """Pairs that are added to both numbers of a change, so that a view of a few Gaussians tells little about others."""
 _LEAST_STEP = 4096
@@ -96,10 +94,7 @@ class TileForecast:
         self._calls.append(_Call(views, size, self._epoch, capacity, counts))
 
     def overflowed(self, *, wait: bool = False) -> list[int]:
-        """Learn from the numbers that have arrived, or wait for all, and return the views of calls that overflowed.
-
-        Such calls needed more places than they had, and therefore drew nothing.
-        """
+        """Learn from the numbers that have arrived, or wait for all; return the views of calls that so drew nothing."""
         lost: list[int] = []
         while self._calls and (wait or self._calls[0].counts.ready()):
             call = self._calls.popleft()
@@ -116,9 +111,6 @@ class TileForecast:
 
 
 def _round_up(number: int, parts: int) -> int:
-    """Round up to one of the steps that divide the way from a power of two to the next into equal parts.
-
-    With 16 parts, at most a sixteenth is added, and the allocator of the device's memory meets sizes that it knows.
-    """
+    """Round up to one of the steps that divide the way from a power of two to the next into equal parts."""
     step = max((1 << number.bit_length() - 1) // parts, _LEAST_STEP)
     return -(-number // step) * step

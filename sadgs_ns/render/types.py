@@ -60,9 +60,8 @@ class RenderOptions:
     absgrad: bool = False
     """Whether `backward` sets `absgrad` of the projected centres, the sum of their absolute gradients. [C, N, 2]"""
     tile_capacity: int | None = None
-    """Number of pairs of a Gaussian and a tile, in all views, for which the Triton backend makes room, so that the host
-    does not wait for the exact number. If there are more, nothing is drawn, no gradient flows and all radii are 0. With
-    None the host waits. The other backends need no such number."""
+    """Number of pairs of a Gaussian and a tile, in all views, for which the Triton backend makes room; None waits for
+    the exact number. If there are more, nothing is drawn, no gradient flows and all radii are 0."""
     backend: BackendName = "auto"
     """The backend that draws (`rasterization.choose_backend`)."""
 
@@ -72,11 +71,11 @@ DEFAULTS = RenderOptions()
 
 
 class Projected(NamedTuple):
-    """Gaussians as cameras see them, which is all that compositing takes. Where a radius is zero, a Gaussian is not
-    drawn in a view, and its other rows there have no meaning."""
+    """Gaussians as cameras see them."""
 
     radii: Tensor
-    """px, int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5; not positive where a Gaussian is not drawn."""
+    """px, int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5; not positive where a Gaussian is not drawn in a view, and its
+    other rows there have no meaning."""
     means2d: Tensor
     """Centres in px. [C, N, 2]"""
     depths: Tensor
@@ -92,8 +91,7 @@ class Projected(NamedTuple):
     height: int
     """px."""
     tiles: Any = None
-    """Tile lists that the Triton backend has begun (`kernels.tiles.PendingTiles`); None where `composite` begins
-    them."""
+    """Tile lists that the Triton backend has begun (`kernels.tiles.PendingTiles`)."""
 
     def info(self) -> dict[str, Any]:
         """Return the part of gsplat's `info` that strategies read; read `radii` through `rasterization.visible`."""
