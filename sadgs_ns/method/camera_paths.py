@@ -1,8 +1,8 @@
 """The space along the cameras' paths, which stays empty while a run densifies.
 
-Nothing stands where somebody walked with a camera. Yet a faint Gaussian may float there, which makes up for something
-in a training view or two. A view from beside it shows it as haze over the whole image. Viewers of exported files show
-it, too, since they draw what is nearer than the run's near plane. Real surfaces near a path have SfM points.
+Nothing stands where somebody walked with a camera. Yet a faint Gaussian may float there, which a view from beside it
+shows as haze over the whole image. Viewers of exported files show it, too, since they draw what is nearer than the
+run's near plane. Real surfaces near a path have SfM points.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ REACH = 1.5
 """Distance from a path up to which space is empty, in near planes. With 2, one view of a flight lost 2.6 dB
 (docs/results.md#exported-files)."""
 HAZE_ANGLE = 0.1
-"""A Gaussian is haze if its longest standard deviation is more than this share of its distance from a path. With 0.2
-some of it stayed."""
+"""Haze has a longest standard deviation of more than this share of its distance from a path. With 0.2 some stayed."""
 SUPPORT = 2.0
 """A Gaussian stands for a surface if a point to start from lies within this many of its standard deviations."""
 MOST_VIEWS = 60

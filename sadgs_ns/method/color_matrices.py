@@ -23,8 +23,8 @@ def anchored(
 ) -> Tensor:
     """Return the matrices of some views, moved so that the mean over all views is the identity. [C, 3, 4]
 
-    Otherwise the Gaussians and all matrices could change together, and held-out views, which have no matrix, would be
-    rendered in colours that no photo has. No gradient flows through the mean, so that a view moves its own matrix only.
+    Otherwise the Gaussians and all matrices could change together, and held-out views, which have no matrix, would have
+    colours that no photo has. No gradient flows through the mean.
     """
     with torch.no_grad():
         shift = torch.eye(3, 4, dtype=matrices.dtype, device=matrices.device) - matrices.mean(dim=0)

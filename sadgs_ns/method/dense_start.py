@@ -1,8 +1,8 @@
 """Points to start from, drawn from stereo depth as densely as the local wavelength asks for.
 
-η asks for Gaussians no longer than the wavelength Λ, so for a number in proportion to 1/Λ² on each surface. A pixel
-with a confident depth is drawn with this weight. A point stays if enough views agree with its depth, and less often the
-more of them there are, because each of them draws points of the same surface.
+η asks for Gaussians no longer than the wavelength Λ, so for 1/Λ² of them on a surface. A pixel with a confident depth
+is drawn with this weight. A point stays if enough views agree with its depth, and less often the more of them there
+are, because each of them draws points of the same surface.
 """
 
 from __future__ import annotations

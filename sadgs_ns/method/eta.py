@@ -1,7 +1,6 @@
 """η at the visible Gaussians: projected axes against the local wavelength (paper, section 3.3, eq. 1, 6, 7).
 
-All functions take the observations of one training step. An observation is a pair (camera, Gaussian) that the
-forward pass found visible; M is their number.
+M is the number of observations of a training step: pairs of a camera and a Gaussian that it sees.
 """
 
 from __future__ import annotations
@@ -70,9 +69,8 @@ def sample_footprint(
     """Draw one point in each Gaussian's footprint, uniformly if the jitter is uniform.
 
     The footprint is the 2σ ellipse of Σ2D: a uniform point in it has mean μ_2D and covariance Σ2D. gsplat's conic
-    contains its screen-space blur, which is taken out again; variances that rounding makes negative are set to 0.
-    Rounded to float32, a conic tells its determinant from 0 only above ε a c: footprints longer than that (thousands of
-    px) are cut to it.
+    contains its screen-space blur, which is taken out again; variances that rounding makes negative are set to 0. A
+    float32 conic tells its determinant from 0 only above ε a c: footprints of thousands of px are cut to that.
 
     Returns:
         Points in px, pixel centres at half-integers; NaN where the conic is NaN or infinite. [M, 2]
@@ -126,7 +124,6 @@ def eta(
 ) -> Tensor:
     """Frequency violation of each axis: η_k = ‖v_k‖ / Λ_min (paper, eq. 6). [M, 3]
 
-    It is above 1 where an axis is longer than the local wavelength. The arguments are results of
-    `projected_axes` and `sample_map`.
+    The arguments are results of `projected_axes` and `sample_map`.
     """
     return torch.hypot(axes[..., 0], axes[..., 1]) / wavelength(structure_tensor)[:, None]

@@ -15,10 +15,7 @@ and statistics, with the line that tells how much of that are files that the sys
 
 
 def available_host_bytes(root: Path = Path("/")) -> float:
-    """Bytes of the host's memory that this process may take, as Linux and a container's limit tell; else infinity.
-
-    The folders `proc` and `sys` lie in `root`.
-    """
+    """Bytes that this process may take, as `proc` and a container's `sys` below `root` tell; else infinity."""
     available = math.inf
     with contextlib.suppress(OSError):
         available = 1024.0 * _numbers(root / "proc/meminfo").get("MemAvailable", math.inf)

@@ -60,10 +60,7 @@ def neighbour_scales(points: Tensor) -> Tensor:
 
 
 def plausible_points(points: Tensor) -> Tensor:
-    """Which SfM points [P, 3] to start from: all but those that are not finite or lie absurdly far out. bool [P]
-
-    A single wild point would otherwise decide the size of the bounding box and of the points on its faces.
-    """
+    """Which SfM points [P, 3] to start from: all but those that are not finite or lie absurdly far out. bool [P]"""
     return ~_far_outliers(points, POINT_SHARE)
 
 
@@ -99,8 +96,7 @@ def starting_points(
 def camera_extent(positions: Tensor) -> float:
     """The extent of cameras at positions [C, 3]: 1.1 times the largest distance from their centre (3DGS).
 
-    Cameras that lie absurdly far from the others (`outliers.far_outliers`) do not count. It is 1 for a single camera or
-    coinciding ones, which have no extent.
+    Cameras that lie absurdly far from the others (`outliers.far_outliers`) do not count. It is 1 where all coincide.
     """
     positions = positions[~_far_outliers(positions, CAMERA_SHARE)]
     extent = 1.1 * float((positions - positions.mean(0)).norm(dim=-1).max())

@@ -40,8 +40,7 @@ def photometric_loss(
         target: Training views, floats in [0, 1] or uint8. [C, H, W, 3]
         ssim_lambda: λ in [0, 1].
         l2_lambda: λ_2 ≥ 0.
-        parts: Numbers whose sum is added to the loss, such as a penalty from `render.activations.activate`, which takes
-            the Triton kernels no launch more. [P]
+        parts: Numbers whose sum is added to the loss, such as a penalty from `render.activations.activate`. [P]
 
     Returns:
         The loss, and PSNR in dB for values in [0, 1], without gradient; both are scalars.

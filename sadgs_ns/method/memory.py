@@ -6,8 +6,7 @@ real peaks.
 
 A step is largest in one of three phases, in which different tensors are alive: while the tile lists are sorted, in the
 loss, and in the backward pass of rasterization. What a Gaussian keeps between steps comes on top of each. Observing η
-takes less before the loss than the backward pass: of a Gaussian and view, samples 8, η 12, and 15 for comparisons and
-sums of `statistics.STATISTICS`.
+takes less than the backward pass.
 """
 
 from __future__ import annotations
@@ -25,12 +24,11 @@ from sadgs_ns.method.ops import Params
 
 COPIES = 4
 """Tensors of a parameter's size: the parameter, its gradient and Adam's two moments. The mean over the last iterations
-is a fifth, in the place of the statistics and of a split's copy, which are as large and gone by then."""
+takes the place of the statistics and of a split's copy, which are gone by then."""
 ACTIVATION_BYTES = 16
 """Bytes of a Gaussian in every phase: exp(scales) 12, sigmoid(opacities) 4."""
 ACTIVATION_GRADIENT_BYTES = 28
-"""Bytes of a Gaussian in the backward pass: gradients of the activations 16, the second gradient of the means 12, since
-the projection and the harmonics each have one."""
+"""Bytes of a Gaussian in the backward pass: gradients of the activations 16, the means' from harmonics 12."""
 PROJECTION_BYTES = 52
 """Bytes of a Gaussian and view from the projection to the end of the step: radii 4, means2d 8, depths 4, conics 12,
 opacities 4, colours 12."""
@@ -57,8 +55,7 @@ Gaussians 4, image 12, five blurred maps 60, three slopes 36, image in bytes 3, 
 TORCH_LOSS_PIXEL_BYTES = 300
 """The same without our kernels, where torch keeps about twenty maps for the loss; measured, not counted."""
 PAIRS_PER_GAUSSIAN = 12
-"""Pairs, of tiles of 8 px, that a trained Gaussian has in a view: 10.5 were counted on fox (8.3 million of 397,000
-Gaussians in two views), and 11 with 300,000 made-up Gaussians of 2 to 5 px at 1920×1080."""
+"""Pairs, of tiles of 8 px, that a trained Gaussian has in a view: 10.5 were counted on fox."""
 
 
 @dataclass(frozen=True)
@@ -77,10 +74,7 @@ class StepSize:
 
     @classmethod
     def of(cls, infos: Sequence[Mapping[str, Any]]) -> StepSize:
-        """The size of a step that was rendered, from the `info` of each of its groups of views.
-
-        It is gsplat's, or that of `distributed.rasterization` with the numbers of this process.
-        """
+        """The size of a step that was rendered, from gsplat's or `distributed.rasterization`'s `info` of its views."""
         return cls(
             sum(info["n_cameras"] for info in infos),
             sum(info.get("num_pixels", info["n_cameras"] * info["width"] * info["height"]) for info in infos),
@@ -90,10 +84,7 @@ class StepSize:
 
 
 def available_bytes(device: torch.device) -> tuple[float, float]:
-    """Bytes of the device's memory that this process may have, with those it has already, and bytes of all of it.
-
-    Without CUDA both are infinite, because an operating system's memory is nothing to plan with.
-    """
+    """Bytes of the device's memory that this process may have or has already, and all bytes; infinite without CUDA."""
     if device.type != "cuda":
         return math.inf, math.inf
     left, total = torch.cuda.mem_get_info(device)
@@ -101,10 +92,7 @@ def available_bytes(device: torch.device) -> tuple[float, float]:
 
 
 def free_bytes(device: torch.device) -> float:
-    """Bytes that new tensors may take: those that the driver has left and that torch's allocator keeps unused.
-
-    They are infinite without CUDA.
-    """
+    """Bytes that new tensors may take, which the driver has left or torch keeps unused; infinite without CUDA."""
     available, _ = available_bytes(device)
     return available - torch.cuda.memory_allocated(device) if device.type == "cuda" else available
 

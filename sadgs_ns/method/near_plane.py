@@ -53,8 +53,7 @@ def scene_near_plane(
 ) -> float:
     """Derive the near plane of a scene, > 0, from the `nearest_depths` of its training cameras.
 
-    It follows the camera that comes nearest to anything: an object close to a single camera is drawn, too. `extent` is
-    `initialization.camera_extent`.
+    An object close to a single camera is drawn, too. `extent` is `initialization.camera_extent`.
     """
     nearest = float(depths.min())
     return NEAR_SHARE * nearest if nearest < math.inf else UNKNOWN_SHARE * extent

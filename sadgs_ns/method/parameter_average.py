@@ -12,12 +12,10 @@ from sadgs_ns.method.ops import Params
 
 
 class RunningMean:
-    """The mean of parameters over iterations (Polyak and Juditsky, "Acceleration of stochastic approximation by
-    averaging").
+    """The mean of parameters over iterations (Polyak and Juditsky).
 
-    Each step renders few views, so that the parameters keep moving around the best ones for all views. Their mean
-    lies closer to it. Parameters are averaged as they are optimized: log scales, logits of opacities, and quaternions,
-    which move too little within a twentieth of a run to need more than that.
+    Each step renders few views, so that the parameters keep moving around the best ones for all views; their mean is
+    closer. Parameters are averaged as they are optimized, such as log scales and logits of opacities.
     """
 
     def __init__(self) -> None:

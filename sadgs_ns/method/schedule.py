@@ -17,7 +17,7 @@ VISITS_PER_VIEW = 50
 STEPS_BEFORE_VIEWS = 2000
 """Optimizer steps that a run should have before a step takes a view more."""
 MOST_EFFORT = 100
-"""Largest `effort`, which is a million iterations of four views for a capture of 760 views."""
+"""Largest `effort`: a million iterations of four views for a capture of 760."""
 MOST_VIEWS = 4
 """Largest number of views in a step that is derived."""
 MORE_VISITS_FROM = (50, 90)
@@ -28,8 +28,7 @@ GROWTH_WITH_EFFORT = (-0.32, 0.8)
 DENSIFICATION_SHARE = 16 / 30
 """Share of a run in which Gaussians are added and removed."""
 RESETS_FROM = 600
-"""Iterations of the shortest run that resets opacities. In shorter ones Gaussians would not recover before the next
-prune: runs of 114 to 385 iterations lost 2.7 to 11 dB by the reset (docs/results.md#short-runs)."""
+"""Iterations of the shortest run that resets opacities: shorter ones lost 2.7 to 11 dB (docs/results.md#short-runs)."""
 _PARTS = 30
 """A run is divided into so many parts of as many whole iterations."""
 _WINDOWS = {
@@ -71,9 +70,8 @@ def schedule(
     """Derive the length of a run from the number of its training views, at least 1; given numbers stay.
 
     With effort 1 the run visits views 2,000 + 50 · num_views times. Less effort, > 0, multiplies that; more effort
-    multiplies it where views are many, and adds nothing where they are few (`MORE_VISITS_FROM`). A step takes one view
-    more for every 2,000 visits, up to four and never more than there are: more views in a step spare the GPU work and
-    the gradients noise, but a run needs its steps.
+    multiplies it where views are many (`MORE_VISITS_FROM`). A step takes one view more for every 2,000 visits, up to
+    four and never more than there are.
     """
     few, many = MORE_VISITS_FROM
     power = 1.0 if effort <= 1 else min(max((num_views - few) / (many - few), 0.0), 1.0)
@@ -92,10 +90,8 @@ def windows(iterations: int, **given: int | None) -> Windows:
 
     In the proportions of the released code: of thirty parts of the run, an AbsGS step ends each from the first to the
     sixteenth, a structure step takes the place of every fifth, and opacities are reset once after twelve, but not in
-    runs of fewer than `RESETS_FROM` iterations. η is observed ten times in a part.
-
-    Densification ends after at most 19/30 of the run (released code). Where that is before `refine_start_iter`, there
-    is none, and nothing that prepares it. Raises TypeError if another name is given.
+    runs of fewer than `RESETS_FROM` iterations. Densification ends after at most 19/30 of the run; where that is before
+    `refine_start_iter`, there is none. Raises TypeError if another name is given.
     """
     part = max(round(iterations / _PARTS), 1)
     derived = {name: max(round(parts * part), 1) for name, parts in _WINDOWS.items()}
@@ -117,11 +113,7 @@ def next_due(iteration: int, every: int) -> float:
 
 
 def growth_threshold(effort: float) -> float:
-    """Factor on the gradients at which AbsGS adds Gaussians.
-
-    Effort above 1 adds more of them, which resolves more on few views as on many; a draft has the thresholds of
-    effort 1, since its steps are fewer already.
-    """
+    """Factor on the gradients at which AbsGS adds Gaussians: effort above 1 adds more of them."""
     power, least = GROWTH_WITH_EFFORT
     return max(effort**power, least) if effort > 1 else 1.0
 
@@ -129,8 +121,7 @@ def growth_threshold(effort: float) -> float:
 def between_one_and_four(views_per_iteration: int, at_four: float) -> float:
     """Interpolate a factor on a learning rate, which is 1 in steps of one view, to steps of several views.
 
-    The mean over several views is less noisy, so that other rates are best. They were measured in steps of one view and
-    of four; those between lie on the power of the number of views that leads from one to the other. From four views on
-    the factor is `at_four`, > 0.
+    They were measured in steps of one view and of four, where the factor is `at_four`, > 0; those between lie on a
+    power of the number of views.
     """
     return float(at_four ** min(math.log(views_per_iteration, MOST_VIEWS), 1.0))

@@ -62,9 +62,8 @@ def grid_split(params: Params, optimizers: Optimizers, state: State, counts: Ten
     afterwards is [unsplit, children grouped by parent]. Children start with zero optimizer moments and empty rows of
     every tensor in `state`: observations of the parent, which was longer, do not hold for them.
 
-    Such children stand √12 of their own standard deviations apart. Children k times as large (not in the paper) fill
-    these gaps: their grid is narrower, so that the covariance stays, and their opacity 1/k for each axis that is split,
-    so that the integral of opacity stays.
+    Children k times as large (not in the paper) fill the gaps between them: their grid is narrower, so that the
+    covariance stays, and their opacity 1/k for each axis that is split, so that the integral of opacity stays.
 
     Args:
         params: `means`, log `scales`, `quats` and any others with leading dimension N.

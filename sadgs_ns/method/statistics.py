@@ -1,7 +1,6 @@
 """η observations → per-Gaussian multiview statistics (paper, section 3.4).
 
-The statistics are tensors with leading dimension N in a gsplat strategy state, so every gsplat operation that adds or
-removes Gaussians keeps them in step with the parameters.
+They are tensors with leading dimension N in a gsplat strategy's state, where gsplat keeps them in step with parameters.
 """
 
 from __future__ import annotations
@@ -95,8 +94,7 @@ def observed_eta(
     """Return η of the axes in each view, NaN where there is no observation. [C, N, 3]
 
     A Gaussian is observed in a view when the rasterizer drew it there, its sample lies in the image and not on a masked
-    pixel, and its η is finite on all axes: NaN and infinities of the projection or of S̄ are no observation. The
-    arguments are those of `observe`.
+    pixel, and its η is finite on all axes. The arguments are those of `observe`.
     """
     if use_triton(params["means"]):
         from sadgs_ns.kernels import statistics as kernel

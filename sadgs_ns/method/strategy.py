@@ -96,7 +96,7 @@ class StructureAwareStrategy(Strategy):
     reset_every: int | None = None
     """Iterations between opacity resets inside the densification window; 0 turns them off.
     None is 12/30 of the run, and 0 in runs of fewer than 600 iterations, which would not recover."""
-    # These are no options, so they have no annotation, which would make them fields.
+    # An annotation would make these options.
     _fitted = cast("Windows | None", None)
     world = World()
     """The processes among which the Gaussians are shared out.
@@ -174,10 +174,7 @@ class StructureAwareStrategy(Strategy):
         return ends or resets or due_rule(iteration, windows) is not None
 
     def needs_absgrad(self, step: int) -> bool:
-        """Whether the rasterizer must provide absolute screen gradients: an AbsGS step will read this step's.
-
-        Those just before a structure step are not read: it forgets them.
-        """
+        """Whether an AbsGS step will read this step's absolute screen gradients; a structure step forgets them."""
         windows = self.windows
         first = max(step + 1, windows.refine_start_iter)
         readers = [rule for rule in RULES.values() if rule.reads is not None]
@@ -298,10 +295,7 @@ class StructureAwareStrategy(Strategy):
         return self._prune(params, optimizers, state, gone if also is None else gone | also)
 
     def _prune(self, params: Any, optimizers: Any, state: Any, mask: Tensor) -> int:
-        """Remove Gaussians, unless fewer than one for each process would be left to train.
-
-        A process may lose all that it has until the shards are evened out.
-        """
+        """Remove Gaussians, unless fewer than one for each process would be left."""
         n_prune = int(mask.sum())
         of_all, total = self.world.sums(n_prune, len(mask))
         if total - of_all < self.world.num_ranks:

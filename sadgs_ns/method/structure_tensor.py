@@ -1,8 +1,7 @@
 """Image → multi-scale structure tensor map S̄ (paper, section 3.2, eq. 2–5).
 
-Borders and masks are handled in one way, by normalised convolution: every blur is a weighted mean over the valid pixels
-that the kernel reaches, and the derivative is the exact derivative of that mean. Nothing is invented outside the image,
-no edge appears at a mask, and an image may be smaller than the largest kernel.
+Borders and masks are handled by normalised convolution: every blur is a weighted mean over the valid pixels that the
+kernel reaches, and the derivative is that of this mean. So no edge appears at a mask, and images may be small.
 """
 
 from __future__ import annotations
@@ -231,7 +230,7 @@ def _correlate(image: Tensor, kernel: Tensor, axis: int) -> Tensor:
     shape = (1, 1, -1, 1) if axis == 2 else (1, 1, 1, -1)
     padding = (radius, 0) if axis == 2 else (0, radius)
     weight = kernel.view(shape).expand(channels, -1, -1, -1)
-    # Full float32, and no search for the fastest algorithm: each of dozens of kernel sizes is used a few times.
+    # Full float32, and no search for the fastest algorithm.
     with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=False, allow_tf32=False):
         return F.conv2d(image, weight, padding=padding, groups=channels)
 
