@@ -64,7 +64,7 @@ CHECKS = {
 def choose_parser(config: FullImageDatamanagerConfig) -> None:
     """Replace the automatic parser by the one that fits the data, so that a run's `config.yml` names that one.
 
-    Raise InputError if the folder cannot be read, and as `automatic_options`.
+    Raise InputError if the folder cannot be read.
     """
     if not isinstance(config.dataparser, AutomaticDataParserConfig):
         return

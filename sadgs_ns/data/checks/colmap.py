@@ -30,14 +30,14 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
     """Check a COLMAP reconstruction in a folder, to which the options' paths are relative, and its images if asked."""
     folder, model_folder = data / options.images_path, data / options.colmap_path
     if (kind := colmap.model_kind(model_folder)) is None:
-        if layouts.find_reconstruction(data) is None:
+        if not (models := layouts.find_reconstructions(data)):
             raise InputError(layouts.no_layout(data))
         found = automatic_options(data)
         problem = f"{model_folder} holds no COLMAP reconstruction, but {data / found.colmap_path} does"
-        raise InputError(f"{problem}: add `{_words(data, found)}` after `colmap`.")
+        raise InputError(f"{problem}: add `{_words(data, found, models[found.colmap_path])}` after `colmap`.")
     cameras_path, poses_path = model_folder / f"cameras.{kind}", model_folder / f"images.{kind}"
     names, views = _read_views(poses_path, cameras_path)
-    this_model = f"end the command with `colmap {_words(data, options)}"
+    this_model = f"end the command with `colmap {_words(data, options, names)}"
     yield from _check_folders(data, options, names, poses_path)
     files = {split: data / f"{split}_list.txt" for split in SPLITS}
     lists = {split: read_text(file).splitlines() for split, file in files.items() if file.is_file()}
@@ -68,25 +68,25 @@ def _check_folders(data: Path, options: ParserOptions, names: Sequence[str], pos
     """Refuse a folder of images that are not those of the model, and warn of a larger model beside it."""
     folder = data / options.images_path
     if not any(os.path.isfile(folder / name) for name in names):
-        if found := layouts.images_folder(data, options.colmap_path):
+        if found := layouts.images_folder(data, options.colmap_path, names):
             problem = f"{poses}: image {names[0]} is not in {folder}, but in {data / found}"
-            remedy = _words(data, dataclasses.replace(options, images_path=found))
+            remedy = _words(data, dataclasses.replace(options, images_path=found), names)
             raise InputError(f"{problem}: add `{remedy}` after `colmap`.")
         if not folder.is_dir():
             raise InputError(
                 f"{poses} has poses of {len(names)} images, but there is no folder {folder}: put them there, or end "
-                f"the command with `colmap {_words(data, options)} --images-path FOLDER`."
+                f"the command with `colmap {_words(data, options, names)} --images-path FOLDER`."
             )
-    for other, count in layouts.find_reconstructions(data).items():
-        if count > len(names):
-            problem = f"{poses} has {len(names)} images, {data / other} has {count}"
-            remedy = f"end the command with `colmap {_words(data, dataclasses.replace(options, colmap_path=other))}`"
-            yield warning(f"{problem}: {remedy} to train on those.")
+    for other, others in layouts.find_reconstructions(data).items():
+        if len(others) > len(names):
+            problem = f"{poses} has {len(names)} images, {data / other} has {len(others)}"
+            words = _words(data, dataclasses.replace(options, colmap_path=other), others)
+            yield warning(f"{problem}: end the command with `colmap {words}` to train on those.")
 
 
-def _words(data: Path, options: ParserOptions) -> str:
-    """Return the options that nerfstudio's parser of COLMAP's files needs to read images and model from here."""
-    words, names = ["--colmap-path", str(options.colmap_path)], colmap.image_names(data / options.colmap_path)
+def _words(data: Path, options: ParserOptions, names: Sequence[str]) -> str:
+    """Return the options that nerfstudio's parser of COLMAP's files needs to read these images and their model."""
+    words = ["--colmap-path", str(options.colmap_path)]
     if options.images_path != ParserOptions.images_path:
         words += ["--images-path", str(options.images_path)]
     if options.downscale_factor not in (None, images.automatic_factor(data / options.images_path / [*names, ""][0])):
@@ -141,13 +141,12 @@ def _check_factor(folder: Path, names: Sequence[str], options: ParserOptions) ->
 
 
 def automatic_options(data: Path) -> ParserOptions:
-    """Return how a folder's reconstruction is read where no parser is named; raises as `colmap.read_poses`.
+    """Return how a folder's reconstruction, which it must have, is read where no parser is named.
 
     Without the smaller copies that it wants, nerfstudio's parser of COLMAP's files asks a question at the terminal. So
     that it never has to, the images are then taken at full resolution, as they are beside a `transforms.json`.
     """
-    model = layouts.find_reconstruction(data) or Path(layouts.COLMAP_FOLDERS[0])
-    names, factor = colmap.image_names(data / model), 1
+    (model, names), factor = next(iter(layouts.find_reconstructions(data).items())), 1
     folder = layouts.images_folder(data, model, names) or Path("images")
     if names and folder != Path():  # The smaller copies of images right in the capture would lie outside of it.
         copies = data / folder

@@ -6,7 +6,7 @@ import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, ParamSpec
+from typing import Any, Literal
 
 import numpy as np
 
@@ -17,22 +17,19 @@ from sadgs_ns.errors import InputError, reason
 class Finding:
     """One thing to know about a data folder."""
 
-    severity: Literal["error", "warning", "note"]
-    """Training is refused, may disappoint, or behaves in a way that is worth knowing."""
-    sentence: str
-    """A sentence that names the file and the remedy."""
+    severity: Literal["error", "warning", "note"]  # Training is refused, may disappoint, or is worth a remark
+    sentence: str  # A sentence that names the file and the remedy
 
 
 fault, warning, note = (functools.partial(Finding, severity) for severity in ("error", "warning", "note"))
 """Make a finding of each severity of its sentence."""
-_Arguments = ParamSpec("_Arguments")
 
 
-def collect_findings(check: Callable[_Arguments, Iterator[Finding]]) -> Callable[_Arguments, list[Finding]]:
+def collect_findings(check: Callable[..., Iterator[Finding]]) -> Callable[..., list[Finding]]:
     """Make a list of a check's findings; where the check gives up with an error, that is the only finding."""
 
     @functools.wraps(check)
-    def findings(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> list[Finding]:
+    def findings(*args: Any, **kwargs: Any) -> list[Finding]:
         try:
             with np.errstate(over="ignore", invalid="ignore"):  # Some numbers are nearly infinite.
                 return list(check(*args, **kwargs))

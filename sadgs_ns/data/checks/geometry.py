@@ -37,33 +37,24 @@ _STRONGEST_DISTORTION = 2.0
 class Camera:
     """Intrinsics of a camera, as all layouts give them."""
 
-    width: int
+    width: int  # Size of the image in px
     height: int
-    """Size of the image in px."""
-    fx: float
+    fx: float  # Focal lengths in px
     fy: float
-    """Focal lengths in px."""
-    cx: float
+    cx: float  # Distance of the principal point from the left and the upper edge in px
     cy: float
-    """Distance of the principal point from the left and the upper edge in px."""
-    radial: tuple[float, ...] = ()
-    """Coefficients k1, k2, … of OpenCV's polynomial of the radius, or of the angle for a fisheye."""
-    tangential: tuple[float, ...] = ()
-    """Coefficients p1, p2 as OpenCV defines them."""
+    radial: tuple[float, ...] = ()  # Coefficients k1, k2, … of OpenCV's polynomial of the radius, or a fisheye's angle
+    tangential: tuple[float, ...] = ()  # Coefficients p1, p2 as OpenCV defines them
     fisheye: bool = False
 
 
 class View(NamedTuple):
     """A camera at its place."""
 
-    where: str
-    """The start of a sentence about its pose: file and image."""
-    where_camera: str
-    """The start of a sentence about its camera."""
-    rotation: NDArray[np.float64]
-    """Rotation from world to camera, in OpenCV's axes. [3, 3]"""
-    centre: NDArray[np.float64]
-    """Position of the camera in world units. [3]"""
+    where: str  # The start of a sentence about its pose: file and image
+    where_camera: str  # The start of a sentence about its camera
+    rotation: NDArray[np.float64]  # Rotation from world to camera, in OpenCV's axes. [3, 3]
+    centre: NDArray[np.float64]  # Position of the camera in world units. [3]
     camera: Camera
 
 

@@ -36,8 +36,7 @@ class Frame:
     """An image, and the size that its camera tells."""
 
     image: Path
-    size: Size | None
-    """The camera's size; None if it has none of its own."""
+    size: Size | None  # The camera's size; None if it has none of its own
     mask: Path | None = None
 
 
@@ -46,8 +45,8 @@ class _Image:
     """The header of an image file."""
 
     size: Size = (0, 0)  # Zeros if it is unknown
-    mode: str = ""
-    format: str = ""  # Pillow's names for the kind of pixels and the format of the file
+    mode: str = ""  # Pillow's name for the kind of pixels
+    format: str = ""  # Pillow's name for the format of the file
     orientation: int = 1  # As EXIF tells it
     problem: str = ""  # The rest of a sentence that starts with the file; empty for a good image
 

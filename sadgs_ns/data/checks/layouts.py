@@ -56,19 +56,17 @@ def find_reconstruction(data: Path) -> Path | None:
     return next(iter(find_reconstructions(data)), None)
 
 
-def find_reconstructions(data: Path) -> dict[Path, int]:
-    """Return the folders of COLMAP's reconstructions, relative to the data, and how many images each has.
+def find_reconstructions(data: Path) -> dict[Path, list[str]]:
+    """Return the folders of COLMAP's reconstructions, relative to the data, and the names of each one's images.
 
-    The first is the one to read: one in a usual place, or else the one with the most images.
-    A reconstruction right in the data's folder counts if there is no other and its images are at hand. The number is 0
-    if a reconstruction cannot be read.
+    The first is the one to read: one in a usual place, or else the one with the most images. A reconstruction right in
+    the data's folder counts if there is no other and its images are at hand. One that cannot be read has no names.
     """
-    folders = _model_folders(data)
-    counts = dict.fromkeys(folders, 0)
-    for folder in folders:
+    found: dict[Path, list[str]] = {folder: [] for folder in _model_folders(data)}
+    for folder in found:
         with contextlib.suppress(InputError):
-            counts[folder] = len(colmap.image_names(data / folder))
-    return dict(sorted(counts.items(), key=lambda item: 0 if str(item[0]) in COLMAP_FOLDERS else 1 / (1 + item[1])))
+            found[folder] = colmap.image_names(data / folder)
+    return dict(sorted(found.items(), key=lambda item: 0 if str(item[0]) in COLMAP_FOLDERS else 1 / (1 + len(item[1]))))
 
 
 def _model_folders(data: Path) -> list[Path]:
@@ -77,8 +75,8 @@ def _model_folders(data: Path) -> list[Path]:
     if found := [folder for folder in folders if colmap.model_kind(data / folder)]:
         return found
     kind = colmap.model_kind(data)
-    has_images = kind and (data / f"images.{kind}").is_file() and images_folder(data, Path()) is not None
-    return [Path()] if has_images else []
+    is_whole = kind and (data / f"images.{kind}").is_file()
+    return [Path()] if is_whole and images_folder(data, Path(), colmap.image_names(data)) is not None else []
 
 
 def find_cameras(data: Path) -> Path | None:
@@ -89,9 +87,8 @@ def find_cameras(data: Path) -> Path | None:
     return next((file for file in files if file.is_file()), None)
 
 
-def images_folder(data: Path, model: Path, names: Sequence[str] = ()) -> Path | None:
-    """Return the folder that has images of a reconstruction, both relative to the data, or None."""
-    names = names or colmap.image_names(data / model)
+def images_folder(data: Path, model: Path, names: Sequence[str]) -> Path | None:
+    """Return the folder that has images of a reconstruction by their names, both relative to the data, or None."""
     others = [path.name for path in data.iterdir() if not re.search(r"mask|depth|normal|_\d+$", path.name)]
     beside = [folder / "images" for folder in (model, *model.parents)]
     folders = map(Path, ("images", "", model, *beside, *sorted(others)))

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sadgs_ns.data.checks.findings import Finding, warning
+from sadgs_ns.data.checks.findings import Finding, and_more, warning
 from sadgs_ns.data.checks.layouts import ParserOptions
 from sadgs_ns.errors import InputError
 
@@ -48,8 +48,8 @@ def check_splits(
             raise InputError(f"{called(split)} is no list of images' names: correct it, or remove all such lists.")
         unknown = [name for name in listed if locate(name) not in images]
         if unknown:
-            more = f" (and {len(unknown) - 1} more)" if len(unknown) > 1 else ""
-            raise InputError(f"{called(split)} names {unknown[0]!r}{more}, which is no image with a pose: correct it.")
+            which = and_more(repr(unknown[0]), len(unknown))
+            raise InputError(f"{called(split)} names {which}, which is no image with a pose: correct it.")
         located[split] = set(map(locate, listed))
     if not located.get("test"):
         state = "is empty" if "test" in located else "is missing"
