@@ -106,12 +106,7 @@ def export(options: Export) -> int:
     from sadgs_ns.method.cleaning import Cleaning  # It imports torch.
 
     cleaning = Cleaning(options.min_views, options.max_extent, options.crop, options.dust)
-    similarity = None
-    if options.frame == "colmap":
-        if not (folder / TRANSFORMS_NAME).is_file():
-            problem = f"{folder} holds no {TRANSFORMS_NAME}, where nerfstudio notes how it moved the data"
-            raise InputError(f"{problem}: give the run where it was made, or export in nerfstudio's frame.")
-        similarity = from_data(folder / TRANSFORMS_NAME).inverse()
+    similarity = from_data(folder / TRANSFORMS_NAME).inverse() if options.frame == "colmap" else None
     params, drawing = read_checkpoint(options.run)
     cameras = start = None
     if is_page or is_mesh or cleaning.needs_views:

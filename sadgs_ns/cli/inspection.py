@@ -43,12 +43,9 @@ class View:
     """A photo of the data and its camera."""
 
     name: str
-    photo: Tensor
-    """Colours in [0, 1]. [H, W, 3]"""
-    structure_tensor: Tensor
-    """S̄ of the photo. [H, W, 3]"""
-    camera: Pinholes
-    """A single camera."""
+    photo: Tensor  # Colours in [0, 1]. [H, W, 3]
+    structure_tensor: Tensor  # S̄ of the photo. [H, W, 3]
+    camera: Pinholes  # A single camera
 
 
 def load_run(path: Path, load_step: int | None = None, data: Path | None = None) -> tuple[SadgsPipeline, int]:

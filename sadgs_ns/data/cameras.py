@@ -27,13 +27,9 @@ def check_camera_types(cameras: Cameras) -> None:
     nerfstudio gives full images of any camera type to a splatting model, and undistorts those of perspective and
     fisheye cameras with a distortion coefficient other than 0. Others would be rendered wrongly, as pinholes.
     """
-    types = cameras.camera_type.flatten().cpu()  # [C]
-    distorted = torch.zeros_like(types, dtype=torch.bool)
-    if cameras.distortion_params is not None and len(types) > 0:
-        distorted = (cameras.distortion_params.reshape(len(types), -1) != 0).any(dim=1).cpu()
-    for index, (number, is_distorted) in enumerate(zip(types.tolist(), distorted.tolist(), strict=True)):
-        where, camera_type = f"Camera {index} is {CameraType(number).name}", CameraType(number)
-        if camera_type in _UNDISTORTED and not is_distorted:
+    for index, camera_type in enumerate(map(CameraType, cameras.camera_type.flatten().tolist())):
+        where, coefficients = f"Camera {index} is {camera_type.name}", cameras.distortion_params
+        if camera_type in _UNDISTORTED and (coefficients is None or not coefficients[index].any()):
             raise InputError(f"{where} {NO_COEFFICIENTS}")
         if camera_type not in (CameraType.PERSPECTIVE, *_UNDISTORTED):
             raise InputError(

@@ -37,11 +37,9 @@ class Camera:
     """Intrinsics of a camera, as COLMAP stores them."""
 
     model: str
-    width: int
+    width: int  # Size of the images in px
     height: int
-    """Size of the images in px."""
-    params: tuple[float, ...]
-    """Parameters in the order of the model; the first are focal lengths in px."""
+    params: tuple[float, ...]  # Parameters in the order of the model; the first are focal lengths in px
 
 
 class _Binary:

@@ -28,12 +28,9 @@ _TOLERANCE = 1e-4
 class Similarity:
     """A map x ↦ scale · orthogonal · x + translation from one world frame to another."""
 
-    scale: float
-    """Factor by which lengths grow; it is positive."""
-    orthogonal: Array
-    """A rotation, or a rotation times −1, which is a reflection. [3, 3]"""
-    translation: Array
-    """Translation in units of the frame that results. [3]"""
+    scale: float  # Factor by which lengths grow; it is positive
+    orthogonal: Array  # A rotation, or a rotation times −1, which is a reflection. [3, 3]
+    translation: Array  # Translation in units of the frame that results. [3]
 
     @staticmethod
     def of(transform: Array) -> Similarity:

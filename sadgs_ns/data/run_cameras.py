@@ -21,12 +21,9 @@ from sadgs_ns.errors import InputError, reason
 class RunCameras:
     """C pinhole cameras in the frame of training, and their image files; distortion is left out."""
 
-    camera_to_worlds: Tensor
-    """OpenGL axes (x right, y up, z backward). [C, 3, 4]"""
-    Ks: Tensor
-    """Intrinsics in px. [C, 3, 3]"""
-    sizes: list[tuple[int, int]]
-    """Widths and heights in px."""
+    camera_to_worlds: Tensor  # OpenGL axes (x right, y up, z backward). [C, 3, 4]
+    Ks: Tensor  # Intrinsics in px. [C, 3, 3]
+    sizes: list[tuple[int, int]]  # Widths and heights in px
     photos: list[Path]
 
 

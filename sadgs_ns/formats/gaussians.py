@@ -25,20 +25,16 @@ class Start:
     """The camera with which a page opens, in the Gaussians' frame; it stands upright."""
 
     position: tuple[float, float, float]
-    target: tuple[float, float, float]
-    """A point that it looks at, around which the mouse turns it."""
-    degrees: float
-    """Angle of view along the longer side of the window."""
+    target: tuple[float, float, float]  # A point that it looks at, around which the mouse turns it
+    degrees: float  # Angle of view along the longer side of the window
 
 
 @dataclass(frozen=True)
 class Context:
     """What a writer may need beside the Gaussians."""
 
-    frame: Frame = "nerfstudio"
-    """That of the Gaussians."""
-    start: Start | None = None
-    """There if the file is a page."""
+    frame: Frame = "nerfstudio"  # That of the Gaussians
+    start: Start | None = None  # There if the file is a page
 
 
 DEFAULTS = Context()
@@ -48,18 +44,12 @@ DEFAULTS = Context()
 class Gaussians:
     """N Gaussians, in the parameters of the original 3D Gaussian splatting code."""
 
-    means: Array
-    """Positions in the file's frame. [N, 3]"""
-    scales: Array
-    """Logarithms of the standard deviations in the file's units. [N, 3]"""
-    quats: Array
-    """Rotations, wxyz, of unit length. [N, 4]"""
-    opacities: Array
-    """Logits. [N]"""
-    features_dc: Array
-    """Spherical harmonics of degree 0; the colour is 0.5 + `DEGREE_0` times this. [N, 3]"""
-    features_rest: Array
-    """The higher degrees, with a K of 0, 3, 8 or 15. [N, K, 3]"""
+    means: Array  # Positions in the file's frame. [N, 3]
+    scales: Array  # Logarithms of the standard deviations in the file's units. [N, 3]
+    quats: Array  # Rotations, wxyz, of unit length. [N, 4]
+    opacities: Array  # Logits. [N]
+    features_dc: Array  # Spherical harmonics of degree 0; the colour is 0.5 + `DEGREE_0` times this. [N, 3]
+    features_rest: Array  # The higher degrees, with a K of 0, 3, 8 or 15. [N, K, 3]
 
     def __len__(self) -> int:
         return len(self.means)

@@ -37,14 +37,10 @@ _SMALLEST_SHARE = 0.01
 class DepthView:
     """The image of a pinhole camera."""
 
-    depth: NDArray[np.float32]
-    """Along the viewing axis, in world units; 0 without a surface. [H, W]"""
-    color: NDArray[np.float32]
-    """In [0, 1]. [H, W, 3]"""
-    K: NDArray[np.float64]
-    """Intrinsics in px; pixel centres lie at half-integers. [3, 3]"""
-    viewmat: NDArray[np.float64]
-    """World to camera, OpenCV axes (x right, y down, z forward). [4, 4]"""
+    depth: NDArray[np.float32]  # Along the viewing axis, in world units; 0 without a surface. [H, W]
+    color: NDArray[np.float32]  # In [0, 1]. [H, W, 3]
+    K: NDArray[np.float64]  # Intrinsics in px; pixel centres lie at half-integers. [3, 3]
+    viewmat: NDArray[np.float64]  # World to camera, OpenCV axes (x right, y down, z forward). [4, 4]
 
     @property
     def focal(self) -> float:

@@ -532,7 +532,7 @@ def test_a_damaged_latest_checkpoint_is_passed_over_aloud(tmp_path: Path, capsys
         ("no means", r".*7\.ckpt holds no means of Gaussians, so another method made it: give another .*\."),
         ("wrong shape", r".*7\.ckpt holds no .* exported \(quats must .* \[3, 4\], got \[3, 3\]\): give another .*\."),
         ("degree 4", r".*7\.ckpt holds no .* exported \(features_rest must hold .*, got 24\): give another .*\."),
-        ("no transform", r".*run holds no dataparser_transforms\.json, .*: give the run where it was made, or .*\."),
+        ("no transform", r".*run/data\S+\.json does not tell how to return .* \(No such file .*\): copy it .*\."),
         ("shear", r".*transforms\.json does not tell .* \(it is no rotation, scale and translation\): copy .*\."),
         ("not json", r".*transforms\.json does not tell how to return to the data's frame \(.*\): copy it .*\."),
         ("nan", r".*transforms\.json does not tell .*\): copy it from the run again, or export in .*\."),

@@ -859,7 +859,7 @@ def test_photos_that_colmap_could_not_write_are_told(tmp_path: Path):
     (folder / "transforms.json").write_text(json.dumps({"frames": [{"file_path": f"images/{n}.png"} for n in "ab"]}))
     (folder / "images" / "b.png").write_bytes((folder / "images" / "b.png").read_bytes()[:30])
     with pytest.raises(OSError, match=r"images could not be written \(the disk is full; .* free there"):
-        program._publish(folder, tmp_path)
+        program._publish(folder, tmp_path, grown=False)
 
 
 @pytest.mark.hard_case("two runs in one folder at a time", "the second is refused")

@@ -26,7 +26,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from sadgs_ns import events
 from sadgs_ns.cli.cameras.colmap import Report, run_colmap
-from sadgs_ns.cli.cameras.folder import find_source
+from sadgs_ns.cli.cameras.folder import find_source, find_videos
 from sadgs_ns.cli.cameras.panoramas import VIEWS
 from sadgs_ns.cli.cameras.photos import (
     Photo,
@@ -41,7 +41,7 @@ from sadgs_ns.cli.cameras.photos import (
     write_masks,
 )
 from sadgs_ns.cli.cameras.plan import Matching, Summary, choose_matching, expected_work
-from sadgs_ns.cli.cameras.video import find_videos, video_frames, write_frames
+from sadgs_ns.cli.cameras.video import video_frames, write_frames
 from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_json
 from sadgs_ns.data.checks.layouts import poses_elsewhere
 from sadgs_ns.data.coordinates import FRAME_KEYS
@@ -290,7 +290,7 @@ def _reporter(progress: Progress) -> Report:
     return report
 
 
-def _publish(undistorted: Path, out: Path, grown: bool = False) -> None:
+def _publish(undistorted: Path, out: Path, grown: bool) -> None:
     """Move undistorted photos, their model and what nerfstudio reads of it to the scene's folder.
 
     A finished scene that has `grown` by these photos stays one until all are there. Raise an OSError if a file cannot

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageOps
 
-from sadgs_ns.cli.cameras.video import find_videos
 from sadgs_ns.cli.program import read_settings
 from sadgs_ns.data import IMAGE_SUFFIXES
 from sadgs_ns.data.checks.images import image_size
@@ -23,6 +22,7 @@ from sadgs_ns.errors import InputError
 COLMAP_FORMATS = {"JPEG", "MPO", "PNG", "BMP", "TIFF"}
 """Pillow's names of the formats that COLMAP and OpenCV read."""
 _FORMATS = COLMAP_FORMATS | {"WEBP", "AVIF"}
+_VIDEOS = {".3gp", ".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".mts", ".ogv", ".webm", ".wmv"}
 _NOT_READ = "images that are not read (make them .jpg or .png files)"
 _RAW_OR_HEIC = {".heic", ".heif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
 """Suffixes of formats that are not read. Programs also give them to JPEG; Pillow takes previews of some for TIFF."""
@@ -55,19 +55,29 @@ def find_source(source: Path, out: Path) -> tuple[list[str], bool, dict[str, str
     return photos, False, masks, others
 
 
+def find_videos(folder: Path) -> list[str]:
+    """Return the names of a folder's videos, relative to it, in order."""
+    return [name for name in _visible_files(folder) if Path(name).suffix.lower() in _VIDEOS]
+
+
+def _visible_files(folder: Path) -> list[str]:
+    """Return the names of all files in a folder, sorted, without hidden ones, as macOS writes them."""
+    names = [path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*")) if not path.is_dir()]
+    return [name for name in names if "/." not in f"/{name}"]
+
+
 def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[str]]:
     """Return the photos of a folder for a scene, their masks by photo, and sentences on the other images that it has.
 
-    Names are relative to the folder. Photos that the scene was begun with stay photos. Hidden files, as macOS writes
-    them, and those of scenes in the same folder are left out.
+    Names are relative to the folder. Photos that the scene was begun with stay photos. Hidden files and those of scenes
+    in the same folder are left out.
     """
     folder, scene = Path(os.path.realpath(source)), Path(os.path.realpath(out))
     scenes = {scene, *(path.parents[1] for path in folder.glob(os.path.join("*", "**", "work", "settings.json")))}
     known = {*read_settings(out / "work" / "settings.json", out).get("photos", [])}
     found, stems, masks = defaultdict(list), defaultdict(list), {}
-    for path in sorted(folder.rglob("*")):
-        name = path.relative_to(folder).as_posix()
-        if scenes.isdisjoint(path.parents) and "/." not in f"/{name}" and (kind := _kind(path)):
+    for name in _visible_files(folder):
+        if scenes.isdisjoint((folder / name).parents) and (kind := _kind(folder / name)):
             if kind == "photos" and name not in known:
                 kind = "thumbnails or trash" if _SERVICE.fullmatch(name) else "masks" if _MASK.fullmatch(name) else kind
             found[kind].append(name)

@@ -35,20 +35,14 @@ _NAMED = 20  # How many unreadable photos a message names
 class Photo:
     """The content of a photo's header."""
 
-    name: str
-    """Relative to the folder of the photos."""
-    size: tuple[int, int]
-    """Width and height in px, upright."""
-    camera: tuple
-    """Equal for photos by one camera at one focal length, as far as size and EXIF tell."""
+    name: str  # Relative to the folder of the photos
+    size: tuple[int, int]  # Width and height in px, upright
+    camera: tuple  # Equal for photos by one camera at one focal length, as far as size and EXIF tell
     position: tuple[float, ...]
     """Latitude, longitude and altitude as EXIF holds them; empty if one lacks, because COLMAP then uses none."""
-    has_alpha: bool
-    """Whether some pixels may be transparent."""
-    is_read: bool = True
-    """Whether COLMAP reads its format."""
-    lies: bool = False
-    """Whether EXIF says that the pixels have to be turned or mirrored to be upright."""
+    has_alpha: bool  # Whether some pixels may be transparent
+    is_read: bool = True  # Whether COLMAP reads its format
+    is_turned: bool = False  # Whether EXIF says that the pixels are to be turned or mirrored to be upright
     is_panorama: bool = False
 
     @property
@@ -158,7 +152,7 @@ def _numbers(value: Any) -> tuple[float, ...]:
 
 
 def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tuple[Path, list[Photo]]:
-    """Convert photos in formats that COLMAP does not read, turn those that lie and cut panoramas, if there are any.
+    """Convert photos that COLMAP does not read, turn those that are not upright, and cut panoramas.
 
     The folder `converted` then holds conversions, and links to the other photos, unless it exists already. Return the
     folder of photos that COLMAP reads, and the photos and views in it.
@@ -172,7 +166,7 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
 
     views = [view for photo in photos for view in photo.views]
     new = [dataclasses.replace(view, name=converted_name(view)) for view in views]
-    if new == list(photos) and all(photo.is_read and not photo.lies for photo in photos):
+    if new == list(photos) and all(photo.is_read and not photo.is_turned for photo in photos):
         return folder, new
     if converted.exists():
         return converted, new
@@ -183,11 +177,11 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
         targets = [partial / converted_name(view) for view in photo.views]
         target = targets[0]
         target.parent.mkdir(parents=True, exist_ok=True)
-        if photo.lies or not photo.is_read or photo.is_panorama:
+        if photo.is_turned or not photo.is_read or photo.is_panorama:
             with Image.open(source) as image:
                 exif = Image.Exif() if image.format == "TIFF" else image.getexif()  # A TIFF's tells of its pixels, too.
                 image.info.pop("exif", None)  # Pillow would write it anew, which fails where it is damaged.
-                pixels = ImageOps.exif_transpose(image) if photo.lies else image
+                pixels = ImageOps.exif_transpose(image) if photo.is_turned else image
                 exif.pop(ExifTags.Base.Orientation, None)
                 kept = b""
                 with contextlib.suppress(Exception):  # Pillow raises anything where EXIF is damaged.
@@ -236,7 +230,7 @@ def write_masks(
             with Image.open(folder / masks[photo.name]) as image, Image.open(folder / photo.name) as stored:
                 grey = np.asarray(image.convert("L"))
                 mask = Image.fromarray(np.uint8(255 * (grey > (127 if grey.max() > 15 else 0))))
-                if photo.lies and (mask.width > mask.height) != (photo.size[0] > photo.size[1]):
+                if photo.is_turned and (mask.width > mask.height) != (photo.size[0] > photo.size[1]):
                     mask.getexif()[ExifTags.Base.Orientation] = stored.getexif()[ExifTags.Base.Orientation]
                     mask = ImageOps.exif_transpose(mask)
         if not 0.97 < mask.width * photo.size[1] / (mask.height * photo.size[0]) < 1.03:

@@ -32,13 +32,10 @@ class Summary:
     photos: int
     registered: int
     points: int
-    reprojection_error: float
-    """Mean over all observations, px."""
-    left_out: dict[str, str]
-    """The reason for each photo that did not register."""
+    reprojection_error: float  # Mean over all observations, px
+    left_out: dict[str, str]  # The reason for each photo that did not register
     matching: Matching
-    attempts: str = ""
-    """A sentence on a second attempt to place the cameras, if one was made."""
+    attempts: str = ""  # A sentence on a second attempt to place the cameras, if one was made
 
     def __str__(self) -> str:
         lines = [

@@ -15,15 +15,6 @@ from av.error import InvalidDataError
 from sadgs_ns.errors import InputError
 from sadgs_ns.files import atomic_path
 
-VIDEO_SUFFIXES = (".3gp", ".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".mts", ".ogv", ".webm", ".wmv")
-
-
-def find_videos(folder: Path) -> list[str]:
-    """Return the sorted names of a folder's videos, relative to it, without hidden ones."""
-    found = [path for path in folder.rglob("*") if path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir()]
-    names = sorted(path.relative_to(folder).as_posix() for path in found)
-    return [name for name in names if "/." not in f"/{name}"]
-
 
 def count_frames(video: Path) -> int:
     """Return the number of a video's frames, which recordings do not tell; raise InputError if it is no video."""
