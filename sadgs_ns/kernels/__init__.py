@@ -46,8 +46,7 @@ def use_triton(place: torch.device | Tensor) -> bool:
     """Return whether to use the kernels of this package; torch and gsplat compute the same, more slowly.
 
     `place` is the device that computes, or a tensor that a kernel would read, which must be float32. With another
-    backend than Triton's (`render.rasterization.choose_backend`), everything but projection and compositing still uses
-    these kernels.
+    backend than Triton's, everything but projection and compositing still uses these kernels.
     """
     if isinstance(place, Tensor):
         if place.dtype != torch.float32:

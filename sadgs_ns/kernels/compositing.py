@@ -122,8 +122,7 @@ def load_tile(tile, starts, num_pairs, height, width, tile_width, tile_height, T
 def highest_alpha(listed, opacity):
     """Return what `alphas` compares with, from 0 where a Gaussian is not listed: 1/255 <= alpha <= opacity.
 
-    The latter is σ >= 0, with some units in the last place for rounding. Bits of positive floats are ordered as these,
-    so that one unsigned comparison finds both.
+    The latter is σ >= 0, with some units in the last place for rounding. One unsigned comparison of bits finds both.
     """
     return tl.maximum(tl.where(listed, opacity, 0.0).to(tl.int32, bitcast=True) - _FAINTEST + 4, 0)
 
@@ -208,13 +207,12 @@ def composite_forward(
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Do what gsplat's `rasterize_to_pixels` does, for three channels and tiles of TILE_SIZE.
 
-    All tensors are contiguous, with shapes as in `render.types.Projected`. `isect_offsets` and `flatten_ids` are the
-    `starts` and `ids` of `tiles.TileLists`; lists of tiles below the image are passed over. A colour that is not finite
-    makes the pixels that see it NaN, and no others.
+    All tensors are contiguous, with shapes as in `render.types.Projected`. `isect_offsets` and `flatten_ids` are
+    `tiles.TileLists`; tiles below the image are passed over. Only pixels that see a colour that is not finite are NaN.
 
     Returns:
-        Colours [C, height, width, 3]; alphas [C, height, width, 1]; and the place in the lists of the last Gaussian
-        that a pixel drew, int32 [C, height, width].
+        Colours [C, height, width, 3]; alphas [C, height, width, 1]; and the place in the lists of each pixel's last
+        Gaussian, int32 [C, height, width].
     """
     views, tile_height, tile_width = isect_offsets.shape
     make = means2d.new_empty if len(flatten_ids) else means2d.new_zeros
@@ -362,8 +360,7 @@ def composite_backward(
     """Differentiate `composite_forward`, given its arguments and results; all tensors are contiguous.
 
     `v_renders` and `v_alphas` are the gradients of its colours and alphas; the latter is None where nothing depends on
-    alphas. A pixel whose gradient is not finite, or at least 1e18, makes the gradients of the Gaussians that it sees
-    NaN, and of no others.
+    alphas. Only Gaussians seen by a pixel whose gradient is not finite, or at least 1e18, have gradients of NaN.
 
     Returns:
         Gradients of means2d, conics, colors and opacities, in their shapes, and with `absgrad` the sum of the absolute

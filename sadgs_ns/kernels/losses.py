@@ -1,8 +1,7 @@
 """`method.losses.photometric_loss` in five kernels: separable blurs and sums forward, the blurs' adjoints backward.
 
 Images stay [C, H, W, 3]: a row has 3W numbers, and a horizontal neighbour lies 3 numbers away. The window is symmetric,
-so that the adjoint of a blur is the same blur of the zero-padded map. Sizes are not specialised, since Triton would
-compile the kernels anew for other images.
+so that the adjoint of a blur is the same blur of the zero-padded map. Of specialised sizes Triton would compile anew.
 """
 
 from __future__ import annotations
@@ -233,8 +232,7 @@ def photometric_loss(
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Do what `method.losses.photometric_loss` does, for views at least as large as SSIM's window.
 
-    `window` holds the window's weights along one axis, and is symmetric. `predicted` and `parts` are float32, and
-    `parts` is contiguous.
+    `window` has its weights along one axis, and is symmetric. `predicted` and `parts` are float32, `parts` contiguous.
     """
     check_pixels(*predicted.shape[:3])
     return _PhotometricLoss.apply(  # type: ignore[return-value]

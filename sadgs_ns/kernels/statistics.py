@@ -39,8 +39,10 @@ def _screen_axis(viewmat, x, y, z, scale, jacobian):
 
 
 @triton.jit
-def _eta(u, v, xx, xy, yy, EPSILON: tl.constexpr):
-    """η of one axis (u, v), as in `method.eta.eta`."""
+def _eta(axis, tensor, EPSILON: tl.constexpr):
+    """η of one axis, as in `method.eta.eta`."""
+    u, v = axis
+    xx, xy, yy = tensor
     largest = 0.5 * (xx + yy) + _hypot(0.5 * (xx - yy), xy)
     return _hypot(u, v) * (tl.sqrt(tl.maximum(largest, 0.0)) + EPSILON)
 
@@ -51,8 +53,7 @@ def _frequency(byte, HIGHEST: tl.constexpr, OCTAVES: tl.constexpr):
     return tl.where(byte > 0, HIGHEST * tl.exp2(OCTAVES * ((byte - 1) / 254 - 1)), 0.0)
 
 
-# One view's intrinsics and S̄ may be part of a tensor of several views, and begin at no multiple of 16 bytes: Triton
-# would compile another kernel for that.
+# One view's intrinsics and S̄ may begin at no multiple of 16 bytes: Triton would compile another kernel for that.
 @triton.jit(
     do_not_specialize=["n", "num_views", "width", "height"],
     do_not_specialize_on_alignment=["structure_tensors", "Ks"],
@@ -121,12 +122,10 @@ def _observe(
         jxx, jyy = fx / depth, fy / depth
         jacobian = jxx, -jxx * tangent_x, jyy, -jyy * tangent_y
         r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation(qw, qx, qy, qz)
-        u0, v0 = _screen_axis(viewmat, r00, r10, r20, scale0, jacobian)
-        u1, v1 = _screen_axis(viewmat, r01, r11, r21, scale1, jacobian)
-        u2, v2 = _screen_axis(viewmat, r02, r12, r22, scale2, jacobian)
-        eta0 = _eta(u0, v0, s_xx, s_xy, s_yy, EPSILON)
-        eta1 = _eta(u1, v1, s_xx, s_xy, s_yy, EPSILON)
-        eta2 = _eta(u2, v2, s_xx, s_xy, s_yy, EPSILON)
+        tensor = s_xx, s_xy, s_yy
+        eta0 = _eta(_screen_axis(viewmat, r00, r10, r20, scale0, jacobian), tensor, EPSILON)
+        eta1 = _eta(_screen_axis(viewmat, r01, r11, r21, scale1, jacobian), tensor, EPSILON)
+        eta2 = _eta(_screen_axis(viewmat, r02, r12, r22, scale2, jacobian), tensor, EPSILON)
         observed = observed & (eta0 < float("inf")) & (eta1 < float("inf")) & (eta2 < float("inf"))
         eta0, eta1 = tl.where(observed, eta0, float("nan")), tl.where(observed, eta1, float("nan"))
         store3(eta, 3 * at, eta0, eta1, tl.where(observed, eta2, float("nan")), candidate)

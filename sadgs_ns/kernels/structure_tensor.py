@@ -1,7 +1,6 @@
 """The three operations of `method.structure_tensor`.
 
-cuDNN's depthwise convolutions take several times as long for such long kernels, and torch needs forty launches for the
-rest of a level.
+For such long kernels cuDNN takes several times as long, and torch needs forty launches for the rest of a level.
 """
 
 from __future__ import annotations

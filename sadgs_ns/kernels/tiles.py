@@ -2,8 +2,7 @@
 
 gsplat lists a Gaussian in every tile that its 3σ square (1.4) or rectangle (1.5) touches. Most of a long, thin or faint
 Gaussian's square lies outside the ellipse in which it is at least 1/255 opaque, and there the rasterizer skips it pixel
-by pixel, forward and backward. Here a tile is listed only if the ellipse meets the rectangle of its pixel centres. What
-is drawn stays the same.
+by pixel. Here a tile is listed only if the ellipse meets the rectangle of its pixel centres, which draws the same.
 """
 
 from __future__ import annotations
@@ -58,8 +57,7 @@ def _load_ellipse(
     a = tl.load(conics + 3 * g, drawn, 1.0)
     b = tl.load(conics + 3 * g + 1, drawn, 0.0)
     c = tl.load(conics + 3 * g + 2, drawn, 1.0)
-    # The determinant of a thin Gaussian's conic cancels in float32, and so does its exponent in gsplat: the level is
-    # raised by what rounding may add there.
+    # The determinant of a thin conic cancels in float32, as does gsplat's exponent: its rounding raises the level.
     determinant = (a.to(tl.float64) * c.to(tl.float64) - b.to(tl.float64) * b.to(tl.float64)).to(tl.float32)
     proper = (determinant > 1e-30) & (determinant < float("inf"))  # otherwise every tile of gsplat's is listed
     a, b, c = tl.where(proper, a, 1.0), tl.where(proper, b, 0.0), tl.where(proper, c, 1.0)
@@ -136,8 +134,8 @@ def _list(
     A Gaussian of more than FEW pairs is left to `_list_parts`: each of its parts is noted in `parts`, as _PLACE times
     its place in the order plus the part's number, and counted in `part_count`.
 
-    The rest of the `num_pairs` places is given to the last tile, or all of them where they are too few: then all radii
-    become 0 and `overflowed` 1.
+    The last tile gets the rest of the `num_pairs` places, or all of them if they are too few: then all radii become 0
+    and `overflowed` 1.
     """
     lane = tl.program_id(0) * LANES + tl.arange(0, LANES)
     exists = lane < n

@@ -105,8 +105,7 @@ def find_remaining(
     """Find which Gaussians stay. `seen` is needed where `cleaning.needs_views`.
 
     Returns:
-        Which stay, bool [N]; and a sentence for each option that is set, with the number of Gaussians that it takes
-        away after the options before it.
+        Which stay, bool [N]; and for each option that is set a sentence, with how many it takes of what is left.
     """
     means, extents = params["means"].detach(), params["scales"].detach().amax(dim=1).exp()
     goes: list[tuple[Tensor, str]] = []

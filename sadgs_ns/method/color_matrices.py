@@ -38,9 +38,8 @@ def correct_colors(
 ) -> Tensor:
     """Apply affine maps (M | b) to the colours and alphas that `composite` returned: M c + α b. [C, H, W, 3]
 
-    The offset b counts as much as the Gaussians cover, as if each Gaussian's own colour had been changed. Pixels that
-    nothing covers stay black, and teach the matrices nothing. Raises InputError if the views have more pixels than the
-    Triton kernels can address (kernels/limits.py).
+    The offset b counts as much as the Gaussians cover: pixels that nothing covers stay black, and teach the matrices
+    nothing. Raises InputError if the views have more pixels than the Triton kernels can address (kernels/limits.py).
     """
     if use_triton(render):
         from sadgs_ns.kernels.color_matrices import correct_colors as fused_correct_colors

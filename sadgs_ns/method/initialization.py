@@ -45,8 +45,7 @@ def bounding_box_points(points: Tensor, grid: int = FACE_GRID) -> tuple[Tensor, 
 def neighbour_scales(points: Tensor) -> Tensor:
     """The initial scale, > 0, of points [P, 3]: the mean distance to the 3 nearest neighbours (3DGS, splatfacto). [P]
 
-    Duplicates have distance 0; the scale is then a millionth of the cloud's extent, so that its logarithm is finite.
-    Raises ValueError if there is no point.
+    It is at least a millionth of the cloud's extent, to have a logarithm. Raises ValueError if there is no point.
     """
     if len(points) == 0:
         raise ValueError("There are no points to start from: give SfM points, or set pipeline.model.random-init True.")

@@ -1,12 +1,10 @@
 """How much memory a training step takes on CUDA, and how many Gaussians may be added so that the next one fits.
 
 The bytes are counted from the code that allocates them: `render.backend_triton` and gsplat's `fully_fused_projection`,
-`kernels.tiles`, `kernels.losses` and `kernels.compositing`. `tests/benchmarks/test_step.py` compares the count with
-real peaks.
+`kernels.tiles`, `kernels.losses` and `kernels.compositing`; `tests/benchmarks/test_step.py` measures real peaks.
 
-A step is largest in one of three phases, in which different tensors are alive: while the tile lists are sorted, in the
-loss, and in the backward pass of rasterization. What a Gaussian keeps between steps comes on top of each. Observing η
-takes less than the backward pass.
+A step is largest in one of three phases: while the tile lists are sorted, in the loss, and in the backward pass of
+rasterization. What a Gaussian keeps between steps comes on top of each.
 """
 
 from __future__ import annotations
@@ -30,8 +28,7 @@ ACTIVATION_BYTES = 16
 ACTIVATION_GRADIENT_BYTES = 28
 """Bytes of a Gaussian in the backward pass: gradients of the activations 16, the means' from harmonics 12."""
 PROJECTION_BYTES = 52
-"""Bytes of a Gaussian and view from the projection to the end of the step: radii 4, means2d 8, depths 4, conics 12,
-opacities 4, colours 12."""
+"""Bytes of a Gaussian and view in every phase: radii 4, means2d 8, depths 4, conics 12, opacities 4, colours 12."""
 DEPTH_SORT_BYTES = 40
 """Bytes of a Gaussian and view besides, while Gaussians are sorted by depth: numbers of tiles 8, indices before 8 and
 after 8 the sort, sorted depths 4, the sort's buffers 12."""

@@ -1,8 +1,7 @@
 """How near anything is to the cameras: the near plane of a scene.
 
 A faint Gaussian just before a camera covers the whole image with haze. Training cameras fade those before themselves,
-but not those before a view between them. Nothing real can be there: the photos show nothing that near. So Gaussians
-nearer than the near plane are not drawn.
+but not those before a view between them. The photos show nothing that near, so that such Gaussians are not drawn.
 """
 
 from __future__ import annotations
@@ -33,10 +32,9 @@ def nearest_depths(
     Ks: Tensor,  # [C, 3, 3]
     sizes: Tensor,  # [C, 2]
 ) -> Tensor:
-    """Measure the depth of the `NEAREST_POINTS`-th SfM point before each view; a few nearer ones may be wrong.
+    """Measure the depth of the `NEAREST_POINTS`-th SfM point before each view, given arguments of `depths_in_views`.
 
-    It is along the viewing axis, in world units, > 0, and infinite in views that see fewer points. The arguments are
-    those of `depths_in_views`. [C]
+    It is along the viewing axis, in world units, > 0, and infinite in views that see fewer points. [C]
     """
     points = points[plausible_points(points)]
     if len(points) < NEAREST_POINTS:

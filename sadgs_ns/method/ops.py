@@ -33,8 +33,7 @@ def update_param_with_optimizer(
 ) -> None:
     """Replace parameters and their optimizers' moments, as gsplat's `duplicate` and `split` do.
 
-    While a parameter is changed, its optimizer has no state, by which training/trainer.py recognizes that memory ran
-    out meanwhile.
+    Meanwhile its optimizer has no state, by which training/trainer.py recognizes that memory ran out.
 
     Args:
         param_fn: Makes the new parameter from its name and the old one.

@@ -43,8 +43,7 @@ def limit_scales(
 def _distances(means: Tensor, positions: Tensor) -> Tensor:
     """Return the distance of each point from the nearest camera. [N, 3], [C, 3] → [N]
 
-    One axis is added at a time: matrix products cancel far from the origin, and without them `torch.cdist` runs a block
-    of CUDA threads for every single distance.
+    One axis is added at a time: matrix products cancel far from the origin, and without them `torch.cdist` is slow.
     """
     nearest = []
     for part in means.split(max(_PAIRS // len(positions), 1)):

@@ -21,8 +21,7 @@ MOST_EFFORT = 100
 MOST_VIEWS = 4
 """Largest number of views in a step that is derived."""
 MORE_VISITS_FROM = (50, 90)
-"""Number of training views up to which effort above 1 adds no visits, because they would overfit, and number from which
-it multiplies them."""
+"""Numbers of views up to which effort above 1 adds no visits, not to overfit, and from which it multiplies them."""
 GROWTH_WITH_EFFORT = (-0.32, 0.8)
 """Power of effort that multiplies the thresholds of growth, and the least factor: effort 2 and more is 0.8."""
 DENSIFICATION_SHARE = 16 / 30
@@ -70,8 +69,7 @@ def schedule(
     """Derive the length of a run from the number of its training views, at least 1; given numbers stay.
 
     With effort 1 the run visits views 2,000 + 50 · num_views times. Less effort, > 0, multiplies that; more effort
-    multiplies it where views are many (`MORE_VISITS_FROM`). A step takes one view more for every 2,000 visits, up to
-    four and never more than there are.
+    multiplies it if views are many (`MORE_VISITS_FROM`). A step takes a view more for every 2,000 visits, up to four.
     """
     few, many = MORE_VISITS_FROM
     power = 1.0 if effort <= 1 else min(max((num_views - few) / (many - few), 0.0), 1.0)
@@ -121,7 +119,6 @@ def growth_threshold(effort: float) -> float:
 def between_one_and_four(views_per_iteration: int, at_four: float) -> float:
     """Interpolate a factor on a learning rate, which is 1 in steps of one view, to steps of several views.
 
-    They were measured in steps of one view and of four, where the factor is `at_four`, > 0; those between lie on a
-    power of the number of views.
+    It is measured for steps of four views, `at_four`, > 0; factors between lie on a power of the number of views.
     """
     return float(at_four ** min(math.log(views_per_iteration, MOST_VIEWS), 1.0))

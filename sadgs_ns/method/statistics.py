@@ -138,7 +138,6 @@ def consistent(
 ) -> Tensor:
     """Whether a response was seen in more than a fraction of the observations: N / N_total > τ (paper, section 3.4).
 
-    `counts` are `n_high` or `n_low`, and the threshold τ_split or τ_prune. Fewer than `min_observations` say nothing:
-    one of one would be all of them. bool [N, 3]
+    `counts` are `n_high` or `n_low`, the threshold τ_split or τ_prune. Below `min_observations` none is. bool [N, 3]
     """
     return (counts > threshold * n_total[:, None]) & (n_total >= min_observations)[:, None]

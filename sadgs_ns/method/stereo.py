@@ -3,11 +3,9 @@
 Each view is compared with a few neighbours, which see the same points from other directions. A hypothesis is an inverse
 depth: it says where a pixel lies in a neighbour. The windows around both places are compared by their zero-mean
 normalised cross-correlation (NCC), which ignores exposure. The coarsest level tests the view's whole range of depths,
-each finer level a few hypotheses around the depth known so far. In the end, a depth counts only where the depth maps of
-neighbours agree with it.
+each finer level a few around the depth known so far. In the end, a depth counts only where neighbours agree with it.
 
-Pixels move evenly with inverse depth, and planes are linear in it. Places in a picture are those of `grid_sample`: it
-spans [−1, 1]² on every level.
+Pixels move evenly with inverse depth, and planes are linear in it. A picture spans [−1, 1]², as for `grid_sample`.
 """
 
 from __future__ import annotations
@@ -35,8 +33,7 @@ HYPOTHESES = 128
 NEIGHBOURS = 4
 """Neighbours per view. Time grows with them; with fewer, occlusions leave holes."""
 NOISE = 0.004
-"""Standard deviation of grey values in [0, 1] that counts as noise: one step of 8 bits. Where the texture is weaker,
-the correlation fades to 0."""
+"""Standard deviation of grey values in [0, 1], a step of 8 bits, below which the correlation fades to 0."""
 SCORES = (0.5, 0.8)
 """Correlation at which confidence begins, and from which on it is full. Lower ones add few pixels."""
 AGREEING = 3
@@ -113,8 +110,7 @@ def depth_maps(
         device: Where to compute. The results lie there.
 
     Returns:
-        A map for each view, whose longest side is at most WORKING_SIDE px. It is empty, with confidence 0, where a view
-        has no usable neighbour.
+        A map for each view, whose longest side is at most WORKING_SIDE px; empty if it has no usable neighbour.
     """
     count, device = len(viewmats), torch.device(device)
     masks = [None] * count if masks is None else masks
@@ -148,8 +144,7 @@ def choose_neighbours(
     """Choose the views with which each view is compared, given float64 arguments of `depths_in_views`.
 
     Two views gain from every point that both see: less if the angle between their rays is too small or too wide, and
-    less if one of them sees it larger. A view counts less if one that is chosen already lies in the same direction, so
-    that not all of them miss the same places.
+    less if one of them sees it larger. A view counts less if one that is chosen already lies in the same direction.
 
     Returns:
         Indices of views, the best first, and −1 where there are fewer; on the device of the points. int64 [V, count]

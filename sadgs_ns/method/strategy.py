@@ -27,8 +27,7 @@ Infos = Info | Sequence[Info]
 _WINDOWS = tuple(field.name for field in fields(Windows))
 
 TAU_PRUNE = 0.8
-"""τ_prune: fraction of observations that must be low (η < 0.1) on every axis before a faint Gaussian is pruned (paper,
-section 3.4)."""
+"""τ_prune: fraction of observations that must be low on every axis to prune a faint Gaussian (paper, section 3.4)."""
 PRUNE_OPACITY = 0.1
 """τ_α: opacity under which a Gaussian with consistently low η is pruned (paper, section 3.4)."""
 CLAMP_OPACITY = 0.8
@@ -54,8 +53,7 @@ class StructureAwareStrategy(Strategy):
         ...                                                              # the optimizers step
         strategy.step_post_backward(params, optimizers, state, step, info)
 
-    `docs/strategy.md` holds the whole loop. Views of different sizes are rendered one by one; `info` is then the list
-    of their infos.
+    `docs/strategy.md` holds the whole loop. Where views of different sizes are rendered, `info` lists their infos.
     """
 
     max_gaussians: int = 4_000_000

@@ -1,5 +1,4 @@
-"""Our Triton kernels behind `project` and `composite`: exact tile lists and backward passes of our own around gsplat's
-projection."""
+"""Our Triton kernels behind `project` and `composite`, around the forward pass of gsplat's projection."""
 
 from __future__ import annotations
 
@@ -52,8 +51,7 @@ def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions, begi
 def composite(projected: Projected, options: RenderOptions) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Do what `rasterization.composite` says, but for the depth; the last result is what it adds to the info.
 
-    With `options.tile_capacity`, the tile lists have one more row of tiles than the image, and the list of the last of
-    them is not drawn (`PendingTiles.lists`).
+    With `options.tile_capacity`, the tile lists have one more row of tiles than the image (`PendingTiles.lists`).
     """
     radii, means2d, depths, conics, opacities, colors, width, height, tiles = projected
     if tiles is None:

@@ -67,9 +67,8 @@ class TileForecast:
         """Predict how many places the tile lists of a call should have.
 
         It is the sum over the views of the number at the last visit in this size, times the largest recent growth of
-        any view, times MARGIN, rounded up so that few different numbers occur. None means that the host must wait for
-        the exact number: a view was not visited yet, or not since a densification and neither was any other, or there
-        are more than MOST_PAIRS.
+        any view, times MARGIN, rounded up so that few different numbers occur. None means that the host must wait: a
+        view was not visited yet, or none since a densification, or there are more than MOST_PAIRS.
         """
         if num_gaussians != self._num_gaussians:
             self._epoch, self._num_gaussians = self._epoch + 1, num_gaussians

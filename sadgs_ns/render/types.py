@@ -71,11 +71,10 @@ DEFAULTS = RenderOptions()
 
 
 class Projected(NamedTuple):
-    """Gaussians as cameras see them."""
+    """Gaussians as cameras see them, which are drawn in a view where their radii are positive."""
 
     radii: Tensor
-    """px, int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5; not positive where a Gaussian is not drawn in a view, and its
-    other rows there have no meaning."""
+    """px, int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5. Where one is not positive, other rows have no meaning."""
     means2d: Tensor
     """Centres in px. [C, N, 2]"""
     depths: Tensor
