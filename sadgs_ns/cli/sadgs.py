@@ -239,20 +239,18 @@ class PhotosToSplat:
         few = self._settings.get("few")
         if few and (self.options.anyway or self._checkpoint()) and not photos_added(self.source, self._scene):
             return f"{few}; done before"
-        added, duration, done_before = "", "", ""
+        added, done_before = "", ""
 
         def on_event(event: str, **fields: Any) -> None:
-            nonlocal added, duration, done_before
+            nonlocal added, done_before
             if event == "added":
                 added = f"{fields['photos']}: "
             elif event in ("panoramas", "aside"):
                 line.print(fields["told"])
-            elif event == "expected":
-                duration = f" ({fields['duration']} in all)"
             elif event == "unchanged":
                 done_before = "; done before"
             elif event == "progress":
-                line.update(f"{added}{fields['stage']} {fields['done']} of {fields['total']}{duration}")
+                line.update(f"{added}{fields['stage']} {fields['done']} of {fields['total']}")
 
         worker = self.worker("cameras", "sadgs_ns.cli.cameras.command:process")
         source = Path(os.path.abspath(self.source))

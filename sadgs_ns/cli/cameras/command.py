@@ -40,7 +40,7 @@ from sadgs_ns.cli.cameras.photos import (
     write_alpha,
     write_masks,
 )
-from sadgs_ns.cli.cameras.plan import Matching, Summary, choose_matching, expected_work
+from sadgs_ns.cli.cameras.plan import Matching, Summary, choose_matching, pairs_to_match
 from sadgs_ns.cli.cameras.video import video_frames, write_frames
 from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_json
 from sadgs_ns.data.checks.layouts import poses_elsewhere
@@ -238,10 +238,10 @@ def _tell_work(scene: _Scene, photos: Sequence[Photo], matching: Matching, notic
             f"{panoramas} of the {len(photos)} photos are panoramas: each is cut into {VIEWS} views of 90°, which "
             f"leave out 30° about the zenith and the nadir; {held_out} are held out.",
         )
-    views = [view for photo in photos for view in photo.views]
+    views = sum(len(photo.views) for photo in photos)
     known = sum(len(photo.views) for photo in photos if photo.name in before)
-    expected, duration = expected_work(views, matching, known)
-    _say("expected", f"{notice} {expected}".lstrip(), duration=duration)
+    pairs = pairs_to_match(views, matching, known)
+    _say("planned", f"{notice} {views - known} photos, up to {pairs:,} pairs to match.".lstrip())
 
 
 def _convert(scene: _Scene, folder: Path, stored: Sequence[Photo]) -> tuple[Path, list[Photo]]:

@@ -1,8 +1,7 @@
-"""The choice of the pairs of photos to match, the expected time, and the summary."""
+"""The choice of the pairs of photos to match, and the summary."""
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,11 +12,6 @@ from sadgs_ns.errors import InputError, RunError
 
 EXHAUSTIVE_LIMIT = 200
 """Most photos for which every pair is matched; twice the photos take four times as long."""
-_FEATURES_PER_MEGAPIXEL = 0.55
-"""Processor time in s to find features in a million pixels, as measured on castle, fox and tree."""
-_PAIR_PER_MEGAPIXEL, _LONGEST_PAIR = 0.12, 0.14
-"""Processor time in s to match two photos of a million pixels, and of so many that the limit of features holds."""
-_POSE = 0.5  # Processor time in s to find a photo's camera; .2 to 1.1 as measured
 MAX_SIDE = 3200
 """Longest side in px to which photos are scaled down to find features, as COLMAP does."""
 _PAIRS_PER_PHOTO = {"sequential": 16, "spatial": 50, "vocabulary": 100}
@@ -97,18 +91,10 @@ def searched_pixels(size: tuple[int, int]) -> float:
     return width * height * min(1.0, MAX_SIDE / max(width, height)) ** 2
 
 
-def expected_work(photos: Sequence[Photo], matching: str, known: int = 0) -> tuple[str, str]:
-    """Return a sentence on the work without the `known` photos, and its duration here, such as "roughly a minute"."""
-    new, megapixels = len(photos) - known, sum(searched_pixels(photo.size) for photo in photos) / 1e6
+def pairs_to_match(photos: int, matching: Matching, known: int = 0) -> int:
+    """Return the largest number of pairs that are matched, without those of the `known` photos alone."""
 
     def all_pairs(count: int) -> int:
         return min(count * _PAIRS_PER_PHOTO.get(matching, count), count * (count - 1) // 2)
 
-    pairs = all_pairs(len(photos)) - all_pairs(known)
-    per_pair = min(_PAIR_PER_MEGAPIXEL * megapixels / len(photos), _LONGEST_PAIR)
-    cores = os.cpu_count() or 1
-    features = megapixels * new / len(photos) * _FEATURES_PER_MEGAPIXEL
-    minutes = (features + pairs * per_pair + new * _POSE) / cores / 60
-    duration = f"{minutes / 60:.1f} hours" if minutes >= 60 else f"{minutes:.0f} minutes"
-    duration = f"roughly {duration if minutes >= 2 else 'a minute'}"
-    return f"{new} photos, up to {pairs:,} pairs to match: {duration} on {cores} processor cores.", duration
+    return all_pairs(photos) - all_pairs(known)
