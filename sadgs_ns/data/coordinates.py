@@ -110,7 +110,7 @@ def spherical_harmonics(directions: Array, degree: int) -> Array:
 
 
 def from_data(path: Path) -> Similarity:
-    """Return how nerfstudio moved the data's world into its own; raise InputError if a run's file does not tell."""
+    """Return the map from the data's world to nerfstudio's from a run's file; raise InputError if it has none."""
     try:
         content = json.loads(path.read_bytes())
         return _moved_by(content["transform"], content["scale"])
@@ -120,9 +120,9 @@ def from_data(path: Path) -> Similarity:
 
 
 def fixed_frame(meta: Mapping[str, Any], path: Path) -> Similarity | None:
-    """Return how the content of a `transforms.json`, `meta`, wants to be moved, or None if nerfstudio decides.
+    """Return the map to nerfstudio's world that the content of a `transforms.json` fixes; None if nerfstudio decides.
 
-    Raise InputError if it wants to be moved by anything but a similarity.
+    Raise InputError if it is no similarity.
     """
     if not any(name in meta for name in FRAME_KEYS):
         return None

@@ -103,7 +103,7 @@ def check_capture(config: FullImageDatamanagerConfig, open_images: bool = True) 
 
 
 def keep_findings(config: FullImageDatamanagerConfig, findings: list[Finding]) -> None:
-    """Keep what `check_capture` found with these settings, so that `findings_of` need not check again, once."""
+    """Keep what `check_capture` found with these settings, which `findings_of` then returns once without a check."""
     vars(config)["findings"] = copy.deepcopy(config), findings
 
 

@@ -1,4 +1,4 @@
-"""Checks of a data folder before nerfstudio parses it, which say in one sentence each what would go wrong.
+"""Checks of a data folder before nerfstudio parses it; each finding is a sentence on what would go wrong.
 
 A few hundred images take under a second. Nothing here needs torch or nerfstudio.
 """

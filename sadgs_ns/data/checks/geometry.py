@@ -234,7 +234,7 @@ def _check_distances(positions: NDArray[np.floating], views: Sequence[View], pat
 def _share_of_views_with_points(positions: NDArray[np.float64], views: Sequence[View]) -> float:
     """Return the share of the views, in [0, 1], that have any of the points [P, 3] on their image or not far beside it.
 
-    Of many views and points an even part is looked at.
+    Of many views and points, only every nth is looked at.
     """
     positions = positions[:: len(positions) // 10_000 + 1]  # [P, 3]
     views = views[:: len(views) // 50 + 1]

@@ -87,8 +87,8 @@ def no_copies(folder: Path, factor: int) -> tuple[str, str]:
 def automatic_factor(image: Path, copy_of: Callable[[int], Path] | None = None) -> int:
     """Return the factor by which nerfstudio scales images down if the user names none.
 
-    It is the smallest power of 2 that makes the image's sides 1600 px or less. With `copy_of`, which tells where the
-    copy that is smaller by a factor would lie, it is only as large as such copies exist, as for a `transforms.json`.
+    It is the smallest power of 2 that makes the image's sides 1600 px or less. If `copy_of` returns where the copy for
+    a factor would lie, the factor is only as large as there are copies, as for a `transforms.json`.
     """
     factor, size = 1, image_size(image)
     while max(size) / factor > MAX_AUTO_RESOLUTION and (copy_of is None or copy_of(2 * factor).exists()):

@@ -24,6 +24,8 @@ from sadgs_ns.errors import InputError, reason
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Names of nerfstudio's coefficients, in the order of its distortion_params."""
 _LENS, _PINHOLE = (*_DISTORTION, "distortion_params"), ("fl_x", "fl_y", "cx", "cy", "w", "h")
+_APPLIED = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
+"""Default of `applied_transform`, the map [3, 4] from COLMAP's world to that of the poses: older ns-process-data's."""
 _PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 
@@ -130,7 +132,7 @@ def read_transforms(path: Path) -> dict[str, Any]:
 
 
 def _completed(frame: dict[str, Any], meta: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Return a frame's image, also if its name has \\ for / or no suffix, and intrinsics from what tells of them."""
+    """Return the frame's intrinsics, derived from shared values, angles or the image, and its image's mended name."""
     where, values, name = f"{path}: frame {frame['file_path']}", {**meta, **frame}, frame["file_path"]
     names = (start + suffix for start in (name, name.replace("\\", "/")) for suffix in ("", *sorted(IMAGE_SUFFIXES)))
     name = next((found for found in names if (path.parent / found).is_file()), name)
@@ -168,11 +170,7 @@ def read_blender(path: Path) -> dict[str, Any]:
 
 def _check_transform(meta: dict[str, Any], path: Path) -> None:
     """Raise InputError if the settings of all poses together make no sense."""
-    try:
-        applied = applied_transform(meta)
-    except (TypeError, ValueError, OverflowError):
-        applied = np.empty(0)
-    if applied.shape != (3, 4) or not np.isfinite(applied).all():
+    if (applied := _rows_of_four(meta.get("applied_transform", _APPLIED), 3)) is None or not np.isfinite(applied).all():
         raise InputError(f"{path} has an applied_transform that is not 3 × 4 finite numbers: correct or remove it.")
     if geometry.finite(meta.get("applied_scale", 1), "applied_scale", str(path)) <= 0:
         raise InputError(f"{path} has applied_scale = {meta['applied_scale']}, which must be positive: correct it.")
@@ -184,10 +182,13 @@ def _check_transform(meta: dict[str, Any], path: Path) -> None:
         raise InputError(f"{path} has orientation_override = {method!r}: give one of {', '.join(methods)}.")
 
 
-def applied_transform(meta: dict[str, Any]) -> NDArray[np.float64]:
-    """Return the map [3, 4] from COLMAP's world to that of the poses, by default that of older ns-process-data."""
-    default = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
-    return np.array(meta.get("applied_transform", default), dtype=np.float64)
+def _rows_of_four(value: Any, rows: int) -> NDArray[np.float64] | None:
+    """Return numbers in JSON as a matrix [rows, 4]; None if they are none."""
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return matrix if matrix.shape == (rows, 4) else None
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -214,11 +215,7 @@ def frames_of(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise InputError(f"{path}: frame {number} has no file_path: give it one, or remove the frame.")
         where = f"{path}: frame {frame['file_path']}"
-        try:
-            pose = np.array(frame["transform_matrix"], dtype=np.float64)
-        except (KeyError, TypeError, ValueError, OverflowError):
-            pose = np.empty(0)
-        if pose.shape != (4, 4):
+        if (pose := _rows_of_four(frame.get("transform_matrix"), 4)) is None:
             raise InputError(f"{where} has no pose of 4 × 4 numbers: give it a transform_matrix, or remove the frame.")
         if not np.isfinite(pose).all():
             raise InputError(f"{where} has NaN or infinity in its pose: remove the frame, or compute the poses again.")
@@ -263,7 +260,7 @@ def _check_ply(meta: dict[str, Any], path: Path, views: Sequence[geometry.View])
         remedy = f"restore it, or remove ply_file_path from {path} to start from random points"
         yield from geometry.check_ply(path.parent / str(meta["ply_file_path"]), views, remedy)
     elif (source := colmap.points_file(path.parent / COLMAP_FOLDERS[0])) is not None:
-        positions, transform = colmap.read_points(source)[0], applied_transform(meta)
+        positions, transform = colmap.read_points(source)[0], np.array(meta.get("applied_transform", _APPLIED), float)
         positions = positions[np.isfinite(positions).all(axis=1)]
         positions = positions @ transform[:, :3].T + transform[:, 3]
         if len(positions):
