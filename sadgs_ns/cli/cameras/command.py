@@ -1,8 +1,8 @@
 """`sadgs-process PHOTOS_OR_VIDEO OUT`: from photos to a scene that `ns-train sadgs --data OUT` reads, with pycolmap.
 
 OUT holds `images/`, `transforms.json`, `sparse_pc.ply` and COLMAP's model in `sparse/0`. `OUT/work` holds what an
-interrupted run needs to go on. Of a finished scene it keeps `settings.json`, by which the command knows it again, and
-for photos that are added later the features and matches in `database.db`, and the model before undistortion.
+interrupted run needs to go on. When the scene is finished, `settings.json` stays there, by which the command knows it
+again; and, for photos that are added later, `database.db` with features and matches, and the model before undistortion.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Process:
 
 
 class _Scene:
-    """A scene that was begun, and what is asked of it now; raises InputError if the two do not fit."""
+    """A scene's folder and the options for it; raises InputError if the scene was begun with others."""
 
     def __init__(self, options: Process) -> None:
         self.options, self.work = options, options.out / "work"
@@ -106,21 +106,18 @@ class _Scene:
 
     def _check_unchanged(self) -> None:
         asked: dict[str, Any] = self.settings | ({"max_size": self.options.max_size} if self.finished else {})
-        differing = [name for name in asked if self.begun.get(name) != asked[name]]
-        told, back, kind = [], "", "videos" if self.is_video else "photos"
-        if "source" in differing:  # The rest follows from it.
-            differing = ["source"]
-        else:
+        told, back, kind, names = [], "", "videos" if self.is_video else "photos", ["source"]
+        if self.begun.get("source") == asked["source"]:  # With another source all the rest differs, too.
             before, now = {*self.begun.get("photos", [])}, {*asked["photos"]}
-            for verb, names in (
-                ("changed", changed_photos(self.options.source, self.begun.get("files", {}))),
-                ("added", set() if self.finished and not self.is_video else now - before),
-                ("removed", before - now),
-            ):
-                if names:
-                    told.append(f"{kind} {verb}: {len(names)}, such as {min(names)}")
-                    back = back if verb == "added" else f"put these {kind} back, "
-        for name in (name for name in differing if name != "photos"):
+            changes = {
+                "changed": changed_photos(self.options.source, self.begun.get("files", {})),
+                "added": set() if self.finished and not self.is_video else now - before,
+                "removed": before - now,
+            }
+            told = [f"{kind} {verb}: {len(those)}, such as {min(those)}" for verb, those in changes.items() if those]
+            back = f"put these {kind} back, " if changes["changed"] or changes["removed"] else ""
+            names = [name for name in asked if name != "photos"]
+        for name in (name for name in names if self.begun.get(name) != asked[name]):
             option = name if name == "source" else "--" + name.replace("_", "-")
             told.append(f"{option} was {self.begun.get(name)}, is {asked[name]}")
         if told:

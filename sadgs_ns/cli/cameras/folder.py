@@ -36,8 +36,8 @@ _VARIANT = re.compile(r"(?<=^img_)e(?=\d)|[ ._-]*(mask|edited|copy|thumb|small|\
 def find_source(source: Path, out: Path) -> tuple[list[str], bool, dict[str, str], list[str]]:
     """Return the photos of a folder for a scene, or its videos if it has fewer than three photos.
 
-    Return their names, none for a single video; whether they are videos; then as `look_into`. Raise InputError if there
-    are neither three photos nor a video, or a photo has a name that is no Unicode.
+    The result is their names (none for a single video), whether they are videos, and masks and sentences as of
+    `look_into`. Raise InputError if there are neither three photos nor a video, or a name is no Unicode.
     """
     if source.is_file():
         return [], True, {}, []

@@ -65,7 +65,7 @@ def photo_stamps(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
 
 
 def changed_photos(folder: Path, stamps: Mapping[str, Sequence[int]]) -> list[str]:
-    """Return the photos whose content is another than in their stamps; those of the same time are not read."""
+    """Return the photos whose content differs from their stamps; those of the same size and time are not read."""
     there = {name: (folder / name).stat() for name in stamps if (folder / name).exists()}
     touched = [name for name, now in there.items() if [now.st_size, now.st_mtime_ns] != list(stamps[name][:2])]
     now = photo_stamps(folder, touched)
@@ -126,20 +126,14 @@ def _read_photo(folder: Path, name: str) -> Photo:
         latitude, longitude, altitude = (_numbers(gps.get(tag)) for tag in _POSITION)
         is_known = latitude and longitude and altitude and any(latitude + longitude)  # 0, 0 is what has no position.
         is_known = is_known and latitude[0] <= 90 and longitude[0] <= 180
-        photo = Photo(
-            name,
-            size,
-            (size, *(exif.get(tag) for tag in (ExifTags.Base.Make, ExifTags.Base.Model)), *focals),
-            latitude + longitude + altitude if is_known else (),
-            image.has_transparency_data,
-            image.format in COLMAP_FORMATS,
-            orientation in NOT_UPRIGHT,
-        )
+        position = latitude + longitude + altitude if is_known else ()
+        camera = size, exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model), *focals
+        kinds = image.has_transparency_data, image.format in COLMAP_FORMATS, orientation in NOT_UPRIGHT
         # An eighth of a JPEG's size tells whether it is whole, but not whether it is a panorama.
         least = 512 if width == 2 * height else 0
         image.draft("RGB", (max(least, width // 8), max(least // 2, height // 8)))
         image.load()
-        return dataclasses.replace(photo, is_panorama=is_panorama(image, size))
+        return Photo(name, size, camera, position, *kinds, is_panorama(image, size))
 
 
 def _numbers(value: Any) -> tuple[float, ...]:

@@ -47,7 +47,7 @@ class Summary:
 def choose_matching(
     asked: Matching, photos: Sequence[Photo], is_video: bool, fetch_vocabulary: Callable[[], None]
 ) -> tuple[Matching, str]:
-    """Return any way of matching photos but "auto", and a sentence on the choice, which may be empty.
+    """Return how photos are matched, which is never "auto", and a sentence on the choice, which may be empty.
 
     `fetch_vocabulary` brings COLMAP's vocabulary tree to this machine, or raises RunError. Raise InputError if the way
     that was asked for cannot work on these photos or this machine.
