@@ -38,7 +38,7 @@ _TO_CONTENT = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
 def write(file: IO[bytes], gaussians: Gaussians, context: Context) -> None:
     """Write a page of at least one Gaussian, in a frame in which z is up; it opens at the context's start.
 
-    Raise InputError if Node.js or its package cannot be run, or there are more Gaussians than SOG can hold.
+    Raise InputError if Node.js or its package cannot be run.
     """
     assert context.start is not None
     page, content, settings = _page(), io.BytesIO(), _settings(context.start)

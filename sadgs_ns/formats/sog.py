@@ -18,23 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sadgs_ns.errors import InputError
 from sadgs_ns.formats.gaussians import Context, Gaussians
 from sadgs_ns.formats.packing import codebook, morton_order, nearest_level, sigmoid, smallest_three, to_bytes
 
-_MOST_PIXELS = 16383  # Longest side of a WebP image
 _PALETTE = 1 << 16  # Most sets of higher harmonics
 _SETS_A_ROW = 64  # Sets of harmonics in a row of their image
 _SAMPLE, _ROUNDS = 1 << 16, 8  # Sets from which the coarse clusters are made, and rounds of k-means
 
 
 def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:
-    """Write at least one Gaussian as SOG, neighbours together; raise InputError if more than fit into an image."""
+    """Write at least one Gaussian as SOG, neighbours together."""
     gaussians = gaussians[morton_order(gaussians.means)]
     count = len(gaussians)
     width = 4 * math.ceil(math.sqrt(count) / 4)
-    if width > _MOST_PIXELS:
-        raise InputError(f"{count:,} Gaussians are more than SOG can hold: choose another format.")
     logs = np.sign(gaussians.means) * np.log1p(np.abs(gaussians.means.astype(np.float64)))
     low, high = logs.min(axis=0), logs.max(axis=0)
     positions = np.rint((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(np.uint16)
