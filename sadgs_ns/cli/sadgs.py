@@ -33,6 +33,7 @@ from sadgs_ns.cli.cameras.video import count_frames
 from sadgs_ns.cli.export import Export
 from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_json
 from sadgs_ns.cli.status_line import StatusLine, clock
+from sadgs_ns.cli.timeline import Timeline
 from sadgs_ns.cli.worker import OnEvent, Worker, WorkerError
 from sadgs_ns.data.checks import check_data
 from sadgs_ns.data.checks.findings import check_findings
@@ -49,6 +50,8 @@ _OURS = ("data", "output-dir", "experiment-name", "timestamp", "vis", "load-dir"
 _TRAINING = "sadgs_ns.training.start:train"
 _LOCK_SECONDS = 10.0
 """Time in which the last stage of a killed run may save."""
+_FIRST_PARTS = {"cameras": ("cameras", "checks"), "training": ("start", "imports"), "export": ("export", "checks")}
+"""Stage and part of the time that begin with each stage."""
 _FORMATS = [suffix[1:] for suffix in (*FORMATS, MESH)]
 _ON_CPU = (
     "torch finds no GPU on this machine, so training runs on the CPU, which is for small scenes: a GPU with CUDA is "
@@ -78,6 +81,8 @@ class Sadgs:
     ] = None
     anyway: bool = False
     """Continue even if fewer than half of the photos registered."""
+    profile: bool = False
+    """Also print where the time went as a table."""
 
 
 class PhotosToSplat:
@@ -93,6 +98,7 @@ class PhotosToSplat:
         self._scene, self._runs = self.folder / "scene", self.folder / "training" / "sadgs"
         self._data = self.source if self._camera_file else self._scene
         self._settings: dict[str, Any] = {}
+        self.timeline = Timeline()
         if not 0 < options.effort <= MOST_EFFORT:
             raise InputError(f"--effort must be in (0, {MOST_EFFORT}].")
         check_size(options.max_size)
@@ -158,6 +164,7 @@ class PhotosToSplat:
             needs_training = not self._trained() or (not self._camera_file and photos_added(self.source, self._scene))
             self._trainer = self.worker("training", _TRAINING) if needs_training else None
             for name, stage in STAGES.items():
+                self.timeline.begin(*_FIRST_PARTS[name])
                 with StatusLine(name, self.console) as line:
                     try:
                         line.update(stage(self, line))
@@ -219,6 +226,7 @@ class PhotosToSplat:
         """Call a worker's function as `Worker.run` does, and name the log where it fails."""
 
         def listen(event: str, **fields: Any) -> None:
+            self.timeline.follow(event, **fields)
             line.update(event) if event == "stopping" else on_event(event, **fields)
 
         try:
@@ -323,6 +331,7 @@ class PhotosToSplat:
         if checkpoint and output.is_file() and output.stat().st_mtime >= checkpoint.stat().st_mtime:
             return f"{output}; done before"
         line.update(str(output))
+        self.timeline.begin("export", name)
         worker = self.worker("export", "sadgs_ns.cli.export:export")
         # The folder may have been renamed since the run's config.yml noted where the scene is.
         options = Export(self._run, output, data=self._data)
@@ -384,9 +393,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     def run() -> int:
         with Interrupts(waiting=lambda: True):
-            made = PhotosToSplat(options, train_options, console).make()
+            work = PhotosToSplat(options, train_options, console)
+            made = work.make()
         page = next((path for path in made if path.suffix == ".html"), None)
         shown = f"Open {page.resolve().as_uri()}" if page else f"The splat is {made[0]}."
+        if options.profile:
+            print(work.timeline.table())
+        print(f"{'of it':<19}{work.timeline}")
         print(f"{'in all':<9}{clock(time.monotonic() - start):>8}  {shown}")
         return 0
 

@@ -11,6 +11,7 @@ import torch
 import tyro
 from tyro.conf import FlagConversionOff, SuppressFixed
 
+from sadgs_ns.events import report
 from sadgs_ns.training.deferred_imports import import_nerfstudio
 
 import_nerfstudio()  # It precedes what imports nerfstudio.
@@ -22,6 +23,7 @@ from sadgs_ns.training.presets import sadgs  # noqa: E402
 
 def train() -> None:
     """Do what `ns-train` does with `sys.argv`, whose first two words are `ns-train sadgs`."""
+    report("imported")
     config = tyro.cli(
         SuppressFixed[FlagConversionOff[SadgsTrainerConfig]],  # as nerfstudio annotates its methods
         prog=" ".join(sys.argv[:2]),

@@ -174,6 +174,7 @@ class SadgsTrainer(Trainer):
             )
         out_of_memory = ""
         self._set_clock(0.0)
+        events.report("loop begins")
         try:
             self._train_until_interrupted(total)
         except InputError as error:
@@ -286,6 +287,10 @@ class SadgsTrainer(Trainer):
         if due:
             self.save_checkpoint(step)
         super()._update_viewer_state(step)
+
+    def _after_train(self) -> None:
+        events.report("loop ends")
+        super()._after_train()
 
     def eval_iteration(self, step: int) -> None:
         """Measure held-out views as nerfstudio does, if one device holds all Gaussians."""
