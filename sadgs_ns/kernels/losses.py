@@ -1,7 +1,7 @@
 """`method.losses.photometric_loss` in five kernels: separable blurs and sums forward, the blurs' adjoints backward.
 
 Images stay [C, H, W, 3]: a row has 3W numbers, and a horizontal neighbour lies 3 numbers away. The window is symmetric,
-so that the adjoint of a blur is the same blur of the zero-padded map. Of specialised sizes Triton would compile anew.
+so that the adjoint of a blur is the same blur of the zero-padded map. Specialised sizes would make Triton compile anew.
 """
 
 from __future__ import annotations

@@ -8,16 +8,14 @@ import triton.language as tl
 from torch import Tensor
 
 from sadgs_ns.kernels import cdiv
-from sadgs_ns.kernels.shared import load3, store3
+from sadgs_ns.kernels.shared import TINY, load3, store3
 
 _PIXELS = 1024
 """Pixels that one program handles."""
-_TINY = 1.1754943508222875e-38
-"""The smallest normal float32, whose logarithm is finite."""
 
 
 @triton.jit
-def _to_byte(value, HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, TINY: tl.constexpr):
+def _to_byte(value, HIGHEST: tl.constexpr, OCTAVES: tl.constexpr):
     """Return the byte of a squared frequency plus a half, so that cutting off the fraction rounds it."""
     octaves = 0.5 * tl.log2(tl.maximum(value, TINY) / (HIGHEST * HIGHEST))
     return tl.minimum(tl.maximum(255 + 254 * octaves / OCTAVES, 0.0), 255.0) + 0.5
@@ -26,7 +24,7 @@ def _to_byte(value, HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, TINY: tl.const
 @triton.jit(do_not_specialize=["n"])
 def _quantize(
     tensor, quantized, n,
-    HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, INVALID: tl.constexpr, TINY: tl.constexpr, PIXELS: tl.constexpr,
+    HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, INVALID: tl.constexpr, PIXELS: tl.constexpr,
 ):  # fmt: skip
     pixel = tl.program_id(0).to(tl.int64) * PIXELS + tl.arange(0, PIXELS)
     exists = pixel < n
@@ -38,7 +36,7 @@ def _quantize(
     correlation = tl.where(product > 0, xy / tl.maximum(product, TINY), 0.0)
     correlation = 127.5 + 127 * tl.minimum(tl.maximum(correlation, -1.0), 1.0)
     correlation = tl.where(known, correlation, INVALID)
-    x, y = _to_byte(xx, HIGHEST, OCTAVES, TINY), _to_byte(yy, HIGHEST, OCTAVES, TINY)
+    x, y = _to_byte(xx, HIGHEST, OCTAVES), _to_byte(yy, HIGHEST, OCTAVES)
     store3(quantized, 3 * pixel, x.to(tl.uint8), correlation.to(tl.uint8), y.to(tl.uint8), exists)
 
 
@@ -47,5 +45,5 @@ def quantize(tensor: Tensor, highest_frequency: float, octaves: float, invalid: 
     tensor = tensor.contiguous()
     quantized = torch.empty_like(tensor, dtype=torch.uint8)
     n = tensor.numel() // 3
-    _quantize[cdiv(n, _PIXELS),](tensor, quantized, n, highest_frequency, octaves, invalid, _TINY, _PIXELS)
+    _quantize[cdiv(n, _PIXELS),](tensor, quantized, n, highest_frequency, octaves, invalid, _PIXELS)
     return quantized

@@ -11,14 +11,12 @@ import triton.language as tl
 from torch import Tensor
 
 from sadgs_ns.kernels import cdiv
-from sadgs_ns.kernels.shared import load3, store3
+from sadgs_ns.kernels.shared import TINY, load3, store3
 
 _TILES = {2: (16, 64), 3: (2, 512)}
 """Rows and columns that a program handles, by the axis: tall where the neighbours are above and below."""
 _PIXELS = 1024
 """Pixels that a program handles where no neighbours matter."""
-_TINY = 1.1754943508222875e-38
-"""The smallest normal float32, whose logarithm is finite."""
 
 
 @triton.jit(do_not_specialize=["height", "width", "taps"])
@@ -73,7 +71,7 @@ def _differentiate(
 @triton.jit(do_not_specialize=["n", "weight_stride", "exponent", "frequency"])
 def _aggregate(
     products, total, energy, total_of_energy, trace_floor, numerator, denominator,
-    n, weight_stride, exponent, frequency, TINY: tl.constexpr, PIXELS: tl.constexpr,
+    n, weight_stride, exponent, frequency, PIXELS: tl.constexpr,
 ):  # fmt: skip
     pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     exists = pixel < n
@@ -126,5 +124,5 @@ def aggregate(
     n = tensor[0].shape[2] * tensor[0].shape[3]
     _aggregate[cdiv(n, _PIXELS), len(tensor[0])](
         *tensor, *energy, trace_floor, numerator, denominator,
-        n, n * (len(tensor[1]) > 1), exponent, frequency, _TINY, _PIXELS,
+        n, n * (len(tensor[1]) > 1), exponent, frequency, _PIXELS,
     )  # fmt: skip

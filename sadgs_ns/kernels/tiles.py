@@ -314,10 +314,8 @@ class PendingTiles:
         gradient flows and no statistic counts the views. Raises InputError if 32 bits do not number the pairs.
         """
         views, rows, columns = self.tile_counts
-        if capacity is None:
-            num_pairs, rows_per_view = sum(self.pair_counts.wait()), rows
-        else:
-            num_pairs, rows_per_view = capacity, rows + 1
+        num_pairs = sum(self.pair_counts.wait()) if capacity is None else capacity
+        rows_per_view = rows if capacity is None else rows + 1
         check_pairs(num_pairs)
         num_tiles, device = views * rows_per_view * columns, self.ends.device
         # Tiles are numbered from −2^15, so that 16 bits tell 65,536 of them apart.

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 REACH = 1.5
-"""Distance from a path of empty space, in near planes; 2 cost a view 2.6 dB (docs/results.md#exported-files)."""
+"""Reach of the empty space around a path, in near planes; 2 cost a view 2.6 dB (docs/results.md#exported-files)."""
 HAZE_ANGLE = 0.1
 """Haze has a longest standard deviation of more than this share of its distance from a path. With 0.2 some stayed."""
 SUPPORT = 2.0

@@ -213,11 +213,10 @@ def _operations(image: Tensor) -> tuple[Callable[..., Tensor], Callable[..., tup
     """The operations `_correlate`, `_differentiate` and `_aggregate`, by Triton where it runs."""
     if not use_triton(image):
         return _correlate, _differentiate, _aggregate
-    from sadgs_ns.kernels import limits
-    from sadgs_ns.kernels import structure_tensor as kernel
+    from sadgs_ns.kernels import limits, structure_tensor
 
     limits.check_batch(*image.shape)
-    return kernel.correlate, kernel.differentiate, kernel.aggregate
+    return structure_tensor.correlate, structure_tensor.differentiate, structure_tensor.aggregate
 
 
 def _correlate(image: Tensor, kernel: Tensor, axis: int) -> Tensor:

@@ -45,13 +45,11 @@ class _Call(NamedTuple):
 class TileForecast:
     """Remembers how many pairs the training views had, and derives the capacity of tile lists from it.
 
-    For each call of the rasterizer, `capacity` says how many places its tile lists should have, and `rendered` takes
-    the exact numbers, which arrive later. `overflowed` reads those that have arrived. Views are the indices of training
-    views, and `size` the width and height in px in which they were rendered.
+    Views are the indices of training views, and `size` the width and height in px in which they are rendered.
 
     Attributes:
         round_to_powers: Whether capacities are rounded up to powers of two and one and a half times these, so that
-            only few different ones occur. They are a fifth larger in the mean then, which small scenes do not notice.
+            only few different ones occur.
         times_overflowed: Number of calls that drew nothing so far, because they needed more places.
     """
 
@@ -86,14 +84,11 @@ class TileForecast:
         return rounded if rounded <= MOST_PAIRS else None
 
     def rendered(self, views: Sequence[int], size: tuple[int, int], capacity: int | None, counts: Counts) -> None:
-        """Take the exact numbers of the call for which `capacity` was asked last; they may not have arrived yet.
-
-        `capacity` is None if the tile lists had the exact length.
-        """
+        """Take the exact numbers, which may arrive later, of the call for which `capacity` was asked last."""
         self._calls.append(_Call(views, size, self._epoch, capacity, counts))
 
     def overflowed(self, *, wait: bool = False) -> list[int]:
-        """Learn from the numbers that have arrived, or wait for all; return the views of calls that so drew nothing."""
+        """Learn from the numbers that have arrived, or wait for all; return the views of calls that overflowed."""
         lost: list[int] = []
         while self._calls and (wait or self._calls[0].counts.ready()):
             call = self._calls.popleft()

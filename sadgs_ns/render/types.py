@@ -74,7 +74,7 @@ class Projected(NamedTuple):
     """Gaussians as cameras see them, which are drawn in a view where their radii are positive."""
 
     radii: Tensor
-    """px, int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5. Where one is not positive, other rows have no meaning."""
+    """px, int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5. Where one is not positive, other tensors mean nothing."""
     means2d: Tensor
     """Centres in px. [C, N, 2]"""
     depths: Tensor
