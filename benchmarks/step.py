@@ -118,7 +118,7 @@ class Step:
     def observe(self) -> None:
         """One observation of η."""
         jitter = torch.rand_like(self.info["means2d"])
-        observe(self.state, self.params, self.info, jitter=jitter)  # type: ignore[arg-type]
+        observe(self.state, self.params, self.info, jitter)  # type: ignore[arg-type]
 
     def optimize(self) -> None:
         """Adam on all parameters that have gradients: our kernel in one launch, as in training."""

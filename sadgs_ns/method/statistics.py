@@ -67,20 +67,13 @@ def observe(
     statistics: MutableMapping[str, Tensor],
     params: Params,
     info: Mapping[str, Any],
-    *,
-    generator: torch.Generator | None = None,
-    jitter: Tensor | None = None,  # [C, N, 2]
+    jitter: Tensor,  # [C, N, 2] in [0, 1)
 ) -> None:
     """Add one forward pass to `STATISTICS`, in place: one jittered sample per visible Gaussian and view.
 
-    Args:
-        info: gsplat's meta, unpacked, of C views of one size, plus `structure_tensors` [C, H, W, 3] (S̄,
-            which may be quantized), `viewmats` [C, 4, 4] and `Ks` [C, 3, 3].
-        jitter: In [0, 1) [C, N, 2]; None draws it here, with the generator.
+    `info` is gsplat's meta, unpacked, of C views of one size, plus `structure_tensors` [C, H, W, 3] (S̄, which may be
+    quantized), `viewmats` [C, 4, 4] and `Ks` [C, 3, 3].
     """
-    if jitter is None:
-        means2d = info["means2d"]
-        jitter = torch.rand(means2d.shape, generator=generator, device=means2d.device)  # [C, N, 2]
     of_views = observed_eta(params, info, jitter)
     for name, statistic in STATISTICS.items():
         statistic.update(statistics[name], of_views)
@@ -138,6 +131,6 @@ def consistent(
 ) -> Tensor:
     """Whether a response was seen in more than a fraction of the observations: N / N_total > τ (paper, section 3.4).
 
-    `counts` are `n_high` or `n_low`, the threshold τ_split or τ_prune. Below `min_observations` none is. bool [N, 3]
+    `counts` are `n_high` or `n_low`, with τ_split or τ_prune. Fewer than `min_observations` say nothing. bool [N, 3]
     """
     return (counts > threshold * n_total[:, None]) & (n_total >= min_observations)[:, None]

@@ -190,7 +190,7 @@ class StructureAwareStrategy(Strategy):
             if self.needs_absgrad(step):
                 keep_gradient(view["means2d"])
             if self.observes(step):
-                observe(state, params, view, jitter=self.world.rand(view["means2d"]))
+                observe(state, params, view, self.world.rand(view["means2d"]))
 
     def step_post_backward(
         self, params: Params, optimizers: Optimizers, state: State, step: int, info: Infos, packed: bool = False

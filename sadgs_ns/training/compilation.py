@@ -150,9 +150,9 @@ class _Stages:
 
     def observation(self) -> None:
         params: Any = {"means": self.means, "quats": self.gaussians.quats, "scales": self.scales.log()}
-        tensors, generator = self.image.byte().repeat(self.views, 1, 1, 1), torch.Generator(self.device).manual_seed(0)
+        tensors = self.image.byte().repeat(self.views, 1, 1, 1)
         info = self.info | {"structure_tensors": tensors, "viewmats": self.cameras.viewmats, "Ks": self.cameras.Ks}
-        observe(empty_statistics(_GAUSSIANS, self.device), params, info, generator=generator)
+        observe(empty_statistics(_GAUSSIANS, self.device), params, info, torch.zeros_like(info["means2d"]))
 
     def exchange(self) -> None:
         from sadgs_ns.kernels.exchange import pack, unpack

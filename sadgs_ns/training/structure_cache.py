@@ -118,5 +118,6 @@ def observe_training_views(
         cameras = Cameras(viewmats, Ks, tensors.shape[2], tensors.shape[1])
         _, _, info = model.render(cameras, model.color_options())
         info |= {"viewmats": viewmats, "Ks": Ks, "structure_tensors": tensors}
-        observe(statistics, params, info, generator=generator)
+        jitter = torch.rand(info["means2d"].shape, generator=generator, device=model.device)
+        observe(statistics, params, info, jitter)
     return statistics

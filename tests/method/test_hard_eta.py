@@ -75,9 +75,7 @@ def forward(params: dict[str, torch.nn.Parameter], focal: float) -> dict[str, An
     return {**info, "viewmats": viewmats, "Ks": Ks, "structure_tensors": uniform_map()}
 
 
-def observed(
-    params: dict[str, torch.nn.Parameter], info: dict[str, Any], rounds: int = 3, **options: Any
-) -> dict[str, Tensor]:
+def observed(params: dict[str, torch.nn.Parameter], info: dict[str, Any], rounds: int = 3) -> dict[str, Tensor]:
     """The statistics after some rounds, the same from torch code and kernel, and finite."""
     results = []
     for fused in (False, True):
@@ -85,12 +83,12 @@ def observed(
         # Triton's interpreter computes with numpy, which would warn of what a GPU computes in silence.
         with triton_switched(fused), np.errstate(all="ignore"):
             for seed in range(rounds):
+                generator = torch.Generator(DEVICE).manual_seed(seed)
                 observe(
                     state,
                     {name: torch.nn.Parameter(value.detach().to(DEVICE)) for name, value in params.items()},
                     {k: v.detach().to(DEVICE) if isinstance(v, Tensor) else v for k, v in info.items()},
-                    generator=torch.Generator(DEVICE).manual_seed(seed),
-                    **options,
+                    torch.rand(info["means2d"].shape, generator=generator, device=DEVICE),
                 )
         assert all(value.isfinite().all() for value in state.values()), f"fused={fused}"
         results.append({name: value.cpu() for name, value in state.items()})

@@ -8,8 +8,9 @@ import pytest
 import torch
 from scenes import camera, random_params, splat
 
+from sadgs_ns.method import statistics as statistics_of_eta
 from sadgs_ns.method.quantization import quantize
-from sadgs_ns.method.statistics import consistent, empty_statistics, observe
+from sadgs_ns.method.statistics import consistent, empty_statistics
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 
 WIDTH, HEIGHT = 64, 48
@@ -21,6 +22,10 @@ def forward(params, structure_tensor: list[float], per_axis_radii: bool, views: 
     _, _, info = splat(params, viewmats, Ks, WIDTH, HEIGHT, per_axis_radii=per_axis_radii)
     tensors = torch.tensor(structure_tensor).expand(views, HEIGHT, WIDTH, 3)
     return {**info, "viewmats": viewmats, "Ks": Ks, "structure_tensors": tensors}
+
+
+def observe(statistics, params, info):
+    statistics_of_eta.observe(statistics, params, info, torch.rand(info["means2d"].shape))
 
 
 def three_gaussians():
