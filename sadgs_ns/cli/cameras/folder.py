@@ -61,8 +61,9 @@ def find_videos(folder: Path) -> list[str]:
 
 
 def _visible_files(folder: Path) -> list[str]:
-    """Return the names of all files in a folder, sorted, without hidden ones, as macOS writes them."""
-    names = [path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*")) if not path.is_dir()]
+    """Return the names of all files and broken links in a folder, sorted, without hidden ones, as macOS writes them."""
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file() or not path.exists()]
+    names = [path.relative_to(folder).as_posix() for path in files]
     return [name for name in names if "/." not in f"/{name}"]
 
 
@@ -101,8 +102,6 @@ def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[
 def _kind(path: Path) -> str:
     """Return "photos" by a file's suffix and content, even if damaged, `_NOT_READ` for other images, or ""."""
     suffix, kind, start = path.suffix.lower(), "", b""
-    if path.exists() and not path.is_file():
-        return ""
     with contextlib.suppress(OSError), path.open("rb") as file:  # What cannot be read is named later.
         start = file.read(12)
     if suffix in IMAGE_SUFFIXES and start[4:8] not in (b"ftyp", b"JXL ") and start[:2] != b"\xff\x0a":

@@ -83,8 +83,6 @@ def _no_transforms(data: Path, path: Path) -> str:
 @collect_findings
 def check_blender(data: Path, options: ParserOptions, open_images: bool = True) -> Iterator[Finding]:
     """Check a synthetic scene in NeRF's layout, `transforms_train.json` and its siblings, and its images if asked."""
-    if not (data / "transforms_train.json").is_file():
-        raise InputError(no_layout(data))
     for split in SPLITS:
         path = data / f"transforms_{split}.json"
         if split == "test" and not path.is_file():
