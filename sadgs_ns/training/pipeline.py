@@ -111,7 +111,7 @@ class SadgsPipeline(VanillaPipeline):
         step_end, run_end = TrainingCallbackLocation.AFTER_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN
         counts = TrainingCallback([step_end, run_end], lambda step: self.structure.refresh())
         read = TrainingCallback([step_end], lambda step: self._report_nonfinite() if self.log.full else None)
-        last = TrainingCallback([run_end], lambda step: self._report_at_the_end())
+        last = TrainingCallback([run_end], lambda step: self._report_nonfinite(last=True))
         # The log is read before densification makes new parameters, which have no gradients.
         return [read, *super().get_training_callbacks(training_callback_attributes), counts, last]
 
@@ -163,17 +163,6 @@ class SadgsPipeline(VanillaPipeline):
         forecast = self.model.tile_forecast
         if forecast is not None and (lost := forecast.overflowed(wait=wait)):
             self.views.sampler.requeue(lost)
-
-    def _report_at_the_end(self) -> None:
-        """Print what was not finite in the last iterations, and how often nothing was drawn."""
-        self._report_nonfinite(last=True)
-        self._repeat_overflowed(wait=True)
-        forecast = self.model.tile_forecast
-        if forecast is not None and (times := forecast.times_overflowed) > 0:
-            note(
-                f"In {times:,} iteration{'s' * (times > 1)} nothing was drawn, since the Gaussians reached more tiles "
-                "than foreseen; these views were drawn again later."
-            )
 
     def next_views(self, step: int) -> list[ViewGroup]:
         """Draw the views of a step, bring their images to the device, and group them by their sizes."""

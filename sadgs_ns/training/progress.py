@@ -39,12 +39,10 @@ def warn(text: str) -> None:
 
 def duration(seconds: float) -> str:
     """Return a time as "40 s", "12 min" or "3 h 5 min"."""
+    minutes = round(seconds / 60)
     if seconds < 99.5:
         return f"{seconds:.0f} s"
-    minutes = round(seconds / 60)
-    if minutes < 100:
-        return f"{minutes} min"
-    return f"{minutes // 60} h {minutes % 60} min"
+    return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60} min"
 
 
 def time_left(first: int, step: int, total: int, seconds: float) -> float | None:
@@ -62,27 +60,21 @@ def cpu_notice(threads: int) -> str:
         "This run trains on the CPU, which is for small scenes and tests: a GPU with CUDA is about a hundred times as "
         "fast."
     )
-    if threads > 1:
-        text += (
-            f" It computes with {threads} threads; beside other work one is quicker: put OMP_NUM_THREADS=1 before the "
-            "command."
-        )
-    return text
+    advice = f"It computes with {threads} threads; beside other work one is quicker: put OMP_NUM_THREADS=1 before the "
+    return f"{text} {advice}command." if threads > 1 else text
 
 
 def next_commands(config: Path, gaussians: int) -> str:
     """Return the commands for a finished run, from the path of its `config.yml` and its number of Gaussians."""
     file, metrics, splat = (shlex.quote(str(config.with_name(n))) for n in (config.name, "eval.json", "splat.ply"))
-    return "\n".join(
-        [
-            f"What can be done with these {gaussians:,} Gaussians:",
-            f"  ns-viewer --load-config {file}",
-            "    shows the Gaussians in a browser",
-            f"  ns-eval --load-config {file} --output-path {metrics}",
-            "    compares held-out views with their photos",
-            f"  sadgs-export {file} --output {splat}",
-            "    writes the Gaussians for other programs",
-        ]
+    return (
+        f"What can be done with these {gaussians:,} Gaussians:\n"
+        f"  ns-viewer --load-config {file}\n"
+        "    shows the Gaussians in a browser\n"
+        f"  ns-eval --load-config {file} --output-path {metrics}\n"
+        "    compares held-out views with their photos\n"
+        f"  sadgs-export {file} --output {splat}\n"
+        "    writes the Gaussians for other programs"
     )
 
 

@@ -172,7 +172,6 @@ class SadgsTrainer(Trainer):
                 f"This run is finished after {self._start_step} iterations: --max-num-iterations of more than "
                 f"{self._start_step} trains on."
             )
-        out_of_memory = ""
         self._set_clock(0.0)
         events.report("loop begins")
         try:
@@ -187,7 +186,8 @@ class SadgsTrainer(Trainer):
         except RunError:
             raise
         except torch.cuda.OutOfMemoryError as error:
-            out_of_memory = _memory(error)  # RunError is raised below, when the failed step's tensors are gone.
+            full = f"The GPU's memory was full at iteration {self.step} with {self.pipeline.model.num_points} Gaussians"
+            raise RunError(f"{full} ({_memory(error)}): {_LESS_MEMORY}; {self._resume}.") from error
         except OSError as error:
             if error.errno is None:  # This is a WriteError, or not from the disk.
                 raise
@@ -198,14 +198,11 @@ class SadgsTrainer(Trainer):
         except RuntimeError as error:
             if self._peers is None or not self._peers.ended():
                 raise
-            resume = f"what the last checkpoint holds goes on with --load-dir {self.checkpoint_dir}"
-            raise RunError(f"{_ANOTHER_ENDED}: {resume}.") from error
+            raise RunError(f"{_ANOTHER_ENDED}: {self._resume}.") from error
         finally:
             self.config.max_num_iterations = total
             self.pipeline.views.close()
             remove_tables()
-        if out_of_memory:
-            raise RunError(self._rescue(out_of_memory))
         processes.leave()
 
     def _train_until_interrupted(self, total: int) -> None:
@@ -224,31 +221,12 @@ class SadgsTrainer(Trainer):
                     raise
                 self._stop(interruption, total)
 
-    def _rescue(self, out_of_memory: str) -> str:
-        """Save the state before the present step if it is whole, and return what to tell the user.
-
-        If memory ran out during a split, the state holds the step's update, and the resumed run makes it again.
-        """
-        torch.cuda.empty_cache()
-        model = self.pipeline.model
-        tensors, whole = [*model.gauss_params.values(), *model.strategy_state.values()], True
-        for name, parameter in model.gauss_params.items():
-            states = self.optimizers.optimizers[name].state
-            whole &= bool(states) or not parameter.numel()  # gsplat takes the state out while it rewrites it.
-            tensors += [value for state in states.values() for value in state.values()]
-        whole &= len({len(value) for value in tensors if isinstance(value, Tensor) and value.dim()}) == 1
-        if not whole or self.step <= self._start_step or not self.world.alone:
-            kept = "nothing newer than the last checkpoint could be saved"
-        else:
-            try:
-                self.save_checkpoint(max(self.step - 1, self._completed_step))
-                kept = f"what was trained is saved and goes on with --load-dir {self.checkpoint_dir}"
-            except WriteError as error:
-                kept = f"what was trained is lost, since {error}"
-        return (
-            f"The GPU's memory was full at iteration {self.step} with {model.num_points} Gaussians ({out_of_memory}): "
-            f"{_LESS_MEMORY}; {kept}."
-        )
+    @property
+    def _resume(self) -> str:
+        """What to tell the user after an error between two checkpoints."""
+        if not any(self.checkpoint_dir.glob("*.ckpt")):
+            return "no checkpoint was made yet"
+        return f"what the last checkpoint holds goes on with --load-dir {self.checkpoint_dir}"
 
     def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
         """Train on the views of a step, which no signal stops until `_update_viewer_state`; return loss and metrics."""
