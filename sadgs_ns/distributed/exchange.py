@@ -31,11 +31,9 @@ class Exchange:
         bands: Those that this process composites.
         counts: Rows that each process has for each of these bands.
         places: Indices in V · N of the rows that this process sends, in the order of all bands. int64 [M]
-        fused: Whether kernels write and read rows, and gradients have the columns of `_GRADIENTS`; the same in all
-            processes.
+        fused: Whether kernels write and read rows, and gradients have the columns of `_GRADIENTS`, in all processes.
         whole_views: Whether each view is one band, so that no row is sent twice.
-        absolute: The centres in which compositing leaves absolute gradients for `backward`, for each of these bands, if
-            they are asked for.
+        absolute: Centres of each of these bands, in which compositing leaves the absolute gradients asked for.
     """
 
     def __init__(self, world: World, projected: Projected, bands: Sequence[Band]) -> None:

@@ -99,28 +99,24 @@ def map_rows(state: dict[str, Any], change: Callable[[Tensor], Tensor]) -> dict[
     """Return a checkpoint whose tensors [N, …] of Gaussians went, in a fixed order, through `change`."""
     pipeline, optimizers = dict(state["pipeline"]), dict(state["optimizers"])
     names = sorted(name for name in pipeline if ".gauss_params." in name)
-    for name in names:
-        pipeline[name] = change(pipeline[name])
+    pipeline |= {name: change(pipeline[name]) for name in names}
     for name in sorted(key for name in names if (key := name.rpartition(".")[2]) in optimizers):
-        moments = {
-            index: {key: _changed(value, change) for key, value in sorted(values.items())}
-            for index, values in sorted(optimizers[name]["state"].items())
-        }
+        moments = {index: _rows(values, change) for index, values in sorted(optimizers[name]["state"].items())}
         optimizers[name] = {**optimizers[name], "state": moments}
-    extra = dict(pipeline.get("_model._extra_state", {}))
-    for part in ("strategy_state", "average"):
-        if part in extra:
-            extra[part] = {key: _changed(value, change) for key, value in sorted(extra[part].items())}
-    if "average" in extra:
-        means = extra["average"]["means"]
-        extra["average"]["means"] = {name: change(mean) for name, mean in sorted(means.items())}
-    pipeline["_model._extra_state"] = extra
+    if "_model._extra_state" in pipeline:
+        extra = pipeline["_model._extra_state"]
+        statistics, average = _rows(extra["strategy_state"], change), extra["average"]
+        average = {**average, "means": _rows(average["means"], change)}
+        pipeline["_model._extra_state"] = {**extra, "strategy_state": statistics, "average": average}
     return {**state, "pipeline": pipeline, "optimizers": optimizers}
 
 
-def _changed(value: Any, change: Callable[[Tensor], Tensor]) -> Any:
-    """Change a tensor that has rows; Adam's number of steps has none."""
-    return change(value) if isinstance(value, Tensor) and value.dim() > 0 else value
+def _rows(values: dict[str, Any], change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
+    """Change tensors that have rows; Adam's number of steps has none."""
+    return {
+        key: change(value) if isinstance(value, Tensor) and value.dim() > 0 else value
+        for key, value in sorted(values.items())
+    }
 
 
 def write(folder: Path, step: int, state: dict[str, Any], keep: bool) -> None:

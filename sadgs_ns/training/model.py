@@ -68,7 +68,7 @@ class SadgsModel(SplatfactoModel):
         self.step = 0
         self.average = RunningMean()
         self.camera_positions: Tensor | None = None  # [C, 3]
-        self.near_plane = NEAR_PLANE if config.near_plane is None else config.near_plane
+        self.near_plane = config.near_plane or NEAR_PLANE
         self.infos: list[dict[str, Any]] = []
         self.tile_forecast: TileForecast | None = TileForecast()
         self.color_matrices: torch.nn.Parameter | None = None  # [V, 3, 4]
@@ -103,11 +103,10 @@ class SadgsModel(SplatfactoModel):
         distance to neighbours limits these, too.
         """
         room = max(min(len(means), self.strategy.max_gaussians - self.num_points), 0)
-        means, colors, scales = means[:room], colors[:room], scales[:room]
         if not room:
             return 0
         known = self.means.detach()[~self.synthetic.to(self.means.device)]
-        added = beside(known, means, colors, scales, self.config)
+        added = beside(known, means[:room], colors[:room], scales[:room], self.config)
         for name, parameter in self.gauss_params.items():
             parameter.data = torch.cat([parameter.data, added[name].to(parameter)])
         self.synthetic = torch.cat([self.synthetic, torch.zeros(room, dtype=torch.bool)])
@@ -361,14 +360,10 @@ class SadgsModel(SplatfactoModel):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return the step, the strategy's state and the mean of the parameters so far."""
-        return {
-            "step": self.step,
-            "strategy_state": {
-                key: asdict(value) if isinstance(value, CameraPaths) else value
-                for key, value in self.strategy_state.items()
-            },
-            "average": self.average.state_dict(),
-        }
+        state = dict(self.strategy_state)
+        if "camera_paths" in state:
+            state["camera_paths"] = asdict(state["camera_paths"])
+        return {"step": self.step, "strategy_state": state, "average": self.average.state_dict()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` saved."""

@@ -159,10 +159,9 @@ class RunLengthDecayScheduler(Scheduler):
 
     def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LambdaLR:
         """Make torch's scheduler, whose state torch's safe loader can load."""
-        max_steps = self.config.max_steps
-        if max_steps is None:
-            raise ValueError("max_steps is unset: SadgsTrainer sets it to the length of the run.")
-        initial, final, hold = self.config.initial_factor, self.config.final_factor, self.config.hold_share
+        max_steps, hold = self.config.max_steps, self.config.hold_share
+        initial, final = self.config.initial_factor, self.config.final_factor
+        assert max_steps is not None, "the plan of the run sets it"
 
         def factor(step: int) -> float:
             t = min(max((step / max(max_steps, 1) - hold) / (1 - hold), 0.0), 1.0)

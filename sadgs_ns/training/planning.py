@@ -67,26 +67,19 @@ def plan_run(
     leaves no room for Gaussians.
     """
     options, model = config.pipeline, pipeline.model
+    strategy, cap = options.model.strategy, options.model.strategy.max_gaussians
     requested = {name: getattr(options, name) for name in ("effort", "views_per_iteration", "memory_budget_gb")}
-    requested |= {f"model.strategy.{name}": value for name, value in asdict(options.model.strategy).items()}
-    if before is not None:
-        old = before.requested
-        changed = [
-            f"pipeline.{name} was {old[name]} and is {value}"
-            for name, value in requested.items()
-            if old.get(name, value) != value
-        ]
-        if changed:
-            warn(f"The checkpoint's run had other settings; this one goes on with its own: {', '.join(changed)}.")
-    strategy, growth = options.model.strategy, growth_threshold(options.effort)
-    clone, split = growth * strategy.clone_grad2d, growth * strategy.split_absgrad2d
-    if dense:
-        clone, split = clone * DENSE_THRESHOLDS, split * DENSE_THRESHOLDS
-    cap = strategy.max_gaussians
+    requested |= {f"model.strategy.{name}": value for name, value in asdict(strategy).items()}
+    old = requested if before is None else requested | before.requested
+    changed = [f"pipeline.{name} was {old[name]} and is {now}" for name, now in requested.items() if old[name] != now]
+    if changed:
+        warn(f"The checkpoint's run had other settings; this one goes on with its own: {', '.join(changed)}.")
     if strategy.refine_stop_iter != 0:
         cap = _cap_in_memory(options, pipeline, length.views_per_iteration)
         if before is not None and all(requested[name] == before.requested[name] for name in _CAP_OPTIONS):
             cap = _kept_cap(cap, before.strategy.max_gaussians)
+    growth, more = growth_threshold(options.effort), DENSE_THRESHOLDS if dense else 1.0
+    clone, split = growth * strategy.clone_grad2d * more, growth * strategy.split_absgrad2d * more
     planned = replace(strategy, max_gaussians=cap, clone_grad2d=clone, split_absgrad2d=split)
     planned = planned.for_run(length.iterations)
     windows = planned.windows

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import socket
 from pathlib import Path
@@ -58,21 +57,12 @@ def _check_address(viewer: ViewerConfig) -> None:
     host, port = viewer.websocket_host, viewer.websocket_port
     try:
         places = socket.getaddrinfo(host, port or 0, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-    except OSError as error:
-        raise InputError(
-            f"viewer.websocket_host {host!r} is unknown ({reason(error)}): 127.0.0.1 opens the viewer to this "
-            "machine only, 0.0.0.0 to the network."
-        ) from error
-    try:
         for family, _, _, _, address in places:
             socket.create_server(address, family=family).close()
     except OSError as error:
         problem = reason(error).partition(" (while")[0]
-        if error.errno == errno.EADDRINUSE:
-            message = (
-                f"viewer.websocket_port {port} is taken on {host} ({problem}): give another, or none for a free one."
-            )
-        else:
-            message = f"The viewer cannot listen on {host}{f':{port}' if port else ''} ({problem}): give another "
-            message += "viewer.websocket_host or viewer.websocket_port."
-        raise InputError(message) from error
+        raise InputError(
+            f"The viewer cannot listen on {host}{f':{port}' if port else ''} ({problem}): give another "
+            "viewer.websocket_port, or none for a free one, or another viewer.websocket_host: 127.0.0.1 opens the "
+            "viewer to this machine only, 0.0.0.0 to the network."
+        ) from error
